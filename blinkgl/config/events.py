@@ -129,7 +129,28 @@ def _pixel(sensor: SensorConfig) -> dict[str, Any]:
     )
 
 
-class EsimConfig(EmulatorConfig):
+class _TwoThresholds:
+    """What holds for emulators with ``contrast_threshold``, ``contrast_threshold_off`` and ``threshold_ratio``."""
+
+    if TYPE_CHECKING:
+        model_fields: ClassVar[dict[str, Any]]
+
+    @classmethod
+    def completed(cls, data: dict[str, Any]) -> dict[str, Any]:
+        return _with_both_thresholds(data, cls.model_fields["contrast_threshold"].default)
+
+    @rule("threshold_ratio", "contrast_threshold", "contrast_threshold_off")
+    def _the_ratio_is_theirs(ratio: float | None, on: float, off: float):
+        if ratio is not None and not any(math.isclose(off, on * r, rel_tol=1e-6) for r in (ratio, 1 / ratio)):
+            raise Refused(
+                "is not the ratio of the two thresholds that are given beside it",
+                where="threshold_ratio",
+                value=ratio,
+                accepted=f"one of them, or {off / on:.6g}",
+            )
+
+
+class EsimConfig(_TwoThresholds, EmulatorConfig):
     """ESIM (Rebecq, Gehrig, Scaramuzza, CoRL 2018): log intensity against per-pixel levels, linear in time."""
 
     reconstructions = ("linear", "pchip", "hermite")
@@ -188,20 +209,6 @@ class EsimConfig(EmulatorConfig):
     causes: bool = _CAUSES
 
     @classmethod
-    def completed(cls, data: dict[str, Any]) -> dict[str, Any]:
-        return _with_both_thresholds(data, cls.model_fields["contrast_threshold"].default)
-
-    @rule("threshold_ratio", "contrast_threshold", "contrast_threshold_off")
-    def _the_ratio_is_theirs(ratio: float | None, on: float, off: float):
-        if ratio is not None and not any(math.isclose(off, on * r, rel_tol=1e-6) for r in (ratio, 1 / ratio)):
-            raise Refused(
-                "is not the ratio of the two thresholds that are given beside it",
-                where="threshold_ratio",
-                value=ratio,
-                accepted=f"one of them, or {off / on:.6g}",
-            )
-
-    @classmethod
     def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:
         return _pixel(sensor)
 
@@ -229,7 +236,7 @@ V2E_PRESETS = {
 }
 
 
-class V2eConfig(EmulatorConfig):
+class V2eConfig(_TwoThresholds, EmulatorConfig):
     """V2E (Hu, Liu, Delbruck, CVPRW 2021): finite bandwidth, mismatch, leak, shot noise, refractory period."""
 
     reconstructions = ("linear",)
@@ -318,20 +325,6 @@ class V2eConfig(EmulatorConfig):
     def _noise_needs_bandwidth(noise, cutoff_hz):
         if noise and cutoff_hz == 0:
             raise Refused("photoreceptor_noise needs cutoff_hz > 0 and not infinite bandwidth")
-
-    @classmethod
-    def completed(cls, data: dict[str, Any]) -> dict[str, Any]:
-        return _with_both_thresholds(data, cls.model_fields["contrast_threshold"].default)
-
-    @rule("threshold_ratio", "contrast_threshold", "contrast_threshold_off")
-    def _the_ratio_is_theirs(ratio: float | None, on: float, off: float):
-        if ratio is not None and not any(math.isclose(off, on * r, rel_tol=1e-6) for r in (ratio, 1 / ratio)):
-            raise Refused(
-                "is not the ratio of the two thresholds that are given beside it",
-                where="threshold_ratio",
-                value=ratio,
-                accepted=f"one of them, or {off / on:.6g}",
-            )
 
     @classmethod
     def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:

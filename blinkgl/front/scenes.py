@@ -157,8 +157,10 @@ class Light(_Piece):
     sun_color, sky_color : (3,) linear factors, white by default.
     lights : tables as under ``light.lights`` of the YAML: ``{"kind": "point", "position": (0, 0, 2), "strength": 3}``,
     ``{"kind": "spot", "position": …, "look_at": …, "angle": 40}``, ``{"kind": "sun", "elevation": 20}``.
+    environment : a panorama in the place of sun and sky, as ``light.environment``: ``{"map": "park.hdr"}``.
+    shadows : "off", "hard" or "soft".   sun_size : degrees, softens.   shadow_size : texels a side of a shadow map.
     unlit : radiance = albedo everywhere.
-    Raises ConfigError."""
+    Raises ConfigError; a panorama that is missing is found when the scene is built."""
 
     def __init__(
         self,
@@ -170,6 +172,10 @@ class Light(_Piece):
         sun_color: Vector | None = None,
         sky_color: Vector | None = None,
         lights: Sequence[Mapping[str, Any]] = (),
+        environment: Mapping[str, Any] | None = None,
+        shadows: Literal["off", "hard", "soft"] = "off",
+        sun_size: float = 0.53,
+        shadow_size: int = 1024,
         unlit: bool = False,
     ):
         check.one_of(lights, "Light.lights", (list, tuple), "a list of tables")
@@ -180,8 +186,13 @@ class Light(_Piece):
             sun_azimuth=azimuth,
             sun_color=sun_color,
             sky_color=sky_color,
+            shadows=shadows,
+            sun_size=sun_size,
+            shadow_size=shadow_size,
             unlit=unlit,
         )
+        if environment is not None:
+            tree["environment"] = check.given(**check.one_of(environment, "Light.environment", Mapping, "a table"))
         if lights:
             for k, one in enumerate(lights):
                 check.one_of(one, f"Light.lights[{k}]", Mapping, "a table")

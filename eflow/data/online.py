@@ -1,7 +1,7 @@
 """Samples that are rendered while they are trained on: a recipe in, no file kept.
 
-    source = OnlineSource(StreamJob.of(load_run("configs/eflow/real.yaml"), seed=0), workers=2)
-    sample = source[0]                  # waits until it is there
+    with open_online(SourceConfig(recipe="configs/eflow/real_data.yaml", online=True, workers=2), seed=0) as source:
+        sample = source[0]              # waits until it is there
 
 Worker processes (:class:`~blinkgl.dataset.executor.Local`'s, each with an OpenGL context of its own and one thread)
 render sequences and cut several windows out of each, of lengths of their own. What comes of it lies for a moment in a

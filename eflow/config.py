@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,6 +11,7 @@ from pydantic import Field
 from blinkgl.config.base import Config, Refused, one_of, rule, validate
 from blinkgl.config.reader import read_table
 from blinkgl.config.sequence import apply_overrides
+from eflow import shipped
 
 
 class VoxelConfig(Config):
@@ -346,7 +348,11 @@ class TrainConfig(Config):
     data: DataConfig = Field(description="what is trained and validated on")
     optim: OptimConfig = Field(OptimConfig(), description="AdamW, its schedule and the loss")
     run: RunConfig = Field(RunConfig(), description="how it runs and what it writes")
-    init_from: str | None = Field(None, description="checkpoint whose weights training starts from (fine-tuning)")
+    init_from: str | None = Field(
+        None,
+        description="checkpoint whose weights training starts from (fine-tuning), or the name of a network that comes "
+        "with the package",
+    )
 
 
 def load_train_config(path: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> TrainConfig:
@@ -366,6 +372,14 @@ def load_train_config(path: str | Path, overrides: list[str] | tuple[str, ...] =
     return config.model_copy(
         update={
             "data": config.data.model_copy(update=sources),
-            "init_from": absolute(config.init_from) if config.init_from else None,
+            "init_from": _start(config.init_from, absolute),
         }
     )
+
+
+def _start(init_from: str | None, absolute: Callable[[str], str]) -> str | None:
+    """A file beside the YAML goes before a shipped network of that name."""
+    if not init_from:
+        return None
+    path = absolute(init_from)
+    return init_from if init_from in shipped.names() and not Path(path).exists() else path

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import sys
 import traceback
 from pathlib import Path
@@ -100,6 +101,16 @@ def evaluate(
     ] = None,
     format: Annotated[str, typer.Option(help="auto, blinkgl, dsec, mvsec or blinkflow.")] = "auto",
     dt: Annotated[int, typer.Option(help="MVSEC: 1 or 4 images.")] = 1,
+    protocol: Annotated[
+        str, typer.Option(help="MVSEC: which frames and rows are scored: all, ste-flownet or e-raft (20 Hz).")
+    ] = "all",
+    ground_truth: Annotated[
+        str | None,
+        typer.Option(
+            "--ground-truth",
+            help="MVSEC: propagated through the 20 Hz flow, or one field scaled; default: the protocol's.",
+        ),
+    ] = None,
     pictures: Annotated[int, typer.Option(min=0, help="Number of pictures.")] = 12,
     iterations: Annotated[int | None, typer.Option(min=1, help="GRU iterations, where the network has them.")] = None,
     confidence: Annotated[
@@ -130,7 +141,7 @@ def evaluate(
     elif window_ms is not None:
         raise ConfigError("only of a recipe", where="--window-ms", value=window_ms, accepted="a dataset FILE.yaml")
     else:
-        source = open_source(dataset, _format(format), dt=dt)
+        source = open_source(dataset, _format(format), dt=dt, protocol=protocol, truth=ground_truth)
     with console.status("evaluating") as status:
         result = score(
             model,
@@ -385,6 +396,27 @@ def pack(
     typer.echo(f"written: {folder}")
     for line in shipped.lines(full):
         typer.echo(line)
+
+
+@app.command()
+def export(
+    checkpoint: Network,
+    out: Annotated[str, typer.Option("--out", "-o", help="New .onnx file.")],
+    size: Annotated[
+        str | None, typer.Option(metavar="WxH", help="The only size it takes; default: any multiple of its stride.")
+    ] = None,
+    iterations: Annotated[int | None, typer.Option(min=1, help="GRU iterations, where the network has them.")] = None,
+    raw: Annotated[bool, typer.Option("--raw", help="The last weights instead of the averaged ones.")] = False,
+) -> None:
+    """A network as an ONNX file, for programs without torch; onnxruntime's flow is compared before it appears."""
+    missing = [name for name in EXTRAS["onnx"][0] if importlib.util.find_spec(name) is None]
+    if missing:
+        raise BlinkGLError(f"{missing[0]} is not installed", accepted=f"run {install(*EXTRAS['onnx'][0])}")
+    from eflow.export import OPSET, export_onnx
+
+    wanted = _size(size)
+    told = export_onnx(_model(checkpoint, "cpu", raw, "fp32", iterations), out, size=wanted)
+    typer.echo(f"written: {out}, opset {OPSET}, sizes: {told['sizes']}; onnxruntime agrees with torch")
 
 
 @app.command()

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
+import signal
 import sys
 import traceback
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,6 +18,9 @@ from blinkgl.machine.extras import EXTRAS, install
 from blinkgl.machine.interrupts import interruptible
 from blinkgl.show.terminal import never_fail_to_print
 from eflow.methods.table import METHODS, make_method
+
+if TYPE_CHECKING:
+    from eflow.config import SourceConfig
 
 app = typer.Typer(name="eflow", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -41,6 +45,10 @@ Focal = Annotated[
 ]
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")
+]
+WindowMs = Annotated[
+    str | None,
+    typer.Option(metavar="LOW-HIGH", help="Of a recipe: lengths of windows; default: its label interval."),
 ]
 
 
@@ -82,24 +90,61 @@ def train(
 
 
 @app.command()
+def render(
+    recipe: Annotated[str, typer.Argument(help="YAML file of `blinkgl generate`.")],
+    out: Annotated[str, typer.Option("--out", "-o", help="New folder of windows, to train on or to evaluate with.")],
+    samples: Annotated[int, typer.Option("--samples", "-n", min=1, help="How many windows.")] = 1000,
+    per_sequence: Annotated[int, typer.Option(min=1, max=1000, help="Windows out of each sequence.")] = 8,
+    window_ms: WindowMs = None,
+    min_events: Annotated[int, typer.Option(min=1, help="Fewest events in each of a sample's two windows.")] = 40,
+    max_flow: Annotated[float, typer.Option(help="Longest median flow of a sample, px.")] = 40.0,
+    split: Annotated[str, typer.Option(help="Whose groups: train or test.")] = "train",
+    seed: Annotated[int, typer.Option(min=0, help="Other windows for each.")] = 0,
+    overrides: Overrides = None,
+    workers: Annotated[int, typer.Option("--workers", "-w", min=0, help="Rendering processes.")] = 1,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+) -> None:
+    """Render windows of a recipe into a folder that several trainings can share. Ctrl-C keeps what is there by then."""
+    from blinkgl.io.sequence_dir import refuse_existing
+    from eflow.data.online import open_online
+    from eflow.data.pool import render_pool
+    from eflow.progress import Counting
+
+    _one_of("--split", split, ("train", "test"))
+    source = _windows_of(
+        recipe,
+        window_ms,
+        samples=per_sequence,
+        min_events=min_events,
+        max_flow=max_flow,
+        set=tuple(overrides or ()),
+        workers=workers,
+    )
+    kept = {key: getattr(source, key) for key in ("set", "window_ms", "min_events", "max_flow")}
+    about = {"recipe": Path(recipe).name, "split": split, "seed": seed, "per_sequence": per_sequence, **kept}
+    refuse_existing(Path(out))  # before a worker has been started
+    with interruptible(signal.SIGTERM), open_online(source, seed, split=split) as stream:
+        done = render_pool(stream, samples, out, about=about, progress=Counting(samples, "windows", not quiet))
+    if not quiet:
+        print(f"{done} windows in {out}", file=sys.stderr)
+
+
+@app.command()
 def evaluate(
     checkpoint: Answer,
     dataset: Annotated[
         str,
         typer.Argument(
-            help="Folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences; or a recipe (.yaml), whose groups of split "
-            "test are rendered for it."
+            help="Folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences, or of rendered windows; or a recipe (.yaml), "
+            "whose groups of split test are rendered for it."
         ),
     ],
     out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for results.json and pictures.")] = None,
     by_density: Annotated[
         bool, typer.Option("--by-density", help="How long the flow is where events are few, and where they are many.")
     ] = False,
-    window_ms: Annotated[
-        str | None,
-        typer.Option(metavar="LOW-HIGH", help="Of a recipe: lengths of windows; default: its label interval."),
-    ] = None,
-    format: Annotated[str, typer.Option(help="auto, blinkgl, dsec, mvsec or blinkflow.")] = "auto",
+    window_ms: WindowMs = None,
+    format: Annotated[str, typer.Option(help="auto, blinkgl, dsec, mvsec, blinkflow or windows.")] = "auto",
     dt: Annotated[int, typer.Option(help="MVSEC: 1 or 4 images.")] = 1,
     protocol: Annotated[
         str, typer.Option(help="MVSEC: which frames and rows are scored: all, ste-flownet or e-raft (20 Hz).")
@@ -233,7 +278,7 @@ def predict(
 
     predictor, of_views = predicting(empty, warm_start), predicting("zero", False)
     if whole:
-        window, factor = infer.whole_file(file)
+        window, factor = infer.whole_file(file, ("old", "new") if model is None else model.reads)
         stream, span = [window], window.new.t1 - window.old.t0
     else:
         first = next((int(c.t[0]) for c in file.chunks()), None)
@@ -541,11 +586,17 @@ def _one_of(option: str, value: str, accepted: tuple[str, ...]) -> None:
 
 def _rendered(recipe: str, window_ms: str | None, limit: int | None):
     """Samples of a recipe, held in memory."""
-    from blinkgl.config.base import validate
-    from eflow.config import SourceConfig
     from eflow.data.online import held
 
-    tree: dict = {"recipe": recipe, "online": True, "samples": 4, "min_events": 40, "max_flow": 40}
+    return held(_windows_of(recipe, window_ms, samples=4, min_events=40, max_flow=40.0), limit or 128)
+
+
+def _windows_of(recipe: str, window_ms: str | None, **how) -> SourceConfig:
+    """The online source of a recipe, as a command line asks for it."""
+    from blinkgl.config.base import validate
+    from eflow.config import SourceConfig
+
+    tree: dict = {"recipe": recipe, "online": True, **how}
     if window_ms is not None:
         ends = window_ms.split("-")
         try:
@@ -555,7 +606,7 @@ def _rendered(recipe: str, window_ms: str | None, limit: int | None):
             raise ConfigError(
                 "not lengths of windows", where="--window-ms", value=window_ms, accepted="LOW-HIGH in ms, such as 5-100"
             ) from None
-    return held(validate(SourceConfig, tree), limit or 128)
+    return validate(SourceConfig, tree)
 
 
 def _size(text: str | None) -> tuple[int, int] | None:

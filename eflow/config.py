@@ -125,6 +125,11 @@ class EvFlowNetConfig(Config):
     width: int | None = Field(
         None, ge=4, le=512, multiple_of=2, description="channels of the first encoder; null: the size's"
     )
+    consensus: bool = Field(
+        False,
+        description="at the coarsest scale, an affine field is fitted to each feature over the image and added: what "
+        "moves everywhere is known where nothing happens (not in the paper)",
+    )
 
 
 class SpikeFlowNetConfig(Config):
@@ -187,7 +192,7 @@ class SourceConfig(Config):
     """One data set: a folder, or a recipe that is rendered while it is trained on."""
 
     path: str | None = Field(None, description="folder; relative to the YAML file")
-    format: Literal["auto", "blinkgl", "dsec", "mvsec", "blinkflow"] = Field(
+    format: Literal["auto", "blinkgl", "dsec", "mvsec", "blinkflow", "windows"] = Field(
         "auto", description="layout of the set; auto: told by its files"
     )
     dt: Literal[1, 4] = Field(1, description="MVSEC: images between the ends of the flow")
@@ -263,6 +268,9 @@ class LossConfig(Config):
         0.0, ge=0, le=1e6, description="weight of the end-point error as a share of the true length (and knee)"
     )
     log: float = Field(0.0, ge=0, le=1e6, description="weight of the end-point error compressed by a logarithm, px")
+    length: float = Field(
+        0.0, ge=0, le=1e6, description="weight of the logarithm of predicted over true length (with knee), either way"
+    )
     knee: float = Field(
         1.0,
         gt=0,
@@ -272,7 +280,7 @@ class LossConfig(Config):
 
     @rule("l1", "epe", "relative", "log")
     def _something(l1, epe, relative, log):
-        if not l1 + epe + relative + log:
+        if not l1 + epe + relative + log:  # length alone has no direction
             raise Refused("no term has a weight", where="l1", value=0, accepted="l1, epe, relative or log above 0")
 
 

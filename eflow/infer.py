@@ -41,7 +41,7 @@ def pad_batch(batch: dict, model: FlowModel) -> tuple[dict, int, int]:
     right, down = -width % multiple, -height % multiple
     left, top = (right, down) if model.pad_start else (0, 0)
     pad = (left, right - left, top, down - top)
-    return {**batch, "old": F.pad(batch["old"], pad), "new": F.pad(batch["new"], pad)}, left, top
+    return {**batch, **{k: F.pad(batch[k], pad) for k in ("old", "new") if k in batch}}, left, top
 
 
 @torch.inference_mode()
@@ -141,14 +141,15 @@ def likely_span(file: EventFile, predictor: Callable[[StreamWindow], tuple[np.nd
     return span
 
 
-def whole_file(file: EventFile) -> tuple[StreamWindow, float]:
-    """The file as one pair: its first half is the old window, its second the new. Also gives the factor from the flow
-    over the second half to the flow over the whole file at constant image velocity."""
+def whole_file(file: EventFile, reads: tuple[str, ...] = ("old", "new")) -> tuple[StreamWindow, float]:
+    """The file as one pair: its first half is the old window, its second the new; for a network that ``reads`` the new
+    one alone, all of it is that. Also gives the factor from the flow over the new window to the flow over the whole
+    file at constant image velocity."""
     events = file.read()
     if len(events) < 2:
         raise EventDataError("no events", where=str(file.path))
     t0, t1 = int(events.t[0]), int(events.t[-1]) + 1
-    t = (t0 + t1) // 2
+    t = (t0 + t1) // 2 if "old" in reads else t0
     cut = lambda a, b: Window(*(getattr(events.window(a, b), k) for k in "xytp"), a, b)
     return StreamWindow(t, cut(t0, t), cut(t, t1)), (t1 - t0) / (t1 - t)
 
@@ -204,19 +205,19 @@ class Predictor:
 
     def __call__(self, window: StreamWindow) -> tuple[np.ndarray, np.ndarray]:
         """flow (H, W, 2) float32 px t -> t + Δ, and the new window's event tensor (C, H, W)."""
-        for name in ("old", "new"):
-            w = getattr(window, name)
+        read = {name: getattr(window, name) for name in self.model.reads}
+        for name, w in read.items():
             if not len(w) and self.empty == "error":
                 raise EventDataError(
                     f"no events in the {name} window [{w.t0}, {w.t1}) µs",
                     accepted="use --empty zero to write zero flow there",
                 )
-        new = self.model.representation(window.new, self.height, self.width)
-        if not (len(window.old) and len(window.new)):
+        grids = {name: self.model.representation(w, self.height, self.width) for name, w in read.items()}
+        new = grids["new"]
+        if not all(len(w) for w in read.values()):
             self._low = None
             return np.zeros((self.height, self.width, 2), np.float32), new
-        old = self.model.representation(window.old, self.height, self.width)
-        batch = {"old": torch.from_numpy(old)[None], "new": torch.from_numpy(new)[None]}
+        batch = {name: torch.from_numpy(grid)[None] for name, grid in grids.items()}
         if self.warm_start and self._low is not None:
             batch["flow_init"] = forward_warp(self._low)
         prediction = predict(self.model, batch, precision=self.precision)

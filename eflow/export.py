@@ -30,7 +30,6 @@ from eflow.models import FlowModel
 OPSET = 18
 TOLERANCE = 1e-4
 """Largest difference between onnxruntime's and torch's flow, px, or share of the longest flow."""
-ONE_WINDOW = ("ev_flownet", "spike_flownet", "ste_flownet")
 FREE_BATCH = ("ev_flownet", "spike_flownet")
 """Whose batch the exporter leaves open; that of the others is 1."""
 REFUSED = {
@@ -44,16 +43,10 @@ class _Flow(nn.Module):
 
     def __init__(self, model: FlowModel):
         super().__init__()
-        self.model, self.names = model, input_names(model)
+        self.model = model
 
     def forward(self, *tensors: Tensor) -> Tensor:
-        given = dict(zip(self.names, tensors, strict=True))
-        return self.model({"old": given.get("old", given["new"]), "new": given["new"]}).flow
-
-
-def input_names(model: FlowModel) -> list[str]:
-    """Of the exported network."""
-    return ["new"] if model.config.name in ONE_WINDOW else ["old", "new"]
+        return self.model(dict(zip(self.model.reads, tensors, strict=True))).flow
 
 
 def export_onnx(
@@ -80,7 +73,7 @@ def export_onnx(
     model = model.eval().cpu().float()
     if hasattr(model.config, "correlation"):  # which of two ways is a question of memory, asked of a size
         model.config = model.config.model_copy(update={"correlation": "dense"})
-    wrapped, names = _Flow(model), input_names(model)
+    wrapped, names = _Flow(model), model.reads
     multiples = _multiple(model.divisor, model.least)
     example = size or (multiples(160), multiples(192))
     told = {
@@ -96,7 +89,7 @@ def export_onnx(
                 _random(model, 2 if name in FREE_BATCH and size is None else 1, example, len(names)),
                 dynamo=True,
                 opset_version=OPSET,
-                input_names=names,
+                input_names=list(names),
                 output_names=["flow"],
                 dynamic_shapes=None if size else {"tensors": tuple(_free(model) for _ in names)},
                 verbose=False,

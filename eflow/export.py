@@ -32,6 +32,8 @@ TOLERANCE = 1e-4
 """Largest difference between onnxruntime's and torch's flow, px, or share of the longest flow."""
 FREE_BATCH = ("ev_flownet", "spike_flownet")
 """Whose batch the exporter leaves open; that of the others is 1."""
+ONE_SIZE = ("eflowformer",)
+"""Whose sizes it does not: attention is padded to windows."""
 REFUSED = {
     "ste_flownet": "its three sweeps over five slices unroll into a graph that the exporter does not finish in ten "
     "minutes",
@@ -63,6 +65,8 @@ def export_onnx(
         raise ConfigError(f"{name} is not exported: {REFUSED[name]}")
     if model.pad_start:
         raise ConfigError(f"{name} with E-RAFT's own padding is not exported", accepted="padding: end")
+    if size is None and name in ONE_SIZE:
+        raise ConfigError(f"{name} is exported for one size only", where="--size", accepted="WIDTHxHEIGHT")
     if size is not None and (min(size) < model.least or any(s % model.divisor for s in size)):
         raise ConfigError(
             "a size the network does not take",

@@ -382,8 +382,8 @@ def validate(
     precision: str,
     size: int = 1,
 ) -> dict[str, float]:
-    """AEE per validation set, with the averaged weights; ``zero`` is the AEE of zero flow on the same samples. size : at
-    most so many samples at once."""
+    """AEE per validation set, with the averaged weights; ``zero`` is the AEE of zero flow on the same samples.
+    size : at most so many samples at once."""
     own = {k: v.detach().clone() for k, v in model.state_dict().items()} if ema is not None else None
     if ema is not None:
         model.load_state_dict(ema)
@@ -541,8 +541,8 @@ def _average(ema: dict[str, Tensor], model: FlowModel, decay: float) -> None:
 
 
 class Readings:
-    """Loss, end-point error and gradient norm of the steps, which stay on the device until they are asked for: to read a
-    number is to wait for all that was computed before it. The latest ones that were read are ``loss``, ``epe`` and
+    """Loss, end-point error and gradient norm of the steps, which stay on the device until they are asked for: to read
+    a number is to wait for all that was computed before it. The latest ones that were read are ``loss``, ``epe`` and
     ``norm``."""
 
     def __init__(self, out: Path):

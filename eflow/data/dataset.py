@@ -80,8 +80,8 @@ class Mixture:
         return self._cache[1]
 
     def first(self, source: int, n: int, rank: int = 0, world: int = 1) -> int:
-        """Number of the sample of an endless ``source`` that comes next when n samples of the run have been taken, every
-        ``world``-th of them, beginning with ``rank``, by the process that asks."""
+        """Number of the sample of an endless ``source`` that comes next when n samples of the run have been taken,
+        every ``world``-th of them, beginning with ``rank``, by the process that asks."""
         epoch, position = divmod(n, self.epoch_length)
         if world == 1:
             return epoch * self.counts[source] + sum(key.source == source for key in self.epoch(epoch)[:position])

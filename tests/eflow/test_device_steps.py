@@ -1,4 +1,4 @@
-"""What makes a card wait: nothing of a training step is read back, or made on the host and copied over, step by step."""
+"""What makes a card wait: nothing of a training step is read back, or made on the host and copied over."""
 
 from collections import Counter
 

@@ -21,7 +21,7 @@ def network(**tree):
     torch.manual_seed(0)
     model = build_model(model_config(tree)).eval()
     for name, p in model.named_parameters():  # flow heads start near zero: agreement of nothing shows nothing
-        if name.startswith("heads.") or name.startswith("update.flow_head.2"):
+        if name.startswith(("heads.", "update.flow_head.2")):
             torch.nn.init.normal_(p, std=0.05)
     return model
 
@@ -75,7 +75,6 @@ def test_one_size_alone(tmp_path):
     [
         {"name": "spike_flownet", "width": 8, "steps": 2},
         {"name": "eraft", "size": "tiny", "iterations": 3, "train_iterations": 3},
-        {"name": "eflowformer", "size": "tiny", "iterations": 3, "train_iterations": 3},
     ],
     ids=lambda tree: tree["name"],
 )
@@ -85,10 +84,18 @@ def test_other_networks_of_any_size(tmp_path, tree):
     agrees(model, tmp_path / "n.onnx", [(128, 144), (160, 128)])
 
 
+@pytest.mark.slow
+def test_eflowformer_of_one_size(tmp_path):
+    model = network(name="eflowformer", size="tiny", iterations=2, train_iterations=2)
+    export_onnx(model, tmp_path / "n.onnx", size=(128, 144))
+    agrees(model, tmp_path / "n.onnx", [(128, 144)])
+
+
 def test_what_is_not_exported(tmp_path, capsys):
     for model, message in (
         (network(name="ste_flownet", size="tiny"), "ste_flownet is not exported: its three sweeps"),
         (network(name="eraft", size="tiny", padding="start"), "own padding is not exported"),
+        (network(name="eflowformer", size="tiny"), "--size: eflowformer is exported for one size only"),
     ):
         with pytest.raises(ConfigError, match=message):
             export_onnx(model, tmp_path / "n.onnx")

@@ -375,6 +375,10 @@ def _bands(taken, start, edges, progress, share, packed, frame, codes, table, x_
         b = take_part(taken, start)
 
 
+_TAIL = 4.0
+"""Time constants of the low-pass after which a step, e^4 times the threshold at most, is over."""
+
+
 class V2e(Emulator):
     """See the module and :class:`~blinkgl.events.emulator.Emulator`. Luminance 1.0 is ``config.full_scale`` DN.
 
@@ -465,6 +469,12 @@ class V2e(Emulator):
     def _tables_changed(self) -> None:
         self._table = self._decode * self._scale
         self._x_table = lin_log(self._table)
+
+    def memory_s(self, luminance: np.ndarray) -> np.ndarray | None:
+        if self.config.cutoff_hz == 0:
+            return None
+        corner = self.config.cutoff_hz * (luminance.astype(np.float64) * self.config.full_scale + 20.0) / 275.0
+        return _TAIL / (2 * np.pi * corner)
 
     def _start(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
         intensity = self._table[frame] if frame.dtype == np.uint8 else frame * self._scale

@@ -33,11 +33,18 @@ def open_events(path: str | os.PathLike) -> EventFile:
     return formats.open_events(check.path(path, "path"))
 
 
-def read_events(path: str | os.PathLike) -> Events:
-    """All :class:`Events` of a file, t in µs, in memory. Raises AssetError and
-    EventDataError (times that run backwards …)."""
+def read_events(path: str | os.PathLike, *, truth: bool = False) -> Events:
+    """All :class:`Events` of a file, t in µs, in memory.
+
+    truth : of a sequence's ``events.h5`` also what made them (``Events.truth``), from ``event_labels.h5`` beside it.
+    Raises AssetError and EventDataError (times that run backwards …)."""
     with open_events(path) as file:
-        return file.read()
+        events = file.read()
+    if not check.one_of(truth, "truth", bool, "True or False"):
+        return events
+    from blinkgl.io.event_labels import with_truth
+
+    return with_truth(events, 0, check.path(path, "path").parent)
 
 
 def write_events(

@@ -324,7 +324,7 @@ def predict(
         if milliseconds is None:
             typer.echo(f"windows of {span / 1000:g} ms")
         stream = infer.windows(file, span, start_us=at(start_ms), end_us=at(end_ms))
-    count = 0
+    count = began = 0
     with contextlib.ExitStack() as opened:
         files = [name for name, wanted in zip(infer.FILES, (npy, flo, h5), strict=True) if wanted]
         writer = opened.enter_context(infer.FlowWriter(out, files=files)) if out else None
@@ -359,7 +359,9 @@ def predict(
             if writer:
                 writer.add(window, flow, tensor, gt, doubt)
             if shown:
-                caption = f"{(window.t_us - window.old.t0) / 1000:g} ms at {window.t_us / 1e6:.3f} s"
+                began = window.new.t0 if count == 1 else began
+                # Recordings may count from 1970: the video begins at 0.
+                caption = f"{(window.new.t1 - window.new.t0) / 1000:g} ms at {(window.t_us - began) / 1e6:.3f} s"
                 shown.add(caption, events_of(tensor), flow, doubt)
         if not count:
             raise BlinkGLError(

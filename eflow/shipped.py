@@ -188,6 +188,7 @@ def pack(
         temporary.mkdir()
     try:
         write_tensors(temporary / WEIGHTS, tensors, metadata_of(model))
+        (temporary / WEIGHTS).chmod(0o644)  # of an installation that others use
         again = load_model(temporary / WEIGHTS, expected=model.config)
         read = (temporary / WEIGHTS).read_bytes()
         full = Card(

@@ -3,17 +3,22 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
 torch = pytest.importorskip("torch")
 
+from shared_data import shared  # noqa: E402
+
 from blinkgl.errors import AssetError, ConfigError, OutputError  # noqa: E402
 from blinkgl.io.formats import write_events  # noqa: E402
+from blinkgl.tools import real_recordings as rr  # noqa: E402
 from eflow import checkpoint as ckpt, shipped  # noqa: E402
 from eflow.cli import run  # noqa: E402
 from eflow.config import load_train_config  # noqa: E402
 from eflow.infer import predict  # noqa: E402
+from eflow.methods.iwe import flow_warp_loss  # noqa: E402
 from eflow.models import build_model, model_config  # noqa: E402
 from flow_data import SPAN, blinkgl_set, moving_events  # noqa: E402
 
@@ -186,3 +191,20 @@ def test_what_ships_is_whole(name):
     assert card.name == name and card.bytes <= shipped.LARGEST
     assert card.bytes == (shipped.FOLDER / name / shipped.WEIGHTS).stat().st_size
     assert card.parameters == sum(p.numel() for p in model.parameters()) and card.network == model.config.name
+
+
+@pytest.mark.parametrize("name", shipped.names())
+def test_what_ships_sees_what_a_camera_saw(name):
+    """A pan over an office: the network's flow is the way, and nearly as long, as the translation that makes the events
+    sharpest, and sharpens them, too."""
+    pytest.importorskip("scipy")
+    path = shared("data/events/evbench_davis240/seq_0001_e.mat")
+    events, height, width = rr.looked_at(path)
+    pair = rr.cut(events, int(events.t[len(events) // 2]), 100_000)
+    flow = rr.answer_of(name, height, width)(pair)
+    found = rr.answer_of("contrast-translation", height, width)(pair)
+    mine = flow[pair.new.y, pair.new.x].astype(float)
+    size = np.hypot(*mine.T)
+    assert (mine @ found[0, 0] / np.maximum(size * np.hypot(*found[0, 0]), 1e-9)).mean() > 0.95
+    assert 0.75 < size.mean() / np.hypot(*found[0, 0]) < 1.3
+    assert flow_warp_loss(pair.new, flow) > 1.0

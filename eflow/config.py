@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,6 +11,7 @@ from pydantic import Field
 from blinkgl.config.base import Config, Refused, one_of, rule, validate
 from blinkgl.config.reader import read_table
 from blinkgl.config.sequence import apply_overrides
+from eflow import shipped
 
 
 class VoxelConfig(Config):
@@ -123,6 +125,11 @@ class EvFlowNetConfig(Config):
     width: int | None = Field(
         None, ge=4, le=512, multiple_of=2, description="channels of the first encoder; null: the size's"
     )
+    consensus: bool = Field(
+        False,
+        description="at the coarsest scale, an affine field is fitted to each feature over the image and added: what "
+        "moves everywhere is known where nothing happens (not in the paper)",
+    )
 
 
 class SpikeFlowNetConfig(Config):
@@ -185,7 +192,7 @@ class SourceConfig(Config):
     """One data set: a folder, or a recipe that is rendered while it is trained on."""
 
     path: str | None = Field(None, description="folder; relative to the YAML file")
-    format: Literal["auto", "blinkgl", "dsec", "mvsec", "blinkflow"] = Field(
+    format: Literal["auto", "blinkgl", "dsec", "mvsec", "blinkflow", "windows"] = Field(
         "auto", description="layout of the set; auto: told by its files"
     )
     dt: Literal[1, 4] = Field(1, description="MVSEC: images between the ends of the flow")
@@ -261,6 +268,9 @@ class LossConfig(Config):
         0.0, ge=0, le=1e6, description="weight of the end-point error as a share of the true length (and knee)"
     )
     log: float = Field(0.0, ge=0, le=1e6, description="weight of the end-point error compressed by a logarithm, px")
+    length: float = Field(
+        0.0, ge=0, le=1e6, description="weight of the logarithm of predicted over true length (with knee), either way"
+    )
     knee: float = Field(
         1.0,
         gt=0,
@@ -270,7 +280,7 @@ class LossConfig(Config):
 
     @rule("l1", "epe", "relative", "log")
     def _something(l1, epe, relative, log):
-        if not l1 + epe + relative + log:
+        if not l1 + epe + relative + log:  # length alone has no direction
             raise Refused("no term has a weight", where="l1", value=0, accepted="l1, epe, relative or log above 0")
 
 
@@ -338,7 +348,11 @@ class TrainConfig(Config):
     data: DataConfig = Field(description="what is trained and validated on")
     optim: OptimConfig = Field(OptimConfig(), description="AdamW, its schedule and the loss")
     run: RunConfig = Field(RunConfig(), description="how it runs and what it writes")
-    init_from: str | None = Field(None, description="checkpoint whose weights training starts from (fine-tuning)")
+    init_from: str | None = Field(
+        None,
+        description="checkpoint whose weights training starts from (fine-tuning), or the name of a network that comes "
+        "with the package",
+    )
 
 
 def load_train_config(path: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> TrainConfig:
@@ -358,6 +372,14 @@ def load_train_config(path: str | Path, overrides: list[str] | tuple[str, ...] =
     return config.model_copy(
         update={
             "data": config.data.model_copy(update=sources),
-            "init_from": absolute(config.init_from) if config.init_from else None,
+            "init_from": _start(config.init_from, absolute),
         }
     )
+
+
+def _start(init_from: str | None, absolute: Callable[[str], str]) -> str | None:
+    """A file beside the YAML goes before a shipped network of that name."""
+    if not init_from:
+        return None
+    path = absolute(init_from)
+    return init_from if init_from in shipped.names() and not Path(path).exists() else path

@@ -122,6 +122,26 @@ class Waiting(Generic[T]):
         return self._waited / max(self._clock() - self._began, 1e-9)
 
 
+class Counting:
+    """So many of so many things, with the time left: at once, every ten seconds, and at the end."""
+
+    def __init__(self, total: int, what: str, enabled: bool, clock: Callable[[], float] = time.monotonic):
+        self.total, self.what, self.enabled, self._clock = total, what, enabled, clock
+        self._began, self._said = clock(), -float("inf")
+
+    def __call__(self, done: int) -> None:
+        now = self._clock()
+        if not self.enabled or (now - self._said < _QUIET_S and done < self.total):
+            return
+        self._said, spent = now, now - self._began
+        left = spent * (self.total - done) / done
+        print(  # noqa: T201
+            f"{done}/{self.total} {self.what}  {done / max(spent, 1e-9):.1f}/s  {_hms(left)} left",
+            file=sys.stderr,
+            flush=True,
+        )
+
+
 def told(rendering: dict[str, float], waited: float) -> str:
     """What online rendering cost, in words."""
     line = (

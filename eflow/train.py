@@ -167,6 +167,7 @@ def _train(
         augment=config.data.augment,
         crop=config.data.crop,
         empty=config.data.empty,
+        reads=model.reads,
     )
     _check_sizes(dataset, model, config.data.crop)
     validation = _validation(config, model) if lead else []
@@ -312,7 +313,7 @@ def _forward(net, batch: dict, config: TrainConfig, world: int) -> tuple[Tensor,
         _compile_errors(config.run.compile),
         torch.autocast(kind, torch.bfloat16, enabled=config.run.precision == "bf16"),
     ):
-        prediction = net({k: batch[k] for k in ("old", "new")})
+        prediction = net({k: batch[k] for k in ("old", "new") if k in batch})
     count = None
     # DDP averages gradients over ranks: dividing by the mean count makes it the mean over all valid pixels.
     if world > 1:
@@ -496,7 +497,7 @@ def _validation(config: TrainConfig, model: FlowModel) -> list[tuple[str, FlowDa
             source = held(s, config.data.validate_samples)
         else:
             source = open_source(s.path, s.format, dt=s.dt)
-        dataset = FlowDataset([source], model.representation, empty=config.data.empty)
+        dataset = FlowDataset([source], model.representation, empty=config.data.empty, reads=model.reads)
         count = min(config.data.validate_samples, len(dataset))
         sets.append((_title(s), dataset, [int(i) for i in np.linspace(0, len(dataset) - 1, count).round()]))
     return sets
@@ -509,7 +510,7 @@ def _title(s: SourceConfig) -> str:
 def _to_device(batch: dict, device: torch.device, channels_last: bool) -> dict:
     out = {k: v.to(device, non_blocking=True) if torch.is_tensor(v) else v for k, v in batch.items()}
     if channels_last:
-        out.update({k: out[k].contiguous(memory_format=torch.channels_last) for k in ("old", "new")})
+        out.update({k: out[k].contiguous(memory_format=torch.channels_last) for k in ("old", "new") if k in out})
     return out
 
 

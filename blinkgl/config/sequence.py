@@ -41,8 +41,8 @@ from blinkgl.config.sensor import (
     sensor_names,
     spelled_out,
 )
-from blinkgl.config.tracks import TracksConfig, check_tracks
 from blinkgl.config.timeline import DisplacementTimeline, TimelineConfig
+from blinkgl.config.tracks import TracksConfig, check_tracks
 from blinkgl.errors import ConfigError
 from blinkgl.labels import LABELS  # noqa: F401 - whose rows bring the keys of `labels:`
 

@@ -34,8 +34,8 @@ from blinkgl.scene.lights import is_coloured, lamps_of
 from blinkgl.scene.shapes.table import DEFORMERS
 from blinkgl.scene.types import Light, Scene
 from blinkgl.sequence import simulate_sequence
-from blinkgl.sequence.inertial import measured
 from blinkgl.sequence.folders import folder_of
+from blinkgl.sequence.inertial import measured
 from blinkgl.sequence.qualify import Verdict, shown, verdict
 from blinkgl.sequence.recorded import RECORDED
 from blinkgl.sequence.rendered import SURFACES, surfaces_at

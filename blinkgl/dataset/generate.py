@@ -19,8 +19,8 @@ from blinkgl.dataset.report import Progress, SequenceReport, config_yaml, losses
 from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging.metering import decibels
 from blinkgl.io.frame_camera import ExposureLine
-from blinkgl.io.tracks import TRACKS
 from blinkgl.io.sequence_dir import SequenceWriter, refuse_existing
+from blinkgl.io.tracks import TRACKS
 from blinkgl.labels import LABELS
 from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Simulation, simulate_sequence
 from blinkgl.sequence.clock import StageClock

@@ -11,7 +11,16 @@ from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.events.types import Events
 from blinkgl.front import arguments as check
-from blinkgl.front.runs import MAX_INDEX, EmulatorSettings, ImageSettings, ImuSettings, Source, Timeline, TrackSettings, configured
+from blinkgl.front.runs import (
+    MAX_INDEX,
+    EmulatorSettings,
+    ImageSettings,
+    ImuSettings,
+    Source,
+    Timeline,
+    TrackSettings,
+    configured,
+)
 from blinkgl.front.scenes import Scene
 from blinkgl.labels import Flow, LabelFrame
 from blinkgl.render.tracks import Tracks
@@ -48,8 +57,8 @@ def simulate_sequence(
 
     source : :class:`Scene` or what :func:`load` gave, recorded frames (``frames:``)
     included.   index : number of the sequence.
-    emulator, sensor, timeline, quality, labels, images, imu, tracks : as of :func:`record`; what ``labels`` does not name is not
-    drawn.
+    emulator, sensor, timeline, quality, labels, images, imu, tracks : as of :func:`record`; what ``labels`` does not
+    name is not drawn; ``imu()`` and ``tracks()`` of the iterator give the last two.
     events : False leaves them out.
     pictures_hz : gives a :class:`Picture` so many times per second of simulated time, at event frames.
     The iterator has ``config``, ``height``, ``width``, ``t0_ns``, ``t1_ns``, and counts ``frames``, ``events``,
@@ -182,7 +191,7 @@ def record(
                 times.append(item.t_ns // 1000)
             elif isinstance(item, CameraImage):
                 taken.append(item)
-        inertial, tracks = sequence.imu(), sequence.tracks()
+        inertial, followed = sequence.imu(), sequence.tracks()
     t_us = np.array(times, np.int64)
     return Recording(
         Events.concatenate(chunks),
@@ -195,5 +204,5 @@ def record(
         sum(sequence.losses[:2]),
         tuple(taken),
         inertial,
-        tracks,
+        followed,
     )

@@ -40,6 +40,7 @@ from blinkgl.config.imu import ImuConfig
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.errors import AssetError, BlinkGLError, OutputError
 from blinkgl.events.types import Events
+from blinkgl.io import imu as imu_files
 from blinkgl.io.atomic import fsync, output_errors, remove_stale, temporary_beside
 from blinkgl.io.dsec import DsecEventWriter
 from blinkgl.io.event_labels import EVENT_LABELS, EventLabelsWriter
@@ -52,7 +53,6 @@ from blinkgl.io.frame_camera import (
     picture_file,
     stamps_txt,
 )
-from blinkgl.io import imu as imu_files
 from blinkgl.io.hdf5 import blosc_dataset, write_rows
 from blinkgl.io.records import InsidePath, entries_below, open_regular, parse, read_text, shown
 from blinkgl.labels import Form, Label, label_of

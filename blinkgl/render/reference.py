@@ -27,6 +27,7 @@ way to anti-alias, not a property of the scene.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
@@ -273,7 +274,7 @@ def _relative_rate(scene: Scene, thing: SceneObject, t_ns: int) -> np.ndarray:
     return rate
 
 
-def applied(scene: Scene, hits: Hits, matrix_of) -> np.ndarray:
+def applied(scene: Scene, hits: Hits, matrix_of: Callable[[SceneObject], np.ndarray]) -> np.ndarray:
     """(N, 3) matrix_of(object) (3, 4) applied to every object-local point; nan where nothing is hit."""
     parts, out = scene_parts(scene), np.full((len(hits.hit), 3), np.nan)
     for p, rows in _by_part(hits.part):

@@ -47,23 +47,22 @@ def track_points(scene: Scene, config: TracksConfig, times_ns: Sequence[int], rn
     times = [int(t) for t in times_ns]
     if config.choose == "surface":
         return _of_surfaces(scene, config.points, times, rng)
-    query, hits = _of_a_grid(scene, config.points, times) if config.choose == "grid" else _drawn(
-        scene, config.points, times, rng
+    query, hits = (
+        _of_a_grid(scene, config.points, times) if config.choose == "grid" else _drawn(scene, config.points, times, rng)
     )
     return _followed(scene, hits, times, query)
 
 
 def _followed(scene: Scene, hits: Hits, times: list[int], query: np.ndarray) -> Tracks:
-    n, shape = len(hits.hit), (len(hits.hit), len(times))
+    shape = (len(hits.hit), len(times))
     xy, world = np.zeros((*shape, 2)), np.zeros((*shape, 3))
     depth, occluded = np.zeros(shape), np.ones(shape, bool)
     for k, t_ns in enumerate(times):
         xy[:, k], world[:, k], depth[:, k], seen = places(scene, hits, t_ns)
         occluded[:, k] = ~seen
-    order = np.arange(n)
     return Tracks(
         np.array([t // 1000 for t in times], np.int64),
-        query[order],
+        query,
         xy,
         occluded,
         world,
@@ -107,7 +106,8 @@ _ARRAYS = ("xy", "hit", "depth", "instance", "part", "triangle", "front", "bary"
 
 
 def _joined(some: list[Hits]) -> Hits:
-    return replace(some[0], **{name: np.concatenate([getattr(one, name) for one in some]) for name in _ARRAYS})
+    arrays = [np.concatenate([getattr(one, name) for one in some]) for name in _ARRAYS]
+    return Hits(arrays[0], some[0].t_ns, *arrays[1:])
 
 
 def _of_a_grid(scene: Scene, points: int, times: list[int]) -> tuple[np.ndarray, Hits]:
@@ -190,9 +190,7 @@ def _of_surfaces(scene: Scene, points: int, times: list[int], rng: np.random.Gen
     if not kept:
         empty = reference.cast(scene, times[0], np.zeros((0, 2)))
         return _followed(scene, empty, times, np.zeros((0, 3)))
-    return replace(
-        kept[0], **{name: np.concatenate([getattr(one, name) for one in kept]) for name in _OF_POINTS}
-    )
+    return replace(kept[0], **{name: np.concatenate([getattr(one, name) for one in kept]) for name in _OF_POINTS})
 
 
 _OF_POINTS = tuple(name for name in Tracks.__dataclass_fields__ if name != "t_us")

@@ -53,9 +53,7 @@ def place_of(config: ImuConfig) -> np.ndarray:
     return T
 
 
-def measured(
-    path: PosePath, config: ImuConfig, t0_ns: int, t1_ns: int, rng: np.random.Generator
-) -> Inertial:
+def measured(path: PosePath, config: ImuConfig, t0_ns: int, t1_ns: int, rng: np.random.Generator) -> Inertial:
     """What the unit measures over [t0, t1] on a camera that moves by ``path``, T_world_cam.
 
     Raises ConfigError where the camera's velocity jumps, which no force can do."""

@@ -18,7 +18,9 @@ def living() -> Scene:
     scene = Scene(Camera(96, 64, fov=60, pose=way), duration=0.1, label_rate=20)
     scene += Primitive("cuboid", extents=(0.1, 9, 9), pose=(2, 0, 0), category="wall")
     scene += Primitive("figure", clip="run", height=1.2, tempo=2, pose=(0.3, -0.6, -0.6))
-    scene += Primitive("grid", width=0.8, depth=0.8, deform=Deform("wave", period=0.1), pose=Pose((0, 0.5, 0.3), euler=(0, 90, 0)))
+    scene += Primitive(
+        "grid", width=0.8, depth=0.8, deform=Deform("wave", period=0.1), pose=Pose((0, 0.5, 0.3), euler=(0, 90, 0))
+    )
     turns = Keyframes({0.0: Pose((-0.8, -0.6, -0.1)), 0.2: Pose((-0.8, 0.6, 0.1), euler=(0, 0, 30))})
     scene += Primitive("cuboid", extents=(0.2, 0.4, 0.5), pose=turns, material=Material(color=(0.7, 0.2, 0.1)))
     return scene
@@ -34,7 +36,7 @@ def made():
 
 
 def test_of_every_pixel_they_are_the_labels(made):
-    scene, times, drawn = made
+    _, _, drawn = made
     tracks = drawn.tracks
     y, x = tracks.query_points[:, 1:].astype(int).T
     assert len(x) > 6000 and (tracks.query_points[:, 0] == 0).all() and len(np.unique(tracks.instance)) == 4
@@ -92,7 +94,7 @@ def test_a_point_goes_where_its_corner_goes(made):
     lively = [i for i, (p, _) in enumerate(tracks.surface) if parts[p][1].mesh.deformer is not None]
     assert len(lively) > 50
     for i in lively[:20]:
-        (part, triangle), (thing, piece) = tracks.surface[i], parts[tracks.surface[i, 0]]
+        (_, triangle), (thing, piece) = tracks.surface[i], parts[tracks.surface[i, 0]]
         for k, t_ns in enumerate(times):
             corners = piece.mesh.deformer.positions(piece.mesh, t_ns)[piece.mesh.faces[triangle]]
             world = thing.path.pose(t_ns) @ (*(tracks.weights[i] @ corners), 1)

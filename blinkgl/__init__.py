@@ -26,6 +26,7 @@ _HOMES = {
         "Pose",
         "Primitive",
         "Scene",
+        "Trajectory",
         "Way",
         "look_at",
     ),
@@ -39,10 +40,12 @@ _HOMES = {
         "open_events",
         "read_events",
         "read_flow",
+        "read_trajectory",
         "simulate",
         "simulate_file",
         "write_events",
         "write_flow",
+        "write_trajectory",
     ),
     "blinkgl.events.types": ("Events",),
     "blinkgl.sequence.items": ("CameraImage", "EventChunk", "GroundTruth", "Picture"),
@@ -61,10 +64,12 @@ if TYPE_CHECKING:  # what a type checker and an editor see; a test compares it w
         open_events,
         read_events,
         read_flow,
+        read_trajectory,
         simulate,
         simulate_file,
         write_events,
         write_flow,
+        write_trajectory,
     )
     from blinkgl.front.runs import Timeline, generate, load, verify
     from blinkgl.front.scenes import (
@@ -79,6 +84,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see; a test compares it w
         Pose,
         Primitive,
         Scene,
+        Trajectory,
         Way,
         look_at,
     )
@@ -117,6 +123,7 @@ __all__ = [
     "Renderer",
     "Scene",
     "Timeline",
+    "Trajectory",
     "V2e",
     "Way",
     "compare",
@@ -128,6 +135,7 @@ __all__ = [
     "open_events",
     "read_events",
     "read_flow",
+    "read_trajectory",
     "record",
     "render_frame",
     "simulate",
@@ -136,6 +144,7 @@ __all__ = [
     "verify",
     "write_events",
     "write_flow",
+    "write_trajectory",
 ]
 
 

@@ -16,6 +16,7 @@ from blinkgl.io import flow as flow_files, formats, trajectories
 from blinkgl.io.formats import EventFile
 
 if TYPE_CHECKING:
+    from blinkgl.recordings.calibration import Calibration
     from blinkgl.recordings.comparison import Comparison
     from blinkgl.recordings.simulation import SimulationReport
 
@@ -198,6 +199,56 @@ def compare(
         interval_ms=check.number(interval_ms, "interval_ms", above=0, most=1e7),
         zero_time=bool(zero_time),
         judge=bool(judge),
+    )
+
+
+def calibrate(
+    recording: str | os.PathLike,
+    frames: str | os.PathLike | None = None,
+    *,
+    emulator: EmulatorSettings = "esim",
+    fixed: Iterable[str] = (),
+    still: bool = False,
+    fps: float | None = None,
+    timestamps: str | os.PathLike | None = None,
+    gamma: str | float = "linear",
+    interpolate: str = "motion",
+    max_px: float = 1.0,
+    frame_delay_ms: float | None = None,
+    starts: int = 3,
+    seed: int = 0,
+) -> Calibration:
+    """Fits an emulator to a camera's own recording. ``config`` of the result is the emulator as fitted, ``values`` and
+    ``uncertainty`` are of its fitted keys, ``untold`` says why others were left alone, ``judged`` how near it comes in
+    the half that was fitted and in the other, ``sensor()`` is the table of a sensor file.
+
+    recording : event file.   frames : what the camera saw, of its size (default: the recording's own).   emulator : a
+    name, or a mapping where the fit begins.   fixed : its keys that stay as they are there.   still : a scene that
+    stands still in constant light, without frames: noise alone.   fps : of the frames, Hz.   timestamps : file of the
+    frames' times.   gamma : of their codes, "linear", "srgb" or an exponent.   interpolate : between them, "motion" or
+    "linear".   max_px : of "motion", px.   frame_delay_ms : added to their times, ms; None: found.
+    starts : of the search.   Raises AssetError, EventDataError, ConfigError."""
+    from blinkgl.recordings import calibration
+
+    keys = fixed if isinstance(fixed, Iterable) and not isinstance(fixed, str) else [None]
+    keys = tuple(keys)
+    if not all(isinstance(key, str) for key in keys):
+        raise ConfigError("not names of keys", where="fixed", value=fixed, accepted="a list of texts")
+    delay = None if frame_delay_ms is None else check.number(frame_delay_ms, "frame_delay_ms", least=-1e6, most=1e6)
+    return calibration.calibrate(
+        check.path(recording, "recording"),
+        None if frames is None else check.path(frames, "frames"),
+        emulator=events_tree(emulator),
+        fixed=keys,
+        still=bool(still),
+        fps=_fps(fps),
+        timestamps=None if timestamps is None else check.path(timestamps, "timestamps"),
+        gamma=gamma,
+        interpolate=interpolate,
+        max_px=check.number(max_px, "max_px", above=0, most=1000),
+        frame_delay_ms=delay,
+        starts=check.whole(starts, "starts", 1, 20),
+        seed=check.seed(seed),
     )
 
 

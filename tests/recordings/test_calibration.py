@@ -145,9 +145,9 @@ def test_from_files_to_a_sensor_file_and_a_page(tmp_path, capsys):
     assert "output file exists" in capsys.readouterr().err
 
 
-def still_recording(folder, seconds: float = 2.0, size=(48, 60), **noise):
+def still_recording(folder, seconds: float = 2.0, size=(48, 60), seed: int = 3, **noise):
     ends = Events(*(np.zeros(2, np.uint16) for _ in "xy"), np.array([0, round(seconds * 1e6)]), np.zeros(2, np.uint8))
-    events = clip_of_still(ends, size).simulate(emulator_config({"emulator": "v2e", **noise}), 3)
+    events = clip_of_still(ends, size).simulate(emulator_config({"emulator": "v2e", **noise}), seed)
     write_events(folder / "dark.npz", events, *size)
     return folder / "dark.npz"
 
@@ -168,6 +168,42 @@ def test_noise_of_a_still_scene_comes_back(tmp_path):
         "leak_rate_hz": pytest.approx(1.0, rel=0.1),
         "shot_noise_rate_hz": pytest.approx(4.0, rel=0.1),
     }
+
+
+FIVE = range(5)
+
+
+def recovered(folder, seed: int) -> dict[str, float]:
+    """Relative errors of a fit to a simulation with known values, whose texture and chance are of this seed."""
+    camera, frames = files(folder, moving(seed=seed), seed=seed + 20)
+    fixed = {"log_eps": TRUE["log_eps"], "threshold_sigma": TRUE["threshold_sigma"]}
+    result = calibrate(camera, frames, emulator={"emulator": "esim", **fixed}, fixed=fixed, starts=2)
+    return {key: value / TRUE[key] - 1 for key, value in result.values.items()}
+
+
+def recovered_noise(folder, seed: int) -> dict[str, float]:
+    """The same of V2E's noise on a still scene."""
+    true = dict(leak_rate_hz=1.0, shot_noise_rate_hz=4.0)
+    path = still_recording(folder, seed=seed + 20, **true)
+    fixed = [key for key in emulator_config("v2e").fitted if key not in true]
+    result = calibrate(path, still=True, emulator="v2e", fixed=fixed, starts=1)
+    return {key: result.values[key] / value - 1 for key, value in true.items()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", FIVE)
+def test_known_values_come_back(tmp_path, seed):
+    """Thresholds within 2 %, the dead time within 5."""
+    errors = recovered(tmp_path, seed)
+    assert set(errors) == {"contrast_threshold", "contrast_threshold_off", "refractory_us"}
+    assert all(abs(e) <= (0.05 if key == "refractory_us" else 0.02) for key, e in errors.items()), errors
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", FIVE)
+def test_known_noise_comes_back(tmp_path, seed):
+    errors = recovered_noise(tmp_path, seed)
+    assert all(abs(e) <= 0.1 for e in errors.values()), errors
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------

@@ -38,7 +38,12 @@ class Programs(dict["Kind", Uniforms]):
 
     def __missing__(self, kind: Kind) -> Uniforms:
         foggy = {"FOG": 1} if self._pass.lit and self._painter.scene.fog is not None else {}
-        defines = self._pass.defines(kind) | kind.defines(self._pass.lit) | self._painter.lighting.defines(self._pass, kind) | foggy
+        defines = (
+            self._pass.defines(kind)
+            | kind.defines(self._pass.lit)
+            | self._painter.lighting.defines(self._pass, kind)
+            | foggy
+        )
         program = self._painter.gl.program(self._pass.program, defines)
         uniforms = self[kind] = self._painter.uniforms(program)
         return uniforms

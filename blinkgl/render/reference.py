@@ -138,6 +138,13 @@ class ReferenceFrame:
     velocity: np.ndarray
     forward: Flow | None
     backward: Flow | None
+    front: np.ndarray
+    xy: np.ndarray
+
+    def hits(self) -> Hits:
+        """What was hit at the pixels' centres, row by row."""
+        flat = {name: (a := getattr(self, name)).reshape(self.hit.size, *a.shape[2:]) for name in _HIT_IMAGES}
+        return Hits(t_ns=self.t_ns, **flat)
 
 
 def scene_parts(scene: Scene) -> list[tuple[SceneObject, Part]]:
@@ -716,7 +723,7 @@ def render(
     )
 
 
-_HIT_IMAGES = ("hit", "depth", "instance", "part", "triangle", "bary", "local")
+_HIT_IMAGES = ("xy", "hit", "depth", "instance", "part", "triangle", "front", "bary", "local")
 _FLOW_IMAGES = ("flow", "valid", "occluded", "outside", "depth", "hidden_by")
 
 

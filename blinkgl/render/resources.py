@@ -34,7 +34,7 @@ _ATTRIBUTES = (("in_position", "3f", 12), ("in_normal", "3f", 12), ("in_uv", "2f
 class Kind(NamedTuple):
     """What of a material, and of a shape that changes with time, makes another program. shape : macros of the
     latter.   hued : whether its luminance takes three channels: where its colour and that of the light, or two colours
-    of its own, vary independently.   masked : it has holes.   more : macros of what else it is to passes that are lit, of MORE."""
+    of its own, vary independently.   masked : it has holes.   more : of MORE, what it is to passes that are lit."""
 
     textured: bool
     lit: bool

@@ -133,7 +133,7 @@ class Mask:
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """albedo(u, v) = texture(uv * uv_scale) * base_color * the mesh's colours, linear light; matt unless it has a gloss.
+    """albedo(u, v) = texture(uv * uv_scale) * base_color * the mesh's colours, linear light; matt without a gloss.
 
     texture      : None means white.
     base_color   : (3,) linear factor.

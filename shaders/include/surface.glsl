@@ -79,7 +79,7 @@ ILLUMINANT shone(ILLUMINANT base, vec3 normal, vec3 at, vec2 coordinates)
 #endif
     roughness = max(roughness, SMOOTHEST);
     float facing_eye = clamp(dot(n, v), 1e-3, 1.0), square = roughness * roughness * roughness * roughness;
-    vec2 part = map_at(energy, vec2(facing_eye, roughness), 0.0).rg;
+    vec2 cells = vec2(textureSize(energy, 0)), part = map_at(energy, (vec2(facing_eye, roughness) * (cells - 1.0) + 0.5) / cells, 0.0).rg;
     float lost = 1.0 / (part.r + part.g) - 1.0;
     float clear = 1.0 + DIELECTRIC * lost, even_clear = clear * (DIELECTRIC * part.r + part.g);
     ILLUMINANT metal = 1.0 + base * lost, even_metal = metal * (base * part.r + part.g);

@@ -71,5 +71,6 @@ def split_mirrored(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
     number[both] = n + np.arange(len(both))
     faces = mesh.faces.copy()
     faces[mirrored] = number[faces[mirrored]]
-    given = {name: getattr(mesh, name) for name in ("vertices", "normals", "uvs", "colours")}
-    return replace(mesh, faces=faces, **{k: v if v is None else v[index] for k, v in given.items()}), index
+    colours = None if mesh.colours is None else mesh.colours[index]
+    made = replace(mesh, vertices=mesh.vertices[index], faces=faces, normals=mesh.normals[index], uvs=mesh.uvs[index])
+    return replace(made, colours=colours), index

@@ -388,7 +388,7 @@ class Document:
     def _coloured(
         self, primitive: dict, material: Material | None, count: int
     ) -> tuple[Material | None, np.ndarray | None]:
-        """The material, times the vertices' colour (linear) where they all have the same; else (V, 3) those beside it."""
+        """The material, times the vertices' colour (linear) where they all have the same; else (V, 3) of them."""
         if "COLOR_0" not in primitive["attributes"]:
             return material, None
         index = primitive["attributes"]["COLOR_0"]

@@ -168,7 +168,8 @@ def _load(
     for number, piece in enumerate(pieces):
         if len(piece.faces) == 0 and len(pieces) > 1:
             continue
-        source: list[np.ndarray] | None = [] if played is not None or has_own_vertices(piece, has_materials) else None
+        own = has_own_vertices(piece, has_materials)
+        source: list[np.ndarray] | None = [] if played is not None or own else None
         # A palette picked by degenerate coordinates is fine with the file's own texture, useless with any other.
         own_texture = has_materials and piece.material is not None and piece.material.texture is not None
         mesh = make_mesh(
@@ -184,7 +185,7 @@ def _load(
             log=log,
             source=source,
         )
-        if source is not None and has_own_vertices(piece, has_materials):
+        if source is not None and own:
             mesh = with_own_vertices(mesh, piece, source)
         if played is not None and source is not None:
             deformer = played.deformer(nodes[number], piece, source[0], turn @ at_rest[number], turn)
@@ -204,7 +205,7 @@ def _load(
 
 
 def has_own_vertices(piece: gltf.Piece, materials: bool = True) -> bool:
-    """Whether a piece's vertices carry what :func:`make_mesh` knows nothing of. materials : whether it keeps its own."""
+    """Whether a piece's vertices carry what :func:`make_mesh` knows nothing of. materials : whether it has its own."""
     bumped = piece.material is not None and piece.material.bumps is not None
     return materials and (piece.colours is not None or bumped)
 

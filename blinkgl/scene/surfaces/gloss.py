@@ -1,18 +1,17 @@
 """Surfaces that shine: the numbers of glTF's metal and roughness that shaders look up, in float64.
 
-A lobe is GGX with the height-correlated Smith term and Schlick's Fresnel term (Walter et al. 2007, "Microfacet Models for
-Refraction through Rough Surfaces"; Heitz 2014, "Understanding the Masking-Shadowing Function"; glTF 2.0, appendix B).
-Once through it sends back ``F0 r + g`` of even light (Karis 2013, "Real Shading in Unreal Engine 4"), which is too little
-where it is rough: light that hits twice is lost. A factor ``1 + F0 (1 / (r + g) - 1)`` gives it back (Fdez-Agüera 2019,
-"A Multiple-Scattering Microfacet Model for Real-Time Image-based Lighting"), so that a white metal under even light is
-white. What is no metal reflects 4 %, and scatters below that what is not reflected.
+A lobe is GGX with the height-correlated Smith term and Schlick's Fresnel term (Walter et al. 2007, "Microfacet Models
+for Refraction through Rough Surfaces"; Heitz 2014, "Understanding the Masking-Shadowing Function"; glTF 2.0, appendix
+B). Once through it sends back ``F0 r + g`` of even light (Karis 2013, "Real Shading in Unreal Engine 4"), which is too
+little where it is rough: light that hits twice is lost. A factor ``1 + F0 (1 / (r + g) - 1)`` gives it back
+(Fdez-Agüera 2019, "A Multiple-Scattering Microfacet Model for Real-Time Image-based Lighting"), so that a white metal
+under even light is white. What is no metal reflects 4 %, and scatters below that what is not reflected.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
 
-import cv2
 import numpy as np
 
 from blinkgl.scene.surfaces.environment import pixel_directions
@@ -25,12 +24,10 @@ LEVELS = 8
 """Roughnesses at which surroundings are blurred: 0, 1/7, ... 1; in between linearly."""
 _ANGLES, _ROUGHNESSES = 64, 32
 _SAMPLES = 1024
-_SHARP = 128  # px, width of what is blurred a little
-_SOFT = 64  # and much
 
 
 def lobe(nl: np.ndarray, nv: np.ndarray, nh: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """pi times the lobe without its Fresnel term: D V, 1/sr times pi. Cosines at the normal: of light, eye, half way."""
+    """pi times the lobe without its Fresnel term, D V. Cosines at the normal: of light, eye, half way."""
     a2 = np.maximum(roughness, SMOOTHEST) ** 4
     distribution = a2 / (nh**2 * (a2 - 1) + 1) ** 2
     return distribution * 0.5 / (nl * np.sqrt(nv**2 * (1 - a2) + a2) + nv * np.sqrt(nl**2 * (1 - a2) + a2))
@@ -39,15 +36,15 @@ def lobe(nl: np.ndarray, nv: np.ndarray, nh: np.ndarray, roughness: np.ndarray) 
 @lru_cache(maxsize=1)
 def energy() -> np.ndarray:
     """(roughness 32, cosine 64, 2) float64 (r, g): a lobe with reflectance F0 sends back F0 r + g of even light, once
-    through. Sampled at (i + 0.5) / n of both; by visible half vectors (Dupuy and Benyoub 2023, "Sampling Visible GGX
-    Normals with Spherical Caps"), whose weights are smooth."""
-    nv = (np.arange(_ANGLES) + 0.5) / _ANGLES
+    through. Roughness and cosine are i / (n - 1); by visible half vectors (Dupuy and Benyoub 2023, "Sampling Visible
+    GGX Normals with Spherical Caps"), whose weights are smooth."""
+    nv = np.maximum(np.arange(_ANGLES) / (_ANGLES - 1), 1e-3)
     i = np.arange(_SAMPLES)
     u1, u2 = (i + 0.5) / _SAMPLES, (i * 0.6180339887498949 + 0.5) % 1.0
     out = np.empty((_ROUGHNESSES, _ANGLES, 2))
-    sv = np.sqrt(1 - nv**2)
+    sv = np.sqrt(np.maximum(1 - nv**2, 0))
     for k in range(_ROUGHNESSES):
-        alpha = max((k + 0.5) / _ROUGHNESSES, SMOOTHEST) ** 2
+        alpha = max(k / (_ROUGHNESSES - 1), SMOOTHEST) ** 2
         x, z = alpha * sv, nv.copy()
         length = np.hypot(x, z)
         x, z = (x / length)[:, None], (z / length)[:, None]
@@ -62,7 +59,9 @@ def energy() -> np.ndarray:
         a2 = alpha**2
         of_eye, of_light = np.sqrt(nv[:, None] ** 2 * (1 - a2) + a2), np.sqrt(np.maximum(nl, 0) ** 2 * (1 - a2) + a2)
         # G2 / G1: what of the light that was reflected once comes out
-        weight = np.where(nl > 0, nl * (nv[:, None] + of_eye) / np.maximum(nl * of_eye + nv[:, None] * of_light, 1e-12), 0)
+        weight = np.where(
+            nl > 0, nl * (nv[:, None] + of_eye) / np.maximum(nl * of_eye + nv[:, None] * of_light, 1e-12), 0
+        )
         edge = np.clip(1 - vh, 0, 1) ** 5
         out[k, :, 0], out[k, :, 1] = (weight * (1 - edge)).mean(axis=1), (weight * edge).mean(axis=1)
     return out
@@ -70,7 +69,7 @@ def energy() -> np.ndarray:
 
 def energy_at(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
     """(N, 2) of :func:`energy`, bilinear, at (N,) cosines and roughnesses."""
-    return _bilinear(energy(), cosine * _ANGLES - 0.5, roughness * _ROUGHNESSES - 0.5)
+    return _bilinear(energy(), cosine * (_ANGLES - 1), roughness * (_ROUGHNESSES - 1))
 
 
 def _bilinear(table: np.ndarray, x: np.ndarray, y: np.ndarray, around: bool = False) -> np.ndarray:
@@ -81,50 +80,39 @@ def _bilinear(table: np.ndarray, x: np.ndarray, y: np.ndarray, around: bool = Fa
     fx, fy = (x - x0)[:, None], (y - y0)[:, None]
     y1 = np.minimum(y0 + 1, height - 1)
     x0, x1 = (np.mod(x0, width), np.mod(x0 + 1, width)) if around else (x0, np.minimum(x0 + 1, width - 1))
-    return (table[y0, x0] * (1 - fx) + table[y0, x1] * fx) * (1 - fy) + (table[y1, x0] * (1 - fx) + table[y1, x1] * fx) * fy
+    return (table[y0, x0] * (1 - fx) + table[y0, x1] * fx) * (1 - fy) + (
+        table[y1, x0] * (1 - fx) + table[y1, x1] * fx
+    ) * fy
 
 
 def blurred(picture: np.ndarray) -> np.ndarray:
     """(LEVELS, h, w, 3) float32: a panorama as surfaces of the roughnesses k / (LEVELS - 1) mirror it, looked at along
     the normal: its mean over the lobe, weighed by the cosine (Karis 2013). The first is the picture itself.
 
-    picture : (h, w, 3) float32, at most 256 px wide."""
-    height, width = picture.shape[:2]
-    out = np.empty((LEVELS, height, width, 3), np.float32)
+    picture : (h, w, 3) float32."""
+    out = np.empty((LEVELS, *picture.shape), np.float32)
     out[0] = picture
     for k in range(1, LEVELS):
-        roughness = k / (LEVELS - 1)
-        small = min(_SHARP if roughness < 0.4 else _SOFT, width)
-        source = cv2.resize(picture, (small, small // 2), interpolation=cv2.INTER_AREA) if small < width else picture
-        out[k] = _enlarged(_blurred(source, roughness), height, width)
+        out[k] = _blurred(picture, k / (LEVELS - 1))
     return out
 
 
-def _blurred(source: np.ndarray, roughness: float) -> np.ndarray:
-    directions, solid = pixel_directions(*source.shape[:2])
-    flat = directions.reshape(-1, 3).astype(np.float32)
-    weights = np.repeat(solid, source.shape[1]).astype(np.float32)
-    colours = np.concatenate([source.reshape(-1, 3), np.ones((len(flat), 1), np.float32)], axis=1) * weights[:, None]
-    a2, out = np.float32(max(roughness, SMOOTHEST) ** 4), np.empty((len(flat), 3), np.float32)
-    for rows in range(0, len(flat), 1024):
-        cosine = flat[rows : rows + 1024] @ flat.T  # n.l; v = n, so n.h = cos of half the angle
-        half = np.clip(0.5 + 0.5 * cosine, 0, 1)
-        # the half vectors' density is that of the light's directions times 4 v.h, and v.h = n.h: D / 4 (n.l)
-        weight = np.maximum(cosine, 0) / (half * (a2 - 1) + 1) ** 2
-        sums = weight @ colours
-        out[rows : rows + 1024] = sums[:, :3] / np.maximum(sums[:, 3:], 1e-30)
-    return out.reshape(source.shape)
-
-
-def _enlarged(picture: np.ndarray, height: int, width: int) -> np.ndarray:
-    if picture.shape[:2] == (height, width):
-        return picture
-    padded = np.concatenate([picture[:, -2:], picture, picture[:, :2]], axis=1)
-    factor = width / picture.shape[1]
-    x = (np.arange(width, dtype=np.float32) + 0.5) / factor - 0.5 + 2
-    y = (np.arange(height, dtype=np.float32) + 0.5) * picture.shape[0] / height - 0.5
-    grid = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
-    return cv2.remap(padded, *grid, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+def _blurred(picture: np.ndarray, roughness: float) -> np.ndarray:
+    """What one pixel weighs for another depends on their rows and on how many columns lie between them: along a row
+    this is a convolution."""
+    height, width = picture.shape[:2]
+    directions, solid = pixel_directions(height, width)
+    z = directions[:, 0, 2]
+    across = np.sqrt(1 - z**2)
+    turn = np.cos(np.arange(width) * (2 * np.pi / width))
+    cosine = (z[:, None] * z)[..., None] + (across[:, None] * across)[..., None] * turn  # n.l, of v = n
+    half = 0.5 + 0.5 * cosine  # (n.h)^2
+    # half vectors are as dense as directions times 4 v.h, and v.h = n.h: what is left of D (n.h) is D / 4
+    a2 = max(roughness, SMOOTHEST) ** 4
+    weight = np.maximum(cosine, 0) / (half * (a2 - 1) + 1) ** 2 * solid[:, None]
+    waves = np.fft.rfft(weight, axis=2)
+    sums = np.einsum("ijf,jfc->ifc", waves, np.fft.rfft(picture.astype(np.float64), axis=1), optimize=True)
+    return np.fft.irfft(sums, n=width, axis=1) / waves[..., 0].real.sum(axis=1)[:, None, None]
 
 
 def mirrored(levels: np.ndarray, directions: np.ndarray, roughness: np.ndarray) -> np.ndarray:

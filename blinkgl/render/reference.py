@@ -208,8 +208,7 @@ def _forest(scene: Scene, t_ns: int) -> Forest:
             if part.mesh not in _trees:
                 _trees[part.mesh] = build_tree(part.mesh.vertices, part.mesh.faces)
             trees.append(_trees[part.mesh])
-        cull, holes = ([of(part) for _, part in parts] for of in (lambda part: part.culled, _holes_of))
-        kept[key] = join_trees(trees, cull, holes)
+        kept[key] = join_trees(trees, [part.culled for _, part in parts], [_holes_of(part) for _, part in parts])
         while len(kept) > KEPT:
             kept.pop(next(iter(kept)))
     return kept[key]
@@ -474,7 +473,8 @@ def bumped(
     hits: Hits, rows: np.ndarray, part: Part, pose: np.ndarray, normal: np.ndarray, at: np.ndarray
 ) -> np.ndarray:
     """(N, 3) unit normals, world axes, as the part's normal map has them. normal : without it, on the camera's side."""
-    mesh = part.mesh
+    mesh, bumps = part.mesh, part.material.bumps
+    assert bumps is not None
     corners, bary = mesh.faces[hits.triangle[rows]], hits.bary[rows]
     given = tangents(mesh).astype(np.float64)
     if mesh.deformer is not None:  # the way along the texture turns as a normal does
@@ -486,7 +486,7 @@ def bumped(
     along = along - n * (along * n).sum(axis=1, keepdims=True)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-15)
     hand = np.sign(np.einsum("nc,nc->n", bary, given[:, 3][corners]))[:, None]
-    bump = 2.0 * sample_map(part.material.bumps, at) - 1.0
+    bump = 2.0 * sample_map(bumps, at) - 1.0
     x, y, z = (bump[:, k : k + 1] for k in range(3))
     scale = part.material.bump_scale
     mapped = side * (along * x * scale + np.cross(n, along) * hand * y * scale + n * z)

@@ -1,5 +1,5 @@
-"""The pictures of docs/light.md and docs/materials.md: one scene, each kind of light added to what was there before; and
-a row of balls, each with one thing more than a matt colour.
+"""The pictures of docs/light.md and docs/materials.md: one scene, each kind of light added to what was there before; a
+row of balls, each with one thing more than a matt colour.
 
 python -m blinkgl.tools.light_effects [--out docs/images/light.jpg] [--materials docs/images/materials.jpg]
 """

@@ -34,6 +34,7 @@ _HOMES = {
     "blinkgl.front.drawing": ("Renderer", "render_frame"),
     "blinkgl.front.sensors": ("DvsVoltmeter", "Esim", "V2e", "load_sensor"),
     "blinkgl.front.files": (
+        "calibrate",
         "compare",
         "convert",
         "open_events",
@@ -56,6 +57,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see; a test compares it w
     from blinkgl.events.types import Events
     from blinkgl.front.drawing import Renderer, render_frame
     from blinkgl.front.files import (
+        calibrate,
         compare,
         convert,
         open_events,
@@ -119,6 +121,7 @@ __all__ = [
     "Timeline",
     "V2e",
     "Way",
+    "calibrate",
     "compare",
     "convert",
     "generate",

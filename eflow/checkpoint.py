@@ -23,6 +23,7 @@ from torch import Tensor
 
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.atomic import fsync, output_errors, remove_stale, temporary_beside
+from eflow import shipped
 from eflow.models import FlowModel, build_model, model_config
 
 FORMAT = "eflow-1"
@@ -79,15 +80,21 @@ class Checkpoint:
 
 
 def find_checkpoint(path: str | os.PathLike, *, averaged: bool = True) -> Checkpoint:
-    """``path``: a .safetensors file, a checkpoint folder, or a run folder (its newest
-    checkpoint). Raises AssetError."""
+    """``path``: a .safetensors file, a checkpoint folder, a run folder (its newest checkpoint), or the name of a
+    network that comes with the package (:mod:`eflow.shipped`), where no file or folder has it. Raises AssetError."""
     path = Path(path)
     if path.is_file():
         return Checkpoint(None, path)
+    if shipped.is_shipped(path):
+        return Checkpoint(None, shipped.weights_of(shipped.FOLDER / path))
     if not path.is_dir():
         raise AssetError(
-            "no such checkpoint", where=str(path), accepted="a .safetensors file, a checkpoint folder or a run folder"
+            f"no such checkpoint{shipped.suggestion(str(path))}",
+            where=str(path),
+            accepted=f"a .safetensors file, a checkpoint folder or a run folder{shipped.known()}",
         )
+    if (path / shipped.WEIGHTS).is_file():
+        return Checkpoint(None, shipped.weights_of(path))
     folder = path if (path / "weights.safetensors").is_file() else newest(path)
     if folder is None:
         raise AssetError(
@@ -229,8 +236,9 @@ def load_optimizer(path: Path, model: FlowModel, optimizer: torch.optim.Optimize
         found = {k.removeprefix(f"{name}/"): v for k, v in tensors.items() if k.startswith(f"{name}/")}
         if any(v.shape not in ((), p.shape) for v in found.values()):
             raise AssetError(f"optimiser state of '{name}' has another shape", where=str(path))
-        if found:  # AdamW keeps its step counter on the CPU
-            optimizer.state[p] = {k: v.clone() if k == "step" else v.to(p.device, copy=True) for k, v in found.items()}
+        if found:  # AdamW keeps its step counter on the CPU, unless it is fused
+            here = p.device if optimizer.defaults.get("fused") else torch.device("cpu")
+            optimizer.state[p] = {k: v.to(here if k == "step" else p.device, copy=True) for k, v in found.items()}
     if "/rng/cpu" not in tensors:
         raise AssetError("no generator state", where=str(path))
     torch.set_rng_state(tensors["/rng/cpu"])

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
+import signal
 import sys
 import traceback
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,6 +19,9 @@ from blinkgl.machine.interrupts import interruptible
 from blinkgl.show.terminal import never_fail_to_print
 from eflow.methods.table import METHODS, make_method
 
+if TYPE_CHECKING:
+    from eflow.config import SourceConfig
+
 app = typer.Typer(name="eflow", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 Precision = Annotated[str, typer.Option(help="fp32, or bf16 (autocast with fp32 islands).")]
@@ -24,8 +29,15 @@ Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
 Answer = Annotated[
     str,
     typer.Argument(
-        help="Run folder, checkpoint folder or .safetensors file; or a method that needs no training: "
-        f"{', '.join(METHODS)}."
+        help="Run folder, checkpoint folder or .safetensors file; or a network that comes with the package (eflow "
+        f"models); or a method that needs no training: {', '.join(METHODS)}."
+    ),
+]
+Network = Annotated[
+    str,
+    typer.Argument(
+        help="Run folder, checkpoint folder or .safetensors file; or a network that comes with the package (eflow "
+        "models)."
     ),
 ]
 Focal = Annotated[
@@ -33,6 +45,10 @@ Focal = Annotated[
 ]
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")
+]
+WindowMs = Annotated[
+    str | None,
+    typer.Option(metavar="LOW-HIGH", help="Of a recipe: lengths of windows; default: its label interval."),
 ]
 
 
@@ -56,21 +72,96 @@ def _print_version(wanted: bool) -> None:
 
 @app.command()
 def train(
-    config: Annotated[str, typer.Argument(help="YAML file; see configs/eflow/.")],
-    out: Annotated[str, typer.Option("--out", "-o", help="Run folder to make (or to go on in, with --resume).")],
+    config: Annotated[
+        str | None, typer.Argument(help="YAML file; see configs/eflow/. Without one: --model and --data.")
+    ] = None,
+    out: Annotated[
+        str | None,
+        typer.Option("--out", "-o", help="Run folder to make (or to go on in, with --resume).", show_default=False),
+    ] = None,
+    model: Annotated[
+        str | None, typer.Option("--model", "-m", help="A network and its size, e.g. ev_flownet-tiny.")
+    ] = None,
+    data: Annotated[
+        list[str] | None,
+        typer.Option("--data", help="Folder, or recipe (.yaml) that is rendered meanwhile; may be repeated."),
+    ] = None,
+    minutes: Annotated[
+        float | None, typer.Option(min=1e-3, help="Length of the training; the rate falls towards its end.")
+    ] = None,
     overrides: Overrides = None,
+    print_config: Annotated[
+        bool, typer.Option("--print-config", help="Print all keys as they would be used, as YAML, and do nothing.")
+    ] = False,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on from the newest checkpoint in the run folder.")
     ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
     """Train a network. SIGINT and SIGTERM write a checkpoint and exit 0."""
+    from eflow.bench import PRESETS, preset
     from eflow.config import load_train_config
-    from eflow.train import train as run_training
+    from eflow.train import as_yaml, train as run_training
 
-    result = run_training(load_train_config(config, overrides or []), out, resume=resume, quiet=quiet)
+    said = overrides or []
+    if config is None and not (model or any(o.startswith("model") for o in said)):
+        raise ConfigError("no network to train", accepted="a YAML file, or --model, e.g. ev_flownet-tiny, and --data")
+    if config is None and not (data or any(o.startswith("data.train") for o in said)):
+        raise ConfigError("nothing to train on", accepted="a YAML file, or --data, a folder or a recipe")
+    if model is not None:
+        preset(model)
+    tree = None if model is None else PRESETS[model]
+    whole = load_train_config(config, said, model=tree, data=data or (), minutes=minutes)
+    if print_config:
+        typer.echo(as_yaml(whole), nl=False)
+        return
+    if out is None:
+        raise ConfigError("no run folder", where="--out", accepted="a new folder, or one to go on in, with --resume")
+    result = run_training(whole, out, resume=resume, quiet=quiet)
     if not quiet:
         print(f"{result.reason} at step {result.step}: {result.checkpoint}", file=sys.stderr)
+
+
+@app.command()
+def render(
+    recipe: Annotated[str, typer.Argument(help="YAML file of `blinkgl generate`.")],
+    out: Annotated[str, typer.Option("--out", "-o", help="New folder of windows, to train on or to evaluate with.")],
+    samples: Annotated[int, typer.Option("--samples", "-n", min=1, help="How many windows.")] = 1000,
+    per_sequence: Annotated[int, typer.Option(min=1, max=1000, help="Windows out of each sequence.")] = 8,
+    window_ms: WindowMs = None,
+    min_events: Annotated[int, typer.Option(min=1, help="Fewest events in each of a sample's two windows.")] = 40,
+    max_flow: Annotated[float, typer.Option(help="Longest median flow of a sample, px.")] = 40.0,
+    min_density: Annotated[float, typer.Option(help="Fewest events per pixel and px of mean flow.")] = 0.0,
+    split: Annotated[str, typer.Option(help="Whose groups: train or test.")] = "train",
+    seed: Annotated[int, typer.Option(min=0, help="Other windows for each.")] = 0,
+    overrides: Overrides = None,
+    workers: Annotated[int, typer.Option("--workers", "-w", min=0, help="Rendering processes.")] = 1,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+) -> None:
+    """Render windows of a recipe into a folder that several trainings can share. Ctrl-C keeps what is there by then."""
+    from blinkgl.io.sequence_dir import refuse_existing
+    from eflow.data.online import open_online
+    from eflow.data.pool import render_pool
+    from eflow.progress import Counting
+
+    _one_of("--split", split, ("train", "test"))
+    source = _windows_of(
+        recipe,
+        window_ms,
+        samples=per_sequence,
+        min_events=min_events,
+        max_flow=max_flow,
+        min_density=min_density,
+        set=tuple(overrides or ()),
+        workers=workers,
+    )
+    kept = {key: getattr(source, key) for key in ("set", "window_ms", "min_events", "max_flow", "min_density")}
+    about = {"recipe": Path(recipe).name, "split": split, "seed": seed, "per_sequence": per_sequence, **kept}
+    refuse_existing(Path(out))  # before a worker has been started
+    with interruptible(signal.SIGTERM), open_online(source, seed, split=split) as stream:
+        done = render_pool(stream, samples, out, about=about, progress=Counting(samples, "windows", not quiet))
+    if not quiet:
+        print(f"{done} windows in {out}", file=sys.stderr)
 
 
 @app.command()
@@ -79,22 +170,33 @@ def evaluate(
     dataset: Annotated[
         str,
         typer.Argument(
-            help="Folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences; or a recipe (.yaml), whose groups of split "
-            "test are rendered for it."
+            help="Folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences, or of rendered windows; or a recipe (.yaml), "
+            "whose groups of split test are rendered for it."
         ),
     ],
     out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for results.json and pictures.")] = None,
     by_density: Annotated[
         bool, typer.Option("--by-density", help="How long the flow is where events are few, and where they are many.")
     ] = False,
-    window_ms: Annotated[
-        str | None,
-        typer.Option(metavar="LOW-HIGH", help="Of a recipe: lengths of windows; default: its label interval."),
-    ] = None,
-    format: Annotated[str, typer.Option(help="auto, blinkgl, dsec, mvsec or blinkflow.")] = "auto",
+    window_ms: WindowMs = None,
+    format: Annotated[str, typer.Option(help="auto, blinkgl, dsec, mvsec, blinkflow or windows.")] = "auto",
     dt: Annotated[int, typer.Option(help="MVSEC: 1 or 4 images.")] = 1,
+    protocol: Annotated[
+        str, typer.Option(help="MVSEC: which frames and rows are scored: all, ste-flownet or e-raft (20 Hz).")
+    ] = "all",
+    ground_truth: Annotated[
+        str | None,
+        typer.Option(
+            "--ground-truth",
+            help="MVSEC: propagated through the 20 Hz flow, or one field scaled; default: the protocol's.",
+        ),
+    ] = None,
     pictures: Annotated[int, typer.Option(min=0, help="Number of pictures.")] = 12,
     iterations: Annotated[int | None, typer.Option(min=1, help="GRU iterations, where the network has them.")] = None,
+    confidence: Annotated[
+        bool,
+        typer.Option("--confidence", help="Also whether predict's --confidence knows where the errors are; slow."),
+    ] = False,
     empty: Annotated[str, typer.Option(help="Windows without events: error or skip.")] = "error",
     limit: Annotated[int | None, typer.Option(min=1, help="Score only so many samples, evenly spaced.")] = None,
     raw: Annotated[bool, typer.Option("--raw", help="The last weights instead of the averaged ones.")] = False,
@@ -119,7 +221,7 @@ def evaluate(
     elif window_ms is not None:
         raise ConfigError("only of a recipe", where="--window-ms", value=window_ms, accepted="a dataset FILE.yaml")
     else:
-        source = open_source(dataset, _format(format), dt=dt)
+        source = open_source(dataset, _format(format), dt=dt, protocol=protocol, truth=ground_truth)
     with console.status("evaluating") as status:
         result = score(
             model,
@@ -129,6 +231,7 @@ def evaluate(
             empty=empty,
             precision=precision,
             limit=limit,
+            confidence=confidence,
             progress=lambda i, n, aee: status.update(f"{i}/{n} samples, AEE {aee:.3f} px"),
         )
     show(result, by_density=by_density)
@@ -157,7 +260,17 @@ def predict(
     ] = None,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Sensor size, where the file does not say.")] = None,
     npy: Annotated[bool, typer.Option("--npy", help="Also float32 .npy.")] = False,
+    flo: Annotated[bool, typer.Option("--flo", help="Also Middlebury's .flo.")] = False,
+    h5: Annotated[bool, typer.Option("--h5", help="Also all of it in one flow.h5, float32.")] = False,
     video: Annotated[str | None, typer.Option(help="Also a video of events and flow, .mp4.")] = None,
+    confidence: Annotated[
+        bool,
+        typer.Option(
+            "--confidence",
+            help="Also by how much, px, mirrored and thinned views of the same events disagree, pixel by pixel; five "
+            "times the work.",
+        ),
+    ] = False,
     warm_start: Annotated[
         bool, typer.Option("--warm-start", help="Start each window's refinement from the last flow.")
     ] = False,
@@ -177,6 +290,7 @@ def predict(
 
     from blinkgl.events.types import Events
     from eflow import infer
+    from eflow.confidence import disagreement
     from eflow.doubts import doubts
     from eflow.methods.iwe import flow_warp_loss
     from eflow.metrics import frame_metrics
@@ -190,19 +304,16 @@ def predict(
     for line in doubts(next(iter(file.chunks()), Events.empty()), file.height, file.width):
         typer.echo(f"{events}: {line}", err=True)
     gt = infer.read_truth(truth, file.height, file.width) if truth else None
-    if method is not None:
-        predictor = infer.MethodPredictor(method, file.height, file.width, empty=empty)
-    else:
-        predictor = infer.Predictor(
-            model,
-            file.height,
-            file.width,
-            warm_start=warm_start,
-            precision=_precision(model, precision),
-            empty=empty,
-        )
+    precision = precision if model is None else _precision(model, precision)
+
+    def predicting(empty: str, warm_start: bool):
+        if method is not None:
+            return infer.MethodPredictor(method, file.height, file.width, empty=empty)
+        return infer.Predictor(model, file.height, file.width, warm_start=warm_start, precision=precision, empty=empty)
+
+    predictor, of_views = predicting(empty, warm_start), predicting("zero", False)
     if whole:
-        window, factor = infer.whole_file(file)
+        window, factor = infer.whole_file(file, ("old", "new") if model is None else model.reads)
         stream, span = [window], window.new.t1 - window.old.t0
     else:
         first = next((int(c.t[0]) for c in file.chunks()), None)
@@ -215,17 +326,23 @@ def predict(
         stream = infer.windows(file, span, start_us=at(start_ms), end_us=at(end_ms))
     count = 0
     with contextlib.ExitStack() as opened:
-        writer = opened.enter_context(infer.FlowWriter(out, npy=npy)) if out else None
-        shown = opened.enter_context(FlowVideo(video, file.height, file.width, _fps(span))) if video else None
+        files = [name for name, wanted in zip(infer.FILES, (npy, flo, h5), strict=True) if wanted]
+        writer = opened.enter_context(infer.FlowWriter(out, files=files)) if out else None
+        shown = FlowVideo(video, file.height, file.width, _fps(span), doubts=confidence) if video else None
+        if shown:
+            opened.enter_context(shown)
         for window in stream:
             flow, tensor = predictor(window)
             sharper = flow_warp_loss(window.new, flow)
+            doubt = disagreement(of_views, window, flow) * np.float32(factor) if confidence else None
             flow = flow * np.float32(factor)
             count += 1
             line = (
                 f"t {window.t_us} us  {len(window.old) + len(window.new)} events  mean speed "
                 f"{np.hypot(*np.moveaxis(flow, -1, 0)).mean():.3f} px  FWL {sharper:.3f}"
             )
+            if doubt is not None:
+                line += f"  disagreement {np.median(doubt):.3f} px (median)"
             if gt is not None:
                 valid = np.isfinite(gt).all(-1)
                 hit = np.zeros_like(valid)
@@ -240,10 +357,10 @@ def predict(
                         )
             typer.echo(line)
             if writer:
-                writer.add(window, flow, tensor, gt)
+                writer.add(window, flow, tensor, gt, doubt)
             if shown:
                 caption = f"{(window.t_us - window.old.t0) / 1000:g} ms at {window.t_us / 1e6:.3f} s"
-                shown.add(caption, events_of(tensor), flow)
+                shown.add(caption, events_of(tensor), flow, doubt)
         if not count:
             raise BlinkGLError(
                 f"shorter than two windows of {span / 1000:g} ms",
@@ -274,7 +391,7 @@ def _milliseconds(text: str) -> float | None:
 
 @app.command()
 def submit(
-    checkpoint: Annotated[str, typer.Argument(help="Run folder, checkpoint folder or .safetensors file.")],
+    checkpoint: Network,
     dataset: Annotated[str, typer.Argument(help="The benchmark's test set.")],
     benchmark: Annotated[str, typer.Option(help="dsec or blinkflow.")],
     out: Annotated[str, typer.Option("--out", "-o", help="Zip file to make.")],
@@ -315,6 +432,71 @@ def import_(
 
     model = import_published(checkpoint, out, bins=bins)
     typer.echo(f"written: {out}, {parameters_of(model) / 1e6:.2f} M parameters")
+
+
+@app.command()
+def models(
+    name: Annotated[str | None, typer.Argument(help="Only this one, with all that its card says.")] = None,
+    json_out: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+) -> None:
+    """The trained networks that come with the package. Their names stand where a checkpoint may stand."""
+    import json
+
+    from eflow import shipped
+
+    cards = [shipped.card_of(n) for n in ([name] if name is not None else shipped.names())]
+    if json_out:
+        typer.echo(json.dumps([card.model_dump(mode="json") for card in cards], indent=1))
+        return
+    for card in cards:
+        for line in shipped.lines(card, whole=name is not None):
+            typer.echo(line)
+    if not cards:
+        typer.echo("no trained network comes with this version; eflow train makes one")
+    if name is None:
+        typer.echo(f"without training: {', '.join(METHODS)}")
+
+
+@app.command()
+def pack(
+    checkpoint: Network,
+    name: Annotated[str, typer.Option(help="What it will be called by.")],
+    card: Annotated[str, typer.Option(help="YAML: about, data, training, scores, limits, commands (docs/eflow.md).")],
+    out: Annotated[str, typer.Option("--out", "-o", help="Folder that its folder is made in; eflow/weights ships it.")],
+    store: Annotated[str, typer.Option(help="fp32, or fp16: half the size; it computes in fp32.")] = "fp32",
+    raw: Annotated[bool, typer.Option("--raw", help="The last weights instead of the averaged ones.")] = False,
+) -> None:
+    """Make a training a network that can come with the package: weights and a card, 5 MB at most.
+
+    They are read back and compared before the folder appears."""
+    from eflow import shipped
+
+    _one_of("--store", store, ("fp32", "fp16"))
+    folder, full = shipped.pack(checkpoint, name, card, out, stored=store, averaged=not raw)
+    typer.echo(f"written: {folder}")
+    for line in shipped.lines(full):
+        typer.echo(line)
+
+
+@app.command()
+def export(
+    checkpoint: Network,
+    out: Annotated[str, typer.Option("--out", "-o", help="New .onnx file.")],
+    size: Annotated[
+        str | None, typer.Option(metavar="WxH", help="The only size it takes; default: any multiple of its stride.")
+    ] = None,
+    iterations: Annotated[int | None, typer.Option(min=1, help="GRU iterations, where the network has them.")] = None,
+    raw: Annotated[bool, typer.Option("--raw", help="The last weights instead of the averaged ones.")] = False,
+) -> None:
+    """A network as an ONNX file, for programs without torch; onnxruntime's flow is compared before it appears."""
+    missing = [name for name in EXTRAS["onnx"][0] if importlib.util.find_spec(name) is None]
+    if missing:
+        raise BlinkGLError(f"{missing[0]} is not installed", accepted=f"run {install(*EXTRAS['onnx'][0])}")
+    from eflow.export import OPSET, export_onnx
+
+    wanted = _size(size)
+    told = export_onnx(_model(checkpoint, "cpu", raw, "fp32", iterations), out, size=wanted)
+    typer.echo(f"written: {out}, opset {OPSET}, sizes: {told['sizes']}; onnxruntime agrees with torch")
 
 
 @app.command()
@@ -439,11 +621,17 @@ def _one_of(option: str, value: str, accepted: tuple[str, ...]) -> None:
 
 def _rendered(recipe: str, window_ms: str | None, limit: int | None):
     """Samples of a recipe, held in memory."""
-    from blinkgl.config.base import validate
-    from eflow.config import SourceConfig
     from eflow.data.online import held
 
-    tree: dict = {"recipe": recipe, "online": True, "samples": 4, "min_events": 40, "max_flow": 40}
+    return held(_windows_of(recipe, window_ms, samples=4, min_events=40, max_flow=40.0), limit or 128)
+
+
+def _windows_of(recipe: str, window_ms: str | None, **how) -> SourceConfig:
+    """The online source of a recipe, as a command line asks for it."""
+    from blinkgl.config.base import validate
+    from eflow.config import SourceConfig
+
+    tree: dict = {"recipe": recipe, "online": True, **how}
     if window_ms is not None:
         ends = window_ms.split("-")
         try:
@@ -453,7 +641,7 @@ def _rendered(recipe: str, window_ms: str | None, limit: int | None):
             raise ConfigError(
                 "not lengths of windows", where="--window-ms", value=window_ms, accepted="LOW-HIGH in ms, such as 5-100"
             ) from None
-    return held(validate(SourceConfig, tree), limit or 128)
+    return validate(SourceConfig, tree)
 
 
 def _size(text: str | None) -> tuple[int, int] | None:

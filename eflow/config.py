@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,6 +11,7 @@ from pydantic import Field
 from blinkgl.config.base import Config, Refused, one_of, rule, validate
 from blinkgl.config.reader import read_table
 from blinkgl.config.sequence import apply_overrides
+from eflow import shipped
 
 
 class VoxelConfig(Config):
@@ -123,6 +125,11 @@ class EvFlowNetConfig(Config):
     width: int | None = Field(
         None, ge=4, le=512, multiple_of=2, description="channels of the first encoder; null: the size's"
     )
+    consensus: bool = Field(
+        False,
+        description="at the coarsest scale, an affine field is fitted to each feature over the image and added: what "
+        "moves everywhere is known where nothing happens (not in the paper)",
+    )
 
 
 class SpikeFlowNetConfig(Config):
@@ -185,7 +192,7 @@ class SourceConfig(Config):
     """One data set: a folder, or a recipe that is rendered while it is trained on."""
 
     path: str | None = Field(None, description="folder; relative to the YAML file")
-    format: Literal["auto", "blinkgl", "dsec", "mvsec", "blinkflow"] = Field(
+    format: Literal["auto", "blinkgl", "dsec", "mvsec", "blinkflow", "windows"] = Field(
         "auto", description="layout of the set; auto: told by its files"
     )
     dt: Literal[1, 4] = Field(1, description="MVSEC: images between the ends of the flow")
@@ -203,6 +210,13 @@ class SourceConfig(Config):
     )
     min_events: int = Field(1, ge=1, le=10**9, description="fewest events in each of a sample's two windows")
     max_flow: float = Field(400.0, gt=0, le=1e4, description="longest median flow of a sample, px")
+    min_density: float = Field(
+        0.0,
+        ge=0,
+        le=1e3,
+        description="fewest events per pixel of the new window and px of its mean flow (0.3 px where that is shorter): "
+        "below 0.01 hardly anything can be told",
+    )
 
     @rule("path", "recipe", "online")
     def _folder_or_recipe(path, recipe, online):
@@ -261,6 +275,9 @@ class LossConfig(Config):
         0.0, ge=0, le=1e6, description="weight of the end-point error as a share of the true length (and knee)"
     )
     log: float = Field(0.0, ge=0, le=1e6, description="weight of the end-point error compressed by a logarithm, px")
+    length: float = Field(
+        0.0, ge=0, le=1e6, description="weight of the logarithm of predicted over true length (with knee), either way"
+    )
     knee: float = Field(
         1.0,
         gt=0,
@@ -270,7 +287,7 @@ class LossConfig(Config):
 
     @rule("l1", "epe", "relative", "log")
     def _something(l1, epe, relative, log):
-        if not l1 + epe + relative + log:
+        if not l1 + epe + relative + log:  # length alone has no direction
             raise Refused("no term has a weight", where="l1", value=0, accepted="l1, epe, relative or log above 0")
 
 
@@ -314,6 +331,7 @@ class RunConfig(Config):
     precision: Literal["fp32", "bf16"] = Field(
         "fp32", description="bf16: autocast with fp32 islands; fp32 where the device has no bf16 instructions"
     )
+    tf32: bool = Field(True, description="a card with TF32 units makes fp32 products of those, but in fp32 islands")
     channels_last: bool = Field(False, description="memory layout that some cards convolve faster in")
     compile: bool = Field(False, description="torch.compile of the update step")
     threads: int | None = Field(None, ge=1, description="CPU threads; null: torch's choice")
@@ -338,14 +356,43 @@ class TrainConfig(Config):
     data: DataConfig = Field(description="what is trained and validated on")
     optim: OptimConfig = Field(OptimConfig(), description="AdamW, its schedule and the loss")
     run: RunConfig = Field(RunConfig(), description="how it runs and what it writes")
-    init_from: str | None = Field(None, description="checkpoint whose weights training starts from (fine-tuning)")
+    init_from: str | None = Field(
+        None,
+        description="checkpoint whose weights training starts from (fine-tuning), or the name of a network that comes "
+        "with the package",
+    )
 
 
-def load_train_config(path: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> TrainConfig:
+def load_train_config(
+    path: str | Path | None,
+    overrides: list[str] | tuple[str, ...] = (),
+    *,
+    model: dict | None = None,
+    data: Sequence[str] = (),
+    minutes: float | None = None,
+) -> TrainConfig:
     """Reads a YAML file and applies ``a.b=c`` overrides; data paths become absolute, from the YAML file's folder.
 
-    Raises ConfigError: missing file, bad YAML, unknown key, bad value."""
-    path, tree = Path(path), read_table(path)
+    model, data, minutes : what a command line says in place of the file's ``model``, ``data.train`` (folders, or
+    recipes, which are rendered meanwhile) and ``optim.minutes``, from the working folder. path : None: nothing but
+    those and the overrides; images are then not scaled, which would need a crop.
+    Raises ConfigError: missing file, bad YAML, unknown key, bad value; without a file, no model or no data."""
+    tree = {} if path is None else read_table(path)
+    if path is None and not any(text.partition("=")[0].startswith("data.augment") for text in overrides):
+        tree = {"data": {"augment": {"scale_probability": 0}}}
+    if model is not None:
+        tree = {**tree, "model": model}
+    if data:
+        sets = [
+            {"recipe": str(Path(p).resolve()), "online": True}
+            if p.endswith((".yaml", ".yml"))
+            else {"path": str(Path(p).resolve())}
+            for p in data
+        ]
+        tree = {**tree, "data": {**(tree.get("data") or {}), "train": sets}}
+    if minutes is not None:
+        tree = {**tree, "optim": {**(tree.get("optim") or {}), "minutes": minutes}}
+    path = Path("train.yaml" if path is None else path)
     config = validate(TrainConfig, apply_overrides(tree, overrides))
     absolute = lambda p: str(path.parent.resolve() / p)  # an absolute p stays
     sources = {
@@ -358,6 +405,14 @@ def load_train_config(path: str | Path, overrides: list[str] | tuple[str, ...] =
     return config.model_copy(
         update={
             "data": config.data.model_copy(update=sources),
-            "init_from": absolute(config.init_from) if config.init_from else None,
+            "init_from": _start(config.init_from, absolute),
         }
     )
+
+
+def _start(init_from: str | None, absolute: Callable[[str], str]) -> str | None:
+    """A file beside the YAML goes before a shipped network of that name."""
+    if not init_from:
+        return None
+    path = absolute(init_from)
+    return init_from if init_from in shipped.names() and not Path(path).exists() else path

@@ -18,10 +18,11 @@ from blinkgl.errors import AssetError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.sequence_dir import refuse_existing
 from blinkgl.show.terminal import plain_console
+from eflow.confidence import SHARES, area, disagreement, sparsification
 from eflow.data.dataset import FlowDataset, collate
 from eflow.data.sources import Source
 from eflow.density import LengthByDensity
-from eflow.infer import PICTURED, predict
+from eflow.infer import PICTURED, MethodPredictor, Predictor, StreamWindow, predict
 from eflow.methods import Method
 from eflow.metrics import NAMES, Tally, frame_metrics
 from eflow.models import FlowModel, parameters_of
@@ -43,15 +44,19 @@ def evaluate(
     empty: str = "error",
     precision: str = "fp32",
     limit: int | None = None,
+    confidence: bool = False,
     progress: Callable[[int, int, float], None] | None = None,
 ) -> dict[str, Any]:
     """Scores ``model``, or a method that needs no training, on every labelled sample of ``source``.
 
     out : new folder for ``results.json`` and ``pictures/`` (evenly spaced samples: events, truth, prediction, error
     map); None: nothing is written. limit : score only so many samples, evenly spaced.
+    confidence : judge :func:`~eflow.confidence.disagreement`, too, by leaving out the pixels that it doubts.
     progress : called with (done, of, AEE so far).
     Returns {"methods": {name: {"total": …, "scenes": …}}, "lengths": rows of :class:`~eflow.density.LengthByDensity`,
-    "ms", "samples", "skipped", "model", "parameters"}; metrics as in :mod:`eflow.metrics`.
+    "ms", "samples", "skipped", "model", "parameters"}; metrics as in :mod:`eflow.metrics`. "confidence", where asked
+    for: {"area": mean over samples of :func:`~eflow.confidence.area`, "left_out": shares, and the AEE of the rest by
+    "doubt", at "best", by "chance", means over samples}.
 
     Raises AssetError: no ground truth, unreadable files. EventDataError: a window without events
     (unless ``empty="skip"``)."""
@@ -71,6 +76,7 @@ def evaluate(
     tallies = {name: Tally() for name in ("network", *BASELINES)}
     lengths = LengthByDensity()
     spent, sum_aee, scored = 0.0, 0.0, 0
+    curves: list[dict[str, np.ndarray]] = []
     for done, i in enumerate(indices, 1):
         batch = collate([dataset[i]])
         raw = batch["raw"][0]
@@ -91,6 +97,16 @@ def evaluate(
         ):
             tallies[name].add(scene, frame_metrics(np.broadcast_to(constant, truth.shape), truth, valid))
         lengths.add(flow, truth, valid, len(raw.new), raw.hit)
+        if confidence:
+            where = (raw.height, raw.width)
+            views = (
+                Predictor(model, *where, precision=precision, empty="zero")
+                if method is None
+                else MethodPredictor(method, *where, empty="zero")
+            )
+            doubt = disagreement(views, StreamWindow(raw.new.t0, raw.old, raw.new), flow)
+            curve = sparsification(np.hypot(*np.moveaxis(flow - truth, -1, 0)), doubt, valid)
+            curves += [] if curve is None else [curve]
         if metrics:
             sum_aee, scored = sum_aee + metrics["AEE"], scored + 1
         if progress is not None:
@@ -112,6 +128,12 @@ def evaluate(
         "methods": {name: {"total": t.total(), "scenes": t.scenes()} for name, t in tallies.items()},
         "lengths": lengths.rows(),
     }
+    if confidence:
+        result["confidence"] = {
+            "area": float(np.mean([area(c) for c in curves])),
+            "left_out": SHARES.tolist(),
+            **{k: np.mean([c[k] for c in curves], axis=0).tolist() for k in ("doubt", "best", "chance")},
+        }
     if out is not None:
         write_json(out / "results.json", result)
     return result
@@ -130,6 +152,16 @@ def _lengths(rows: list[dict[str, Any]]) -> Table:
             f"{row['events']:.2f}",
             "{:.2f} to {:.2f}".format(*row["quartiles"]),
         )
+    return table
+
+
+def _confidence(judged: dict[str, Any]) -> Table:
+    table = Table(title=f"confidence: {judged['area']:.2f} of the area of chance (0 is perfect, 1 says nothing)")
+    for name in ("most doubtful left out", "AEE of the rest, px", "at best", "by chance"):
+        table.add_column(name, justify="right")
+    for share, *values in zip(*(judged[k] for k in ("left_out", "doubt", "best", "chance")), strict=True):
+        if round(100 * share) % 25 == 0 or share == judged["left_out"][-1]:
+            table.add_row(f"{100 * share:.0f} %", *(f"{v:.3f}" for v in values))
     return table
 
 
@@ -196,5 +228,7 @@ def show(result: dict[str, Any], console: Console | None = None, by_density: boo
         for scene, scores in scenes.items():
             table.add_row(scene, str(scores["frames"]), *(f"{scores[c]:.3f}" for c in columns))
         console.print(table)
+    if "confidence" in result:
+        console.print(_confidence(result["confidence"]))
     if result["skipped"]:
         console.print(f"{result['skipped']} samples without a valid pixel were left out")

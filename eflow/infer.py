@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import h5py
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -15,6 +16,7 @@ import torch.nn.functional as F
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.events.types import Events
 from blinkgl.io.atomic import output_errors, remove_stale, temporary_beside
+from blinkgl.io.flo import encode_flo
 from blinkgl.io.flow_png import write_flow_png
 from blinkgl.io.formats import EventFile, open_events
 from blinkgl.io.images import encode_npy
@@ -39,7 +41,7 @@ def pad_batch(batch: dict, model: FlowModel) -> tuple[dict, int, int]:
     right, down = -width % multiple, -height % multiple
     left, top = (right, down) if model.pad_start else (0, 0)
     pad = (left, right - left, top, down - top)
-    return {**batch, "old": F.pad(batch["old"], pad), "new": F.pad(batch["new"], pad)}, left, top
+    return {**batch, **{k: F.pad(batch[k], pad) for k in ("old", "new") if k in batch}}, left, top
 
 
 @torch.inference_mode()
@@ -139,14 +141,15 @@ def likely_span(file: EventFile, predictor: Callable[[StreamWindow], tuple[np.nd
     return span
 
 
-def whole_file(file: EventFile) -> tuple[StreamWindow, float]:
-    """The file as one pair: its first half is the old window, its second the new. Also gives the factor from the flow
-    over the second half to the flow over the whole file at constant image velocity."""
+def whole_file(file: EventFile, reads: tuple[str, ...] = ("old", "new")) -> tuple[StreamWindow, float]:
+    """The file as one pair: its first half is the old window, its second the new; for a network that ``reads`` the new
+    one alone, all of it is that. Also gives the factor from the flow over the new window to the flow over the whole
+    file at constant image velocity."""
     events = file.read()
     if len(events) < 2:
         raise EventDataError("no events", where=str(file.path))
     t0, t1 = int(events.t[0]), int(events.t[-1]) + 1
-    t = (t0 + t1) // 2
+    t = (t0 + t1) // 2 if "old" in reads else t0
     cut = lambda a, b: Window(*(getattr(events.window(a, b), k) for k in "xytp"), a, b)
     return StreamWindow(t, cut(t0, t), cut(t, t1)), (t1 - t0) / (t1 - t)
 
@@ -202,19 +205,19 @@ class Predictor:
 
     def __call__(self, window: StreamWindow) -> tuple[np.ndarray, np.ndarray]:
         """flow (H, W, 2) float32 px t -> t + Δ, and the new window's event tensor (C, H, W)."""
-        for name in ("old", "new"):
-            w = getattr(window, name)
+        read = {name: getattr(window, name) for name in self.model.reads}
+        for name, w in read.items():
             if not len(w) and self.empty == "error":
                 raise EventDataError(
                     f"no events in the {name} window [{w.t0}, {w.t1}) µs",
                     accepted="use --empty zero to write zero flow there",
                 )
-        new = self.model.representation(window.new, self.height, self.width)
-        if not (len(window.old) and len(window.new)):
+        grids = {name: self.model.representation(w, self.height, self.width) for name, w in read.items()}
+        new = grids["new"]
+        if not all(len(w) for w in read.values()):
             self._low = None
             return np.zeros((self.height, self.width, 2), np.float32), new
-        old = self.model.representation(window.old, self.height, self.width)
-        batch = {"old": torch.from_numpy(old)[None], "new": torch.from_numpy(new)[None]}
+        batch = {name: torch.from_numpy(grid)[None] for name, grid in grids.items()}
         if self.warm_start and self._low is not None:
             batch["flow_init"] = forward_warp(self._low)
         prediction = predict(self.model, batch, precision=self.precision)
@@ -258,13 +261,22 @@ def read_truth(path: str | os.PathLike, height: int, width: int) -> np.ndarray:
     return flow
 
 
-class FlowWriter:
-    """A folder of flow that appears whole or not at all: ``%06d.png`` (DSEC's 16 bits), optional ``npy/%06d.npy``,
-    ``pictures/%06d.png``, and ``timestamps.txt`` (from_us, to_us). Existing folders are refused."""
+FILES = ("npy", "flo", "h5")
+"""What :class:`FlowWriter` makes besides."""
 
-    def __init__(self, final: str | os.PathLike, *, npy: bool = False, pictures: bool = True):
-        self.final, self.npy, self.pictures, self.count = Path(final), npy, pictures, 0
+
+class FlowWriter:
+    """A folder of flow that appears whole or not at all: ``%06d.png`` (DSEC's 16 bits), ``pictures/%06d.png``, and
+    ``timestamps.txt`` (from_us, to_us). Existing folders are refused.
+
+    files : besides, exact: "npy" ``npy/%06d.npy``, "flo" ``flo/%06d.flo`` (Middlebury's), "h5" ``flow.h5`` with
+    ``flow`` (N, H, W, 2) float32 px, ``from_us`` and ``to_us`` (N,) int64, and ``disagreement`` (N, H, W) float32 px
+    where it is given. Disagreements are ``disagreement/%06d.npy`` besides."""
+
+    def __init__(self, final: str | os.PathLike, *, files: Sequence[str] = (), pictures: bool = True):
+        self.final, self.files, self.pictures, self.count = Path(final), files, pictures, 0
         self._lines = ["# from_timestamp_us, to_timestamp_us"]
+        self._h5: h5py.File | None = None
 
     def __enter__(self) -> FlowWriter:
         refuse_existing(self.final)
@@ -272,35 +284,72 @@ class FlowWriter:
             self.final.parent.mkdir(parents=True, exist_ok=True)
             remove_stale(self.final.parent)
             self._tmp = temporary_beside(self.final)
-            for folder in [
-                self._tmp,
-                *([self._tmp / "npy"] if self.npy else []),
-                *([self._tmp / "pictures"] if self.pictures else []),
-            ]:
-                folder.mkdir()
+            self._tmp.mkdir()
         return self
 
-    def add(self, window: StreamWindow, flow: np.ndarray, tensor: np.ndarray, truth: np.ndarray | None = None) -> None:
-        name = f"{self.count:06d}"
-        write_flow_png(self._tmp / f"{name}.png", flow, np.isfinite(flow).all(-1))
+    def add(
+        self,
+        window: StreamWindow,
+        flow: np.ndarray,
+        tensor: np.ndarray,
+        truth: np.ndarray | None = None,
+        doubt: np.ndarray | None = None,
+    ) -> None:
+        """flow (H, W, 2) px; tensor : the new window's events, as a predictor gives them; doubt (H, W) px."""
+        name, valid, flow = f"{self.count:06d}", np.isfinite(flow).all(-1), flow.astype(np.float32, copy=False)
+        write_flow_png(self._tmp / f"{name}.png", flow, valid)
         with output_errors(self.final):
-            if self.npy:
-                (self._tmp / "npy" / f"{name}.npy").write_bytes(encode_npy(flow.astype(np.float32)))
+            if "npy" in self.files:
+                self._part("npy", f"{name}.npy").write_bytes(encode_npy(flow))
+            if "flo" in self.files:
+                self._part("flo", f"{name}.flo").write_bytes(encode_flo(flow, valid))
+            if doubt is not None:
+                self._part("disagreement", f"{name}.npy").write_bytes(encode_npy(doubt))
+            if "h5" in self.files:
+                self._append(flow=flow, from_us=window.new.t0, to_us=window.new.t1, disagreement=doubt)
             if self.pictures:
-                valid = None if truth is None else np.isfinite(truth).all(-1)
-                write_picture(self._tmp / "pictures" / f"{name}.png", comparison(events_of(tensor), flow, truth, valid))
+                where = None if truth is None else np.isfinite(truth).all(-1)
+                strip = comparison(events_of(tensor), flow, truth, where, doubt=doubt)
+                write_picture(self._part("pictures", f"{name}.png"), strip)
         self._lines.append(f"{window.new.t0}, {window.new.t1}")
         self.count += 1
 
+    def _part(self, folder: str, name: str) -> Path:
+        (self._tmp / folder).mkdir(exist_ok=True)
+        return self._tmp / folder / name
+
+    def _append(self, **columns: np.ndarray | int | None) -> None:
+        if self._h5 is None:
+            self._h5 = h5py.File(self._tmp / "flow.h5", "w")
+            self._h5.attrs["unit"] = "px from from_us to to_us, at the pixels of from_us; +x right, +y down"
+        for name, value in columns.items():
+            if value is None:
+                continue
+            row = np.asarray(value)
+            if name not in self._h5:
+                shape, packed = row.shape, {"compression": "gzip", "shuffle": True} if row.ndim else {}
+                self._h5.create_dataset(
+                    name,
+                    (0, *shape),
+                    row.dtype,
+                    maxshape=(None, *shape),
+                    chunks=(1 if shape else 1024, *shape),
+                    **packed,
+                )
+            self._h5[name].resize(self.count + 1, 0)
+            self._h5[name][self.count] = row
+
     def __exit__(self, kind, *_) -> None:
-        if kind is not None:
-            shutil.rmtree(self._tmp, ignore_errors=True)
-            return
         try:
             with output_errors(self.final):
-                (self._tmp / "timestamps.txt").write_text("\n".join(self._lines) + "\n", encoding="utf-8")
-                refuse_existing(self.final)
-                os.rename(self._tmp, self.final)
+                if self._h5 is not None:
+                    self._h5.close()
+                if kind is None:
+                    (self._tmp / "timestamps.txt").write_text("\n".join(self._lines) + "\n", encoding="utf-8")
+                    refuse_existing(self.final)
+                    os.rename(self._tmp, self.final)
         except BaseException:
+            if kind is None:  # else the first error is what is told
+                raise
+        finally:
             shutil.rmtree(self._tmp, ignore_errors=True)
-            raise

@@ -52,6 +52,8 @@ def pixel_error(predicted: Tensor, target: Tensor, loss: LossConfig) -> Tensor:
 
     l1: |du| + |dv|.   epe: e.   relative: e / (|true flow| + k).
     log: k log(1 + e / k), which is e where that is small and hardly grows where it is large.
+    length: |log((|flow| + k) / (|true flow| + k))|. What is uncertain is best left short by the other terms (their
+    minimum is the median of each component); this one is smallest at the median of the length, whatever the direction.
     """
     difference = predicted - target
     total = predicted.new_zeros(predicted.shape[0], *predicted.shape[2:])
@@ -66,4 +68,7 @@ def pixel_error(predicted: Tensor, target: Tensor, loss: LossConfig) -> Tensor:
             total = total + loss.relative * error / (target.norm(dim=1) + loss.knee)
         if loss.log:
             total = total + loss.log * loss.knee * torch.log1p(error / loss.knee)
+    if loss.length:
+        length = ((predicted**2).sum(1) + 1e-6).sqrt()
+        total = total + loss.length * (torch.log(length + loss.knee) - torch.log(target.norm(dim=1) + loss.knee)).abs()
     return total

@@ -152,6 +152,9 @@ EFLOW_COMMANDS = [
     "evaluate nowhere nowhere --out scores",
     "predict nowhere broken.h5 --out flow",
     "submit nowhere nowhere --out submission.zip",
+    "models nowhere",
+    "pack nowhere --name planes --card missing.yaml --out packed",
+    "pack nowhere --name good --card missing.yaml --out packed",
     "",
 ][1:-1]
 
@@ -211,6 +214,9 @@ def test_commands_say_what_is_wrong(tmp_path, monkeypatch, capsys):
     except ImportError:
         eflow_cli = None
     if eflow_cli is not None:
+        from eflow import shipped
+
+        monkeypatch.setattr(shipped, "FOLDER", tmp_path / "none")  # messages name what is shipped
         said += ["eflow " + _said(eflow_cli.run, capsys, words, tmp_path) for words in EFLOW_COMMANDS]
     for entry in said:
         assert "Traceback" not in entry and "left behind" not in entry, entry

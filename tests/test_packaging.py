@@ -28,6 +28,7 @@ PACKAGES = {
     "configs": "blinkgl/configs",
     "tools": "blinkgl/tools",
 }
+NETWORK = ("model.safetensors", "card.yaml")
 
 PROBE = """
 import json, sys
@@ -84,7 +85,7 @@ def expected_files() -> set[str]:
     for here, there in PACKAGES.items():
         for path in (REPOSITORY / here).rglob("*"):
             if (
-                path.suffix in (".py", ".typed", ".glsl", ".yaml", ".html", ".js", ".css")
+                path.suffix in (".py", ".typed", ".glsl", ".yaml", ".html", ".js", ".css", ".safetensors")
                 and "__pycache__" not in path.parts
             ):
                 found.add(f"{there}/{path.relative_to(REPOSITORY / here).as_posix()}")
@@ -115,12 +116,15 @@ def check_installation(bin_: Path, root: Path, elsewhere: Path) -> None:
 
 def test_wheel(source, tmp_path):
     pytest.importorskip("build")
+    for name in NETWORK:  # whatever is shipped
+        (source / "eflow" / "weights" / "toy").mkdir(parents=True, exist_ok=True)
+        (source / "eflow" / "weights" / "toy" / name).write_bytes(b"")
     run(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", tmp_path / "dist", source, cwd=tmp_path)
     (wheel,) = (tmp_path / "dist").iterdir()
     assert wheel.name == f"blinkgl-{blinkgl.__version__}-py3-none-any.whl"
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
-    missing = expected_files() - names
+    missing = (expected_files() | {f"eflow/weights/toy/{name}" for name in NETWORK}) - names
     assert not missing, f"not in the wheel (packages and package_data in setup.cfg): {sorted(missing)}"
     assert not [name for name in names if name.startswith(("tests/", "docs/"))]
     assert any(name.endswith("LICENSE") for name in names)
@@ -211,7 +215,7 @@ def test_constraints_pin_what_setup_cfg_asks_for():
     parser = configparser.ConfigParser()
     parser.read(REPOSITORY / "setup.cfg")
     wanted = parser["options"]["install_requires"].split("\n")
-    for extra in ("dev", "docs", "check", "learn"):
+    for extra in ("dev", "docs", "check", "learn", "onnx"):
         wanted += parser["options.extras_require"][extra].split("\n")
     for line in filter(None, wanted):
         requirement = Requirement(line)

@@ -1,24 +1,32 @@
 """Every emulator fitted to the recordings that have frames: the table of docs/results.md.
 
-    python -m blinkgl.tools.fit_recordings FOLDER [--only TEXT] [--starts N]
+    python -m blinkgl.tools.fit_recordings FOLDER [--only TEXT] [--starts N] [--leave-one-out EMULATOR]
 
 FOLDER : of the recordings slider_depth, cuke_davis346 (needs dv-processing) and evbench_davis240, as docs/results.md
 names them. Each is fitted on its first half in time and judged on its second.
+
+--leave-one-out: each recording beside a sensor made of what was fitted to the others, a distribution over units: the
+rate of its middle and of units drawn from it, and how well the judge of `compare --judge` tells default, that sensor's
+middle and the recording's own fit from the recording.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from blinkgl.config.draw import draw, middle
 from blinkgl.events.types import Events
 from blinkgl.io.frames import open_frames, read_any_image
-from blinkgl.recordings.calibration import calibrate_events
+from blinkgl.recordings.calibration import Calibration, calibrate_events
 from blinkgl.recordings.clip import read_recording, timed_frames
+from blinkgl.recordings.judge import judge, judge_halves
+from blinkgl.recordings.simulation import emulator_config
 
 Recording = tuple[Events, tuple[int, int], list[tuple[np.ndarray, int, str]], bool]
 """Events, (height, width), frames, and whether their times are the middles of exposures."""
@@ -90,14 +98,74 @@ def rows(folder: Path, only: str = "", starts: int = 3) -> Iterator[str]:
             yield f"<!-- {told}; not told: {', '.join(found.untold) or 'none'}; {found.notes[0]} -->"
 
 
+def units_of(configs: list[dict[str, Any]], keys: Iterable[str]) -> dict[str, Any]:
+    """Keys of `events:` as a sensor file says them, of what was fitted to ``configs``: log-uniform where they differ.
+
+    Of n values from a uniform law of width w the range is w (n - 1)/(n + 1) in the mean: so much wider than what was
+    seen, on both sides, is the law that is taken."""
+    found: dict[str, Any] = {}
+    for key in keys:
+        logs = np.log([c[key] for c in configs if c[key]])
+        if not logs.size:
+            continue
+        seen = float(np.ptp(logs))
+        beyond = seen / max(logs.size - 1, 1)
+        ends = np.exp([logs.min() - beyond, logs.max() + beyond])
+        found[key] = float(ends[0]) if seen < 1e-6 else {"log_uniform": [float(end) for end in ends]}
+    return found
+
+
+def left_out(folder: Path, emulator: str, starts: int = 3, units: int = 20) -> Iterator[str]:
+    """Lines of a Markdown table, one for each recording."""
+    found: dict[str, Calibration] = {}
+    for name, read in RECORDINGS.items():
+        events, size, frames, exposures = read(folder)
+        found[name] = calibrate_events(
+            events, size, frames, name=name, exposures=exposures, emulator=emulator, starts=starts
+        )
+    yield (
+        "| recording | rate, middle | 90 % of units | judge: halves | default | others' sensor | own fit | "
+        "others' sensor says |"
+    )
+    yield "|---|---|---|---|---|---|---|---|"
+    for name, own in found.items():
+        clip, base = own.clip, own.before
+        law = units_of([o.config.model_dump() for n, o in found.items() if n != name], base.fitted)
+        config = lambda keys, base=base: emulator_config({**base.model_dump(), **keys})
+        recorded = len(clip.events)
+        ratio = lambda keys: len(clip.simulate(config(keys), 1)) / recorded
+        rates = np.sort([ratio(draw(law, unit, 0)) for unit in range(units)])
+        low, high = np.quantile(rates, (0.05, 0.95))
+        span = (int(clip.edges_us[0]), int(clip.edges_us[-1]))
+        area = lambda keys: judge(clip.events, clip.simulate(config(keys), 1), clip.size, span).auc
+        values = ", ".join(
+            f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v['log_uniform'][0]:.3g}-{v['log_uniform'][1]:.3g}"
+            for k, v in law.items()
+        )
+        yield (
+            f"| {name} | {ratio(middle(law)):.3f} | {low:.2f}-{high:.2f} "
+            f"| {judge_halves(clip.events, clip.size, span).auc:.3f} | {area({}):.3f} | {area(middle(law)):.3f} "
+            f"| {area(own.config.model_dump()):.3f} | {values} |"
+        )
+        yield (
+            f"<!-- {name}: own fit "
+            + ", ".join(f"{k} {v:.4g} ± {own.uncertainty[k]:.2g}" for k, v in own.values.items())
+            + f"; second half rate {own.judged[1].rate_ratio:.3f}, KS {own.judged[1].interval_distance:.3f} -->"
+        )
+
+
 def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--only", default="", help="part of 'RECORDING EMULATOR'")
     parser.add_argument("--starts", type=int, default=3)
+    parser.add_argument("--leave-one-out", metavar="EMULATOR", choices=EMULATORS)
     options = parser.parse_args()
-    for line in rows(options.folder, options.only, options.starts):
+    lines = rows(options.folder, options.only, options.starts)
+    if options.leave_one_out:
+        lines = left_out(options.folder, options.leave_one_out, options.starts)
+    for line in lines:
         print(line, flush=True)
 
 

@@ -26,7 +26,7 @@ from blinkgl.config.events import EmulatorConfig, EsimConfig, followers
 from blinkgl.config.frames import MAX_SPAN_S, FramesConfig
 from blinkgl.config.gl import GLConfig
 from blinkgl.config.images import ImagesConfig, check_images, readout_us
-from blinkgl.config.labels import LabelsConfig
+from blinkgl.config.labels import LabelsConfig, fill_causes
 from blinkgl.config.lod import LodConfig
 from blinkgl.config.quality import Quality, fill_quality
 from blinkgl.config.reader import parse_yaml, read_table
@@ -375,6 +375,7 @@ FILLS = (
         fill_sensor,
         (("events", "sensor.emulators.*"), ("events", "sensor"), ("camera", "sensor"), ("readout", "sensor.readout")),
     ),
+    Fill(("labels.events", "events.emulator"), ("events.causes",), fill_causes),
     Fill(("images",), ("labels.images",), lambda images: {} if images is None else {"labels": {"images": False}}),
 )
 _OF_THE_RUN = ("seed", "output", "gl")

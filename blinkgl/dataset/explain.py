@@ -34,6 +34,7 @@ from blinkgl.sequence import simulate_sequence
 from blinkgl.sequence.folders import folder_of
 from blinkgl.sequence.qualify import Verdict, shown, verdict
 from blinkgl.sequence.recorded import RECORDED
+from blinkgl.sequence.rendered import SURFACES, surfaces_at
 
 PROBES = 12
 DEPTH_BYTES = 4
@@ -138,7 +139,8 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
         if not on:
             result.left_out.append((name, why))
     brought = {LABELS[name].heading for name in RECORDED}
-    others = dict.fromkeys(label.heading for label in LABELS.values() if label.heading not in brought)
+    headings = [*(label.heading for label in LABELS.values()), "what made each event"]
+    others = dict.fromkeys(heading for heading in headings if heading not in brought)
     result.left_out.append((", ".join(others), "recorded frames bring none"))
     result.seconds = sum(p.seconds for p in result.passes)
     result.seconds_per_simulated_second = result.seconds / duration
@@ -312,6 +314,17 @@ def _passes(
                 each * labels,
             )
         )
+    if config.labels.events:
+        result.passes.append(
+            Pass(
+                "what made each event",
+                "surfaces at every event frame (labels.events)",
+                ("geometry",),
+                pixels * (sum(BUFFERS[LABELS[name].buffer].bytes for name in SURFACES.buffers) + DEPTH_BYTES),
+                result.frames,
+                _timed(lambda t: surfaces_at(renderer, t), times[:3]) * result.frames,
+            )
+        )
     if config.preview.enabled:
         pictures = int(duration * config.preview.rate) + 1
         each = _timed(
@@ -387,6 +400,7 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
     for name, on, key in (
         *((heading, heading in there, why) for heading, why in labels.items()),
         ("preview", config.preview.enabled, "preview.enabled: false"),
+        ("what made each event", config.labels.events, "labels.events: false"),
         ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)"),
         ("frame camera: motion blur, noise, lens", images is not None, "images: null"),
     ):

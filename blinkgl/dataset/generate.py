@@ -74,6 +74,7 @@ def generate_sequence(
             config_yaml=config_yaml(sequence.config, index),
             t_offset_us=sequence.t0_ns // 1000,
             labels=config.labels,
+            truth=sequence.tells,
         ) as writer,
     ):
         clock, span_ns = sequence.clock, sequence.t1_ns - sequence.t0_ns

@@ -3,7 +3,8 @@
 One sample per flow label, its files side by side under one key:
 
     flying_000017_000003.json        sequence, times in µs, size, polarity convention
-    flying_000017_000003.old.npz     events of the interval before the label: x, y uint16, t int64 µs, p uint8
+    flying_000017_000003.old.npz     events of the interval before the label: x, y uint16, t int64 µs, p uint8; with
+                                     labels.events also instance, depth and velocity of what made them
     flying_000017_000003.new.npz     events of the label's interval [from, to)
     flying_000017_000003.flow.png    DSEC 16-bit flow; also back.png, image.png, occlusion.png where the data set has
                                      them: every label whose row names a ``shard``
@@ -26,9 +27,10 @@ from typing import Any
 import numpy as np
 
 from blinkgl.errors import AssetError, OutputError
-from blinkgl.events.types import Events
+from blinkgl.events.types import TOLD, Events
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.dsec import DsecEventReader
+from blinkgl.io.event_labels import EVENT_LABELS, with_truth
 from blinkgl.io.frame_camera import EXPOSURES, ExposureLine, picture_file, read_exposures
 from blinkgl.io.index import sequence_folders
 from blinkgl.io.sequence_dir import read_manifest, verify_sequence
@@ -109,6 +111,9 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
         about["camera"] = {"image": taken[0], **asdict(taken[1])}
     with DsecEventReader(folder / "events.h5") as reader:
         windows = {"old": reader.slice(2 * start - end, start), "new": reader.slice(start, end)}
+        if EVENT_LABELS in manifest["files"]:
+            first = reader.number(2 * start - end), reader.number(start)
+            windows = {name: with_truth(one, k, folder) for (name, one), k in zip(windows.items(), first)}
     yield f"{key}.json", json.dumps(about, sort_keys=True).encode()
     for name, events in windows.items():
         yield f"{key}.{name}.npz", _npz(events)
@@ -132,5 +137,8 @@ def _last_image(folder: Path, manifest: dict[str, Any], t_us: int) -> tuple[int,
 
 def _npz(events: Events) -> bytes:
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, **{k: getattr(events, k) for k in events.columns})
+    columns = {k: getattr(events, k) for k in events.columns if k != "truth"}
+    if events.truth is not None:
+        columns.update({k: events.truth[k] for k in TOLD})
+    np.savez_compressed(buffer, **columns)
     return buffer.getvalue()

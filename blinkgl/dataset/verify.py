@@ -29,6 +29,7 @@ from blinkgl.dataset.work import RUN_FOLDER
 from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.events.types import Cause
 from blinkgl.gl import GLContext, create_context
+from blinkgl.io.event_labels import EVENT_LABELS, EventLabelsReader, problem_of as problem_of_truth
 from blinkgl.io.frame_camera import (
     FOLDER as FRAME_CAMERA,
     STAMPS as IMAGE_STAMPS,
@@ -178,6 +179,8 @@ def _look(folder: Path, name: str) -> tuple[list[str], _Known | None]:
             _guarded(lambda: check_events(folder / "events.h5", manifest)) if "events.h5" in manifest["files"] else []
         )
         problems = [line if line.startswith("events.h5") else f"events.h5: {line}" for line in problems]
+        if EVENT_LABELS in manifest["files"]:
+            problems += _guarded(lambda: _check_truth(folder, manifest))
         problems += _guarded(lambda: _check_labels(folder, manifest))
         if config.images is not None:
             problems += _guarded(lambda: _check_images(folder, manifest, config))
@@ -228,6 +231,8 @@ def _bound(name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[
 def _files_of(config: SequenceConfig) -> Iterator[str]:
     """Names of the files of a generated sequence, the manifest left out."""
     yield from ("events.h5", "poses.npz", "config.yaml")
+    if config.labels.events:
+        yield EVENT_LABELS
     for name in asked_for(config.labels):
         label = LABELS[name]
         if label.stamps is not None:
@@ -306,6 +311,24 @@ def _check_causes(file: h5py.File, path: Path, manifest: dict[str, Any]) -> list
     if found == wanted and counts.sum() == sum(found.values()):
         return []
     return [f"events.h5: causes are {found}, manifest says {wanted}"]
+
+
+def _check_truth(folder: Path, manifest: dict[str, Any]) -> list[str]:
+    """A row per event, of what can be, and the causes that ``events.h5`` says."""
+    count, instances = manifest["events"], {thing["id"] for thing in manifest.get("objects", ())}
+    with EventLabelsReader(folder) as reader, open_hdf5(folder / "events.h5") as file:
+        if reader.count != count:
+            return [f"{EVENT_LABELS}: rows of {reader.count} events, manifest says {count}"]
+        said = "events/cause" in file
+        if said != reader.causes:
+            return [f"{EVENT_LABELS}: causes " + ("are missing" if said else "that events.h5 does not have")]
+        for begin in range(0, count, _BLOCK):
+            truth, cause = reader.read(begin, begin + _BLOCK)
+            if (problem := problem_of_truth(truth, instances)) is not None:
+                return [f"{EVENT_LABELS}: {problem}"]
+            if said and (cause != file["events/cause"][begin : begin + _BLOCK]).any():
+                return [f"{EVENT_LABELS}: causes that are not those of events.h5"]
+    return []
 
 
 def _check_labels(folder: Path, manifest: dict[str, Any]) -> list[str]:

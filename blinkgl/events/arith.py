@@ -213,8 +213,13 @@ def exp_f64(v: float) -> float:
 
 @register_jitable
 def fall_f64(x: float) -> float:
-    """e^-x for float64 x >= 0, scalars; without the range reduction where x <= 1/2."""
-    return _exp_reduced(-x) if x <= 0.5 else exp_f64(-x)
+    """e^-x for float64 x >= 0; without the range reduction where x <= 1/2, and without a branch."""
+    v = np.maximum(-x, _EXP_MIN_64)
+    # The sum's low bits are the exponent: the constant's own leave with the shift.
+    t = select(x <= _HALF, _ROUND_64, v * _LOG2E_64 + _ROUND_64)
+    n = t - _ROUND_64
+    p = _exp_reduced((v - n * _LN2_HI_64) - n * _LN2_LO_64)
+    return p * _L((_D(t).view(np.int64) + _BIAS_64) << _EXP52).view(np.float64)
 
 
 _S0, _S1, _S2, _S3, _S4, _S5, _S6 = (

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from blinkgl.events.filters import make_filter
 from blinkgl.events.pixels import Latency, PixelNoise
 from blinkgl.events.readout import Readout
 from blinkgl.events.table import make_emulator
+from blinkgl.events.truth import Surfaces, SurfaceTruth
 from blinkgl.events.types import Events
 
 _NOTHING = nullcontext()
@@ -31,12 +33,13 @@ class EventFrame(NamedTuple):
 
     luminance : (H, W) float32, linear, or uint8 codes.   rate : (H, W) float32, d(luminance)/dt per second, or None.
     rows : (y0, y1): outside these rows the frame is the one before; None: it may differ anywhere.
-    As of ``Emulator.step``."""
+    As of ``Emulator.step``. surfaces : what the pixels show, of a camera that says what made its events."""
 
     t_ns: int
     luminance: np.ndarray
     rate: np.ndarray | None = None
     rows: tuple[int, int] | None = None
+    surfaces: Surfaces | None = None
 
 
 class EventCamera:
@@ -45,6 +48,7 @@ class EventCamera:
     Events go from the emulator through the pixels' defects, their latency, the bus with its clock, and the filters, as
     far as the configuration has them. readout : None: none of it.   seed : of the draws.
     reconstruction : the path between frames, see :class:`Emulator`.   emulator : the :class:`Emulator` itself.
+    truth : says what made each event, of frames that come with their ``surfaces``; None: nobody asks.
     Raises EventDataError: size, or a path that the emulator cannot follow."""
 
     def __init__(
@@ -55,7 +59,9 @@ class EventCamera:
         width: int,
         seed: int,
         reconstruction: str = "linear",
+        truth: SurfaceTruth | None = None,
     ):
+        self._truth = truth
         self.emulator = make_emulator(config, height, width, seed, reconstruction)
         self._pixels, self._latency, self._readout, self._filters = None, None, None, ()
         self._luminance: np.ndarray | None = None
@@ -66,6 +72,11 @@ class EventCamera:
                 self._latency = Latency(readout.latency, height, width, seed)
             self._readout = Readout(readout)
             self._filters = tuple(make_filter(one, height, width) for one in readout.filters)
+
+    @property
+    def tells(self) -> bool:
+        """Whether events say what made them, so that frames have to come with their ``surfaces``."""
+        return self._truth is not None
 
     @property
     def frames(self) -> int:
@@ -105,6 +116,9 @@ class EventCamera:
         except EventDataError as error:
             error.t_ns = frame.t_ns
             raise
+        if self._truth is not None and frame.surfaces is not None:
+            memory_s = self.emulator.memory_s(self.emulator.decoded(frame.luminance))
+            self._truth.see(frame.t_ns, frame.surfaces, memory_s)
         return self._read_out(events, frame.luminance)
 
     def flush(self) -> Events:
@@ -112,11 +126,15 @@ class EventCamera:
         return self._read_out(self.emulator.flush(), self._luminance)
 
     def _read_out(self, events: Events, luminance: np.ndarray | None) -> Events:
-        if self._readout is None or self.done_ns is None:
+        if self.done_ns is None:
             return events
         until_us = self.done_ns // 1000
         if self._pixels is not None:
             events = self._pixels.step(events, until_us)
+        if self._truth is not None:  # what is behind the pixels carries it along, whenever it lets an event go
+            events = replace(events, truth=self._truth.of(events, self.done_ns))
+        if self._readout is None:
+            return events
         if self._latency is not None and luminance is not None:
             if self.emulator.lags:  # for flush, which has no frame
                 self._luminance = luminance.copy()

@@ -127,6 +127,11 @@ class Emulator(ABC):
     def _tables_changed(self) -> None:  # noqa: B027 - most emulators keep nothing that depends on the tables
         pass
 
+    def memory_s(self, luminance: np.ndarray) -> np.ndarray | None:
+        """(H, W) how long a pixel's signal goes on following a change of light that is over, s, of linear luminance
+        (H, W); None: not at all. Whoever says what made an event asks."""
+        return None
+
     @property
     def causes(self) -> bool:
         """Whether events say what caused them, ``config.causes``."""

@@ -42,7 +42,8 @@ class Stream(IntEnum):
     LATENCY = 11  # jitter of latency, "pixel" is the event's number
 
 
-@register_jitable
+# "always": loops over draws become vector instructions only if nothing is called in them.
+@register_jitable(inline="always")
 def _round(c0, c1, c2, c3, k0, k1):
     # Two products of 32 x 32 bits; their high halves cross over to the other pair of words.
     p0 = c0 * _M0
@@ -50,7 +51,7 @@ def _round(c0, c1, c2, c3, k0, k1):
     return (p1 >> _S32) ^ c1 ^ k0, p1 & _MASK32, (p0 >> _S32) ^ c3 ^ k1, p0 & _MASK32
 
 
-@register_jitable
+@register_jitable(inline="always")
 def philox4x32(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> tuple[int, int, int, int]:
     """Four 32-bit words (held in uint64) of the block at counter (c0, c1, c2, c3) under key (k0, k1)."""
     # Ten rounds, the key bumped between them by the golden ratio and sqrt(3) - 1. Written out, since arrays come
@@ -76,7 +77,7 @@ def philox4x32(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> tuple[in
     return _round(c0, c1, c2, c3, k0, k1)
 
 
-@register_jitable
+@register_jitable(inline="always")
 def uniform2(seed: int, pixel: int, stream: int, index: int) -> tuple[float, float]:
     """Two independent uniforms in the open interval (0, 1), 53 bits each. All arguments uint64 (or arrays of it)."""
     w0, w1, w2, w3 = philox4x32(pixel & _MASK32, stream, index & _MASK32, index >> _S32, seed & _MASK32, seed >> _S32)
@@ -96,7 +97,7 @@ def normal2(seed: int, pixel: int, stream: int, index: int) -> tuple[float, floa
 _THREE_ROOT, _TWO, _ULP32 = _D(np.sqrt(3.0)), _D(2.0), _D(2.0**-32)
 
 
-@register_jitable
+@register_jitable(inline="always")
 def rough_normal(seed: int, pixel: int, stream: int, index: int) -> float:
     """Mean 0, variance 1, near normal (sum of four uniforms, within +-3.5): a third of the cost of a normal, for
     jitters whose exact law nobody has measured."""

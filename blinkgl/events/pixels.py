@@ -6,6 +6,8 @@ continuous time that the steps only look at: its events are numbered, and number
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numba
 import numpy as np
 
@@ -14,7 +16,7 @@ from blinkgl.errors import EventDataError
 from blinkgl.events.arith import exp_f64, log_f64
 from blinkgl.events.packing import JIT
 from blinkgl.events.philox import Stream, normal2, pixel_counters, uniform2
-from blinkgl.events.types import Cause, Events
+from blinkgl.events.types import OPTIONAL, Cause, Events
 
 _BATCH, _MOST_HZ = 1024, 1e6
 _DEFECT, _OWN, _LATE = np.uint64(Stream.DEFECT), np.uint64(Stream.OWN_NOISE), np.uint64(Stream.LATENCY)
@@ -131,8 +133,7 @@ class Latency:
             self._count += len(events)
             t = np.empty(len(events), np.int64)
             _delay(pixel, events.t, np.maximum(delay, 0.0), self._last, t)
-            late = Events(events.x, events.y, t, events.p, events.cause)
-            self._held = Events.concatenate([self._held, late])
+            self._held = Events.concatenate([self._held, replace(events, t=t)])
             self._held = self._held.part(np.argsort(self._held.t, kind="stable"))
         count = int(np.searchsorted(self._held.t, until_us, side="right"))
         known, self._held = self._held.part(slice(count)), self._held.part(slice(count, None)).copy()
@@ -151,7 +152,7 @@ def _columns(name: str, events: Events) -> dict[str, np.ndarray]:
 
 
 def _events(name: str, state: dict[str, np.ndarray], others: set[str]) -> Events:
-    columns = [f"{name}_{k}" for k in ("x", "y", "t", "p", *(["cause"] if f"{name}_cause" in state else []))]
-    if set(state) != {*others, *columns}:
+    columns = ("x", "y", "t", "p", *(k for k in OPTIONAL if f"{name}_{k}" in state))
+    if set(state) != {*others, *(f"{name}_{k}" for k in columns)}:
         raise EventDataError("saved state is of another camera", value=sorted(state))
-    return Events(*(state[k].copy() for k in columns))
+    return Events(**{k: state[f"{name}_{k}"].copy() for k in columns})

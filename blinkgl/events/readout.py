@@ -22,7 +22,7 @@ import numpy as np
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events.packing import JIT
-from blinkgl.events.types import Events
+from blinkgl.events.types import OPTIONAL, Events
 
 _PS_PER_US = 1_000_000
 
@@ -112,8 +112,9 @@ class Readout:
         }
 
     def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
-        columns = [f"on_bus_{k}" for k in ("x", "y", "t", "p", *(["cause"] if "on_bus_cause" in state else []))]
-        if set(state) != {"waiting", "state", "dropped", *columns} or state["waiting"].shape != self._waiting.shape:
+        columns = ("x", "y", "t", "p", *(k for k in OPTIONAL if f"on_bus_{k}" in state))
+        known = {"waiting", "state", "dropped", *(f"on_bus_{k}" for k in columns)}
+        if set(state) != known or state["waiting"].shape != self._waiting.shape:
             raise EventDataError("saved state is of another read-out", value=sorted(state))
         self._waiting[...], self._state[...], self.dropped = state["waiting"], state["state"], int(state["dropped"][0])
-        self._on_bus = Events(*(state[k].copy() for k in columns))
+        self._on_bus = Events(**{k: state[f"on_bus_{k}"].copy() for k in columns})

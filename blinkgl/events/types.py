@@ -24,6 +24,16 @@ class Cause(IntEnum):
     HOT = 3  # V2E: leak of a hot pixel
 
 
+TRUTH = np.dtype([("instance", np.uint16), ("depth", np.float32), ("velocity", np.float32, (2,))])
+"""What is known of the surface that made an event: its instance id, 0: nothing; depth along the optical axis, world
+units, inf: nothing; image velocity, px/s, +x right, +y down."""
+TOLD = ("instance", "depth", "velocity")
+"""Fields of :data:`TRUTH`."""
+OPTIONAL = ("cause", "truth")
+"""Columns that events may be without."""
+_TYPES = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8, "cause": np.uint8, "truth": TRUTH}
+
+
 @dataclass(frozen=True, eq=False)
 class Events:
     """Events of one chunk, columnar, sorted by time.
@@ -32,6 +42,8 @@ class Events:
     t    : (N,) int64 microseconds, non-decreasing inside a chunk and across the chunks of one emulator.
     p    : (N,) uint8, 1 brighter (ON), 0 darker (OFF).
     cause : (N,) uint8 of :class:`Cause`, or None where nobody asked for it (``events.causes``) or knows.
+    truth : (N,) of :data:`TRUTH`, the surface that made each (:mod:`blinkgl.events.truth`), or None likewise
+        (``labels.events``): ``truth["instance"]`` (N,), ``truth["depth"]`` (N,), ``truth["velocity"]`` (N, 2).
 
     Raises EventDataError: a column of another type or length.
     """
@@ -41,11 +53,12 @@ class Events:
     t: np.ndarray
     p: np.ndarray
     cause: np.ndarray | None = None
+    truth: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        for name, dtype in (("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.uint8), ("cause", np.uint8)):
+        for name, dtype in _TYPES.items():
             column = getattr(self, name)
-            if name == "cause" and column is None:
+            if name in OPTIONAL and column is None:
                 continue
             if (
                 not isinstance(column, np.ndarray)
@@ -71,26 +84,26 @@ class Events:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of those there are: "x", "y", "t", "p" and perhaps "cause"."""
-        return ("x", "y", "t", "p") if self.cause is None else ("x", "y", "t", "p", "cause")
+        """Names of those there are: "x", "y", "t", "p" and perhaps "cause" and "truth"."""
+        return ("x", "y", "t", "p", *(name for name in OPTIONAL if getattr(self, name) is not None))
 
     def part(self, which: slice | np.ndarray) -> Events:
         """Those of a slice (views) or of an index array or mask (copies), which must keep the order of time."""
-        return Events(*(getattr(self, k)[which] for k in self.columns))
+        return Events(**{k: getattr(self, k)[which] for k in self.columns})
 
     def copy(self) -> Events:
         """With memory of its own."""
-        return Events(*(getattr(self, k).copy() for k in self.columns))
+        return Events(**{k: getattr(self, k).copy() for k in self.columns})
 
     @staticmethod
     def concatenate(chunks: list[Events] | tuple[Events, ...]) -> Events:
-        """Chunks joined in the given order (they must already be in time order); with causes where all that are not
-        empty have them."""
+        """Chunks joined in the given order (they must already be in time order); with causes and truth where all
+        that are not empty have them."""
         full = [c for c in chunks if len(c)] or list(chunks[:1])
         if not full:
             return Events.empty()
-        known = "xytp" if any(c.cause is None for c in full) else full[0].columns
-        return Events(*(np.concatenate([getattr(c, k) for c in full]) for k in known))
+        known = [k for k in full[0].columns if all(getattr(c, k) is not None for c in full)]
+        return Events(**{k: np.concatenate([getattr(c, k) for c in full]) for k in known})
 
     def window(self, t0_us: int, t1_us: int) -> Events:
         """Events of the half-open window [t0_us, t1_us); views, no copy."""

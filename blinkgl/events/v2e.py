@@ -32,16 +32,14 @@ from blinkgl.events.blocks import compact_flags, copy_block, lookup_block, scale
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
 from blinkgl.events.esim import draw_thresholds
 from blinkgl.events.noise import noise_table
-from blinkgl.events.packing import CAUSE_SHIFT, JIT, T_SHIFT, cause_of
-from blinkgl.events.philox import Stream, normal2, rough_normal, uniform2
+from blinkgl.events.packing import JIT, T_SHIFT
+from blinkgl.events.philox import Stream, normal2, uniform2
 from blinkgl.events.response import Response, smallest_threshold
 from blinkgl.events.threads import take_part
-from blinkgl.events.types import Cause, Events
+from blinkgl.events.types import Events
 from blinkgl.events.v2e_model import (
     DARKEST,
     REBASE,
-    crossing_fraction,
-    curve_of,
     draw_hot,
     draw_leaks,
     draw_start,
@@ -55,15 +53,14 @@ from blinkgl.events.v2e_model import (
     shot_draw,
     shot_factor,
     shot_tables,
-    signal_at,
 )
+from blinkgl.events.v2e_waves import FLOATS, INTS, emit_waves
 
 _F = np.float32
-_ZERO, _ONE, _HALF, _JOINT, _INF = _F(0), _F(1), _F(0.5), _F(20.0), _F(np.inf)
-_SHOT, _LEAK_JITTER, _NOISE = np.uint64(Stream.SHOT), np.uint64(Stream.LEAK_JITTER), np.uint64(Stream.NOISE)
-_U2, _U1, _U1000, _MASK41 = np.uint64(2), np.uint64(1), np.uint64(1000), 2**41 - 1
-_INSERTION_LIMIT = 32
-_CAUSE_LEAK, _CAUSE_SHOT, _CAUSE_HOT = int(Cause.LEAK), int(Cause.SHOT), int(Cause.HOT)
+_ZERO, _HALF, _JOINT = _F(0), _F(0.5), _F(20.0)
+_SHOT, _NOISE = np.uint64(Stream.SHOT), np.uint64(Stream.NOISE)
+_U2, _U1, _U1000 = np.uint64(2), np.uint64(1), np.uint64(1000)
+_INSERTION_LIMIT, _DRAWS = 32, 16
 _FARTHEST, _FAR_BELOW = _F(1e6), np.int32(-(2**31))
 
 
@@ -110,11 +107,9 @@ class Interval(NamedTuple):
 
 
 @numba.njit(**JIT)
-def _lin_log_block(intensity, out, z):
+def _lin_log_block(intensity, out):
     for i in range(intensity.size):
-        x = lin_log(intensity[i])
-        out[i] = x
-        z[i] = x
+        out[i] = lin_log(intensity[i])
 
 
 @numba.njit(**JIT)
@@ -122,7 +117,7 @@ def _relax_block(lag, before, now, intensity_before, intensity_now, kappa, out, 
     for i in range(now.size):
         lag_now = relax(lag[i], before[i], now[i], intensity_before[i], intensity_now[i], kappa)
         out[i] = lag_now
-        z[i] += lag_now
+        z[i] = now[i] + lag_now
 
 
 @numba.njit(**JIT)
@@ -130,7 +125,7 @@ def _relax_block_gently(lag, before, now, intensity_before, intensity_now, kappa
     for i in range(now.size):
         lag_now = relax_gently(lag[i], before[i], now[i], intensity_before[i], intensity_now[i], kappa)
         out[i] = lag_now
-        z[i] += lag_now
+        z[i] = now[i] + lag_now
 
 
 @numba.njit(**JIT)
@@ -166,7 +161,30 @@ def _flag_block(z, upper, lower, flags):
 
 
 @numba.njit(**JIT)
-def _shot_block(block, pixels_in_block, p, v, intensity_now, keys):
+def _flag_block_leaking(z, leak, since, upper, lower, flags):
+    """:func:`_flag_block` of z with what has leaked."""
+    farthest = _FAR_BELOW
+    for i in range(z.size):
+        leaked = np.float32(z[i] + np.float32(leak[i] * since))
+        above, below = np.float32(leaked - upper[i]), np.float32(lower[i] - leaked)
+        beyond = np.float32(select(above > below, above, below))
+        flags[i] = np.uint8(beyond >= _ZERO)
+        farthest = max(farthest, beyond.view(np.int32))
+    return np.int32(farthest).view(np.float32)
+
+
+@numba.njit(**JIT)
+def _shot_draws(seed, block, index, rate_per_ns, gaps, picks, accepts):
+    """Of the candidates from number ``index`` on: more than are wanted, but in vector instructions."""
+    for j in range(gaps.size):
+        number = index + np.uint64(j)
+        gaps[j], picks[j] = shot_draw(seed, block, number, rate_per_ns)
+        # Odd: shot_draw has the even numbers.
+        accepts[j], _ = uniform2(seed, block, _SHOT, number * _U2 + _U1)
+
+
+@numba.njit(**JIT)
+def _shot_block(block, pixels_in_block, p, v, intensity_now, keys, draws):
     """Shot noise of one block in the interval: accepted events into ``keys`` (pixel in block << 42 | ns from the
     interval's start << 1 | polarity), sorted. Returns (events, time and number of the next candidate); -1 events
     when ``keys`` is too small."""
@@ -177,8 +195,15 @@ def _shot_block(block, pixels_in_block, p, v, intensity_now, keys):
     # A Poisson process of candidates for the block as a whole, as fast as if all its pixels were dark, thinned below to
     # what their intensities allow (Lewis and Shedler, Naval Research Logistics 26, 1979). One clock a block instead of
     # one a pixel.
+    drawn = _DRAWS
+    gaps, picks, accepts = draws
     while t_ns <= end_ns:
-        gap, pick = shot_draw(v.seed, np.uint64(block), np.uint64(index), v.shot_unit_per_ns * whole)
+        if drawn == _DRAWS:
+            rate = v.shot_unit_per_ns * whole
+            _shot_draws(v.seed, np.uint64(block), np.uint64(index), rate, gaps, picks, accepts)
+            drawn = 0
+        gap, pick, accept = gaps[drawn], picks[drawn], accepts[drawn]
+        drawn += 1
         # How many entries are <= weight. Weights are much alike, so the proportional guess is a cache line away.
         weight, place = np.float32(pick * whole), np.int64(pick * table.size)
         while place > 0 and table[place - 1] > weight:
@@ -190,9 +215,7 @@ def _shot_block(block, pixels_in_block, p, v, intensity_now, keys):
             i = first + offset
             after = max(t_ns - v.t0_ns, 0)
             intensity = p.intensity[i] + (intensity_now[offset] - p.intensity[i]) * (after / v.dt_ns)
-            # Odd: shot_draw has the even numbers.
-            u, _ = uniform2(v.seed, np.uint64(block), _SHOT, np.uint64(index) * _U2 + _U1)
-            if u * DARKEST < shot_factor(intensity):
+            if accept * DARKEST < shot_factor(intensity):
                 if count == keys.size:
                     return -1, t_ns, index  # the caller doubles ``keys`` and begins the block anew: draws know no state
                 key = (offset << 42) | (after << 1) | np.int64(on)
@@ -211,143 +234,8 @@ def _shot_block(block, pixels_in_block, p, v, intensity_now, keys):
 
 
 @numba.njit(**JIT)
-def _emit_block(active, count, first, now, constants, keys, noise_end, p, v, cap, packed, begin):
-    """Events of the listed pixels of one block into ``packed[begin:]``, in raster order; moves levels.
-
-    ``now``: (intensity, x, lag, noise) of the block at the interval's end. Returns (end of the events, cut)."""
-    out, cut, noise = begin, 0, 0
-    intensity_now, x_now, lag_now, noise_now = now
-    dt_ns, dt = v.dt_ns, v.dt_ns * 1e-9
-    start_ns, end_ns = v.t0_ns - 1000 * v.base_us, v.t0_ns + v.dt_ns
-    y = first // v.width
-    row_end = (y + 1) * v.width
-    for j in range(count):  # by themselves, so that the cache misses overlap
-        for c in range(3):
-            constants[j, c] = p.constants[active[j], c]
-    for j in range(count):
-        i = np.int64(active[j])
-        o = i - first
-        while i >= row_end:
-            y += 1
-            row_end += v.width
-        pixel = (y << 17) | ((i - row_end + v.width) << 1)
-        leak = np.float64(p.leak[i]) if p.leak.size else 0.0
-        x0 = np.float64(p.x[i])
-        dx = np.float64(x_now[o]) - x0
-        # Over the interval, s from 0 to 1: z(s) = lin-log (a straight line) + lag (e^-ks, see curve_of) + leak and
-        # noise (straight lines).
-        lag, k = 0.0, -1.0
-        if p.lag.size:
-            lag = np.float64(p.lag[i])
-            k = v.kappa * (0.5 * (np.float64(p.intensity[i]) + np.float64(intensity_now[o])) + 20.0)
-        shift = 0.0
-        if p.noise.size:
-            x0 += np.float64(p.noise[i])
-            shift = np.float64(noise_now[o]) - np.float64(p.noise[i])
-        base, drift = x0 + leak * v.since_epoch_0, shift + leak * dt
-        c, rise, fall = curve_of(base, drift, dx, lag, k)
-        end = base + drift + dx  # z(1); the low-pass has been evaluated already
-        if p.lag.size:
-            end += np.float64(lag_now[o])
-        up, down = np.float64(p.upper[i]), np.float64(p.lower[i])
-        on, off = np.float64(constants[j, 0]), np.float64(constants[j, 1])
-        s, now_ns, dead = 0.0, np.int64(0), False
-        since_ns, noise_then = np.int64(0), 0.0
-        if p.since_ns.size:
-            since_ns, noise_then = p.since_ns[i] - v.t0_ns, np.float64(p.noise_then[i])
-        # In its dead time, which ends where the comparator takes its new reference.
-        if p.release.size and up == -np.inf:
-            if p.release[i] > end_ns:
-                dead = True
-            else:
-                now_ns = max(p.release[i] - v.t0_ns, 0)
-                s = now_ns / dt_ns
-                reference = signal_at(s, c, rise, fall, k)
-                up, down = reference + on, reference - off
-                since_ns = now_ns
-                if p.noise.size:
-                    noise_then = np.float64(p.noise[i]) + shift * s
-        while noise < noise_end and (keys[noise] >> 42) < o:  # left by pixels that died before them
-            noise += 1
-        emitted = 0
-        # One turn per event: the crossing that comes next or the shot noise that comes before it.
-        while not dead:
-            while noise < noise_end and (keys[noise] >> 42) == o and ((keys[noise] >> 1) & _MASK41) < now_ns:
-                noise += 1
-            fires, polarity, target = False, np.int64(0), 0.0
-            if end >= up:
-                fires, polarity, target = True, np.int64(1), up
-            elif end <= down:
-                fires, target = True, down
-            # A crossing leaves the reference at the level that it met.
-            event_s, event_ns, reference = (2.0, np.int64(0), target)
-            if fires:
-                event_s = crossing_fraction(s, target, polarity, c, rise, fall, k, end)
-                event_ns = np.int64(event_s * dt_ns)
-            from_noise = False
-            if noise < noise_end and (keys[noise] >> 42) == o:
-                noise_ns = (keys[noise] >> 1) & _MASK41
-                if not fires or noise_ns <= event_ns:
-                    fires, from_noise, polarity, event_ns = True, True, keys[noise] & 1, noise_ns
-                    event_s = noise_ns / dt_ns
-                    noise += 1
-            if not fires:
-                break
-            if emitted < cap:
-                word = pixel | polarity
-                if p.since_ns.size:
-                    if from_noise:
-                        word |= _CAUSE_SHOT << CAUSE_SHIFT
-                    else:
-                        sign, size = (1.0, on) if polarity else (-1.0, off)
-                        by_leak, by_noise = sign * leak * ((event_ns - since_ns) * 1e-9), 0.0
-                        if p.noise.size:
-                            by_noise = sign * (np.float64(p.noise[i]) + shift * event_s - noise_then)
-                        cause = cause_of(size - by_leak - by_noise, by_leak, by_noise)
-                        if cause == _CAUSE_LEAK and p.hot[i]:
-                            cause = _CAUSE_HOT
-                        word |= cause << CAUSE_SHIFT
-                packed[out] = (np.int64(np.uint64(start_ns + event_ns) // _U1000) << T_SHIFT) | word
-                out += 1
-                emitted += 1
-            else:
-                cut += 1
-            s, now_ns = event_s, event_ns
-            if v.leak_jitter > 0.0:  # every event draws the leak anew: what follows moves over to its line
-                a = rough_normal(v.seed, np.uint64(i), _LEAK_JITTER, np.uint64(v.t0_ns + event_ns))
-                p.leak[i] = np.float32(constants[j, 2] / max(0.1, 1.0 + v.leak_jitter * a))
-                change = np.float64(p.leak[i]) - leak
-                leak += change
-                reference += change * (v.since_epoch_0 + s * dt)  # the same reference, seen from the new drift
-                c += change * v.since_epoch_0
-                rise += change * dt
-                end += change * v.since_epoch_1
-            if p.release.size:
-                now_ns = event_ns + v.refractory_ns
-                if now_ns > dt_ns:
-                    p.release[i] = v.t0_ns + now_ns
-                    dead = True
-                    break
-                s = now_ns / dt_ns
-            # Noise, and the end of a dead time, leave the reference wherever the signal is.
-            if from_noise or p.release.size:
-                reference = signal_at(s, c, rise, fall, k)
-            up, down = reference + on, reference - off
-            since_ns = now_ns
-            if p.noise.size:
-                noise_then = np.float64(p.noise[i]) + shift * s
-        if p.since_ns.size:
-            p.since_ns[i], p.noise_then[i] = v.t0_ns + since_ns, np.float32(noise_then)
-        if dead:  # both levels are passed, whatever comes: the pixel is looked at until it is released
-            p.upper[i], p.lower[i] = -_INF, _INF
-        else:
-            p.upper[i], p.lower[i] = np.float32(up), np.float32(down)
-    return out, cut
-
-
-@numba.njit(**JIT)
 def _emit_block_plain(active, count, first, x_now, constants, p, v, cap, packed, begin):
-    """:func:`_emit_block` without low-pass, leak, noise and dead time: the same bits, straight lines only."""
+    """:func:`emit_waves` without low-pass, leak, noise and dead time: the same bits, straight lines only."""
     out, cut, dt_ns = begin, 0, v.dt_ns
     start_ns = v.t0_ns - 1000 * v.base_us
     y = first // v.width
@@ -390,7 +278,9 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
     flags, scratch, active = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64), np.empty(BLOCK + 8, np.int32)
     z, intensity, x = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     lag, noise, normals = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    keys, constants = np.empty(BLOCK, np.int64), np.empty((BLOCK, 3), np.float32)
+    keys, constants = np.empty(BLOCK, np.int64), np.empty((BLOCK, 2), np.float32)
+    floats, ints = np.empty(FLOATS, np.float64), np.empty(INTS, np.int64)
+    draws = np.empty(_DRAWS, np.int64), np.empty(_DRAWS), np.empty(_DRAWS)
     kappa, since = np.float32(v.kappa), np.float32(v.since_epoch_1)
     plain = not (p.lag.size or p.leak.size or p.noise.size or p.release.size or p.clock_ns.size)
     for block in range(first_block, stop_block):
@@ -401,20 +291,21 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
             flags[:] = 0
         if codes.size:
             lookup_block(codes[s:e], x_table, x[:n])
-            copy_block(x[:n], z[:n])
             if p.intensity.size:
                 lookup_block(codes[s:e], table, intensity[:n])
         else:
             scale_block(frame[s:e], v.scale, intensity[:n])
-            _lin_log_block(intensity[:n], x[:n], z[:n])
+            _lin_log_block(intensity[:n], x[:n])
         if p.lag.size:
             if v.gentle:
                 _relax_block_gently(p.lag[s:e], p.x[s:e], x[:n], p.intensity[s:e], intensity[:n], kappa, lag[:n], z[:n])
             else:
                 _relax_block(p.lag[s:e], p.x[s:e], x[:n], p.intensity[s:e], intensity[:n], kappa, lag[:n], z[:n])
-        if p.leak.size:
-            _add_scaled_block(p.leak[s:e], since, z[:n])
+        elif p.noise.size:
+            copy_block(x[:n], z[:n])
         if p.noise.size:
+            if p.leak.size:
+                _add_scaled_block(p.leak[s:e], since, z[:n])
             _noise_block(
                 p.noise[s:e],
                 p.intensity[s:e],
@@ -428,13 +319,17 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
                 noise[:n],
                 z[:n],
             )
-        farthest = _flag_block(z[:n], p.upper[s:e], p.lower[s:e], flags)
+        signal = z if p.lag.size or p.noise.size else x
+        if p.leak.size and not p.noise.size:
+            farthest = _flag_block_leaking(signal[:n], p.leak[s:e], since, p.upper[s:e], p.lower[s:e], flags)
+        else:
+            farthest = _flag_block(signal[:n], p.upper[s:e], p.lower[s:e], flags)
         shots, clock_ns, clock_index = 0, np.int64(0), np.int64(0)
         if p.clock_ns.size:
-            shots, clock_ns, clock_index = _shot_block(block, n, p, v, intensity, keys)
+            shots, clock_ns, clock_index = _shot_block(block, n, p, v, intensity, keys, draws)
             while shots < 0:
                 keys = np.empty(2 * keys.size, np.int64)
-                shots, clock_ns, clock_index = _shot_block(block, n, p, v, intensity, keys)
+                shots, clock_ns, clock_index = _shot_block(block, n, p, v, intensity, keys, draws)
             for j in range(shots):
                 flags[keys[j] >> 42] = 1
         if farthest >= _ZERO or shots:
@@ -451,7 +346,9 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
                 filled, cut_here = _emit_block_plain(active, count, s, x, constants, p, v, cap, packed, filled)
             else:
                 now = (intensity, x, lag, noise)
-                filled, cut_here = _emit_block(active, count, s, now, constants, keys, shots, p, v, cap, packed, filled)
+                filled, cut_here = emit_waves(
+                    active, count, s, now, keys, shots, p, v, cap, packed, filled, floats, ints
+                )
             cut += cut_here
         # Last: until here these are of the frame before.
         if p.intensity.size:
@@ -476,6 +373,10 @@ def _bands(taken, start, edges, progress, share, packed, frame, codes, table, x_
         progress[b, 0], progress[b, 1] = block, filled
         progress[b, 2] += cut
         b = take_part(taken, start)
+
+
+_TAIL = 4.0
+"""Time constants of the low-pass after which a step, e^4 times the threshold at most, is over."""
 
 
 class V2e(Emulator):
@@ -568,6 +469,12 @@ class V2e(Emulator):
     def _tables_changed(self) -> None:
         self._table = self._decode * self._scale
         self._x_table = lin_log(self._table)
+
+    def memory_s(self, luminance: np.ndarray) -> np.ndarray | None:
+        if self.config.cutoff_hz == 0:
+            return None
+        corner = self.config.cutoff_hz * (luminance.astype(np.float64) * self.config.full_scale + 20.0) / 275.0
+        return _TAIL / (2 * np.pi * corner)
 
     def _start(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
         intensity = self._table[frame] if frame.dtype == np.uint8 else frame * self._scale

@@ -156,7 +156,7 @@ def shot_factor(intensity: float) -> float:
     return 1.0 - 0.75 * min(max((intensity + 20.0) / 275.0, 0.0), 1.0)
 
 
-@register_jitable
+@register_jitable(inline="always")
 def shot_draw(seed: int, block: int, index: int, rate_per_ns: float) -> tuple[int, float]:
     """Draw number ``index`` of a block: (ns to the event after it, uniform that picks pixel and polarity)."""
     u, v = uniform2(seed, block, _SHOT, index * _U2)

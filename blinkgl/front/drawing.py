@@ -11,7 +11,7 @@ import numpy as np
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
-from blinkgl.front.runs import MAX_INDEX, Source, configured, labels_tree, scene_of
+from blinkgl.front.runs import MAX_INDEX, OF_EVENTS, Source, configured, label_names, labels_tree, scene_of
 from blinkgl.gl import create_context
 from blinkgl.labels import LabelFrame, asked_for
 from blinkgl.render.renderer import Renderer as SceneRenderer
@@ -64,8 +64,10 @@ class Renderer:
     ) -> LabelFrame:
         """:class:`LabelFrame` at t s with the named buffers; "images" is its ``colour``, (H, W, 3) float32 linear.
 
-        labels : as of :func:`record`.
+        labels : as of :func:`record`, "events" left out, which is of no time.
         to, back_to : s, where flow and flow_backward lead; default: one label interval on and back."""
+        if of_events := [name for name in OF_EVENTS if name in label_names(labels)]:
+            raise ConfigError("is of events and not of a time", where="labels", value=of_events[0], accepted="record()")
         request = asked_for(LabelsConfig.model_validate(labels_tree(labels)))
         t_ns, interval = _ns(t, "t"), self.config.time.interval_ns
         return self._renderer.labels(

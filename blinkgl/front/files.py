@@ -16,6 +16,7 @@ from blinkgl.io import flow as flow_files, formats
 from blinkgl.io.formats import EventFile
 
 if TYPE_CHECKING:
+    from blinkgl.recordings.calibration import Calibration
     from blinkgl.recordings.comparison import Comparison
     from blinkgl.recordings.simulation import SimulationReport
 
@@ -32,11 +33,18 @@ def open_events(path: str | os.PathLike) -> EventFile:
     return formats.open_events(check.path(path, "path"))
 
 
-def read_events(path: str | os.PathLike) -> Events:
-    """All :class:`Events` of a file, t in µs, in memory. Raises AssetError and
-    EventDataError (times that run backwards …)."""
+def read_events(path: str | os.PathLike, *, truth: bool = False) -> Events:
+    """All :class:`Events` of a file, t in µs, in memory.
+
+    truth : of a sequence's ``events.h5`` also what made them (``Events.truth``), from ``event_labels.h5`` beside it.
+    Raises AssetError and EventDataError (times that run backwards …)."""
     with open_events(path) as file:
-        return file.read()
+        events = file.read()
+    if not check.one_of(truth, "truth", bool, "True or False"):
+        return events
+    from blinkgl.io.event_labels import with_truth
+
+    return with_truth(events, 0, check.path(path, "path").parent)
 
 
 def write_events(
@@ -169,6 +177,67 @@ def compare(
         interval_ms=check.number(interval_ms, "interval_ms", above=0, most=1e7),
         zero_time=bool(zero_time),
         judge=bool(judge),
+    )
+
+
+def calibrate(
+    recording: str | os.PathLike,
+    frames: str | os.PathLike | None = None,
+    *,
+    emulator: EmulatorSettings = "esim",
+    fixed: Iterable[str] = (),
+    still: bool = False,
+    flicker: tuple[float, float] | None = None,
+    fps: float | None = None,
+    timestamps: str | os.PathLike | None = None,
+    gamma: str | float = "linear",
+    interpolate: str = "motion",
+    max_px: float = 1.0,
+    frame_delay_ms: float | None = None,
+    starts: int = 3,
+    seed: int = 0,
+) -> Calibration:
+    """Fits an emulator to a camera's own recording. ``config`` of the result is the emulator as fitted, ``values`` and
+    ``uncertainty`` are of its fitted keys, ``untold`` says why others were left alone, ``judged`` how near it comes in
+    the half that was fitted and in the other, ``sensor()`` is the table of a sensor file.
+
+    recording : event file.   frames : what the camera saw, of its size (default: the recording's own).   emulator : a
+    name, or a mapping where the fit begins.   fixed : its keys that stay as they are there.   still : a scene that
+    stands still in constant light, without frames: noise alone.   flicker : (Hz, contrast) of light that goes as
+    1 + contrast sin on an even scene, without frames: thresholds.   fps : of the frames, Hz.   timestamps : file of the
+    frames' times.   gamma : of their codes, "linear", "srgb" or an exponent.   interpolate : between them, "motion" or
+    "linear".   max_px : of "motion", px.   frame_delay_ms : added to their times, ms; None: found.
+    starts : of the search.   Raises AssetError, EventDataError, ConfigError."""
+    from blinkgl.recordings import calibration
+    from blinkgl.recordings.clip import Flicker
+
+    keys = fixed if isinstance(fixed, Iterable) and not isinstance(fixed, str) else [None]
+    keys = tuple(keys)
+    if not all(isinstance(key, str) for key in keys):
+        raise ConfigError("not names of keys", where="fixed", value=fixed, accepted="a list of texts")
+    light = None
+    if flicker is not None:
+        hz, contrast = check.array(flicker, "flicker", (2,), "(Hz, contrast)").tolist()
+        light = Flicker(
+            check.number(hz, "flicker[0]", least=0.01, most=1e4),
+            check.number(contrast, "flicker[1]", above=0, most=0.999),
+        )
+    delay = None if frame_delay_ms is None else check.number(frame_delay_ms, "frame_delay_ms", least=-1e6, most=1e6)
+    return calibration.calibrate(
+        check.path(recording, "recording"),
+        None if frames is None else check.path(frames, "frames"),
+        emulator=events_tree(emulator),
+        fixed=keys,
+        still=bool(still),
+        flicker=light,
+        fps=_fps(fps),
+        timestamps=None if timestamps is None else check.path(timestamps, "timestamps"),
+        gamma=gamma,
+        interpolate=interpolate,
+        max_px=check.number(max_px, "max_px", above=0, most=1000),
+        frame_delay_ms=delay,
+        starts=check.whole(starts, "starts", 1, 20),
+        seed=check.seed(seed),
     )
 
 

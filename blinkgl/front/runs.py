@@ -192,9 +192,13 @@ def images_tree(images: ImageSettings) -> dict[str, Any]:
     return tree
 
 
+OF_EVENTS = ("events",)
+"""Labels that are of events and not of a time."""
+
+
 def label_names(labels: Sequence[str]) -> set[str]:
     """Raises ConfigError: no such label (:mod:`blinkgl.labels`)."""
-    known = list(dict.fromkeys(label.said for label in LABELS.values()))
+    known = [*dict.fromkeys(label.said for label in LABELS.values()), *OF_EVENTS]
     wanted = check.one_of(labels, "labels", (list, tuple, set, frozenset), "a list of names of labels")
     for name in wanted:
         if name not in known:
@@ -211,4 +215,5 @@ def labels_tree(labels: Sequence[str]) -> dict[str, Any]:
         label.ask(everything)
         if label.said in wanted:
             label.ask(asked)
-    return {key: asked.get(key, [] if isinstance(value, list) else False) for key, value in everything.items()}
+    tree = {key: asked.get(key, [] if isinstance(value, list) else False) for key, value in everything.items()}
+    return {**tree, **{name: name in wanted for name in OF_EVENTS}}

@@ -140,7 +140,7 @@ def record(
     timeline : :class:`Timeline`.
     quality : "fast", "balanced", "accurate" or "reference".
     labels : names of labels, such as images, flow, flow_backward, occlusion, depth
-    (docs/configuration.md has all); default: the source's.
+    (docs/configuration.md has all); "events": what made each event, ``events.truth``; default: the source's.
     images : a frame camera: the name of a preset, "deblurring", or a table of ``images:``, ``{"exposure_us": 10000}``.
     Raises ConfigError, AssetError, GLError, EventDataError."""
     config = _configured(

@@ -296,6 +296,15 @@ class DsecEventReader:
             self._wrong_table(t0_us, t1_us, (start, stop))
         return events.window(t0_us, t1_us)
 
+    def number(self, t_us: int) -> int:
+        """How many events lie before t_us, image clock: the number of the first that does not. Raises as
+        :meth:`slice`."""
+        ms = (int(t_us) - self.t_offset_us) // 1000
+        start, stop = self._index(ms, 0), self._index(ms + 1, self.count)
+        if not 0 <= start <= stop <= self.count:
+            self._wrong_table(t_us, t_us, (start, stop))
+        return start + int(np.searchsorted(self._read(start, stop).t, t_us, side="left"))
+
     def _wrong_table(self, t0_us: int, t1_us: int, found: tuple[int, int]) -> NoReturn:
         raise AssetError(
             f"'ms_to_idx' does not lead to the events of [{t0_us}, {t1_us}) µs",

@@ -254,6 +254,12 @@ def write_events(
     count = 0
     with event_writer(path, height, width, **options) as writer:
         for events in [chunks] if isinstance(chunks, Events) else chunks:
+            if events.truth is not None:
+                raise OutputError(
+                    "event files do not hold what made the events",
+                    where=str(path),
+                    accepted="dataclasses.replace(events, truth=None), or `generate`, which writes event_labels.h5",
+                )
             writer.append(events)
             count += len(events)
     return count

@@ -2,6 +2,7 @@
 
     <sequence>/
       events.h5                      DSEC layout (blinkgl.io.dsec)
+      event_labels.h5                what made each event, a row per event (blinkgl.io.event_labels)    (on request)
       images/%06d.png                sRGB frames at label times;        images/timestamps.txt   one µs per line
       flow/forward/%06d.png          DSEC 16-bit flow;                  flow/forward_timestamps.txt   from_us,to_us
       flow/forward_npy/%06d.npy      float32 (H, W, 3) = u, v, valid    (as BlinkFlow's; on request)
@@ -38,6 +39,7 @@ from blinkgl.errors import AssetError, BlinkGLError, OutputError
 from blinkgl.events.types import Events
 from blinkgl.io.atomic import fsync, output_errors, remove_stale, temporary_beside
 from blinkgl.io.dsec import DsecEventWriter
+from blinkgl.io.event_labels import EVENT_LABELS, EventLabelsWriter
 from blinkgl.io.frame_camera import (
     EXPOSURES,
     STAMPS,
@@ -72,6 +74,7 @@ class SequenceWriter:
     t_offset_us : time of the sequence's start, µs; events before it are refused by the DSEC format.
     labels : ``labels:``, which says in which forms labels are written; None: each in its first.
     events : False makes no ``events.h5``.
+    truth : True makes ``event_labels.h5`` beside it, of events that say what made them.
 
     Attributes
     ----------
@@ -94,6 +97,7 @@ class SequenceWriter:
         t_offset_us: int = 0,
         labels: LabelsConfig | None = None,
         events: bool = True,
+        truth: bool = False,
     ):
         self.final = Path(final)
         self.height, self.width, self.config_yaml, self.t_offset_us = (
@@ -106,9 +110,9 @@ class SequenceWriter:
         self.info: dict[str, Any] = {}
         self.t_end_us: int | None = None
         self.lost: dict[str, int] = {}
-        self._with_events = events
+        self._with_events, self._with_truth = events, truth
         self._files: dict[str, dict[str, Any]] = {}
-        self._promised = {"events.h5"} if events else set()
+        self._promised = {name for name, on in (("events.h5", events), (EVENT_LABELS, truth)) if on}
         self._timestamps: dict[str, list[str]] = {}
         self._row_files: dict[str, h5py.File] = {}
         self._exposures: list[ExposureLine] = []
@@ -123,7 +127,10 @@ class SequenceWriter:
             self._tmp.mkdir()
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="sequence-writer")
         self._slots = threading.BoundedSemaphore(_IN_FLIGHT)
+        self._truth: EventLabelsWriter | None = None
         try:
+            if self._with_truth:
+                self._truth = EventLabelsWriter(self._tmp / EVENT_LABELS)
             self._events = (
                 DsecEventWriter(self._tmp / "events.h5", self.height, self.width, self.t_offset_us)
                 if self._with_events
@@ -155,6 +162,8 @@ class SequenceWriter:
         """The next events, in time order (µs on the sequence's clock)."""
         self._check()
         self._events.append(events)
+        if self._truth is not None and len(events):
+            self._submit(partial(self._truth.append, events.copy()))
 
     def label(self, name: str, index: int, value: Any, t_us: int, to_us: int | None = None) -> None:
         """The ``index``-th value of a label (:mod:`blinkgl.labels`) of ``t_us``; ``to_us``: where it leads, of those
@@ -276,6 +285,8 @@ class SequenceWriter:
         self.text("config.yaml", self.config_yaml)
         if self._events is not None:
             self._events.close(self.t_end_us)
+        if self._truth is not None:
+            self._submit(self._truth.close)
         self._pool.shutdown(wait=True)
         self._check()
         with output_errors(self.final):
@@ -326,6 +337,8 @@ class SequenceWriter:
         self._pool.shutdown(wait=True, cancel_futures=True)
         if getattr(self, "_events", None) is not None:
             self._events.abort()
+        if self._truth is not None:
+            self._truth.abort()
         for file in self._row_files.values():
             try:
                 file.close()

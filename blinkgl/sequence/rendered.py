@@ -14,30 +14,52 @@ from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events import emulator_of
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
+from blinkgl.events.truth import Surfaces, SurfaceTruth
 from blinkgl.events.types import Events
 from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging import FrameCamera
 from blinkgl.labels import LABELS, LabelRequest, asked_for
+from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import recording, sequence_scene
+from blinkgl.scene.rig import Sensor
 from blinkgl.scene.types import Dynamics, Scene
 from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.items import GroundTruth, Picture
 from blinkgl.sequence.simulate import Simulation
 from blinkgl.timeline import Timeline, make_timeline
 
+SURFACES = LabelRequest("ids", "depth", "velocity")
+"""Labels that say what made an event."""
 
-def drawn(renderer: Renderer, times: Iterable[int], rates: bool = False) -> Iterator[EventFrame]:
+
+def drawn(
+    renderer: Renderer, times: Iterable[int], rates: bool = False, surfaces: bool = False
+) -> Iterator[EventFrame]:
     """The frames of the event pass at ``times``, ns; a :class:`Timeline` is told every one.
-    rates : with d(luminance)/dt."""
+    rates : with d(luminance)/dt.   surfaces : with what every pixel shows."""
     observe, frame = times.observe if isinstance(times, Timeline) else None, None
     for t_ns in times:
         before, frame = frame, renderer.luminance(t_ns, rate=rates)
         luminance, rate = frame.view(), frame.view("rate") if rates else None
         if observe is not None:
             observe(t_ns, luminance, rate)
-        yield EventFrame(t_ns, luminance, rate, frame.rows_changed_since(before))
+        shown = surfaces_at(renderer, t_ns) if surfaces else None
+        yield EventFrame(t_ns, luminance, rate, frame.rows_changed_since(before), shown)
+
+
+def _truth_of(sensor: Sensor, config: SequenceConfig) -> SurfaceTruth | None:
+    """What says what made a sensor's events; None where its labels do not ask."""
+    if sensor.labels is None or not sensor.labels.events:
+        return None
+    return SurfaceTruth(reach=int(samples_of(config.render.antialiasing).stored > 1))
+
+
+def surfaces_at(renderer: Renderer, t_ns: int) -> Surfaces:
+    """What every pixel's centre shows at t_ns."""
+    seen = renderer.labels(t_ns, SURFACES)
+    return Surfaces(seen.ids, seen.depth, seen.velocity)
 
 
 class RenderedSequence(Simulation):
@@ -85,6 +107,7 @@ class RenderedSequence(Simulation):
                     *size,
                     kernel_seed(config.seed, index, Role.EVENTS),
                     config.timeline.reconstruction,
+                    _truth_of(self.sensor, config),
                 )
                 response, dynamics = emulator_of(emulator).response(emulator), scene.dynamics
                 self.timeline = make_timeline(
@@ -111,7 +134,9 @@ class RenderedSequence(Simulation):
     def _event_pass(self) -> Iterator[tuple[int, Events]]:
         try:
             yield from emulate(
-                drawn(self.renderer, self.timeline, self.camera.emulator.needs_rate), self.camera, self.clock
+                drawn(self.renderer, self.timeline, self.camera.emulator.needs_rate, self.camera.tells),
+                self.camera,
+                self.clock,
             )
         except EventDataError as error:
             raise self._explained(error) from error

@@ -236,6 +236,11 @@ class Simulation(ABC):
         return None if self.camera is None else self.camera.filtered
 
     @property
+    def tells(self) -> bool:
+        """Whether its events say what made them (``labels.events``)."""
+        return self.camera is not None and self.camera.tells
+
+    @property
     def causes(self) -> dict[str, int]:
         """Events so far by what caused them; empty unless ``events.causes`` asks for it."""
         asked = self.camera is not None and self.camera.emulator.causes

@@ -7,8 +7,9 @@ the same augmentation, whatever the number of workers and however often the run 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -78,10 +79,18 @@ class Mixture:
             self._cache = (epoch, [Key(epoch, position, *pick) for position, pick in enumerate(picks)])
         return self._cache[1]
 
-    def first(self, source: int, n: int) -> int:
-        """Number of the sample of an endless ``source`` that comes next when n samples of the run have been taken."""
+    def first(self, source: int, n: int, rank: int = 0, world: int = 1) -> int:
+        """Number of the sample of an endless ``source`` that comes next when n samples of the run have been taken,
+        every ``world``-th of them, beginning with ``rank``, by the process that asks."""
         epoch, position = divmod(n, self.epoch_length)
-        return epoch * self.counts[source] + sum(key.source == source for key in self.epoch(epoch)[:position])
+        if world == 1:
+            return epoch * self.counts[source] + sum(key.source == source for key in self.epoch(epoch)[:position])
+        ends = [self.epoch_length] * epoch + [position]
+        return sum(
+            key.source == source and (e * self.epoch_length + i) % world == rank
+            for e, end in enumerate(ends)
+            for i, key in enumerate(self.epoch(e)[:end])
+        )
 
     def key(self, n: int) -> Key:
         """The n-th sample of the run."""
@@ -106,7 +115,8 @@ class FlowDataset(Dataset):
     Gives a dict: old, new (C, H, W) float32; flow (2, H, W) float32 px, valid (H, W) bool (finite, |flow| < 400), mask
     (H, W) bool, name, scene; without ground truth flow and valid are left out.
 
-    raw : the RawSample itself besides, as "raw".
+    raw : the RawSample itself besides, as "raw".   reads : windows that are made tensors of
+    (:attr:`eflow.models.FlowModel.reads`).
     empty : "error" refuses a sample without an event in either window; "skip" takes the next sample that has some.
     """
 
@@ -120,8 +130,10 @@ class FlowDataset(Dataset):
         crop: tuple[int, int] | None = None,
         empty: str = "error",
         raw: bool = False,
+        reads: tuple[str, ...] = ("old", "new"),
     ):
         self.sources, self.representation, self.seed, self.raw = sources, representation, seed, raw
+        self.reads = reads
         self.augment, self.crop, self.empty = augment, crop, empty
         self._starts = np.cumsum([0, *(0 if is_endless(s) else len(s) for s in sources)])
         if augment is not None and augment.time_reversal > 0 and not all(s.has_backward for s in sources):
@@ -166,7 +178,7 @@ class FlowDataset(Dataset):
 
     def _tensors(self, s: RawSample, rng: np.random.Generator | None) -> dict:
         try:
-            grids = {k: self.representation(w, s.height, s.width) for k, w in (("old", s.old), ("new", s.new))}
+            grids = {k: self.representation(getattr(s, k), s.height, s.width) for k in self.reads}
         except EventDataError as error:
             raise EventDataError(error.problem, where=f"{s.name}: {error.where}") from None
         out = {k: torch.from_numpy(g) for k, g in grids.items()}
@@ -174,7 +186,9 @@ class FlowDataset(Dataset):
             if not np.isfinite(s.flow[s.valid]).all():
                 raise EventDataError("flow is NaN or infinite and marked valid", where=s.name)
             out["flow"] = torch.from_numpy(np.ascontiguousarray(s.flow.transpose(2, 0, 1), dtype=np.float32))
-            out["valid"] = torch.from_numpy(np.ascontiguousarray(s.valid)) & ((out["flow"] ** 2).sum(0) < MAX_FLOW**2)
+            with np.errstate(over="ignore", invalid="ignore"):  # where it is not valid there may be anything
+                moves = np.square(s.flow[..., 0]) + np.square(s.flow[..., 1])  # torch would call in all its threads
+            out["valid"] = torch.from_numpy(s.valid & (moves < MAX_FLOW**2))
             out["mask"] = (
                 torch.from_numpy(np.ascontiguousarray(s.mask)) if s.mask is not None else torch.ones_like(out["valid"])
             )
@@ -219,7 +233,7 @@ def scaled(sample: dict, factor: float, least: tuple[int, int] | None = None) ->
     height, width = sample["new"].shape[-2:]
     size = [max(round(height * factor), (least or (1, 1))[0]), max(round(width * factor), (least or (1, 1))[1])]
     resize = lambda a: torch.nn.functional.interpolate(a[None], size=size, mode="bilinear", align_corners=False)[0]
-    out = {**sample, **{k: resize(sample[k]) for k in ("old", "new")}}
+    out = {**sample, **{k: resize(sample[k]) for k in ("old", "new") if k in sample}}
     if "flow" in sample:
         ratio = torch.tensor([size[1] / width, size[0] / height])[:, None, None]
         out["flow"] = resize(torch.where(sample["valid"], sample["flow"], 0)) * ratio
@@ -247,7 +261,8 @@ def cropped(sample: dict, size: tuple[int, int], rng: np.random.Generator, name:
 
 class StepSampler(Sampler):
     """Batches of keys from training step ``start`` on, for one rank of ``world``: step s takes samples s·B … (s+1)·B -
-    1 of the mixture, rank r every world-th of them."""
+    1 of the mixture, rank r every world-th of them. Each rank renders an endless source of its own, whose samples it
+    takes one after the other."""
 
     def __init__(self, mixture: Mixture, batch: int, start: int, stop: int, rank: int = 0, world: int = 1):
         self.mixture, self.batch, self.start, self.stop, self.rank, self.world = (
@@ -263,10 +278,14 @@ class StepSampler(Sampler):
         return max(self.stop - self.start, 0)
 
     def __iter__(self) -> Iterator[list[Key]]:
+        own = (self.rank, self.world)
+        endless = [k for k, without_end in enumerate(self.mixture.endless) if without_end and self.world > 1]
+        numbers = {k: itertools.count(self.mixture.first(k, self.start * self.batch, *own)) for k in endless}
         for step in range(self.start, self.stop):
-            yield [
+            keys = [
                 self.mixture.key(n) for n in range(step * self.batch + self.rank, (step + 1) * self.batch, self.world)
             ]
+            yield [replace(key, index=next(numbers[key.source])) if key.source in numbers else key for key in keys]
 
 
 def collate(samples: list[dict]) -> dict:

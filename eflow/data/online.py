@@ -39,6 +39,7 @@ from blinkgl.errors import BlinkGLError, ConfigError, EventDataError, may_pass
 from blinkgl.events.types import Events
 from blinkgl.sequence import simulate_sequence
 from eflow.config import SourceConfig
+from eflow.data.pool import read_window, write_window
 from eflow.data.window import RawSample, Window
 
 MIX = 8
@@ -46,13 +47,13 @@ MIX = 8
 TRIES = 8
 """Sequences of a slot that are tried before it is given up."""
 _APART = 1_000_000  # between numbers of a slot's sequences
+_LEAST_PX = 0.3  # shorter flow counts as so long where density is asked for
 _CANDIDATES = 6  # windows drawn for each that is wanted
 _ATTEMPTS = 3  # at a slot whose worker died
 _SLOT_S = 900.0  # longest for a slot
 _FREE_FAILURES, _FAILURE_SHARE = 10, 0.5
 _SPOOL_FREE = 2**30
 _ERROR = "error"
-_COLUMNS = ("x", "y", "t", "p")
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,8 @@ class StreamJob:
     recipe : YAML text, its seed already the stream's.   base : folder that its paths start from.
     samples : windows of a slot.   window_us : shortest and longest window, µs, drawn log-uniformly for each; None: the
     recipe's label interval.   min_events : fewest events in each of a sample's two windows.
-    max_flow : longest median of the flow in a sample, px.   split : which groups.   seed : of windows and their order.
+    max_flow : longest median of the flow in a sample, px.   min_density : fewest events per pixel of the new window and
+    px of its mean flow.   split : which groups.   seed : of windows and their order.
     out : the spool folder."""
 
     out: str
@@ -72,6 +74,7 @@ class StreamJob:
     window_us: tuple[int, int] | None = None
     min_events: int = 1
     max_flow: float = 400.0
+    min_density: float = 0.0
     split: str = "train"
     seed: int = 0
     maker: ClassVar[str] = "eflow.data.online:WindowMaker"
@@ -139,7 +142,7 @@ class WindowMaker(Maker):
                 found = self._windows(config, index, number, tried, self.job.samples - made)
                 name = sequence_name(config.output, index).split("/")[1]
                 for sample in found:
-                    _write(Path(self.job.out), number, made, sample, name)
+                    write_window(_file(Path(self.job.out), number, made), sample, name)
                     made += 1
             except Exception as error:  # noqa: BLE001 - whatever it is, the next sequence goes on
                 message = failed(number, error)
@@ -170,10 +173,8 @@ class WindowMaker(Maker):
     def _dice(self, slot: int, tried: int, what: int) -> np.random.Generator:
         return np.random.default_rng(np.random.SeedSequence(self.job.seed, spawn_key=(4, slot, tried, what)))
 
-    def _windows(
-        self, config: SequenceConfig, index: int, slot: int, tried: int, wanted: int
-    ) -> Iterator[tuple[RawSample, int]]:
-        """Up to ``wanted`` windows of a sequence that have something to say, and the reference time of each, µs."""
+    def _windows(self, config: SequenceConfig, index: int, slot: int, tried: int, wanted: int) -> Iterator[RawSample]:
+        """Up to ``wanted`` windows of a sequence that have something to say."""
         job = self.job
         with simulate_sequence(config, index, self.gl, base=Path(job.base), labels=False) as sequence:
             events = sequence.gather()
@@ -193,20 +194,19 @@ class WindowMaker(Maker):
                 lengths = np.hypot(*forward.flow[forward.valid][::7].T)
                 if not len(lengths) or np.median(lengths) > job.max_flow:
                     continue
-                yield (
-                    RawSample(
-                        old,
-                        new,
-                        sequence.height,
-                        sequence.width,
-                        name="",
-                        scene="",
-                        flow=forward.flow,
-                        valid=forward.valid,
-                        backward=None if backward is None else backward.flow,
-                        backward_valid=None if backward is None else backward.valid,
-                    ),
-                    t,
+                if len(new) < job.min_density * forward.valid.size * max(float(lengths.mean()), _LEAST_PX):
+                    continue
+                yield RawSample(
+                    old,
+                    new,
+                    sequence.height,
+                    sequence.width,
+                    name="",
+                    scene="",
+                    flow=forward.flow,
+                    valid=forward.valid,
+                    backward=None if backward is None else backward.flow,
+                    backward_valid=None if backward is None else backward.valid,
                 )
                 wanted -= 1
                 if wanted == 0:
@@ -248,42 +248,6 @@ def _window(events: Events, t0: int, t1: int) -> Window:
 
 def _file(spool: Path, slot: int, item: int) -> Path:
     return spool / f"{slot:09d}_{item:03d}.npz"
-
-
-def _write(spool: Path, slot: int, item: int, found: tuple[RawSample, int], name: str) -> None:
-    """Whole or not at all: the reader waits for the name."""
-    sample, t = found
-    arrays = {f"{side}_{c}": getattr(getattr(sample, side), c) for side in ("old", "new") for c in _COLUMNS}
-    arrays |= {"flow": sample.flow, "valid": sample.valid}
-    if sample.backward is not None:
-        arrays |= {"backward": sample.backward, "backward_valid": sample.backward_valid}
-    span = sample.new.t1 - t
-    path = _file(spool, slot, item)
-    temporary = path.with_suffix(f".{os.getpid()}")
-    with open(temporary, "wb") as file:
-        np.savez(file, name=np.array(f"{name}/{t}us+{span}us"), t=np.array(t), span=np.array(span), **arrays)
-    os.replace(temporary, path)
-
-
-def _read(path: Path) -> RawSample:
-    with np.load(path, allow_pickle=False) as z:
-        arrays = {key: z[key] for key in z.files}
-    t, span, name = int(arrays["t"]), int(arrays["span"]), str(arrays["name"])
-    old, new = (
-        Window(*(arrays[f"{side}_{c}"] for c in _COLUMNS), t0, t0 + span)
-        for side, t0 in (("old", t - span), ("new", t))
-    )
-    return RawSample(
-        old,
-        new,
-        *arrays["valid"].shape,
-        name=name,
-        scene=name.split("/")[0],
-        flow=arrays["flow"],
-        valid=arrays["valid"],
-        backward=arrays.get("backward"),
-        backward_valid=arrays.get("backward_valid"),
-    )
 
 
 @dataclass
@@ -344,20 +308,22 @@ class OnlineSource:
         raise TypeError("an online source has no end")
 
     def __getitem__(self, n: int) -> RawSample:
+        return read_window(self.path(n))
+
+    def path(self, n: int) -> Path:
+        """The file of sample n (:mod:`eflow.data.pool`), when it is there; until :meth:`taken` says otherwise."""
         slot, item = self._place(n)
         path = _file(self._spool, slot, item)
         began = time.monotonic()
-        while True:
-            try:
-                return _read(path)
-            except FileNotFoundError:
-                self._explain(slot)
+        while not path.is_file():
+            self._explain(slot)
             if not self._workers and self._executor is not None:
                 self._make(slot)
             else:
                 time.sleep(0.003)
             self.stats.waited_s += time.monotonic() - began
             began = time.monotonic()
+        return path
 
     def _place(self, n: int) -> tuple[int, int]:
         """Slot and item of sample n: the samples of a block, shuffled."""
@@ -499,6 +465,7 @@ def open_online(s: SourceConfig, seed: int, *, split: str = "train", first: int 
         None if s.window_ms is None else (round(1000 * s.window_ms[0]), round(1000 * s.window_ms[1])),
         s.min_events,
         s.max_flow,
+        s.min_density,
         split,
         seed,
     )

@@ -1,5 +1,5 @@
 """Data sets on disk as lists of samples: BlinkGL's sequence directories, DSEC, BlinkFlow. (MVSEC:
-:mod:`eflow.data.mvsec`.)
+:mod:`eflow.data.mvsec`; windows that were rendered one by one: :mod:`eflow.data.pool`.)
 
 All three are an event file beside one flow file per label, so one reader serves them;
 what differs is where the files lie.
@@ -30,9 +30,10 @@ from blinkgl.io.flow_png import read_flow_png
 from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
 from blinkgl.io.index import INDEX, read_index
 from blinkgl.labels import LABELS
+from eflow.data.pool import ABOUT, PoolSource
 from eflow.data.window import RawSample, Window
 
-FORMATS = ("blinkgl", "dsec", "mvsec", "blinkflow")
+FORMATS = ("blinkgl", "dsec", "mvsec", "blinkflow", "windows")
 _OPEN_FILES = 16
 
 
@@ -342,6 +343,8 @@ def detect_format(root: Path) -> str:
         return "mvsec"
     if not root.is_dir():
         raise AssetError("no such data set", where=str(root), accepted="a folder")
+    if (root / ABOUT).is_file():
+        return "windows"
     if (root / INDEX).is_file() or next(root.rglob("manifest.json"), None):
         return "blinkgl"
     if next(root.rglob("forward_flow"), None):
@@ -351,23 +354,33 @@ def detect_format(root: Path) -> str:
     if next(root.rglob("events.h5"), None):
         return "dsec"
     raise AssetError(
-        "no data set found", where=str(root), accepted="a folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences"
+        "no data set found",
+        where=str(root),
+        accepted="a folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences, or of eflow render's windows",
     )
 
 
-def open_source(path: str | os.PathLike, format: str = "auto", *, dt: int = 1) -> Source:
-    """The data set at ``path``; ``dt``: MVSEC's interval in images, 1 or 4.
+def open_source(
+    path: str | os.PathLike, format: str = "auto", *, dt: int = 1, protocol: str = "all", truth: str | None = None
+) -> Source:
+    """The data set at ``path``; of MVSEC alone ``dt``, its interval in images, 1 or 4, and ``protocol`` and ``truth``,
+    see :class:`~eflow.data.mvsec.MvsecSource`.
 
-    Raises AssetError: nothing there, or a damaged index; files of single samples are only
-    looked at when they are asked for."""
+    Raises ConfigError: those two, of another set. AssetError: nothing there, or a damaged index; files of single
+    samples are only looked at when they are asked for."""
     root = Path(path)
     kind = detect_format(root) if format == "auto" else format
     if kind == "mvsec":
         from eflow.data.mvsec import MvsecSource
 
-        return MvsecSource(root, dt)
+        return MvsecSource(root, dt, protocol, truth)
+    for name, value in (("protocol", protocol), ("truth", truth)):
+        if value not in ("all", None):
+            raise ConfigError("only of MVSEC", where=name, value=value, accepted="a set of MVSEC's layout")
     if not root.is_dir():
         raise AssetError("no such data set", where=str(root), accepted="a folder")
+    if kind == "windows":
+        return PoolSource(root)
     sequences = {"blinkgl": find_blinkgl, "dsec": find_dsec, "blinkflow": find_blinkflow}[kind](root)
     source = FolderSource(sequences)
     if not len(source):

@@ -51,6 +51,8 @@ class FlowModel(nn.Module):
     """Height and width must be multiples of this; :mod:`eflow.infer` pads."""
     least: int = 32
     """Smallest accepted height and width, px."""
+    reads: ClassVar[tuple[str, ...]] = ("old", "new")
+    """The windows that it looks at; a batch need not hold others."""
     pad_to: int | None = None
     """Multiple that :mod:`eflow.infer` pads to; None: ``divisor``."""
     pad_start: bool = False

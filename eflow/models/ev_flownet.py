@@ -12,7 +12,7 @@ from torch import nn
 from eflow.config import EvFlowNetConfig
 from eflow.data.representation import CountsAndTimes, VoxelGrid
 from eflow.models.contract import FlowModel, FlowPrediction, initialise
-from eflow.models.unets import Residual, ScaledTanh, double, encoder_widths, to_size
+from eflow.models.unets import Consensus, Residual, ScaledTanh, double, encoder_widths, to_size
 
 
 class EvFlowNet(FlowModel):
@@ -21,6 +21,7 @@ class EvFlowNet(FlowModel):
 
     Config = EvFlowNetConfig
     divisor, least = 16, 32
+    reads = ("new",)
 
     def __init__(self, config: EvFlowNetConfig):
         super().__init__()
@@ -30,6 +31,7 @@ class EvFlowNet(FlowModel):
         w = widths[1]
         self.encoders = nn.ModuleList([nn.Conv2d(a, b, 3, 2, 1) for a, b in itertools.pairwise(widths)])
         self.residuals = nn.Sequential(Residual(8 * w), Residual(8 * w))
+        self.consensus = Consensus(8 * w) if config.consensus else None
         self.decoders = nn.ModuleList(
             [
                 nn.Conv2d(c, c_out, 3, padding=1)
@@ -49,7 +51,10 @@ class EvFlowNet(FlowModel):
         for encoder in self.encoders:
             x = F.relu(encoder(x))
             skips.append(x)
-        x, flows = self.residuals(x), []
+        x, flows = self.residuals[0](x), []
+        if self.consensus is not None:
+            x = self.consensus(x)
+        x = self.residuals[1](x)
         for decoder, head in zip(self.decoders, self.heads, strict=True):
             parts = [x, skips.pop()] + ([flows[-1].to(x.dtype) / head.largest] if flows else [])
             x = F.relu(decoder(double(torch.cat(parts, 1))))

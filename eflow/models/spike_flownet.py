@@ -45,6 +45,7 @@ class SpikeFlowNet(FlowModel):
 
     Config = SpikeFlowNetConfig
     divisor, least = 16, 32
+    reads = ("new",)
 
     def __init__(self, config: SpikeFlowNetConfig):
         super().__init__()

@@ -43,6 +43,7 @@ class SteFlowNet(FlowModel):
 
     Config = SteFlowNetConfig
     divisor, least = 16, 32
+    reads = ("new",)
 
     def __init__(self, config: SteFlowNetConfig):
         super().__init__()

@@ -74,6 +74,57 @@ class Residual(nn.Module):
         return F.relu(x + self.conv2(F.relu(self.conv1(x))))
 
 
+class Consensus(nn.Module):
+    """x + a linear layer of the affine field that is nearest to x over the image, each channel by least squares with
+    weights that are learned, too: places where nothing happens have no say, and hear what the others agree on. A camera
+    that turns, slides along a wall or rolls moves the image by such a field, which convolutions cannot carry across.
+
+    As many weights as ``groups``, each for its share of the channels. Places are counted in px of the input from where
+    the weights lie, so that images of any size are alike."""
+
+    SPAN = 64.0
+    """px that are 1 in the coordinates."""
+    RIDGE = 0.02
+    """Added to the spread of the weights, SPAN squared: what lies on a point or a line has no slope across it."""
+
+    def __init__(self, channels: int, groups: int = 4, stride: int = 16):
+        super().__init__()
+        self.groups, self.stride = groups, stride
+        self.weight, self.mix = nn.Conv2d(channels, groups, 1), nn.Conv2d(channels, channels, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        weight = torch.sigmoid(self.weight(x).float())
+        with torch.autocast(x.device.type, enabled=False):
+            field = self.fitted(x.float(), weight)
+        return F.relu(x + self.mix(field.to(x.dtype)))
+
+    def fitted(self, x: Tensor, weight: Tensor) -> Tensor:
+        """The affine field nearest to x (N, C, h, w), where ``weight`` (N, groups, h, w) says; float32."""
+        n, channels, height, width = x.shape
+        unit = self.stride / self.SPAN
+        v, u = torch.meshgrid(
+            unit * torch.arange(height, dtype=x.dtype, device=x.device),
+            unit * torch.arange(width, dtype=x.dtype, device=x.device),
+            indexing="ij",
+        )
+        u, v = u.reshape(1, 1, -1), v.reshape(1, 1, -1)
+        w = weight.flatten(2) + 1e-4
+        w = w / w.sum(2, keepdim=True)  # (N, groups, h w)
+        u, v = u - (w * u).sum(2, keepdim=True), v - (w * v).sum(2, keepdim=True)
+        uu, vv, uv = (
+            (w * u * u).sum(2, keepdim=True) + self.RIDGE,
+            (w * v * v).sum(2, keepdim=True) + self.RIDGE,
+            (w * u * v).sum(2, keepdim=True),
+        )
+        det = uu * vv - uv * uv
+        x = x.reshape(n, self.groups, channels // self.groups, height * width)
+        with_weight = lambda a: torch.matmul(x, a.unsqueeze(-1))  # (N, groups, C / groups, 1)
+        mean, xu, xv = with_weight(w), with_weight(w * u), with_weight(w * v)
+        uu, vv, uv, det, u, v = (a.unsqueeze(2) for a in (uu, vv, uv, det, u, v))
+        field = mean + (vv * xu - uv * xv) / det * u + (uu * xv - uv * xu) / det * v
+        return field.reshape(n, channels, height, width)
+
+
 def double(x: Tensor) -> Tensor:
     """Nearest-neighbour upsampling by two."""
     return F.interpolate(x, scale_factor=2, mode="nearest")

@@ -1,5 +1,7 @@
 """The networks: size and arithmetic as published, the equalities between them, and what they refuse."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -9,8 +11,9 @@ from blinkgl.errors import BlinkGLError  # noqa: E402
 from eflow.config import LossConfig  # noqa: E402
 from eflow.counting import count  # noqa: E402
 from eflow.infer import predict  # noqa: E402
-from eflow.losses import sequence_loss  # noqa: E402
+from eflow.losses import pixel_error, sequence_loss  # noqa: E402
 from eflow.models import NETWORKS, SIZES, FlowPrediction, build_model, model_config, parameters_of  # noqa: E402
+from eflow.models.unets import Consensus  # noqa: E402
 from eflow.train import learning_rate  # noqa: E402
 
 
@@ -409,3 +412,41 @@ def test_terms_of_the_loss_by_hand(terms, expected):
 def test_a_loss_of_nothing_is_refused():
     with pytest.raises(Exception, match="no term has a weight"):
         LossConfig(l1=0)
+
+
+def test_consensus_gives_an_affine_field_back_wherever_it_is_seen():
+    """What is affine over the image is found from the places that have a say, at any size, and carried to the rest;
+    places without weight change nothing."""
+    torch.manual_seed(0)
+    layer = Consensus(8, groups=2)
+    layer.RIDGE = 0.0
+    for height, width in ((8, 8), (11, 15)):
+        v, u = torch.meshgrid(torch.arange(height) * 1.0, torch.arange(width) * 1.0, indexing="ij")
+        slopes = torch.randn(8, 3, 1, 1)
+        true = (slopes[:, 0] + slopes[:, 1] * u + slopes[:, 2] * v)[None]
+        seen = torch.zeros(1, 2, height, width)
+        seen[..., 2:7, 1:6] = torch.rand(5, 5) + 0.5
+        noisy = torch.where(seen[:, :1] > 0, true, true + 1e-2 * torch.randn_like(true))
+        assert (layer.fitted(noisy, seen) - true).abs().max() < 2e-2
+        assert (layer.fitted(true, torch.rand(1, 2, height, width)) - true).abs().max() < 1e-3
+    # A line of places has no slope across it: the ridge keeps it flat there.
+    line = torch.zeros(1, 2, 8, 8)
+    line[..., 3, :] = 1
+    flat = Consensus(8, groups=2).fitted(torch.randn(1, 8, 8, 8), line)
+    assert flat.isfinite().all() and (flat[..., 7, :] - flat[..., 0, :]).abs().max() < 0.5
+    with torch.autocast("cpu", torch.bfloat16):
+        x = torch.randn(1, 8, 8, 8, dtype=torch.bfloat16)
+        assert Consensus(8)(x).dtype == torch.bfloat16
+
+
+def test_length_is_priced_either_way_and_whatever_the_direction():
+    loss = LossConfig(l1=0, epe=1e-9, length=1, knee=1)
+    target = torch.tensor([3.0, 0.0]).reshape(1, 2, 1, 1)
+    price = lambda u, v: float(pixel_error(torch.tensor([u, v]).reshape(1, 2, 1, 1), target, loss))
+    assert price(3.0, 0.0) < 1e-5 and price(0.0, -3.0) < 1e-5
+    assert price(1.0, 0.0) == pytest.approx(math.log(2), abs=1e-4) and price(7.0, 0.0) == pytest.approx(
+        math.log(2), abs=1e-4
+    )
+    still = torch.zeros(1, 2, 1, 1, requires_grad=True)
+    pixel_error(still, target, loss).sum().backward()
+    assert still.grad.isfinite().all()

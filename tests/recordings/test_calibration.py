@@ -12,10 +12,11 @@ import yaml
 
 from blinkgl.cli import run
 from blinkgl.errors import BlinkGLError, ConfigError, EventDataError
+from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.types import Events
 from blinkgl.io.formats import write_events
 from blinkgl.recordings.calibration import calibrate
-from blinkgl.recordings.clip import Clip, clip_of_frames, clip_of_still, clock_offset
+from blinkgl.recordings.clip import Clip, Flicker, clip_of_frames, clip_of_still, clock_offset
 from blinkgl.recordings.simulation import emulator_config
 from blinkgl.recordings.statistics import numbers, sums, target
 from tests.shared_data import shared
@@ -145,9 +146,9 @@ def test_from_files_to_a_sensor_file_and_a_page(tmp_path, capsys):
     assert "output file exists" in capsys.readouterr().err
 
 
-def still_recording(folder, seconds: float = 2.0, size=(48, 60), **noise):
+def still_recording(folder, seconds: float = 2.0, size=(48, 60), seed: int = 3, **noise):
     ends = Events(*(np.zeros(2, np.uint16) for _ in "xy"), np.array([0, round(seconds * 1e6)]), np.zeros(2, np.uint8))
-    events = clip_of_still(ends, size).simulate(emulator_config({"emulator": "v2e", **noise}), 3)
+    events = clip_of_still(ends, size).simulate(emulator_config({"emulator": "v2e", **noise}), seed)
     write_events(folder / "dark.npz", events, *size)
     return folder / "dark.npz"
 
@@ -168,6 +169,85 @@ def test_noise_of_a_still_scene_comes_back(tmp_path):
         "leak_rate_hz": pytest.approx(1.0, rel=0.1),
         "shot_noise_rate_hz": pytest.approx(4.0, rel=0.1),
     }
+
+
+def flickering(hz: float = 20.0, contrast: float = 0.6, seconds: float = 0.6, size=(32, 40), **emulator) -> Events:
+    """An even scene under such light, drawn here for itself, darkest at 3 ms."""
+    camera = EventCamera(emulator_config({"emulator": "esim", **TRUE, **emulator}), None, *size, 5)
+    t = np.arange(0, seconds, 1 / (hz * 200))
+    light = 0.4 * (1 - contrast * np.cos(2 * np.pi * hz * (t - 3e-3)))
+    shown = (EventFrame(round(1e9 * a), np.full(size, v, np.float32)) for a, v in zip(t, light))
+    return Events.concatenate([events for _, events in emulate(shown, camera)])
+
+
+def test_thresholds_of_flickering_light(tmp_path):
+    events = flickering(hz=20.1)
+    write_events(tmp_path / "lamp.npz", events, 32, 40)
+    fixed = {key: TRUE[key] for key in ("log_eps", "refractory_us")}
+    result = calibrate(
+        tmp_path / "lamp.npz", flicker=Flicker(20.0, 0.6), emulator={"emulator": "esim", **fixed}, fixed=fixed, starts=1
+    )
+    assert result.clip.facts["flicker_hz"] == pytest.approx(20.1, abs=0.06)
+    light = np.array([frame[0, 0] for _, frame in result.clip.frames])
+    darkest = np.array([t for t, _ in result.clip.frames])[light < light.min() * 1.001] * 1e-9
+    assert np.abs((darkest - 3e-3) * 20.1 - np.round((darkest - 3e-3) * 20.1)).max() < 0.04, "periods"
+    for key, within in (("contrast_threshold", 0.02), ("contrast_threshold_off", 0.02), ("threshold_sigma", 0.15)):
+        assert result.values[key] == pytest.approx(TRUE[key], rel=within), key
+    assert result.judged[1].rate_ratio == pytest.approx(1, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        (["--flicker", "31,0.6"], "do not go up and down with the light"),
+        (["--flicker", "20"], "not a frequency and a contrast"),
+        (["--flicker", "20,1.5"], "not a frequency and a contrast"),
+        (["--flicker", "20,0.6", "--still"], "needs no frames, and does not stand still"),
+        (["--flicker", "4,0.6"], "too few periods|do not go up"),
+    ],
+)
+def test_flicker_that_is_not(tmp_path, capsys, options, said):
+    write_events(tmp_path / "lamp.npz", flickering(), 32, 40)
+    assert run(["calibrate", str(tmp_path / "lamp.npz"), "--out", str(tmp_path / "out.yaml"), *options]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and re.search(said, error), error
+    assert [p.name for p in tmp_path.iterdir()] == ["lamp.npz"]
+
+
+FIVE = range(5)
+
+
+def recovered(folder, seed: int) -> dict[str, float]:
+    """Relative errors of a fit to a simulation with known values, whose texture and chance are of this seed."""
+    camera, frames = files(folder, moving(seed=seed), seed=seed + 20)
+    fixed = {"log_eps": TRUE["log_eps"], "threshold_sigma": TRUE["threshold_sigma"]}
+    result = calibrate(camera, frames, emulator={"emulator": "esim", **fixed}, fixed=fixed, starts=2)
+    return {key: value / TRUE[key] - 1 for key, value in result.values.items()}
+
+
+def recovered_noise(folder, seed: int) -> dict[str, float]:
+    """The same of V2E's noise on a still scene."""
+    true = dict(leak_rate_hz=1.0, shot_noise_rate_hz=4.0)
+    path = still_recording(folder, seed=seed + 20, **true)
+    fixed = [key for key in emulator_config("v2e").fitted if key not in true]
+    result = calibrate(path, still=True, emulator="v2e", fixed=fixed, starts=1)
+    return {key: result.values[key] / value - 1 for key, value in true.items()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", FIVE)
+def test_known_values_come_back(tmp_path, seed):
+    """Thresholds within 2 %, the dead time within 5."""
+    errors = recovered(tmp_path, seed)
+    assert set(errors) == {"contrast_threshold", "contrast_threshold_off", "refractory_us"}
+    assert all(abs(e) <= (0.05 if key == "refractory_us" else 0.02) for key, e in errors.items()), errors
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", FIVE)
+def test_known_noise_comes_back(tmp_path, seed):
+    errors = recovered_noise(tmp_path, seed)
+    assert all(abs(e) <= 0.1 for e in errors.values()), errors
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------

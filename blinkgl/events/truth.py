@@ -1,0 +1,103 @@
+"""What made an event: which surface, where it was and how it moved, by looking at the two frames that the event lies
+between.
+
+An emulator sees a pixel at the times of its frames and nothing in between, so what made its events is in one of them:
+
+- shows the pixel the same surface in both, that surface, as it is in the nearer frame in time;
+- does it not (an edge has passed), the one that is nearer to the camera: it is its edge that moved. So what an object
+  leaves behind itself is made by the object and not by what it uncovers.
+
+"The same surface" is the same instance at about the same depth (``_JUMP``): an arm in front of its own body passes,
+too. Where event frames are anti-aliased, what covers a part of a pixel changes it as well; then the four pixels around
+it are looked at besides (``reach``).
+
+A pixel may go on following a change that is over (V2E's low-pass; :meth:`Emulator.memory_s`): for so long its events
+are still those of the surface that left. Noise events get what their pixel shows.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from blinkgl.events.types import TRUTH, Events
+
+_JUMP = 0.05
+"""Relative change of depth from frame to frame beyond which one instance shows another surface of itself."""
+_AROUND = ((0, 0), (0, -1), (0, 1), (-1, 0), (1, 0))
+
+
+class Surfaces(NamedTuple):
+    """What every pixel shows at one time. ids : (H, W) whole numbers, 0: nothing.   depth : (H, W) float32 along the
+    optical axis, inf: nothing.   velocity : (H, W, 2) float32 px/s."""
+
+    ids: np.ndarray
+    depth: np.ndarray
+    velocity: np.ndarray
+
+
+class SurfaceTruth:
+    """Gives events the surfaces that made them. It is shown the surfaces at the time of every frame.
+
+    reach : 1 where a frame's pixels see more than their centres, 0 where they do not."""
+
+    def __init__(self, reach: int = 0):
+        self._offsets = _AROUND if reach else _AROUND[:1]
+        self._seen: list[tuple[int, Surfaces]] = []
+        self._left: Surfaces | None = None
+        self._until_ns = np.empty(0, np.int64)
+
+    def see(self, t_ns: int, surfaces: Surfaces, memory_s: np.ndarray | None = None) -> None:
+        """At the time of a frame, in order. The arrays are kept until the frame after the next.
+
+        memory_s : (H, W) how long a pixel goes on following what it has seen, s; None: not at all."""
+        if memory_s is not None and self._seen:
+            before = self._seen[-1][1]
+            gone = (before.depth < surfaces.depth) & (before.ids != surfaces.ids)
+            if self._left is None:
+                self._left = Surfaces(*(array.copy() for array in before))
+                self._until_ns = np.full(gone.shape, np.iinfo(np.int64).min)
+            for kept, array in zip(self._left, before):
+                kept[gone] = array[gone]
+            self._until_ns[gone] = t_ns + np.rint(1e9 * memory_s[gone]).astype(np.int64)
+        self._seen = [*self._seen[-2:], (t_ns, surfaces)]
+
+    def of(self, events: Events, done_ns: int) -> np.ndarray:
+        """(N,) of :data:`~blinkgl.events.types.TRUTH` of events of the interval that ends at the frame of done_ns."""
+        truth = np.empty(len(events), TRUTH)
+        at = next(k for k, (t_ns, _) in enumerate(self._seen) if t_ns == done_ns)
+        (before_ns, before), (after_ns, after) = self._seen[max(at - 1, 0)], self._seen[at]
+        late = 2 * (1000 * events.t + 500) >= before_ns + after_ns
+        x, y = events.x.astype(np.intp), events.y.astype(np.intp)
+        height, width = after.ids.shape
+        pixel = y * width + x
+        found = _where(late, _looked_up(after, pixel), _looked_up(before, pixel))
+        best = found[1].copy()
+        for surfaces in (before, after):
+            for dy, dx in self._offsets:
+                place = np.clip(y + dy, 0, height - 1) * width + np.clip(x + dx, 0, width - 1)
+                other = _looked_up(surfaces, place)
+                # of the same instance only where it is another part of it, and only at the pixel itself
+                jump = other[1] < best * (1 - _JUMP) if dy == dx == 0 else False
+                passes = (other[1] < best) & ((other[0] != found[0]) | jump)
+                found, best = _where(passes, other, found), np.where(passes, other[1], best)
+        if self._left is not None:
+            left = _looked_up(self._left, pixel)
+            follows = (1000 * events.t <= self._until_ns.reshape(-1)[pixel]) & (left[1] < best)
+            found = _where(follows & (left[0] != found[0]), left, found)
+        truth["instance"], truth["depth"], truth["velocity"] = found
+        return truth
+
+
+def _looked_up(surfaces: Surfaces, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    ids, depth, velocity = surfaces
+    return ids.reshape(-1)[pixel], depth.reshape(-1)[pixel], velocity.reshape(-1, 2)[pixel]
+
+
+def _where(which: np.ndarray, one: tuple, other: tuple) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return (
+        np.where(which, one[0], other[0]),
+        np.where(which, one[1], other[1]),
+        np.where(which[:, None], one[2], other[2]),
+    )

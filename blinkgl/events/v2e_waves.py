@@ -1,0 +1,495 @@
+"""V2E's events of one block of pixels, all pixels at once: their first events together, then their second ones, ...
+
+Which pixels fire, how often, and what of dead time, leak and noise comes in between, nobody can predict: pixel by pixel
+these questions are branches that a processor guesses wrongly, which costs more than the arithmetic. So the quantities
+of the firing pixels of a block are gathered into rows, and each question is asked of a whole row by a loop without
+branches, which the compiler turns into vector instructions. A wave is one event of every pixel that has one; those that
+have another go on into the next. In the end the events are put back into raster order.
+
+Rows are pieces of two flat arrays (``floats``, ``ints``), at distances that are known when compiling: the compiler then
+sees that no row overlaps another, however many of them a loop works on. Indices are unsigned: negative ones would count
+from the end, and asking costs the vector instructions.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numba.extending import register_jitable
+
+from blinkgl.events.arith import fall_f64, select
+from blinkgl.events.packing import CAUSE_SHIFT, JIT, T_SHIFT, cause_of
+from blinkgl.events.philox import Stream, rough_normal
+from blinkgl.events.types import Cause
+from blinkgl.events.v2e_model import crossing_fraction, signal_at
+
+_U = np.uint64
+_U0, _U1, _U1000 = _U(0), _U(1), _U(1000)
+SLOTS = 256
+"""Pixels that are taken in one go: their rows stay in the first cache."""
+_WIDE = _U(32)
+"""Loops over rows go on to a multiple of it, over whatever stands there: what is left over from unrolled vector loops
+is otherwise done one by one, and that would be most of it."""
+_STRIDE = SLOTS + 8  # with SLOTS alone, a power of two, all rows would want the same lines of the cache
+_ROWS = [_U(_STRIDE * row) for row in range(20)]
+# z(s) = C + RISE s + FALL e^(-K s), END at s = 1; S: where the pixel's comparator looks from; E: e^(-K S) there.
+_C, _RISE, _FALL, _K, _END, _S, _E, _UP, _DOWN, _ON, _OFF, _LEAK, _MEAN_LEAK, _NOISE_THEN = _ROWS[:14]
+_TARGET, _SIGN, _AT, _DRAW = _ROWS[14:18]  # of the wave's event: the level that is met, 1 or -1, s, a random number
+_X0, _X1, _LAG0, _LAG1, _I0, _I1, _NOISE, _SHIFT = (
+    _END,
+    _S,
+    _FALL,
+    _E,
+    _K,
+    _TARGET,
+    _C,
+    _RISE,
+)  # before the curve is made of them
+_KEPT = 14  # rows that go on into the next wave
+FLOATS = 18 * _STRIDE
+# The pixel; its bits of a packed event; ns of S; place of its next shot noise; ns of its
+# reference; its number in the first wave.
+_PIXEL, _BITS, _NOW, _SHOT, _SINCE, _SLOT = _ROWS[:6]
+_FIRES, _OPEN, _AT_NS, _POLARITY, _BY_NOISE = _ROWS[6:11]  # of the wave's event
+_COUNT = _OPEN
+_KEPT_INTS = 6
+INTS = 11 * _STRIDE
+_LEAK_JITTER = _U(Stream.LEAK_JITTER)
+_CAUSE_LEAK, _CAUSE_SHOT, _CAUSE_HOT = int(Cause.LEAK), int(Cause.SHOT), int(Cause.HOT)
+_MASK41, _INF = 2**41 - 1, np.float32(np.inf)
+
+
+@numba.njit(**JIT)
+def _curves(floats, count, kappa, since, dt, low_pass):
+    """Of what was gathered: C, RISE, FALL, K, END (see curve_of), at S = 0."""
+    if low_pass:
+        for j in range(count):
+            x, shift, leak = floats[j + _X0], floats[j + _SHIFT], floats[j + _LEAK]
+            dx = floats[j + _X1] - x
+            k = kappa * (0.5 * (floats[j + _I0] + floats[j + _I1]) + 20.0)
+            behind = dx / k
+            base, drift = x + floats[j + _NOISE] + leak * since, shift + leak * dt
+            end = base + drift + dx + floats[j + _LAG1]
+            floats[j + _C] = base - behind
+            floats[j + _RISE] = drift + dx
+            floats[j + _FALL] = floats[j + _LAG0] + behind
+            floats[j + _K] = k
+            floats[j + _END] = end
+            floats[j + _S] = 0.0
+            floats[j + _E] = 1.0
+    else:
+        for j in range(count):
+            x, shift, leak = floats[j + _X0], floats[j + _SHIFT], floats[j + _LEAK]
+            dx = floats[j + _X1] - x
+            base, drift = x + floats[j + _NOISE] + leak * since, shift + leak * dt
+            floats[j + _C] = base
+            floats[j + _RISE] = drift + dx
+            floats[j + _FALL] = 0.0
+            floats[j + _K] = -1.0
+            floats[j + _END] = base + drift + dx
+            floats[j + _S] = 0.0
+            floats[j + _E] = 1.0
+
+
+@numba.njit(**JIT)
+def _wake(floats, ints, count, dt_ns):
+    """New levels for those whose dead time ends in the interval (UP is -inf), at its end (NOW)."""
+    for j in range(count):
+        asleep = floats[j + _UP] == -np.inf
+        s = ints[j + _NOW] / dt_ns
+        e = fall_f64(floats[j + _K] * s)
+        reference = floats[j + _C] + floats[j + _RISE] * s + floats[j + _FALL] * e
+        floats[j + _S] = select(asleep, s, 0.0)
+        floats[j + _E] = select(asleep, e, 1.0)
+        floats[j + _UP] = select(asleep, reference + floats[j + _ON], floats[j + _UP])
+        floats[j + _DOWN] = select(asleep, reference - floats[j + _OFF], floats[j + _DOWN])
+
+
+@numba.njit(**JIT)
+def _wake_lines(floats, ints, count, dt_ns):
+    for j in range(count):
+        asleep = floats[j + _UP] == -np.inf
+        s = ints[j + _NOW] / dt_ns
+        reference = floats[j + _C] + floats[j + _RISE] * s
+        floats[j + _S] = select(asleep, s, 0.0)
+        floats[j + _UP] = select(asleep, reference + floats[j + _ON], floats[j + _UP])
+        floats[j + _DOWN] = select(asleep, reference - floats[j + _OFF], floats[j + _DOWN])
+
+
+@numba.njit(**JIT)
+def _aim(floats, ints, count):
+    """Which level is met by the interval's end, if any."""
+    for j in range(count):
+        end, up, down = floats[j + _END], floats[j + _UP], floats[j + _DOWN]
+        above = end >= up
+        floats[j + _TARGET] = select(above, up, down)
+        floats[j + _SIGN] = select(above, 1.0, -1.0)
+        ints[j + _POLARITY] = np.int64(above)
+        ints[j + _FIRES] = np.int64(above | (end <= down))
+
+
+@register_jitable(inline="always")
+def _newton(s, low, high, target, sign, c, rise, fall, k):
+    """One turn of crossing_fraction's loop, where it does not leave its bracket."""
+    e = fall * fall_f64(k * s)
+    f = sign * (c + rise * s + e - target)
+    slope = sign * (rise - k * e)
+    following = s - f / slope
+    low, high = select(f < 0, s, low), select(f < 0, high, s)
+    inside = (slope > 0) & (low <= following) & (following <= high)
+    moved = abs(following - s)
+    met = inside & ((moved * moved * k * k * abs(e) <= 2e-6 * slope) | (moved < 1e-9))
+    return following, low, high, inside, met
+
+
+@numba.njit(**JIT)
+def _meet(floats, ints, count):
+    """crossing_fraction up to its second step of Newton's method; OPEN where it wants another."""
+    for j in range(count):
+        c, rise, fall, k = floats[j + _C], floats[j + _RISE], floats[j + _FALL], floats[j + _K]
+        low, e_low, target, sign = floats[j + _S], floats[j + _E], floats[j + _TARGET], floats[j + _SIGN]
+        end = floats[j + _END]
+        f_low = sign * (c + rise * low + fall * e_low - target)
+        f_high = sign * (end - target)
+        v_low, v_high = sign * (rise - k * fall * e_low), sign * (rise - k * (end - c - rise))
+        width, height = 1.0 - low, f_high - f_low
+        u = -f_low / height
+        s = low + width * u
+        stretch = height / (width * v_low * v_high)
+        guess = u * ((1.0 - u) * stretch * ((1.0 - u) * v_high - u * v_low) + u * (3.0 - 2.0 * u))
+        s = select((v_low > 0) & (v_high > 0) & (guess > 0.0) & (guess < 1.0), low + width * guess, s)
+        s, lower, upper, newton, met = _newton(s, low, 1.0, target, sign, c, rise, fall, k)
+        again, _, _, newton_again, met_again = _newton(s, lower, upper, target, sign, c, rise, fall, k)
+        at_once = f_low >= 0
+        floats[j + _AT] = select(at_once, low, select(met, s, again))
+        ints[j + _OPEN] = np.int64(not (at_once | met | (newton & newton_again & met_again)))
+
+
+@numba.njit(**JIT)
+def _meet_lines(floats, ints, count):
+    for j in range(count):
+        s = (floats[j + _TARGET] - floats[j + _C]) / floats[j + _RISE]
+        s = select(s > floats[j + _S], s, floats[j + _S])
+        floats[j + _AT] = select(s < 1.0, s, 1.0)
+        ints[j + _OPEN] = 0
+
+
+@numba.njit(**JIT)
+def _draw_leaks(floats, ints, count, seed, t0_ns):
+    for j in range(count):
+        floats[j + _DRAW] = rough_normal(seed, _U(ints[j + _PIXEL]), _LEAK_JITTER, _U(t0_ns + ints[j + _AT_NS]))
+
+
+@numba.njit(**JIT)
+def _change_leaks(floats, ints, count, jitter, since_0, since_1, dt):
+    """Every event draws the leak anew: what follows moves over to its line."""
+    for j in range(count):
+        leak = floats[j + _LEAK]
+        spread = 1.0 + jitter * floats[j + _DRAW]
+        drawn = np.float64(np.float32(floats[j + _MEAN_LEAK] / select(spread > 0.1, spread, 0.1)))
+        change = select(ints[j + _FIRES] != 0, drawn - leak, 0.0)
+        floats[j + _LEAK] = leak + change
+        floats[j + _TARGET] += change * (since_0 + floats[j + _AT] * dt)  # the same reference, seen from the new drift
+        floats[j + _C] += change * since_0
+        floats[j + _RISE] += change * dt
+        floats[j + _END] += change * since_1
+
+
+@numba.njit(**JIT)
+def _reference_after_dead_time(floats, ints, count, dt_ns):
+    for j in range(count):
+        fires, s = ints[j + _FIRES] != 0, ints[j + _NOW] / dt_ns
+        e = fall_f64(floats[j + _K] * s)
+        floats[j + _TARGET] = floats[j + _C] + floats[j + _RISE] * s + floats[j + _FALL] * e
+        floats[j + _S] = select(fires, s, floats[j + _S])
+        floats[j + _E] = select(fires, e, floats[j + _E])
+
+
+@numba.njit(**JIT)
+def _reference_of_lines_after_dead_time(floats, ints, count, dt_ns):
+    for j in range(count):
+        fires, s = ints[j + _FIRES] != 0, ints[j + _NOW] / dt_ns
+        floats[j + _TARGET] = floats[j + _C] + floats[j + _RISE] * s
+        floats[j + _S] = select(fires, s, floats[j + _S])
+
+
+@numba.njit(**JIT)
+def _look_again(floats, count):
+    """E at S."""
+    for j in range(count):
+        floats[j + _E] = fall_f64(floats[j + _K] * floats[j + _S])
+
+
+@numba.njit(**JIT)
+def _set_levels(floats, ints, count):
+    for j in range(count):
+        fires, reference = ints[j + _FIRES] != 0, floats[j + _TARGET]
+        floats[j + _UP] = select(fires, reference + floats[j + _ON], floats[j + _UP])
+        floats[j + _DOWN] = select(fires, reference - floats[j + _OFF], floats[j + _DOWN])
+
+
+@numba.njit(**JIT)
+def _awake(active, p, v, ints):
+    """Takes those out of the list whose dead time goes on, and puts down when that of the others ended (NOW)."""
+    kept, end_ns = _U0, v.t0_ns + v.dt_ns
+    for j in range(_U(active.size)):
+        i = active[j]
+        asleep, release = p.upper[i] == -_INF, p.release[i]
+        active[kept] = i
+        ints[kept + _NOW] = select(asleep, max(release - v.t0_ns, 0), 0)
+        kept += _U(not (asleep & (release > end_ns)))
+    return kept
+
+
+@numba.njit(**JIT)
+def _gather(active, first, now, keys, key, noise_end, p, v, floats, ints):
+    """Rows of the listed pixels that can fire in the interval; returns how many, and the key after theirs."""
+    intensity_now, x_now, lag_now, noise_now = now
+    kept = _U(active.size)
+    if p.release.size:
+        kept = _awake(active, p, v, ints)
+    else:
+        for j in range(kept):
+            ints[j + _NOW] = 0
+    for j in range(kept):  # what the block's own loops have not brought along: by itself, so that the misses overlap
+        i = active[j]
+        floats[j + _ON], floats[j + _OFF] = p.constants[i, 0], p.constants[i, 1]
+        floats[j + _MEAN_LEAK] = p.constants[i, 2]
+    y = first // v.width
+    row_end = (y + 1) * v.width
+    for j in range(kept):
+        i = active[j]
+        while i >= row_end:
+            y += 1
+            row_end += v.width
+        ints[j + _PIXEL], ints[j + _BITS] = i, (y << 17) | ((i - row_end + v.width) << 1)
+        ints[j + _SHOT], ints[j + _SLOT] = noise_end, j
+        floats[j + _UP], floats[j + _DOWN] = p.upper[i], p.lower[i]
+        floats[j + _X0], floats[j + _X1] = p.x[i], x_now[i - first]
+        floats[j + _LEAK] = floats[j + _NOISE] = floats[j + _SHIFT] = 0.0
+    if p.leak.size:
+        for j in range(kept):
+            floats[j + _LEAK] = p.leak[active[j]]
+    if p.lag.size:
+        for j in range(kept):
+            i = active[j]
+            o = i - first
+            floats[j + _LAG0], floats[j + _LAG1] = p.lag[i], lag_now[o]
+            floats[j + _I0], floats[j + _I1] = p.intensity[i], intensity_now[o]
+    if p.noise.size:
+        for j in range(kept):
+            i = active[j]
+            floats[j + _NOISE] = p.noise[i]
+            floats[j + _SHIFT] = np.float64(noise_now[i - first]) - np.float64(p.noise[i])
+    if p.since_ns.size:
+        for j in range(kept):
+            i = active[j]
+            ints[j + _SINCE], floats[j + _NOISE_THEN] = p.since_ns[i] - v.t0_ns, p.noise_then[i]
+    j = _U0
+    while key < noise_end and j < kept:  # both in raster order
+        pixel = first + (keys[key] >> 42)
+        if pixel < ints[j + _PIXEL]:
+            key += 1  # of a pixel that is in its dead time
+        else:
+            if pixel == ints[j + _PIXEL]:
+                ints[j + _SHOT] = key
+                while key < noise_end and first + (keys[key] >> 42) == pixel:
+                    key += 1
+            j += _U1
+    return kept, key
+
+
+@numba.njit(**JIT)
+def _shots(floats, ints, count, keys, noise_end, dt_ns):
+    """Where shot noise comes before the crossing, it is the event."""
+    for j in range(count):
+        key = ints[j + _SHOT]
+        ints[j + _BY_NOISE] = 0
+        if key == noise_end:
+            continue
+        offset = keys[key] >> 42
+        while key < noise_end and keys[key] >> 42 == offset and (keys[key] >> 1) & _MASK41 < ints[j + _NOW]:
+            key += 1
+        if key < noise_end and keys[key] >> 42 == offset:
+            noise_ns = (keys[key] >> 1) & _MASK41
+            if ints[j + _FIRES] == 0 or noise_ns <= np.int64(floats[j + _AT] * dt_ns):
+                ints[j + _FIRES], ints[j + _BY_NOISE], ints[j + _POLARITY] = 1, 1, keys[key] & 1
+                ints[j + _AT_NS], floats[j + _AT] = noise_ns, noise_ns / dt_ns
+                key += 1
+        ints[j + _SHOT] = key if key < noise_end and keys[key] >> 42 == offset else noise_end
+
+
+@numba.njit(**JIT)
+def _cause(floats, ints, j, noise_then, p, v):
+    """Of the event of pixel j, shifted to its place; noise_then : the photoreceptor's noise at it."""
+    if ints[j + _BY_NOISE]:
+        return _CAUSE_SHOT << CAUSE_SHIFT
+    sign, size = floats[j + _SIGN], floats[j + _ON] if ints[j + _POLARITY] else floats[j + _OFF]
+    by_leak = sign * floats[j + _LEAK] * ((ints[j + _AT_NS] - ints[j + _SINCE]) * 1e-9)
+    by_noise = sign * (noise_then - floats[j + _NOISE_THEN])
+    cause = cause_of(size - by_leak - by_noise, by_leak, by_noise)
+    if cause == _CAUSE_LEAK and p.hot[ints[j + _PIXEL]]:
+        cause = _CAUSE_HOT
+    return cause << CAUSE_SHIFT
+
+
+@numba.njit(**JIT)
+def _noise_at(floats, ints, j, s, first, noise_now, p):
+    """The photoreceptor's noise of pixel j at s."""
+    if not p.noise.size:
+        return 0.0
+    i = ints[j + _PIXEL]
+    noise = np.float64(p.noise[i])
+    return noise + (np.float64(noise_now[i - first]) - noise) * s
+
+
+@numba.njit(**JIT)
+def _in_order(packed, begin, end, owners, slots, ints):
+    """Events that lie wave by wave, pixel by pixel."""
+    waves = packed[begin:end].copy()
+    for j in range(slots):
+        ints[j + _COUNT] = 0
+    for e in range(waves.size):
+        ints[_U(owners[e]) + _COUNT] += 1
+    place = begin
+    for j in range(slots):
+        count = ints[j + _COUNT]
+        ints[j + _COUNT] = place
+        place += count
+    for e in range(waves.size):
+        packed[ints[_U(owners[e]) + _COUNT]] = waves[e]
+        ints[_U(owners[e]) + _COUNT] += 1
+
+
+@numba.njit(**JIT)
+def emit_waves(active, count, first, now, keys, noise_end, p, v, cap, packed, begin, floats, ints):
+    """Events of the listed pixels of one block into ``packed[begin:]``, in raster order; moves levels.
+
+    now : (intensity, x, lag, noise) of the block at the interval's end.   keys : of ``noise_end`` shot noise events,
+    sorted.   cap : most events of a pixel; there is room for so many of each.   floats, ints : scratch of FLOATS
+    and INTS.   Returns (end of the events, cut)."""
+    out, cut, key = begin, 0, 0
+    for start in range(0, count, SLOTS):
+        here = active[start : min(start + SLOTS, count)]
+        out, cut_here, key = _emit(here, first, now, keys, key, noise_end, p, v, cap, packed, out, floats, ints)
+        cut += cut_here
+    return out, cut
+
+
+@register_jitable
+def _wide(count):
+    return (count + _WIDE - _U1) // _WIDE * _WIDE
+
+
+@numba.njit(**JIT)
+def _emit(active, first, now, keys, key, noise_end, p, v, cap, packed, begin, floats, ints):
+    """:func:`emit_waves` of at most SLOTS pixels; ``key`` : of their first shot noise, and returned, of the next."""
+    noise_now, dt_ns, dt = now[3], v.dt_ns, v.dt_ns * 1e-9
+    start_ns = v.t0_ns - 1000 * v.base_us
+    low_pass, dead_time, told = p.lag.size > 0, p.release.size > 0, p.since_ns.size > 0
+    slots, key = _gather(active, first, now, keys, key, noise_end, p, v, floats, ints)
+    wide = _wide(slots)
+    _curves(floats, wide, v.kappa, v.since_epoch_0, dt, low_pass)
+    if dead_time:
+        if told:
+            for j in range(slots):
+                if floats[j + _UP] == -np.inf:
+                    ints[j + _SINCE] = ints[j + _NOW]
+                    s = ints[j + _NOW] / dt_ns
+                    floats[j + _NOISE_THEN] = _noise_at(floats, ints, j, s, first, noise_now, p)
+        if low_pass:
+            _wake(floats, ints, wide, dt_ns)
+        else:
+            _wake_lines(floats, ints, wide, dt_ns)
+    out, cut, wave, left = begin, 0, 0, slots
+    owners = np.empty(2 * SLOTS, np.int32)
+    while left > 0:
+        wide = _wide(left)
+        _aim(floats, ints, wide)
+        if low_pass:
+            if wave > 0 and not dead_time:
+                _look_again(floats, wide)
+            _meet(floats, ints, wide)
+            for j in range(left):
+                if ints[j + _OPEN] & ints[j + _FIRES]:
+                    floats[j + _AT] = crossing_fraction(
+                        floats[j + _S], floats[j + _TARGET], ints[j + _POLARITY],
+                        floats[j + _C], floats[j + _RISE], floats[j + _FALL], floats[j + _K], floats[j + _END],
+                    )  # fmt: skip
+        else:
+            _meet_lines(floats, ints, wide)
+        for j in range(left):
+            ints[j + _AT_NS] = np.int64(floats[j + _AT] * dt_ns)
+        if noise_end:
+            _shots(floats, ints, left, keys, noise_end, dt_ns)
+        if wave < cap:
+            filled = out - begin
+            if filled + np.int64(left) > owners.size:
+                longer = np.empty(2 * (filled + np.int64(left)), np.int32)
+                longer[:filled] = owners[:filled]
+                owners = longer
+            for j in range(left):
+                word = ints[j + _BITS] | ints[j + _POLARITY]
+                if told:
+                    if not noise_end:
+                        ints[j + _BY_NOISE] = 0
+                    word |= _cause(
+                        floats, ints, j, _noise_at(floats, ints, j, floats[j + _AT], first, noise_now, p), p, v
+                    )
+                packed[out] = (np.int64(_U(start_ns + ints[j + _AT_NS]) // _U1000) << T_SHIFT) | word
+                owners[out - begin] = ints[j + _SLOT]
+                out += ints[j + _FIRES]
+        else:
+            for j in range(left):
+                cut += ints[j + _FIRES]
+        if v.leak_jitter > 0.0:
+            _draw_leaks(floats, ints, wide, v.seed, v.t0_ns)
+            _change_leaks(floats, ints, wide, v.leak_jitter, v.since_epoch_0, v.since_epoch_1, dt)
+        if dead_time:
+            for j in range(left):
+                ints[j + _NOW] = select(ints[j + _FIRES] != 0, ints[j + _AT_NS] + v.refractory_ns, ints[j + _NOW])
+            if low_pass:
+                _reference_after_dead_time(floats, ints, wide, dt_ns)
+            else:
+                _reference_of_lines_after_dead_time(floats, ints, wide, dt_ns)
+        else:
+            for j in range(left):
+                ints[j + _NOW] = ints[j + _AT_NS]
+                floats[j + _S] = floats[j + _AT]
+            if noise_end:  # noise leaves the reference wherever the signal is
+                for j in range(left):
+                    if ints[j + _BY_NOISE]:
+                        floats[j + _TARGET] = signal_at(
+                            floats[j + _AT], floats[j + _C], floats[j + _RISE], floats[j + _FALL], floats[j + _K]
+                        )
+        _set_levels(floats, ints, wide)
+        kept = _U0
+        for j in range(left):
+            i, fires, now_ns = ints[j + _PIXEL], ints[j + _FIRES] != 0, ints[j + _NOW]
+            up, down, end = floats[j + _UP], floats[j + _DOWN], floats[j + _END]
+            dead = dead_time & fires & (now_ns > dt_ns)
+            again = fires & (not dead) & ((end >= up) | (end <= down) | (ints[j + _SHOT] != noise_end))
+            if told:
+                if fires and not dead:
+                    ints[j + _SINCE] = now_ns
+                    floats[j + _NOISE_THEN] = _noise_at(floats, ints, j, floats[j + _S], first, noise_now, p)
+            if again:
+                for row in range(_KEPT):
+                    floats[kept + _U(_STRIDE * row)] = floats[j + _U(_STRIDE * row)]
+                for row in range(_KEPT_INTS):
+                    ints[kept + _U(_STRIDE * row)] = ints[j + _U(_STRIDE * row)]
+                kept += _U1
+            else:
+                # In a dead time both levels are passed, whatever comes: the pixel is looked at until it is released.
+                p.upper[i], p.lower[i] = select(dead, -_INF, np.float32(up)), select(dead, _INF, np.float32(down))
+                if v.leak_jitter > 0.0:
+                    p.leak[i] = np.float32(floats[j + _LEAK])
+                if dead:
+                    p.release[i] = v.t0_ns + now_ns
+                if told:
+                    p.since_ns[i] = v.t0_ns + ints[j + _SINCE]
+                    p.noise_then[i] = np.float32(floats[j + _NOISE_THEN])
+        left, wave = kept, wave + 1
+    if wave > 1:
+        _in_order(packed, begin, out, owners, slots, ints)
+    return out, cut, key

@@ -1,0 +1,151 @@
+"""What made each event of a sequence: ``event_labels.h5`` beside ``events.h5``, a row per event, in the same order.
+
+instance  (N,)   u2   instance id of the surface, 0: nothing
+depth     (N,)   f4   along the optical axis, world units; inf: nothing
+velocity  (N, 2) f4   px/s, +x right, +y down
+cause     (N,)   u1   blinkgl.events.types.Cause, where the emulator says it
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from blinkgl.errors import AssetError
+from blinkgl.events.types import TOLD, TRUTH, Events
+from blinkgl.io.atomic import output_errors
+from blinkgl.io.hdf5 import blosc_dataset, dataset, hdf5_errors, open_hdf5, write_rows
+
+EVENT_LABELS = "event_labels.h5"
+BLOCK = 1 << 17
+"""Rows per HDF5 chunk and per write, as in ``events.h5``."""
+
+
+class EventLabelsWriter:
+    """Takes the events that ``events.h5`` is given and writes what made them. The same events give the same bytes
+    however they were chunked. Raises OutputError: the disk refuses; what is written is then of no use."""
+
+    def __init__(self, path: str | os.PathLike):
+        self.path = Path(path)
+        self._held: list[Events] = []
+        self._fill = self._written = 0
+        with output_errors(self.path):
+            self._file = h5py.File(self.path, "w", rdcc_nbytes=0)
+            self._columns = {
+                name: blosc_dataset(self._file, name, (0, *shape), base, (BLOCK, *shape))
+                for name, (base, shape) in {name: _parts(TRUTH[name]) for name in TOLD}.items()
+            }
+
+    def append(self, events: Events) -> None:
+        """The next events, which are kept until there is a block of them and not to be changed. Raises TypeError where
+        they do not say what made them."""
+        if not len(events):
+            return
+        if events.truth is None:
+            raise TypeError("event labels: events that do not say what made them")
+        if not self._held and not self._written and events.cause is not None:
+            with output_errors(self.path):
+                self._columns["cause"] = blosc_dataset(self._file, "cause", (0,), np.uint8, (BLOCK,))
+        self._held.append(events)
+        self._fill += len(events)
+        while self._fill >= BLOCK:
+            joined = Events.concatenate(self._held)
+            self._store(joined.part(slice(BLOCK)))
+            rest = joined.part(slice(BLOCK, None))
+            self._held, self._fill = ([rest] if len(rest) else []), len(rest)
+
+    def close(self) -> None:
+        if self._fill:
+            self._store(Events.concatenate(self._held))
+        with output_errors(self.path):
+            self._file.close()
+
+    def abort(self) -> None:
+        """Stops without finishing; never raises."""
+        try:
+            self._file.close()
+        except Exception:  # noqa: BLE001 - a full disk refuses the flush; the file is deleted anyway
+            pass
+
+    def _store(self, events: Events) -> None:
+        assert events.truth is not None
+        rows = {name: np.ascontiguousarray(events.truth[name]) for name in TOLD}
+        if events.cause is not None:
+            rows["cause"] = events.cause
+        with output_errors(self.path):
+            for name, column in self._columns.items():
+                write_rows(column, self._written, rows[name])
+        self._written += len(events)
+
+
+def _parts(kind: np.dtype) -> tuple[np.dtype, tuple[int, ...]]:
+    return (kind, ()) if kind.subdtype is None else kind.subdtype
+
+
+class EventLabelsReader:
+    """What made the events of a sequence, by their number in ``events.h5``: ``reader.read(i, j)``. Use as a context
+    manager.
+
+    path : the file, or the folder of its sequence.   count : rows.   causes : whether it holds them.
+    Raises AssetError: missing, damaged, or no such file."""
+
+    def __init__(self, path: str | os.PathLike):
+        path = Path(path)
+        self.path = path / EVENT_LABELS if path.is_dir() else path
+        self._file = open_hdf5(self.path)
+        with hdf5_errors(self.path, self._file):
+            self._columns = {name: self._column(name, *_parts(TRUTH[name])) for name in TOLD}
+            self.causes = "cause" in self._file
+            if self.causes:
+                self._columns["cause"] = self._column("cause", np.dtype(np.uint8), ())
+            lengths = {len(column) for column in self._columns.values()}
+            if len(lengths) != 1:
+                raise AssetError("columns of events differ in length", where=str(self.path), value=sorted(lengths))
+            self.count = lengths.pop()
+
+    def __enter__(self) -> EventLabelsReader:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def _column(self, name: str, kind: np.dtype, shape: tuple[int, ...]) -> h5py.Dataset:
+        return dataset(self._file, name, self.path, shape=(None, *shape), kinds="f" if kind.kind == "f" else "iu")
+
+    def read(self, start: int = 0, stop: int | None = None) -> tuple[np.ndarray, np.ndarray | None]:
+        """Of the events number ``start`` to ``stop`` (None: the last): (N,) of :data:`~blinkgl.events.types.TRUTH`, and
+        their causes (N,) uint8, None where the file has none. Raises AssetError: damaged."""
+        rows = slice(*slice(start, stop).indices(self.count)[:2])
+        with hdf5_errors(self.path):
+            truth = np.empty(max(rows.stop - rows.start, 0), TRUTH)
+            for name in TOLD:
+                truth[name] = self._columns[name][rows]
+            return truth, self._columns["cause"][rows].astype(np.uint8) if self.causes else None
+
+
+def with_truth(events: Events, first: int, path: str | os.PathLike) -> Events:
+    """Events of ``events.h5`` from number ``first`` on, with what made them, from the ``event_labels.h5`` at ``path``
+    (the file, or the folder of its sequence). Raises AssetError: missing, damaged, or of another number of events."""
+    with EventLabelsReader(path) as reader:
+        truth, cause = reader.read(first, first + len(events))
+        if len(truth) < len(events):
+            raise AssetError(
+                "rows of fewer events than there are",
+                where=str(reader.path),
+                value=reader.count,
+                accepted=f"at least {first + len(events)}",
+            )
+    return replace(events, truth=truth, cause=events.cause if cause is None else cause)
+
+
+def problem_of(truth: np.ndarray, instances: set[int]) -> str | None:
+    """What cannot be among rows of a scene with these instances, in words; None: nothing."""
+    if strange := set(np.unique(truth["instance"]).tolist()) - instances - {0}:
+        return f"instance {min(strange)}, which the scene does not have"
+    if not (truth["depth"] > 0).all():
+        return "a depth that is not above 0"
+    return None if np.isfinite(truth["velocity"]).all() else "a velocity that is no finite number"

@@ -1,0 +1,154 @@
+"""Samples as files: what :mod:`eflow.data.online` renders, kept in a folder, so that several networks can be trained
+on the same windows, or one more than once, without rendering them again.
+
+    eflow render configs/eflow/real_data.yaml --samples 20000 --window-ms 5-100 --out out/real_windows
+
+The folder holds ``windows.json`` (how many, and of what) and one ``%07d.npz`` for each sample.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from blinkgl.errors import AssetError
+from blinkgl.io.atomic import output_errors, remove_stale, temporary_beside
+from blinkgl.io.sequence_dir import refuse_existing
+from eflow.data.window import RawSample, Window
+
+if TYPE_CHECKING:
+    from eflow.data.online import OnlineSource
+
+ABOUT = "windows.json"
+_VERSION = 1
+_COLUMNS = ("x", "y", "t", "p")
+
+
+def write_window(path: Path, sample: RawSample, name: str) -> None:
+    """One sample as ``path`` (.npz), whole or not at all: who waits for the name finds all of it. Its two windows meet
+    at ``sample.new.t0`` and are equally long; ``name``: the sequence's."""
+    arrays = {f"{side}_{c}": getattr(getattr(sample, side), c) for side in ("old", "new") for c in _COLUMNS}
+    arrays |= {"flow": sample.flow, "valid": sample.valid}
+    if sample.backward is not None:
+        arrays |= {"backward": sample.backward, "backward_valid": sample.backward_valid}
+    t, span = sample.new.t0, sample.new.t1 - sample.new.t0
+    temporary = path.with_suffix(f".{os.getpid()}")
+    with open(temporary, "wb") as file:
+        np.savez(file, name=np.array(f"{name}/{t}us+{span}us"), t=np.array(t), span=np.array(span), **arrays)
+    os.replace(temporary, path)
+
+
+def read_window(path: Path) -> RawSample:
+    """What :func:`write_window` wrote. Raises FileNotFoundError."""
+    with np.load(path, allow_pickle=False) as z:
+        arrays = {key: z[key] for key in z.files}
+    t, span, name = int(arrays["t"]), int(arrays["span"]), str(arrays["name"])
+    old, new = (
+        Window(*(arrays[f"{side}_{c}"] for c in _COLUMNS), t0, t0 + span)
+        for side, t0 in (("old", t - span), ("new", t))
+    )
+    return RawSample(
+        old,
+        new,
+        *arrays["valid"].shape,
+        name=name,
+        scene=name.split("/")[0],
+        flow=arrays["flow"],
+        valid=arrays["valid"],
+        backward=arrays.get("backward"),
+        backward_valid=arrays.get("backward_valid"),
+    )
+
+
+class PoolSource:
+    """A folder of :func:`render_pool`'s as a :class:`~eflow.data.sources.Source`.
+
+    Raises AssetError: not such a folder, files missing; a damaged sample when it is asked for."""
+
+    def __init__(self, root: Path):
+        self.root = root
+        about = _about(root)
+        self.count, self.has_backward = about["samples"], about["backward"]
+        there = sum(1 for _ in root.glob("*.npz"))
+        if there != self.count:
+            raise AssetError("windows are missing", where=str(root), value=there, accepted=f"{self.count} .npz files")
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> RawSample:
+        path = self.root / f"{index:07d}.npz"
+        try:
+            return read_window(path)
+        except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
+            raise AssetError(f"not a window of eflow render: {error}", where=str(path)) from None
+        except Exception as error:  # zipfile and zlib have errors of their own
+            if type(error).__module__ not in ("zipfile", "zlib"):
+                raise
+            raise AssetError(f"a damaged window: {error}", where=str(path)) from None
+
+
+def _about(root: Path) -> dict[str, Any]:
+    path = root / ABOUT
+    wanted = "samples and backward"
+    try:
+        about = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise AssetError(f"not readable: {error}", where=str(path)) from None
+    if not isinstance(about, dict) or about.get("version") != _VERSION:
+        raise AssetError("of another version", where=str(path), accepted=f"version {_VERSION}")
+    samples, backward = about.get("samples"), about.get("backward")
+    if not isinstance(samples, int) or isinstance(samples, bool) or samples < 1 or not isinstance(backward, bool):
+        raise AssetError("not a list of windows", where=str(path), value=(samples, backward), accepted=wanted)
+    return about
+
+
+def render_pool(
+    source: OnlineSource,
+    count: int,
+    out: str | os.PathLike,
+    *,
+    about: dict[str, Any] | None = None,
+    progress: Callable[[int], None] = lambda done: None,
+) -> int:
+    """The first ``count`` samples of an online source as the folder ``out``, which appears when it is whole. An
+    interruption keeps what is there by then. Returns the number of samples.
+
+    about : further entries of windows.json.   Raises OutputError (the folder exists, no space), ConfigError (a recipe
+    that gives no samples)."""
+    final = Path(out)
+    refuse_existing(final)
+    with output_errors(final):
+        final.parent.mkdir(parents=True, exist_ok=True)
+        remove_stale(final.parent)
+        temporary = temporary_beside(final)
+        temporary.mkdir()
+    done = 0
+    try:
+        try:
+            for n in range(count):
+                made = source.path(n)
+                with output_errors(final):
+                    shutil.copyfile(made, temporary / f"{n:07d}.npz")
+                done = n + 1
+                source.taken(done)
+                progress(done)
+        except KeyboardInterrupt:
+            if done == 0:
+                raise
+            (temporary / f"{done:07d}.npz").unlink(missing_ok=True)
+        tree = {**(about or {}), "version": _VERSION, "samples": done, "backward": source.has_backward}
+        with output_errors(final):
+            (temporary / ABOUT).write_text(json.dumps(tree, indent=1) + "\n", encoding="utf-8")
+            refuse_existing(final)
+            os.rename(temporary, final)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+    return done

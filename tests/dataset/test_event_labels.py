@@ -1,0 +1,130 @@
+"""What made each event, in a data set: file, verify, resume, shards, report; `verify` sees it altered."""
+
+import io
+import json
+import shutil
+import tarfile
+from itertools import pairwise
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from blinkgl import AssetError, Events, read_events
+from blinkgl.cli import run
+from blinkgl.dataset.shards import export_shards
+from blinkgl.dataset.verify import verify_dataset
+from blinkgl.events.types import TRUTH
+from blinkgl.io.event_labels import BLOCK, EventLabelsReader, EventLabelsWriter
+
+CONFIG = """
+camera: {width: 48, height: 36}
+time: {duration: 0.05, label_rate: 50}
+events: {emulator: EMULATOR}
+labels: {events: true, ids: true}
+preview: {enabled: false}
+scene: {kind: random, pool: {primitives: [cuboid], urdfs: false}, textures: {photographs: false, max_size: 32}}
+"""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("told")
+    (folder / "c.yaml").write_text(CONFIG.replace("EMULATOR", "esim"))
+    assert run(["generate", str(folder / "c.yaml"), "--out", str(folder / "d")]) == 0
+    return folder / "d"
+
+
+def sequence_of(root: Path) -> Path:
+    return next(root.rglob("event_labels.h5")).parent
+
+
+def test_a_row_per_event_of_what_the_scene_has(made):
+    folder = sequence_of(made)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    events = read_events(folder / "events.h5", truth=True)
+    assert len(events) == manifest["events"] > 500 and events.cause is not None
+    assert set(np.unique(events.truth["instance"])) <= {0, *(thing["id"] for thing in manifest["objects"])}
+    assert verify_dataset(made, deep=1).clean
+    assert "causes: true" in (folder / "config.yaml").read_text(), "asked for with it"
+    with h5py.File(folder / "event_labels.h5") as file:
+        assert {name: str(file[name].dtype) for name in file} == {
+            "instance": "uint16",
+            "depth": "float32",
+            "velocity": "float32",
+            "cause": "uint8",
+        }
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        (lambda f: f["instance"].__setitem__(3, 999), "instance 999, which the scene does not have"),
+        (lambda f: f["velocity"].__setitem__((2, 0), np.nan), "a velocity that is no finite number"),
+        (lambda f: f["depth"].__setitem__(1, -1), "a depth that is not above 0"),
+        (lambda f: f["cause"].__setitem__(1, 3), "causes that are not those of events.h5"),
+        (lambda f: f["cause"].resize(7, axis=0), "columns of events differ in length"),
+        (lambda f: [f[k].resize(7, axis=0) for k in f], "rows of 7 events, manifest says"),
+        (lambda f: f.__delitem__("cause"), "causes are missing"),
+        (lambda f: f.__delitem__("depth"), "no dataset 'depth'"),
+    ],
+)
+def test_verify_sees_what_cannot_be(made, tmp_path, change, said):
+    from blinkgl.dataset.verify import _check_truth, _guarded
+
+    folder = tmp_path / "s"
+    shutil.copytree(sequence_of(made), folder)
+    with h5py.File(folder / "event_labels.h5", "r+") as file:
+        change(file)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    (line,) = _guarded(lambda: _check_truth(folder, manifest))
+    assert "event_labels.h5" in line and said in line and "\n" not in line
+    assert not verify_dataset(folder).clean
+
+
+def test_an_emulator_that_knows_no_causes_and_one_that_is_told_not_to(tmp_path):
+    (tmp_path / "c.yaml").write_text(CONFIG.replace("EMULATOR", "v2e, causes: false"))
+    assert run(["generate", str(tmp_path / "c.yaml"), "--out", str(tmp_path / "d")]) == 0
+    folder = sequence_of(tmp_path / "d")
+    assert verify_dataset(tmp_path / "d").clean
+    with EventLabelsReader(folder) as reader:
+        assert not reader.causes and reader.read(5, 9)[1] is None and len(reader.read(5, 9)[0]) == 4
+
+
+def test_shards_carry_it(made, tmp_path):
+    export_shards(made, tmp_path / "shards")
+    events = read_events(sequence_of(made) / "events.h5", truth=True)
+    with tarfile.open(next((tmp_path / "shards").glob("*.tar"))) as tar:
+        about = {m.name: tar.extractfile(m).read() for m in tar}
+    name = next(name for name in about if name.endswith(".json"))
+    start, end = (json.loads(about[name])[key] for key in ("from_us", "to_us"))
+    for which, window in (("old", events.window(2 * start - end, start)), ("new", events.window(start, end))):
+        with np.load(io.BytesIO(about[name.replace("json", f"{which}.npz")])) as columns:
+            assert len(window) and set(columns.files) == {*"xytp", "cause", *TRUTH.names}
+            assert np.array_equal(columns["instance"], window.truth["instance"])
+            assert np.array_equal(columns["velocity"], window.truth["velocity"])
+
+
+def test_the_bytes_do_not_hang_on_the_chunks(tmp_path):
+    n = BLOCK + 1000
+    rng = np.random.default_rng(0)
+    truth = np.zeros(n, TRUTH)
+    truth["instance"], truth["depth"] = rng.integers(0, 9, n), rng.random(n) + 1
+    events = Events(*(np.zeros(n, t) for t in ("u2", "u2", "i8", "u1")), truth=truth)
+    for name, edges in (("a", [0, n]), ("b", [0, 10, 10, 70_000, 140_000, n])):
+        writer = EventLabelsWriter(tmp_path / name)
+        edges = sorted(min(edge, n) for edge in edges)
+        for i, j in pairwise(edges):
+            writer.append(events.part(slice(i, j)))
+        writer.close()
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    with EventLabelsReader(tmp_path / "a") as reader:
+        assert np.array_equal(reader.read()[0], truth) and reader.count == n
+
+
+def test_one_line_where_there_is_none(made, tmp_path):
+    shutil.copytree(sequence_of(made), tmp_path / "s")
+    (tmp_path / "s" / "event_labels.h5").unlink()
+    with pytest.raises(AssetError, match=r"event_labels\.h5"):
+        read_events(tmp_path / "s" / "events.h5", truth=True)

@@ -1,0 +1,188 @@
+"""Networks that come with the package: a folder of weights and a card, called by name; packing; what is refused."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+torch = pytest.importorskip("torch")
+
+from blinkgl.errors import AssetError, ConfigError, OutputError  # noqa: E402
+from blinkgl.io.formats import write_events  # noqa: E402
+from eflow import checkpoint as ckpt, shipped  # noqa: E402
+from eflow.cli import run  # noqa: E402
+from eflow.config import load_train_config  # noqa: E402
+from eflow.infer import predict  # noqa: E402
+from eflow.models import build_model, model_config  # noqa: E402
+from flow_data import SPAN, blinkgl_set, moving_events  # noqa: E402
+
+CARD = {
+    "about": "flow of a texture that a test made up",
+    "data": "none",
+    "training": "0 s",
+    "scores": {"simulated test, AEE of zero flow": 1.02, "real bursts": "never tried"},
+    "limits": ["it was not trained", "nor will it be"],
+    "commands": ["pytest tests/eflow/test_shipped.py"],
+}
+
+
+def weights(path: Path, scale: float = 1.0, **tree) -> Path:
+    torch.manual_seed(0)
+    model = build_model(model_config({"name": "ev_flownet", "width": 8, **tree}))
+    tensors = {k: v * scale if v.is_floating_point() else v for k, v in model.state_dict().items()}
+    ckpt.write_tensors(path, tensors, ckpt.metadata_of(model))
+    return path
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory) -> Path:
+    """A network, a card and a run folder whose averaged weights differ from the last ones."""
+    root = tmp_path_factory.mktemp("source")
+    (root / "card.yaml").write_text(yaml.safe_dump(CARD))
+    weights(root / "net.safetensors")
+    step = root / "run" / "checkpoints" / "000000010"
+    step.mkdir(parents=True)
+    weights(step / "weights.safetensors", 0.9)
+    weights(step / "ema.safetensors")
+    return root
+
+
+@pytest.fixture
+def list_of(monkeypatch, tmp_path):
+    """An own folder in the place of the package's."""
+    monkeypatch.setattr(shipped, "FOLDER", tmp_path / "weights")
+    return tmp_path / "weights"
+
+
+def packed(source: Path, out: Path, *options: str, name: str = "toy_net") -> int:
+    return run(
+        ["pack", str(source / "run"), "--name", name, "--card", str(source / "card.yaml"), "-o", str(out), *options]
+    )
+
+
+def test_pack_then_call_by_name(source, list_of, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert packed(source, list_of) == 0, capsys.readouterr().err
+    assert sorted(p.name for p in list_of.rglob("*")) == ["card.yaml", "model.safetensors", "toy_net"]
+    card = shipped.card_of("toy_net")
+    assert (card.network, card.stored, card.rounding_px) == ("ev_flownet", "fp32", 0.0)
+    assert card.parameters == sum(p.numel() for p in ckpt.load_model("toy_net").parameters())
+    wanted = ckpt.load_model(source / "net.safetensors").state_dict()  # the averaged weights
+    assert all(torch.equal(v, wanted[k]) for k, v in ckpt.load_model("toy_net").state_dict().items())
+
+    blinkgl_set(tmp_path / "data", sequences=1, labels=1)
+    write_events(tmp_path / "e.npz", moving_events(64, 80, 0, 3 * SPAN), 64, 80)
+    for words in (
+        ["evaluate", "toy_net", "data", "--pictures", "0"],
+        ["predict", "toy_net", "e.npz", "--out", "flow"],
+        ["predict", str(list_of / "toy_net"), "e.npz"],  # the folder itself
+    ):
+        assert run(words) == 0, capsys.readouterr().err
+    capsys.readouterr()
+    assert run(["models"]) == 0 and run(["models", "toy_net"]) == 0
+    text = capsys.readouterr().out
+    for said in ("toy_net", "ev_flownet base, 0.2", "zero flow: 1.02", "again     pytest tests", card.sha256):
+        assert said in text, text
+    assert text.count("nor will it be") == 1, "limits are in the card, not in the list"
+    assert run(["models", "--json"]) == 0 and json.loads(capsys.readouterr().out)[0]["sha256"] == card.sha256
+
+
+def test_half_precision_halves_the_file_and_says_what_it_costs(source, list_of, capsys):
+    assert packed(source, list_of) == 0 and packed(source, list_of, "--store", "fp16", name="half") == 0
+    whole, half = shipped.card_of("toy_net"), shipped.card_of("half")
+    assert half.stored == "fp16" and half.bytes < 0.55 * whole.bytes and 0 < half.rounding_px < 0.05
+    model = ckpt.load_model("half")
+    assert all(p.dtype == torch.float32 for p in model.parameters())
+    batch = {k: torch.randn(1, model.representation.channels, 64, 64) for k in ("old", "new")}
+    a, b = (predict(m, batch).flow for m in (model, ckpt.load_model("toy_net")))
+    assert 0 < (a - b).abs().max() < 0.05
+
+
+def test_a_file_of_that_name_goes_first(source, list_of, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    packed(source, list_of)
+    weights(tmp_path / "toy_net", 0.5)
+    own, package = ckpt.load_model("toy_net"), ckpt.load_model(list_of / "toy_net")
+    assert not any(torch.equal(a, b) for a, b in zip(own.parameters(), package.parameters(), strict=True) if a.ndim > 1)
+
+
+def test_training_may_start_from_one(source, list_of, tmp_path):
+    packed(source, list_of)
+    tree = {
+        "model": {"name": "ev_flownet"},
+        "data": {"train": [{"path": "x"}], "crop": [64, 64]},
+        "init_from": "toy_net",
+    }
+    (tmp_path / "c.yaml").write_text(yaml.safe_dump(tree))
+    assert load_train_config(tmp_path / "c.yaml").init_from == "toy_net"
+    (tmp_path / "toy_net").mkdir()
+    assert load_train_config(tmp_path / "c.yaml").init_from == str(tmp_path / "toy_net"), "a folder beside the YAML"
+    assert load_train_config(tmp_path / "c.yaml", ["init_from=w"]).init_from == str(tmp_path / "w")
+
+
+def test_an_empty_list_works(list_of, capsys):
+    assert run(["models"]) == 0 and "no trained network" in capsys.readouterr().out
+    assert run(["models", "--json"]) == 0 and json.loads(capsys.readouterr().out) == []
+    assert run(["models", "toy_net"]) == 2 and "none comes with this version" in capsys.readouterr().err
+    with pytest.raises(AssetError, match="no such checkpoint.*a run folder$"):
+        ckpt.load_model("toy_net")
+
+
+def test_an_unknown_name_lists_the_known(source, list_of, capsys):
+    packed(source, list_of)
+    with pytest.raises(AssetError, match=r"did you mean toy_net\?.*comes with the package: toy_net"):
+        ckpt.load_model("toynet")
+    with pytest.raises(ConfigError, match=r"did you mean toy_net\?.*toy_net"):
+        shipped.card_of("toy_nett")
+
+
+def test_weights_that_are_not_the_cards(source, list_of):
+    packed(source, list_of)
+    path = list_of / "toy_net" / shipped.WEIGHTS
+    path.write_bytes(path.read_bytes()[:-4] + b"\0\0\0\1")
+    with pytest.raises(AssetError, match="not the weights that the card is of"):
+        ckpt.load_model("toy_net")
+    path.unlink()
+    with pytest.raises(AssetError, match=r"model\.safetensors: cannot be read"):
+        ckpt.load_model("toy_net")
+
+
+@pytest.mark.parametrize(
+    "name, change, message",
+    [
+        ("Toy Net", {}, "--name: not a name"),
+        ("planes", {}, "--name: not a name"),
+        ("eraft", {}, "--name: not a name"),
+        ("toy", {"scores": {}}, "card.yaml.*scores"),
+        ("toy", {"commands": None}, "card.yaml.*commands"),
+        ("toy", {"sha256": "0" * 64}, "card.yaml.*sha256.*unknown key"),
+    ],
+)
+def test_what_cannot_be_packed(source, tmp_path, name, change, message):
+    card = tmp_path / "card.yaml"
+    card.write_text(yaml.safe_dump({**CARD, **change}))
+    with pytest.raises(ConfigError, match=message):
+        shipped.pack(source / "run", name, card, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_too_large_or_beyond_fp16(source, tmp_path):
+    with pytest.raises(AssetError, match=r"too large to come with the package .*14\.\d MB.*at most 5 MB$"):
+        shipped.pack(weights(tmp_path / "l.safetensors", width=32), "l", source / "card.yaml", tmp_path / "out")
+    with pytest.raises(AssetError, match="too large for fp16; expected --store fp32"):
+        shipped.pack(
+            weights(tmp_path / "b.safetensors", 1e6), "b", source / "card.yaml", tmp_path / "out", stored="fp16"
+        )
+    shipped.pack(source / "run", "twice", source / "card.yaml", tmp_path / "ok")
+    with pytest.raises(OutputError, match="exists"):
+        shipped.pack(source / "run", "twice", source / "card.yaml", tmp_path / "ok")
+    assert not (tmp_path / "out").exists() and [p.name for p in (tmp_path / "ok").iterdir()] == ["twice"]
+
+
+@pytest.mark.parametrize("name", shipped.names())
+def test_what_ships_is_whole(name):
+    card, model = shipped.card_of(name), ckpt.load_model(name)
+    assert card.name == name and card.bytes <= shipped.LARGEST
+    assert card.bytes == (shipped.FOLDER / name / shipped.WEIGHTS).stat().st_size
+    assert card.parameters == sum(p.numel() for p in model.parameters()) and card.network == model.config.name

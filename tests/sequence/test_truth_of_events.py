@@ -1,0 +1,160 @@
+"""What made each event, of whole sequences: whose it is, how it moved, whether it depends on anything that it should
+not depend on."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from blinkgl import (
+    Camera,
+    ConfigError,
+    Keyframes,
+    Light,
+    Material,
+    OutputError,
+    Pose,
+    Primitive,
+    Scene,
+    look_at,
+    record,
+    render_frame,
+    write_events,
+)
+from blinkgl.config.sequence import RunTemplate
+from blinkgl.events.types import Cause
+from blinkgl.front.runs import configured
+from blinkgl.sequence import simulate_sequence
+
+SQUARES = np.where(((np.indices((64, 64)) // 8).sum(0) % 2)[..., None], (230, 200, 60), (40, 60, 110)).astype(np.uint8)
+CAMERA = Camera(72, 48, fov=60, pose=look_at((-3, 0, 0), (0, 0, 0)))
+SPAN = dict(duration=0.05, label_rate=20)
+
+
+def apart() -> Scene:
+    """Two boxes before nothing, 2 in the left half of the picture and 1 in the right."""
+    scene = Scene(CAMERA, **SPAN)
+    for y in (-0.9, 0.9):
+        way = Keyframes({0.0: Pose((0, y - 0.1, -0.1)), 0.2: Pose((0, y + 0.1, 0.1), euler=(0, 0, 40))})
+        scene += Primitive("cuboid", extents=(0.4, 0.7, 0.9), pose=way, material=Material(SQUARES))
+    return scene
+
+
+def before_a_wall() -> Scene:
+    """Box 2 passes before wall 1, which looks the same everywhere and so makes nothing itself."""
+    scene = Scene(CAMERA, light=Light(unlit=True), **SPAN)
+    scene += Primitive("cuboid", extents=(0.1, 9, 9), pose=(2, 0, 0), material=Material(color=(0.5, 0.5, 0.5)))
+    way = Keyframes({0.0: Pose((0, -0.6, -0.1)), 0.2: Pose((0, 0.6, 0.1), euler=(0, 0, 30))})
+    scene += Primitive("cuboid", extents=(0.4, 0.7, 0.9), pose=way, material=Material(SQUARES))
+    return scene
+
+
+def made(scene: Scene, **more):
+    """The events of a scene with sections of a configuration laid over it."""
+    template = configured(scene, labels=["events"])
+    config = RunTemplate({**template.tree, **more}, template.base).sequence(0)
+    with simulate_sequence(config, scene=scene.build(config)) as sequence:
+        return sequence.gather()
+
+
+@pytest.mark.parametrize("emulator", ["esim", "v2e", "voltmeter"])
+def test_events_carry_the_object_that_made_them(emulator):
+    for scene, whose in (
+        (apart(), lambda e: np.where(e.x < CAMERA.tree["width"] / 2, 2, 1)),
+        (before_a_wall(), lambda e: np.full(len(e), 2)),
+    ):
+        events = record(scene, labels=["events"], emulator=emulator).events
+        signal = events.cause == Cause.SIGNAL
+        right = events.truth["instance"] == whose(events)
+        assert signal.sum() > 1000 and right[signal].mean() >= 0.995
+        if emulator == "esim":
+            assert right.all()
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"timeline": {"kind": "uniform", "fps": 150}},  # five pixels from frame to frame
+        {"timeline": {"kind": "displacement", "reconstruction": "pchip"}},  # events one frame late
+        {"render": {"antialiasing": "ssaa2"}},  # edges that cover a part of a pixel
+        {"render": {"antialiasing": "msaa4"}},
+        {"readout": {"latency": {"fixed_us": 4000}, "events_per_second": 5e5}},  # long after it happened
+    ],
+    ids=["far apart", "one frame late", "ssaa2", "msaa4", "late"],
+)
+def test_it_is_theirs_whatever_stands_between(more):
+    events = made(before_a_wall(), **more)
+    assert len(events) > 1000 and (events.truth["instance"] == 2).mean() >= 0.995
+
+
+def test_velocity_and_depth_are_those_of_the_surface():
+    """A wall that fills the picture and slides sideways: everything moves alike, at one depth."""
+    scene = Scene(CAMERA, light=Light(unlit=True), **SPAN)
+    way = Keyframes({0.0: Pose((2.05, -0.3, 0)), 1.0: Pose((2.05, 3.7, 0))}, interpolation="linear")
+    scene += Primitive("cuboid", extents=(0.1, 60, 60), pose=way, material=Material(SQUARES, uv_scale=(90, 90)))
+    events = record(scene, labels=["events"]).events
+    focal = scene.build(configured(scene).sequence(0)).camera.K[0, 0]
+    assert len(events) > 1000 and (events.truth["instance"] == 1).all()
+    assert np.allclose(events.truth["depth"], 5.0, rtol=1e-5)
+    assert np.allclose(events.truth["velocity"], (-4.0 * focal / 5.0, 0.0), atol=1e-2)
+
+
+def test_the_events_are_those_that_come_without_it():
+    scene = apart()
+    plain = record(scene, labels=["ids"]).events
+    told = record(scene, labels=["ids", "events"]).events
+    assert plain.truth is None and told.truth is not None
+    assert all(np.array_equal(getattr(plain, name), getattr(told, name)) for name in "xytp")
+
+
+@pytest.mark.slow
+def test_moved_back_by_its_velocity_an_edge_is_sharp():
+    """The variance of the image of events, over that of the same events where they lie: five random worlds."""
+    ratios = []
+    for seed in range(5):
+        tree = {
+            "seed": seed,
+            "camera": {"width": 80, "height": 60},
+            "time": {"duration": 0.06, "label_rate": 50},
+            "scene": {
+                "kind": "random",
+                "objects": {"count": 4, "distance": [2, 5]},
+                "pool": {"urdfs": False, "primitives": ["cuboid", "sphere"]},
+                "textures": {"photographs": False, "variants": 6, "max_size": 64},
+                "camera_motion": {"speed": [2, 3], "rotation_rate": [20, 40]},
+            },
+            "labels": {"events": True, "images": False, "flow": [], "occlusion": False},
+        }
+        with simulate_sequence(RunTemplate(tree, Path(".")).sequence(0)) as sequence:
+            events = sequence.gather()
+        window = events.window(10_000, 70_000)
+        back = 1e-6 * (window.t - 40_000)[:, None] * window.truth["velocity"]
+        place = np.column_stack([window.x, window.y]).astype(float)
+        variance = [_image(one, 60, 80).var() for one in (place - back, place)]
+        ratios.append(variance[0] / variance[1])
+        assert (np.linalg.norm(window.truth["velocity"], axis=1) * 0.06).max() > 3, "nothing moves: it says nothing"
+    assert min(ratios) > 1 and np.median(ratios) > 1.3, f"variance ratios {np.round(ratios, 2)}"
+
+
+def _image(place: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Events counted at places between pixels, bilinear."""
+    image = np.zeros((height, width))
+    low = np.floor(place).astype(int)
+    part = place - low
+    for dx in (0, 1):
+        for dy in (0, 1):
+            x, y = low[:, 0] + dx, low[:, 1] + dy
+            weight = np.abs(1 - dx - part[:, 0]) * np.abs(1 - dy - part[:, 1])
+            there = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+            np.add.at(image, (y[there], x[there]), weight[there])
+    return image[4:-4, 4:-4]
+
+
+def test_what_has_no_place_for_it_says_so(tmp_path):
+    scene = apart()
+    with pytest.raises(ConfigError, match="is of events and not of a time"):
+        render_frame(scene, 0.0, labels=["events"])
+    events = record(scene, labels=["events"]).events
+    with pytest.raises(OutputError, match="event files do not hold what made the events"):
+        write_events(tmp_path / "e.h5", events, 48, 72)
+    assert not list(tmp_path.iterdir())

@@ -27,7 +27,7 @@ from blinkgl.config.scene import (
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.surfaces.environment import Environment, pixel_directions
 from blinkgl.scene.surfaces.gloss import blurred
-from blinkgl.scene.types import Lamp, Light
+from blinkgl.scene.types import Lamp, Light, Panorama
 
 if TYPE_CHECKING:
     from blinkgl.scene.types import PosePath
@@ -108,10 +108,10 @@ def seen_around(light: Light) -> np.ndarray:
     """(h, w, 3) float32 radiance from all around, without lamps, as a panorama whose pixels lie as in
     :func:`~blinkgl.scene.surfaces.environment.pixel_directions`. Of light that is known by its quadric alone what a
     white surface gives back takes its place: as smooth as that is."""
-    height, width = _SKY_SIZE if light.surroundings is None else light.surroundings.shape[:2]
+    height, width = _SKY_SIZE if light.surroundings is None else light.surroundings.pixels.shape[:2]
     picture = np.zeros((height, width, 3), np.float32)
     if light.surroundings is not None:
-        picture += light.surroundings
+        picture += light.surroundings.pixels
     elif light.around is not None:
         directions, _ = pixel_directions(height, width)
         picture += ambient(np.asarray(light.around, np.float64), directions)
@@ -190,7 +190,7 @@ def lit_by(panorama: Environment, factor: float, light: Light) -> Light:
         for sun in panorama.suns
     ]
     around = tuple(tuple(tuple(float(factor * v) for v in row) for row in one) for one in panorama.quadric)
-    picture = panorama.picture * np.float32(factor)
+    picture = Panorama(panorama.picture * np.float32(factor))
     return replace(light, sun=0.0, sky=0.0, lamps=(*suns, *light.lamps), around=around, surroundings=picture)
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -233,6 +233,13 @@ class Lamp:
 WHITE = (1.0, 1.0, 1.0)
 
 
+class Panorama(NamedTuple):
+    """pixels : (h, w, 3) float32 radiance from all around, as of
+    :func:`~blinkgl.scene.surfaces.environment.pixel_directions`."""
+
+    pixels: np.ndarray
+
+
 @dataclass(frozen=True)
 class Light:
     """Sun + sky: irradiance factor E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 * n_z); radiance = albedo * E. Both are
@@ -243,8 +250,8 @@ class Light:
     lamps : what shines beside them.
     around : quadric of what else comes from all around (:func:`blinkgl.scene.lights.ambient`), 3 x 4 x 4 numbers; None:
         nothing.
-    surroundings : (h, w, 3) float32 radiance of the same as a picture, its suns taken out, for what shines; pixels as
-        of :func:`~blinkgl.scene.surfaces.environment.pixel_directions`. None: the sky alone, ``sky`` above the horizon.
+    surroundings : the same as a picture, its suns taken out, for what shines; lights that differ in nothing else are
+        equal. None: the sky alone, ``sky`` above the horizon.
     shadows : of suns and spot lights; soft by their size.   shadow_size : px a side of the map of each.
 
     The defaults are those of ``light:`` in the configuration, where nothing is random.
@@ -258,7 +265,7 @@ class Light:
     sun_size: float = math.radians(LightConfig().sun_size)
     lamps: tuple[Lamp, ...] = ()
     around: tuple[tuple[tuple[float, ...], ...], ...] | None = None
-    surroundings: np.ndarray | None = field(default=None, compare=False, repr=False)
+    surroundings: Panorama | None = field(default=None, compare=False, repr=False)
     shadows: Literal["off", "hard", "soft"] = "off"
     shadow_size: int = LightConfig().shadow_size
 

@@ -28,7 +28,7 @@ def kinds() -> list[Kind]:
     for hued in (False, True):
         surfaces += [Kind(True, True, False, hued=hued, more=more) for more in SURFACES]
     bent = next(iter(shapes))
-    surfaces += [Kind(False, True, True, bent, more=MORE), Kind(False, True, True, bent, True, True, MORE)]
+    surfaces.append(Kind(True, True, True, bent, True, more=MORE))
     return [*KINDS, *(Kind(True, True, True, shape) for shape in shapes), *surfaces]
 
 

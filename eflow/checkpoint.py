@@ -236,8 +236,9 @@ def load_optimizer(path: Path, model: FlowModel, optimizer: torch.optim.Optimize
         found = {k.removeprefix(f"{name}/"): v for k, v in tensors.items() if k.startswith(f"{name}/")}
         if any(v.shape not in ((), p.shape) for v in found.values()):
             raise AssetError(f"optimiser state of '{name}' has another shape", where=str(path))
-        if found:  # AdamW keeps its step counter on the CPU
-            optimizer.state[p] = {k: v.clone() if k == "step" else v.to(p.device, copy=True) for k, v in found.items()}
+        if found:  # AdamW keeps its step counter on the CPU, unless it is fused
+            here = p.device if optimizer.defaults.get("fused") else torch.device("cpu")
+            optimizer.state[p] = {k: v.to(here if k == "step" else p.device, copy=True) for k, v in found.items()}
     if "/rng/cpu" not in tensors:
         raise AssetError("no generator state", where=str(path))
     torch.set_rng_state(tensors["/rng/cpu"])

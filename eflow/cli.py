@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import signal
 import sys
 import traceback
@@ -71,19 +72,52 @@ def _print_version(wanted: bool) -> None:
 
 @app.command()
 def train(
-    config: Annotated[str, typer.Argument(help="YAML file; see configs/eflow/.")],
-    out: Annotated[str, typer.Option("--out", "-o", help="Run folder to make (or to go on in, with --resume).")],
+    config: Annotated[
+        str | None, typer.Argument(help="YAML file; see configs/eflow/. Without one: --model and --data.")
+    ] = None,
+    out: Annotated[
+        str | None,
+        typer.Option("--out", "-o", help="Run folder to make (or to go on in, with --resume).", show_default=False),
+    ] = None,
+    model: Annotated[
+        str | None, typer.Option("--model", "-m", help="A network and its size, e.g. ev_flownet-tiny.")
+    ] = None,
+    data: Annotated[
+        list[str] | None,
+        typer.Option("--data", help="Folder, or recipe (.yaml) that is rendered meanwhile; may be repeated."),
+    ] = None,
+    minutes: Annotated[
+        float | None, typer.Option(min=1e-3, help="Length of the training; the rate falls towards its end.")
+    ] = None,
     overrides: Overrides = None,
+    print_config: Annotated[
+        bool, typer.Option("--print-config", help="Print all keys as they would be used, as YAML, and do nothing.")
+    ] = False,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on from the newest checkpoint in the run folder.")
     ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
     """Train a network. SIGINT and SIGTERM write a checkpoint and exit 0."""
+    from eflow.bench import PRESETS, preset
     from eflow.config import load_train_config
-    from eflow.train import train as run_training
+    from eflow.train import as_yaml, train as run_training
 
-    result = run_training(load_train_config(config, overrides or []), out, resume=resume, quiet=quiet)
+    said = overrides or []
+    if config is None and not (model or any(o.startswith("model") for o in said)):
+        raise ConfigError("no network to train", accepted="a YAML file, or --model, e.g. ev_flownet-tiny, and --data")
+    if config is None and not (data or any(o.startswith("data.train") for o in said)):
+        raise ConfigError("nothing to train on", accepted="a YAML file, or --data, a folder or a recipe")
+    if model is not None:
+        preset(model)
+    tree = None if model is None else PRESETS[model]
+    whole = load_train_config(config, said, model=tree, data=data or (), minutes=minutes)
+    if print_config:
+        typer.echo(as_yaml(whole), nl=False)
+        return
+    if out is None:
+        raise ConfigError("no run folder", where="--out", accepted="a new folder, or one to go on in, with --resume")
+    result = run_training(whole, out, resume=resume, quiet=quiet)
     if not quiet:
         print(f"{result.reason} at step {result.step}: {result.checkpoint}", file=sys.stderr)
 
@@ -97,6 +131,7 @@ def render(
     window_ms: WindowMs = None,
     min_events: Annotated[int, typer.Option(min=1, help="Fewest events in each of a sample's two windows.")] = 40,
     max_flow: Annotated[float, typer.Option(help="Longest median flow of a sample, px.")] = 40.0,
+    min_density: Annotated[float, typer.Option(help="Fewest events per pixel and px of mean flow.")] = 0.0,
     split: Annotated[str, typer.Option(help="Whose groups: train or test.")] = "train",
     seed: Annotated[int, typer.Option(min=0, help="Other windows for each.")] = 0,
     overrides: Overrides = None,
@@ -116,10 +151,11 @@ def render(
         samples=per_sequence,
         min_events=min_events,
         max_flow=max_flow,
+        min_density=min_density,
         set=tuple(overrides or ()),
         workers=workers,
     )
-    kept = {key: getattr(source, key) for key in ("set", "window_ms", "min_events", "max_flow")}
+    kept = {key: getattr(source, key) for key in ("set", "window_ms", "min_events", "max_flow", "min_density")}
     about = {"recipe": Path(recipe).name, "split": split, "seed": seed, "per_sequence": per_sequence, **kept}
     refuse_existing(Path(out))  # before a worker has been started
     with interruptible(signal.SIGTERM), open_online(source, seed, split=split) as stream:
@@ -145,6 +181,16 @@ def evaluate(
     window_ms: WindowMs = None,
     format: Annotated[str, typer.Option(help="auto, blinkgl, dsec, mvsec, blinkflow or windows.")] = "auto",
     dt: Annotated[int, typer.Option(help="MVSEC: 1 or 4 images.")] = 1,
+    protocol: Annotated[
+        str, typer.Option(help="MVSEC: which frames and rows are scored: all, ste-flownet or e-raft (20 Hz).")
+    ] = "all",
+    ground_truth: Annotated[
+        str | None,
+        typer.Option(
+            "--ground-truth",
+            help="MVSEC: propagated through the 20 Hz flow, or one field scaled; default: the protocol's.",
+        ),
+    ] = None,
     pictures: Annotated[int, typer.Option(min=0, help="Number of pictures.")] = 12,
     iterations: Annotated[int | None, typer.Option(min=1, help="GRU iterations, where the network has them.")] = None,
     confidence: Annotated[
@@ -175,7 +221,7 @@ def evaluate(
     elif window_ms is not None:
         raise ConfigError("only of a recipe", where="--window-ms", value=window_ms, accepted="a dataset FILE.yaml")
     else:
-        source = open_source(dataset, _format(format), dt=dt)
+        source = open_source(dataset, _format(format), dt=dt, protocol=protocol, truth=ground_truth)
     with console.status("evaluating") as status:
         result = score(
             model,
@@ -430,6 +476,27 @@ def pack(
     typer.echo(f"written: {folder}")
     for line in shipped.lines(full):
         typer.echo(line)
+
+
+@app.command()
+def export(
+    checkpoint: Network,
+    out: Annotated[str, typer.Option("--out", "-o", help="New .onnx file.")],
+    size: Annotated[
+        str | None, typer.Option(metavar="WxH", help="The only size it takes; default: any multiple of its stride.")
+    ] = None,
+    iterations: Annotated[int | None, typer.Option(min=1, help="GRU iterations, where the network has them.")] = None,
+    raw: Annotated[bool, typer.Option("--raw", help="The last weights instead of the averaged ones.")] = False,
+) -> None:
+    """A network as an ONNX file, for programs without torch; onnxruntime's flow is compared before it appears."""
+    missing = [name for name in EXTRAS["onnx"][0] if importlib.util.find_spec(name) is None]
+    if missing:
+        raise BlinkGLError(f"{missing[0]} is not installed", accepted=f"run {install(*EXTRAS['onnx'][0])}")
+    from eflow.export import OPSET, export_onnx
+
+    wanted = _size(size)
+    told = export_onnx(_model(checkpoint, "cpu", raw, "fp32", iterations), out, size=wanted)
+    typer.echo(f"written: {out}, opset {OPSET}, sizes: {told['sizes']}; onnxruntime agrees with torch")
 
 
 @app.command()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -210,6 +210,13 @@ class SourceConfig(Config):
     )
     min_events: int = Field(1, ge=1, le=10**9, description="fewest events in each of a sample's two windows")
     max_flow: float = Field(400.0, gt=0, le=1e4, description="longest median flow of a sample, px")
+    min_density: float = Field(
+        0.0,
+        ge=0,
+        le=1e3,
+        description="fewest events per pixel of the new window and px of its mean flow (0.3 px where that is shorter): "
+        "below 0.01 hardly anything can be told",
+    )
 
     @rule("path", "recipe", "online")
     def _folder_or_recipe(path, recipe, online):
@@ -324,6 +331,7 @@ class RunConfig(Config):
     precision: Literal["fp32", "bf16"] = Field(
         "fp32", description="bf16: autocast with fp32 islands; fp32 where the device has no bf16 instructions"
     )
+    tf32: bool = Field(True, description="a card with TF32 units makes fp32 products of those, but in fp32 islands")
     channels_last: bool = Field(False, description="memory layout that some cards convolve faster in")
     compile: bool = Field(False, description="torch.compile of the update step")
     threads: int | None = Field(None, ge=1, description="CPU threads; null: torch's choice")
@@ -355,11 +363,36 @@ class TrainConfig(Config):
     )
 
 
-def load_train_config(path: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> TrainConfig:
+def load_train_config(
+    path: str | Path | None,
+    overrides: list[str] | tuple[str, ...] = (),
+    *,
+    model: dict | None = None,
+    data: Sequence[str] = (),
+    minutes: float | None = None,
+) -> TrainConfig:
     """Reads a YAML file and applies ``a.b=c`` overrides; data paths become absolute, from the YAML file's folder.
 
-    Raises ConfigError: missing file, bad YAML, unknown key, bad value."""
-    path, tree = Path(path), read_table(path)
+    model, data, minutes : what a command line says in place of the file's ``model``, ``data.train`` (folders, or
+    recipes, which are rendered meanwhile) and ``optim.minutes``, from the working folder. path : None: nothing but
+    those and the overrides; images are then not scaled, which would need a crop.
+    Raises ConfigError: missing file, bad YAML, unknown key, bad value; without a file, no model or no data."""
+    tree = {} if path is None else read_table(path)
+    if path is None and not any(text.partition("=")[0].startswith("data.augment") for text in overrides):
+        tree = {"data": {"augment": {"scale_probability": 0}}}
+    if model is not None:
+        tree = {**tree, "model": model}
+    if data:
+        sets = [
+            {"recipe": str(Path(p).resolve()), "online": True}
+            if p.endswith((".yaml", ".yml"))
+            else {"path": str(Path(p).resolve())}
+            for p in data
+        ]
+        tree = {**tree, "data": {**(tree.get("data") or {}), "train": sets}}
+    if minutes is not None:
+        tree = {**tree, "optim": {**(tree.get("optim") or {}), "minutes": minutes}}
+    path = Path("train.yaml" if path is None else path)
     config = validate(TrainConfig, apply_overrides(tree, overrides))
     absolute = lambda p: str(path.parent.resolve() / p)  # an absolute p stays
     sources = {

@@ -58,14 +58,16 @@ class TrainProgress:
             self._live.start()
         return self
 
-    def update(self, step: int, loss: float, epe: float) -> None:
+    def update(self, step: int, values: Iterable[tuple[float, float]] = ()) -> None:
+        """After ``step`` steps. values : (loss, end-point error) of those that have been read since the last call."""
         now = self._clock()
         speed = (step - self._step) * self.batch / max(now - self._time, 1e-9)
         self.rate = speed if self.rate == 0 else 0.9 * self.rate + 0.1 * speed
-        self._loss = loss if self._loss is None else 0.95 * self._loss + 0.05 * loss
-        self._epe = epe if self._epe is None else 0.95 * self._epe + 0.05 * epe
+        for loss, epe in values:
+            self._loss = loss if self._loss is None else 0.95 * self._loss + 0.05 * loss
+            self._epe = epe if self._epe is None else 0.95 * self._epe + 0.05 * epe
         self._step, self._time = step, now
-        if not self.enabled:
+        if not self.enabled or self._loss is None or self._epe is None:
             return
         text = f"loss {self._loss:.2f}  EPE {self._epe:.2f} px  {self.rate:.2f} samples/s  {self._left(now)}"
         if self._live is not None:

@@ -14,12 +14,13 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import itertools
 import json
 import os
 import re
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +31,7 @@ from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
 from blinkgl.config.reader import to_yaml
+from blinkgl.config.recipe import derived_seed
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.sequence_dir import refuse_existing
@@ -43,7 +45,7 @@ from eflow.losses import sequence_loss
 from eflow.metrics import frame_metrics
 from eflow.models import FlowModel, build_model
 from eflow.pictures import comparison, events_of, write_picture
-from eflow.precision import precision_on
+from eflow.precision import precision_on, use_tf32
 from eflow.progress import TrainProgress, Waiting, told
 
 
@@ -92,9 +94,10 @@ class Course:
         share = step / self.optim.steps
         if self.optim.minutes is None:
             return share
+        if world == 1:
+            return max(share, self.seconds / (60 * self.optim.minutes))
         seconds = torch.tensor(self.seconds, dtype=torch.float64, device=device)
-        if world > 1:
-            dist.broadcast(seconds, 0)
+        dist.broadcast(seconds, 0)
         return max(share, float(seconds) / (60 * self.optim.minutes))
 
     def minutes_left(self, time_limit: float | None) -> float | None:
@@ -155,11 +158,19 @@ def _train(
         [{"params": decay}, {"params": no_decay, "weight_decay": 0.0}],
         lr=config.optim.lr,
         weight_decay=config.optim.weight_decay,
+        fused=device.type == "cuda",
     )
     ema = {k: v.detach().clone() for k, v in model.state_dict().items()} if config.optim.ema else None
     start, spent = _resume(out, config, model, optimizer, ema) if resume else (0, 0.0)
 
-    mixture, sources = _training_sets(config, start, world, stack)
+    if config.data.batch % world:
+        raise ConfigError(
+            "not a multiple of the number of processes",
+            where="data.batch",
+            value=config.data.batch,
+            accepted=f"a multiple of {world}",
+        )
+    mixture, sources = _training_sets(config, start, rank, world, stack)
     dataset = FlowDataset(
         sources,
         model.representation,
@@ -171,13 +182,6 @@ def _train(
     )
     _check_sizes(dataset, model, config.data.crop)
     validation = _validation(config, model) if lead else []
-    if config.data.batch % world:
-        raise ConfigError(
-            "not a multiple of the number of processes",
-            where="data.batch",
-            value=config.data.batch,
-            accepted=f"a multiple of {world}",
-        )
     steps = config.optim.steps
     stop = steps if stop_after is None else min(steps, start + stop_after)
     sampler = StepSampler(mixture, config.data.batch, start, stop, rank, world)
@@ -192,7 +196,8 @@ def _train(
     net.train()
     if lead:
         _write_config(out, config)
-    step, reason, loss_value, began = start, None, float("nan"), time.monotonic()
+    step, reason, began = start, None, time.monotonic()
+    read = Readings(out)
     course = Course(config.optim, clock(), spent, clock)
     done = course.done(step, device, world)
     if done >= 1:
@@ -231,34 +236,38 @@ def _train(
             loss, epe, flow = _forward(net, batch, config, world)
             loss.backward()
             norm = torch.nn.utils.clip_grad_norm_(model.parameters(), config.optim.clip)
-            loss_value = float(loss.detach())
-            if not (np.isfinite(loss_value) and torch.isfinite(norm)):
-                _stop_on_nan(out, step, batch, loss_value, float(norm))
+            read.add(step, batch["name"], loss, epe, norm)
             optimizer.step()
             step += 1
             if ema is not None:
                 _average(ema, model, min(config.optim.ema, step / (step + 10)))
 
-            progress.update(step, loss_value, epe)
-            done = course.done(step, device, world)
+            # What is between processes, or between device and host, makes everybody wait: now and then is enough.
+            looking = step == start + 1 or any(
+                step % every == 0
+                for every in (config.run.log_every, config.run.validate_every, config.run.checkpoint_every)
+            )
+            if world == 1 or looking:
+                done = course.done(step, device, world)
             last = step == stop or done >= 1
             if done >= 1:
                 reason = "finished"
-            else:
+            elif world == 1 or looking or last:
                 reason = (
                     signals.reason
                     or ("time limit" if _over(began, config.run.time_limit) else None)
                     or ("stop" if last else None)
                 )
                 reason = _agree(reason, device) if world > 1 else reason
+            progress.update(step, read.values() if looking or last or reason else ())
             if lead and (step % config.run.log_every == 0 or last):
                 log.write(
                     step,
                     "train",
-                    loss=loss_value,
-                    epe=epe,
+                    loss=read.loss,
+                    epe=read.epe,
                     lr=rate,
-                    grad_norm=float(norm),
+                    grad_norm=read.norm,
                     samples_per_s=progress.rate,
                     processor_s=time.process_time(),
                     waited=waiting.share,
@@ -269,7 +278,7 @@ def _train(
             # The clock ends a training as its last step does; a signal is in a hurry.
             ended = reason in ("finished", "time limit")
             if lead and validation and (step % config.run.validate_every == 0 or ended):
-                scores = validate(model, ema, validation, config.run.precision)
+                scores = validate(model, ema, validation, config.run.precision, -(-config.data.batch // world))
                 log.write(step, "validation", **scores)
                 progress.note(step, scores)
             if lead and (step % config.run.checkpoint_every == 0 or reason is not None):
@@ -284,16 +293,15 @@ def _train(
     if world > 1:
         dist.barrier()
         dist.destroy_process_group()
-    return TrainResult(step, reason or "finished", path if lead else out, loss_value)
+    return TrainResult(step, reason or "finished", path if lead else out, read.loss)
 
 
 def _training_sets(
-    config: TrainConfig, start: int, world: int, stack: contextlib.ExitStack
+    config: TrainConfig, start: int, rank: int, world: int, stack: contextlib.ExitStack
 ) -> tuple[Mixture, list[Source]]:
-    """The order of the samples, and the open sets; what renders is ended by ``stack``."""
+    """The order of the samples, and the open sets; what renders is ended by ``stack``. Each rank renders for itself,
+    sequences that no other has."""
     data = config.data
-    if world > 1 and any(s.online for s in data.train):
-        raise ConfigError("online data are for one process", where="data.train", accepted="folders, or one process")
     sources = {k: open_source(s.path, s.format, dt=s.dt) for k, s in enumerate(data.train) if not s.online}
     sizes = [len(sources[k]) if k in sources else None for k in range(len(data.train))]
     mixture = Mixture(sizes, [s.weight for s in data.train], config.seed)
@@ -301,13 +309,14 @@ def _training_sets(
         if s.online:
             from eflow.data.online import open_online  # brings the renderer
 
-            first = mixture.first(k, start * data.batch)
-            sources[k] = stack.enter_context(open_online(s, config.seed, first=first, batch=data.batch))
+            first = mixture.first(k, start * data.batch, rank, world)
+            seed = derived_seed(config.seed, f"rank {rank}") if rank else config.seed
+            sources[k] = stack.enter_context(open_online(s, seed, first=first, batch=data.batch // world))
     return mixture, [sources[k] for k in range(len(data.train))]
 
 
-def _forward(net, batch: dict, config: TrainConfig, world: int) -> tuple[Tensor, float, Tensor]:
-    """loss, end-point error of the last field, and that field."""
+def _forward(net, batch: dict, config: TrainConfig, world: int) -> tuple[Tensor, Tensor, Tensor]:
+    """loss, end-point error of the last field, and that field; nothing is read back from the device."""
     kind = batch["new"].device.type
     with (
         _compile_errors(config.run.compile),
@@ -331,8 +340,9 @@ def _forward(net, batch: dict, config: TrainConfig, world: int) -> tuple[Tensor,
         count=count,
     )
     with torch.no_grad():
-        error = (prediction.flow - torch.where(batch["valid"][:, None], batch["flow"], 0)).norm(dim=1)
-        epe = float(error[batch["valid"]].mean()) if batch["valid"].any() else 0.0
+        valid = batch["valid"]
+        error = (prediction.flow - torch.where(valid[:, None], batch["flow"], 0)).norm(dim=1)
+        epe = torch.where(valid, error, 0).sum() / valid.sum().clamp(min=1)
     return loss, epe, prediction.flow.detach()
 
 
@@ -370,8 +380,10 @@ def validate(
     ema: dict[str, Tensor] | None,
     validation: list[tuple[str, FlowDataset, list[int]]],
     precision: str,
+    size: int = 1,
 ) -> dict[str, float]:
-    """AEE per validation set, with the averaged weights; ``zero`` is the AEE of zero flow on the same samples."""
+    """AEE per validation set, with the averaged weights; ``zero`` is the AEE of zero flow on the same samples.
+    size : at most so many samples at once."""
     own = {k: v.detach().clone() for k, v in model.state_dict().items()} if ema is not None else None
     if ema is not None:
         model.load_state_dict(ema)
@@ -379,13 +391,13 @@ def validate(
         scores = {}
         for name, dataset, indices in validation:
             rows = []
-            for i in indices:
-                batch = collate([dataset[i]])
-                flow = predict(model, batch, precision=precision).flow[0].permute(1, 2, 0).cpu().numpy()
-                truth, valid = batch["flow"][0].permute(1, 2, 0).numpy(), (batch["valid"] & batch["mask"])[0].numpy()
-                metrics, zero = frame_metrics(flow, truth, valid), frame_metrics(np.zeros_like(flow), truth, valid)
-                if metrics:
-                    rows.append((metrics["AEE"], zero["AEE"]))
+            for batch in _alike((dataset[i] for i in indices), size):
+                flows = predict(model, batch, precision=precision).flow.permute(0, 2, 3, 1).cpu().numpy()
+                truths, valids = batch["flow"].permute(0, 2, 3, 1).numpy(), (batch["valid"] & batch["mask"]).numpy()
+                for flow, truth, valid in zip(flows, truths, valids, strict=True):
+                    metrics, zero = frame_metrics(flow, truth, valid), frame_metrics(np.zeros_like(flow), truth, valid)
+                    if metrics:
+                        rows.append((metrics["AEE"], zero["AEE"]))
             scores[f"{name}/AEE"], scores[f"{name}/zero"] = (
                 (float(v) for v in np.mean(rows, axis=0)) if rows else (float("nan"),) * 2
             )
@@ -393,6 +405,13 @@ def validate(
     finally:
         if own is not None:
             model.load_state_dict(own)
+
+
+def _alike(samples: Iterable[dict], size: int) -> Iterator[dict]:
+    """Batches, in order, of up to ``size`` samples of one height and width."""
+    for _, group in itertools.groupby(samples, key=lambda sample: sample["new"].shape):
+        while part := list(itertools.islice(group, size)):
+            yield collate(part)
 
 
 def _setup(config: TrainConfig) -> tuple[int, int, torch.device]:
@@ -406,6 +425,7 @@ def _setup(config: TrainConfig) -> tuple[int, int, torch.device]:
     device = torch.device("cuda", local) if kind == "cuda" else torch.device("cpu")
     if kind == "cuda":
         torch.cuda.set_device(device)
+        use_tf32(device, config.run.tf32)
     if kind == "cpu":
         keep_memory()
     if config.run.threads:
@@ -520,12 +540,39 @@ def _average(ema: dict[str, Tensor], model: FlowModel, decay: float) -> None:
         ema[k].lerp_(v, 1 - decay) if v.is_floating_point() else ema[k].copy_(v)
 
 
-def _stop_on_nan(out: Path, step: int, batch: dict, loss: float, norm: float) -> None:
+class Readings:
+    """Loss, end-point error and gradient norm of the steps, which stay on the device until they are asked for: to read
+    a number is to wait for all that was computed before it. The latest ones that were read are ``loss``, ``epe`` and
+    ``norm``."""
+
+    def __init__(self, out: Path):
+        self._out, self._pending = out, []
+        self.loss = self.epe = self.norm = float("nan")
+
+    def add(self, step: int, names: list[str], loss: Tensor, epe: Tensor, norm: Tensor) -> None:
+        """After ``step`` steps, on the samples of these names."""
+        self._pending.append((step, names, torch.stack([v.detach().float() for v in (loss, epe, norm)])))
+
+    def values(self) -> list[tuple[float, float]]:
+        """(loss, end-point error) of each step since the last call, in one copy.
+
+        Raises TrainingError at the first that is not finite, having named its samples in ``nan_batch.json``. Steps
+        after it were made with what it left, so whoever saves asks before."""
+        read = torch.stack([v for _, _, v in self._pending]).tolist() if self._pending else []
+        for (step, names, _), (loss, _, norm) in zip(self._pending, read, strict=True):
+            if not np.isfinite([loss, norm]).all():
+                _stop_on_nan(self._out, step, names, loss, norm)
+        if read:
+            self.loss, self.epe, self.norm = read[-1]
+        self._pending.clear()
+        return [(loss, epe) for loss, epe, _ in read]
+
+
+def _stop_on_nan(out: Path, step: int, names: list[str], loss: float, norm: float) -> None:
     path = out / "nan_batch.json"
     with output_errors(path):
         path.write_text(
-            json.dumps({"step": step, "loss": str(loss), "grad_norm": str(norm), "samples": batch["name"]}, indent=1)
-            + "\n"
+            json.dumps({"step": step, "loss": str(loss), "grad_norm": str(norm), "samples": names}, indent=1) + "\n"
         )
     raise TrainingError(
         f"loss or gradient is not finite at step {step}",
@@ -560,9 +607,14 @@ def _agree(reason: str | None, device: torch.device) -> str | None:
     return codes[int(code)]
 
 
+def as_yaml(config: TrainConfig) -> str:
+    """All keys with their values, as a run folder's ``config.yaml`` has them."""
+    return to_yaml(json.loads(config.model_dump_json()))
+
+
 def _write_config(out: Path, config: TrainConfig) -> None:
     with atomic_file(out / "config.yaml") as path, output_errors(path):
-        Path(path).write_text(to_yaml(json.loads(config.model_dump_json())), encoding="utf-8")
+        Path(path).write_text(as_yaml(config), encoding="utf-8")
 
 
 class _Signals:

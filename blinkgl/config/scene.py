@@ -626,6 +626,11 @@ class MaterialConfig(Config):
     uv_scale: tuple[Repeats, Repeats] = Field((1.0, 1.0), description="texture repeats per unit of texture coordinate")
     unlit: bool = Field(False, description="radiance = albedo, whatever the light")
     double_sided: bool = Field(False, description="draw back faces, with the normal turned round")
+    metallic: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="how much of it is metal")
+    roughness: Annotated[float, Field(ge=0, le=1)] = Field(
+        1.0, description="0: a mirror; 1, of what is no metal: matt, without any reflection"
+    )
+    emission: tuple[Radiance, Radiance, Radiance] = Field((0.0, 0.0, 0.0), description="radiance of its own, linear")
 
     @rule("texture", "procedural", "photograph")
     def _one(*sources):

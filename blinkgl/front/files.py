@@ -209,6 +209,7 @@ def calibrate(
     emulator: EmulatorSettings = "esim",
     fixed: Iterable[str] = (),
     still: bool = False,
+    flicker: tuple[float, float] | None = None,
     fps: float | None = None,
     timestamps: str | os.PathLike | None = None,
     gamma: str | float = "linear",
@@ -224,16 +225,25 @@ def calibrate(
 
     recording : event file.   frames : what the camera saw, of its size (default: the recording's own).   emulator : a
     name, or a mapping where the fit begins.   fixed : its keys that stay as they are there.   still : a scene that
-    stands still in constant light, without frames: noise alone.   fps : of the frames, Hz.   timestamps : file of the
+    stands still in constant light, without frames: noise alone.   flicker : (Hz, contrast) of light that goes as
+    1 + contrast sin on an even scene, without frames: thresholds.   fps : of the frames, Hz.   timestamps : file of the
     frames' times.   gamma : of their codes, "linear", "srgb" or an exponent.   interpolate : between them, "motion" or
     "linear".   max_px : of "motion", px.   frame_delay_ms : added to their times, ms; None: found.
     starts : of the search.   Raises AssetError, EventDataError, ConfigError."""
     from blinkgl.recordings import calibration
+    from blinkgl.recordings.clip import Flicker
 
     keys = fixed if isinstance(fixed, Iterable) and not isinstance(fixed, str) else [None]
     keys = tuple(keys)
     if not all(isinstance(key, str) for key in keys):
         raise ConfigError("not names of keys", where="fixed", value=fixed, accepted="a list of texts")
+    light = None
+    if flicker is not None:
+        hz, contrast = check.array(flicker, "flicker", (2,), "(Hz, contrast)").tolist()
+        light = Flicker(
+            check.number(hz, "flicker[0]", least=0.01, most=1e4),
+            check.number(contrast, "flicker[1]", above=0, most=0.999),
+        )
     delay = None if frame_delay_ms is None else check.number(frame_delay_ms, "frame_delay_ms", least=-1e6, most=1e6)
     return calibration.calibrate(
         check.path(recording, "recording"),
@@ -241,6 +251,7 @@ def calibrate(
         emulator=events_tree(emulator),
         fixed=keys,
         still=bool(still),
+        flicker=light,
         fps=_fps(fps),
         timestamps=None if timestamps is None else check.path(timestamps, "timestamps"),
         gamma=gamma,

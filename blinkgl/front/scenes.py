@@ -224,7 +224,7 @@ class Light(_Piece):
 
 
 class Material(_Piece):
-    """A Lambert surface: ``color`` times at most one texture.
+    """A surface: ``color`` times at most one texture, matt or with a gloss, and light of its own.
 
     image : an image file (sRGB; .hdr is linear), or an array: (h, w, 3) uint8 sRGB, or
     float, linear light; row 0 is the top.
@@ -232,6 +232,7 @@ class Material(_Piece):
     photograph : one that scikit-image brings, such as "astronaut".   uv_scale : (2,) repeats.
     max_size : px, longer sides of a file are reduced.
     unlit : radiance = albedo, whatever the light.   double_sided : draw back faces.
+    metallic, roughness : 0 to 1; 0 and 1 are matt.   emission : (3,) linear radiance of its own.
     Raises ConfigError; a missing file is found when the scene is built."""
 
     def __init__(
@@ -246,6 +247,9 @@ class Material(_Piece):
         max_size: int = 2048,
         unlit: bool = False,
         double_sided: bool = False,
+        metallic: float = 0.0,
+        roughness: float = 1.0,
+        emission: Vector = (0.0, 0.0, 0.0),
     ):
         self.image: data.Texture | None = None
         if image is not None and not isinstance(image, (str, os.PathLike)):
@@ -262,6 +266,9 @@ class Material(_Piece):
             uv_scale=uv_scale,
             unlit=unlit,
             double_sided=double_sided,
+            metallic=metallic,
+            roughness=roughness,
+            emission=emission,
         )
         self.tree = self._checked(MaterialConfig, tree, texture="image")
 

@@ -14,6 +14,7 @@ EXTRAS = {  # extra of setup.cfg -> (distributions, what they are for)
         "Blender: blinkgl import, a path tracer; better in an environment of its own, see docs/install.md",
     ),
     "learn": (("torch", "safetensors", "tensorboard"), "training"),
+    "onnx": (("onnx", "onnxscript", "onnxruntime"), "networks for programs without torch: eflow export"),
     "cluster": (("ray",), "many machines"),
     "physics": (("mujoco",), "scenes in which things fall"),
     "formats": (
@@ -25,7 +26,7 @@ EXTRAS = {  # extra of setup.cfg -> (distributions, what they are for)
     "docs": (("zensical", "mkdocstrings", "towncrier"), "the documentation as a site"),
     "dev": (("pytest", "pytest-xdist", "hypothesis", "build"), "tests and packaging"),
 }
-_PINNED = {"torch": "torch==2.13.0", "bpy": "bpy>=4.5,<4.6", "mujoco": "mujoco>=3.17,<4"}
+_PINNED = {"torch": "torch>=2.6", "bpy": "bpy>=4.5,<4.6", "mujoco": "mujoco>=3.17,<4"}
 
 
 def python() -> str:

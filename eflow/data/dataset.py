@@ -7,8 +7,9 @@ the same augmentation, whatever the number of workers and however often the run 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -78,10 +79,18 @@ class Mixture:
             self._cache = (epoch, [Key(epoch, position, *pick) for position, pick in enumerate(picks)])
         return self._cache[1]
 
-    def first(self, source: int, n: int) -> int:
-        """Number of the sample of an endless ``source`` that comes next when n samples of the run have been taken."""
+    def first(self, source: int, n: int, rank: int = 0, world: int = 1) -> int:
+        """Number of the sample of an endless ``source`` that comes next when n samples of the run have been taken,
+        every ``world``-th of them, beginning with ``rank``, by the process that asks."""
         epoch, position = divmod(n, self.epoch_length)
-        return epoch * self.counts[source] + sum(key.source == source for key in self.epoch(epoch)[:position])
+        if world == 1:
+            return epoch * self.counts[source] + sum(key.source == source for key in self.epoch(epoch)[:position])
+        ends = [self.epoch_length] * epoch + [position]
+        return sum(
+            key.source == source and (e * self.epoch_length + i) % world == rank
+            for e, end in enumerate(ends)
+            for i, key in enumerate(self.epoch(e)[:end])
+        )
 
     def key(self, n: int) -> Key:
         """The n-th sample of the run."""
@@ -252,7 +261,8 @@ def cropped(sample: dict, size: tuple[int, int], rng: np.random.Generator, name:
 
 class StepSampler(Sampler):
     """Batches of keys from training step ``start`` on, for one rank of ``world``: step s takes samples s·B … (s+1)·B -
-    1 of the mixture, rank r every world-th of them."""
+    1 of the mixture, rank r every world-th of them. Each rank renders an endless source of its own, whose samples it
+    takes one after the other."""
 
     def __init__(self, mixture: Mixture, batch: int, start: int, stop: int, rank: int = 0, world: int = 1):
         self.mixture, self.batch, self.start, self.stop, self.rank, self.world = (
@@ -268,10 +278,14 @@ class StepSampler(Sampler):
         return max(self.stop - self.start, 0)
 
     def __iter__(self) -> Iterator[list[Key]]:
+        own = (self.rank, self.world)
+        endless = [k for k, without_end in enumerate(self.mixture.endless) if without_end and self.world > 1]
+        numbers = {k: itertools.count(self.mixture.first(k, self.start * self.batch, *own)) for k in endless}
         for step in range(self.start, self.stop):
-            yield [
+            keys = [
                 self.mixture.key(n) for n in range(step * self.batch + self.rank, (step + 1) * self.batch, self.world)
             ]
+            yield [replace(key, index=next(numbers[key.source])) if key.source in numbers else key for key in keys]
 
 
 def collate(samples: list[dict]) -> dict:

@@ -1,16 +1,17 @@
-"""MVSEC as samples: image pairs dt = 1 or 4 apart, ground truth propagated through the 20
-Hz flow (Zhu et al., RSS 2018)."""
+"""MVSEC as samples: image pairs dt = 1 or 4 apart, ground truth propagated through the 20 Hz flow (Zhu et al., RSS
+2018); or the pairs, rows and ground truth of published tables (:data:`PROTOCOLS`)."""
 
 from __future__ import annotations
 
 import math
 import os
 import zipfile
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from blinkgl.errors import AssetError, EventDataError
+from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.columns import check_events, microseconds
 from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
 from blinkgl.io.images import npy_header, numpy_errors
@@ -21,6 +22,33 @@ HEIGHT, WIDTH = 260, 346
 CROP = 256
 HOOD_ROW = 193
 """Outdoors the car's hood fills the rows from here down."""
+TRUTHS = ("propagated", "scaled")
+"""Ground truth over a time that is no interval of the 20 Hz flow: pixels followed through field after field; or, as the
+code of the published tables has it for a time shorter than an interval, the field that it begins in times the share of
+its interval, even where the time goes on into the next one (0.10 to 0.23 px apart)."""
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """What a table is made of.
+
+    at : samples at "images", dt apart, or at the stamps of the "flow" (20 Hz). frames : of a sequence, the ranges
+    [first, end) of image or flow numbers that are scored; other sequences whole. hood : first row that is not scored
+    outdoors. truth : of :data:`TRUTHS`."""
+
+    at: str = "images"
+    frames: dict[str, tuple[tuple[int, int], ...]] = field(default_factory=dict)
+    hood: int = HOOD_ROW
+    truth: str = "propagated"
+
+
+PROTOCOLS = {
+    "all": Protocol(),
+    "ste-flownet": Protocol(frames={"outdoor_day1": ((9200, 9600), (10500, 10900))}, hood=192, truth="scaled"),
+    "e-raft": Protocol(at="flow", frames={"outdoor_day1": ((4356, 4706),)}),
+}
+"""``all``: every pair that has ground truth. ``ste-flownet``: images of outdoor_day1 as in the tables of Spike-FlowNet
+and STE-FlowNet, whose centre crop ends above row 192. ``e-raft``: 20 Hz, as E-RAFT's table."""
 
 
 class NpzRows:
@@ -63,39 +91,65 @@ class MvsecSource:
     """Samples of ``<seq>_data.hdf5`` + ``<seq>_gt_flow_dist.npz`` files at or below ``root``.
 
     Sample i of a sequence: events between images i - dt … i (old) and i … i + dt (new); ground truth over the same
-    time, by following pixels through the successive 20 Hz flow fields. ``mask``: pixels with an event in the new
-    window, inside the 256x256 centre crop, above the hood outdoors. Times: µs since the sequence's first image."""
+    time. ``mask``: pixels with an event in the new window, inside the 256x256 centre crop, above the hood outdoors.
+    Times: µs since the sequence's first image.
+
+    protocol : of :data:`PROTOCOLS`; at "flow" a sample's windows lie between stamps i - 1, i, i + 1 of the flow.
+    truth : of :data:`TRUTHS`; None: the protocol's.
+    Raises AssetError: no sequence, or one without the frames that the protocol scores. EventDataError: dt.
+    ConfigError: protocol, truth."""
 
     has_backward = False
 
-    def __init__(self, root: Path, dt: int = 1):
+    def __init__(self, root: Path, dt: int = 1, protocol: str = "all", truth: str | None = None):
         if dt not in (1, 4):
             raise EventDataError("MVSEC interval", where="dt", value=dt, accepted="1 or 4")
+        for name, value, known in (("protocol", protocol, PROTOCOLS), ("truth", truth or TRUTHS[0], TRUTHS)):
+            if value not in known:
+                raise ConfigError("unknown choice", where=name, value=value, accepted=", ".join(known))
+        self.protocol = PROTOCOLS[protocol]
+        if self.protocol.at == "flow" and dt != 1:
+            raise ConfigError(f"{protocol} has samples at 20 Hz", where="dt", value=dt, accepted="1")
         files = [root] if root.is_file() else sorted(root.rglob("*_data.hdf5"))
         if not files:
             raise AssetError("no *_data.hdf5", where=str(root))
-        self.dt, self._index, self._sequences = dt, [], []
+        self.dt, self.truth, self._index, self._sequences = dt, truth or self.protocol.truth, [], []
         for path in files:
             self._sequences.append(s := _MvsecSequence(path))
-            # Flow must cover [image i, image i + dt].
-            i0, i1 = np.searchsorted(s.image_us, (s.flow_us[0], s.flow_us[-1]))
-            self._index += [(s, i) for i in range(max(int(i0), dt), min(int(i1), len(s.image_us)) - dt)]
+            stamps = self._stamps(s)
+            # Flow must cover [stamp i, stamp i + dt], and events [stamp i - dt, stamp i].
+            i0, i1 = np.searchsorted(stamps, (s.flow_us[0], s.flow_us[-1]))
+            end = i1 + 1 if self.protocol.at == "flow" else i1  # its last stamp is a sample's end
+            found = range(max(int(i0), dt), min(int(end), len(stamps)) - dt)
+            ranges = self.protocol.frames.get(s.name)
+            scored = [i for i in found if ranges is None or any(a <= i < b for a, b in ranges)]
+            if not scored and ranges is not None:
+                raise AssetError(
+                    f"has none of the frames that {protocol} scores",
+                    where=str(path),
+                    value=f"{found.start} to {found.stop - 1}",
+                    accepted=" and ".join(f"{a} to {b - 1}" for a, b in ranges),
+                )
+            self._index += [(s, i) for i in scored]
+
+    def _stamps(self, s: _MvsecSequence) -> np.ndarray:
+        return s.image_us if self.protocol.at == "images" else s.flow_us
 
     def __len__(self) -> int:
         return len(self._index)
 
     def __getitem__(self, index: int) -> RawSample:
         s, i = self._index[index]
-        t_old, t, t_new = (int(s.image_us[j]) for j in (i - self.dt, i, i + self.dt))
-        old, new = s.window(t_old, t, i - self.dt, i), s.window(t, t_new, i, i + self.dt)
-        flow, valid = s.flow_between(t, t_new)
+        t_old, t, t_new = (int(self._stamps(s)[j]) for j in (i - self.dt, i, i + self.dt))
+        old, new = s.window(t_old, t), s.window(t, t_new)
+        flow, valid = s.flow_between(t, t_new, self.truth)
         mask = np.zeros((HEIGHT, WIDTH), bool)
         mask[new.y, new.x] = True
         inside = np.zeros_like(mask)
         top, left = (HEIGHT - CROP) // 2, (WIDTH - CROP) // 2
         inside[top : top + CROP, left : left + CROP] = True
         if "outdoor" in s.name:
-            inside[HOOD_ROW:] = False
+            inside[self.protocol.hood :] = False
         return RawSample(
             old, new, HEIGHT, WIDTH, f"{s.name}/{i:06d}", s.name, flow=flow, valid=valid, mask=mask & inside
         )
@@ -133,13 +187,14 @@ class _MvsecSequence:
     def __getstate__(self) -> dict:
         return {**self.__dict__, "_file": None, "_pid": None}
 
-    def window(self, t0: int, t1: int, image0: int, image1: int) -> Window:
+    def window(self, t0: int, t1: int) -> Window:
         """Events of [t0, t1) µs; the images' event indices say where to look, the times decide."""
         if self._pid != os.getpid():  # HDF5 handles do not survive a fork
             self._file, self._pid = open_hdf5(self.path), os.getpid()
         with hdf5_errors(self.path):
             table = event_table(self._file, self.path)
-        low, high = (int(np.clip(self._inds[k], 0, self._count)) for k in (image0, image1))
+        images = np.searchsorted(self.image_us, t0, side="right") - 1, np.searchsorted(self.image_us, t1)
+        low, high = (int(np.clip(self._inds[min(max(k, 0), len(self._inds) - 1)], 0, self._count)) for k in images)
         margin = 4096
         while True:
             i, j = max(low - margin, 0), min(high + margin, self._count)
@@ -155,9 +210,12 @@ class _MvsecSequence:
         e = events.window(t0, t1)
         return Window(e.x, e.y, e.t, e.p, t0, t1)
 
-    def flow_between(self, t0: int, t1: int) -> tuple[np.ndarray, np.ndarray]:
-        """flow (H, W, 2) float32 and valid over [t0, t1] µs; see :func:`propagate`."""
+    def flow_between(self, t0: int, t1: int, truth: str = "propagated") -> tuple[np.ndarray, np.ndarray]:
+        """flow (H, W, 2) float32 and valid over [t0, t1] µs; see :func:`propagate`. truth : of :data:`TRUTHS`."""
         k = int(np.clip(np.searchsorted(self.flow_us, t0, side="right") - 1, 0, len(self.flow_us) - 2))
+        interval = int(self.flow_us[k + 1] - self.flow_us[k])
+        if truth == "scaled" and t1 - t0 < interval:
+            return propagate([(self._field(k), (t1 - t0) / interval)])
         pieces = []
         while k < len(self.flow_us) - 1 and self.flow_us[k] < t1:
             a, b = int(self.flow_us[k]), int(self.flow_us[k + 1])

@@ -360,17 +360,23 @@ def detect_format(root: Path) -> str:
     )
 
 
-def open_source(path: str | os.PathLike, format: str = "auto", *, dt: int = 1) -> Source:
-    """The data set at ``path``; ``dt``: MVSEC's interval in images, 1 or 4.
+def open_source(
+    path: str | os.PathLike, format: str = "auto", *, dt: int = 1, protocol: str = "all", truth: str | None = None
+) -> Source:
+    """The data set at ``path``; of MVSEC alone ``dt``, its interval in images, 1 or 4, and ``protocol`` and ``truth``,
+    see :class:`~eflow.data.mvsec.MvsecSource`.
 
-    Raises AssetError: nothing there, or a damaged index; files of single samples are only
-    looked at when they are asked for."""
+    Raises ConfigError: those two, of another set. AssetError: nothing there, or a damaged index; files of single
+    samples are only looked at when they are asked for."""
     root = Path(path)
     kind = detect_format(root) if format == "auto" else format
     if kind == "mvsec":
         from eflow.data.mvsec import MvsecSource
 
-        return MvsecSource(root, dt)
+        return MvsecSource(root, dt, protocol, truth)
+    for name, value in (("protocol", protocol), ("truth", truth)):
+        if value not in ("all", None):
+            raise ConfigError("only of MVSEC", where=name, value=value, accepted="a set of MVSEC's layout")
     if not root.is_dir():
         raise AssetError("no such data set", where=str(root), accepted="a folder")
     if kind == "windows":

@@ -31,9 +31,9 @@ class WindowAttention(nn.Module):
         tokens = x.view(n, rows, s, columns, s, c).transpose(2, 3).reshape(n * rows * columns, s * s, c)
         q, k, v = self.qkv(tokens).view(len(tokens), s * s, 3, self.heads, c // self.heads).permute(2, 0, 3, 1, 4)
         mask = None
-        if down or right:
+        if torch.compiler.is_compiling() or down or right:  # a size that is not known yet may need it
             real = x.new_zeros(rows * s, columns * s, dtype=torch.bool)
-            real[:h, :w] = True
+            real[:h, :w].fill_(True)
             real = real.view(rows, s, columns, s).transpose(1, 2).reshape(1, rows * columns, 1, 1, s * s)
             mask = real.expand(n, -1, 1, s * s, -1).reshape(n * rows * columns, 1, s * s, s * s)
         out = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)

@@ -63,7 +63,7 @@ class DenseCorrelation:
         (level*side + dy)*side + dx with side = 2r+1, zero outside."""
         if self.slow:
             return lookup_slow(self.levels, coords, self.radius)
-        if coords.device.type == "cpu" and not torch.is_grad_enabled():
+        if coords.device.type == "cpu" and not torch.is_grad_enabled() and not torch.compiler.is_compiling():
             return _lookup_cpu(self.levels, coords, self.radius)
         n, h, w = self.shape
         flat = coords.permute(0, 2, 3, 1).reshape(-1, 2)
@@ -154,7 +154,8 @@ def expected_position(
 
     gain : () factor on the logits.   prior : () price of a displacement, 1/cells^2: ``prior`` times its squared length
     is taken off a target's logit.   first : token that the first row is of."""
-    if not torch.is_grad_enabled() and logits.shape[1] > _ROWS:  # row blocks that stay in the cache
+    # Row blocks that stay in the cache.
+    if not torch.is_grad_enabled() and not torch.compiler.is_compiling() and logits.shape[1] > _ROWS:
         parts = [
             expected_position(logits[:, s : s + _ROWS], h, w, prior, gain, first + s)
             for s in range(0, logits.shape[1], _ROWS)

@@ -3,10 +3,22 @@ upsampling (errors of px otherwise)."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 from torch import Tensor
 
 
-def fp32(x: Tensor) -> torch.autocast:
-    """Context in which autocast is off on ``x``'s device: an fp32 island. Cast the inputs with ``.float()``."""
-    return torch.autocast(x.device.type if x.device.type in ("cpu", "cuda") else "cpu", enabled=False)
+@contextmanager
+def fp32(x: Tensor) -> Iterator[None]:
+    """Context in which autocast, and on a card TF32, are off: an fp32 island. Cast the inputs with ``.float()``."""
+    with torch.autocast(x.device.type if x.device.type in ("cpu", "cuda") else "cpu", enabled=False):
+        tf32 = x.device.type == "cuda" and torch.backends.cuda.matmul.allow_tf32
+        if tf32:
+            torch.backends.cuda.matmul.allow_tf32 = False
+        try:
+            yield
+        finally:
+            if tf32:
+                torch.backends.cuda.matmul.allow_tf32 = True

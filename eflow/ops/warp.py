@@ -16,9 +16,10 @@ def backward_warp(image: Tensor, flow: Tensor, border: str = "zero") -> Tensor:
     h, w = image.shape[-2:]
     with fp32(image):
         at = (pixel_grid(h, w, flow) + flow.float()).permute(0, 2, 3, 1)
-        size = torch.tensor([w, h], device=flow.device, dtype=torch.float32)
         beyond = {"zero": "zeros", "replicate": "border"}[border]
-        return F.grid_sample(image.float(), (2 * at + 1) / size - 1, align_corners=False, padding_mode=beyond)
+        # (Not divided by a tensor [w, h]: a card would wait for its two numbers.)
+        normal = torch.stack([(2 * at[..., k] + 1) / size - 1 for k, size in ((0, w), (1, h))], -1)
+        return F.grid_sample(image.float(), normal, align_corners=False, padding_mode=beyond)
 
 
 def forward_warp(flow: Tensor) -> Tensor:

@@ -9,8 +9,10 @@ pytest.importorskip("torch")
 
 from blinkgl.config.recipe import all_groups
 from blinkgl.config.sequence import load_run
+from eflow.cli import run
 from eflow.config import load_train_config
 from eflow.models import NETWORKS, model_config
+from flow_data import blinkgl_set
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 FOLDER = REPOSITORY / "configs" / "eflow"
@@ -72,3 +74,49 @@ def test_one_per_network_and_a_smoke_run():
     models = {load_train_config(FOLDER / n).model.name for n in TRAINING}
     assert models == set(NETWORKS)
     assert {"smoke.yaml", "eflowformer.yaml", "h100_30min.yaml"} <= set(TRAINING)
+
+
+def test_what_is_printed_is_what_is_trained(tmp_path, capsys):
+    """--print-config: every key, paths absolute; read again it is the same configuration, from any folder."""
+    (tmp_path / "c.yaml").write_text(
+        "model: {name: eraft, size: tiny}\ndata: {train: [{path: set}], crop: [64, 64]}\noptim: {steps: 7}\n"
+    )
+    words = ["train", str(tmp_path / "c.yaml"), "--set", "optim.lr=1e-3", "--print-config"]
+    assert run(words) == 0
+    (tmp_path / "elsewhere").mkdir()
+    again = tmp_path / "elsewhere" / "printed.yaml"
+    again.write_text(printed := capsys.readouterr().out)
+    wanted = load_train_config(tmp_path / "c.yaml", ["optim.lr=1e-3"])
+    assert load_train_config(again) == wanted and wanted.optim.lr == 1e-3
+    assert str(tmp_path / "set") in printed and "picture_every: 2000" in printed and "match_weight" in printed
+
+
+def test_a_training_from_the_command_line_alone(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    blinkgl_set(tmp_path / "set", sequences=1, labels=1)
+    words = ["train", "--model", "ev_flownet-tiny", "--data", "set", "--set", "model.width=4", "--set", "data.batch=1"]
+    assert run([*words, "--out", "run", "--set", "optim.steps=1", "--quiet"]) == 0, capsys.readouterr().err
+    trained = load_train_config("run/config.yaml")
+    assert trained.model.name == "ev_flownet" and trained.data.train[0].path == str(tmp_path / "set")
+    assert run([*words, "--data", "r.yaml", "--minutes", "5", "--print-config"]) == 0
+    (tmp_path / "p.yaml").write_text(capsys.readouterr().out)
+    asked = load_train_config("p.yaml")
+    assert asked.optim.minutes == 5 and [s.online for s in asked.data.train] == [False, True]
+    mended = load_train_config("p.yaml", model={"name": "eraft"}, data=["other"])
+    assert mended.model.name == "eraft" and mended.data.train[0].path.endswith("/other") and mended.optim.minutes == 5
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (["--out", "run"], "no network to train; expected a YAML file, or --model"),
+        (["--model", "eraft", "--out", "run"], "nothing to train on; expected a YAML file, or --data"),
+        (["--model", "raft", "--data", "set", "--out", "run"], "--model: unknown model"),
+        (["--model", "eraft", "--data", "set"], "--out: no run folder"),
+    ],
+)
+def test_a_training_that_was_said_in_part(words, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run(["train", *words]) == 2
+    err = capsys.readouterr().err
+    assert said in err and err.count("\n") == 1 and not list(tmp_path.iterdir())

@@ -3,6 +3,8 @@
 import json
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +17,7 @@ from blinkgl.errors import ConfigError, EventDataError  # noqa: E402
 from eflow.checkpoint import newest  # noqa: E402
 from eflow.cli import run  # noqa: E402
 from eflow.config import load_train_config  # noqa: E402
-from eflow.data.dataset import ENDLESS, Mixture  # noqa: E402
+from eflow.data.dataset import ENDLESS, Mixture, StepSampler  # noqa: E402
 from eflow.data.online import MIX, drawn_spans, open_online  # noqa: E402
 from eflow.train import train  # noqa: E402
 from small_recipe import RECIPE, asked, said  # noqa: E402
@@ -61,6 +63,58 @@ def test_another_seed_another_split_other_sequences(recipe):
     assert flows(0, "train") == flows(0, "train") and not flows(0, "train") & flows(1, "train")
     assert {name.split("_")[0] for name in names(0, "train")} <= {"one", "two"}
     assert {name.split("_")[0] for name in names(0, "test")} == {"judge"}
+
+
+def test_ranks_take_their_own_streams_one_sample_after_the_other():
+    """Of a stream of its own each rank takes the samples 0, 1, 2 …; of a folder they share the order of one process."""
+    mixture = Mixture([None, 10, None], [1.0, 0.3, 0.5], seed=3)
+    batch, world, steps = 6, 3, 1600  # beyond an epoch
+    assert steps * batch > mixture.epoch_length
+    alone = [key for keys in StepSampler(mixture, batch, 0, steps) for key in keys]
+    ranks = [list(StepSampler(mixture, batch, 0, steps, rank, world)) for rank in range(world)]
+    for rank, taken in enumerate(ranks):
+        mine = [key for keys in taken for key in keys]
+        assert [(k.epoch, k.position, k.source) for k in mine] == [
+            (k.epoch, k.position, k.source) for k in alone[rank::world]
+        ]
+        assert [k.index for k in mine if k.source == 1] == [k.index for k in alone[rank::world] if k.source == 1]
+        for endless in (0, 2):
+            numbers = [k.index for k in mine if k.source == endless]
+            assert numbers == list(range(len(numbers)))
+        for start in (7, 1500):
+            assert list(StepSampler(mixture, batch, start, steps, rank, world)) == taken[start:], "resumed"
+            count = sum(k.source == 2 for keys in taken[:start] for k in keys)
+            assert mixture.first(2, start * batch, rank, world) == count
+
+
+@pytest.mark.slow
+def test_two_processes_render_for_themselves(recipe, tmp_path):
+    """torchrun: each rank its own sequences; the run is resumed, and its folder is that of any run."""
+    path = run_file(tmp_path, {"recipe": str(recipe), "online": True, "workers": 1, "samples": 2})
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1"}
+    words = [
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc-per-node",
+        "2",
+        "-m",
+        "eflow.cli",
+        "train",
+        str(path),
+    ]
+    for more in (["--set", "run.time_limit=0.0001"], ["--resume"]):
+        done = subprocess.run(
+            [sys.executable, *words, "--out", str(tmp_path / "run"), "--quiet", *more],
+            capture_output=True,
+            text=True,
+            timeout=300,
+            env=environment,
+        )
+        assert done.returncode == 0, done.stderr[-3000:]
+    assert int(newest(tmp_path / "run").name) == 12
+    line = json.loads((tmp_path / "run" / "log.jsonl").read_text().splitlines()[-1])
+    assert line["rendered"] >= 2 and line["failed_sequences"] == 0
 
 
 def test_windows_lie_inside_and_lengths_are_log_uniform():

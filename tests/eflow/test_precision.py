@@ -91,19 +91,19 @@ def test_progress_tells_rate_and_time_left_by_steps_and_by_clock(capsys):
     with TrainProgress(100, 0, 4, True, "cpu, fp32", clock=lambda: now[0]) as progress:
         assert lines() == ["training: 100 steps of 4 samples on cpu, fp32"]
         now[0] += 2.0
-        progress.update(1, 3.0, 5.0)
+        progress.update(1, [(3.0, 5.0)])
         assert lines() == ["step 1/100  loss 3.00  EPE 5.00 px  2.00 samples/s  0:03:18 left"], "at once, with a rate"
         for step in range(2, 6):
             now[0] += 2.0
-            progress.update(step, 3.0, 5.0)
+            progress.update(step, [(3.0, 5.0)])
         assert lines() == []
         now[0] += 2.0
-        progress.update(6, 3.0, 5.0)
+        progress.update(6, [(3.0, 5.0)])
         assert lines() == ["step 6/100  loss 3.00  EPE 5.00 px  2.00 samples/s  0:03:08 left"], "every ten seconds"
     with TrainProgress(100, 50, 4, True, "cpu, fp32", minutes=1.0, began=now[0] - 10, clock=lambda: now[0]) as progress:
         assert lines() == ["training: 50 steps of 4 samples on cpu, fp32, 0:00:50 at most"]
         now[0] += 2.0
-        progress.update(51, 3.0, 5.0)
+        progress.update(51, [(3.0, 5.0)])
         assert lines() == [
             "step 51/100  loss 3.00  EPE 5.00 px  2.00 samples/s  0:00:48 left, the time limit, at about step 75"
         ]

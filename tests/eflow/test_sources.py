@@ -1,9 +1,12 @@
 """Every layout read from files of that layout; damaged ones refused by name."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
-from blinkgl.errors import AssetError, BlinkGLError
+from blinkgl.errors import AssetError, BlinkGLError, ConfigError
+from eflow.data import mvsec
 from eflow.data.mvsec import HOOD_ROW, MvsecSource, NpzRows, propagate
 from eflow.data.sources import detect_format, open_source, read_flow
 from flow_data import SPAN, blinkflow_set, blinkgl_set, constant_flow, dsec_set, moving_events, mvsec_set
@@ -89,6 +92,85 @@ def test_mvsec(tmp_path, dt, compressed):
 
 def test_mvsec_hood(tmp_path):
     assert not open_source(mvsec_set(tmp_path, "outdoor_day1"), "mvsec")[0].mask[HOOD_ROW:].any()
+
+
+def outdoor(root, fields=7):
+    """outdoor_day1 whose flow grows: 1, 2, 3 … px per interval."""
+    mvsec_set(root, "outdoor_day1")
+    path = root / "outdoor_day1_gt_flow_dist.npz"
+    stored = np.load(path)
+    grow = np.arange(1, fields + 1)[:, None, None]
+    np.savez(path, timestamps=stored["timestamps"], **{k: stored[k] * grow for k in ("x_flow_dist", "y_flow_dist")})
+    return root
+
+
+def protocol(monkeypatch, name, **changes):
+    monkeypatch.setitem(mvsec.PROTOCOLS, name, dataclasses.replace(mvsec.PROTOCOLS[name], **changes))
+
+
+def test_published_protocols_of_mvsec_are_as_published():
+    ste, eraft = mvsec.PROTOCOLS["ste-flownet"], mvsec.PROTOCOLS["e-raft"]
+    assert ste.frames == {"outdoor_day1": ((9200, 9600), (10500, 10900))} and eraft.frames["outdoor_day1"] == (
+        (4356, 4706),
+    )
+    assert (ste.at, ste.hood, ste.truth, eraft.at, eraft.hood) == ("images", 192, "scaled", "flow", 193)
+
+
+def test_mvsec_frames_of_a_protocol(tmp_path, monkeypatch):
+    root = outdoor(tmp_path)
+    everything = [s.name for s in MvsecSource(root)]
+    assert everything == [f"outdoor_day1/{i:06d}" for i in range(1, 9)]
+    with pytest.raises(AssetError, match="none of the frames that ste-flownet scores .*1 to 8.*9200 to 9599 and 10500"):
+        MvsecSource(root, protocol="ste-flownet")
+    protocol(monkeypatch, "ste-flownet", frames={"outdoor_day1": ((2, 4), (6, 7)), "indoor_flying1": ((0, 1),)})
+    source = MvsecSource(root, protocol="ste-flownet")
+    assert [s.name[-1] for s in source] == ["2", "3", "6"]
+    # rows 2 … 191: the centre crop begins at row 2, and the hood at 192
+    mask = source[0].mask
+    rows = np.flatnonzero(mask.any(1))
+    assert rows[0] == 2 and rows[-1] == 191 and MvsecSource(root)[1].mask[192].any()
+
+
+def test_both_conventions_of_mvsecs_ground_truth(tmp_path):
+    """Images at 31 Hz, flow at 20: image 3 is at 96.8 ms, and its interval goes over the stamp at 100."""
+    root = outdoor(tmp_path)
+    interval, begin = 1 / 31 * 20, 3 / 31 * 20
+    first, second = 2 - begin, interval - (2 - begin)  # shares of the fields of 2 and 3 px
+    middle = (100, 150)
+    for truth, u in (("propagated", 2 * first + 3 * second), ("scaled", 2 * interval)):
+        sample = MvsecSource(root, truth=truth)[2]
+        assert sample.name.endswith("000003") and sample.valid[middle]
+        assert sample.flow[middle] == pytest.approx((u, -u / 2), abs=1e-3), truth
+    inside = [MvsecSource(root, truth=t)[1].flow for t in mvsec.TRUTHS]  # image 2: within one field
+    np.testing.assert_allclose(*inside, atol=1e-6)
+    four = [MvsecSource(root, 4, truth=t)[0].flow for t in mvsec.TRUTHS]  # longer than a field: followed, either way
+    assert np.array_equal(*four)
+
+
+def test_mvsec_at_20_hz(tmp_path, monkeypatch):
+    protocol(monkeypatch, "e-raft", frames={"outdoor_day1": ((2, 4),)})
+    source = MvsecSource(outdoor(tmp_path), protocol="e-raft")
+    assert [s.name[-1] for s in source] == ["2", "3"]
+    sample = source[0]
+    assert (sample.old.t0, sample.new.t0, sample.new.t1) == (50_000, 100_000, 150_000)
+    assert sample.flow[100, 150] == pytest.approx((3, -1.5), abs=1e-4), "field 2 as it is"
+    e = moving_events(260, 346, 0, int(12 / 31 * 1e6), n=20000)
+    assert abs(len(sample.new) - len(e.window(100_000, 150_000))) <= 1
+    protocol(monkeypatch, "e-raft", frames={})
+    assert [s.name[-1] for s in MvsecSource(outdoor(tmp_path / "all"), protocol="e-raft")] == list("12345")
+
+
+def test_what_is_asked_of_mvsec_alone(tmp_path):
+    root = mvsec_set(tmp_path / "m")
+    for options, message in (
+        ({"protocol": "kitti"}, "protocol: unknown choice .*all, ste-flownet, e-raft"),
+        ({"truth": "guessed"}, "truth: unknown choice"),
+        ({"protocol": "e-raft", "dt": 4}, "dt"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            open_source(root, **options)
+    with pytest.raises(ConfigError, match="protocol: only of MVSEC"):
+        open_source(blinkgl_set(tmp_path / "b", sequences=1, labels=1), protocol="e-raft")
 
 
 def test_propagation_through_successive_fields():

@@ -40,7 +40,7 @@ from blinkgl.scene.shapes.deformer import gait
 from blinkgl.scene.surfaces.coats import COATS, coat
 from blinkgl.scene.surfaces.images import content_hash, decode_image, photographs
 from blinkgl.scene.surfaces.textures import procedural_texture
-from blinkgl.scene.types import Material, Mesh, Part, PosePath, Scene, SceneObject, Texture
+from blinkgl.scene.types import Gloss, Material, Mesh, Part, PosePath, Scene, SceneObject, Texture
 from blinkgl.scene.worlds.pool import resolve
 from blinkgl.scene.worlds.sky import with_environment
 
@@ -288,7 +288,10 @@ def _material(config: MaterialConfig, base: Path, where: str, texture: Texture |
                 accepted="one of: " + ", ".join(bundled) if bundled else "run 'pip install scikit-image'",
             )
         texture = _texture(bundled[config.photograph], config.max_size, f"{where}.photograph", config.photograph)
-    return Material(texture, config.color, config.uv_scale, config.unlit, config.double_sided)
+    shines = config.metallic > 0 or config.roughness < 1
+    gloss = Gloss(config.metallic, config.roughness) if shines else None
+    plain = texture, config.color, config.uv_scale, config.unlit, config.double_sided
+    return Material(*plain, gloss=gloss, emission=config.emission)
 
 
 def _texture(path: Path, max_size: int, where: str, given: str) -> Texture:

@@ -40,13 +40,13 @@ def test_everything_compiles_and_nothing_is_unused(shader):
     result = json.loads(out)
     assert status == 0 and result["errors"] == [] and result["unused"] == []
     assert result["programs"] == {
-        "colour.glsl": 88,
-        "debug.glsl": 13,
+        "colour.glsl": 118,
+        "debug.glsl": 14,
         "downsample.glsl": 2,
-        "label.glsl": 819,
-        "luminance.glsl": 214,
-        "shadow.glsl": 13,
-        "velocity.glsl": 26,
+        "label.glsl": 882,
+        "luminance.glsl": 364,
+        "shadow.glsl": 14,
+        "velocity.glsl": 28,
     }
 
 

@@ -385,6 +385,13 @@ def calibrate(
     still: Annotated[
         bool, typer.Option("--still", help="No frames: a scene that stands still in constant light. Noise alone.")
     ] = False,
+    flicker: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HZ,CONTRAST",
+            help="No frames: an even scene under light that goes as 1 + CONTRAST sin, HZ times a second. Thresholds.",
+        ),
+    ] = None,
     emulator: Annotated[str, typer.Option("--emulator", "-e", help="esim, v2e or voltmeter.")] = "esim",
     sensor: Annotated[str | None, typer.Option("--sensor", help="A sensor whose values the fit begins with.")] = None,
     overrides: Annotated[
@@ -412,6 +419,7 @@ def calibrate(
         frames,
         out,
         still=still,
+        flicker=flicker,
         emulator=emulator,
         sensor=sensor,
         overrides=overrides or [],

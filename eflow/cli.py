@@ -131,6 +131,7 @@ def render(
     window_ms: WindowMs = None,
     min_events: Annotated[int, typer.Option(min=1, help="Fewest events in each of a sample's two windows.")] = 40,
     max_flow: Annotated[float, typer.Option(help="Longest median flow of a sample, px.")] = 40.0,
+    min_density: Annotated[float, typer.Option(help="Fewest events per pixel and px of mean flow.")] = 0.0,
     split: Annotated[str, typer.Option(help="Whose groups: train or test.")] = "train",
     seed: Annotated[int, typer.Option(min=0, help="Other windows for each.")] = 0,
     overrides: Overrides = None,
@@ -150,10 +151,11 @@ def render(
         samples=per_sequence,
         min_events=min_events,
         max_flow=max_flow,
+        min_density=min_density,
         set=tuple(overrides or ()),
         workers=workers,
     )
-    kept = {key: getattr(source, key) for key in ("set", "window_ms", "min_events", "max_flow")}
+    kept = {key: getattr(source, key) for key in ("set", "window_ms", "min_events", "max_flow", "min_density")}
     about = {"recipe": Path(recipe).name, "split": split, "seed": seed, "per_sequence": per_sequence, **kept}
     refuse_existing(Path(out))  # before a worker has been started
     with interruptible(signal.SIGTERM), open_online(source, seed, split=split) as stream:

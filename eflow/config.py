@@ -210,6 +210,13 @@ class SourceConfig(Config):
     )
     min_events: int = Field(1, ge=1, le=10**9, description="fewest events in each of a sample's two windows")
     max_flow: float = Field(400.0, gt=0, le=1e4, description="longest median flow of a sample, px")
+    min_density: float = Field(
+        0.0,
+        ge=0,
+        le=1e3,
+        description="fewest events per pixel of the new window and px of its mean flow (0.3 px where that is shorter): "
+        "below 0.01 hardly anything can be told",
+    )
 
     @rule("path", "recipe", "online")
     def _folder_or_recipe(path, recipe, online):

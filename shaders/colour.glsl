@@ -1,19 +1,32 @@
 #version 430 core
-// Colour pass: linear radiance, rgb, into one target. Material variants as in luminance.glsl: TEXTURED, LIT, TWO_SIDED, LIGHTS, HUED.
+// Colour pass: linear radiance, rgb, into one target. Material variants as in luminance.glsl: TEXTURED, LIT, TWO_SIDED, LIGHTS, HUED,
+// TINTED, EMISSIVE, GLOSSY, BUMPED, GLOSS_MAP, MASKED.
 // SHOW_LOOKUP, the shader debugger's: also writes what was looked up, see lookup.glsl.
 
+#if defined(LIT) && (defined(GLOSSY) || defined(BUMPED))
+#define SURFACED
+#endif
 #ifdef LIT
 #define NEEDS_NORMAL
 #endif
-#ifdef TEXTURED
+#if defined(TEXTURED) || defined(EMISSION_MAP) || defined(GLOSS_MAP) || defined(BUMPED)
 #define NEEDS_UV
 #endif
-#if defined(LAMPS) || defined(SHADOWS)
+#ifdef TINTED
+#define NEEDS_TINT
+#endif
+#ifdef BUMPED
+#define NEEDS_TANGENT
+#endif
+#if defined(LAMPS) || defined(SHADOWS) || defined(GLOSSY)
 #define NEEDS_LOCAL
 #endif
 #include "vertex.glsl"
 
 #ifdef FRAGMENT_SHADER
+#if defined(SURFACED) || defined(EMISSION_MAP)
+#include "maps.glsl"
+#endif
 #ifdef SHOW_LOOKUP
 #include "lookup.glsl"
 #endif
@@ -22,8 +35,18 @@ uniform vec3 base_color;
 #ifdef TEXTURED
 uniform sampler2D albedo;
 #endif
+#ifdef EMISSIVE
+uniform vec3 emission;
+#ifdef EMISSION_MAP
+uniform sampler2D emission_map;
+uniform mat3x2 emission_map_place;
+#endif
+#endif
 #ifdef LIT
 #include "light.glsl"
+#endif
+#ifdef SURFACED
+#include "surface.glsl"
 #endif
 #ifdef FOG
 #include "fog.glsl"
@@ -33,11 +56,22 @@ uniform sampler2D albedo;
 void main()
 {
     vec3 radiance = base_color;
-#ifdef TEXTURED
+#ifdef NEEDS_UV
     vec2 uv = within_reach(uv); // hides the varying
+#endif
+#ifdef TEXTURED
     radiance *= texture(albedo, uv).rgb;
 #endif
-#ifdef LIT
+#ifdef TINTED
+    radiance *= tint;
+#endif
+#ifdef SURFACED
+#ifdef TWO_SIDED
+    float side = gl_FrontFacing ? 1.0 : -1.0;
+#else
+    const float side = 1.0;
+#endif
+#elif defined(LIT)
 #ifdef TWO_SIDED
     vec3 facing = gl_FrontFacing ? normal : -normal;
 #else
@@ -47,16 +81,46 @@ void main()
 #else
     const float light = 1.0;
 #endif
+    vec3 added = vec3(0.0);
+#ifdef SURFACED
+#ifdef BUMPED
+    vec4 along = tangent;
+#else
+    const vec4 along = vec4(0.0);
+#endif
+#ifndef NEEDS_UV
+    const vec2 uv = vec2(0.0);
+#endif
+#ifdef GLOSSY
+    Spot spot = Spot(radiance, normal, along, local, uv);
+    added = radiated(spot, side);
+    ILLUMINANT light = shown_matt;
+    added -= radiance * light;
+#else
+    radiated(Spot(ILLUMINANT(1.0), normal, along, vec3(0.0), uv), side);
+    ILLUMINANT light = shown_matt;
+#endif
+#endif
+#ifdef EMISSIVE
+#ifdef EMISSION_MAP
+    added += emission * map_at(emission_map, emission_map_place * vec3(uv, 1.0), 0.0).rgb;
+#else
+    added += emission;
+#endif
+#endif
 #ifdef SHOW_LOOKUP
 #ifdef HUED
     vec3 weighed = radiance * vec3(0.2126, 0.7152, 0.0722); // Rec. 709
-    show_lookup(radiance, dot(weighed, light) / max(weighed.r + weighed.g + weighed.b, 1e-30));
+    show_lookup(radiance, dot(weighed, light) / max(weighed.r + weighed.g + weighed.b, 1e-30), added);
 #else
-    show_lookup(radiance, light);
+    show_lookup(radiance, light, added);
 #endif
 #endif
 #ifdef LIT
     radiance *= light;
+#endif
+#if defined(EMISSIVE) || defined(GLOSSY)
+    radiance += added;
 #endif
 #ifdef FOG
     radiance = in_fog(radiance);

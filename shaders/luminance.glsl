@@ -11,40 +11,61 @@
 //            FOG        seen through fog, see fog.glsl
 //            LIGHTS     more light than that, see lights.glsl; HUED: the albedo is r, g, b, each times its share of the
 //                       luminance, since coloured light takes of each as much as it has
+//            TINTED     times the vertices' colours
+//            EMISSIVE   light of its own, EMISSION_MAP: from a texture of its luminance
+//            GLOSSY, BUMPED, GLOSS_MAP   see surface.glsl
+//            MASKED     has holes, see vertex.glsl
 //            SHOW_LOOKUP  the shader debugger's: also writes what was looked up, see lookup.glsl
 
-#if defined(RATE) && (defined(TEXTURED) || defined(LIT) || defined(FOG))
+#if defined(RATE) && (defined(TEXTURED) || defined(LIT) || defined(FOG) || defined(TINTED))
 #define CHANGES
 #endif
+#if defined(LIT) && (defined(GLOSSY) || defined(BUMPED))
+#define SURFACED
+#endif
 
-#ifdef TEXTURED
+#if defined(TEXTURED) || defined(EMISSION_MAP) || defined(GLOSS_MAP) || defined(BUMPED)
 #define NEEDS_UV
 #endif
 #ifdef LIT
 #define NEEDS_NORMAL
 #endif
-#if defined(CHANGES) || defined(LAMPS) || defined(SHADOWS)
+#ifdef TINTED
+#define NEEDS_TINT
+#endif
+#ifdef BUMPED
+#define NEEDS_TANGENT
+#endif
+#if defined(CHANGES) || defined(LAMPS) || defined(SHADOWS) || defined(GLOSSY)
 #define NEEDS_LOCAL
 #endif
 #ifdef CHANGES
 #define NEEDS_RATE
 #ifdef LIT
 #define NEEDS_NORMAL_RATE
-#ifdef LAMPS
+#if defined(LAMPS) || defined(GLOSSY)
 #define NEEDS_LOCAL_RATE
+#endif
+#ifdef BUMPED
+#define NEEDS_TANGENT_RATE
 #endif
 #endif
 #endif
 #ifdef HUED
 #define ALBEDO vec3
 #define CHANNELS rgb
+#define WEIGHTS vec3(0.2126, 0.7152, 0.0722) // of the luminance, Rec. 709, which the albedo has in it
 #else
 #define ALBEDO float
 #define CHANNELS r
+#define WEIGHTS 1.0
 #endif
 #include "vertex.glsl"
 
 #ifdef FRAGMENT_SHADER
+#if defined(SURFACED) || defined(EMISSION_MAP)
+#include "maps.glsl"
+#endif
 #ifdef SHOW_LOOKUP
 #include "lookup.glsl"
 #endif
@@ -70,17 +91,37 @@ const float every = 1.0;
 #ifdef TEXTURED
 uniform sampler2D albedo;
 #else
-uniform float albedo;
+uniform ALBEDO albedo;
+#endif
+#ifdef TINTED
+#ifdef HUED
+#define TINT(colour) colour
+#else
+uniform vec3 tint_shares; // of r, g and b in the luminance of what is tinted
+#define TINT(colour) dot(colour, tint_shares)
+#endif
+#endif
+#ifdef EMISSIVE
+uniform float emission; // luminance
+#ifdef EMISSION_MAP
+uniform sampler2D emission_map; // of its luminance
+uniform mat3x2 emission_map_place;
+#endif
 #endif
 #ifdef LIT
 #include "light.glsl"
+#endif
+#ifdef SURFACED
+#include "surface.glsl"
 #endif
 #include "guard.glsl"
 
 void main()
 {
-#ifdef TEXTURED
+#ifdef NEEDS_UV
     vec2 uv = within_reach(uv); // hides the varying
+#endif
+#ifdef TEXTURED
 #ifdef TAPS4
     // At the centres of the pixel's four quarters, each filtered for a quarter: a box of two by two samples of the
     // texture.
@@ -98,14 +139,6 @@ void main()
 #else
     ALBEDO luminance = albedo;
 #endif
-#ifdef LIT
-#ifdef TWO_SIDED
-    vec3 facing = gl_FrontFacing ? normal : -normal;
-#else
-    vec3 facing = normal;
-#endif
-    ILLUMINANT light = irradiance(facing);
-#endif
 #ifdef RATE
     ALBEDO change = ALBEDO(0.0);
 #endif
@@ -122,7 +155,67 @@ void main()
     change = texture_rate(albedo, uv, motion, every);
 #endif
 #endif
+#endif
+#ifdef TINTED
+#ifdef CHANGES
+    change = change * TINT(tint) + luminance * TINT(seen_rate(tint, motion));
+#endif
+    luminance *= TINT(tint);
+#endif
+    ALBEDO unlit = luminance;
 #ifdef LIT
+#ifdef SURFACED
+#ifdef TWO_SIDED
+    float side = gl_FrontFacing ? 1.0 : -1.0;
+#else
+    const float side = 1.0;
+#endif
+    Spot spot = Spot(unlit / WEIGHTS, normal, vec4(0.0), vec3(0.0), vec2(0.0));
+#ifdef BUMPED
+    spot.along = tangent;
+#endif
+#ifdef NEEDS_LOCAL
+    spot.at = local;
+#endif
+#ifdef NEEDS_UV
+    spot.coordinates = uv;
+#endif
+#if defined(EVERY) && !defined(RATE)
+    map_bias = -log2(every);
+#endif
+#ifdef CHANGES
+    // L of the surface as a whole, a little before and after.
+    Spot spot_change = Spot(change / WEIGHTS, seen_rate(normal, motion), vec4(0.0), seen_rate(local, motion), vec2(0.0));
+#ifdef BUMPED
+    spot_change.along.xyz = seen_rate(tangent.xyz, motion);
+#endif
+#ifdef NEEDS_UV
+    spot_change.coordinates = seen_rate(uv, motion);
+    map_x = seen_rate(uv, vec2(-1.0 / every, 0.0));
+    map_y = seen_rate(uv, vec2(0.0, -1.0 / every));
+#endif
+#ifdef DEFORM
+    spot_change.normal += normal_rate; // and as the surface itself turns
+#ifdef NEEDS_LOCAL_RATE
+    spot_change.at += local_rate;
+#endif
+#ifdef BUMPED
+    spot_change.along.xyz += tangent_rate;
+#endif
+#endif
+#endif
+    luminance = radiated(spot, side) * WEIGHTS;
+#ifdef CHANGES
+    change = radiated_rate(spot, spot_change, side, length(motion)) * WEIGHTS;
+#endif
+#else
+#ifdef TWO_SIDED
+    vec3 facing = gl_FrontFacing ? normal : -normal;
+#else
+    vec3 facing = normal;
+#endif
+    ILLUMINANT light = irradiance(facing);
+#ifdef CHANGES
     // L = albedo E(n): the product rule. ``luminance`` is still the albedo here, and the normal seen changes as the
     // surface slides by.
     vec3 facing_rate = seen_rate(facing, motion);
@@ -148,19 +241,8 @@ void main()
     change = change * light + luminance * irradiance_rate(facing, facing_rate);
 #endif
 #endif
-#endif
-#ifdef SHOW_LOOKUP
-#ifdef HUED
-    float unlit = luminance.r + luminance.g + luminance.b;
-    show_lookup(vec3(unlit), dot(luminance, light) / max(unlit, 1e-30));
-#elif defined(LIT)
-    show_lookup(vec3(luminance), light);
-#else
-    show_lookup(vec3(luminance), 1.0);
-#endif
-#endif
-#ifdef LIT
     luminance *= light;
+#endif
 #endif
 #ifdef HUED
     // The albedo has the luminance's weights in it.
@@ -169,8 +251,44 @@ void main()
     float seen_change = change.r + change.g + change.b;
 #endif
 #else
-#define seen luminance
-#define seen_change change
+    float seen = luminance;
+#ifdef RATE
+    float seen_change = change;
+#endif
+#endif
+#ifdef EMISSIVE
+#ifdef EMISSION_MAP
+    vec2 emission_uv = emission_map_place * vec3(uv, 1.0);
+#ifdef CHANGES
+    seen_change += emission * texture_rate(emission_map, emission_uv, motion, every).r;
+#endif
+    float own = emission * map_at(emission_map, emission_uv, -log2(every)).r;
+#else
+    float own = emission;
+#endif
+#endif
+#ifdef SHOW_LOOKUP
+#ifdef SURFACED
+    ILLUMINANT light = shown_matt;
+#elif !defined(LIT)
+    const float light = 1.0;
+#endif
+#ifdef HUED
+    float known = unlit.r + unlit.g + unlit.b, seen_light = dot(unlit, vec3(light)) / max(known, 1e-30);
+#else
+    float known = unlit, seen_light = light;
+#endif
+    float added = 0.0;
+#ifdef GLOSSY
+    added += seen - known * seen_light;
+#endif
+#ifdef EMISSIVE
+    added += own;
+#endif
+    show_lookup(vec3(known), seen_light, vec3(added));
+#endif
+#ifdef EMISSIVE
+    seen += own;
 #endif
 #ifdef FOG
 #ifdef CHANGES

@@ -347,6 +347,8 @@ WRONG = [
     ("fixed", lambda d: b.calibrate(d / "a.h5", fixed=3)),
     ("emulator", lambda d: b.calibrate(d / "a.h5", emulator="jaer")),
     ("starts", lambda d: b.calibrate(d / "a.h5", starts=0)),
+    ("flicker", lambda d: b.calibrate(d / "a.h5", flicker=50)),
+    ("flicker[1]", lambda d: b.calibrate(d / "a.h5", flicker=(50, 1.5))),
     ("frame_delay_ms", lambda d: b.calibrate(d / "a.h5", frame_delay_ms="soon")),
     ("{d}/a.h5", lambda d: b.calibrate(d / "a.h5")),
     ("--still", lambda d: b.calibrate(d / "a.h5", d, still=True)),

@@ -1,6 +1,8 @@
-"""What light costs: processor time of an event frame with each effect, in turns, as ratios to the plain sun and sky.
+"""What light and materials cost: processor time of an event frame with each effect, in turns, as ratios to the plain
+sun and sky, and to matt surfaces.
 
-    python -m blinkgl.tools.bench_light [CONFIG] [--frames 24] [--rounds 5] [--set a.b=c …] [--json FILE]
+    python -m blinkgl.tools.bench_light [CONFIG] [--materials] [--only NAME …] [--frames 24] [--rounds 5]
+                                        [--set a.b=c …] [--json FILE]
 
 Every round draws the same frames with every light, one light after the other, so that a machine's moods are
 everybody's; the figure is the median over the rounds. Labels and colour are not drawn.
@@ -26,7 +28,7 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.lights import lamp_pose
 from blinkgl.scene.motion.paths import StaticPath
-from blinkgl.scene.types import Lamp, Light, Scene
+from blinkgl.scene.types import Gloss, Lamp, Light, Map, Mask, Part, Scene, SceneObject, Texture
 
 
 def lights(plain: Light) -> dict[str, Light]:
@@ -50,10 +52,36 @@ def lights(plain: Light) -> dict[str, Light]:
     }
 
 
-def measure(gl, scene: Scene, config, frames: int, rounds: int) -> dict[str, dict[str, float]]:
-    """By light: ms of processor time per frame, and times the plain light's, medians over the rounds."""
+def dressed(scene: Scene) -> dict[str, Scene]:
+    """By what all its objects are made of; the first is as it is."""
+    bumps = Map(Texture(np.random.default_rng(0).integers(96, 160, (256, 256, 3)).astype(np.uint8)))
+    opacity = np.kron(np.indices((16, 16)).sum(axis=0) % 4 > 0, np.ones((16, 16))).astype(np.uint8) * 255
+    materials = {
+        "plain": {},
+        "gloss": {"gloss": Gloss(0.0, 0.4)},
+        "metal": {"gloss": Gloss(1.0, 0.4)},
+        "normal map": {"bumps": bumps},
+        "gloss and normal map": {"gloss": Gloss(0.0, 0.4), "bumps": bumps},
+        "light of its own": {"emission": (0.1, 0.1, 0.1)},
+        "holes": {"mask": Mask(opacity)},
+    }
+
+    def of(thing: SceneObject, more: dict) -> SceneObject:
+        if thing.category == "sky":
+            return thing
+        return replace(thing, parts=tuple(Part(p.mesh, replace(p.material, **more)) for p in thing.parts))
+
+    return {
+        name: replace(scene, objects=tuple(of(thing, more) for thing in scene.objects))
+        for name, more in materials.items()
+    }
+
+
+def measure(gl, scenes: dict[str, Scene], config, frames: int, rounds: int) -> dict[str, dict[str, float]]:
+    """By name: ms of processor time per frame, and times the first one's, medians over the rounds."""
+    scene = next(iter(scenes.values()))
     times = np.linspace(scene.t0_ns, scene.t1_ns, frames + 2).astype(np.int64)[1:-1].tolist()
-    renderers = {name: Renderer(gl, replace(scene, light=light), config) for name, light in lights(scene.light).items()}
+    renderers = {name: Renderer(gl, one, config) for name, one in scenes.items()}
     spent: dict[str, list[float]] = {name: [] for name in renderers}
     for renderer in renderers.values():
         renderer.luminance(times[-1]).read()  # compiles and uploads
@@ -77,6 +105,8 @@ def main() -> None:
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="a.b=c")
     parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--materials", action="store_true", help="of materials instead: all objects wear each")
+    parser.add_argument("--only", action="append", default=[], metavar="NAME", help="these rows, beside the first")
     parser.add_argument("--json", metavar="FILE")
     options = parser.parse_args()
     template = load_run(options.config, options.overrides)
@@ -85,7 +115,11 @@ def main() -> None:
     console = Console()
     with create_context() as gl:
         console.print(bench.machine_line(gl.renderer), highlight=False, soft_wrap=True)
-        found = measure(gl, scene, config.render, options.frames, options.rounds)
+        of_lights = {name: replace(scene, light=light) for name, light in lights(scene.light).items()}
+        scenes = dressed(scene) if options.materials else of_lights
+        if options.only:
+            scenes = {name: one for k, (name, one) in enumerate(scenes.items()) if k == 0 or name in options.only}
+        found = measure(gl, scenes, config.render, options.frames, options.rounds)
     table = Table(title=f"{scene.camera.width}x{scene.camera.height}, event frames", title_justify="left")
     for name in ("light", "processor ms per frame", "times the plain one"):
         table.add_column(name, justify="left" if name == "light" else "right")

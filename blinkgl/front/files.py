@@ -12,7 +12,7 @@ from blinkgl.errors import ConfigError, EventDataError
 from blinkgl.events.types import Events
 from blinkgl.front import arguments as check
 from blinkgl.front.runs import EmulatorSettings, events_tree
-from blinkgl.io import flow as flow_files, formats
+from blinkgl.io import flow as flow_files, formats, trajectories
 from blinkgl.io.formats import EventFile
 
 if TYPE_CHECKING:
@@ -150,6 +150,28 @@ def write_flow(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray | No
     return flow_files.write_flow(check.path(path, "path"), field.astype(np.float32), mask.astype(bool))
 
 
+def read_trajectory(path: str | os.PathLike, *, form: str | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Times (N,) int64 ns and poses T_world_body (N, 4, 4) float64 of TUM's text or EuRoC's CSV.
+
+    form : "tum" or "euroc"; None: EuRoC's where lines have commas.
+    Raises AssetError, naming the line: no pose, times that do not increase, a gap."""
+    if form not in (None, *trajectories.FORMATS):
+        raise ConfigError("unknown form", where="form", value=form, accepted="tum, euroc or None")
+    return trajectories.read_trajectory(check.path(path, "path"), form)
+
+
+def write_trajectory(path: str | os.PathLike, t_ns: np.ndarray, poses: np.ndarray) -> None:
+    """Writes poses (N, 4, 4) at t_ns (N,) whole ns as TUM's text, t x y z qx qy qz qw: those of a sequence's
+    ``poses.npz`` are ``t_ns`` and ``T_world_cam``. Raises OutputError, ConfigError."""
+    times = check.array(t_ns, "t_ns", (None,), "an array (N,) of whole ns")
+    placed = check.array(poses, "poses", (len(times), 4, 4), f"an array ({len(times)}, 4, 4)")
+    if times.dtype.kind not in "iu" or (np.diff(times) <= 0).any():
+        raise ConfigError(
+            "times do not increase", where="t_ns", value=times[:3].tolist(), accepted="whole ns, in order"
+        )
+    trajectories.write_trajectory(check.path(path, "path"), times, placed.astype(np.float64))
+
+
 def compare(
     a: str | os.PathLike,
     b: str | os.PathLike | None = None,
@@ -187,6 +209,7 @@ def calibrate(
     emulator: EmulatorSettings = "esim",
     fixed: Iterable[str] = (),
     still: bool = False,
+    flicker: tuple[float, float] | None = None,
     fps: float | None = None,
     timestamps: str | os.PathLike | None = None,
     gamma: str | float = "linear",
@@ -202,16 +225,25 @@ def calibrate(
 
     recording : event file.   frames : what the camera saw, of its size (default: the recording's own).   emulator : a
     name, or a mapping where the fit begins.   fixed : its keys that stay as they are there.   still : a scene that
-    stands still in constant light, without frames: noise alone.   fps : of the frames, Hz.   timestamps : file of the
+    stands still in constant light, without frames: noise alone.   flicker : (Hz, contrast) of light that goes as
+    1 + contrast sin on an even scene, without frames: thresholds.   fps : of the frames, Hz.   timestamps : file of the
     frames' times.   gamma : of their codes, "linear", "srgb" or an exponent.   interpolate : between them, "motion" or
     "linear".   max_px : of "motion", px.   frame_delay_ms : added to their times, ms; None: found.
     starts : of the search.   Raises AssetError, EventDataError, ConfigError."""
     from blinkgl.recordings import calibration
+    from blinkgl.recordings.clip import Flicker
 
     keys = fixed if isinstance(fixed, Iterable) and not isinstance(fixed, str) else [None]
     keys = tuple(keys)
     if not all(isinstance(key, str) for key in keys):
         raise ConfigError("not names of keys", where="fixed", value=fixed, accepted="a list of texts")
+    light = None
+    if flicker is not None:
+        hz, contrast = check.array(flicker, "flicker", (2,), "(Hz, contrast)").tolist()
+        light = Flicker(
+            check.number(hz, "flicker[0]", least=0.01, most=1e4),
+            check.number(contrast, "flicker[1]", above=0, most=0.999),
+        )
     delay = None if frame_delay_ms is None else check.number(frame_delay_ms, "frame_delay_ms", least=-1e6, most=1e6)
     return calibration.calibrate(
         check.path(recording, "recording"),
@@ -219,6 +251,7 @@ def calibrate(
         emulator=events_tree(emulator),
         fixed=keys,
         still=bool(still),
+        flicker=light,
         fps=_fps(fps),
         timestamps=None if timestamps is None else check.path(timestamps, "timestamps"),
         gamma=gamma,

@@ -20,7 +20,17 @@ from scipy.stats import qmc
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.events.types import Events
-from blinkgl.recordings.clip import Clip, clip_of_frames, clip_of_still, clock_offset, read_recording, timed_frames
+from blinkgl.recordings.clip import (
+    Clip,
+    Flicker,
+    clip_of_flicker,
+    clip_of_frames,
+    clip_of_still,
+    clock_offset,
+    flicker_lag,
+    read_recording,
+    timed_frames,
+)
 from blinkgl.recordings.simulation import INTERPOLATIONS, emulator_config
 from blinkgl.recordings.statistics import Sums, Target, interval_distance, sums, target
 
@@ -33,6 +43,8 @@ UNTOLD = 0.5
 """Standard deviation of a parameter's logarithm from which on the data are taken not to tell it."""
 VAGUE = 0.25
 """From which on other places are tried, too."""
+LEAST_CHANCE = 0.05
+"""Of a number's error, where chance is known at all."""
 TOLERANCE = 0.5
 """How much worse the fit may become by putting a parameter that is not told back to its default."""
 _MOST_STEPS = 20
@@ -119,6 +131,7 @@ def calibrate(
     emulator: str | EmulatorConfig | dict = EmulatorConfig.members.default,
     fixed: Iterable[str] = (),
     still: bool = False,
+    flicker: Flicker | None = None,
     fps: float | None = None,
     timestamps: str | os.PathLike | None = None,
     gamma: str | float = "linear",
@@ -133,7 +146,7 @@ def calibrate(
 
     frames : what the camera saw, of its size and at the middle of the exposures
     (:func:`~blinkgl.io.frames.open_frames`; default: the recording's own).   still : a scene that stands still in
-    constant light, without frames: noise alone.
+    constant light, without frames: noise alone.   flicker : an even scene under such light, without frames.
     emulator : a name, or where the fit begins; ``fixed``: keys that stay as they are there.
     gamma, interpolate, max_px : as of ``simulate``.   frame_delay_ms : added to the frames' times; None: found.
     starts : of the search.   progress : called with (what is being done, fraction).
@@ -145,12 +158,18 @@ def calibrate(
     _keys(base, fixed)
     if still and frames is not None:
         raise ConfigError("a still scene needs no frames", where="--still", accepted="either of the two")
+    if flicker is not None and (still or frames is not None):
+        raise ConfigError(
+            "an even scene under flickering light needs no frames, and does not stand still",
+            where="--flicker",
+            accepted="one of --flicker, --still, --frames",
+        )
     if progress:
         progress("reading", 0.0)
     events, size = read_recording(recording, least=LEAST_EVENTS)
     options = dict(name=os.fspath(recording), emulator=base, fixed=fixed, starts=starts, seed=seed, progress=progress)
-    if still:
-        return calibrate_events(events, size, None, **options)
+    if still or flicker is not None:
+        return calibrate_events(events, size, None, flicker=flicker, **options)
     frames = _own_frames(recording) if frames is None else frames
     given, exposures = timed_frames(frames, fps=fps, timestamps=timestamps)
     return calibrate_events(
@@ -172,6 +191,7 @@ def calibrate_events(
     size: tuple[int, int],
     frames: Sequence[tuple[np.ndarray, int, str]] | None,
     *,
+    flicker: Flicker | None = None,
     name: str = "events",
     frames_name: str = "frames",
     exposures: bool = False,
@@ -186,7 +206,8 @@ def calibrate_events(
     progress: Callable[[str, float], None] | None = None,
 ) -> Calibration:
     """:func:`calibrate` of what was read already. size : (height, width) of the sensor.   frames : (array, t_ns, name);
-    None: a still scene.   exposures : whether their times are known to be the middles of exposures."""
+    None: a still scene, or an even one under ``flicker``.   exposures : whether their times are known to be the
+    middles of exposures."""
     base = emulator_config(emulator)
     keys = _keys(base, fixed)
     if interpolate not in INTERPOLATIONS[::2]:
@@ -195,7 +216,23 @@ def calibrate_events(
         )
     say = progress or (lambda *_: None)
     start, untold = None, {}
-    if frames is None:
+    if flicker is not None:
+        look = lambda lag_us: clip_of_flicker(events, size, flicker, lag_us=lag_us, where=name, seed=seed)
+        clip = look(0)
+        first = _Search(clip, base, (clip.intervals + 1) // 2, seed, lambda done: say("phase", done))
+        keys = first.responding(keys)
+        start, untold = first.roughly(keys, starts), first.untold
+        lag_us = flicker_lag(clip.simulate(first.config(keys, start), seed), clip)
+        clip = look(lag_us)
+        notes = [
+            (
+                f"Light of {clip.facts['flicker_hz']:.6g} Hz (asked: {flicker.hz:g}) and contrast "
+                f"{flicker.contrast:g} was assumed, everywhere and of middle brightness; "
+                f"{100 * clip.facts['flicker_share']:.0f} % of the polarity goes with it, and the emulator's events "
+                f"come {lag_us / 1000:.2f} ms after it."
+            )
+        ]
+    elif frames is None:
         clip = clip_of_still(events, size)
         notes = [
             "A still scene of middle brightness was assumed: what depends on light, or its change, is not in it.",
@@ -306,7 +343,7 @@ def _own_frames(recording: str | os.PathLike) -> str | os.PathLike:
     raise EventDataError(
         "the recording has no frames, and without them nobody knows what the camera saw",
         where=os.fspath(recording),
-        accepted="--frames, or --still for a scene that stands still",
+        accepted="--frames, --still for a scene that stands still, or --flicker for an even one under such light",
     )
 
 
@@ -447,10 +484,11 @@ class _Search:
         moved = (t.jackknife - t.jackknife.mean(axis=0)) * (t.weight / t.error) @ pull.T
         count = len(t.jackknife)
         spread = np.sqrt((count - 1) / count * (moved**2).sum(axis=0))
-        # Where the model is off by more than chance, by that much.
-        misfit = max(
-            1.0, float(np.sqrt(np.mean((self._residual / t.weight * t.error / np.maximum(t.chance, 1e-12)) ** 2)))
-        )
+        # Where the model is off by more than chance, by that much; a number that hardly any group of pixels moves says
+        # nothing of chance.
+        known = t.chance > LEAST_CHANCE * t.error
+        off = self._residual[known] / t.weight[known] * t.error[known] / t.chance[known]
+        misfit = max(1.0, float(np.sqrt(np.mean(off**2)))) if known.any() else 1.0
         return {key: float(np.exp(v) * s * misfit) for key, v, s in zip(self._keys, self._at, spread)}
 
     def _spread(self) -> np.ndarray:

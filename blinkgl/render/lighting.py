@@ -61,7 +61,10 @@ class Lighting:
     def defines(self, pass_: Pass, kind: Kind) -> dict[str, Any]:
         """Of the variant that a pass is drawn in. HUED: light of three channels, where one does not do: for pictures in
         colour, and for the luminance of what is of several colours itself."""
-        if self.plain or not (kind.lit and pass_.lit):
+        hued = {"HUED": 1} if kind.hued and pass_.one_channel else {}
+        if not (kind.lit and pass_.lit):
+            return hued if pass_.lit else {}
+        if self.plain and not kind.whole:
             return {}
         counts = {"SUNS": self._suns, "LAMPS": len(self.lamps) - self._suns, "SPOTS": self._spots}
         ambient = 2 if self._quadric[:, :3, :3].any() else 1
@@ -70,7 +73,7 @@ class Lighting:
             | {name: count for name, count in counts.items() if count}
             | ({"AMBIENT": ambient} if self._quadric.any() else {})
             | self._shadows(pass_)
-            | ({"HUED": 1} if self.coloured and (kind.hued or not pass_.one_channel) else {})
+            | (hued or ({"HUED": 1} if not pass_.one_channel and (self.coloured or "GLOSSY" in kind.more) else {}))
         )
 
     def _shadows(self, pass_: Pass) -> dict[str, Any]:
@@ -81,7 +84,7 @@ class Lighting:
 
     def place(self, uniforms: Uniforms, item: DrawItem, moment: Moment) -> None:
         """Sets what lights.glsl asks for, of whichever variant the program is."""
-        if self.plain:
+        if self.plain and not item.kind.whole:
             return
         index, channel = item.object_index, item.material.base_color
         for name, per_channel in _FIXED.items():
@@ -90,7 +93,7 @@ class Lighting:
                 key = (name, channel) if one else (name,)
                 if key not in self._bytes:
                     values = self._fixed[name]
-                    values = self._channel(channel) @ values if one else values.T if per_channel else values
+                    values = self.channel(channel) @ values if one else values.T if per_channel else values
                     self._bytes[key] = np.ascontiguousarray(values, np.float32).tobytes()
                 uniform.write(self._bytes[key])
         rates = any(f"{name}_rate" in uniforms for name in _PLACED)
@@ -100,10 +103,10 @@ class Lighting:
                 if (uniform := uniforms.get(one)) is not None:
                     values = placed[one][index]
                     if per_channel and uniform.array_length == 1:
-                        values = (self._channel(channel) @ values).astype(np.float32)
+                        values = (self.channel(channel) @ values).astype(np.float32)
                     uniform.write(values.tobytes())
 
-    def _channel(self, base: tuple[float, ...]) -> np.ndarray:
+    def channel(self, base: tuple[float, ...]) -> np.ndarray:
         """(3,) what one channel stands for: the shares of r, g, b in the luminance of what is of this base colour."""
         if base not in self._weights:
             shares = LUMA * np.asarray(base, np.float64)

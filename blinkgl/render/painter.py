@@ -6,6 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import moderngl
+import numpy as np
 
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.lighting import Lighting
@@ -17,10 +18,14 @@ if TYPE_CHECKING:
     from blinkgl.render.moment import Moment
     from blinkgl.render.passes.base import Pass, Shot
     from blinkgl.render.resources import DrawItem, Kind, SceneResources
-    from blinkgl.scene.types import Scene
+    from blinkgl.scene.types import Map, Scene
 
 FREE_UNIT = 8
 """Texture unit from which on a shape may put its own: a pass has a material's and those of its inputs."""
+MATERIAL_UNITS = {
+    name: 16 + k for k, name in enumerate(("coverage", "emission_map", "bumps", "gloss_map", "energy", "surroundings"))
+}
+"""Texture units of what a material has beside a base colour."""
 Uniforms = dict[str, Any]
 """name -> moderngl.Uniform of one program; "" is the program itself."""
 
@@ -33,7 +38,12 @@ class Programs(dict["Kind", Uniforms]):
 
     def __missing__(self, kind: Kind) -> Uniforms:
         foggy = {"FOG": 1} if self._pass.lit and self._painter.scene.fog is not None else {}
-        defines = self._pass.defines(kind) | kind.defines | self._painter.lighting.defines(self._pass, kind) | foggy
+        defines = (
+            self._pass.defines(kind)
+            | kind.defines(self._pass.lit)
+            | self._painter.lighting.defines(self._pass, kind)
+            | foggy
+        )
         program = self._painter.gl.program(self._pass.program, defines)
         uniforms = self[kind] = self._painter.uniforms(program)
         return uniforms
@@ -93,6 +103,55 @@ class Painter:
             uniforms["sun_direction"].value = tuple(light.sun_direction @ R)
             uniforms["up_direction"].value = tuple(R[2])
         self.lighting.place(uniforms, item, moment)
+        if item.extended:
+            self._dress(uniforms, item, moment)
+
+    def _dress(self, uniforms: Uniforms, item: DrawItem, moment: Moment) -> None:
+        """Sets what a material has beside a base colour."""
+        material, resources = item.material, self.resources
+        if "coverage" in uniforms and material.mask is not None:
+            self._look_up(uniforms, "coverage", resources.coverage_texture(material))
+            uniforms["cutoff"].value = material.mask.threshold
+        if "tint_shares" in uniforms:
+            uniforms["tint_shares"].value = tuple(self.lighting.channel(material.base_color))
+        if "emission" in uniforms:
+            colour = uniforms["emission"].dimension == 3
+            uniforms["emission"].value = material.emission if colour else resources.emitted_luminance(material)
+            if "emission_map" in uniforms and material.emission_map is not None:
+                self._look_up(
+                    uniforms, "emission_map", resources.emission_texture(material, colour), material.emission_map
+                )
+        if "bumps" in uniforms and material.bumps is not None:
+            self._look_up(uniforms, "bumps", resources.numbers_texture(material.bumps), material.bumps)
+            uniforms["bump_scale"].value = material.bump_scale
+        if "gloss" in uniforms and (gloss := material.gloss) is not None:
+            self._shine(uniforms, item, moment)
+            uniforms["gloss"].value = gloss.metallic, gloss.roughness
+            if "gloss_map" in uniforms and gloss.map is not None:
+                self._look_up(uniforms, "gloss_map", resources.numbers_texture(gloss.map), gloss.map)
+
+    def _shine(self, uniforms: Uniforms, item: DrawItem, moment: Moment) -> None:
+        """Sets what is seen in what shines, and from where."""
+        self._look_up(uniforms, "energy", self.resources.energy_texture())
+        self._look_up(uniforms, "surroundings", self.resources.surroundings_texture())
+        pose = moment.T_world_obj[item.object_index]
+        R, away = pose[:3, :3], moment.T_world_cam[:3, 3] - pose[:3, 3]
+        uniforms["eye"].value = tuple(away @ R)
+        uniforms["to_world"].write(np.ascontiguousarray(R.T, np.float32).tobytes())
+        if "eye_rate" in uniforms:
+            rate = moment.rates.T_world_obj[item.object_index]
+            dR, moving = rate[:3, :3], moment.dT_world_cam[:3, 3] - rate[:3, 3]
+            uniforms["eye_rate"].value = tuple(away @ dR + moving @ R)
+            uniforms["to_world_rate"].write(np.ascontiguousarray(dR.T, np.float32).tobytes())
+
+    def _look_up(self, uniforms: Uniforms, name: str, texture: Any, map_: Map | None = None) -> None:
+        """Hands a program a texture of a material, and where it lies."""
+        unit = MATERIAL_UNITS[name]
+        texture.use(unit)
+        uniforms[name].value = unit
+        if map_ is not None:
+            a, b, c, d, e, f = map_.at
+            uniforms[f"{name}_place"].value = (a, d, b, e, c, f)
 
     def deform(self, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
         """Sets what the vertex stage of a shape that changes with time takes besides; to be called after

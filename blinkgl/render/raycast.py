@@ -47,6 +47,10 @@ class Forest(NamedTuple):
 
     root, first, size : (P,) int32 root node, first triangle and number of triangles of each part.
     cull : (P,) bool, back faces of this part are not hit.   extent : (P,) largest local coordinate.
+    mask : (P,) int32 row of ``masks`` that says where a part has holes, -1: nowhere.   uvs : (M, 3, 2) float64 texture
+    coordinates of the corners of all faces of parts with holes.
+    masks : (K, 6) int64 of each: first face in ``uvs``; first texel in ``texels``, height, width; wrap modes along u
+    and v, of :data:`WRAPS`.   cutoffs : (K,) opacity below which there is nothing.   texels : (T,) float32 opacity.
     """
 
     triangles: np.ndarray
@@ -60,6 +64,24 @@ class Forest(NamedTuple):
     size: np.ndarray
     cull: np.ndarray
     extent: np.ndarray
+    mask: np.ndarray
+    uvs: np.ndarray
+    masks: np.ndarray
+    cutoffs: np.ndarray
+    texels: np.ndarray
+
+
+WRAPS = ("repeat", "mirror", "clamp")
+
+
+class Holes(NamedTuple):
+    """Of one part. uvs : (F, 3, 2) float64 of its faces' corners.   opacity : (h, w) float32, 0 to 1.
+    cutoff : what is less is a hole.   wrap : along u and v, of :data:`WRAPS`."""
+
+    uvs: np.ndarray
+    opacity: np.ndarray
+    cutoff: float
+    wrap: tuple[str, str]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -112,8 +134,9 @@ def build_tree(vertices: np.ndarray, faces: np.ndarray) -> Tree:
     return Tree(corners[order], order.astype(np.int32), lower[:nodes], upper[:nodes], child[:nodes], count[:nodes])
 
 
-def join_trees(trees: list[Tree], cull: list[bool]) -> Forest:
-    """One forest; part p of the forest is ``trees[p]``."""
+def join_trees(trees: list[Tree], cull: list[bool], holes: list[Holes | None] | None = None) -> Forest:
+    """One forest; part p of the forest is ``trees[p]``, with ``holes[p]`` in it."""
+    mask, uvs, masks, cutoffs, texels = _holes(len(trees), holes or [])
 
     def starts(sizes):
         return np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
@@ -137,7 +160,53 @@ def join_trees(trees: list[Tree], cull: list[bool]) -> Forest:
         size=size,
         cull=np.array(cull, np.bool_),
         extent=np.array([np.abs(tree.triangles).max() for tree in trees], np.float64),
+        mask=mask,
+        uvs=uvs,
+        masks=masks,
+        cutoffs=cutoffs,
+        texels=texels,
     )
+
+
+def _holes(parts: int, holes: list[Holes | None]) -> tuple[np.ndarray, ...]:
+    """The last five of a :class:`Forest`."""
+    mask, rows, uvs, texels = np.full(parts, -1, np.int32), [], [np.empty((0, 3, 2))], [np.empty(0, np.float32)]
+    for p, one in enumerate(holes):
+        if one is not None:
+            mask[p] = len(rows)
+            wraps = [WRAPS.index(w) for w in one.wrap]
+            rows.append([sum(map(len, uvs)), sum(map(len, texels)), *one.opacity.shape, *wraps])
+            uvs.append(np.asarray(one.uvs, np.float64))
+            texels.append(np.asarray(one.opacity, np.float32).ravel())
+    cutoffs = np.array([one.cutoff for one in holes if one is not None], np.float64)
+    return mask, np.concatenate(uvs), np.array(rows, np.int64).reshape(-1, 6), cutoffs, np.concatenate(texels)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _texel_index(i, size, wrap):
+    if wrap == 2:
+        return min(max(i, 0), size - 1)
+    if wrap == 1:
+        i %= 2 * size
+        return i if i < size else 2 * size - 1 - i
+    return i % size
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _is_hole(mask, uvs, cutoff, texels, face, a, b, c):
+    """Whether the point of a face with these barycentrics is cut out: bilinear in ``texels``. mask : a row of
+    ``Forest.masks``."""
+    first, start, height, width = mask[0] + face, mask[1], mask[2], mask[3]
+    u = a * uvs[first, 0, 0] + b * uvs[first, 1, 0] + c * uvs[first, 2, 0]
+    v = a * uvs[first, 0, 1] + b * uvs[first, 1, 1] + c * uvs[first, 2, 1]
+    x, y = u * width - 0.5, v * height - 0.5
+    i, j = np.int64(np.floor(x)), np.int64(np.floor(y))
+    fx, fy = x - i, y - j
+    x0, x1 = _texel_index(i, width, mask[4]), _texel_index(i + 1, width, mask[4])
+    y0, y1 = start + _texel_index(j, height, mask[5]) * width, start + _texel_index(j + 1, height, mask[5]) * width
+    top = texels[y0 + x0] * (1.0 - fx) + texels[y0 + x1] * fx
+    bottom = texels[y1 + x0] * (1.0 - fx) + texels[y1 + x1] * fx
+    return top * (1.0 - fy) + bottom * fy < cutoff
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -199,7 +268,7 @@ def nearest_tree(
     Output: hit (N, 3) int32 (part, face, 1 when seen from the front) or -1; bary (N, 3); depth (N,), inf when nothing
     is hit.
     """
-    triangles, face, lower, upper, child, count, root, _, size, cull, extent = forest
+    triangles, face, lower, upper, child, count, root, _, size, cull, extent, mask, uvs, masks, cutoffs, texels = forest
     o, d, inverse, o_lo, o_hi = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     stack, entry = np.empty(_STACK, np.int64), np.empty(_STACK)
     for i in range(rays.shape[0]):
@@ -233,6 +302,9 @@ def nearest_tree(
                         if s < near or s > best or s >= far[i] or (cull[p] and not front):
                             continue
                         if s == best and (hit[i, 0] < p or hit[i, 1] < face[j]):
+                            continue
+                        k = mask[p]
+                        if k >= 0 and _is_hole(masks[k], uvs, cutoffs[k], texels, face[j], u, v, w):
                             continue
                         best, depth[i] = s, s
                         hit[i, 0], hit[i, 1], hit[i, 2] = p, face[j], front
@@ -274,7 +346,7 @@ def nearest_exhaustive(
     depth: np.ndarray,
 ) -> None:
     """The slow twin of :func:`nearest_tree`: every triangle against every ray; the same arguments and answer."""
-    triangles, face, _, _, _, _, root, first, size, cull, _ = forest
+    triangles, face, _, _, _, _, root, first, size, cull, _, mask, uvs, masks, cutoffs, texels = forest
     d = np.empty(3)
     for i in range(rays.shape[0]):
         depth[i] = np.inf
@@ -289,6 +361,9 @@ def nearest_exhaustive(
                 if s < near or s > depth[i] or s >= far[i] or (cull[p] and not front):
                     continue
                 if s == depth[i] and (hit[i, 0] < p or hit[i, 1] < face[j]):
+                    continue
+                k = mask[p]
+                if k >= 0 and _is_hole(masks[k], uvs, cutoffs[k], texels, face[j], u, v, w):
                     continue
                 depth[i] = s
                 hit[i, 0], hit[i, 1], hit[i, 2] = p, face[j], front

@@ -27,6 +27,7 @@ way to anti-alias, not a property of the scene.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
@@ -34,10 +35,12 @@ import numpy as np
 from scipy import ndimage
 
 from blinkgl.camera import CameraModel
-from blinkgl.render.raycast import Forest, build_tree, join_trees, nearest_exhaustive, nearest_tree
-from blinkgl.scene.lights import ambient, beam, lamps_of, quadric_of, shadowing
+from blinkgl.render.raycast import Forest, Holes, build_tree, join_trees, nearest_exhaustive, nearest_tree
+from blinkgl.scene.geometry.tangents import tangents
+from blinkgl.scene.lights import ambient, beam, lamps_of, quadric_of, shadowing, surroundings_of
 from blinkgl.scene.shapes.deformer import normals_at
-from blinkgl.scene.types import Lamp, Material, Mesh, Part, Scene, SceneObject, Texture
+from blinkgl.scene.surfaces import gloss
+from blinkgl.scene.types import REPEAT, Lamp, Map, Material, Mesh, Part, Scene, SceneObject, Texture
 
 LUMA = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709, of linear R, G, B
 # A visibility ray ends this much (relative) before the point it aims at, so that the point does not hide itself:
@@ -136,6 +139,13 @@ class ReferenceFrame:
     velocity: np.ndarray
     forward: Flow | None
     backward: Flow | None
+    front: np.ndarray
+    xy: np.ndarray
+
+    def hits(self) -> Hits:
+        """What was hit at the pixels' centres, row by row."""
+        flat = {name: (a := getattr(self, name)).reshape(self.hit.size, *a.shape[2:]) for name in _HIT_IMAGES}
+        return Hits(t_ns=self.t_ns, **flat)
 
 
 def scene_parts(scene: Scene) -> list[tuple[SceneObject, Part]]:
@@ -199,11 +209,19 @@ def _forest(scene: Scene, t_ns: int) -> Forest:
             if part.mesh not in _trees:
                 _trees[part.mesh] = build_tree(part.mesh.vertices, part.mesh.faces)
             trees.append(_trees[part.mesh])
-        cull = [part.mesh.closed and not part.material.double_sided for _, part in parts]
-        kept[key] = join_trees(trees, cull)
+        kept[key] = join_trees(trees, [part.culled for _, part in parts], [_holes_of(part) for _, part in parts])
         while len(kept) > KEPT:
             kept.pop(next(iter(kept)))
     return kept[key]
+
+
+def _holes_of(part: Part) -> Holes | None:
+    """As the ray caster takes them."""
+    mask, mesh = part.material.mask, part.mesh
+    if mask is None:
+        return None
+    uvs = mesh.uvs[mesh.faces].astype(np.float64) * np.asarray(part.material.uv_scale)
+    return Holes(uvs, mask.alpha.astype(np.float32) / np.float32(255), mask.threshold, part.material.wrap)
 
 
 def _nearest(scene, t_ns, rays, far=None, skip=None, exhaustive=False, eye=None, near=None):
@@ -273,7 +291,7 @@ def _relative_rate(scene: Scene, thing: SceneObject, t_ns: int) -> np.ndarray:
     return rate
 
 
-def _apply(scene: Scene, hits: Hits, matrix_of) -> np.ndarray:
+def applied(scene: Scene, hits: Hits, matrix_of: Callable[[SceneObject], np.ndarray]) -> np.ndarray:
     """(N, 3) matrix_of(object) (3, 4) applied to every object-local point; nan where nothing is hit."""
     parts, out = scene_parts(scene), np.full((len(hits.hit), 3), np.nan)
     for p, rows in _by_part(hits.part):
@@ -309,7 +327,7 @@ def local_at(scene: Scene, hits: Hits, t_ns: int) -> np.ndarray:
 def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
     """Displacement of every hit point from ``hits.t_ns`` to t_ns, and whether it is seen there."""
     camera = scene.camera
-    change = _apply(scene, hits, lambda thing: _relative_change(scene, thing, hits.t_ns, t_ns))
+    change = applied(scene, hits, lambda thing: _relative_change(scene, thing, hits.t_ns, t_ns))
     _add_of_shapes(scene, hits, change, t_ns, lambda mesh: vertices_at(mesh, t_ns) - vertices_at(mesh, hits.t_ns))
     depth = hits.depth + change[:, 2]
     valid = hits.hit & (depth > 0.0)
@@ -318,20 +336,30 @@ def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
         there = hits.xy + flow
         inside = valid & ((there >= -0.5) & (there < [camera.width - 0.5, camera.height - 0.5])).all(axis=1)
 
-    candidate = inside & (depth >= camera.near)
-    facing = _faces_camera(scene, hits, t_ns, candidate)
-    candidate &= facing
-    hidden_by = np.full((len(hits.hit), 2), -1, np.int32)
-    rows = np.flatnonzero(candidate)
     # the ray aims at the moved point itself: through there = xy + flow it would carry that sum's rounding
     there_hits = replace(hits, local=local_at(scene, hits, t_ns))
-    moved = _apply(scene, there_hits, lambda thing: relative_pose_at(scene, thing, t_ns))[rows]
-    skip = np.ascontiguousarray(np.stack([hits.part[rows], hits.triangle[rows]], axis=1))
-    far = moved[:, 2] * (1.0 - VISIBILITY_SLACK)
-    blocker, _, _ = _nearest(scene, t_ns, moved[:, :2] / moved[:, 2:], far=far, skip=skip)
-    hidden_by[rows] = blocker[:, :2]
-    occluded = valid & ~(candidate & (hidden_by[:, 0] < 0))
+    moved = applied(scene, there_hits, lambda thing: relative_pose_at(scene, thing, t_ns))
+    seen, hidden_by = is_seen(scene, hits, t_ns, moved, inside & (depth >= camera.near))
+    occluded = valid & ~seen
     return Flow(int(t_ns), flow, valid, occluded, valid & ~inside, depth, hidden_by)
+
+
+def is_seen(
+    scene: Scene, hits: Hits, t_ns: int, moved: np.ndarray, candidate: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) bool: which of the points of ``hits`` are seen at t_ns, and (N, 2) int32 (part, triangle) of the nearest
+    thing in the way, or -1.
+
+    moved : (N, 3) where they are then, camera axes.   candidate : (N,) bool, those in the image and behind the near
+    plane; the others are not seen."""
+    candidate = candidate & _faces_camera(scene, hits, t_ns, candidate)
+    hidden_by = np.full((len(hits.hit), 2), -1, np.int32)
+    rows = np.flatnonzero(candidate)
+    skip = np.ascontiguousarray(np.stack([hits.part[rows], hits.triangle[rows]], axis=1))
+    far = moved[rows, 2] * (1.0 - VISIBILITY_SLACK)
+    blocker, _, _ = _nearest(scene, t_ns, moved[rows, :2] / moved[rows, 2:], far=far, skip=skip)
+    hidden_by[rows] = blocker[:, :2]
+    return candidate & (hidden_by[:, 0] < 0), hidden_by
 
 
 def is_hidden(scene: Scene, t_ns: int, xy: np.ndarray, depth: np.ndarray, slack: float) -> np.ndarray:
@@ -344,7 +372,7 @@ def is_hidden(scene: Scene, t_ns: int, xy: np.ndarray, depth: np.ndarray, slack:
 
 def velocity(scene: Scene, hits: Hits) -> np.ndarray:
     """(N, 2) px/s image velocity of every hit point at ``hits.t_ns``, from the analytic twists."""
-    rate = _apply(scene, hits, lambda thing: _relative_rate(scene, thing, hits.t_ns))
+    rate = applied(scene, hits, lambda thing: _relative_rate(scene, thing, hits.t_ns))
     _add_of_shapes(scene, hits, rate, hits.t_ns, lambda mesh: mesh.deformer.velocity(mesh, hits.t_ns))
     with np.errstate(invalid="ignore"):
         points = _rays(scene.camera, hits.xy) * hits.depth[:, None]
@@ -361,7 +389,7 @@ def _faces_camera(scene: Scene, hits: Hits, t_ns: int, rows: np.ndarray) -> np.n
     shown = np.ones(len(rows), bool)
     for p, (thing, part) in enumerate(scene_parts(scene)):
         on = np.flatnonzero(rows & (hits.part == p))
-        if len(on) and part.mesh.closed and not part.material.double_sided:
+        if len(on) and part.culled:
             m = relative_pose_at(scene, thing, t_ns)
             eye = -m[:3, :3].T @ m[:3, 3]
             a, b, c = np.moveaxis(vertices_at(part.mesh, t_ns)[part.mesh.faces[hits.triangle[on]]], 1, 0)
@@ -388,12 +416,12 @@ def surface(scene: Scene, hits: Hits) -> Surface:
         normal[rows] = sign * (blend / length) @ thing.path.pose(hits.t_ns)[:3, :3].T
         uv[rows] = np.einsum("nc,nck->nk", bary, part.mesh.uvs[corners].astype(np.float64))
         albedo[rows] = sample_albedo(part.material, uv[rows])
+        if part.mesh.colours is not None:
+            albedo[rows] *= np.einsum("nc,nck->nk", bary, part.mesh.colours[corners].astype(np.float64))
         colour[rows] = albedo[rows]
         if not part.material.unlit:
-            pose = thing.path.pose(hits.t_ns)
-            points = hits.local[rows] @ pose[:3, :3].T + pose[:3, 3]
-            own = np.column_stack([hits.part[rows], hits.triangle[rows]])
-            colour[rows] *= received(scene, hits.t_ns, points, normal[rows], own).total
+            sent = radiated(scene, hits, rows, albedo[rows], normal[rows], uv[rows])
+            colour[rows] = albedo[rows] * sent.matt + sent.added
     colour = seen_through_fog(scene, hits, colour)
     return Surface(normal, uv, albedo, colour, colour @ LUMA)
 
@@ -406,6 +434,119 @@ def seen_through_fog(scene: Scene, hits: Hits, colour: np.ndarray) -> np.ndarray
     distance = hits.depth * np.linalg.norm(rays / rays[:, 2:], axis=1)
     arrives = np.exp(-scene.fog.density * distance)[:, None]
     return np.where(hits.hit[:, None], colour * arrives + scene.fog.radiance * (1 - arrives), colour)
+
+
+@dataclass(frozen=True, eq=False)
+class Radiated:
+    """What N points of one part send to the camera, (N, 3) each: albedo * matt + mirrored + emission.
+
+    matt : radiance that a white surface of this kind scatters.   mirrored : of the lamps and of all around."""
+
+    matt: np.ndarray
+    mirrored: np.ndarray
+    emission: np.ndarray
+
+    @property
+    def added(self) -> np.ndarray:
+        """What does not go through the albedo."""
+        return self.mirrored + self.emission
+
+
+def radiated(
+    scene: Scene, hits: Hits, rows: np.ndarray, albedo: np.ndarray, normal: np.ndarray, uv: np.ndarray
+) -> Radiated:
+    """Of the hits ``rows``, all of one part, which is lit. albedo, normal : (N, 3), (N, 3) unit, world axes, without a
+    normal map.   uv : (N, 2)."""
+    thing, part = scene_parts(scene)[int(hits.part[rows[0]])]
+    material, pose = part.material, thing.path.pose(hits.t_ns)
+    at = uv * np.asarray(material.uv_scale)
+    emission = np.broadcast_to(np.asarray(material.emission, np.float64), albedo.shape)
+    if material.emission_map is not None:
+        emission = emission * sample_map(material.emission_map, at, colour=True)
+    if material.bumps is not None:
+        normal = bumped(hits, rows, part, pose, normal, at)
+    points = hits.local[rows] @ pose[:3, :3].T + pose[:3, 3]
+    own = np.column_stack([hits.part[rows], hits.triangle[rows]])
+    light = received(scene, hits.t_ns, points, normal, own)
+    if material.gloss is None:
+        return Radiated(light.total, np.zeros_like(albedo), emission)
+    metallic, roughness = np.full(len(at), material.gloss.metallic), np.full(len(at), material.gloss.roughness)
+    if material.gloss.map is not None:
+        given = sample_map(material.gloss.map, at)
+        metallic, roughness = metallic * given[:, 2], roughness * given[:, 1]
+    eye = scene.camera_path.pose(hits.t_ns)[:3, 3] - points
+    eye /= np.linalg.norm(eye, axis=1, keepdims=True)
+    matt, mirrored = shone(scene, hits.t_ns, light, points, normal, eye, albedo, metallic, roughness)
+    return Radiated(matt * light.total, mirrored, emission)
+
+
+def bumped(
+    hits: Hits, rows: np.ndarray, part: Part, pose: np.ndarray, normal: np.ndarray, at: np.ndarray
+) -> np.ndarray:
+    """(N, 3) unit normals, world axes, as the part's normal map has them. normal : without it, on the camera's side."""
+    mesh, bumps = part.mesh, part.material.bumps
+    assert bumps is not None
+    corners, bary = mesh.faces[hits.triangle[rows]], hits.bary[rows]
+    given = tangents(mesh).astype(np.float64)
+    if mesh.deformer is not None:  # the way along the texture turns as a normal does
+        turned = mesh.deformer.normals(replace(mesh, normals=given[:, :3].astype(np.float32)), hits.t_ns)
+        given = np.column_stack([turned, given[:, 3]])
+    side = np.where(hits.front[rows], 1.0, -1.0)[:, None]
+    n = normal * side
+    along = np.einsum("nc,nck->nk", bary, given[:, :3][corners]) @ pose[:3, :3].T
+    along = along - n * (along * n).sum(axis=1, keepdims=True)
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-15)
+    hand = np.sign(np.einsum("nc,nc->n", bary, given[:, 3][corners]))[:, None]
+    bump = 2.0 * sample_map(bumps, at) - 1.0
+    x, y, z = (bump[:, k : k + 1] for k in range(3))
+    scale = part.material.bump_scale
+    mapped = side * (along * x * scale + np.cross(n, along) * hand * y * scale + n * z)
+    return mapped / np.maximum(np.linalg.norm(mapped, axis=1, keepdims=True), 1e-15)
+
+
+def shone(
+    scene: Scene,
+    t_ns: int,
+    light: Received,
+    points: np.ndarray,
+    normal: np.ndarray,
+    eye: np.ndarray,
+    albedo: np.ndarray,
+    metallic: np.ndarray,
+    roughness: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """((N, 1) share of the light that goes through the albedo, (N, 3) radiance that is mirrored) of a surface with a
+    gloss (:mod:`blinkgl.scene.surfaces.gloss`). light : what a matt one receives there.   eye : (N, 3) unit vectors."""
+    roughness = np.maximum(roughness, gloss.SMOOTHEST)
+    nv = np.clip((normal * eye).sum(axis=1), 1e-3, 1.0)
+    part = gloss.energy_at(nv, roughness)
+    lost = (1.0 / part.sum(axis=1) - 1.0)[:, None]
+    mix = metallic[:, None]
+    clear, metal = 1.0 + gloss.DIELECTRIC * lost, 1.0 + albedo * lost
+    even_clear = clear * (gloss.DIELECTRIC * part[:, :1] + part[:, 1:])
+    even_metal = metal * (albedo * part[:, :1] + part[:, 1:])
+    away = 2.0 * (normal * eye).sum(axis=1, keepdims=True) * normal - eye
+    if id(scene.light) not in _surroundings:
+        _surroundings.clear()
+        _surroundings[id(scene.light)] = scene.light, surroundings_of(scene.light)
+    around = gloss.mirrored(_surroundings[id(scene.light)][1], away, roughness)
+    out = around * (even_clear * (1 - mix) + even_metal * mix)
+    for k, lamp in enumerate(lamps_of(scene.light)):
+        towards, _ = beam(lamp, lamp.path.pose(t_ns), points)
+        nl = (towards * normal).sum(axis=1)
+        half = towards + eye
+        half /= np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-15)
+        lit = nl > 0
+        edge = (1.0 - np.clip((half * eye).sum(axis=1, keepdims=True), 0, 1)) ** 5
+        lobe = gloss.lobe(np.maximum(nl, 1e-12), nv, (half * normal).sum(axis=1), roughness)
+        of_clear = clear * (gloss.DIELECTRIC + (1 - gloss.DIELECTRIC) * edge)
+        of_metal = metal * (albedo + (1 - albedo) * edge)
+        # ``direct`` has the cosine, the strength and the shadow in it
+        out += np.where(lit, lobe, 0.0)[:, None] * light.direct[k] * (of_clear * (1 - mix) + of_metal * mix)
+    return (1 - mix) * (1 - even_clear), out
+
+
+_surroundings: dict[int, tuple] = {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -499,18 +640,43 @@ def sample_albedo(material: Material, uv: np.ndarray) -> np.ndarray:
     base = np.asarray(material.base_color, np.float64)
     if material.texture is None:
         return np.broadcast_to(base, (len(uv), 3)).copy()
-    return sample_bilinear(material.texture, uv * np.asarray(material.uv_scale)) * base
+    return sample_bilinear(material.texture, uv * np.asarray(material.uv_scale), material.wrap) * base
 
 
-def sample_bilinear(texture: Texture, uv: np.ndarray) -> np.ndarray:
-    """(N, 3) linear light, bilinear over the four nearest texels, repeating; texel centres at (i + 0.5) / size."""
+def sample_map(given: Map, at: np.ndarray, colour: bool = False) -> np.ndarray:
+    """(N, 3) of a map at (N, 2) coordinates of the base colour: numbers as they are stored, 0 to 1, or linear light."""
+    a, b, c, d, e, f = given.at
+    there = at @ np.array([[a, b], [d, e]]).T + [c, f]
+    texture = given.texture
+    if not colour:
+        if texture not in _as_numbers:
+            _as_numbers[texture] = Texture(texture.image.astype(np.float32) / np.float32(255))
+        texture = _as_numbers[texture]
+    return sample_bilinear(texture, there, given.wrap)
+
+
+_as_numbers: WeakKeyDictionary = WeakKeyDictionary()
+
+
+def _wrapped(index: np.ndarray, size: int, wrap: str) -> np.ndarray:
+    """Of (N,) texel numbers, where a picture goes on beyond its edges."""
+    if wrap == "clamp":
+        return np.clip(index, 0, size - 1)
+    if wrap == "mirror":
+        index = np.mod(index, 2 * size)
+        return np.where(index < size, index, 2 * size - 1 - index)
+    return np.mod(index, size)
+
+
+def sample_bilinear(texture: Texture, uv: np.ndarray, wrap: tuple[str, str] = REPEAT) -> np.ndarray:
+    """(N, 3) linear light, bilinear over the four nearest texels; texel centres at (i + 0.5) / size."""
     image = texture.image
     size = np.array([image.shape[1], image.shape[0]])
     at = uv * size - 0.5
     low = np.floor(at)
     frac = at - low
-    x0, y0 = np.mod(low, size).astype(np.int64).T
-    x1, y1 = (x0 + 1) % size[0], (y0 + 1) % size[1]
+    x0, x1 = (_wrapped(low[:, 0].astype(np.int64) + k, size[0], wrap[0]) for k in (0, 1))
+    y0, y1 = (_wrapped(low[:, 1].astype(np.int64) + k, size[1], wrap[1]) for k in (0, 1))
     fx, fy = frac[:, :1], frac[:, 1:]
 
     def texel(y, x):
@@ -568,7 +734,7 @@ def render(
     )
 
 
-_HIT_IMAGES = ("hit", "depth", "instance", "part", "triangle", "bary", "local")
+_HIT_IMAGES = ("xy", "hit", "depth", "instance", "part", "triangle", "front", "bary", "local")
 _FLOW_IMAGES = ("flow", "valid", "occluded", "outside", "depth", "hidden_by")
 
 

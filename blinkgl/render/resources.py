@@ -16,31 +16,62 @@ from blinkgl.errors import AssetError
 from blinkgl.gl import GLContext
 from blinkgl.gl.shader import MADE
 from blinkgl.render.colour import LUMA, linear_image, luminance_image
-from blinkgl.scene.lights import is_coloured
+from blinkgl.scene.geometry.tangents import tangents
+from blinkgl.scene.lights import is_coloured, surroundings_of
 from blinkgl.scene.shapes.deformer import Deformer
 from blinkgl.scene.shapes.table import define_of, includes
-from blinkgl.scene.types import Material, Mesh, Scene
+from blinkgl.scene.surfaces.gloss import energy
+from blinkgl.scene.types import IDENTITY, REPEAT, Map, Material, Mesh, Part, Scene, Texture, Wrap
 
 MADE.append(includes)
 
 _TEXTURE_2D, _TEXTURE_LOD_BIAS = 0x0DE1, 0x8501
+_TEXTURE_WRAP = 0x2802, 0x2803
+_WRAPS = {"repeat": 0x2901, "mirror": 0x8370, "clamp": 0x812F}
 _ATTRIBUTES = (("in_position", "3f", 12), ("in_normal", "3f", 12), ("in_uv", "2f", 8))
 
 
 class Kind(NamedTuple):
     """What of a material, and of a shape that changes with time, makes another program. shape : macros of the
-    latter.   hued : lit, and of several colours under light that is not white, so that its luminance takes three
-    channels."""
+    latter.   hued : whether its luminance takes three channels: where its colour and that of the light, or two colours
+    of its own, vary independently.   masked : it has holes.   more : of MORE, what it is to passes that are lit."""
 
     textured: bool
     lit: bool
     two_sided: bool
     shape: tuple[tuple[str, int], ...] = ()
     hued: bool = False
+    masked: bool = False
+    more: tuple[str, ...] = ()
+
+    def defines(self, lit: bool) -> dict[str, int]:
+        """Of its variants. lit : of a pass that is."""
+        plain = ("TEXTURED", self.textured), ("LIT", self.lit), ("TWO_SIDED", self.two_sided), ("MASKED", self.masked)
+        return {name: 1 for name, on in plain if on} | dict(self.shape) | (dict.fromkeys(self.more, 1) if lit else {})
 
     @property
-    def defines(self) -> dict[str, int]:
-        return {name: 1 for name, on in zip(("TEXTURED", "LIT", "TWO_SIDED"), self) if on} | dict(self.shape)
+    def whole(self) -> bool:
+        """Whether light is not a factor on its albedo, or one that its own normal does not tell: it takes the general
+        light's programs."""
+        return self.lit and (self.hued or "GLOSSY" in self.more or "BUMPED" in self.more)
+
+
+MORE = ("TINTED", "EMISSIVE", "EMISSION_MAP", "GLOSSY", "GLOSS_MAP", "BUMPED")
+
+
+def more_of(material: Material, mesh: Mesh) -> tuple[str, ...]:
+    """Those of MORE that a part asks for."""
+    lit = not material.unlit
+    gloss, emissive = material.gloss if lit else None, lit and any(material.emission)
+    on = (
+        mesh.colours is not None,
+        emissive,
+        emissive and material.emission_map is not None,
+        gloss is not None,
+        gloss is not None and gloss.map is not None,
+        lit and material.bumps is not None,
+    )
+    return tuple(name for name, one in zip(MORE, on) if one)
 
 
 def shape_of(deformer: Deformer | None) -> tuple[tuple[str, int], ...]:
@@ -77,6 +108,7 @@ class DrawItem:
     layer : 0 objects, 1 ground and walls, 2 sky; drawn in this order so that depth rejects hidden fragments early.
     two_sided : no culling, and the normal is turned towards the camera.   hued : as of :class:`Kind`.
     casts : whether it throws shadows: objects and walls do, unless they are unlit (screens, skies of files).
+    extended : whether its material has more than a base colour: maps and numbers of its own to hand to programs.
     """
 
     object_index: int
@@ -98,7 +130,10 @@ class DrawItem:
     def __post_init__(self) -> None:
         self.textured = self.material.texture is not None
         self.deformer = self.mesh.deformer
-        self.kind = Kind(self.textured, self.lit, self.two_sided, shape_of(self.deformer), self.hued)
+        shape, more = shape_of(self.deformer), more_of(self.material, self.mesh)
+        masked = self.material.mask is not None
+        self.kind = Kind(self.textured, self.lit, self.two_sided, shape, self.hued, masked, more)
+        self.extended = masked or bool(more)
         self.corners = box_corners(self.low, self.high)
 
 
@@ -170,20 +205,33 @@ class Shape:
 
 
 class _Greys:
-    """Whether materials are all of one colour: looked at where the light is not white, once per texture."""
+    """Which materials take three channels of luminance; pictures are looked at where it matters, once each."""
 
     def __init__(self, coloured_light: bool):
         self._coloured_light = coloured_light
         self._known: dict[int, bool] = {}
 
-    def hued(self, material: Material) -> bool:
-        if not self._coloured_light or material.texture is None or material.unlit:
+    def _grey(self, values: np.ndarray) -> bool:
+        if id(values) not in self._known:
+            self._known[id(values)] = all(np.array_equal(values[..., 0], values[..., k]) for k in (1, 2))
+        return self._known[id(values)]
+
+    def hued(self, material: Material, mesh: Mesh) -> bool:
+        gloss = None if material.unlit else material.gloss
+        metal = gloss is not None and gloss.metallic > 0
+        if not (metal or mesh.colours is not None or (self._coloured_light and not material.unlit)):
             return False
-        key = id(material.texture)
-        if key not in self._known:
-            image = material.texture.image
-            self._known[key] = all(np.array_equal(image[..., 0], image[..., k]) for k in (1, 2))
-        return not self._known[key]
+        pictured = material.texture is not None and not self._grey(material.texture.image)
+        tinted = mesh.colours is not None and not self._grey(mesh.colours)
+        if pictured and tinted:
+            return True
+        if material.unlit:
+            return False
+        coloured = pictured or tinted
+        if gloss is None:
+            return self._coloured_light and coloured
+        # What is mirrored has another colour than what is scattered.
+        return (self._coloured_light or metal) and (coloured or len(set(material.base_color)) > 1)
 
 
 class SceneResources:
@@ -196,6 +244,7 @@ class SceneResources:
         self._textures: dict[tuple, moderngl.Texture] = {}
         self._vaos: dict[tuple, moderngl.VertexArray] = {}
         self._shapes: dict[int, Shape] = {}
+        self._volumes: dict[str, moderngl.Texture3D] = {}
         grey = _Greys(is_coloured(scene.light))
         self.items = [
             _draw_item(index, part.mesh, part.material, obj.category, not obj.is_static, scene.t0_ns, scene.t1_ns, grey)
@@ -214,9 +263,10 @@ class SceneResources:
 
     def vertex_array(self, program: moderngl.Program, item: DrawItem) -> moderngl.VertexArray:
         """VAO of the attributes ``program`` uses; the rest of the interleaved vertex is skipped."""
-        key = (id(program), id(item.mesh), item.material.uv_scale)
+        whole = _by_whole_repeats(item.material)
+        key = (id(program), id(item.mesh), item.material.uv_scale, whole)
         if key not in self._vaos:
-            vertices, indices = self._mesh_buffers(item.mesh, item.material.uv_scale)
+            vertices, indices = self._mesh_buffers(item.mesh, item.material.uv_scale, whole)
             formats, names = [], []
             for name, fmt, size in _ATTRIBUTES:
                 used = name in program
@@ -226,6 +276,11 @@ class SceneResources:
             streams = [(vertices, " ".join(formats), *names)]
             if item.deformer is not None:
                 streams += self.shape(item.deformer).streams(program)
+            streams += [
+                (self._stream(item.mesh, name), f"{n}f", name)
+                for name, n in (("in_tangent", 4), ("in_tint", 3))
+                if name in program
+            ]
             self._vaos[key] = self.ctx.vertex_array(program, streams, indices, 4)
         return self._vaos[key]
 
@@ -237,34 +292,98 @@ class SceneResources:
 
     def luminance_texture(self, material: Material) -> moderngl.Texture:
         """R32F: luminance of texture * base_color (mip-mapped in linear light)."""
-        key = ("luminance", id(material.texture), material.base_color)
+        key = ("luminance", id(material.texture), material.base_color, material.wrap)
         if key not in self._textures:
             image = luminance_image(material.texture.image, material.base_color)
-            self._textures[key] = self._upload(image[..., None], material.texture.name)
+            self._textures[key] = self._upload(image[..., None], material.texture.name, wrap=material.wrap)
         return self._textures[key]
 
     def shares_texture(self, material: Material) -> moderngl.Texture:
         """RGB32F: what r, g and b of texture * base_color have in its luminance; their sum is
         :meth:`luminance_texture`."""
-        key = ("shares", id(material.texture), material.base_color)
+        key = ("shares", id(material.texture), material.base_color, material.wrap)
         if key not in self._textures:
             shares = (LUMA * np.asarray(material.base_color, np.float64)).astype(np.float32)
-            self._textures[key] = self._upload(linear_image(material.texture.image) * shares, material.texture.name)
+            image = linear_image(material.texture.image) * shares
+            self._textures[key] = self._upload(image, material.texture.name, wrap=material.wrap)
         return self._textures[key]
 
     def colour_texture(self, material: Material) -> moderngl.Texture:
         """Linear rgb of the texture alone: sRGB8 when the image is 8-bit, else RGB32F."""
-        key = ("colour", id(material.texture))
+        return self._colour(material.texture, material.wrap)
+
+    def _colour(self, texture: Texture, wrap: tuple[Wrap, Wrap]) -> moderngl.Texture:
+        key = ("colour", id(texture), wrap)
         if key not in self._textures:
-            image = material.texture.image
+            image = texture.image
             srgb8 = image.dtype == np.uint8
             # 0x8C41: GL_SRGB8.
             self._textures[key] = self._upload(
-                image if srgb8 else linear_image(image),
-                material.texture.name,
-                internal_format=0x8C41 if srgb8 else None,
+                image if srgb8 else linear_image(image), texture.name, 0x8C41 if srgb8 else None, wrap
             )
         return self._textures[key]
+
+    # ---- of materials that are more than a base colour
+
+    def coverage_texture(self, material: Material) -> moderngl.Texture:
+        """R32F: opacity, of one level."""
+        key = ("coverage", id(material.mask), material.wrap)
+        if key not in self._textures:
+            image = material.mask.alpha.astype(np.float32)[..., None] / np.float32(255)
+            self._textures[key] = self._upload(image, "mask", wrap=material.wrap, levels=False)
+        return self._textures[key]
+
+    def numbers_texture(self, given: Map) -> moderngl.Texture:
+        """RGB32F: three numbers a pixel, as they are stored. Drivers filter 8 bits to 8 bits again: a smooth surface
+        would shine in steps, and have a rate of noise."""
+        key = ("numbers", id(given.texture), given.wrap)
+        if key not in self._textures:
+            image = given.texture.image.astype(np.float32) / np.float32(255)
+            self._textures[key] = self._upload(image, given.texture.name, wrap=given.wrap)
+        return self._textures[key]
+
+    def emission_texture(self, material: Material, colour: bool) -> moderngl.Texture:
+        """Linear rgb, or R32F of what the material sends of it, which has a luminance of 1 at most."""
+        given = material.emission_map
+        if colour:
+            return self._colour(given.texture, given.wrap)
+        key = ("emission", id(given.texture), material.emission, given.wrap)
+        if key not in self._textures:
+            shares = np.asarray(material.emission, np.float64) / self.emitted_luminance(material)
+            image = luminance_image(given.texture.image, tuple(shares))
+            self._textures[key] = self._upload(image[..., None], given.texture.name, wrap=given.wrap)
+        return self._textures[key]
+
+    def emitted_luminance(self, material: Material) -> float:
+        return float(LUMA @ np.asarray(material.emission, np.float64))
+
+    def energy_texture(self) -> moderngl.Texture:
+        """RG32F of :func:`~blinkgl.scene.surfaces.gloss.energy`."""
+        if ("energy",) not in self._textures:
+            table = self._textures["energy",] = self._upload(
+                energy().astype(np.float32), "energy", wrap=("clamp", "clamp"), levels=False
+            )
+            table.filter = (moderngl.LINEAR, moderngl.LINEAR)
+        return self._textures["energy",]
+
+    def surroundings_texture(self) -> moderngl.Texture3D:
+        """RGB32F of :func:`~blinkgl.scene.surfaces.gloss.blurred`: longitude, latitude, roughness."""
+        if "surroundings" not in self._volumes:
+            levels = surroundings_of(self.scene.light)
+            depth, height, width, _ = levels.shape
+            volume = self.ctx.texture3d((width, height, depth), 3, levels.tobytes(), dtype="f4")
+            volume.filter = (moderngl.LINEAR, moderngl.LINEAR)
+            volume.repeat_x, volume.repeat_y, volume.repeat_z = True, False, False
+            self._volumes["surroundings"] = volume
+        return self._volumes["surroundings"]
+
+    def _stream(self, mesh: Mesh, name: str) -> moderngl.Buffer:
+        """Of vertices' tangents or colours."""
+        key = (name, id(mesh))
+        if key not in self._buffers:
+            values = tangents(mesh) if name == "in_tangent" else mesh.colours
+            self._buffers[key] = (self.ctx.buffer(np.ascontiguousarray(values, np.float32).tobytes()),)
+        return self._buffers[key][0]
 
     def albedo_luminance(self, material: Material) -> float:
         """Of a material without texture."""
@@ -281,16 +400,19 @@ class SceneResources:
         for pair in self._buffers.values():
             for buffer in pair:
                 buffer.release()
-        for owned in (*self._textures.values(), *self._shapes.values()):
+        for owned in (*self._textures.values(), *self._volumes.values(), *self._shapes.values()):
             owned.release()
-        self._buffers, self._textures, self._shapes = {}, {}, {}
+        self._buffers, self._textures, self._volumes, self._shapes = {}, {}, {}, {}
 
-    def _mesh_buffers(self, mesh: Mesh, uv_scale: tuple[float, float]) -> tuple[moderngl.Buffer, moderngl.Buffer]:
-        key = (id(mesh), uv_scale)
+    def _mesh_buffers(
+        self, mesh: Mesh, uv_scale: tuple[float, float], whole: bool
+    ) -> tuple[moderngl.Buffer, moderngl.Buffer]:
+        key = (id(mesh), uv_scale, whole)
         if key not in self._buffers:
             data = np.empty((len(mesh.vertices), 8), np.float32)
             data[:, :3], data[:, 3:6] = mesh.vertices, mesh.normals
-            data[:, 6:] = _near_zero(mesh.uvs * np.asarray(uv_scale, np.float64))
+            uvs = mesh.uvs * np.asarray(uv_scale, np.float64)
+            data[:, 6:] = _near_zero(uvs) if whole else uvs
             if not np.isfinite(data).all():
                 first = int(np.flatnonzero(~np.isfinite(data).all(axis=1))[0])
                 raise AssetError(
@@ -305,7 +427,14 @@ class SceneResources:
             )
         return self._buffers[key]
 
-    def _upload(self, image: np.ndarray, name: str, internal_format: int | None = None) -> moderngl.Texture:
+    def _upload(
+        self,
+        image: np.ndarray,
+        name: str,
+        internal_format: int | None = None,
+        wrap: tuple[Wrap, Wrap] = REPEAT,
+        levels: bool = True,
+    ) -> moderngl.Texture:
         height, width, components = image.shape
         limit = self.ctx.info["GL_MAX_TEXTURE_SIZE"]
         if max(height, width) > limit:
@@ -332,6 +461,13 @@ class SceneResources:
             dtype=dtype,
             internal_format=internal_format,
         )
+        if wrap != REPEAT:
+            texture.use(0)
+            for axis, kind in zip(_TEXTURE_WRAP, wrap):
+                self._parameter(_TEXTURE_2D, axis, _WRAPS[kind])
+        if not levels:
+            texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
+            return texture
         texture.build_mipmaps()
         texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
         texture.anisotropy = self.anisotropy
@@ -339,6 +475,12 @@ class SceneResources:
             texture.use(0)
             self._parameter(_TEXTURE_2D, _TEXTURE_LOD_BIAS, self.mip_bias)
         return texture
+
+
+def _by_whole_repeats(material: Material) -> bool:
+    """Whether a shift of its texture coordinates by whole numbers shows nothing."""
+    maps = (material.bumps, material.emission_map, material.gloss.map if material.gloss is not None else None)
+    return material.wrap == REPEAT and all(m is None or (m.at == IDENTITY and m.wrap == REPEAT) for m in maps)
 
 
 def _near_zero(uvs: np.ndarray) -> np.ndarray:
@@ -365,7 +507,6 @@ def _draw_item(
             value=radius,
             accepted=f"at most {MAX_RADIUS:g} units from its centre, all coordinates finite",
         )
-    two_sided = material.double_sided or not mesh.closed
     return DrawItem(
         index,
         mesh,
@@ -375,9 +516,9 @@ def _draw_item(
         low,
         high,
         _LAYER[category],
-        two_sided,
+        not Part(mesh, material).culled,
         not material.unlit,
         moves,
-        hued=grey.hued(material),
+        hued=grey.hued(material, mesh),
         casts=category in ("object", "wall") and not material.unlit,
     )

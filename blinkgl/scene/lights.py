@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,14 +25,16 @@ from blinkgl.config.scene import (
     direction_of,
 )
 from blinkgl.scene.motion.paths import StaticPath
-from blinkgl.scene.surfaces.environment import Environment
-from blinkgl.scene.types import Lamp, Light
+from blinkgl.scene.surfaces.environment import Environment, pixel_directions
+from blinkgl.scene.surfaces.gloss import blurred
+from blinkgl.scene.types import Lamp, Light, Panorama
 
 if TYPE_CHECKING:
     from blinkgl.scene.types import PosePath
 
 MAX_LAMPS = 32
 """Of a scene: each is looked at by every lit pixel."""
+_SKY_SIZE = (64, 128)  # of the plain sky, which has an edge at the horizon and is even otherwise
 NEAREST = 1e-3
 """World units; what is nearer to a point or spot light than this is lit as if it were this far."""
 
@@ -101,6 +104,34 @@ def ambient(quadric: np.ndarray, normal: np.ndarray) -> np.ndarray:
     return np.maximum(np.einsum("...i,cij,...j->...c", n, quadric, n), 0.0)
 
 
+def seen_around(light: Light) -> np.ndarray:
+    """(h, w, 3) float32 radiance from all around, without lamps, as a panorama whose pixels lie as in
+    :func:`~blinkgl.scene.surfaces.environment.pixel_directions`. Of light that is known by its quadric alone what a
+    white surface gives back takes its place: as smooth as that is."""
+    height, width = _SKY_SIZE if light.surroundings is None else light.surroundings.pixels.shape[:2]
+    picture = np.zeros((height, width, 3), np.float32)
+    if light.surroundings is not None:
+        picture += light.surroundings.pixels
+    elif light.around is not None:
+        directions, _ = pixel_directions(height, width)
+        picture += ambient(np.asarray(light.around, np.float64), directions)
+    picture[: height // 2] += np.float32(light.sky) * np.asarray(light.sky_color, np.float32)
+    return picture
+
+
+def surroundings_of(light: Light) -> np.ndarray:
+    """(levels, h, w, 3) float32: :func:`seen_around` as surfaces of several roughnesses mirror it
+    (:func:`~blinkgl.scene.surfaces.gloss.blurred`)."""
+    if light.around is None and light.surroundings is None:
+        return _half_a_sky() * (np.float32(light.sky) * np.asarray(light.sky_color, np.float32))
+    return blurred(seen_around(light))
+
+
+@lru_cache(maxsize=1)
+def _half_a_sky() -> np.ndarray:
+    return blurred(seen_around(Light(sun=0.0, sky=1.0)))
+
+
 def beam(lamp: Lamp, pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """What a lamp sends to (N, 3) points, both in world axes: (N, 3) unit vectors towards it, and (N, 3) strength,
     the radiance of a white surface that faces it, in nobody's shadow. pose : (4, 4) T_world_lamp."""
@@ -159,7 +190,8 @@ def lit_by(panorama: Environment, factor: float, light: Light) -> Light:
         for sun in panorama.suns
     ]
     around = tuple(tuple(tuple(float(factor * v) for v in row) for row in one) for one in panorama.quadric)
-    return replace(light, sun=0.0, sky=0.0, lamps=(*suns, *light.lamps), around=around)
+    picture = Panorama(panorama.picture * np.float32(factor))
+    return replace(light, sun=0.0, sky=0.0, lamps=(*suns, *light.lamps), around=around, surroundings=picture)
 
 
 LUMENS_PER_WATT = 683.0

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -58,6 +58,7 @@ class Mesh:
     closed   : watertight with consistent outward winding, so back faces can be culled.
     name, source_hash : where it came from; ``source_hash`` is a stable hash of the content (train/test splits).
     deformer : how its shape changes with time, in object-local coordinates; None: it does not.
+    colours  : (V, 3) float32 linear factors on the albedo; None: white.
     """
 
     vertices: np.ndarray
@@ -68,6 +69,7 @@ class Mesh:
     name: str = ""
     source_hash: str = ""
     deformer: Deformer | None = None
+    colours: np.ndarray | None = None
 
     @property
     def radius(self) -> float:
@@ -84,14 +86,65 @@ class Texture:
     source_hash: str = ""
 
 
+Wrap = Literal["repeat", "mirror", "clamp"]
+REPEAT: tuple[Wrap, Wrap] = ("repeat", "repeat")
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Map:
+    """Numbers over a surface, (h, w, 3) uint8 standing for 0 to 1 as they are, or sRGB where it is a colour.
+
+    at   : (a, b, c, d, e, f): looked up at (a u + b v + c, d u + e v + f), (u, v) those of the base colour.
+    wrap : what lies beside the picture, along u and v.
+    """
+
+    texture: Texture
+    at: tuple[float, float, float, float, float, float] = IDENTITY
+    wrap: tuple[Wrap, Wrap] = REPEAT
+
+
+@dataclass(frozen=True, eq=False)
+class Gloss:
+    """A surface that shines: glTF's metal and roughness (docs/materials.md).
+
+    metallic, roughness : 0 to 1; times the blue and the green channel of ``map``, where there is one.
+    """
+
+    metallic: float = 0.0
+    roughness: float = 1.0
+    map: Map | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Mask:
+    """Where a surface has holes. alpha : (h, w) uint8 over the texture coordinates and with the wrap modes of the base
+    colour, bilinear, never mip-mapped: a hole is where ``factor`` times it, 0 to 1, is below ``cutoff``."""
+
+    alpha: np.ndarray
+    factor: float = 1.0
+    cutoff: float = 0.5
+
+    @property
+    def threshold(self) -> float:
+        """What the picture's own alpha, 0 to 1, is compared with."""
+        return self.cutoff / self.factor
+
+
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Lambert (or unlit) surface: albedo(u, v) = texture(uv * uv_scale) * base_color, linear light.
+    """albedo(u, v) = texture(uv * uv_scale) * base_color * the mesh's colours, linear light; matt without a gloss.
 
     texture      : None means white.
     base_color   : (3,) linear factor.
     unlit        : radiance = albedo, whatever the light (sky boxes, screens).
     double_sided : draw back faces with the normal turned round; otherwise they are culled when the mesh is closed.
+    wrap         : what lies beside the texture, along u and v.
+    gloss        : None: Lambert.
+    bumps        : normal map, x to the right in the texture, y up, z outwards, 0 to 1 for -1 to 1; None: none.
+    bump_scale   : of its x and y.
+    emission     : (3,) radiance of its own, linear; times ``emission_map``, a colour.
+    mask         : where it has holes; None: nowhere.
     """
 
     texture: Texture | None = None
@@ -99,6 +152,13 @@ class Material:
     uv_scale: tuple[float, float] = (1.0, 1.0)
     unlit: bool = False
     double_sided: bool = False
+    wrap: tuple[Wrap, Wrap] = REPEAT
+    gloss: Gloss | None = None
+    bumps: Map | None = None
+    bump_scale: float = 1.0
+    emission: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    emission_map: Map | None = None
+    mask: Mask | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +167,11 @@ class Part:
 
     mesh: Mesh
     material: Material
+
+    @property
+    def culled(self) -> bool:
+        """Whether its back faces are not drawn: of closed surfaces without holes that are not asked for from behind."""
+        return self.mesh.closed and not self.material.double_sided and self.material.mask is None
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,6 +233,13 @@ class Lamp:
 WHITE = (1.0, 1.0, 1.0)
 
 
+class Panorama(NamedTuple):
+    """pixels : (h, w, 3) float32 radiance from all around, as of
+    :func:`~blinkgl.scene.surfaces.environment.pixel_directions`."""
+
+    pixels: np.ndarray
+
+
 @dataclass(frozen=True)
 class Light:
     """Sun + sky: irradiance factor E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 * n_z); radiance = albedo * E. Both are
@@ -178,6 +250,8 @@ class Light:
     lamps : what shines beside them.
     around : quadric of what else comes from all around (:func:`blinkgl.scene.lights.ambient`), 3 x 4 x 4 numbers; None:
         nothing.
+    surroundings : the same as a picture, its suns taken out, for what shines; lights that differ in nothing else are
+        equal. None: the sky alone, ``sky`` above the horizon.
     shadows : of suns and spot lights; soft by their size.   shadow_size : px a side of the map of each.
 
     The defaults are those of ``light:`` in the configuration, where nothing is random.
@@ -191,6 +265,7 @@ class Light:
     sun_size: float = math.radians(LightConfig().sun_size)
     lamps: tuple[Lamp, ...] = ()
     around: tuple[tuple[tuple[float, ...], ...], ...] | None = None
+    surroundings: Panorama | None = field(default=None, compare=False, repr=False)
     shadows: Literal["off", "hard", "soft"] = "off"
     shadow_size: int = LightConfig().shadow_size
 

@@ -10,9 +10,10 @@ from rich.progress import BarColumn, Progress, TimeElapsedColumn
 from rich.table import Table
 
 from blinkgl.config.reader import to_short_yaml
-from blinkgl.errors import OutputError
+from blinkgl.errors import ConfigError, OutputError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.recordings.calibration import calibrate
+from blinkgl.recordings.clip import Flicker
 from blinkgl.report.calibration import page, parameters, rows
 from blinkgl.show.simulate import emulator_options
 from blinkgl.show.terminal import plain_column, plain_console, say
@@ -24,6 +25,7 @@ def run(
     out: str,
     *,
     emulator: str,
+    flicker: str | None = None,
     sensor: str | None = None,
     overrides: Sequence[str] = (),
     overwrite: bool = False,
@@ -53,7 +55,15 @@ def run(
     with bar:
         task = bar.add_task("reading", total=1.0)
         progress = lambda what, done: bar.update(task, description=what, completed=done)
-        result = calibrate(recording, frames, emulator=base, fixed=fixed, progress=progress, **options)
+        result = calibrate(
+            recording,
+            frames,
+            emulator=base,
+            fixed=fixed,
+            flicker=None if flicker is None else _flicker(flicker),
+            progress=progress,
+            **options,
+        )
     text = to_short_yaml(result.sensor())
     with atomic_file(beside, overwrite=overwrite) as html, atomic_file(target, overwrite=overwrite) as file:
         with output_errors(target):
@@ -75,3 +85,19 @@ def run(
         say(console, note)
     say(console, f"written: {target}, {beside}")
     return 0
+
+
+def _flicker(text: str) -> Flicker:
+    hz, comma, contrast = text.partition(",")
+    try:
+        found = Flicker(float(hz), float(contrast))
+    except ValueError:
+        found = Flicker(0.0, 0.0)
+    if not (comma and 0.01 <= found.hz <= 1e4 and 0 < found.contrast < 1):
+        raise ConfigError(
+            "not a frequency and a contrast",
+            where="--flicker",
+            value=text,
+            accepted="HZ,CONTRAST: 0.01 to 10,000 Hz, and (brightest - darkest)/(brightest + darkest) between 0 and 1",
+        )
+    return found

@@ -47,6 +47,7 @@ MIX = 8
 TRIES = 8
 """Sequences of a slot that are tried before it is given up."""
 _APART = 1_000_000  # between numbers of a slot's sequences
+_LEAST_PX = 0.3  # shorter flow counts as so long where density is asked for
 _CANDIDATES = 6  # windows drawn for each that is wanted
 _ATTEMPTS = 3  # at a slot whose worker died
 _SLOT_S = 900.0  # longest for a slot
@@ -62,7 +63,8 @@ class StreamJob:
     recipe : YAML text, its seed already the stream's.   base : folder that its paths start from.
     samples : windows of a slot.   window_us : shortest and longest window, µs, drawn log-uniformly for each; None: the
     recipe's label interval.   min_events : fewest events in each of a sample's two windows.
-    max_flow : longest median of the flow in a sample, px.   split : which groups.   seed : of windows and their order.
+    max_flow : longest median of the flow in a sample, px.   min_density : fewest events per pixel of the new window and
+    px of its mean flow.   split : which groups.   seed : of windows and their order.
     out : the spool folder."""
 
     out: str
@@ -72,6 +74,7 @@ class StreamJob:
     window_us: tuple[int, int] | None = None
     min_events: int = 1
     max_flow: float = 400.0
+    min_density: float = 0.0
     split: str = "train"
     seed: int = 0
     maker: ClassVar[str] = "eflow.data.online:WindowMaker"
@@ -190,6 +193,8 @@ class WindowMaker(Maker):
                 forward, backward = truth.forward, truth.backward
                 lengths = np.hypot(*forward.flow[forward.valid][::7].T)
                 if not len(lengths) or np.median(lengths) > job.max_flow:
+                    continue
+                if len(new) < job.min_density * forward.valid.size * max(float(lengths.mean()), _LEAST_PX):
                     continue
                 yield RawSample(
                     old,
@@ -460,6 +465,7 @@ def open_online(s: SourceConfig, seed: int, *, split: str = "train", first: int 
         None if s.window_ms is None else (round(1000 * s.window_ms[0]), round(1000 * s.window_ms[1])),
         s.min_events,
         s.max_flow,
+        s.min_density,
         split,
         seed,
     )

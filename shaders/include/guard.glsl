@@ -21,6 +21,10 @@ void drop_artefact()
     // NaN.
     if (floatBitsToUint(W) - inverse_depths.x > inverse_depths.y || fwidth(W) > STEEPEST * W)
         discard;
+#ifdef MASKED
+    if (is_hole())
+        discard;
+#endif
 }
 
 // Texture coordinates that differences between neighbours may be taken of. Beside a surface that ends at the horizon

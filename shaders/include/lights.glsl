@@ -3,6 +3,7 @@
 //   SUNS     number of suns           LAMPS    number of point and spot lights, SPOTS: the last of them are spot lights
 //   AMBIENT  light from all around    HUED     of three channels; else of one, what the luminance of this material takes
 //   SHADOWS  see shadows.glsl
+//   SURFACED with RATE: all of this is as it is ``later`` by so many seconds, to first order, for surface.glsl
 //
 // Everything is in the object's own frame, made from float64 poses, so that neither normals nor positions need a matrix.
 // A lamp is a Beam at a point of the surface: whoever shades by more than Lambert's cosine asks for the same beams.
@@ -10,6 +11,28 @@
 #define ILLUMINANT vec3
 #else
 #define ILLUMINANT float
+#endif
+
+#if defined(SURFACED) && defined(RATE)
+#define MOVED
+float later = 0.0;                 // s
+vec3 local_seen = vec3(0.0);       // d(local)/dt at this pixel
+#define NOW(name, i) (name[i] + later * name##_rate[i])
+#else
+#define NOW(name, i) name[i]
+#endif
+
+#ifdef RATE
+// What turns and moves in the object's frame, per second.
+#ifdef SUNS
+uniform vec3 sun_towards_rate[SUNS];
+#endif
+#ifdef LAMPS
+uniform vec3 lamp_place_rate[LAMPS];
+#endif
+#ifdef SPOTS
+uniform vec3 spot_axis_rate[SPOTS];
+#endif
 #endif
 
 #ifdef SHADOWS
@@ -29,7 +52,7 @@ uniform ILLUMINANT sun_strength[SUNS];
 
 Beam sun_beam(int i)
 {
-    return Beam(sun_towards[i], sun_strength[i]);
+    return Beam(NOW(sun_towards, i), sun_strength[i]);
 }
 #endif
 
@@ -43,9 +66,18 @@ uniform vec3 spot_axis[SPOTS]; // unit, against the way it shines
 uniform vec2 spot_cone[SPOTS]; // scale and offset of the cosine
 #endif
 
+vec3 here()
+{
+#ifdef MOVED
+    return local + later * local_seen;
+#else
+    return local;
+#endif
+}
+
 Beam lamp_beam(int i, vec3 at)
 {
-    vec3 way = lamp_place[i] - at;
+    vec3 way = NOW(lamp_place, i) - at;
     float square = max(dot(way, way), NEAREST * NEAREST), inverse = inversesqrt(square);
     vec3 towards = way * inverse;
     float fall = inverse * inverse * max(0.0, 1.0 - square * square * lamp_fading[i]);
@@ -53,7 +85,7 @@ Beam lamp_beam(int i, vec3 at)
     if (i >= LAMPS - SPOTS)
     {
         int k = i - (LAMPS - SPOTS);
-        float share = clamp(dot(towards, spot_axis[k]) * spot_cone[k].x + spot_cone[k].y, 0.0, 1.0);
+        float share = clamp(dot(towards, NOW(spot_axis, k)) * spot_cone[k].x + spot_cone[k].y, 0.0, 1.0);
         fall *= share * share;
     }
 #endif
@@ -73,12 +105,19 @@ uniform vec4 around_even[BANDS];
 #if AMBIENT > 1
 uniform vec3 around_squares[BANDS], around_mixed[BANDS];
 #endif
+#ifdef RATE
+uniform vec4 around_even_rate[BANDS];
+#if AMBIENT > 1
+uniform vec3 around_squares_rate[BANDS], around_mixed_rate[BANDS];
+#endif
+#endif
 
 float around_band(int band, vec3 n)
 {
-    float sum = dot(around_even[band].xyz, n) + around_even[band].w;
+    vec4 even = NOW(around_even, band);
+    float sum = dot(even.xyz, n) + even.w;
 #if AMBIENT > 1
-    sum += dot(around_squares[band], n * n) + dot(around_mixed[band], n * n.yzx);
+    sum += dot(NOW(around_squares, band), n * n) + dot(NOW(around_mixed, band), n * n.yzx);
 #endif
     return sum;
 }
@@ -113,6 +152,9 @@ ILLUMINANT irradiance(vec3 normal)
 #ifdef SHADOW_SUNS
         if (i < SHADOW_SUNS)
         {
+#ifdef MOVED
+            if (later == 0.0)
+#endif
             shadow_share[i] = facing > 0.0 ? shadow(i, local, n, facing, vec3(0.0)) : 1.0; // not looked up where it does not shine
             facing *= shadow_share[i];
         }
@@ -123,7 +165,7 @@ ILLUMINANT irradiance(vec3 normal)
 #ifdef LAMPS
     for (int i = 0; i < LAMPS; ++i)
     {
-        Beam beam = lamp_beam(i, local);
+        Beam beam = lamp_beam(i, here());
         float facing = max(0.0, dot(n, beam.towards));
 #ifdef SHADOW_SPOTS
         int k = i - (LAMPS - SPOTS);
@@ -131,6 +173,9 @@ ILLUMINANT irradiance(vec3 normal)
         {
             int map = SHADOWS - SHADOW_SPOTS + k;
             bool shines = facing > 0.0 && beam.strength != ILLUMINANT(0.0);
+#ifdef MOVED
+            if (later == 0.0)
+#endif
             shadow_share[map] = shines ? shadow(map, local, n, facing, lamp_place[i]) : 1.0;
             facing *= shadow_share[map];
         }
@@ -141,23 +186,8 @@ ILLUMINANT irradiance(vec3 normal)
     return sum;
 }
 
-#ifdef RATE
-// What turns and moves in the object's frame, per second.
-#ifdef SUNS
-uniform vec3 sun_towards_rate[SUNS];
-#endif
-#ifdef LAMPS
-uniform vec3 lamp_place_rate[LAMPS];
-#endif
-#ifdef SPOTS
-uniform vec3 spot_axis_rate[SPOTS];
-#endif
+#if defined(RATE) && !defined(MOVED)
 #ifdef AMBIENT
-uniform vec4 around_even_rate[BANDS];
-#if AMBIENT > 1
-uniform vec3 around_squares_rate[BANDS], around_mixed_rate[BANDS];
-#endif
-
 // The product rule on around_band, whose numbers turn with the object.
 float around_band_rate(int band, vec3 n, vec3 turn)
 {

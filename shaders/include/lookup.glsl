@@ -4,6 +4,7 @@
 
 layout(location = 1) out vec4 shown_lookup; // u, v (times uv_scale), mip level (before clamping), light
 layout(location = 2) out vec4 shown_albedo; // what is multiplied by the light; number of look-ups
+layout(location = 3) out vec4 shown_added;  // to their product: what is mirrored, and light of its own
 
 vec4 noted = vec4(0.0); // sum over the look-ups of (u, v, level, 1)
 
@@ -38,8 +39,9 @@ vec4 noted_texture_grad(sampler2D image, vec2 at, vec2 along_x, vec2 along_y)
 }
 
 // To be called once, when the albedo is known and the light has not been multiplied yet.
-void show_lookup(vec3 unlit, float light)
+void show_lookup(vec3 unlit, float light, vec3 added)
 {
+    shown_added = vec4(added, 0.0);
     shown_lookup = vec4(noted.xyz / max(noted.w, 1.0), light);
     shown_albedo = vec4(unlit, noted.w);
 }

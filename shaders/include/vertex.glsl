@@ -6,6 +6,10 @@
 //   NEEDS_UV      in vec2 uv      texture coordinates, times the material's scale
 //   NEEDS_NORMAL  in vec3 normal  object frame, not normalised
 //   NEEDS_LOCAL   in vec3 local   position, object frame
+//   NEEDS_TINT    in vec3 tint    the vertices' colours
+//   NEEDS_TANGENT in vec4 tangent the way a texture's u runs, object frame, of any length; 1 or -1 (scene/geometry/tangents.py)
+//
+// MASKED, a surface with holes: is_hole(), which drop_artefact() of guard.glsl asks.
 //
 // Of a shape that changes with time (DEFORM, deform.glsl) all of these are as they are now, and there is besides, in clip
 // space, rows x, y, w:
@@ -14,6 +18,11 @@
 //   NEEDS_BACKWARD     in vec3 shape_backward  the same of backward flow
 //   NEEDS_NORMAL_RATE  in vec3 normal_rate     of ``normal``, object frame, per second
 //   NEEDS_LOCAL_RATE   in vec3 local_rate      of ``local``: dq/dt, object frame, per second
+//   NEEDS_TANGENT_RATE in vec3 tangent_rate    of ``tangent``, which turns as a normal does
+
+#if defined(MASKED) && !defined(NEEDS_UV)
+#define NEEDS_UV
+#endif
 
 #ifdef VERTEX_SHADER
 in vec3 in_position;
@@ -30,6 +39,14 @@ out vec3 normal;
 #endif
 #ifdef NEEDS_LOCAL
 out vec3 local;
+#endif
+#ifdef NEEDS_TINT
+in vec3 in_tint;
+out vec3 tint;
+#endif
+#ifdef NEEDS_TANGENT
+in vec4 in_tangent;
+out vec4 tangent;
 #endif
 #ifdef DEFORM
 #include "deform.glsl"
@@ -50,6 +67,9 @@ out vec3 normal_rate;
 #endif
 #ifdef NEEDS_LOCAL_RATE
 out vec3 local_rate;
+#endif
+#ifdef NEEDS_TANGENT_RATE
+out vec3 tangent_rate;
 #endif
 #endif
 
@@ -74,6 +94,16 @@ void main()
 #ifdef NEEDS_LOCAL
     local = position;
 #endif
+#ifdef NEEDS_TINT
+    tint = in_tint;
+#endif
+#ifdef NEEDS_TANGENT
+#ifdef DEFORM
+    tangent = vec4(deformed_normal(in_position, in_tangent.xyz), in_tangent.w);
+#else
+    tangent = in_tangent;
+#endif
+#endif
 #ifdef DEFORM
 #ifdef NEEDS_RATE
     shape_rate = clip_rate * deformed_rate(in_position);
@@ -90,6 +120,9 @@ void main()
 #ifdef NEEDS_LOCAL_RATE
     local_rate = deformed_rate(in_position);
 #endif
+#ifdef NEEDS_TANGENT_RATE
+    tangent_rate = deformed_normal_rate(in_position, in_tangent.xyz);
+#endif
 #endif
 }
 #endif
@@ -103,6 +136,22 @@ in vec3 normal;
 #endif
 #ifdef NEEDS_LOCAL
 in vec3 local;
+#endif
+#ifdef NEEDS_TINT
+in vec3 tint;
+#endif
+#ifdef NEEDS_TANGENT
+in vec4 tangent;
+#endif
+#ifdef MASKED
+uniform sampler2D coverage; // opacity over the coordinates of the base colour
+uniform float cutoff;
+
+// Of the finest level whatever the distance: a hole is a shape, which every pass, the shadow maps and the float64 ray caster see alike.
+bool is_hole()
+{
+    return textureLod(coverage, uv, 0.0).r < cutoff;
+}
 #endif
 #ifdef DEFORM
 #ifdef NEEDS_RATE
@@ -119,6 +168,9 @@ in vec3 normal_rate;
 #endif
 #ifdef NEEDS_LOCAL_RATE
 in vec3 local_rate;
+#endif
+#ifdef NEEDS_TANGENT_RATE
+in vec3 tangent_rate;
 #endif
 #endif
 #endif

@@ -12,7 +12,7 @@ from blinkgl.dataset.explain import explain
 from blinkgl.show.generate import MAX_NOTES, Display, run
 from tests.scene.gltf_files import GltfBuilder, triangle
 
-LINE = "card.glb asks for what is not drawn: alpha BLEND (drawn opaque); metal and roughness (drawn matt)"
+LINE = "card.glb asks for what is not drawn: alpha BLEND (drawn opaque); occlusion maps"
 SMALL = {
     "camera": {"width": 32, "height": 24},
     "time": {"duration": 0.05, "label_rate": 20},
@@ -37,7 +37,7 @@ RANDOM = {
 
 def recipe(tmp_path, scene):
     builder = GltfBuilder()
-    builder.tree["materials"] = [{"alphaMode": "BLEND"}]
+    builder.tree["materials"] = [{"alphaMode": "BLEND", "occlusionTexture": {"index": 0}}]
     builder.node(mesh=triangle(builder, material=0))
     (tmp_path / "assets").mkdir()
     (tmp_path / "assets/card.glb").write_bytes(builder.glb())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import re
 
@@ -12,10 +13,11 @@ import yaml
 
 from blinkgl.cli import run
 from blinkgl.errors import BlinkGLError, ConfigError, EventDataError
+from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.types import Events
 from blinkgl.io.formats import write_events
-from blinkgl.recordings.calibration import calibrate
-from blinkgl.recordings.clip import Clip, clip_of_frames, clip_of_still, clock_offset
+from blinkgl.recordings.calibration import _Search, calibrate
+from blinkgl.recordings.clip import Clip, Flicker, clip_of_frames, clip_of_still, clock_offset
 from blinkgl.recordings.simulation import emulator_config
 from blinkgl.recordings.statistics import numbers, sums, target
 from tests.shared_data import shared
@@ -121,6 +123,22 @@ def test_tiles_of_a_large_sensor_have_the_same_events(monkeypatch):
     assert np.array_equal(a, b)
 
 
+def test_a_number_that_chance_does_not_move_says_nothing_of_the_misfit():
+    """It made ± of a threshold of 0.24 5,000 (cuke_davis346)."""
+    clip, config = scene(), emulator_config({"emulator": "esim", **TRUE})
+    recorded = sums(clip.simulate(config, 1), clip, 0, 3)
+    search = _Search(clip.with_events(clip.simulate(config, 1)), config, 3, 0, lambda _: None)
+    search.target = target(recorded).beside(sums(clip.simulate(config, 2), clip, 0, 3, recorded.polarity), floor="seen")
+    search._keys, search._at = ["contrast_threshold"], np.log([0.25])
+    search._residual = np.ones(len(search.target.values))
+    search._jacobian = np.ones((len(search._residual), 1)) * 10
+    before = search.uncertainty()["contrast_threshold"]
+    chance = search.target.chance.copy()
+    chance[5] = 1e-15
+    search.target = dataclasses.replace(search.target, chance=chance)
+    assert search.uncertainty()["contrast_threshold"] == pytest.approx(before, rel=0.2)
+
+
 # --- the fit ----------------------------------------------------------------------------------------------------------
 
 
@@ -168,6 +186,49 @@ def test_noise_of_a_still_scene_comes_back(tmp_path):
         "leak_rate_hz": pytest.approx(1.0, rel=0.1),
         "shot_noise_rate_hz": pytest.approx(4.0, rel=0.1),
     }
+
+
+def flickering(hz: float = 20.0, contrast: float = 0.6, seconds: float = 0.6, size=(32, 40), **emulator) -> Events:
+    """An even scene under such light, drawn here for itself, darkest at 3 ms."""
+    camera = EventCamera(emulator_config({"emulator": "esim", **TRUE, **emulator}), None, *size, 5)
+    t = np.arange(0, seconds, 1 / (hz * 200))
+    light = 0.4 * (1 - contrast * np.cos(2 * np.pi * hz * (t - 3e-3)))
+    shown = (EventFrame(round(1e9 * a), np.full(size, v, np.float32)) for a, v in zip(t, light))
+    return Events.concatenate([events for _, events in emulate(shown, camera)])
+
+
+def test_thresholds_of_flickering_light(tmp_path):
+    events = flickering(hz=20.1)
+    write_events(tmp_path / "lamp.npz", events, 32, 40)
+    fixed = {key: TRUE[key] for key in ("log_eps", "refractory_us")}
+    result = calibrate(
+        tmp_path / "lamp.npz", flicker=Flicker(20.0, 0.6), emulator={"emulator": "esim", **fixed}, fixed=fixed, starts=1
+    )
+    assert result.clip.facts["flicker_hz"] == pytest.approx(20.1, abs=0.06)
+    light = np.array([frame[0, 0] for _, frame in result.clip.frames])
+    darkest = np.array([t for t, _ in result.clip.frames])[light < light.min() * 1.001] * 1e-9
+    assert np.abs((darkest - 3e-3) * 20.1 - np.round((darkest - 3e-3) * 20.1)).max() < 0.04, "periods"
+    for key, within in (("contrast_threshold", 0.02), ("contrast_threshold_off", 0.02), ("threshold_sigma", 0.15)):
+        assert result.values[key] == pytest.approx(TRUE[key], rel=within), key
+    assert result.judged[1].rate_ratio == pytest.approx(1, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        (["--flicker", "31,0.6"], "do not go up and down with the light"),
+        (["--flicker", "20"], "not a frequency and a contrast"),
+        (["--flicker", "20,1.5"], "not a frequency and a contrast"),
+        (["--flicker", "20,0.6", "--still"], "needs no frames, and does not stand still"),
+        (["--flicker", "4,0.6"], "too few periods|do not go up"),
+    ],
+)
+def test_flicker_that_is_not(tmp_path, capsys, options, said):
+    write_events(tmp_path / "lamp.npz", flickering(), 32, 40)
+    assert run(["calibrate", str(tmp_path / "lamp.npz"), "--out", str(tmp_path / "out.yaml"), *options]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and re.search(said, error), error
+    assert [p.name for p in tmp_path.iterdir()] == ["lamp.npz"]
 
 
 FIVE = range(5)

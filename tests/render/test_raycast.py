@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from blinkgl.render.raycast import LEAF_TRIANGLES, build_tree, join_trees, nearest_exhaustive, nearest_tree
+from blinkgl.render.raycast import LEAF_TRIANGLES, Holes, build_tree, join_trees, nearest_exhaustive, nearest_tree
 
 
 def triangles(seed: int, count: int) -> np.ndarray:
@@ -75,6 +75,7 @@ def forest_with_an_empty_part(parts, cull):
         size=np.insert(whole.size, at, 0).astype(np.int32),
         cull=np.array(cull),
         extent=np.insert(whole.extent, at, 1.0),
+        mask=np.insert(whole.mask, at, -1).astype(np.int32),
     )
 
 
@@ -198,3 +199,31 @@ def test_no_parts_at_all():
     forest = join_trees([], [])
     hit, _, depth = ask(nearest_tree, forest, np.empty((0, 3)), np.empty((0, 3, 3)), np.zeros((2, 2)))
     assert (hit == -1).all() and np.isinf(depth).all()
+
+
+@pytest.mark.parametrize("kernel", [nearest_tree, nearest_exhaustive])
+@pytest.mark.parametrize("wrap", [("repeat", "clamp"), ("mirror", "repeat")])
+def test_rays_pass_through_holes(kernel, wrap):
+    """A card with a picture of holes before a card without: what is hit is what the picture's bilinear value says, by
+    SciPy, which knows its wrap modes by other names."""
+    from scipy.ndimage import map_coordinates
+
+    rng = np.random.default_rng(3)
+    square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0.0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    uvs = np.array([[-1.3, 2.1], [1.9, 2.1], [1.9, -0.7], [-1.3, -0.7]])
+    opacity, cutoff = rng.random((5, 7)).astype(np.float32), 0.45
+    trees = [build_tree(square + [0, 0, z], faces) for z in (2.0, 3.0)]
+    forest = join_trees(trees, [False, False], [Holes(uvs[faces], opacity, cutoff, wrap), None])
+    rays = rng.uniform(-0.33, 0.33, (4000, 2))
+    hit, _, depth = ask(kernel, forest, np.zeros((2, 3)), np.repeat(np.eye(3)[None], 2, 0), rays)
+    at = (2 * rays + 1) / 2
+    u, v = -1.3 + 3.2 * at[:, 0], 2.1 - 2.8 * at[:, 1]
+    padded = np.pad(opacity, ((40, 40), (0, 0)), {"repeat": "wrap", "clamp": "edge", "mirror": "symmetric"}[wrap[1]])
+    padded = np.pad(padded, ((0, 0), (42, 42)), {"repeat": "wrap", "clamp": "edge", "mirror": "symmetric"}[wrap[0]])
+    value = map_coordinates(padded.astype(float), [v * 5 - 0.5 + 40, u * 7 - 0.5 + 42], order=1)
+    clear = np.abs(value - cutoff) > 1e-6
+    there = np.where(value < cutoff, 1, 0)
+    np.testing.assert_array_equal(hit[clear, 0], there[clear])
+    assert 0.2 < there.mean() < 0.8
+    np.testing.assert_allclose(depth[clear], 2.0 + there[clear], rtol=1e-12)

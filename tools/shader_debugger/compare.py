@@ -78,6 +78,10 @@ def _absolute(g, r, gpu, ref):
     return length(g.astype(np.float64) - r)
 
 
+def _relative(g, r, gpu, ref):
+    return length(g.astype(np.float64) - r) / np.maximum(1.0, length(r))
+
+
 def _per_step(g, r, gpu, ref):
     return length(g.astype(np.float64) - r) * gpu.when.step_s
 
@@ -94,7 +98,8 @@ def _misplaced(g, r, gpu, ref):
 
 
 _TWIN = "against a CPU twin of mip-mapped sampling at the GPU's own uv and level; drivers may make mip maps differently"
-_SHADING = "against the GPU's own albedo times its own light"
+_SHADING = "against the GPU's own albedo times its own light, and what it adds"
+_MAPPED = "not graded where a map says how a surface shines, which the reference has without mip maps"
 _LEVEL = "drivers may approximate the level (OpenGL 4.6, 8.14.1)"
 _MIPS = "against a CPU twin of mip-mapped sampling; drivers may make mip maps differently, hence the loose tolerance"
 
@@ -106,7 +111,9 @@ def _shading(name: str, unit: str) -> tuple[Quantity, ...]:
         Quantity(f"{name}_level", "levels", 0.6, _absolute, note=_LEVEL, fit=1.0),
         # sRGB textures of 8 bits: llvmpipe rounds each of their mip levels to 8 bits again, 0.025 after ten
         Quantity(f"{name}_albedo", "linear", 0.05 if name == "colour" else 0.03, _absolute, note=_TWIN, fit=1.0),
-        Quantity(f"{name}_light", "1", 1e-4, _absolute),
+        Quantity(f"{name}_light", "1", 1e-4, _absolute, note=_MAPPED),
+        # a highlight is steep: float32's normal is 1e-7 off, and a mirror's lobe 0.0025 wide
+        Quantity(f"{name}_added", "linear", 2e-3, _relative, note=_MAPPED),
         Quantity(name, unit, 1e-4, _absolute, note=_SHADING),
     )
 
@@ -231,6 +238,12 @@ def histogram(errors: np.ndarray) -> dict[str, int]:
     return out
 
 
+def is_mapped(material: Material) -> bool:
+    """Whether more than its base colour comes from a picture."""
+    gloss = material.gloss is not None and material.gloss.map is not None
+    return material.bumps is not None or material.emission_map is not None or gloss
+
+
 class Comparison:
     """Masks that all buffers share, and :meth:`report` for one of them. objects : names of
     the scene's objects, told apart."""
@@ -267,6 +280,7 @@ class Comparison:
             return gpu[name], self.twin(of)
         if name in ("luminance", "colour"):
             shaded = gpu[f"{name}_albedo"].astype(np.float64) * gpu[f"{name}_light"][..., None]
+            shaded = shaded + gpu[f"{name}_added"]
             shaded = shaded if name == "colour" else shaded[..., 0]
             hit = ref.frame.hit if name == "luminance" else ref.frame.hit[..., None]
             return gpu[name], np.where(hit, shaded, ref[name])
@@ -297,6 +311,13 @@ class Comparison:
                 np.nan_to_num(gpu[f"{of}_uv"][on].astype(np.float64)) + move,
                 gpu[f"{of}_level"][on].astype(np.float64) + level,
             )
+            if part.mesh.colours is not None:
+                frame = self.ref.frame
+                same = on & (frame.part == p)
+                tint = np.ones_like(out)
+                corners = part.mesh.colours[part.mesh.faces[frame.triangle[same]]].astype(np.float64)
+                tint[same] = np.einsum("nc,nck->nk", frame.bary[same], corners)
+                out[on] *= tint[on]
         return out
 
     def errors(self, name: str) -> np.ndarray:
@@ -311,6 +332,10 @@ class Comparison:
         graded = ~self.band
         if quantity.same_triangle:
             graded &= self.same_triangle
+        if lookup_of(name)[1] in ("light", "added"):
+            for p, (_, part) in enumerate(reference.scene_parts(self.ref.scene)):
+                if is_mapped(part.material):
+                    graded &= self.ref.frame.part != p
         if name == "dL_dt":
             for t_ns in (self.gpu.when.before_ns, self.gpu.when.after_ns):
                 other, drawn = self.ref.at(t_ns), self.gpu.renderer.inspect(t_ns)

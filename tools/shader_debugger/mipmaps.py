@@ -14,7 +14,7 @@ import numpy as np
 
 from blinkgl.render import reference
 from blinkgl.render.colour import linear_image
-from blinkgl.scene.types import Material, Texture
+from blinkgl.scene.types import REPEAT, Material, Texture
 
 _chains: WeakKeyDictionary = WeakKeyDictionary()
 
@@ -41,8 +41,8 @@ def _half(image: np.ndarray) -> np.ndarray:
     return image[low] * (1 - part) + image[low + 1] * part
 
 
-def sample_trilinear(texture: Texture, uv: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """(N, 3) linear light at (N, 2) texture coordinates and (N,) levels (below 0: level 0), repeating."""
+def sample_trilinear(texture: Texture, uv: np.ndarray, level: np.ndarray, wrap: tuple[str, str] = REPEAT) -> np.ndarray:
+    """(N, 3) linear light at (N, 2) texture coordinates and (N,) levels (below 0: level 0)."""
     chain = mip_chain(texture)
     level = np.clip(np.nan_to_num(level), 0.0, len(chain) - 1)
     low = np.floor(level).astype(int)
@@ -52,7 +52,8 @@ def sample_trilinear(texture: Texture, uv: np.ndarray, level: np.ndarray) -> np.
         part = (level[on] - k)[:, None]
         upper = chain[min(k + 1, len(chain) - 1)]
         out[on] = (
-            reference.sample_bilinear(chain[k], uv[on]) * (1 - part) + reference.sample_bilinear(upper, uv[on]) * part
+            reference.sample_bilinear(chain[k], uv[on], wrap) * (1 - part)
+            + reference.sample_bilinear(upper, uv[on], wrap) * part
         )
     return out
 
@@ -62,4 +63,4 @@ def mipmapped_albedo(material: Material, uv: np.ndarray, level: np.ndarray) -> n
     base = np.asarray(material.base_color, np.float64)
     if material.texture is None:
         return np.broadcast_to(base, (len(uv), 3)).copy()
-    return sample_trilinear(material.texture, uv, level) * base
+    return sample_trilinear(material.texture, uv, level, material.wrap) * base

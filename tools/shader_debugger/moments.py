@@ -34,7 +34,7 @@ class Pass:
     source: str
 
 
-LOOKUPS = ("uv", "level", "albedo", "light")
+LOOKUPS = ("uv", "level", "albedo", "light", "added")
 """What a textured pass shows of its way to the result, in the order in which it happens."""
 
 
@@ -45,6 +45,7 @@ def _lookups(name: str, program: str) -> tuple[Pass, ...]:
         Pass(f"{name}_level", f"level of {name}", "log2(texels per px)", "scalar", source),
         Pass(f"{name}_albedo", f"albedo of {name}", "linear", "light", source),
         Pass(f"{name}_light", f"light of {name}", "irradiance factor", "scalar", source),
+        Pass(f"{name}_added", f"mirrored and own light of {name}", "linear", "light", source),
     )
 
 
@@ -247,7 +248,8 @@ class ReferenceMoment(_Lazy):
             return {name: (after - before) / self.when.step_s}
         of, what = lookup_of(name)
         if of:
-            return {name: luma_of(self["albedo"]) if name == "luminance_albedo" else self[what]}
+            grey = name in ("luminance_albedo", "luminance_added")
+            return {name: luma_of(self[what]) if grey else self[what]}
         if name in (*LOOKUPS, "colour", "luminance", "texture_size"):
             return self._surface(self.when.t_ns)
         return {
@@ -264,7 +266,7 @@ class ReferenceMoment(_Lazy):
             np.zeros((*shape, 3)),
             np.ones((*shape, 2)),
         )
-        lit = albedo.copy()
+        lit, added = albedo.copy(), albedo.copy()
         xy = reference.pixel_grid(scene.camera).reshape(*shape, 2)
         for p, (thing, part) in enumerate(reference.scene_parts(scene)):
             on = frame.part == p
@@ -286,20 +288,24 @@ class ReferenceMoment(_Lazy):
                     + self.mip_bias
                 )
             albedo[on] = mipmapped_albedo(part.material, uv[on], level[on])
+            if part.mesh.colours is not None:
+                corners = part.mesh.colours[part.mesh.faces[frame.triangle[on]]].astype(np.float64)
+                albedo[on] *= np.einsum("nc,nck->nk", frame.bary[on], corners)
             lit[on], light[on] = albedo[on], 1.0
             if not part.material.unlit:
-                pose = thing.path.pose(t_ns)
-                points = frame.local[on] @ pose[:3, :3].T + pose[:3, 3]
-                own = np.column_stack([frame.part[on], frame.triangle[on]])
-                lit[on] *= (total := reference.received(scene, t_ns, points, frame.normal[on], own).total)
+                hits, rows = frame.hits(), np.flatnonzero(on.ravel())
+                sent = reference.radiated(scene, hits, rows, albedo[on], frame.normal[on], frame.uv[on])
+                lit[on] *= sent.matt
                 grey = albedo[on] @ LUMA
-                light[on] = np.where(grey > 0, lit[on] @ LUMA / np.where(grey > 0, grey, 1.0), total @ LUMA)
-        colour = np.where(frame.hit[..., None], lit, frame.colour)
+                light[on] = np.where(grey > 0, lit[on] @ LUMA / np.where(grey > 0, grey, 1.0), sent.matt @ LUMA)
+                added[on] = sent.added
+        colour = np.where(frame.hit[..., None], lit + added, frame.colour)
         return {
             "uv": uv,
             "light": light,
             "level": level,
             "albedo": albedo,
+            "added": added,
             "colour": colour,
             "luminance": colour @ LUMA,
             "texture_size": size,

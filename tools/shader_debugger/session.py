@@ -251,7 +251,7 @@ class Inspection(ScenePass):
         uniforms["part_number"].value = item.part + 1
 
 
-SHOWN = (Output("lookup", "RGBA32F"), Output("albedo", "RGBA32F"))
+SHOWN = (Output("lookup", "RGBA32F"), Output("albedo", "RGBA32F"), Output("added", "RGBA32F"))
 """What the variant SHOW_LOOKUP writes beside a pass's own output."""
 
 
@@ -303,7 +303,8 @@ class DebugRenderer(Renderer):
     def lookups(self, name: str, t_ns: int) -> dict[str, np.ndarray]:
         """What the pass "luminance" or "colour" looks up and multiplies, float32, as its own source says it (variant
         SHOW_LOOKUP): result (H, W[, 3]) as the pass writes it; uv (H, W, 2); level, light, count (H, W), the number of
-        look-ups; albedo (H, W, 3). One sample at the pixel's centre whatever the anti-aliasing; 0 where nothing is hit.
+        look-ups; albedo, added (H, W, 3). One sample at the pixel's centre whatever the anti-aliasing; 0 where nothing
+        is hit.
 
         Raises ShaderError when the source shows nothing (a copy that is older than the debugger)."""
         program = LOOKUPS[name].program
@@ -327,6 +328,7 @@ class DebugRenderer(Renderer):
             "light": lookup[..., 3],
             "albedo": albedo[..., :3],
             "count": albedo[..., 3],
+            "added": frame.read("added")[..., :3],
         }
 
     def raw(

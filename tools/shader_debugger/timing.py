@@ -116,7 +116,7 @@ class TimedPainter(DebugPainter):
             self.watch.start()
             super().draw(uniforms, item)
             ms, fragments = self.watch.stop()
-            words = (*self._pass.defines(item.kind), *item.kind.defines)
+            words = (*self._pass.defines(item.kind), *item.kind.defines(self._pass.lit))
             variant = " ".join([self._pass.program, *(word.removeprefix("OUT_") for word in words)])
             one = self.result.variants.setdefault(variant, Draws())
             one.gpu_ms, one.fragments = one.gpu_ms + ms, one.fragments + fragments

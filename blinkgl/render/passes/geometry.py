@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from blinkgl.render.resources import DrawItem, Kind
 
 MADE.append(includes)
-_OF_THE_PASS = {"", "mvp", "inverse_depths", "image_size", "clip_rate", "clip_forward", "clip_backward"}
+_OF_THE_PASS = {
+    "", "mvp", "inverse_depths", "image_size", "clip_rate", "clip_forward", "clip_backward", "coverage", "cutoff",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

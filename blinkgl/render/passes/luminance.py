@@ -6,7 +6,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
+
 from blinkgl.render.antialiasing import Samples
+from blinkgl.render.colour import LUMA
 from blinkgl.render.matrices import rows_xyw_bytes
 from blinkgl.render.passes.base import Output, Pass, Shot
 from blinkgl.render.passes.shadow import Shaded, ShadowMap
@@ -26,10 +29,11 @@ class _Luminance(Shaded):
 
     def set(self, painter: Painter, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
         super().set(painter, uniforms, item, shot)
-        if item.kind.hued:
-            painter.resources.shares_texture(item.material).use(0)
-        elif item.textured:
-            painter.resources.luminance_texture(item.material).use(0)
+        if item.textured:
+            resources = painter.resources
+            (resources.shares_texture if item.kind.hued else resources.luminance_texture)(item.material).use(0)
+        elif item.kind.hued:
+            uniforms["albedo"].value = tuple(LUMA * np.asarray(item.material.base_color, np.float64))
         else:
             uniforms["albedo"].value = painter.resources.albedo_luminance(item.material)
         # What is neither textured nor lit does not change; its program has none of these.

@@ -91,8 +91,13 @@ def bounding_sphere(mesh: Mesh) -> tuple[np.ndarray, float]:
 def _fitting(mesh: Mesh, scale: float, config: LodConfig) -> Mesh:
     """The coarsest level whose edges are at most ``edge_px`` (in the mean) and which is wrong
     by at most ``error_px``. A mesh that deforms stays as it is: a level is measured on one shape, and has no
-    weights."""
-    if mesh.deformer is not None or not 0 < scale < np.inf or len(mesh.faces) < 2 * MIN_FACES:
+    weights; so does one whose vertices have colours, which a level would smear."""
+    if (
+        mesh.deformer is not None
+        or mesh.colours is not None
+        or not 0 < scale < np.inf
+        or len(mesh.faces) < 2 * MIN_FACES
+    ):
         return mesh
     centre, radius = bounding_sphere(mesh)
     k = int(2 * np.log2(len(mesh.faces) / max(faces_of_edge(mesh, config.edge_px / scale), MIN_FACES)))

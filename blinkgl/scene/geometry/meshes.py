@@ -469,6 +469,7 @@ def finer(mesh: Mesh, edge: float, max_faces: int = 5_000) -> Mesh:
             faces=faces,
             normals=normals.astype(np.float32),
             uvs=halfway(mesh.uvs).astype(np.float32),
+            colours=None if mesh.colours is None else halfway(mesh.colours).astype(np.float32),
         )
 
 

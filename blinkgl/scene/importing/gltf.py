@@ -3,7 +3,8 @@
 Its own reader rather than trimesh's, because a scene's cameras, unlit and double-sided materials, node names and
 animations are wanted, and because every count and path a file claims has to be checked before it is believed.
 Reference: Khronos glTF 2.0 specification, sections 3.5 (scenes), 3.6 (buffers, accessors), 3.7 (meshes, skins), 3.9
-(materials), 3.10 (cameras), 3.11 (animations); extensions KHR_materials_unlit, KHR_texture_transform.
+(materials), 3.10 (cameras), 3.11 (animations); extensions KHR_materials_unlit, KHR_materials_emissive_strength,
+KHR_texture_transform.
 
 Coordinates stay as in the file (y up) until whoever asked turns them z up (:data:`Z_UP`). What a file asks for
 and is not drawn is collected in :attr:`Document.omissions`.
@@ -17,7 +18,7 @@ import json
 import struct
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import unquote
 
 import numpy as np
@@ -30,20 +31,24 @@ from blinkgl.scene.omissions import Omissions
 from blinkgl.scene.reading import contents, reading
 from blinkgl.scene.shapes.clips import PATHS, Track
 from blinkgl.scene.shapes.skeleton import Locals, Motion, Skeleton
-from blinkgl.scene.surfaces.images import content_hash, decode_image
-from blinkgl.scene.types import Material, Texture
+from blinkgl.scene.surfaces.images import content_hash, decode_alpha, decode_image, decode_numbers
+from blinkgl.scene.types import REPEAT, Gloss, Map, Mask, Material, Texture, Wrap
 from blinkgl.srgb import linear_from_srgb
 
 # Columns: the file's x, y, z axes in a z-up world.
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
-_DRAWN = {"KHR_materials_unlit", "KHR_texture_transform", "KHR_mesh_quantization"}
+_DRAWN = {
+    "KHR_materials_unlit",
+    "KHR_materials_emissive_strength",
+    "KHR_texture_transform",
+    "KHR_mesh_quantization",
+}
 # Not drawn, and yet no reason to refuse a file that requires them: shape, base colour and motion are what they would
 # be, only light is missing from the surface. Everything else that is required (compressed geometry or images,
 # instances, other material models, what nobody has heard of) would be a scene that is not the file's.
 _LIGHTS = "KHR_lights_punctual"
 _LIGHT_ONLY = {
     _LIGHTS,
-    "KHR_materials_emissive_strength",
     "KHR_materials_clearcoat",
     "KHR_materials_sheen",
     "KHR_materials_specular",
@@ -58,7 +63,7 @@ _DTYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125:
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _MAX_NODES, _MAX_DEPTH = 200_000, 256
 _MAX_ZEROS = 64_000_000  # bytes of an accessor without a buffer behind it (all zeros): nothing in the file bounds them
-_WRAPS = {33071: "CLAMP_TO_EDGE", 33648: "MIRRORED_REPEAT"}
+_WRAPS: dict[int, Wrap] = {33071: "clamp", 33648: "mirror"}
 _NEAREST = 9728
 _MAX_TIME = 1e7  # s, of an animation's keys
 _MAX_SETS = 4  # of four joints per vertex
@@ -70,7 +75,8 @@ class Piece:
     """Raw triangles. normals, uvs (v down) and material may be None.
 
     binding : (V, k) joints of the node's skin and (V, k) weights; None: it has no skin.
-    targets : morph targets, (n, V, 3) positions, likewise normals or None; None: it has none."""
+    targets : morph targets, (n, V, 3) positions, likewise normals or None; None: it has none.
+    colours : (V, 3) linear factors on the albedo; None: it has none."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -79,6 +85,23 @@ class Piece:
     material: Material | None = None
     binding: tuple[np.ndarray, np.ndarray] | None = None
     targets: tuple[np.ndarray, np.ndarray | None] | None = None
+    colours: np.ndarray | None = None
+
+
+_INVISIBLE_MATERIAL = Material()
+"""Of what is cut off everywhere."""
+
+
+class _Place(NamedTuple):
+    """Where a texture lies on a mesh: number of its set of coordinates, (3, 3) transform of them or None."""
+
+    coordinates: int
+    matrix: np.ndarray | None
+
+    @classmethod
+    def of(cls, info: dict) -> _Place:
+        transform = info.get("extensions", {}).get("KHR_texture_transform") or {}
+        return cls(transform.get("texCoord", info.get("texCoord", 0)), _texture_transform(transform))
 
 
 def _surface_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -217,10 +240,13 @@ class Document:
             uvs = self._attribute(primitive, f"TEXCOORD_{uv_set}", 2, len(vertices))
             if uvs is not None and uv_matrix is not None:
                 uvs = uvs @ uv_matrix[:2, :2].T + uv_matrix[:2, 2]
+            if material is _INVISIBLE_MATERIAL:
+                continue
+            colours = None
             if self.materials:
-                self._note_wrapping(primitive.get("material"), uvs)
-                material = self._coloured(primitive, material, len(vertices))
-            piece = Piece(vertices, _triangles(order, mode), normals, uvs, material)
+                material, colours = self._coloured(primitive, material, len(vertices))
+                material = self._without_coordinates(material) if uvs is None else material
+            piece = Piece(vertices, _triangles(order, mode), normals, uvs, material, colours=colours)
             if changing:
                 bound, targets = self._binding(primitive, len(vertices)), self._targets(primitive, piece)
                 piece = replace(piece, binding=bound, targets=targets)
@@ -359,35 +385,30 @@ class Document:
             )
         return self.accessor(index).astype(np.float64)
 
-    def _coloured(self, primitive: dict, material: Material | None, count: int) -> Material | None:
-        """The material times the vertices' colour (linear) where they all have the same, which is exact."""
+    def _coloured(
+        self, primitive: dict, material: Material | None, count: int
+    ) -> tuple[Material | None, np.ndarray | None]:
+        """The material, times the vertices' colour (linear) where they all have the same; else (V, 3) of them."""
         if "COLOR_0" not in primitive["attributes"]:
-            return material
+            return material, None
         index = primitive["attributes"]["COLOR_0"]
         width = _WIDTHS[_item(self.tree, "accessors", index, self.where)["type"]]
-        colours = self._attribute(primitive, "COLOR_0", 4 if width == 4 else 3, count)[:, :3]
-        if len(colours) == 0 or not (colours == colours[0]).all():
-            self.omissions.add("vertex colours (left out)")
-            return material
+        given = self._attribute(primitive, "COLOR_0", 4 if width == 4 else 3, count)
+        colours = np.clip(np.nan_to_num(given[:, :3]), 0, 1)
+        if width == 4 and material is not None and material.mask is not None and (given[:, 3] < 1).any():
+            self.omissions.add("opacity of vertex colours (left out)")
         material = material or Material()
-        factor = np.clip(colours[0], 0, 1) * material.base_color
-        return replace(material, base_color=tuple(float(c) for c in factor))
+        if len(colours) and not (colours == colours[0]).all():
+            return material, colours
+        factor = colours[0] * material.base_color if len(colours) else material.base_color
+        return replace(material, base_color=tuple(float(c) for c in factor)), None
 
-    def _note_wrapping(self, material: int | None, uvs: np.ndarray | None) -> None:
-        info = self._base_colour(material).get("baseColorTexture")
-        if info is None or uvs is None or not len(uvs):
-            return
-        sampler = _item(self.tree, "textures", info["index"], self.where).get("sampler")
-        if sampler is None:
-            return
-        settings = _item(self.tree, "samplers", sampler, self.where)
-        for axis, key in enumerate(("wrapS", "wrapT")):
-            # Inside the image all modes show the same, but for the outermost half pixel.
-            outside = uvs[:, axis].min() < -1e-3 or uvs[:, axis].max() > 1 + 1e-3
-            if outside and (name := _WRAPS.get(settings.get(key))):
-                self.omissions.add(f"texture wrap mode {name} (repeated)")
-        if settings.get("magFilter") == _NEAREST:
-            self.omissions.add("unfiltered textures (drawn smooth)")
+    def _without_coordinates(self, material: Material | None) -> Material | None:
+        """Of a mesh that has no texture coordinates: there is no telling which way a normal map lies."""
+        if material is None or material.bumps is None:
+            return material
+        self.omissions.add("normal maps on meshes without texture coordinates (left out)")
+        return replace(material, bumps=None)
 
     def _base_colour(self, material: int | None) -> dict:
         if material is None:
@@ -441,7 +462,7 @@ class Document:
         if index not in self._materials:
             m, pbr = _item(self.tree, "materials", index, self.where), self._base_colour(index)
             info = pbr.get("baseColorTexture") or {}
-            transform = info.get("extensions", {}).get("KHR_texture_transform") or {}
+            base = _Place.of(info)
             material = Material(
                 texture=self._texture(info["index"]) if info and self.materials else None,
                 base_color=tuple(float(c) for c in pbr.get("baseColorFactor", (1, 1, 1, 1))[:3]),
@@ -449,38 +470,96 @@ class Document:
                 double_sided=m.get("doubleSided", False),
             )
             if self.materials:
-                self._note_material(m, pbr)
-            self._materials[index] = (
-                material,
-                transform.get("texCoord", info.get("texCoord", 0)),
-                _texture_transform(transform),
-            )
+                material, base = self._surface(material, m, pbr, base)
+            self._materials[index] = (material, base.coordinates, base.matrix)
         return self._materials[index]
 
-    def _note_material(self, m: dict, pbr: dict) -> None:
-        """What a used material asks for beside a matt base colour."""
-        if m.get("alphaMode", "OPAQUE") != "OPAQUE":
-            self.omissions.add(f"alpha {m['alphaMode']} (drawn opaque)")
+    def _surface(self, material: Material, m: dict, pbr: dict, base: _Place) -> tuple[Material, _Place]:
+        """``material`` with all that glTF says of it beside its base colour, and the place of its coordinates: that of
+        the first of its textures."""
         for name in m.get("extensions", {}):
-            if name not in _DRAWN | _INVISIBLE | {"KHR_materials_emissive_strength"}:
+            if name not in _DRAWN | _INVISIBLE:
                 self.omissions.add(name)
-        if "KHR_materials_unlit" in m.get("extensions", {}):
-            return
-        if any(m.get("emissiveFactor", (0, 0, 0))):
-            self.omissions.add("emissive light")
-        if pbr.get("metallicFactor", 1) > 0 or pbr.get("roughnessFactor", 1) < 1:
-            self.omissions.add("metal and roughness (drawn matt)")
-        for key, name in (("normalTexture", "normal maps"), ("occlusionTexture", "occlusion maps")):
-            if key in m:
-                self.omissions.add(name)
+        info = pbr.get("baseColorTexture") or {}
+        if info and material.texture is not None:
+            material = replace(material, wrap=self._wraps(info["index"]))
+        material = self._masked(material, m, pbr)
+        if material is _INVISIBLE_MATERIAL or material.unlit:
+            return material, base
+        if "occlusionTexture" in m:
+            self.omissions.add("occlusion maps")
+        emissive, bumps = m.get("emissiveTexture"), m.get("normalTexture")
+        rough = pbr.get("metallicRoughnessTexture")
+        if not info:
+            base = _Place.of(next((one for one in (rough, bumps, emissive) if one), {}))
+        strength = m.get("extensions", {}).get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
+        emission = tuple(float(c * strength) for c in m.get("emissiveFactor", (0, 0, 0)))
+        if any(emission):
+            material = replace(material, emission=emission, emission_map=self._map(emissive, base, "colour"))
+        metallic, roughness = (min(float(pbr.get(f"{key}Factor", 1)), 1.0) for key in ("metallic", "roughness"))
+        if metallic > 0 or roughness < 1 or rough:
+            material = replace(material, gloss=Gloss(metallic, roughness, self._map(rough, base, "numbers")))
+        if bumps and (bumped := self._map(bumps, base, "numbers")) is not None:
+            material = replace(material, bumps=bumped, bump_scale=float(bumps.get("scale", 1.0)))
+        return material, base
 
-    def _texture(self, index: int) -> Texture | None:
+    def _masked(self, material: Material, m: dict, pbr: dict) -> Material:
+        """With its holes. One that shows wholly is not masked; one that shows nowhere is _INVISIBLE_MATERIAL."""
+        mode, factor = m.get("alphaMode", "OPAQUE"), float(pbr.get("baseColorFactor", (1, 1, 1, 1))[3])
+        if mode == "OPAQUE":
+            return material
+        info = pbr.get("baseColorTexture") or {}
+        alpha = self._texture(info["index"], "alpha") if info else None
+        image = np.full((1, 1), 255, np.uint8) if alpha is None else alpha.image
+        cutoff = float(m.get("alphaCutoff", 0.5)) if mode == "MASK" else 0.5
+        least, most = (factor * float(v) / 255 for v in (image.min(), image.max()))
+        if mode == "BLEND":
+            if most < cutoff:
+                self.omissions.add("alpha BLEND (drawn opaque)")
+                return material
+            self.omissions.add("alpha BLEND (cut off at a half)" if least < cutoff else "alpha BLEND (drawn opaque)")
+        if most < cutoff:
+            return _INVISIBLE_MATERIAL
+        return replace(material, mask=Mask(image, factor, cutoff)) if least < cutoff else material
+
+    def _map(self, info: dict | None, base: _Place, kind: str) -> Map | None:
+        """A texture beside that of the base colour. kind : "colour" or "numbers"."""
+        if not info:
+            return None
+        place, texture = _Place.of(info), self._texture(info["index"], kind)
+        if texture is None:
+            return None
+        if place.coordinates != base.coordinates:
+            self.omissions.add("maps on a second set of texture coordinates (left out)")
+            return None
+        whole = np.eye(3)
+        own, first = (whole if one.matrix is None else one.matrix for one in (place, base))
+        if abs(np.linalg.det(first)) < 1e-12:
+            at = own
+        else:
+            at = own @ np.linalg.inv(first)
+        a, b, c, d, e, f = (float(v) for v in np.round(at[:2], 12).ravel())
+        return Map(texture, (a, b, c, d, e, f), self._wraps(info["index"]))
+
+    def _wraps(self, index: int) -> tuple[Wrap, Wrap]:
+        """Of a texture."""
+        sampler = _item(self.tree, "textures", index, self.where).get("sampler")
+        if sampler is None:
+            return REPEAT
+        settings = _item(self.tree, "samplers", sampler, self.where)
+        if settings.get("magFilter") == _NEAREST:
+            self.omissions.add("unfiltered textures (drawn smooth)")
+        s, t = (_WRAPS.get(settings.get(key, 10497), "repeat") for key in ("wrapS", "wrapT"))
+        return s, t
+
+    def _texture(self, index: int, kind: str = "colour") -> Texture | None:
+        """kind : "colour"; "numbers", as they are stored; "alpha", (h, w), None where the image is opaque."""
         source = _item(self.tree, "textures", index, self.where).get("source")
         if source is None:
             names = ", ".join(self.tree["textures"][index].get("extensions", {})) or "without an image"
             self.omissions.add(f"textures of another kind ({names})")
             return None
-        if source not in self._textures:
+        if (source, kind) not in self._textures:
             image = _item(self.tree, "images", source, self.where)
             if "bufferView" in image:
                 v = _item(self.tree, "bufferViews", image["bufferView"], self.where)
@@ -490,9 +569,10 @@ class Document:
             else:
                 data = _fetch(image.get("uri", ""), self.path, "image")
             name = str(image.get("name") or f"image-{source}")
-            pixels = decode_image(data, self.max_texture, f"{self.where} (image '{name}')")
-            self._textures[source] = Texture(pixels, name, content_hash(data))
-        return self._textures[source]
+            decode = {"colour": decode_image, "numbers": decode_numbers, "alpha": decode_alpha}[kind]
+            pixels = decode(data, self.max_texture, f"{self.where} (image '{name}')")
+            self._textures[source, kind] = None if pixels is None else Texture(pixels, name, content_hash(data))
+        return self._textures[source, kind]
 
     # ---- animations
     def tracks(self, animation: int) -> list[Track]:

@@ -91,6 +91,10 @@ class TextureInfo(_Part):
     extensions: TextureExtensions = TextureExtensions()
 
 
+class NormalTextureInfo(TextureInfo):
+    scale: Number = 1.0
+
+
 class Pbr(_Part):
     baseColorFactor: Annotated[list[Factor], Field(min_length=4, max_length=4)] = [1, 1, 1, 1]
     baseColorTexture: TextureInfo = None
@@ -99,15 +103,24 @@ class Pbr(_Part):
     metallicRoughnessTexture: TextureInfo = None
 
 
+class EmissiveStrength(_Part):
+    emissiveStrength: Factor = 1.0
+
+
+class MaterialExtensions(_Part):
+    KHR_materials_emissive_strength: EmissiveStrength = None
+
+
 class Material(_Part):
     pbrMetallicRoughness: Pbr = Pbr()
-    normalTexture: TextureInfo = None
+    normalTexture: NormalTextureInfo = None
     occlusionTexture: TextureInfo = None
     emissiveTexture: TextureInfo = None
     emissiveFactor: Annotated[list[Factor], Field(min_length=3, max_length=3)] = [0, 0, 0]
     alphaMode: Literal["OPAQUE", "MASK", "BLEND"] = "OPAQUE"
+    alphaCutoff: Factor = 0.5
     doubleSided: bool = False
-    extensions: Extensions = {}
+    extensions: MaterialExtensions = MaterialExtensions()
 
 
 class Primitive(_Part):

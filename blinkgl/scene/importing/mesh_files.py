@@ -24,6 +24,7 @@ from PIL import Image
 from blinkgl.config.deform import AnimationConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.geometry.meshes import closed_together, concatenate, make_mesh, normalise
+from blinkgl.scene.geometry.tangents import split_mirrored
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.animations import clip_names, play, rest_pieces
 from blinkgl.scene.omissions import Omissions
@@ -31,6 +32,7 @@ from blinkgl.scene.reading import MAX_BYTES, contents, reading
 from blinkgl.scene.shapes.skin import Skin, joined
 from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash, decode_image, shrink
 from blinkgl.scene.types import Material, Mesh, Part, Texture
+from blinkgl.srgb import linear_from_srgb
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb", ".gltf")
 logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # its warnings say nothing a user could act on
@@ -166,7 +168,8 @@ def _load(
     for number, piece in enumerate(pieces):
         if len(piece.faces) == 0 and len(pieces) > 1:
             continue
-        source: list[np.ndarray] | None = None if played is None else []
+        own = has_own_vertices(piece, has_materials)
+        source: list[np.ndarray] | None = [] if played is not None or own else None
         # A palette picked by degenerate coordinates is fine with the file's own texture, useless with any other.
         own_texture = has_materials and piece.material is not None and piece.material.texture is not None
         mesh = make_mesh(
@@ -182,6 +185,8 @@ def _load(
             log=log,
             source=source,
         )
+        if source is not None and own:
+            mesh = with_own_vertices(mesh, piece, source)
         if played is not None and source is not None:
             deformer = played.deformer(nodes[number], piece, source[0], turn @ at_rest[number], turn)
             mesh = replace(mesh, deformer=deformer)
@@ -197,6 +202,23 @@ def _load(
         parts = [Part(replace(p.mesh, closed=True), p.material) for p in parts]  # one solid, split by material
     said = tuple(dict.fromkeys(log)), omissions.lines()
     return Asset(path.stem, digest, tuple(parts), has_materials, *said, tuple(clips))
+
+
+def has_own_vertices(piece: gltf.Piece, materials: bool = True) -> bool:
+    """Whether a piece's vertices carry what :func:`make_mesh` knows nothing of. materials : whether it has its own."""
+    bumped = piece.material is not None and piece.material.bumps is not None
+    return materials and (piece.colours is not None or bumped)
+
+
+def with_own_vertices(mesh: Mesh, piece: gltf.Piece, source: list[np.ndarray]) -> Mesh:
+    """``mesh``, made of a piece, with the colours of its vertices, and split where a normal map meets its mirror image.
+    source : which of the piece's vertices each of the mesh's is; replaced by that of the result."""
+    if piece.colours is not None:
+        mesh = replace(mesh, colours=piece.colours[source[0]].astype(np.float32))
+    if piece.material is not None and piece.material.bumps is not None:
+        mesh, index = split_mirrored(mesh)
+        source[0] = source[0][index]
+    return mesh
 
 
 def joined_mesh(meshes: tuple[Mesh, ...], name: str, source_hash: str) -> Mesh | None:
@@ -270,12 +292,17 @@ def piece_of_trimesh(
         uvs = np.asarray(uvs, np.float64)[:, :2] * [1, -1] + [0, 1]  # trimesh has v upwards
     else:
         uvs = None
+    material, colours = None, None
+    if max_texture is not None:
+        material = _material(mesh.visual, max_texture, where, omissions, resolver)
+        if getattr(mesh.visual, "kind", None) == "vertex":
+            colours = linear_from_srgb(np.asarray(mesh.visual.vertex_colors, float)[:, :3] / 255)
+            if (colours == colours[0]).all():
+                colours = None
+            elif material is not None:
+                material = replace(material, base_color=(1.0, 1.0, 1.0))
     return gltf.Piece(
-        np.asarray(mesh.vertices, np.float64),
-        np.asarray(mesh.faces),
-        normals,
-        uvs,
-        None if max_texture is None else _material(mesh.visual, max_texture, where, omissions, resolver),
+        np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces), normals, uvs, material, colours=colours
     )
 
 
@@ -288,7 +315,7 @@ def _material(
         if kind not in ("face", "vertex"):
             return None
         colours = visual.face_colors if kind == "face" else visual.vertex_colors
-        if not (colours == colours[0]).all():
+        if kind == "face" and not (colours == colours[0]).all():
             omissions.add(f"{kind} colours (drawn in the most frequent one)")
         return Material(base_color=gltf.to_linear(np.asarray(visual.main_color, float)[:3] / 255))
     image = getattr(material, "baseColorTexture", None)

@@ -19,6 +19,7 @@ import numpy as np
 from scipy import ndimage
 
 _WIDTH = 1024  # of what is integrated: harmonics of order 2 do not see more
+PICTURE_WIDTH = 256  # of what is seen in a mirror
 _BRIGHTER = 30.0  # times the mean radiance: the least that a sun is
 _EDGE = 0.1  # of a sun's brightest: where its disc ends
 _LARGEST = math.radians(12.0)  # radius of what may be a sun; a photograph's glare is several times its disc
@@ -38,10 +39,13 @@ class Sun(NamedTuple):
 
 class Environment(NamedTuple):
     """What a panorama sends: the quadric of :func:`blinkgl.scene.lights.ambient`, (3, 4, 4), and its sun, if there is
-    one, or its brightest lamps, which are not in the quadric."""
+    one, or its brightest lamps, which are not in the quadric.
+
+    picture : (h, w, 3) float32 radiance, at most 256 px wide, without those suns: what shines shows."""
 
     quadric: np.ndarray
     suns: tuple[Sun, ...]
+    picture: np.ndarray
 
 
 def environment(radiance: np.ndarray, suns: int = MOST_SUNS) -> Environment:
@@ -57,7 +61,9 @@ def environment(radiance: np.ndarray, suns: int = MOST_SUNS) -> Environment:
         if sun is None:
             break
         found.append(sun)
-    return Environment(quadric_of_harmonics(harmonics(image, directions, solid)), tuple(found))
+    small = (min(image.shape[1], PICTURE_WIDTH), min(image.shape[0], PICTURE_WIDTH // 2))
+    picture = cv2.resize(image, small, interpolation=cv2.INTER_AREA).astype(np.float32)
+    return Environment(quadric_of_harmonics(harmonics(image, directions, solid)), tuple(found), picture)
 
 
 def turned(given: Environment, angle: float) -> Environment:
@@ -65,7 +71,10 @@ def turned(given: Environment, angle: float) -> Environment:
     T = np.eye(4)
     T[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
     suns = tuple(sun._replace(towards=T[:3, :3] @ sun.towards) for sun in given.suns)
-    return Environment(T @ given.quadric @ T.T, suns)
+    columns = angle * given.picture.shape[1] / (2 * np.pi)  # azimuth falls to the right
+    whole, part = math.floor(columns), np.float32(columns - math.floor(columns))
+    a, b = (np.roll(given.picture, -k, axis=1) for k in (whole, whole + 1))
+    return Environment(T @ given.quadric @ T.T, suns, a * (1 - part) + b * part)
 
 
 def pixel_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:

@@ -85,6 +85,39 @@ def decode_image(data: bytes, max_size: int | None, where: str) -> np.ndarray:
         return shrink(image, max_size)
 
 
+def decode_numbers(data: bytes, max_size: int | None, where: str) -> np.ndarray:
+    """(h, w, 3) uint8 of a picture that is no colour but three numbers a pixel, 255 for 1 (normals, roughness): as
+    stored, made smaller by their mean. Raises AssetError as :func:`load_image`, and for high dynamic range."""
+    with reading("image", where):
+        if data[:2] == b"#?" or data[:4] == _EXR:
+            raise AssetError("a map of numbers has high dynamic range", where=where, accepted="8 or 16 bits a channel")
+        return _smaller(_decode_ldr(data, where), max_size)
+
+
+def decode_alpha(data: bytes, max_size: int | None, where: str) -> np.ndarray | None:
+    """(h, w) uint8 of how opaque an image's pixels are; None where all are wholly so. Raises AssetError."""
+    with reading("image", where):
+        if data[:2] == b"#?" or data[:4] == _EXR:
+            return None
+        with _open(data, where) as image:
+            _check_size(*image.size, where)
+            if not image.has_transparency_data:
+                return None
+            image.load()
+            ImageOps.exif_transpose(image, in_place=True)
+            alpha = np.array(image.convert("RGBA").getchannel("A"))
+        return None if alpha.min() == 255 else _smaller(alpha, max_size)
+
+
+def _smaller(numbers: np.ndarray, max_size: int | None) -> np.ndarray:
+    height, width = numbers.shape[:2]
+    if max_size is None or max(height, width) <= max_size:
+        return numbers
+    factor = max_size / max(height, width)
+    size = max(1, round(width * factor)), max(1, round(height * factor))
+    return cv2.resize(numbers, size, interpolation=cv2.INTER_AREA)
+
+
 def _open(data: bytes, where: str) -> Image.Image:
     """``Image.open`` for the formats of textures and without its guard, which the caller replaces."""
     Image.init()

@@ -27,7 +27,7 @@ from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.geometry.meshes import closed_together, make_mesh
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.animations import Animation, clip_names, play, rest_pieces
-from blinkgl.scene.importing.mesh_files import piece_of_trimesh
+from blinkgl.scene.importing.mesh_files import has_own_vertices, piece_of_trimesh, with_own_vertices
 from blinkgl.scene.lights import MAX_LAMPS, lamp_of_gltf, make_light
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.omissions import Omissions
@@ -55,7 +55,9 @@ def scene_from_file(config: FileSceneConfig, camera: CameraModel, t0_ns: int, t1
         raise ConfigError("no such file", where="scene.path", value=config.path, accepted="a gltf or glb file")
     if path.suffix.lower() not in (".gltf", ".glb"):
         raise ConfigError("not a glTF scene", where="scene.path", value=config.path, accepted="a .gltf or .glb file")
-    camera_path = None if config.pose is None else motion_path(config.pose, t0_ns, t1_ns, "scene.pose", camera=True)
+    camera_path = (
+        None if config.pose is None else motion_path(config.pose, t0_ns, t1_ns, "scene.pose", base, camera=True)
+    )
     scene = from_gltf(
         path,
         camera,
@@ -349,7 +351,7 @@ def _parts(
 ) -> tuple[Part, ...]:
     parts = []
     for piece in (gltf.transformed(p, baked) for p in pieces if len(p.faces)):
-        source: list[np.ndarray] | None = None if deformer is None else []
+        source: list[np.ndarray] | None = [] if deformer is not None or has_own_vertices(piece) else None
         textured = piece.material is not None and piece.material.texture is not None
         mesh = make_mesh(
             piece.vertices,
@@ -363,6 +365,8 @@ def _parts(
             log=log,
             source=source,
         )
+        if source is not None and has_own_vertices(piece):
+            mesh = with_own_vertices(mesh, piece, source)
         if deformer is not None and source is not None:
             mesh = replace(mesh, deformer=deformer(piece, source[0]))
         parts.append(Part(mesh, piece.material or Material()))

@@ -1,0 +1,240 @@
+"""How well does a network, or a method, tell the motion in recordings of cameras?
+
+    python -m blinkgl.tools.real_recordings real_small contrast-affine --recordings ../shared/data/events
+    python -m blinkgl.tools.real_recordings real_small contrast-affine --recordings ../shared/data/events --bursts
+
+The first line is for choosing: of every recording but the two bursts with ground truth, up to ``--windows`` pairs of
+windows, evenly spaced, of a length over which contrast maximisation's translation says about five px (the same windows
+for all that are judged; of large sensors their middle). Beside each other, medians over windows:
+
+| column | what it is |
+|---|---|
+| FWL | how much sharper the flow makes the events (Stoffregen et al., ECCV 2020); 1 is zero flow's |
+| cosine, length | beside the affine field that makes the events sharpest (where its FWL > 1.1), at pixels with events |
+| ms | processor time of a window, grids included |
+
+``all`` is the median of the recordings that move (the affine field's FWL above 1.1). A slider's camera moves along the
+image's x axis: ``x`` is the share of its flow along it.
+
+The second line is for judging, and to be used seldom: the bursts' flow is known. AEE and cosine of the whole burst as
+one window, beside zero flow's and the best constant and affine flow (which know the truth); at pixels with events, and
+over all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from blinkgl.errors import BlinkGLError
+from blinkgl.events.types import Events
+from blinkgl.show.terminal import plain_console, say
+from blinkgl.tools.data_statistics import TEST, read, recordings
+from eflow.checkpoint import load_model
+from eflow.data.window import Window
+from eflow.infer import LIKELY_PX, MethodPredictor, Predictor, StreamWindow, read_truth
+from eflow.methods.iwe import flow_warp_loss
+from eflow.methods.table import METHODS, make_method
+
+MOVES = 1.1
+"""FWL of the affine field from which on a window is said to move."""
+LONGEST_MS = 120.0
+MIDDLE = (260, 346)
+"""Height and width, px, that are looked at of a large sensor."""
+Answer = Callable[[StreamWindow], np.ndarray]
+
+
+def looked_at(path: Path) -> tuple[Events, int, int]:
+    """Events, height and width of a recording; of a large sensor its middle (:data:`MIDDLE`), where contrast
+    maximisation takes seconds a window and not minutes. Raises BlinkGLError."""
+    events, height, width = read(path)
+    high, wide = min(height, MIDDLE[0]), min(width, MIDDLE[1])
+    top, left = (height - high) // 2, (width - wide) // 2
+    inside = (events.x >= left) & (events.x < left + wide) & (events.y >= top) & (events.y < top + high)
+    part = events.part(inside)
+    return Events(part.x - np.uint16(left), part.y - np.uint16(top), part.t, part.p), high, wide
+
+
+def cut(events: Events, t: int, span: int) -> StreamWindow:
+    """The pair of windows of ``span`` µs that meet at t."""
+    sides = []
+    for t0 in (t - span, t):
+        e = events.window(t0, t0 + span)
+        sides.append(Window(e.x, e.y, e.t, e.p, t0, t0 + span))
+    return StreamWindow(t, *sides)
+
+
+def answer_of(name: str, height: int, width: int, focal: float | None = None) -> Answer:
+    """A network's or method's flow (H, W, 2) of a pair of windows, zero where there is nothing to go by."""
+    if name == "zero":
+        return lambda window: np.zeros((height, width, 2), np.float32)
+    if name in METHODS:
+        predictor = MethodPredictor(make_method(name, focal), height, width, empty="zero")
+    else:
+        predictor = Predictor(load_model(name), height, width, empty="zero")
+    return lambda window: predictor(window)[0]
+
+
+def likely_span(events: Events, height: int, width: int) -> int:
+    """Length, µs, over which the middle of the recording moves by about :data:`LIKELY_PX`, by contrast maximisation."""
+    translation = answer_of("contrast-translation", height, width)
+    t0, t1 = int(events.t[0]), int(events.t[-1]) + 1
+    longest = int(min((t1 - t0) // 3, 1000 * LONGEST_MS))
+    span = min(20_000, longest)
+    for _ in range(3):
+        speeds = []
+        for place in (0.3, 0.5, 0.7):
+            t = int(np.clip(t0 + place * (t1 - t0), t0 + span, t1 - span))
+            speeds.append(float(np.hypot(*translation(cut(events, t, span))[0, 0])))
+        span = int(np.clip(span * np.clip(LIKELY_PX / max(np.median(speeds), 1e-3), 0.4, 2.5), 1000, longest))
+    return span
+
+
+def judged(path: Path, names: list[str], most: int) -> dict[str, Any]:
+    """What a recording says of each: {"span_ms", "windows", "moves", "rows": {name: {...}}}."""
+    events, height, width = looked_at(path)
+    span = likely_span(events, height, width)
+    t0, t1 = int(events.t[0]), int(events.t[-1]) + 1
+    count = int(np.clip((t1 - t0 - span) // span, 1, most))
+    pairs = [cut(events, int(t), span) for t in np.linspace(t0 + span, max(t1 - span, t0 + span), count)]
+    pairs = [pair for pair in pairs if min(len(pair.old), len(pair.new)) >= 100]
+    if not pairs:
+        raise BlinkGLError("no windows with 100 events", where=str(path))
+    affine = answer_of("contrast-affine", height, width)
+    best = [affine(pair) for pair in pairs]
+    sharp = [flow_warp_loss(pair.new, flow) for pair, flow in zip(pairs, best, strict=True)]
+    rows = {}
+    for name in names:
+        answer = answer_of(name, height, width)
+        answer(pairs[0])  # compiles
+        began = time.process_time()
+        flows = [answer(pair) for pair in pairs]
+        spent = (time.process_time() - began) / len(pairs)
+        cosines, lengths, along = [], [], []
+        for pair, flow, other, fwl in zip(pairs, flows, best, sharp, strict=True):
+            hit = np.zeros((height, width), bool)
+            hit[pair.new.y, pair.new.x] = True
+            mine, its = flow[hit].astype(np.float64), other[hit].astype(np.float64)
+            sizes = np.hypot(*mine.T), np.hypot(*its.T)
+            along.append(float(np.abs(mine[:, 0]).sum() / max(sizes[0].sum(), 1e-9)))
+            if fwl > MOVES:
+                cosines.append(float(np.median((mine * its).sum(1) / np.maximum(sizes[0] * sizes[1], 1e-9))))
+                lengths.append(float(sizes[0].sum() / max(sizes[1].sum(), 1e-9)))
+        middle = lambda values: float(np.median(values)) if values else float("nan")
+        rows[name] = {
+            "fwl": middle([flow_warp_loss(pair.new, flow) for pair, flow in zip(pairs, flows, strict=True)]),
+            "cosine": middle(cosines),
+            "length": middle(lengths),
+            "x": middle(along),
+            "ms": 1000 * spent,
+        }
+    size = f"{width}x{height}"
+    return {"size": size, "span_ms": span / 1000, "windows": len(pairs), "moves": float(np.median(sharp)), "rows": rows}
+
+
+def burst(folder: Path, names: list[str]) -> dict[str, dict[str, float]]:
+    """A burst with its flow, as one window, for each: AEE, its share of zero flow's, cosine (mean over pixels), all
+    pixels and those with events; and what the best constant and affine flow would have."""
+    events, height, width = read(folder / "events.txt")
+    truth = read_truth(folder / "flow.npy", height, width).astype(np.float64)
+    focal = float((folder / "calib.txt").read_text().split()[0])
+    t0, t1 = int(events.t[0]), int(events.t[-1]) + 1
+    whole = Window(events.x, events.y, events.t, events.p, t0, t1)
+    middle = (t0 + t1) // 2
+    halves = cut(events, middle, t1 - middle)
+    valid = np.isfinite(truth).all(-1)
+    hit = np.zeros_like(valid)
+    hit[events.y, events.x] = True
+    v, u = np.mgrid[:height, :width]
+    basis = np.stack([np.ones_like(u), u, v], -1).astype(np.float64)
+    fit = np.linalg.lstsq(basis[valid], truth[valid], rcond=None)[0]
+    flows = {
+        "zero": np.zeros_like(truth),
+        "best constant": np.broadcast_to(np.median(truth[valid], 0), truth.shape),
+        "best affine": basis @ fit,
+    }
+    for name in names:
+        if name in METHODS:
+            # A method's flow is over its new window, which must lie behind an old one.
+            empty = Window(events.x[:0], events.y[:0], events.t[:0], events.p[:0], t0 - (t1 - t0), t0)
+            try:
+                flows[name] = make_method(name, focal)(empty, whole, height, width)
+            except BlinkGLError as error:
+                print(f"{name}: {error}")
+            continue
+        model = load_model(name)
+        predictor = Predictor(model, height, width, empty="zero")
+        one = "old" not in model.reads
+        pair = StreamWindow(t0, whole, whole) if one else halves
+        flows[name] = predictor(pair)[0] * (1.0 if one else (t1 - t0) / (t1 - middle))
+    rows = {}
+    for name, flow in flows.items():
+        row = {}
+        for where, mask in (("events", valid & hit), ("all", valid)):
+            mine, its = np.asarray(flow, np.float64)[mask], truth[mask]
+            error, size = np.hypot(*(mine - its).T).mean(), np.hypot(*its.T)
+            length = np.hypot(*mine.T)
+            row |= {
+                f"aee_{where}": float(error),
+                f"of_zero_{where}": float(error / size.mean()),
+                f"cosine_{where}": float(((mine * its).sum(1) / np.maximum(length * size, 1e-9)).mean()),
+                f"length_{where}": float(length.sum() / size.sum()),
+            }
+        rows[name] = row
+    return rows
+
+
+def table(title: str, heads: list[str], rows: list[list[Any]]) -> str:
+    """Markdown."""
+    cell = lambda v: f"{v:.3g}" if isinstance(v, float) and np.isfinite(v) else "–" if isinstance(v, float) else str(v)
+    lines = ["| " + " | ".join([title, *heads]) + " |", "|" + "---|" * (len(heads) + 1)]
+    return "\n".join(lines + ["| " + " | ".join(map(cell, row)) + " |" for row in rows])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("answers", nargs="+", help=f"checkpoints, packaged networks, or {', '.join(METHODS)}")
+    parser.add_argument("--recordings", type=Path, required=True)
+    parser.add_argument("--windows", type=int, default=12, help="of a recording, at most")
+    parser.add_argument("--bursts", action="store_true", help=f"the recordings of {TEST}, whose flow is known")
+    parser.add_argument("--json", type=Path)
+    a = parser.parse_args()
+    console, found = plain_console(), {}
+    if a.bursts:
+        for folder in sorted((a.recordings / TEST).iterdir()):
+            rows = found[folder.name] = burst(folder, a.answers)
+            keys = [f"{what}_{where}" for where in ("events", "all") for what in ("aee", "of_zero", "cosine", "length")]
+            heads = [key.replace("_", " ") for key in keys]
+            say(console, table(folder.name, heads, [[n, *(row[k] for k in keys)] for n, row in rows.items()]) + "\n")
+    else:
+        for path in recordings(a.recordings):
+            name = path.relative_to(a.recordings).as_posix()
+            if name.startswith(TEST):
+                continue
+            try:
+                found[name] = judged(path, a.answers, a.windows)
+            except BlinkGLError as error:
+                say(console, f"left out: {error}")
+                continue
+            it = found[name]
+            title = f"{name}, {it['size']}, {it['windows']} of {it['span_ms']:.1f} ms, affine {it['moves']:.2f}"
+            keys = ["fwl", "cosine", "length", "x", "ms"]
+            say(console, table(title, keys, [[n, *(row[k] for k in keys)] for n, row in it["rows"].items()]) + "\n")
+        moving = [it for it in found.values() if it["moves"] > MOVES]
+        if not moving:
+            raise SystemExit(f"nothing moves below {a.recordings}")
+        over = lambda name, key: float(np.nanmedian([it["rows"][name][key] for it in moving]))
+        rows = [[n, *(over(n, k) for k in ("fwl", "cosine", "length"))] for n in a.answers]
+        say(console, table(f"all that move ({len(moving)})", ["fwl", "cosine", "length"], rows))
+    if a.json:
+        a.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

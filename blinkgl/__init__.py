@@ -26,6 +26,7 @@ _HOMES = {
         "Pose",
         "Primitive",
         "Scene",
+        "Trajectory",
         "Way",
         "look_at",
     ),
@@ -40,10 +41,12 @@ _HOMES = {
         "open_events",
         "read_events",
         "read_flow",
+        "read_trajectory",
         "simulate",
         "simulate_file",
         "write_events",
         "write_flow",
+        "write_trajectory",
     ),
     "blinkgl.events.types": ("Events",),
     "blinkgl.sequence.items": ("CameraImage", "EventChunk", "GroundTruth", "Picture"),
@@ -63,10 +66,12 @@ if TYPE_CHECKING:  # what a type checker and an editor see; a test compares it w
         open_events,
         read_events,
         read_flow,
+        read_trajectory,
         simulate,
         simulate_file,
         write_events,
         write_flow,
+        write_trajectory,
     )
     from blinkgl.front.runs import Timeline, generate, load, verify
     from blinkgl.front.scenes import (
@@ -81,6 +86,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see; a test compares it w
         Pose,
         Primitive,
         Scene,
+        Trajectory,
         Way,
         look_at,
     )
@@ -119,6 +125,7 @@ __all__ = [
     "Renderer",
     "Scene",
     "Timeline",
+    "Trajectory",
     "V2e",
     "Way",
     "calibrate",
@@ -131,6 +138,7 @@ __all__ = [
     "open_events",
     "read_events",
     "read_flow",
+    "read_trajectory",
     "record",
     "render_frame",
     "simulate",
@@ -139,6 +147,7 @@ __all__ = [
     "verify",
     "write_events",
     "write_flow",
+    "write_trajectory",
 ]
 
 

@@ -24,6 +24,8 @@ class Role(IntEnum):
     SHAPE = 6
     LIGHT = 7
     IMAGES = 8
+    IMU = 9
+    TRACKS = 10
 
 
 def seed_sequence(seed: int, sequence: int, role: Role) -> np.random.SeedSequence:

@@ -482,15 +482,43 @@ class KeyframeConfig(PoseConfig):
     )
 
 
+class TrajectoryConfig(Config):
+    """Poses of a file, and a C2 spline through them. They are T_world_body: of a camera with OpenCV's axes, of an
+    object with its own. The file has to cover the sequence."""
+
+    file: str = Field(description="TUM: t x y z qx qy qz qw; or EuRoC's CSV: t, x, y, z, qw, qx, qy, qz")
+    form: Literal["auto", "tum", "euroc"] = Field("auto", description="auto: EuRoC's where lines have commas")
+    start: float | None = Field(
+        None,
+        ge=-1e10,
+        le=1e10,
+        description="s on the file's clock that are 0 s on the sequence's; null: the first pose is at time.start",
+    )
+    smooth: float = Field(
+        0.0,
+        ge=0,
+        le=60,
+        description="each pose becomes the mean of those within so many s before and after, weighed by a triangle; 0: "
+        "the spline passes them all",
+    )
+
+
 class KeyedMotionConfig(PoseConfig):
-    """A fixed pose, or key frames; before the first and after the last the pose is held. From one key frame to the
-    next a body turns the shortest way (for ``spline``: near it), so ``euler`` may change by less than 180 degrees per
-    step; whole turns need key frames in between."""
+    """A fixed pose, key frames, or a trajectory from a file; before the first and after the last the pose is held.
+    From one key frame to the next a body turns the shortest way (for ``spline``: near it), so ``euler`` may change
+    by less than 180 degrees per step; whole turns need key frames in between."""
 
     keyframes: tuple[KeyframeConfig, ...] = Field((), description="two or more poses with increasing times")
     interpolation: Literal["spline", "linear"] = Field(
         "spline", description="between key frames: C2 spline, or straight lines and slerp"
     )
+
+    trajectory: TrajectoryConfig | None = Field(None, description="poses of a file, in place of a pose or key frames")
+
+    @rule("?trajectory", "#keyframes", "position", "quaternion", "euler", "look_at")
+    def _one_source(trajectory, keyframes, position, *orientation):
+        if trajectory and (keyframes or any(position) or any(o is not None for o in orientation)):
+            raise Refused("give a trajectory, a fixed pose or keyframes, not several of them", where="trajectory")
 
     @rule("keyframes.*.time")
     def _in_order(times: tuple[float, ...]):
@@ -638,10 +666,25 @@ class ObjectConfig(KeyedMotionConfig):
     )
     way: WayConfig | None = Field(None, description="a curve that it follows, in place of a pose or key frames")
 
+    @rule("?way", "?trajectory")
+    def _a_way_or_a_trajectory(way, trajectory):
+        if way and trajectory:
+            raise Refused("give a way or a trajectory, not both", where="way")
+
     @rule("?way", "#keyframes", "position", "quaternion", "euler", "look_at")
     def _one_motion(way, keyframes, position, *orientation):
         if way and (keyframes or any(position) or any(o is not None for o in orientation)):
             raise Refused("give a way, a fixed pose or keyframes, not several of them")
+
+    @rule("physics.kind", "?trajectory")
+    def _the_engine_or_a_trajectory(kind, trajectory):
+        if kind == "dynamic" and trajectory:
+            raise Refused(
+                "a dynamic body has no trajectory: the engine moves it",
+                where="physics.kind",
+                value=kind,
+                accepted="fixed, which pushes what it meets on its way",
+            )
 
     @rule("physics.kind", "#keyframes")
     def _the_engine_or_key_frames(kind, keyframes):

@@ -26,6 +26,7 @@ from blinkgl.config.events import EmulatorConfig, EsimConfig, followers
 from blinkgl.config.frames import MAX_SPAN_S, FramesConfig
 from blinkgl.config.gl import GLConfig
 from blinkgl.config.images import ImagesConfig, check_images, readout_us
+from blinkgl.config.imu import ImuConfig, check_imu
 from blinkgl.config.labels import LabelsConfig, fill_causes
 from blinkgl.config.lod import LodConfig
 from blinkgl.config.quality import Quality, fill_quality
@@ -41,6 +42,7 @@ from blinkgl.config.sensor import (
     spelled_out,
 )
 from blinkgl.config.timeline import DisplacementTimeline, TimelineConfig
+from blinkgl.config.tracks import TracksConfig, check_tracks
 from blinkgl.errors import ConfigError
 from blinkgl.labels import LABELS  # noqa: F401 - whose rows bring the keys of `labels:`
 
@@ -279,6 +281,10 @@ class SequenceConfig(Config):
     images: ImagesConfig | None = Field(
         None, description="a frame camera beside the event camera (docs/images.md); null: none"
     )
+    imu: ImuConfig | None = Field(None, description="an inertial unit on the camera (docs/over_time.md); null: none")
+    tracks: TracksConfig | None = Field(
+        None, description="points on surfaces, followed through the sequence (docs/over_time.md); null: none"
+    )
     preview: PreviewConfig = Field(PreviewConfig(), description="preview.mp4")
     gl: GLConfig = Field(GLConfig(), description="which OpenGL to use")
 
@@ -324,6 +330,26 @@ class SequenceConfig(Config):
                 where="images",
                 accepted="null, or a scene instead of frames",
             )
+
+    @rule("?imu", "?tracks", "?frames")
+    def _frames_have_no_path(imu: bool, tracks: bool, frames: bool):
+        for key, there, what in (("imu", imu, "their camera was"), ("tracks", tracks, "their surfaces are")):
+            if there and frames:
+                raise Refused(
+                    f"recorded frames do not tell where {what}",
+                    where=key,
+                    accepted="null, or a scene instead of frames",
+                )
+
+    @rule("imu.rate", "time.duration", "time.label_rate")
+    def _measurements_fit(rate: float | None, duration: float, label_rate: float):
+        if rate is not None:
+            check_imu(rate, span_s(duration, label_rate))
+
+    @rule("tracks.points", "tracks.rate", "time.duration", "time.label_rate")
+    def _tracks_fit(points: int | None, rate: float | None, duration: float, label_rate: float):
+        if points is not None:
+            check_tracks(points, label_rate if rate is None else rate, duration)
 
     @rule(
         "images.rate",

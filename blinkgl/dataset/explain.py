@@ -19,19 +19,23 @@ from typing import Any
 import numpy as np
 
 from blinkgl.config.images import ImagesConfig
+from blinkgl.config.imu import imu_count
 from blinkgl.config.sequence import RunTemplate, SequenceConfig
+from blinkgl.config.tracks import TracksConfig, track_times
 from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging import FrameCamera
 from blinkgl.labels import LABELS, asked_for
 from blinkgl.labels.label import BUFFERS
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import Renderer
+from blinkgl.render.tracks import track_points
 from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.lights import is_coloured, lamps_of
 from blinkgl.scene.shapes.table import DEFORMERS
 from blinkgl.scene.types import Light, Scene
 from blinkgl.sequence import simulate_sequence
 from blinkgl.sequence.folders import folder_of
+from blinkgl.sequence.inertial import measured
 from blinkgl.sequence.qualify import Verdict, shown, verdict
 from blinkgl.sequence.recorded import RECORDED
 from blinkgl.sequence.rendered import SURFACES, surfaces_at
@@ -340,6 +344,21 @@ def _passes(
                 each * pictures,
             )
         )
+    if config.imu is not None:
+        count = imu_count(config.imu.rate, t0, t1)
+        started = time.perf_counter()
+        measured(scene.camera_path, config.imu, t0, min(t1, t0 + (t1 - t0) // 8), np.random.default_rng(0))
+        each = 8 * (time.perf_counter() - started)
+        said = f"{count} measurements at {config.imu.rate:g} Hz, {'noisy and ' if config.imu.noisy else ''}ideal"
+        result.passes.append(Pass("inertial unit", said, (), 0, count, each))
+    if config.tracks is not None:
+        ends = config.time.label_times_ns[0], config.time.t1_ns, config.time.interval_ns
+        moments, few = track_times(config.tracks.rate, *ends), TracksConfig(points=64)
+        started = time.perf_counter()
+        track_points(renderer.scene, few, moments[:2], np.random.default_rng(0))
+        each = (time.perf_counter() - started) / 2
+        said = f"at most {config.tracks.points} points ({config.tracks.choose}) at {len(moments)} times, float64"
+        result.passes.append(Pass("point tracks", said, (), 0, len(moments), each * len(moments)))
     if config.images is not None:
         result.passes.append(_frame_camera(config.images, renderer, scene))
     each, rate = probe.clock.seconds["events"] / probe.frames, probe.events / max(1e-9 * (seen[-1] - t0), 1e-9)
@@ -400,6 +419,8 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
     for name, on, key in (
         *((heading, heading in there, why) for heading, why in labels.items()),
         ("preview", config.preview.enabled, "preview.enabled: false"),
+        ("inertial unit", config.imu is not None, "imu: null"),
+        ("point tracks", config.tracks is not None, "tracks: null"),
         ("what made each event", config.labels.events, "labels.events: false"),
         ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)"),
         ("frame camera: motion blur, noise, lens", images is not None, "images: null"),

@@ -20,6 +20,7 @@ from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging.metering import decibels
 from blinkgl.io.frame_camera import ExposureLine
 from blinkgl.io.sequence_dir import SequenceWriter, refuse_existing
+from blinkgl.io.tracks import TRACKS
 from blinkgl.labels import LABELS
 from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Simulation, simulate_sequence
 from blinkgl.sequence.clock import StageClock
@@ -99,6 +100,10 @@ def generate_sequence(
         with clock("write"):
             if poses := sequence.poses():
                 writer.poses(**poses)
+            if (inertial := sequence.imu()) is not None:
+                writer.imu(config.imu, vars(inertial))
+            if (tracks := sequence.tracks()) is not None:
+                writer.arrays(TRACKS, **vars(tracks))
             writer.t_end_us = sequence.t1_ns // 1000
             writer.info.update(manifest_info(sequence))
         flushing = StageClock()  # leaving the block waits for the writers' threads and syncs the files

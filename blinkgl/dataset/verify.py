@@ -21,7 +21,9 @@ import h5py
 import numpy as np
 
 from blinkgl.config.images import exposure_starts
+from blinkgl.config.imu import imu_times
 from blinkgl.config.sequence import RunTemplate, SequenceConfig, load_run
+from blinkgl.config.tracks import track_times
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.dataset.plan import Plan, sequence_name
 from blinkgl.dataset.run_folder import RunFolder
@@ -40,9 +42,11 @@ from blinkgl.io.frame_camera import (
     read_exposures,
 )
 from blinkgl.io.hdf5 import dataset, open_hdf5
+from blinkgl.io.imu import FILES as IMU_FILES, read_imu, read_imu_csv
 from blinkgl.io.index import INDEX, entry, read_index, sequence_folders
 from blinkgl.io.records import open_regular, shown
 from blinkgl.io.sequence_dir import MANIFEST, read_manifest, verify_sequence
+from blinkgl.io.tracks import TRACKS, problem_of as problem_of_tracks, read_tracks
 from blinkgl.labels import LABELS, Label, asked_for
 
 _BLOCK = 1 << 20
@@ -182,6 +186,10 @@ def _look(folder: Path, name: str) -> tuple[list[str], _Known | None]:
         if EVENT_LABELS in manifest["files"]:
             problems += _guarded(lambda: _check_truth(folder, manifest))
         problems += _guarded(lambda: _check_labels(folder, manifest))
+        if config.imu is not None:
+            problems += _guarded(lambda: _check_imu(folder, config))
+        if config.tracks is not None:
+            problems += _guarded(lambda: _check_tracks(folder, manifest, config))
         if config.images is not None:
             problems += _guarded(lambda: _check_images(folder, manifest, config))
         if not problems:
@@ -239,6 +247,10 @@ def _files_of(config: SequenceConfig) -> Iterator[str]:
             yield label.stamps
         for form in label.written(config.labels):
             yield from form.files(config.time.label_count + label.at_last)
+    if config.imu is not None:
+        yield from IMU_FILES
+    if config.tracks is not None:
+        yield TRACKS
     if config.images is not None:
         yield from files_of(config.images, len(_exposures_of(config)))
     if config.preview.enabled:
@@ -380,6 +392,31 @@ def _check_value(path: Path, manifest: dict[str, Any], label: Label) -> list[str
     value = label.forms[0].read(path)
     problem = label.wrong(value, manifest["height"], manifest["width"]) or label.problem(value)
     return [] if problem is None else [problem]
+
+
+def _check_imu(folder: Path, config: SequenceConfig) -> list[str]:
+    """As many measurements as the configuration asks for, at its times, finite, and the same in all files."""
+    arrays, wanted = read_imu(folder), imu_times(config.imu.rate, config.time.t0_ns, config.time.t1_ns)
+    if arrays["t_ns"].tolist() != wanted:
+        return [f"{IMU_FILES[2]}: {len(arrays['t_ns'])} measurements, not the {len(wanted)} that config.yaml asks for"]
+    if not all(np.isfinite(array).all() for array in arrays.values()):
+        return [f"{IMU_FILES[2]}: a number that is not finite"]
+    for name, columns in zip(IMU_FILES, (("rate", "acceleration"), ("ideal_rate", "ideal_acceleration"))):
+        told = read_imu_csv(folder / name)
+        if not all(np.array_equal(a, arrays[b]) for a, b in zip(told, ("t_ns", *columns))):
+            return [f"{name}: not what imu.h5 says"]
+    return []
+
+
+def _check_tracks(folder: Path, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
+    """At the times that the configuration asks for, of what the scene has, inside the image where seen."""
+    arrays, time = read_tracks(folder), config.time
+    wanted = track_times(config.tracks.rate, time.label_times_ns[0], time.t1_ns, time.interval_ns)
+    if arrays["t_us"].tolist() != [t // 1000 for t in wanted]:
+        return [f"{TRACKS}: at {len(arrays['t_us'])} times, not at the {len(wanted)} that config.yaml asks for"]
+    instances = {thing["id"] for thing in manifest.get("objects", ())}
+    problem = problem_of_tracks(arrays, manifest["height"], manifest["width"], instances)
+    return [] if problem is None else [f"{TRACKS}: {problem}"]
 
 
 def _check_images(folder: Path, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:

@@ -12,7 +12,7 @@ from blinkgl.errors import ConfigError, EventDataError
 from blinkgl.events.types import Events
 from blinkgl.front import arguments as check
 from blinkgl.front.runs import EmulatorSettings, events_tree
-from blinkgl.io import flow as flow_files, formats
+from blinkgl.io import flow as flow_files, formats, trajectories
 from blinkgl.io.formats import EventFile
 
 if TYPE_CHECKING:
@@ -148,6 +148,28 @@ def write_flow(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray | No
     if not field.size:
         raise ConfigError("no pixels", where="flow", value=field.shape, accepted="an array (H, W, 2), px")
     return flow_files.write_flow(check.path(path, "path"), field.astype(np.float32), mask.astype(bool))
+
+
+def read_trajectory(path: str | os.PathLike, *, form: str | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Times (N,) int64 ns and poses T_world_body (N, 4, 4) float64 of TUM's text or EuRoC's CSV.
+
+    form : "tum" or "euroc"; None: EuRoC's where lines have commas.
+    Raises AssetError, naming the line: no pose, times that do not increase, a gap."""
+    if form not in (None, *trajectories.FORMATS):
+        raise ConfigError("unknown form", where="form", value=form, accepted="tum, euroc or None")
+    return trajectories.read_trajectory(check.path(path, "path"), form)
+
+
+def write_trajectory(path: str | os.PathLike, t_ns: np.ndarray, poses: np.ndarray) -> None:
+    """Writes poses (N, 4, 4) at t_ns (N,) whole ns as TUM's text, t x y z qx qy qz qw: those of a sequence's
+    ``poses.npz`` are ``t_ns`` and ``T_world_cam``. Raises OutputError, ConfigError."""
+    times = check.array(t_ns, "t_ns", (None,), "an array (N,) of whole ns")
+    placed = check.array(poses, "poses", (len(times), 4, 4), f"an array ({len(times)}, 4, 4)")
+    if times.dtype.kind not in "iu" or (np.diff(times) <= 0).any():
+        raise ConfigError(
+            "times do not increase", where="t_ns", value=times[:3].tolist(), accepted="whole ns, in order"
+        )
+    trajectories.write_trajectory(check.path(path, "path"), times, placed.astype(np.float64))
 
 
 def compare(

@@ -26,6 +26,8 @@ MAX_INDEX = 10_000_000
 Source = Scene | RunTemplate
 EmulatorSettings = str | Mapping[str, Any] | Config
 ImageSettings = str | Mapping[str, Any] | Config
+ImuSettings = str | Mapping[str, Any] | Config
+TrackSettings = str | Mapping[str, Any] | Config
 
 
 class Timeline:
@@ -73,13 +75,15 @@ def generate(
     quality: str | None = None,
     labels: Sequence[str] | None = None,
     images: ImageSettings | None = None,
+    imu: ImuSettings | None = None,
+    tracks: TrackSettings | None = None,
 ) -> Outcome:
     """Makes a data set below the folder ``out``, as ``blinkgl generate`` does: the same files, bit for bit.
 
     source : :class:`Scene` or what :func:`load` gave.   num : how many sequences (of each group at
     most).   workers : processes; 1: this one.
     resume : go on where ``out`` holds sequences of this run.   emulator, sensor, timeline,
-    quality, labels, images : as of :func:`record`.
+    quality, labels, images, imu, tracks : as of :func:`record`.
     Returns what was made (``made.events``, ``made.labels`` …) and what was set aside.
     Raises BlinkGLError: ConfigError (also a scene with arrays in it: save them to files
     first), AssetError, GLError, OutputError."""
@@ -87,7 +91,15 @@ def generate(
     from blinkgl.dataset.run import run_dataset
 
     template = configured(
-        source, emulator=emulator, sensor=sensor, timeline=timeline, quality=quality, labels=labels, images=images
+        source,
+        emulator=emulator,
+        sensor=sensor,
+        timeline=timeline,
+        quality=quality,
+        labels=labels,
+        images=images,
+        imu=imu,
+        tracks=tracks,
     )
     if isinstance(source, Scene) and not source.on_disk:
         raise ConfigError(
@@ -120,6 +132,8 @@ def configured(
     quality: str | None = None,
     labels: Sequence[str] | None = None,
     images: ImageSettings | None = None,
+    imu: ImuSettings | None = None,
+    tracks: TrackSettings | None = None,
 ) -> RunTemplate:
     """``source`` as a run, with what is given here laid over it. Raises ConfigError."""
     check.one_of(source, "source", (Scene, RunTemplate), "a Scene, or what load() gives")
@@ -133,6 +147,14 @@ def configured(
         own["labels"] = labels_tree(labels)
     if images is not None:
         own["images"] = images_tree(images)
+    if imu is not None:
+        own["imu"] = section_tree(
+            "imu", imu, "preset", "an inertial unit", "a preset's name, or a table such as {'rate': 400}"
+        )
+    if tracks is not None:
+        own["tracks"] = section_tree(
+            "tracks", tracks, "choose", "point tracks", "grid, random, surface, or a table such as {'points': 100}"
+        )
     own = with_recipes(with_sensors(own, Path.cwd()))
     if "quality" in own:
         validate_field(SequenceConfig, "quality", own["quality"])
@@ -174,21 +196,28 @@ def events_tree(emulator: EmulatorSettings) -> dict[str, Any]:
 
 def images_tree(images: ImageSettings) -> dict[str, Any]:
     """``images:`` of a preset's name, a table, or a configuration. Raises ConfigError."""
-    if not isinstance(images, (str, Mapping, Config)):
-        raise ConfigError(
-            "not a frame camera",
-            where="images",
-            value=images,
-            accepted="a preset's name, or a table such as {'exposure_us': 10000, 'photon_noise': True}",
-        )
-    tree = (
-        images.model_dump(exclude_unset=True)
-        if isinstance(images, Config)
-        else {"preset": images}
-        if isinstance(images, str)
-        else check.plain(images)
+    return section_tree(
+        "images",
+        images,
+        "preset",
+        "a frame camera",
+        "a preset's name, or a table such as {'exposure_us': 10000, 'photon_noise': True}",
     )
-    validate_field(SequenceConfig, "images", tree)
+
+
+def section_tree(key: str, given: Any, named: str, what: str, accepted: str) -> dict[str, Any]:
+    """A section of a configuration of a table, a configuration, or a text, which is its key ``named``.
+    Raises ConfigError."""
+    if not isinstance(given, (str, Mapping, Config)):
+        raise ConfigError(f"not {what}", where=key, value=given, accepted=accepted)
+    tree = (
+        given.model_dump(exclude_unset=True)
+        if isinstance(given, Config)
+        else {named: given}
+        if isinstance(given, str)
+        else check.plain(given)
+    )
+    validate_field(SequenceConfig, key, tree)
     return tree
 
 

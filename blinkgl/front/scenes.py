@@ -114,11 +114,33 @@ class Keyframes(_Piece):
         )
 
 
-def _motion(pose: Pose | Keyframes | Vector, where: str, others: str = "") -> dict[str, Any]:
+class Trajectory(_Piece):
+    """A motion from a file, TUM's or EuRoC's, by a spline: ``Camera(pose=Trajectory("flight.txt"))``.
+
+    file : path.   form : "tum", "euroc"; "auto": EuRoC's where lines have commas.   start : s on the file's clock that
+    are 0 s on the scene's; None: its first pose is where the sequence begins.   smooth : s, each pose becomes the mean
+    of those within it.
+    Raises ConfigError; a file that does not cover the sequence is found when the scene is built."""
+
+    def __init__(
+        self,
+        file: str | os.PathLike,
+        *,
+        form: Literal["auto", "tum", "euroc"] = "auto",
+        start: float | None = None,
+        smooth: float = 0.0,
+    ):
+        tree = check.given(file=os.fspath(check.path(file, "file").absolute()), form=form, start=start, smooth=smooth)
+        self.tree = self._checked(KeyedMotionConfig, {"trajectory": tree}, trajectory="")
+
+
+def _motion(pose: Pose | Keyframes | Trajectory | Vector, where: str, others: str = "") -> dict[str, Any]:
     """A position alone is a pose. others : what else may be given, for the message."""
-    if isinstance(pose, (Pose, Keyframes)):
+    if isinstance(pose, (Pose, Keyframes, Trajectory)):
         return pose.tree
-    check.one_of(pose, where, (list, tuple, np.ndarray), f"a Pose, Keyframes, {others}or a position of three numbers")
+    check.one_of(
+        pose, where, (list, tuple, np.ndarray), f"a Pose, Keyframes, Trajectory, {others}or a position of three numbers"
+    )
     return Pose(pose).tree
 
 
@@ -128,7 +150,8 @@ class Camera(_Piece):
     width, height : px.   fov : horizontal field of view, degrees (default 60), or focal : focal length, px.
     cx, cy : principal point, px; (0, 0) is the centre of the top-left pixel; default: the image's
     centre.   near : m, nothing nearer is drawn.
-    pose : :class:`Pose`, :class:`Keyframes` or a position (3,); OpenCV axes (x right, y down, z forward).
+    pose : :class:`Pose`, :class:`Keyframes`, :class:`Trajectory` or a position (3,); OpenCV axes (x right, y down, z
+    forward).
     Raises ConfigError."""
 
     def __init__(
@@ -141,7 +164,7 @@ class Camera(_Piece):
         cx: float | None = None,
         cy: float | None = None,
         near: float = 0.05,
-        pose: Pose | Keyframes | Vector = (0.0, 0.0, 0.0),
+        pose: Pose | Keyframes | Trajectory | Vector = (0.0, 0.0, 0.0),
     ):
         self.tree = self._checked(
             CameraConfig, check.given(width=width, height=height, fov=fov, focal=focal, cx=cx, cy=cy, near=near)
@@ -384,7 +407,7 @@ class _Object(_Piece):
         self,
         name: str | None,
         material: Material | None,
-        pose: Pose | Keyframes | Way | Vector,
+        pose: Pose | Keyframes | Trajectory | Way | Vector,
         scale: float | Vector,
         category: str,
         body: Body | None,
@@ -413,7 +436,7 @@ class Primitive(_Object):
     parameters : the shape's sizes (m) and numbers of faces, such as ``extents=(1, 1, 2)``, and what a figure does,
     such as ``clip="dance"`` (docs/configuration.md, "primitives").
     material : :class:`Material`, default white, or the coat of what lives.   scale : one factor, or (3,).
-    pose : :class:`Pose`, :class:`Keyframes`, :class:`Way` or a position (3,).
+    pose : :class:`Pose`, :class:`Keyframes`, :class:`Trajectory`, :class:`Way` or a position (3,).
     name : default the shape's.   category : "object", "ground", "wall" or "sky": what collisions make of it.
     body : what it is where things fall, :class:`Body`; None: in the way.
     deform : how its shape changes, :class:`Deform`; None: not, or as what lives does by itself.
@@ -424,7 +447,7 @@ class Primitive(_Object):
         kind: str,
         *,
         material: Material | None = None,
-        pose: Pose | Keyframes | Way | Vector = (0.0, 0.0, 0.0),
+        pose: Pose | Keyframes | Trajectory | Way | Vector = (0.0, 0.0, 0.0),
         scale: float | Vector = 1.0,
         name: str | None = None,
         category: Literal["object", "ground", "wall", "sky"] = "object",
@@ -470,7 +493,7 @@ class Mesh(_Object):
         uvs: ArrayLike | None = None,
         up: Literal["auto", "y", "z"] = "auto",
         material: Material | None = None,
-        pose: Pose | Keyframes | Way | Vector = (0.0, 0.0, 0.0),
+        pose: Pose | Keyframes | Trajectory | Way | Vector = (0.0, 0.0, 0.0),
         scale: float | Vector = 1.0,
         name: str | None = None,
         category: Literal["object", "ground", "wall", "sky"] = "object",

@@ -11,10 +11,21 @@ from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.events.types import Events
 from blinkgl.front import arguments as check
-from blinkgl.front.runs import MAX_INDEX, EmulatorSettings, ImageSettings, Source, Timeline, configured
+from blinkgl.front.runs import (
+    MAX_INDEX,
+    EmulatorSettings,
+    ImageSettings,
+    ImuSettings,
+    Source,
+    Timeline,
+    TrackSettings,
+    configured,
+)
 from blinkgl.front.scenes import Scene
 from blinkgl.labels import Flow, LabelFrame
+from blinkgl.render.tracks import Tracks
 from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Simulation, simulate as core
+from blinkgl.sequence.inertial import Inertial
 from blinkgl.srgb import to_srgb8
 
 
@@ -28,6 +39,8 @@ def simulate_sequence(
     quality: str | None = None,
     labels: Sequence[str] | None = None,
     images: ImageSettings | None = None,
+    imu: ImuSettings | None = None,
+    tracks: TrackSettings | None = None,
     events: bool = True,
     pictures_hz: float | None = None,
 ) -> Simulation:
@@ -44,8 +57,8 @@ def simulate_sequence(
 
     source : :class:`Scene` or what :func:`load` gave, recorded frames (``frames:``)
     included.   index : number of the sequence.
-    emulator, sensor, timeline, quality, labels, images : as of :func:`record`; what ``labels`` does not name is not
-    drawn.
+    emulator, sensor, timeline, quality, labels, images, imu, tracks : as of :func:`record`; what ``labels`` does not
+    name is not drawn; ``imu()`` and ``tracks()`` of the iterator give the last two.
     events : False leaves them out.
     pictures_hz : gives a :class:`Picture` so many times per second of simulated time, at event frames.
     The iterator has ``config``, ``height``, ``width``, ``t0_ns``, ``t1_ns``, and counts ``frames``, ``events``,
@@ -60,6 +73,8 @@ def simulate_sequence(
         quality=quality,
         labels=labels,
         images=images,
+        imu=imu,
+        tracks=tracks,
     )
     check.one_of(events, "events", bool, "True or False")
     if pictures_hz is not None:
@@ -86,7 +101,9 @@ class Recording:
     images : (K + 1, H, W, 3) uint8 sRGB at ``image_t_us`` (K + 1,) int64 (recorded ones as they are), or None.
     config : every value as drawn.   frames : how many the emulator saw.
     lost : events that its limit and the read-out swallowed.
-    camera : :class:`CameraImage` of the frame camera, where ``images:`` asks for one."""
+    camera : :class:`CameraImage` of the frame camera, where ``images:`` asks for one.
+    imu : what an inertial unit measured, :class:`~blinkgl.sequence.inertial.Inertial`; None: there is none.
+    tracks : points followed, :class:`~blinkgl.render.tracks.Tracks`; None: nobody asked."""
 
     events: Events
     t_us: np.ndarray
@@ -97,6 +114,8 @@ class Recording:
     frames: int
     lost: int
     camera: tuple[CameraImage, ...] = ()
+    imu: Inertial | None = None
+    tracks: Tracks | None = None
 
     @property
     def flow(self) -> np.ndarray:
@@ -131,6 +150,8 @@ def record(
     quality: str | None = None,
     labels: Sequence[str] | None = None,
     images: ImageSettings | None = None,
+    imu: ImuSettings | None = None,
+    tracks: TrackSettings | None = None,
 ) -> Recording:
     """Events, images and ground truth of one sequence as arrays: what :func:`generate` writes, held in memory.
 
@@ -142,6 +163,8 @@ def record(
     labels : names of labels, such as images, flow, flow_backward, occlusion, depth
     (docs/configuration.md has all); "events": what made each event, ``events.truth``; default: the source's.
     images : a frame camera: the name of a preset, "deblurring", or a table of ``images:``, ``{"exposure_us": 10000}``.
+    imu : an inertial unit: the name of a preset, "adis16448", or a table of ``imu:``, ``{"rate": 400}``.
+    tracks : points on surfaces, followed: "grid", "random", "surface", or a table of ``tracks:``, ``{"points": 100}``.
     Raises ConfigError, AssetError, GLError, EventDataError."""
     config = _configured(
         source,
@@ -152,6 +175,8 @@ def record(
         quality=quality,
         labels=labels,
         images=images,
+        imu=imu,
+        tracks=tracks,
     )
     pictures, frames, chunks, times, taken = [], [], [], [], []
     with _simulation(source, config, index) as sequence:
@@ -166,6 +191,7 @@ def record(
                 times.append(item.t_ns // 1000)
             elif isinstance(item, CameraImage):
                 taken.append(item)
+        inertial, followed = sequence.imu(), sequence.tracks()
     t_us = np.array(times, np.int64)
     return Recording(
         Events.concatenate(chunks),
@@ -177,4 +203,6 @@ def record(
         sequence.frames,
         sum(sequence.losses[:2]),
         tuple(taken),
+        inertial,
+        followed,
     )

@@ -11,6 +11,8 @@
       occlusion/{forward,backward}/%06d.png   255 where the point is hidden at the other end
       depth/%06d.npy  velocity/%06d.npy  normals/%06d.npy  ids/%06d.png
       frame_camera/                  images with exposure and noise (blinkgl.io.frame_camera)   (on request)
+      imu/                           an inertial unit (blinkgl.io.imu)   (on request)
+      tracks.npz                     points on surfaces, followed (blinkgl.io.tracks)   (on request)
       poses.npz  config.yaml  manifest.json  preview.mp4
 
 Images, flow and all that are labels stand where their rows say (``blinkgl.labels``).
@@ -34,9 +36,11 @@ import h5py
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
+from blinkgl.config.imu import ImuConfig
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.errors import AssetError, BlinkGLError, OutputError
 from blinkgl.events.types import Events
+from blinkgl.io import imu as imu_files
 from blinkgl.io.atomic import fsync, output_errors, remove_stale, temporary_beside
 from blinkgl.io.dsec import DsecEventWriter
 from blinkgl.io.event_labels import EVENT_LABELS, EventLabelsWriter
@@ -185,15 +189,31 @@ class SequenceWriter:
 
     def poses(self, **arrays: np.ndarray) -> None:
         """``poses.npz``: named numeric arrays (camera and object poses, times, intrinsics)."""
+        self.arrays("poses.npz", **arrays)
+
+    def arrays(self, name: str, **arrays: np.ndarray) -> None:
+        """Named numeric arrays as ``name``, an .npz file."""
         arrays = {k: np.array(v) for k, v in arrays.items()}
         if bad := [k for k, v in arrays.items() if v.dtype.hasobject]:
-            raise TypeError(f"poses: object arrays would be pickled: {bad}")
+            raise TypeError(f"{name}: object arrays would be pickled: {bad}")
 
         def save(path: Path) -> None:
             with open(path, "wb") as file:  # NumPy stamps zip members 1980-01-01: the bytes do not depend on the clock
                 np.savez(file, **arrays)
 
-        self.external("poses.npz", save)
+        self.external(name, save)
+
+    def imu(self, config: ImuConfig, measured: Mapping[str, np.ndarray]) -> None:
+        """``imu/``: what an inertial unit measured, the arrays of :class:`~blinkgl.sequence.inertial.Inertial` by
+        name."""
+        noisy, ideal = (
+            tuple(measured[name] for name in names)
+            for names in (("t_ns", "rate", "acceleration"), ("t_ns", "ideal_rate", "ideal_acceleration"))
+        )
+        self.text(imu_files.CSV, imu_files.imu_csv(*noisy))
+        self.text(imu_files.IDEAL, imu_files.imu_csv(*ideal))
+        self._write(imu_files.H5, partial(imu_files.imu_h5, measured))
+        self.text(imu_files.KALIBR, imu_files.kalibr_yaml(config, measured["T_cam_imu"]))
 
     def image(self, pictures: Mapping[str, np.ndarray], exposure: ExposureLine) -> None:
         """The next image of the frame camera: codes of "images" and what is written beside it

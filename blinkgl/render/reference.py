@@ -27,6 +27,7 @@ way to anti-alias, not a property of the scene.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
@@ -290,7 +291,7 @@ def _relative_rate(scene: Scene, thing: SceneObject, t_ns: int) -> np.ndarray:
     return rate
 
 
-def _apply(scene: Scene, hits: Hits, matrix_of) -> np.ndarray:
+def applied(scene: Scene, hits: Hits, matrix_of: Callable[[SceneObject], np.ndarray]) -> np.ndarray:
     """(N, 3) matrix_of(object) (3, 4) applied to every object-local point; nan where nothing is hit."""
     parts, out = scene_parts(scene), np.full((len(hits.hit), 3), np.nan)
     for p, rows in _by_part(hits.part):
@@ -326,7 +327,7 @@ def local_at(scene: Scene, hits: Hits, t_ns: int) -> np.ndarray:
 def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
     """Displacement of every hit point from ``hits.t_ns`` to t_ns, and whether it is seen there."""
     camera = scene.camera
-    change = _apply(scene, hits, lambda thing: _relative_change(scene, thing, hits.t_ns, t_ns))
+    change = applied(scene, hits, lambda thing: _relative_change(scene, thing, hits.t_ns, t_ns))
     _add_of_shapes(scene, hits, change, t_ns, lambda mesh: vertices_at(mesh, t_ns) - vertices_at(mesh, hits.t_ns))
     depth = hits.depth + change[:, 2]
     valid = hits.hit & (depth > 0.0)
@@ -335,20 +336,30 @@ def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
         there = hits.xy + flow
         inside = valid & ((there >= -0.5) & (there < [camera.width - 0.5, camera.height - 0.5])).all(axis=1)
 
-    candidate = inside & (depth >= camera.near)
-    facing = _faces_camera(scene, hits, t_ns, candidate)
-    candidate &= facing
-    hidden_by = np.full((len(hits.hit), 2), -1, np.int32)
-    rows = np.flatnonzero(candidate)
     # the ray aims at the moved point itself: through there = xy + flow it would carry that sum's rounding
     there_hits = replace(hits, local=local_at(scene, hits, t_ns))
-    moved = _apply(scene, there_hits, lambda thing: relative_pose_at(scene, thing, t_ns))[rows]
-    skip = np.ascontiguousarray(np.stack([hits.part[rows], hits.triangle[rows]], axis=1))
-    far = moved[:, 2] * (1.0 - VISIBILITY_SLACK)
-    blocker, _, _ = _nearest(scene, t_ns, moved[:, :2] / moved[:, 2:], far=far, skip=skip)
-    hidden_by[rows] = blocker[:, :2]
-    occluded = valid & ~(candidate & (hidden_by[:, 0] < 0))
+    moved = applied(scene, there_hits, lambda thing: relative_pose_at(scene, thing, t_ns))
+    seen, hidden_by = is_seen(scene, hits, t_ns, moved, inside & (depth >= camera.near))
+    occluded = valid & ~seen
     return Flow(int(t_ns), flow, valid, occluded, valid & ~inside, depth, hidden_by)
+
+
+def is_seen(
+    scene: Scene, hits: Hits, t_ns: int, moved: np.ndarray, candidate: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) bool: which of the points of ``hits`` are seen at t_ns, and (N, 2) int32 (part, triangle) of the nearest
+    thing in the way, or -1.
+
+    moved : (N, 3) where they are then, camera axes.   candidate : (N,) bool, those in the image and behind the near
+    plane; the others are not seen."""
+    candidate = candidate & _faces_camera(scene, hits, t_ns, candidate)
+    hidden_by = np.full((len(hits.hit), 2), -1, np.int32)
+    rows = np.flatnonzero(candidate)
+    skip = np.ascontiguousarray(np.stack([hits.part[rows], hits.triangle[rows]], axis=1))
+    far = moved[rows, 2] * (1.0 - VISIBILITY_SLACK)
+    blocker, _, _ = _nearest(scene, t_ns, moved[rows, :2] / moved[rows, 2:], far=far, skip=skip)
+    hidden_by[rows] = blocker[:, :2]
+    return candidate & (hidden_by[:, 0] < 0), hidden_by
 
 
 def is_hidden(scene: Scene, t_ns: int, xy: np.ndarray, depth: np.ndarray, slack: float) -> np.ndarray:
@@ -361,7 +372,7 @@ def is_hidden(scene: Scene, t_ns: int, xy: np.ndarray, depth: np.ndarray, slack:
 
 def velocity(scene: Scene, hits: Hits) -> np.ndarray:
     """(N, 2) px/s image velocity of every hit point at ``hits.t_ns``, from the analytic twists."""
-    rate = _apply(scene, hits, lambda thing: _relative_rate(scene, thing, hits.t_ns))
+    rate = applied(scene, hits, lambda thing: _relative_rate(scene, thing, hits.t_ns))
     _add_of_shapes(scene, hits, rate, hits.t_ns, lambda mesh: mesh.deformer.velocity(mesh, hits.t_ns))
     with np.errstate(invalid="ignore"):
         points = _rays(scene.camera, hits.xy) * hits.depth[:, None]

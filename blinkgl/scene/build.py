@@ -87,6 +87,10 @@ def check_assets(config: SceneConfig, base: Path | str = ".", split: str = "trai
             objects.split(split)
         textures.split(split)
     elif isinstance(config, ExplicitSceneConfig):
+        moving = [("scene.camera", config.camera), *((f"scene.objects.{k}", o) for k, o in enumerate(config.objects))]
+        for where, motion in moving:
+            if motion.trajectory is not None:
+                _exists(motion.trajectory.file, base, f"{where}.trajectory.file", "a trajectory")
         for name, mesh in config.meshes.items():
             _exists(mesh.file, base, f"scene.meshes.{name}.file", "a mesh file")
             if mesh.primitive is not None:
@@ -96,6 +100,8 @@ def check_assets(config: SceneConfig, base: Path | str = ".", split: str = "trai
     else:
         assert isinstance(config, FileSceneConfig)
         _exists(config.path, base, "scene.path", "a gltf or glb file")
+        if config.pose is not None and config.pose.trajectory is not None:
+            _exists(config.pose.trajectory.file, base, "scene.pose.trajectory.file", "a trajectory")
 
 
 def _exists(path: str | None, base: Path, where: str, what: str) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from blinkgl.config.sequence import SequenceConfig
+from blinkgl.config.tracks import track_times
 from blinkgl.errors import EventDataError
 from blinkgl.events import emulator_of
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
@@ -21,11 +22,13 @@ from blinkgl.imaging import FrameCamera
 from blinkgl.labels import LABELS, LabelRequest, asked_for
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import Renderer
-from blinkgl.rng import Role, kernel_seed
+from blinkgl.render.tracks import Tracks, track_points
+from blinkgl.rng import Role, generator, kernel_seed
 from blinkgl.scene.build import recording, sequence_scene
 from blinkgl.scene.rig import Sensor
 from blinkgl.scene.types import Dynamics, Scene
 from blinkgl.sequence.clock import StageClock
+from blinkgl.sequence.inertial import Inertial, measured
 from blinkgl.sequence.items import GroundTruth, Picture
 from blinkgl.sequence.simulate import Simulation
 from blinkgl.timeline import Timeline, make_timeline
@@ -203,6 +206,20 @@ class RenderedSequence(Simulation):
             "resolution": np.array([scene.camera.width, scene.camera.height], np.int64),
             "near": np.array(scene.camera.near),
         }
+
+    def imu(self) -> Inertial | None:
+        if self.config.imu is None:
+            return None
+        rng = generator(self.config.seed, self.index, Role.IMU)
+        return measured(self.scene.camera_path, self.config.imu, self.config.time.t0_ns, self.config.time.t1_ns, rng)
+
+    def tracks(self) -> Tracks | None:
+        config, time = self.config.tracks, self.config.time
+        if config is None:
+            return None
+        times = track_times(config.rate, time.label_times_ns[0], time.t1_ns, time.interval_ns)
+        # of the scene as it is drawn: its labels are of the same triangles
+        return track_points(self.renderer.scene, config, times, generator(self.config.seed, self.index, Role.TRACKS))
 
     def facts(self) -> dict[str, Any]:
         gl, scene, timeline = self.renderer.gl, self.renderer.scene, self.config.timeline

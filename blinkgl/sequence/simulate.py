@@ -31,8 +31,10 @@ from blinkgl.events.types import Events, count_causes, named_causes
 from blinkgl.gl import GLContext
 from blinkgl.imaging import FrameCamera
 from blinkgl.render.renderer import Renderer
+from blinkgl.render.tracks import Tracks
 from blinkgl.scene.types import Scene
 from blinkgl.sequence.clock import StageClock
+from blinkgl.sequence.inertial import Inertial
 from blinkgl.sequence.items import CameraImage, EventChunk, GroundTruth, Item, Picture
 from blinkgl.timeline import Ticks, Timeline
 
@@ -263,6 +265,15 @@ class Simulation(ABC):
     @abstractmethod
     def poses(self) -> dict[str, np.ndarray]:
         """What poses.npz holds; empty where nobody knows."""
+
+    def imu(self) -> Inertial | None:
+        """What the inertial unit of ``imu:`` measures; None: there is none. Raises ConfigError where the camera's
+        velocity jumps."""
+        return None
+
+    def tracks(self) -> Tracks | None:
+        """The points of ``tracks:``, followed; None: nobody asks."""
+        return None
 
     @abstractmethod
     def _resume(self) -> None:

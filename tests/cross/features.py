@@ -279,6 +279,12 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "all": {"labels": {name: True for name, info in LabelsConfig.model_fields.items() if info.annotation is bool}},
         "fewest": {"labels": {"occlusion": False}},
     },
+    "over time": {
+        "nothing": NOTHING,
+        "grid, noisy": {"tracks": {"points": 30, "choose": "grid"}, "imu": {"preset": "adis16448", "rate": 1000}},
+        "surfaces, ideal": {"tracks": {"points": 20, "choose": "surface", "rate": 300}, "imu": {"rate": 90}},
+        "drawn": {"tracks": {"points": {"integer": [5, 9]}, "choose": "random"}},
+    },
     "preview": {"off": NOTHING, "on": {"preview": {"enabled": True, "rate": 100, "slowdown": 10}}},
     "time": {
         "from 0": NOTHING,
@@ -314,6 +320,13 @@ REFUSED: dict[tuple[Kind, Kind], str] = {
         for camera in FEATURES["frame camera"]
         if camera != "none"
     },
+    **{
+        (("source", source), ("over time", what)): ("tracks" if what == "drawn" else "imu") + ": recorded frames do not"
+        for source in FEATURES["source"]
+        if source.startswith("frames")
+        for what in FEATURES["over time"]
+        if what != "nothing"
+    },
     (("frame camera", "rolling, low light"), ("time", "late")): "images.times: an exposure outside the sequence",
 }
 """Pairs that make no sense, and the line that says so. Recorded frames have neither a timeline nor a time: there those
@@ -330,6 +343,7 @@ ELSEWHERE = {
     "scene": "tests/scene: what a scene is made of; here only where it comes from, whether it is lit, whether the "
     "camera moves, and what moves by itself",
     "images": "tests/config/test_images.py, tests/imaging: every preset, every choice; here what is written and read",
+    "imu": "tests/sequence/test_inertial.py, tests/dataset/test_over_time.py; here what is written and read",
     "gl": RUN_LEVEL["gl"],
 }
 _SCENE_HERE = {"scene.kind", "scene.light.unlit", "scene.camera_motion.kind"}

@@ -299,6 +299,28 @@ class OffsetPath:
         return (v + w * self._arm) * _BOUND_MARGIN, w
 
 
+def smoothed(
+    t_ns: np.ndarray, positions: np.ndarray, rotations: Rotation, aside_ns: int
+) -> tuple[np.ndarray, Rotation]:
+    """(N, 3) positions and N rotations, each the mean of those within ``aside_ns`` before and after it, weighed by a
+    triangle; towards the ends the window is narrower, so that it stays even. 0: as they are.
+
+    t_ns : (N,) int64. Rotations are means of quaternions, good where they lie near each other."""
+    if not aside_ns:
+        return positions, rotations
+    q = rotations.as_quat()
+    turned = np.cumprod(np.where(np.einsum("nk,nk->n", q[1:], q[:-1]) < 0, -1.0, 1.0))
+    q[1:] *= turned[:, None]
+    both, out = np.hstack([positions, q]), np.empty((len(q), 7))
+    for i, t in enumerate(t_ns):
+        wide = min(aside_ns, t - t_ns[0], t_ns[-1] - t)
+        a, b = np.searchsorted(t_ns, (t - wide, t + wide), side="left")
+        b = max(min(b + 1, len(t_ns)), i + 1)
+        weight = np.maximum(1.0 - np.abs(t_ns[a:b] - t) / wide, 0.0) if wide else (t_ns[a:b] == t).astype(float)
+        out[i] = weight @ both[a:b] / weight.sum()
+    return out[:, :3], Rotation.from_quat(out[:, 3:])
+
+
 def rigid(T: ArrayLike, where: str | None = None) -> np.ndarray:
     """(4, 4) float64 copy of ``T``; ConfigError unless it is finite and a rotation with a translation (to 1e-6)."""
     T = np.array(T, dtype=np.float64)

@@ -20,6 +20,7 @@ from blinkgl.config.scene import (
     MaterialConfig,
     MeshConfig,
     PoseConfig,
+    TrajectoryConfig,
     object_names,
 )
 from blinkgl.errors import AssetError, ConfigError
@@ -30,7 +31,7 @@ from blinkgl.scene.importing.mesh_files import Asset, load_asset
 from blinkgl.scene.lights import make_light
 from blinkgl.scene.motion.collision import resolve_collisions
 from blinkgl.scene.motion.dynamics import simulate
-from blinkgl.scene.motion.paths import KeyframePath, StaticPath
+from blinkgl.scene.motion.paths import KeyframePath, StaticPath, smoothed
 from blinkgl.scene.motion.trajectories import look_rotation
 from blinkgl.scene.motion.ways import way_path
 from blinkgl.scene.reading import contents
@@ -103,13 +104,13 @@ def explicit_scene(
             parts = list(deforming(parts, item.deform))
         way = item.way
         if way is None:
-            path = motion_path(item, t0_ns, t1_ns, where)
+            path = motion_path(item, t0_ns, t1_ns, where, base)
         else:
             speed = way.speed or gait(part.mesh for part in parts)[1] or 1.0
             form = {"closed": way.closed, "level": way.level, "start": way.start}
             path = way_path(way.points, speed, t0_ns, t1_ns, **form, where=f"{where}.way")
         objects.append(SceneObject(names[k], k + 1, tuple(parts), path, item.category))
-    path = motion_path(config.camera, t0_ns, t1_ns, "scene.camera", camera=True)
+    path = motion_path(config.camera, t0_ns, t1_ns, "scene.camera", base, camera=True)
     bodies = {name: item.physics for name, item in zip(names, config.objects) if item.physics is not None}
     if config.collisions:
         # What falls is stopped by nothing: the engine knows the others' paths, as they are after this.
@@ -142,9 +143,13 @@ def explicit_scene(
     )
 
 
-def motion_path(config: KeyedMotionConfig, t0_ns: int, t1_ns: int, where: str, camera: bool = False) -> PosePath:
+def motion_path(
+    config: KeyedMotionConfig, t0_ns: int, t1_ns: int, where: str, base: Path, camera: bool = False
+) -> PosePath:
     """The configured pose over [t0, t1], or the path through its key frames (whose times are
-    seconds on the sequence's clock)."""
+    seconds on the sequence's clock) or a file's poses. Raises ConfigError and AssetError."""
+    if config.trajectory is not None:
+        return trajectory_path(config.trajectory, t0_ns, t1_ns, f"{where}.trajectory", base)
     if not config.keyframes:
         return StaticPath(pose_matrix(config, camera), t0_ns, t1_ns)
     poses = np.stack([pose_matrix(k, camera) for k in config.keyframes])
@@ -152,6 +157,35 @@ def motion_path(config: KeyedMotionConfig, t0_ns: int, t1_ns: int, where: str, c
     return KeyframePath(
         times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]), config.interpolation, f"{where}.keyframes"
     )
+
+
+def trajectory_path(config: TrajectoryConfig, t0_ns: int, t1_ns: int, where: str, base: Path) -> PosePath:
+    """A C2 spline through the poses of a file. Raises AssetError, as :func:`read_trajectory`, and ConfigError where the
+    file does not cover [t0, t1]."""
+    from blinkgl.io.trajectories import read_trajectory
+
+    path = resolve(config.file, base)
+    if not path.is_file():
+        raise ConfigError("no such file", where=f"{where}.file", value=config.file, accepted="a trajectory")
+    t_ns, poses = read_trajectory(path, None if config.form == "auto" else config.form)
+    t_ns = t_ns - (t_ns[0] - t0_ns if config.start is None else round(config.start * 1e9))
+    if t_ns[0] > t0_ns or t_ns[-1] < t1_ns:
+        raise ConfigError(
+            "the trajectory does not cover the sequence, with the label interval before the first label",
+            where=where,
+            value=f"{t_ns[0] * 1e-9:.6g} to {t_ns[-1] * 1e-9:.6g} s on its clock",
+            accepted=f"{t0_ns * 1e-9:.6g} to {t1_ns * 1e-9:.6g} s: a shorter time.duration, or another start",
+        )
+    aside = round(1e9 * config.smooth)
+    first = max(0, int(np.searchsorted(t_ns, t0_ns - aside)) - _BEYOND)
+    last = int(np.searchsorted(t_ns, t1_ns + aside)) + _BEYOND
+    t_ns, poses = t_ns[first:last], poses[first:last]
+    positions, rotations = smoothed(t_ns, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]), aside)
+    return KeyframePath(t_ns, positions, rotations, "spline", where)
+
+
+_BEYOND = 8
+"""Poses outside the sequence that its spline knows: farther ones change it by less than 1e-4 of their own size."""
 
 
 def pose_matrix(config: PoseConfig, camera: bool = False) -> np.ndarray:

@@ -55,7 +55,9 @@ def scene_from_file(config: FileSceneConfig, camera: CameraModel, t0_ns: int, t1
         raise ConfigError("no such file", where="scene.path", value=config.path, accepted="a gltf or glb file")
     if path.suffix.lower() not in (".gltf", ".glb"):
         raise ConfigError("not a glTF scene", where="scene.path", value=config.path, accepted="a .gltf or .glb file")
-    camera_path = None if config.pose is None else motion_path(config.pose, t0_ns, t1_ns, "scene.pose", camera=True)
+    camera_path = (
+        None if config.pose is None else motion_path(config.pose, t0_ns, t1_ns, "scene.pose", base, camera=True)
+    )
     scene = from_gltf(
         path,
         camera,

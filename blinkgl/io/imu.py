@@ -1,0 +1,105 @@
+"""Files of an inertial unit, in a folder of its own below the sequence:
+
+imu/
+  imu.csv     EuRoC's columns: time (ns), rates (rad/s), accelerations (m/s²), with noise and biases
+  ideal.csv   the same without
+  imu.h5      all of both, and the biases: t_ns, rate, acceleration, ideal_rate, ideal_acceleration, rate_bias,
+              acceleration_bias, T_cam_imu
+  imu.yaml    Kalibr's: noise densities, rate; and T_cam_imu as its camchain has it
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from blinkgl.config.imu import ImuConfig
+from blinkgl.config.reader import to_yaml
+from blinkgl.errors import AssetError
+from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
+
+FOLDER = "imu"
+CSV, IDEAL, H5, KALIBR = (f"{FOLDER}/{name}" for name in ("imu.csv", "ideal.csv", "imu.h5", "imu.yaml"))
+FILES = (CSV, IDEAL, H5, KALIBR)
+HEADING = (
+    "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
+    "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
+)
+ROWS = ("rate", "acceleration", "ideal_rate", "ideal_acceleration", "rate_bias", "acceleration_bias")
+
+
+def imu_csv(t_ns: np.ndarray, rate: np.ndarray, acceleration: np.ndarray) -> str:
+    """EuRoC's text of N measurements: (N,) int64 ns, (N, 3) rad/s, (N, 3) m/s²; exact to 16 digits."""
+    lines = [HEADING]
+    for t, w, a in zip(t_ns.tolist(), rate.tolist(), acceleration.tolist()):
+        lines.append(f"{t}," + ",".join(repr(v) for v in (*w, *a)))
+    return "\n".join(lines) + "\n"
+
+
+def imu_h5(arrays: Mapping[str, np.ndarray]) -> bytes:
+    """The bytes of ``imu.h5``."""
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        for name in ("t_ns", *ROWS, "T_cam_imu"):
+            file.create_dataset(name, data=arrays[name], track_times=False)
+    return buffer.getvalue()
+
+
+def kalibr_yaml(config: ImuConfig, T_cam_imu: np.ndarray) -> str:
+    """The text of ``imu.yaml``."""
+    keys = (
+        "accelerometer_noise_density",
+        "accelerometer_random_walk",
+        "gyroscope_noise_density",
+        "gyroscope_random_walk",
+    )
+    table = {**{key: getattr(config, key) for key in keys}, "update_rate": config.rate}
+    return to_yaml({**table, "T_cam_imu": T_cam_imu.tolist()})
+
+
+def read_imu_csv(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(N,) int64 ns, (N, 3) rad/s, (N, 3) m/s² of a CSV in EuRoC's columns. Raises AssetError naming the line."""
+    path = Path(path)
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeError) as error:
+        raise AssetError(f"cannot be read: {' '.join(str(error).split())[:120]}", where=str(path)) from None
+    times, rows = [], []
+    for number, line in enumerate(lines, 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        try:
+            first, *rest = line.split(",")
+            values = [float(v) for v in rest]
+            if len(values) != 6 or not np.isfinite(values).all():
+                raise ValueError
+            times.append(int(first))
+            rows.append(values)
+        except ValueError:
+            raise AssetError(
+                f"line {number} is no measurement",
+                where=str(path),
+                value=line[:80],
+                accepted="whole ns, three rates, three accelerations",
+            ) from None
+    both = np.array(rows, np.float64).reshape(-1, 6)
+    t = np.array(times, np.int64)
+    if (np.diff(t) <= 0).any():
+        raise AssetError("times do not increase", where=str(path), value=int(t[int(np.argmax(np.diff(t) <= 0)) + 1]))
+    return t, both[:, :3], both[:, 3:]
+
+
+def read_imu(sequence: str | os.PathLike) -> dict[str, np.ndarray]:
+    """What ``imu.h5`` of a sequence holds, by name. Raises AssetError: there is none, or it is damaged."""
+    path = Path(sequence) / H5
+    with open_hdf5(path) as file, hdf5_errors(path):
+        arrays = {"t_ns": dataset(file, "t_ns", path, shape=(None,))[()]}
+        for name in ROWS:
+            arrays[name] = dataset(file, name, path, shape=(len(arrays["t_ns"]), 3), kinds="f")[()]
+        arrays["T_cam_imu"] = dataset(file, "T_cam_imu", path, shape=(4, 4), kinds="f")[()]
+        return arrays

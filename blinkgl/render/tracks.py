@@ -1,0 +1,201 @@
+"""Points on surfaces, followed in time: in float64, by the algebra and the caster of the reference.
+
+A point is a triangle of a part and three weights of its corners, so it goes where its surface goes, whatever moves or
+deforms that. Where it is seen is a projection; whether, is a ray that has to reach it. Nothing is drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from blinkgl.config.tracks import TracksConfig
+from blinkgl.render import reference
+from blinkgl.render.reference import Hits
+from blinkgl.scene.types import Scene
+
+_DRAWS = 8
+"""Times that places are drawn anew for those where nothing is seen."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """N points at T times.
+
+    t_us : (T,) int64.   query_points : (N, 3) float64, number of the time, y and x of where each point was chosen.
+    target_points : (N, T, 2) float64 px, x and y, (0, 0) the centre of the top-left pixel; 0 behind the camera.
+    occluded : (N, T) bool, not seen: hidden, seen from behind, outside the image or nearer than the near plane.
+    points_world : (N, T, 3) float64.   depth : (N, T) float64 along the optical axis, <= 0 behind the camera.
+    instance : (N,) uint16.   surface : (N, 2) int32 part (of the scene, as it is drawn) and triangle.
+    weights : (N, 3) float64 of the triangle's corners."""
+
+    t_us: np.ndarray
+    query_points: np.ndarray
+    target_points: np.ndarray
+    occluded: np.ndarray
+    points_world: np.ndarray
+    depth: np.ndarray
+    instance: np.ndarray
+    surface: np.ndarray
+    weights: np.ndarray
+
+
+def track_points(scene: Scene, config: TracksConfig, times_ns: Sequence[int], rng: np.random.Generator) -> Tracks:
+    """The points that ``config`` asks for, at (T,) times. rng : what draws them, where they are drawn."""
+    times = [int(t) for t in times_ns]
+    if config.choose == "surface":
+        return _of_surfaces(scene, config.points, times, rng)
+    query, hits = (
+        _of_a_grid(scene, config.points, times) if config.choose == "grid" else _drawn(scene, config.points, times, rng)
+    )
+    return _followed(scene, hits, times, query)
+
+
+def _followed(scene: Scene, hits: Hits, times: list[int], query: np.ndarray) -> Tracks:
+    shape = (len(hits.hit), len(times))
+    xy, world = np.zeros((*shape, 2)), np.zeros((*shape, 3))
+    depth, occluded = np.zeros(shape), np.ones(shape, bool)
+    for k, t_ns in enumerate(times):
+        xy[:, k], world[:, k], depth[:, k], seen = places(scene, hits, t_ns)
+        occluded[:, k] = ~seen
+    return Tracks(
+        np.array([t // 1000 for t in times], np.int64),
+        query,
+        xy,
+        occluded,
+        world,
+        depth,
+        hits.instance.astype(np.uint16),
+        np.stack([hits.part, hits.triangle], axis=1).astype(np.int32),
+        hits.bary,
+    )
+
+
+def places(scene: Scene, hits: Hits, t_ns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Of the points of ``hits`` at a time: (N, 2) px, 0 behind the camera; (N, 3) world; (N,) depth; (N,) bool seen."""
+    camera = scene.camera
+    there = replace(hits, local=_local(scene, hits, t_ns))
+    moved = reference.applied(scene, there, lambda thing: reference.relative_pose_at(scene, thing, t_ns))
+    world = reference.applied(scene, there, lambda thing: thing.path.pose(t_ns))
+    depth = moved[:, 2].copy()
+    ahead = depth > 0
+    xy = np.zeros((len(depth), 2))
+    xy[ahead] = camera.project(moved[ahead])
+    inside = ahead & ((xy >= -0.5) & (xy < [camera.width - 0.5, camera.height - 0.5])).all(axis=1)
+    seen, _ = reference.is_seen(scene, there, t_ns, moved, inside & (depth >= camera.near))
+    return xy, world, depth, seen
+
+
+def _local(scene: Scene, hits: Hits, t_ns: int) -> np.ndarray:
+    """(N, 3) object-local positions at t_ns, of any part."""
+    out, parts = np.full((len(hits.hit), 3), np.nan), reference.scene_parts(scene)
+    for p in np.unique(hits.part):
+        rows, mesh = hits.part == p, parts[p][1].mesh
+        corners = reference.vertices_at(mesh, t_ns)[mesh.faces[hits.triangle[rows]]]
+        out[rows] = np.einsum("nc,nck->nk", hits.bary[rows], corners)
+    return out
+
+
+def _taken(hits: Hits, rows: np.ndarray) -> Hits:
+    return replace(hits, **{name: getattr(hits, name)[rows] for name in _ARRAYS})
+
+
+_ARRAYS = ("xy", "hit", "depth", "instance", "part", "triangle", "front", "bary", "local")
+
+
+def _joined(some: list[Hits]) -> Hits:
+    arrays = [np.concatenate([getattr(one, name) for one in some]) for name in _ARRAYS]
+    return Hits(arrays[0], some[0].t_ns, *arrays[1:])
+
+
+def _of_a_grid(scene: Scene, points: int, times: list[int]) -> tuple[np.ndarray, Hits]:
+    """(N, 3) queries and the hits of a regular grid of whole pixels at the first time."""
+    width, height = scene.camera.width, scene.camera.height
+    columns = min(width, max(1, round(np.sqrt(points * width / height))))
+    rows = min(height, max(1, points // columns))
+    columns = min(width, max(1, points // rows))
+    x = np.floor((np.arange(columns) + 0.5) * width / columns)
+    y = np.floor((np.arange(rows) + 0.5) * height / rows)
+    xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    hits = reference.cast(scene, times[0], xy)
+    hits = _taken(hits, np.flatnonzero(hits.hit))
+    return np.column_stack([np.zeros(len(hits.xy)), hits.xy[:, ::-1]]), hits
+
+
+def _drawn(scene: Scene, points: int, times: list[int], rng: np.random.Generator) -> tuple[np.ndarray, Hits]:
+    """Queries and hits of places drawn evenly in the image, at times drawn; where nothing is seen, drawn again."""
+    size = np.array([scene.camera.width, scene.camera.height])
+    queries, found, left = [np.zeros((0, 3))], [], points
+    for _ in range(_DRAWS):
+        when, xy = np.sort(rng.integers(len(times), size=left)), rng.random((left, 2)) * size - 0.5
+        for k in np.unique(when):
+            hits = reference.cast(scene, times[k], xy[when == k])
+            hits = _taken(hits, np.flatnonzero(hits.hit))
+            queries.append(np.column_stack([np.full(len(hits.xy), float(k)), hits.xy[:, ::-1]]))
+            found.append(hits)
+        left = points - sum(map(len, queries))
+        if left <= 0:
+            break
+    query, hits = np.concatenate(queries), _joined(found)
+    order = np.argsort(query[:, 0], kind="stable")
+    return query[order], _taken(hits, order)
+
+
+def _of_surfaces(scene: Scene, points: int, times: list[int], rng: np.random.Generator) -> Tracks:
+    """Places drawn evenly on what is an object (else on all but the sky), as it is at the first time; of those the ones
+    that are ever seen, queried when they are first."""
+    parts = reference.scene_parts(scene)
+    own = [p for p, (thing, _) in enumerate(parts) if thing.category == "object"]
+    own = own or [p for p, (thing, _) in enumerate(parts) if thing.category != "sky"]
+    which, area = [np.zeros((0, 2), np.int32)], [np.zeros(0)]
+    for p in own:
+        mesh = parts[p][1].mesh
+        a, b, c = np.moveaxis(reference.vertices_at(mesh, times[0])[mesh.faces], 1, 0)
+        area.append(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
+        which.append(np.column_stack([np.full(len(a), p), np.arange(len(a))]).astype(np.int32))
+    places_, ends = np.concatenate(which), np.cumsum(np.concatenate(area))
+    kept: list[Tracks] = []
+    left = points
+    for _ in range(_DRAWS):
+        if not len(ends) or ends[-1] <= 0:
+            break
+        draws = 2 * left
+        chosen = places_[np.minimum(np.searchsorted(ends, rng.random(draws) * ends[-1], side="right"), len(ends) - 1)]
+        u, v = rng.random((2, draws))
+        u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+        ids = np.array([thing.instance_id for thing, _ in parts], np.int32)[chosen[:, 0]]
+        nothing = np.zeros(draws)
+        hits = Hits(
+            np.zeros((draws, 2)),
+            times[0],
+            np.ones(draws, bool),
+            nothing,
+            ids,
+            chosen[:, 0],
+            chosen[:, 1],
+            np.ones(draws, bool),
+            np.column_stack([1 - u - v, u, v]),
+            np.zeros((draws, 3)),
+        )
+        tracks = _followed(scene, hits, times, np.zeros((draws, 3)))
+        rows = np.flatnonzero(~tracks.occluded.all(axis=1))[:left]
+        first = np.argmin(tracks.occluded[rows], axis=1)
+        at = tracks.target_points[rows, first]
+        kept.append(_rows(tracks, rows, np.column_stack([first, at[:, 1], at[:, 0]])))
+        left -= len(rows)
+        if left <= 0:
+            break
+    if not kept:
+        empty = reference.cast(scene, times[0], np.zeros((0, 2)))
+        return _followed(scene, empty, times, np.zeros((0, 3)))
+    return replace(kept[0], **{name: np.concatenate([getattr(one, name) for one in kept]) for name in _OF_POINTS})
+
+
+_OF_POINTS = tuple(name for name in Tracks.__dataclass_fields__ if name != "t_us")
+
+
+def _rows(tracks: Tracks, rows: np.ndarray, query: np.ndarray) -> Tracks:
+    taken = {name: getattr(tracks, name)[rows] for name in _OF_POINTS if name != "query_points"}
+    return replace(tracks, query_points=query.astype(np.float64), **taken)

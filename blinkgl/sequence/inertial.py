@@ -1,0 +1,131 @@
+"""What an inertial unit on the camera measures: body rate and specific force, from the path, with noise and biases.
+
+    rate = w + b_g + n_g          acceleration = R^T (a - g) + b_a + n_a
+
+of the unit's own place, so that its distance from the camera (lever arm) is in a. w is that of the path's analytic
+derivative; a is the central difference of the analytic velocity over 40 µs, which is exact where the velocity is
+quadratic, as a spline's is between its knots.
+
+White noise of density s is sampled with standard deviation s sqrt(rate); a bias of random walk density s gains
+s / sqrt(rate) from one measurement to the next (Kalibr's model; Woodman 2007; Crassidis 2006).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from blinkgl.config.imu import ImuConfig, imu_times
+from blinkgl.errors import ConfigError
+from blinkgl.scene.motion.paths import OffsetPath
+from blinkgl.scene.types import PosePath
+
+_HALF_NS = 20_000
+_LOOK_NS = 1_000_000
+_MOST_LOOKS = 200_000
+
+
+@dataclass(frozen=True, eq=False)
+class Inertial:
+    """Measurements of an inertial unit, in its own axes.
+
+    t_ns : (N,) int64.   rate : (N, 3) float64 rad/s.   acceleration : (N, 3) float64 m/s², at rest that of free fall,
+    upwards.   ideal_rate, ideal_acceleration : the same without noise and bias.   rate_bias, acceleration_bias : (N, 3)
+    that are in them.   T_cam_imu : (4, 4) float64, from the unit's axes to the camera's."""
+
+    t_ns: np.ndarray
+    rate: np.ndarray
+    acceleration: np.ndarray
+    ideal_rate: np.ndarray
+    ideal_acceleration: np.ndarray
+    rate_bias: np.ndarray
+    acceleration_bias: np.ndarray
+    T_cam_imu: np.ndarray
+
+
+def place_of(config: ImuConfig) -> np.ndarray:
+    """(4, 4) T_cam_imu."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("xyz", config.rotation, degrees=True).as_matrix()
+    T[:3, 3] = config.position
+    return T
+
+
+def measured(path: PosePath, config: ImuConfig, t0_ns: int, t1_ns: int, rng: np.random.Generator) -> Inertial:
+    """What the unit measures over [t0, t1] on a camera that moves by ``path``, T_world_cam.
+
+    Raises ConfigError where the camera's velocity jumps, which no force can do."""
+    T_cam_imu = place_of(config)
+    body = OffsetPath(path, T_cam_imu)
+    times = imu_times(config.rate, t0_ns, t1_ns)
+    rate, force = _ideal(body, times, np.asarray(config.gravity))
+    if not path.is_static:
+        _refuse_jumps(body, t0_ns, t1_ns)
+    n, dt = len(times), 1 / config.rate
+    white, walk = rng.normal(size=(2, n, 3)), rng.normal(size=(2, n, 3))
+    walk[:, 0] = 0
+    bias_w = np.asarray(config.gyroscope_bias) + config.gyroscope_random_walk * np.sqrt(dt) * np.cumsum(walk[0], 0)
+    bias_a = np.asarray(config.accelerometer_bias) + config.accelerometer_random_walk * np.sqrt(dt) * np.cumsum(
+        walk[1], 0
+    )
+    return Inertial(
+        np.array(times, np.int64),
+        rate + bias_w + config.gyroscope_noise_density / np.sqrt(dt) * white[0],
+        force + bias_a + config.accelerometer_noise_density / np.sqrt(dt) * white[1],
+        rate,
+        force,
+        bias_w,
+        bias_a,
+        T_cam_imu,
+    )
+
+
+def _ideal(body: PosePath, times: list[int], gravity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 3) body rates and (N, 3) specific forces of a body, its own axes."""
+    R_body_world = body.poses(np.array(times, np.int64))[:, :3, :3].swapaxes(1, 2)
+    if body.is_static:
+        return np.zeros((len(times), 3)), R_body_world @ -gravity
+    turning = R_body_world @ np.array([body.derivative(t)[:3, :3] for t in times])
+    twist = 0.5 * (turning - turning.swapaxes(1, 2))
+    second = np.array([_second(body, t)[:3, 3] for t in times])
+    rate = np.stack([twist[:, 2, 1], twist[:, 0, 2], twist[:, 1, 0]], axis=1)
+    return rate, np.einsum("nij,nj->ni", R_body_world, second - gravity)
+
+
+def _second(path: PosePath, t_ns: int) -> np.ndarray:
+    """(4, 4) second derivative, 1/s², at the ends of the path from inside."""
+    h, seconds = _HALF_NS, _HALF_NS * 1e-9
+    if not path.t0_ns <= t_ns <= path.t1_ns:
+        return np.zeros((4, 4))
+    if path.t1_ns - path.t0_ns < 2 * h:
+        return np.zeros((4, 4))
+    if t_ns - h < path.t0_ns or t_ns + h > path.t1_ns:
+        sign = 1 if t_ns - h < path.t0_ns else -1
+        a, b, c = (path.derivative(t_ns + sign * k * h) for k in (0, 1, 2))
+        return sign * (-3 * a + 4 * b - c) / (2 * seconds)
+    return (path.derivative(t_ns + h) - path.derivative(t_ns - h)) / (2 * seconds)
+
+
+def _refuse_jumps(path: PosePath, t0_ns: int, t1_ns: int) -> None:
+    """Raises ConfigError where the velocity changes by more than its rate of change says."""
+    begin, end = max(t0_ns, path.t0_ns), min(t1_ns, path.t1_ns)
+    step = max(_LOOK_NS, (end - begin) // _MOST_LOOKS)
+    times = range(begin, end + 1, step)
+    first = np.array([path.derivative(t)[:3] for t in times])
+    second = np.array([_second(path, t)[:3] for t in times])
+    if len(first) < 2:
+        return
+    said = 0.5e-9 * step * (second[1:] + second[:-1])
+    left = np.abs(first[1:] - first[:-1] - said).max(axis=(1, 2))
+    # a curve that is smooth leaves a third-order rest; a jump leaves itself
+    allowed = 2e-3 * np.abs(first).max() + 0.25 * np.abs(said).max(axis=(1, 2))
+    if (left > allowed).any():
+        at = int(np.argmax(left - allowed))
+        raise ConfigError(
+            "the camera's velocity jumps, which an inertial unit cannot measure",
+            where="imu",
+            value=f"at {times[at] * 1e-9:.6g} s",
+            accepted="a camera path with `interpolation: spline`, or imu: null",
+        )

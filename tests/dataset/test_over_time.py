@@ -1,0 +1,143 @@
+"""Tracks and an inertial unit in a data set: files, verify, explain; `verify` sees them altered; bad input."""
+
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import yaml
+
+from blinkgl.cli import run
+from blinkgl.config.sequence import load_run
+from blinkgl.dataset.explain import explain
+from blinkgl.dataset.verify import _check_imu, _check_tracks, _guarded, verify_dataset
+from blinkgl.io.imu import read_imu, read_imu_csv
+from blinkgl.io.sequence_dir import read_manifest
+from blinkgl.io.tracks import read_tracks
+
+CONFIG = """
+camera: {width: 48, height: 36}
+time: {duration: 0.1, label_rate: 50}
+imu: {preset: adis16448, rate: 1000, position: [0.05, 0, 0]}
+tracks: {points: 60, choose: surface, rate: 200}
+labels: {flow: [], occlusion: false}
+preview: {enabled: false}
+scene: {kind: random, pool: {primitives: [cuboid], urdfs: false}, textures: {photographs: false, max_size: 32}}
+"""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("over_time")
+    (folder / "c.yaml").write_text(CONFIG)
+    assert run(["generate", str(folder / "c.yaml"), "--out", str(folder / "d")]) == 0
+    return folder / "d"
+
+
+def sequence_of(root: Path) -> Path:
+    return next(root.rglob("manifest.json")).parent
+
+
+def test_files_and_the_same_again(made):
+    folder = sequence_of(made)
+    assert verify_dataset(made, deep=1).clean
+    imu, tracks = read_imu(folder), read_tracks(folder)
+    assert imu["t_ns"].tolist() == [k * 1_000_000 for k in range(121)]
+    t, rate, acceleration = read_imu_csv(folder / "imu/imu.csv")
+    assert np.array_equal(t, imu["t_ns"]) and np.array_equal(rate, imu["rate"])
+    assert not np.array_equal(imu["rate"], imu["ideal_rate"])
+    kalibr = yaml.safe_load((folder / "imu/imu.yaml").read_text())
+    assert kalibr["update_rate"] == 1000 and kalibr["gyroscope_noise_density"] == 1.6968e-4
+    assert np.array(kalibr["T_cam_imu"])[:3, 3].tolist() == [0.05, 0, 0]
+    assert tracks["t_us"].tolist() == list(range(20_000, 120_001, 5_000))
+    assert tracks["target_points"].shape == (60, 21, 2) and not tracks["occluded"].all(axis=1).any()
+    poses = np.load(folder / "poses.npz")  # the unit moves with the camera of poses.npz
+    assert np.array_equal(poses["t_ns"][:2], [0, 20_000_000]) and np.linalg.norm(acceleration.mean(0)) < 60
+
+
+def _arrays(folder: Path, name: str, index, value) -> None:
+    with np.load(folder / "tracks.npz") as file:
+        arrays = dict(file)
+    if index is None:
+        arrays.pop(name)
+    else:
+        arrays[name][index] = value
+    np.savez(folder / "tracks.npz", **arrays)
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        (lambda f: _arrays(f, "instance", 0, 999), "instance 999, which the scene does not have"),
+        (lambda f: _arrays(f, "depth", (0, 0), np.inf), "a number that is not finite"),
+        (lambda f: _arrays(f, "query_points", (0, 0), 21), "a query at a time that is none"),
+        (lambda f: _arrays(f, "target_points", (slice(None), slice(None)), 1e3), "seen outside the image"),
+        (lambda f: _arrays(f, "t_us", 3, 5), "at 21 times, not at the 21 that config.yaml asks for"),
+        (lambda f: _arrays(f, "weights", None, None), "no tracks"),
+        (lambda f: (f / "tracks.npz").write_bytes(b"PK"), "no tracks"),
+    ],
+)
+def test_verify_sees_tracks_that_cannot_be(made, tmp_path, change, said):
+    shutil.copytree(sequence_of(made), tmp_path / "s")
+    change(tmp_path / "s")
+    config = load_run(tmp_path / "s/config.yaml").sequence(0)
+    (line,) = _guarded(lambda: _check_tracks(tmp_path / "s", read_manifest(tmp_path / "s"), config))
+    assert "tracks.npz" in line and said in line and "\n" not in line
+
+
+def _row(folder: Path, name: str, change) -> None:
+    with h5py.File(folder / "imu/imu.h5", "r+") as file:
+        change(file[name])
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        (lambda f: _row(f, "rate", lambda d: d.__setitem__((3, 0), np.nan)), "a number that is not finite"),
+        (lambda f: _row(f, "rate", lambda d: d.__setitem__((3, 0), 7)), "not what imu.h5 says"),
+        (lambda f: _row(f, "t_ns", lambda d: d.__setitem__(3, 7)), "measurements, not the 121 that config.yaml"),
+        (lambda f: (f / "imu/ideal.csv").write_text("0,1,2\n"), "line 1 is no measurement"),
+        (lambda f: (f / "imu/imu.csv").write_text("5,1,2,3,4,5,6\n5,1,2,3,4,5,6\n"), "times do not increase"),
+        (lambda f: (f / "imu/imu.csv").unlink(), "cannot be read"),
+    ],
+)
+def test_verify_sees_measurements_that_cannot_be(made, tmp_path, change, said):
+    shutil.copytree(sequence_of(made), tmp_path / "s")
+    change(tmp_path / "s")
+    (line,) = _guarded(lambda: _check_imu(tmp_path / "s", load_run(tmp_path / "s/config.yaml").sequence(0)))
+    assert "imu/" in line and said in line and "\n" not in line
+
+
+def test_explain_counts_them(tmp_path):
+    (tmp_path / "c.yaml").write_text(CONFIG)
+    told = explain(load_run(tmp_path / "c.yaml"))
+    passes = {one.name: one for one in told.passes}
+    assert passes["inertial unit"].count == 121 and passes["point tracks"].count == 21
+    told = explain(load_run(tmp_path / "c.yaml", ["imu=null", "tracks=null"]))
+    assert {"inertial unit", "point tracks"} <= {what for what, _ in told.left_out}
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        (["imu.rate=2000"], "imu.rate: too large (got 2000); expected a number greater than 0 and at most 1000"),
+        (["imu.noise=1"], "imu.noise: unknown key"),
+        (
+            ["tracks.choose=edges"],
+            "tracks.choose: unknown choice (got 'edges'); expected 'grid', 'random' or 'surface'",
+        ),
+        (["tracks.points=1000000", "tracks.rate=10000"], "tracks.points: 1e+09 positions (got 1000000)"),
+        (["frames={folders: [x], fps: 30}"], "imu: recorded frames do not tell where their camera was"),
+        (
+            ["imu=null", "frames={folders: [x], fps: 30}"],
+            "tracks: recorded frames do not tell where their surfaces are",
+        ),
+    ],
+)
+def test_bad_input_in_one_line(tmp_path, capsys, options, said):
+    (tmp_path / "c.yaml").write_text(CONFIG)
+    sets = [word for option in options for word in ("--set", option)]
+    assert run(["generate", str(tmp_path / "c.yaml"), "--out", str(tmp_path / "d"), *sets]) == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert said in error and not (tmp_path / "d").exists()

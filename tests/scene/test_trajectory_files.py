@@ -1,0 +1,166 @@
+"""Trajectories of other programs, in and out: a flight by formula comes back; what is wrong in a file is named."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from blinkgl import (
+    AssetError,
+    Camera,
+    ConfigError,
+    Primitive,
+    Scene,
+    Trajectory,
+    read_trajectory,
+    record,
+    write_trajectory,
+)
+from blinkgl.config.sequence import load_run
+from blinkgl.front.runs import configured
+from blinkgl.scene.build import check_assets, sequence_scene
+from blinkgl.scene.motion.paths import smoothed
+
+EPOCH = 1_403_636_579_758_555_392
+RNG = np.random.default_rng
+
+
+def circle(t):
+    """(N, 4, 4) at (N,) s: radius 2 about the z axis, looking inwards (OpenCV axes)."""
+    T = np.tile(np.eye(4), (len(t), 1, 1))
+    T[:, 0, 3], T[:, 1, 3] = 2 * np.cos(t), 2 * np.sin(t)
+    zero = np.zeros_like(t)
+    T[:, :3, 0] = np.stack([-np.sin(t), np.cos(t), zero], 1)
+    T[:, :3, 1] = (0, 0, -1)
+    T[:, :3, 2] = np.stack([-np.cos(t), -np.sin(t), zero], 1)
+    return T
+
+
+def euroc_csv(t_ns, T):
+    x, y, z, w = Rotation.from_matrix(T[:, :3, :3]).as_quat().T
+    rows = ["#timestamp, p_RS_R_x [m], p_y, p_z, q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v_RS_R_x"]
+    rows += [
+        f"{t},{a:.12f},{b:.12f},{c:.12f},{q[0]:.12f},{q[1]:.12f},{q[2]:.12f},{q[3]:.12f},0.5"
+        for t, (a, b, c), q in zip(t_ns.tolist(), T[:, :3, 3], zip(w, x, y, z))
+    ]
+    return "\n".join(rows) + "\n"
+
+
+@pytest.fixture
+def flight(tmp_path):
+    """A second and a half at 100 Hz, of an epoch's clock, in both forms."""
+    t = np.arange(151) * 0.01
+    t_ns = EPOCH + np.arange(151) * 10_000_000
+    write_trajectory(tmp_path / "tum.txt", t_ns, circle(t))
+    (tmp_path / "euroc.csv").write_text(euroc_csv(t_ns, circle(t)))
+    return tmp_path
+
+
+def test_both_forms_say_the_same_to_the_nanosecond(flight):
+    for name in ("tum.txt", "euroc.csv"):
+        t_ns, T = read_trajectory(flight / name)
+        assert t_ns[0] == EPOCH and (np.diff(t_ns) == 10_000_000).all()
+        assert np.allclose(T, circle(np.arange(151) * 0.01), atol=1e-9)
+    write_trajectory(flight / "again.txt", t_ns, T)
+    again, T_again = read_trajectory(flight / "again.txt")
+    assert np.array_equal(again, t_ns) and np.allclose(T_again, T, atol=1e-11)
+    write_trajectory(flight / "early.txt", np.array([-1_500_000_000, -1]), T[:2])
+    assert read_trajectory(flight / "early.txt")[0].tolist() == [-1_500_000_000, -1]
+
+
+def scene(pose) -> Scene:
+    made = Scene(Camera(48, 36, pose=pose), duration=0.2, label_rate=20)
+    made += Primitive("cuboid", extents=(0.5, 0.6, 0.7))
+    return made
+
+
+@pytest.mark.parametrize("name", ["tum.txt", "euroc.csv"])
+def test_the_camera_flies_it(flight, name):
+    drawn = record(scene(Trajectory(flight / name)), labels=["flow"], imu={"rate": 100, "gravity": (0, 0, 0)})
+    path = scene(Trajectory(flight / name)).build(drawn.config).camera_path
+    t = np.linspace(0, 0.25, 41)
+    assert np.allclose(path.poses((t * 1e9).astype(np.int64)), circle(t), atol=1e-6)
+    assert np.allclose(drawn.imu.acceleration[2:-2], (0, 0, 2), atol=2e-3), "towards the middle: 1 rad/s at 2 m"
+    assert drawn.valid.any() and np.abs(drawn.flow).max() > 0.1
+    later = scene(Trajectory(flight / name, start=EPOCH * 1e-9 + 0.5))
+    late = later.build(configured(later).sequence(0)).camera_path
+    assert np.allclose(late.pose(100_000_000), circle(np.array([0.6]))[0], atol=1e-4), "a float of an epoch: 0.2 µs"
+
+
+def test_an_object_flies_it_and_from_yaml(flight):
+    (flight / "c.yaml").write_text(
+        "time: {duration: 0.2, label_rate: 20}\n"
+        "scene: {kind: explicit, meshes: {ball: {primitive: sphere}}, camera: {position: [-5, 0, 0]},"
+        " objects: [{mesh: ball, trajectory: {file: tum.txt}}]}\n"
+    )
+    config = load_run(flight / "c.yaml").sequence(0)
+    check_assets(config.scene, flight)
+    made = sequence_scene(config, 0, flight)
+    assert np.allclose(made.objects[0].path.pose(123_000_000), circle(np.array([0.123]))[0], atol=1e-6)
+    (flight / "tum.txt").unlink()
+    with pytest.raises(ConfigError, match=r"scene\.objects\.0\.trajectory\.file: no such file"):
+        check_assets(config.scene, flight)
+
+
+def test_smoothing_takes_noise_away_and_no_line_off_its_way():
+    t_ns, rng = np.arange(200) * 10_000_000, RNG(0)
+    straight = np.outer(np.arange(200), (0.01, -0.02, 0.03))
+    turning = Rotation.from_rotvec(np.outer(np.arange(200) * 0.02, (0, 0, 1)))
+    p, q = smoothed(t_ns, straight, turning, 100_000_000)
+    assert np.allclose(p, straight, atol=1e-12) and (q.inv() * turning).magnitude().max() < 1e-4
+    noisy, shaken = (
+        straight + 0.01 * rng.normal(size=(200, 3)),
+        turning * Rotation.from_rotvec(0.01 * rng.normal(size=(200, 3))),
+    )
+    p, q = smoothed(t_ns, noisy, shaken, 100_000_000)
+    inner = slice(15, -15)
+    assert np.std(p[inner] - straight[inner]) < 0.4 * 0.01
+    assert np.mean((q.inv() * turning).magnitude()[inner]) < 0.4 * np.mean((shaken.inv() * turning).magnitude())
+    assert smoothed(t_ns, noisy, shaken, 0)[0] is noisy
+    flipped = Rotation.from_quat(-shaken.as_quat() * np.where(np.arange(200) % 2, 1, -1)[:, None])
+    assert np.allclose(smoothed(t_ns, noisy, flipped, 100_000_000)[1].as_matrix(), q.as_matrix(), atol=1e-12)
+
+
+GOOD = "0 1 2 3 0 0 0 1\n0.1 1 2 3 0 0 0 1\n0.2 1 2 3 0 0 0 1\n0.3 1 2 3 0 0 0 1\n"
+
+
+@pytest.mark.parametrize(
+    "text, said",
+    [
+        ("", "no trajectory (got '0 poses')"),
+        ("# only a word\n0 1 2 3 0 0 0 1\n", "no trajectory (got '1 poses')"),
+        (GOOD + "0.4 1 2 3 0 0 1\n", "line 5 is no pose"),
+        (GOOD + "0.4 1 2 nan 0 0 0 1\n", "line 5 is no pose"),
+        (GOOD + "0.4 1 2 x 0 0 0 1\n", "line 5 is no pose"),
+        (GOOD + "0.3 1 2 3 0 0 0 1\n", "line 5 is at the time of the one before"),
+        (GOOD + "0.25 1 2 3 0 0 0 1\n", "line 5 is before the one before"),
+        (GOOD + "9 1 2 3 0 0 0 1\n", "a gap before line 5"),
+        (GOOD + "0.4 1 2 3 0 0 0 0.5\n", "line 5 has no rotation"),
+        ("# timestamp tx ty tz qw qx qy qz\n" + GOOD, "quaternions begin with w"),
+        ("0 1 2 3 0 0 0 1\n10000000 1 2 3 0 0 0 1\n", "times of another unit"),
+        ("1,2,3\n4,5,6\n", "line 1 is no pose"),
+    ],
+)
+def test_what_is_wrong_is_said_with_its_line(tmp_path, text, said):
+    (tmp_path / "t.txt").write_text(text)
+    with pytest.raises(AssetError) as error:
+        read_trajectory(tmp_path / "t.txt")
+    assert said in str(error.value) and "\n" not in str(error.value) and "t.txt" in str(error.value)
+
+
+def test_what_a_sequence_cannot_have(flight, tmp_path):
+    with pytest.raises(ConfigError, match="does not cover the sequence"):
+        record(scene(Trajectory(flight / "tum.txt", start=EPOCH * 1e-9 + 1.4)))
+    with pytest.raises(ConfigError, match="no such file"):
+        record(scene(Trajectory(flight / "missing.txt")))
+    with pytest.raises(ConfigError, match=r"Trajectory\.form"):
+        Trajectory("x", form="kitti")
+    with pytest.raises(ConfigError, match="unknown form"):
+        read_trajectory(flight / "tum.txt", form="kitti")
+    with pytest.raises(ConfigError, match="times do not increase"):
+        write_trajectory(tmp_path / "x.txt", np.array([2, 1]), circle(np.zeros(2)))
+    (flight / "c.yaml").write_text(
+        "scene: {kind: explicit, meshes: {ball: {primitive: sphere}}, objects: [{mesh: ball}],"
+        " camera: {position: [-5, 0, 0], trajectory: {file: tum.txt}}}\n"
+    )
+    with pytest.raises(ConfigError, match="give a trajectory, a fixed pose or keyframes"):
+        load_run(flight / "c.yaml")

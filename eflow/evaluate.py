@@ -29,6 +29,8 @@ from eflow.models import FlowModel, parameters_of
 from eflow.pictures import comparison, events_of, write_picture
 
 MEDIAN_FRAMES = 64
+JUDGED = 1000
+"""Pixels of a sample, evenly spaced, that a confidence is judged by over a set."""
 BASELINES = ("zero flow", "median of the set", "median of the frame", "affine of the frame")
 """Zero; one constant flow, the component-wise median of the set's own ground truth; and, frame by frame, the median of
 that frame's ground truth and the affine field nearest to it: the best an answer could be that saw only the global
@@ -55,8 +57,8 @@ def evaluate(
     progress : called with (done, of, AEE so far).
     Returns {"methods": {name: {"total": …, "scenes": …}}, "lengths": rows of :class:`~eflow.density.LengthByDensity`,
     "ms", "samples", "skipped", "model", "parameters"}; metrics as in :mod:`eflow.metrics`. "confidence", where asked
-    for: {"area": mean over samples of :func:`~eflow.confidence.area`, "left_out": shares, and the AEE of the rest by
-    "doubt", at "best", by "chance", means over samples}.
+    for: {"area": :func:`~eflow.confidence.area` over pixels of all samples, "area_in_a_sample": the mean of each one's
+    own, "left_out": shares, and the AEE of the rest by "doubt", at "best", by "chance"}.
 
     Raises AssetError: no ground truth, unreadable files. EventDataError: a window without events
     (unless ``empty="skip"``)."""
@@ -76,7 +78,7 @@ def evaluate(
     tallies = {name: Tally() for name in ("network", *BASELINES)}
     lengths = LengthByDensity()
     spent, sum_aee, scored = 0.0, 0.0, 0
-    curves: list[dict[str, np.ndarray]] = []
+    areas, errors, doubted = [], [], []
     for done, i in enumerate(indices, 1):
         batch = collate([dataset[i]])
         raw = batch["raw"][0]
@@ -105,8 +107,11 @@ def evaluate(
                 else MethodPredictor(method, *where, empty="zero")
             )
             doubt = disagreement(views, StreamWindow(raw.new.t0, raw.old, raw.new), flow)
-            curve = sparsification(np.hypot(*np.moveaxis(flow - truth, -1, 0)), doubt, valid)
-            curves += [] if curve is None else [curve]
+            error = np.hypot(*np.moveaxis(flow - truth, -1, 0))
+            if curves := sparsification(error, doubt, valid):
+                areas.append(area(curves))
+                for kept, field in ((errors, error), (doubted, doubt)):
+                    kept.append(field[valid][:: -(-int(valid.sum()) // JUDGED)])
         if metrics:
             sum_aee, scored = sum_aee + metrics["AEE"], scored + 1
         if progress is not None:
@@ -129,10 +134,13 @@ def evaluate(
         "lengths": lengths.rows(),
     }
     if confidence:
+        error, doubt = np.concatenate(errors), np.concatenate(doubted)
+        curves = sparsification(error, doubt, np.ones(error.shape, bool))
         result["confidence"] = {
-            "area": float(np.mean([area(c) for c in curves])),
+            "area": area(curves),
+            "area_in_a_sample": float(np.nanmean(areas)),
             "left_out": SHARES.tolist(),
-            **{k: np.mean([c[k] for c in curves], axis=0).tolist() for k in ("doubt", "best", "chance")},
+            **{k: v.tolist() for k, v in curves.items()},
         }
     if out is not None:
         write_json(out / "results.json", result)
@@ -156,7 +164,10 @@ def _lengths(rows: list[dict[str, Any]]) -> Table:
 
 
 def _confidence(judged: dict[str, Any]) -> Table:
-    table = Table(title=f"confidence: {judged['area']:.2f} of the area of chance (0 is perfect, 1 says nothing)")
+    table = Table(
+        title=f"confidence: {judged['area']:.2f} of the area of chance over all samples, "
+        f"{judged['area_in_a_sample']:.2f} within one (0 is perfect, 1 says nothing)"
+    )
     for name in ("most doubtful left out", "AEE of the rest, px", "at best", "by chance"):
         table.add_column(name, justify="right")
     for share, *values in zip(*(judged[k] for k in ("left_out", "doubt", "best", "chance")), strict=True):

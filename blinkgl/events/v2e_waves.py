@@ -13,6 +13,8 @@ from the end, and asking costs the vector instructions.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba
 import numpy as np
 from numba.extending import register_jitable
@@ -362,12 +364,26 @@ def _in_order(packed, begin, end, owners, slots, ints):
 
 
 @numba.njit(**JIT)
-def emit_waves(active, count, first, now, keys, noise_end, p, v, cap, packed, begin, floats, ints):
+def emit_waves(
+    active: np.ndarray,
+    count: int,
+    first: int,
+    now: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    keys: np.ndarray,
+    noise_end: int,
+    p: Any,
+    v: Any,
+    cap: int,
+    packed: np.ndarray,
+    begin: int,
+    floats: np.ndarray,
+    ints: np.ndarray,
+) -> tuple[int, int]:
     """Events of the listed pixels of one block into ``packed[begin:]``, in raster order; moves levels.
 
     now : (intensity, x, lag, noise) of the block at the interval's end.   keys : of ``noise_end`` shot noise events,
-    sorted.   cap : most events of a pixel; there is room for so many of each.   floats, ints : scratch of FLOATS
-    and INTS.   Returns (end of the events, cut)."""
+    sorted.   p, v : Pixels and Interval of v2e.py.   cap : most events of a pixel; there is room for so many of each.
+    floats, ints : scratch of FLOATS and INTS.   Returns (end of the events, cut)."""
     out, cut, key = begin, 0, 0
     for start in range(0, count, SLOTS):
         here = active[start : min(start + SLOTS, count)]

@@ -43,6 +43,8 @@ UNTOLD = 0.5
 """Standard deviation of a parameter's logarithm from which on the data are taken not to tell it."""
 VAGUE = 0.25
 """From which on other places are tried, too."""
+LEAST_CHANCE = 0.05
+"""Of a number's error, where chance is known at all."""
 TOLERANCE = 0.5
 """How much worse the fit may become by putting a parameter that is not told back to its default."""
 _MOST_STEPS = 20
@@ -482,10 +484,11 @@ class _Search:
         moved = (t.jackknife - t.jackknife.mean(axis=0)) * (t.weight / t.error) @ pull.T
         count = len(t.jackknife)
         spread = np.sqrt((count - 1) / count * (moved**2).sum(axis=0))
-        # Where the model is off by more than chance, by that much.
-        misfit = max(
-            1.0, float(np.sqrt(np.mean((self._residual / t.weight * t.error / np.maximum(t.chance, 1e-12)) ** 2)))
-        )
+        # Where the model is off by more than chance, by that much; a number that hardly any group of pixels moves says
+        # nothing of chance.
+        known = t.chance > LEAST_CHANCE * t.error
+        off = self._residual[known] / t.weight[known] * t.error[known] / t.chance[known]
+        misfit = max(1.0, float(np.sqrt(np.mean(off**2)))) if known.any() else 1.0
         return {key: float(np.exp(v) * s * misfit) for key, v, s in zip(self._keys, self._at, spread)}
 
     def _spread(self) -> np.ndarray:

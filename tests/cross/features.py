@@ -281,7 +281,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
     },
     "over time": {
         "nothing": NOTHING,
-        "grid, noisy": {"tracks": {"points": 30}, "imu": {"preset": "adis16448", "rate": 1000}},
+        "grid, noisy": {"tracks": {"points": 30, "choose": "grid"}, "imu": {"preset": "adis16448", "rate": 1000}},
         "surfaces, ideal": {"tracks": {"points": 20, "choose": "surface", "rate": 300}, "imu": {"rate": 90}},
         "drawn": {"tracks": {"points": {"integer": [5, 9]}, "choose": "random"}},
     },

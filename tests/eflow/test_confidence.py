@@ -159,5 +159,6 @@ def test_evaluate_says_whether_it_knows_where_the_errors_are(network, tmp_path, 
     assert run(words) == 0, capsys.readouterr().err
     assert "of the area of chance" in capsys.readouterr().out
     judged = json.loads((tmp_path / "s" / "results.json").read_text())["confidence"]
-    assert set(judged) == {"area", "left_out", "doubt", "best", "chance"} and len(judged["doubt"]) == len(SHARES)
+    assert set(judged) == {"area", "area_in_a_sample", "left_out", "doubt", "best", "chance"}
+    assert len(judged["doubt"]) == len(SHARES) and judged["area"] == pytest.approx(judged["area_in_a_sample"], abs=0.2)
     assert judged["doubt"][0] == pytest.approx(judged["best"][0]) == pytest.approx(judged["chance"][-1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import re
 
@@ -15,7 +16,7 @@ from blinkgl.errors import BlinkGLError, ConfigError, EventDataError
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.types import Events
 from blinkgl.io.formats import write_events
-from blinkgl.recordings.calibration import calibrate
+from blinkgl.recordings.calibration import _Search, calibrate
 from blinkgl.recordings.clip import Clip, Flicker, clip_of_frames, clip_of_still, clock_offset
 from blinkgl.recordings.simulation import emulator_config
 from blinkgl.recordings.statistics import numbers, sums, target
@@ -120,6 +121,22 @@ def test_tiles_of_a_large_sensor_have_the_same_events(monkeypatch):
     assert len(again) == len(part.events) > 1000
     a, b = (sums(e, part, 0, part.intervals).polarity for e in (again, part.events))
     assert np.array_equal(a, b)
+
+
+def test_a_number_that_chance_does_not_move_says_nothing_of_the_misfit():
+    """It made ± of a threshold of 0.24 5,000 (cuke_davis346)."""
+    clip, config = scene(), emulator_config({"emulator": "esim", **TRUE})
+    recorded = sums(clip.simulate(config, 1), clip, 0, 3)
+    search = _Search(clip.with_events(clip.simulate(config, 1)), config, 3, 0, lambda _: None)
+    search.target = target(recorded).beside(sums(clip.simulate(config, 2), clip, 0, 3, recorded.polarity), floor="seen")
+    search._keys, search._at = ["contrast_threshold"], np.log([0.25])
+    search._residual = np.ones(len(search.target.values))
+    search._jacobian = np.ones((len(search._residual), 1)) * 10
+    before = search.uncertainty()["contrast_threshold"]
+    chance = search.target.chance.copy()
+    chance[5] = 1e-15
+    search.target = dataclasses.replace(search.target, chance=chance)
+    assert search.uncertainty()["contrast_threshold"] == pytest.approx(before, rel=0.2)
 
 
 # --- the fit ----------------------------------------------------------------------------------------------------------

@@ -233,9 +233,10 @@ def calibrate(
     from blinkgl.recordings import calibration
     from blinkgl.recordings.clip import Flicker
 
-    keys = fixed if isinstance(fixed, Iterable) and not isinstance(fixed, str) else [None]
-    keys = tuple(keys)
-    if not all(isinstance(key, str) for key in keys):
+    listed = isinstance(fixed, Iterable) and not isinstance(fixed, str)
+    given = tuple(fixed) if listed else (None,)
+    keys = tuple(key for key in given if isinstance(key, str))
+    if len(keys) != len(given):
         raise ConfigError("not names of keys", where="fixed", value=fixed, accepted="a list of texts")
     light = None
     if flicker is not None:

@@ -37,18 +37,20 @@ def main() -> None:
     mean = np.convolve(epe, np.ones(SMOOTH) / SMOOTH, "valid") if len(epe) >= SMOOTH else epe
     axes.plot(steps, epe, color="tab:blue", alpha=0.25, linewidth=0.8)
     axes.plot(steps[-len(mean) :], mean, color="tab:blue", label="training batches")
+    top = 2.2 * np.median(epe)
     for key in sorted(k for line in validation[:1] for k in line if k.endswith("/AEE")):
         name = key.removesuffix("/AEE")
         at = [line["step"] for line in validation]
         axes.plot(at, [line[key] for line in validation], "o-", color="tab:red", label=f"{name}: network")
-        axes.plot(at, [line[f"{name}/zero"] for line in validation], "--", color="0.4", label=f"{name}: zero flow")
+        zero = [line[f"{name}/zero"] for line in validation]
+        axes.plot(at, zero, "--", color="0.4", label=f"{name}: zero flow")
+        top = max(top, 1.3 * max(zero))  # what the network is compared with is in the picture
     if a.scores:
         methods = json.loads((a.scores / "results.json").read_text(encoding="utf-8"))["methods"]
         for style, name in ((":", "median of the set"), ("-.", "median of the frame")):
             axes.axhline(methods[name]["total"]["AEE"], linestyle=style, color="0.6", label=name)
-    axes.set(
-        xlabel="step", ylabel="end-point error, px", title=a.title, ylim=(0, 2.2 * np.median(epe)), xlim=(0, steps[-1])
-    )
+            top = max(top, 1.3 * methods[name]["total"]["AEE"])
+    axes.set(xlabel="step", ylabel="end-point error, px", title=a.title, ylim=(0, top), xlim=(0, steps[-1]))
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8, ncols=2)
     figure.savefig(a.out, dpi=110, metadata={"Software": None})

@@ -67,7 +67,7 @@ def everywhere(moment, *args):
 
 
 def both(gl, world, monkeypatch):
-    """The event frame as it is drawn, and with every surface looking into every map; without shadows; where they fall."""
+    """The event frame as it is drawn, and with every surface looking into every map; unshadowed; where they fall."""
     with Renderer(gl, world, PLAIN) as renderer:
         seen = renderer.luminance(0).read()
         places = [one.umbra(renderer.moment(0)).places for one in shadow_maps(world, renderer.items)]

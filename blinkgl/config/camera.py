@@ -64,14 +64,14 @@ class CameraConfig(Config):
     )
 
     @rule("fov", "focal", "fx", "fy")
-    def _one_of(fov, focal, fx, fy):
+    def _one_of(fov: float | None, focal: float | None, fx: float | None, fy: float | None):
         if (fx is None) != (fy is None):
             raise Refused("fx and fy come together; focal is both", where="fx" if fx is None else "fy", accepted="px")
         if sum(value is not None for value in (fov, focal, fx)) > 1:
             raise Refused("give fov or focal, not both" if fx is None else "give fov, focal, or fx and fy")
 
     @rule("calibration", "calibration_name")
-    def _was_read(calibration, name):
+    def _was_read(calibration: str | None, name: str | None):
         if calibration is not None:
             raise Refused(
                 "a calibration is read with the run's file", where="calibration", value=calibration, accepted="load()"
@@ -82,7 +82,7 @@ class CameraConfig(Config):
             )
 
     @rule("lens", "distortion")
-    def _coefficients(lens, distortion):
+    def _coefficients(lens: str, distortion: tuple[float, ...]):
         if len(distortion) not in COUNTS[lens]:
             raise Refused(
                 f"{lens} has other coefficients" if COUNTS[lens] != (0,) else "a pin-hole camera does not distort",
@@ -96,7 +96,7 @@ class CameraConfig(Config):
             )
 
     @rule(*_KEYS)
-    def _can_be_drawn(width, height, lens, distortion, *rest):
+    def _can_be_drawn(width: int, height: int, lens: str, distortion: tuple[float, ...], *rest: Any):
         if lens == "pinhole" or len(distortion) not in COUNTS[lens]:  # of which its own rule speaks
             return
         try:

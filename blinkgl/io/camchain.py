@@ -17,9 +17,9 @@ DSEC has the tables under ``intrinsics``, with ``camera_matrix`` for ``intrinsic
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -43,7 +43,7 @@ class Calibrated:
     T_cam_before: np.ndarray | None = None
 
 
-def read_camchain(path: str | os.PathLike) -> dict[str, Calibrated]:
+def read_camchain(path: str | Path) -> dict[str, Calibrated]:
     """The cameras of a calibration in either form, by name, in the file's order; of DSEC's the raw ones alone.
 
     Raises ConfigError naming file, camera and key: what is no such file, models that are not drawn, a wrong number of
@@ -126,7 +126,7 @@ def _camera(table: dict[str, Any], where: str, key: str) -> Calibrated:
         raise ConfigError("not a size", where=f"{where}.resolution", value=size, accepted="[width, height], whole px")
     intrinsics = _numbers(table, key, (4,), where)
     lens = table.get("distortion_model")
-    kind = "pinhole" if lens in _NONE else lens
+    kind = "pinhole" if lens in _NONE else str(lens)
     if kind not in ("pinhole", *_COUNTS):
         raise ConfigError(
             "unknown distortion model",

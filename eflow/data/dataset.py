@@ -117,7 +117,7 @@ class FlowDataset(Dataset):
 
     raw : the RawSample itself besides, as "raw".   reads : windows that are made tensors of
     (:attr:`eflow.models.FlowModel.reads`).
-    empty : "error" refuses a sample without an event in a window that is read; "skip" takes the next sample that has some.
+    empty : "error" refuses a sample without an event in a window that is read; "skip" takes the next that has some.
     """
 
     def __init__(

@@ -44,6 +44,10 @@ class Equidistant(DistortedModel):
         return min(math.pi, radius_limit(self._k))
 
     @property
+    def plane_limit(self) -> float:
+        return min(math.tan(self._limit), 1e18) if self._limit < math.pi / 2 else 1e18
+
+    @property
     def reach(self) -> float:
         """theta' of the largest angle."""
         return self._limit * float(radial(np.float64(self._limit), self._k)[0])

@@ -106,6 +106,11 @@ class CameraModel(ABC):
         touch, with a pixel to spare on
         every side. The whole image where the hull meets the near plane; None when it is out of the picture."""
 
+    @property
+    def px_per_slope(self) -> float:
+        """How far, px, the image of a point moves at most when (X / Z, Y / Z) changes by a step of length 1."""
+        return self.magnification
+
     def pixels_per_unit(self, centres: np.ndarray, radius: float) -> np.ndarray:
         """(n,) pixels in the image per unit of length on any surface in spheres about (n, 3) centres, at most: 0 for
         a sphere out of the picture,

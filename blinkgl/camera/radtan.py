@@ -40,6 +40,10 @@ class Radtan(DistortedModel):
         return radius_limit((self.k1, self.k2, self.k3))
 
     @property
+    def plane_limit(self) -> float:
+        return min(self._limit, 1e18)
+
+    @property
     def reach(self) -> float:
         """g(limit) of the radial part."""
         return (

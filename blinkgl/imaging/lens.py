@@ -20,9 +20,7 @@ from blinkgl.config.images import LensConfig
 def blur_px(lens: LensConfig, camera: CameraModel, depth: np.ndarray) -> np.ndarray:
     """(…) diameter, px, of the disc that a point at (…) depth Z > 0 becomes; inf is a depth."""
     with np.errstate(divide="ignore"):
-        return (
-            lens.aperture * camera.px_per_slope * np.abs(1.0 / np.asarray(depth, np.float64) - 1.0 / lens.focus)
-        )
+        return lens.aperture * camera.px_per_slope * np.abs(1.0 / np.asarray(depth, np.float64) - 1.0 / lens.focus)
 
 
 def samples(largest_px: float, spacing_px: float) -> int:

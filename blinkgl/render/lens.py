@@ -13,7 +13,6 @@ looks where its ray meets that:
 
 from __future__ import annotations
 
-import math
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -81,14 +80,10 @@ class Lens:
 
     def places(self, width: int, height: int) -> moderngl.Texture:
         """Of a picture of this size."""
-        return self._texture(
-            ("places", width, height), lambda: places_of(self.camera, self.flat, width, height).places
-        )
+        return self._texture(("places", width, height), lambda: places_of(self.camera, self.flat, width, height).places)
 
     def slopes(self, width: int, height: int) -> moderngl.Texture:
-        return self._texture(
-            ("slopes", width, height), lambda: places_of(self.camera, self.flat, width, height).slopes
-        )
+        return self._texture(("slopes", width, height), lambda: places_of(self.camera, self.flat, width, height).slopes)
 
     @property
     def claims(self) -> moderngl.Texture:
@@ -134,5 +129,3 @@ class Lens:
         for texture in self._textures.values():
             texture.release()
         self._textures = {}
-
-

@@ -157,8 +157,9 @@ class Renderer:
         return at if isinstance(at, Moment) else self.moment(at)
 
     def seen(self, pass_: Pass, smooth: bool = False) -> Pass:
-        """A pass that draws the scene as the scene's camera sees it: itself, or what a lens makes of it. smooth : light,
-        which is averaged over pixels; else each looks at one."""
+        """A pass that draws the scene as the scene's camera sees it: itself, or what a lens makes of it.
+
+        smooth : light, which is averaged over pixels; else each looks at one."""
         if self.lens == "":
             return filtered(pass_) if smooth else pass_
         return Gather(one_value(pass_) if smooth else pass_, self.scene.camera, smooth)

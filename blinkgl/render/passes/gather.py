@@ -56,7 +56,8 @@ class Gather(ScreenPass):
         defines: dict[str, Any] = {"SMOOTH": 1} if self.smooth else {}
         for k, output in enumerate(self.outputs):
             whole = FORMATS[output.format].numpy.kind == "u"
-            defines |= {f"SAMPLER_{k}": "usampler2D" if whole else "sampler2D", f"TEXEL_{k}": "uvec4" if whole else "vec4"}
+            prefix = "u" if whole else ""
+            defines |= {f"SAMPLER_{k}": f"{prefix}sampler2D", f"TEXEL_{k}": f"{prefix}vec4"}
         return defines
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
@@ -76,9 +77,9 @@ class Gather(ScreenPass):
     @classmethod
     def every_kind(cls) -> Iterator[Pass]:
         lens = Radtan(4, 3, 4.0, 4.0, 1.5, 1.0)
-        return iter(
-            (cls(Colour(), lens, True), cls(Geometry(("depth", "ids"), "radtan"), lens), cls(Velocity(4, lens="radtan"), lens))
-        )
+        yield cls(Colour(), lens, True)
+        yield cls(Geometry(("depth", "ids"), lens.kind), lens)
+        yield cls(Velocity(4, lens=lens.kind), lens)
 
 
 def one_value(pass_: Pass) -> Pass:

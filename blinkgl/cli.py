@@ -447,11 +447,14 @@ def convert(
         str,
         typer.Argument(
             metavar="IN",
-            help="Event file: DSEC/BlinkFlow/MVSEC .h5, EVT2/EVT3 .raw, .aedat4, .aedat, .txt, .csv, .npz, .npy.",
+            help="Event file: DSEC/BlinkFlow/MVSEC/Prophesee .h5, EVT2/EVT3 .raw, .aedat4, .aedat, .mcap, .txt, .csv, "
+            ".npz, .npy.",
         ),
     ],
     target: Annotated[str, typer.Argument(metavar="OUT", help="Event file; its ending names the format.")],
-    format: Annotated[str | None, typer.Option("--format", help="Where the ending leaves a choice, e.g. evt2.")] = None,
+    format: Annotated[
+        str | None, typer.Option("--format", help="Where the ending leaves a choice: evt2, prophesee.")
+    ] = None,
     size: Annotated[
         str | None, typer.Option(help="WIDTHxHEIGHT, where the file does not say (default: guessed).")
     ] = None,

@@ -24,7 +24,7 @@ LEFT, RIGHT = "left", "right"
 """Folders of a stereo rig's event cameras, each a sequence directory, in that of the rig."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Source:
     """One sequence. Times are µs on its own clock; the events of :meth:`events` are on it, too.
 

@@ -3,6 +3,7 @@
 // (SMOOTH) its mean over the pixel.
 //
 // SAMPLER_k, TEXEL_k   types of the k-th output, its sampler's and its own
+// COLUMNS, ROWS        SMOOTH: places in a pixel. Counts that a pixel finds for itself cost five times as much.
 
 #include "cover.glsl"
 
@@ -11,7 +12,6 @@ uniform sampler2D places;   // where each pixel's centre is in the flat picture,
 uniform vec2 flat_size;     // px of the flat picture in which places are
 #ifdef SMOOTH
 uniform sampler2D slopes;   // d(place) / d(px), columns
-const int MOST = 16;
 #endif
 
 #define PICKED(k, SAMPLER, TEXEL) uniform SAMPLER picked_##k; layout(location = k) out TEXEL out_##k;
@@ -46,20 +46,19 @@ void main()
     vec2 size = vec2(textureSize(picked_0, 0)), scale = size / flat_size;
     vec2 place = texelFetch(places, pixel, 0).xy * scale;
 #ifdef SMOOTH
-    // As many places as the pixel has pixels of the flat picture, each between the four around it: what every one of them
-    // has of the pixel's area.
+    // As many places as a pixel has pixels of the flat picture where it has most, each between the four around it: what
+    // every one of them has of the pixel's area.
     vec4 slope = texelFetch(slopes, pixel, 0);
     vec2 right = slope.xy * scale, down = slope.zw * scale;
-    int columns = clamp(int(ceil(length(right) - 1e-3)), 1, MOST), rows = clamp(int(ceil(length(down) - 1e-3)), 1, MOST);
     vec4 sum = vec4(0.0);
-    for (int y = 0; y < rows; ++y)
-        for (int x = 0; x < columns; ++x)
+    for (int y = 0; y < ROWS; ++y)
+        for (int x = 0; x < COLUMNS; ++x)
         {
             vec2 at = vec2(x, y) + 0.5;
-            vec2 there = place + right * (at.x / float(columns) - 0.5) + down * (at.y / float(rows) - 0.5);
+            vec2 there = place + right * (at.x / float(COLUMNS) - 0.5) + down * (at.y / float(ROWS) - 0.5);
             sum += textureLod(picked_0, there / size, 0.0);
         }
-    out_0 = sum / float(rows * columns);
+    out_0 = sum / float(ROWS * COLUMNS);
 #else
     ivec2 nearest = min(ivec2(place), ivec2(size) - 1);
 #define PICK(k) out_##k = texelFetch(picked_##k, nearest, 0);

@@ -100,9 +100,9 @@ class DistortedModel(CameraModel):
         """Radius on the image plane up to which the radial distortion grows; inf where it does for ever."""
 
     @property
-    @abstractmethod
     def plane_limit(self) -> float:
         """Largest hypot(X, Y) / Z that is seen; a very large number where there is no limit."""
+        return 1e18
 
     # ---- the border of the picture -----------------------------------------------------------------------------
 

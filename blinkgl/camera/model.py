@@ -31,6 +31,8 @@ class CameraModel(ABC):
     kind: ClassVar[str]
     coefficients: ClassVar[tuple[str, ...]] = ()
     """Names of its own parameters, in the order in which calibrations give them."""
+    shader: ClassVar[str] = ""
+    """The macro by which ``shaders/include/lens.glsl`` knows a model that distorts; "": it is not drawn."""
 
     width: int
     height: int
@@ -149,9 +151,13 @@ class CameraModel(ABC):
     def clip_from_cam(self) -> np.ndarray:
         """(4, 4) float64 from camera axes to clip space (:mod:`blinkgl.render.matrices`).
 
-        Raises ConfigError: only a pin-hole image is a matrix's work, so only that is drawn."""
+        Raises ConfigError: only a pin-hole image is a matrix's work; for a lens one is drawn
+        (:func:`blinkgl.camera.drawing.seen_through`)."""
         raise ConfigError(
-            "this camera model cannot be drawn", where="camera", value=self.kind, accepted="a pin-hole camera"
+            "this camera model cannot be drawn",
+            where="camera",
+            value=self.kind,
+            accepted="a pin-hole camera, or a lens that the shaders know",
         )
 
     def displacement(self, rays: np.ndarray, depth: np.ndarray, change: np.ndarray) -> np.ndarray:

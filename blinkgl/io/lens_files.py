@@ -7,13 +7,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import h5py
 import numpy as np
 
 from blinkgl.camera import CameraModel
 from blinkgl.camera.rectified import rectify_map
 from blinkgl.io.camchain import Calibrated, cam_to_cam_yaml, camchain_yaml, read_camchain
-from blinkgl.io.dsec import write_rectify_map
+from blinkgl.io.dsec import read_rectify_map, write_rectify_map
 
 if TYPE_CHECKING:
     from blinkgl.io.sequence_dir import SequenceWriter
@@ -32,17 +31,14 @@ def write_lens(writer: SequenceWriter, camera: CameraModel) -> None:
 
 
 def problems_of_lens(folder: Path, camera: CameraModel) -> list[str]:
-    """In what the files are not those of this camera. Raises OSError and BlinkGLError for files that cannot be read."""
+    """In what the files are not those of this camera. Raises BlinkGLError for files that cannot be read."""
     problems = [
         f"{name}: not the camera of config.yaml"
         for name in (CAM_TO_CAM, CAMCHAIN)
         if camera not in [_near(one.camera, camera) for one in read_camchain(folder / name).values()]
     ]
-    with h5py.File(folder / RECTIFY_MAP, "r") as file:
-        given = file.get("rectify_map")
-        right = isinstance(given, h5py.Dataset) and given.shape == (camera.height, camera.width, 2)
-        off = np.abs(given[()] - rectify_map(camera)).max() if right else np.inf
-    if not off <= _TOLERANCE:
+    given, wanted = read_rectify_map(folder / RECTIFY_MAP), rectify_map(camera)
+    if given.shape != wanted.shape or not np.abs(given - wanted).max() <= _TOLERANCE:
         problems.append(f"{RECTIFY_MAP}: not the map of config.yaml's camera")
     return problems
 

@@ -21,8 +21,9 @@ import numpy as np
 
 from blinkgl.config.reader import to_yaml
 from blinkgl.errors import AssetError
-from blinkgl.io.dsec import identity_rectify_map, write_rectify_map
+from blinkgl.io.dsec import identity_rectify_map, read_rectify_map, write_rectify_map
 from blinkgl.io.flow_png import encode_png
+from blinkgl.io.lens_files import RECTIFY_MAP
 from blinkgl.layouts.files import copy, write_bytes, write_lines
 from blinkgl.layouts.layout import Layout, Missing, needs_flow
 from blinkgl.layouts.source import Source
@@ -111,6 +112,8 @@ def write_events(source: Source, folder: Path) -> None:
 
 def rectify_map(source: Source) -> np.ndarray:
     """(H, W, 2) float32: where a pixel is once the lens's distortion is taken out."""
+    if RECTIFY_MAP in source.manifest["files"]:
+        return read_rectify_map(source.folder / RECTIFY_MAP)
     return identity_rectify_map(source.height, source.width)
 
 

@@ -1,13 +1,13 @@
 """A lens's picture out of a flat one.
 
 A rasteriser draws what a pin-hole camera sees. For a lens that distorts the flat picture that holds all of its own
-(:func:`blinkgl.camera.drawing.seen_through`) is drawn, at 1.5 px a pixel or more, and each pixel of the lens's picture
+(:func:`blinkgl.camera.drawing.seen_through`) is drawn, at 1.42 px a pixel or more, and each pixel of the lens's picture
 looks where its ray meets that:
 
 - light is the mean over the pixel, by area, of the flat picture's pixels;
 - labels are not interpolated. Each pixel claims the one of the flat picture whose centre is nearest to its ray; no two
   claim the same one. That fragment is evaluated where the ray passes it, not at its centre (``along_ray.glsl``), so a
-  label is of the surface that is seen at the flat pixel's centre, at most a third of a pixel of the lens's beside the
+  label is of the surface that is seen at the flat pixel's centre, at most half a pixel of the lens's beside the
   ray, and there exact.
 """
 
@@ -61,6 +61,21 @@ def claims_of(camera: CameraModel, flat: PinHole) -> np.ndarray:
     nearest = np.floor(places).astype(np.intp)
     claims[nearest[..., 1], nearest[..., 0]] = places - (nearest + np.float32(0.5))
     return claims
+
+
+_SPARED = 0.4
+"""px of the flat picture: places are at most 1 + this over their number apart."""
+_MOST = 16
+
+
+@lru_cache(maxsize=32)
+def steps_of(camera: CameraModel, finer: int) -> tuple[int, int]:
+    """Places in a pixel, along x and y, between which a flat picture that is so many times finer has one pixel or a
+    little more, wherever in the picture."""
+    slopes = places_of(camera, seen_through(camera), camera.width, camera.height).slopes  # type: ignore[bad-argument-type]
+    lengths = np.hypot(slopes[..., ::2], slopes[..., 1::2]).max(axis=(0, 1)) * finer
+    columns, rows = np.clip(np.ceil(lengths - _SPARED), 1, _MOST).astype(int)
+    return int(columns), int(rows)
 
 
 class Lens:

@@ -166,8 +166,8 @@ class Renderer:
 
     @property
     def lens(self) -> str:
-        """Kind of the camera's model where it distorts; "" for a pin-hole camera."""
-        return "" if self._painter.lens is None else self.scene.camera.kind
+        """Macro of the camera's model where it distorts; "" for a pin-hole camera."""
+        return "" if self._painter.lens is None else self.scene.camera.shader
 
     def geometry(self, names: tuple[str, ...]) -> Pass:
         """What the label shader writes of labels of these names, in the pixels of the scene's camera."""

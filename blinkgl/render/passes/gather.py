@@ -10,6 +10,7 @@ from moderngl import LINEAR
 
 from blinkgl.camera import CameraModel, Radtan
 from blinkgl.gl import FORMATS
+from blinkgl.render.lens import steps_of
 from blinkgl.render.passes.base import Input, Output, Pass, ScreenPass, Shot
 from blinkgl.render.passes.colour import Colour
 from blinkgl.render.passes.geometry import Geometry
@@ -53,7 +54,10 @@ class Gather(ScreenPass):
         return merged([r for r in seen if r is not None])
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
-        defines: dict[str, Any] = {"SMOOTH": 1} if self.smooth else {}
+        defines: dict[str, Any] = {}
+        if self.smooth:
+            columns, rows = steps_of(self.camera, self.of.samples.grid)
+            defines = {"SMOOTH": 1, "COLUMNS": columns, "ROWS": rows}
         for k, output in enumerate(self.outputs):
             whole = FORMATS[output.format].numpy.kind == "u"
             prefix = "u" if whole else ""
@@ -78,8 +82,8 @@ class Gather(ScreenPass):
     def every_kind(cls) -> Iterator[Pass]:
         lens = Radtan(4, 3, 4.0, 4.0, 1.5, 1.0)
         yield cls(Colour(), lens, True)
-        yield cls(Geometry(("depth", "ids"), lens.kind), lens)
-        yield cls(Velocity(4, lens=lens.kind), lens)
+        yield cls(Geometry(("depth", "ids"), lens.shader), lens)
+        yield cls(Velocity(4, lens=lens.shader), lens)
 
 
 def one_value(pass_: Pass) -> Pass:

@@ -32,7 +32,7 @@ class Geometry(ScenePass):
     """Outputs by the names of their labels, as the shader writes them; 0 where nothing is hit. One sample, at the
     pixel's centre. Labels that lead to another time want the moment there, "forward" or "backward".
 
-    lens : kind of the camera model that the flat picture is drawn for: fragments are evaluated where its pixels' rays
+    lens : macro of the camera model that the flat picture is drawn for: fragments are evaluated where its pixels' rays
     pass (:mod:`blinkgl.render.lens`), and motion is in its pixels; "": a pin-hole camera's own picture.
 
     Raises TypeError, at the first frame, for a label whose ``uniforms`` are not those of its ``glsl``."""
@@ -46,7 +46,7 @@ class Geometry(ScenePass):
         return tuple(Output(name, LABELS[name].buffer) for name in self.names)
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
-        through = {"LENS": 1, "LENS_CLAIMS": 1, self.lens.upper(): 1} if self.lens else {}
+        through = {"LENS": 1, "LENS_CLAIMS": 1, self.lens: 1} if self.lens else {}
         return {define_of(name): i for i, name in enumerate(self.names)} | through
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
@@ -112,4 +112,4 @@ class Geometry(ScenePass):
     def every_kind(cls) -> Iterator[Pass]:
         drawn = [name for name, label in LABELS.items() if label.buffer]
         yield from (cls(names) for count in range(1, len(drawn) + 1) for names in combinations(drawn, count))
-        yield from (cls(tuple(drawn[:8]), lens) for lens in ("radtan", "equidistant"))
+        yield from (cls(tuple(drawn[:8]), lens) for lens in ("RADTAN", "EQUIDISTANT"))

@@ -22,7 +22,7 @@ class Velocity(ScenePass):
     """Output "velocity", (h, w, 2) float32 px/s of the full-size image, 0 where nothing is
     hit, on every n-th pixel in x and y.
     moving_only : leaves out objects that stand still, also where they hide something.
-    lens : kind of the camera model in whose pixels motion is, where a flat picture is drawn for it."""
+    lens : macro of the camera model in whose pixels motion is, where a flat picture is drawn for it."""
 
     every: int = 1
     moving_only: bool = False
@@ -34,7 +34,7 @@ class Velocity(ScenePass):
         return [item for item in moment.visible if item.moves] if self.moving_only else moment.visible
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
-        return ({} if self.every == 1 else {"SMALL": 1}) | ({"LENS": 1, self.lens.upper(): 1} if self.lens else {})
+        return ({} if self.every == 1 else {"SMALL": 1}) | ({"LENS": 1, self.lens: 1} if self.lens else {})
 
     def set(self, painter: Painter, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
         width, height = shot.size
@@ -49,4 +49,4 @@ class Velocity(ScenePass):
 
     @classmethod
     def every_kind(cls) -> Iterator[Pass]:
-        return (cls(every, lens=lens) for every in (1, 4) for lens in ("", "radtan", "equidistant"))
+        return (cls(every, lens=lens) for every in (1, 4) for lens in ("", "RADTAN", "EQUIDISTANT"))

@@ -2,7 +2,7 @@
 
 In:    frames and the emulators' configurations (``blinkgl.events``), a context (``blinkgl.gl``).
 Out:   an ``Emulator`` whose state lies on the card.
-Start: esim.py; the kernels are shaders/events_*.glsl.
+Start: esim.py; the kernels are shaders/compute/events_*.glsl.
 """
 
 from blinkgl.card.esim import CardEsim

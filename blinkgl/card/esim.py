@@ -1,4 +1,4 @@
-"""ESIM on the card (``shaders/events_*.glsl``): the events of :class:`~blinkgl.events.esim.Esim`, bit for bit.
+"""ESIM on the card (``shaders/compute/events_*.glsl``): the events of :class:`~blinkgl.events.esim.Esim`, bit for bit.
 
 A step is ten dispatches. *Mark*: the logarithm of every pixel against its two levels, a bit each. *List*: the pixels
 that fire, in raster order, their places found by prefix sums. *Fire*: how many events each has, its next levels, and a
@@ -130,7 +130,7 @@ class CardEsim(Esim):
         """Marks, lists, fires, and emits as far as there is room."""
         room, kernels, values = self._room, self._kernels, self._values(t_ns)
         kernels.run(
-            "events_mark.glsl",
+            "compute/events_mark.glsl",
             {},
             {0: room["now"], 1: room["levels"], 2: room["marks"]},
             values,
@@ -138,7 +138,7 @@ class CardEsim(Esim):
         )
         kernels.prefix_of_bits(room["listed"], room["marks"], room["sums"], room["places"], room.words)
         kernels.run(
-            "events_list.glsl",
+            "compute/events_list.glsl",
             {},
             {0: room["marks"], 1: room["places"], 2: room["sums"], 3: room["listed"]},
             values,
@@ -167,7 +167,7 @@ class CardEsim(Esim):
             common[3] = room["thresholds"]
         long = {"LONG": 1} if t_ns - self.t_ns >= 2**31 else {}
         self._kernels.run(
-            "events_fire.glsl",
+            "compute/events_fire.glsl",
             {**self._defines, **long, **defines},
             {**common, **buffers},
             values,

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 MADE.append(includes)
 WORD, BLOCK_WORDS, LOCAL, PIXELS_PER_GROUP = 32, 32, 64, 256
-"""As in shaders/events.glsl: pixels of a word of marks, words of a block, invocations of a group."""
+"""As in shaders/include/events.glsl: pixels of a word of marks, words of a block, invocations of a group."""
 HEAD_BYTES, PIXELS_AT, CHUNKS_AT = 48, 0, 12
 """Size of the head of a list, and where in it the two triples for indirect dispatches stand."""
 
@@ -62,18 +62,18 @@ class Kernels:
         all, which the head is told. count : of words, a multiple of 32."""
         chunks = count // BLOCK_WORDS
         buffers, values = {0: head, 1: words, 2: sums}, {"chunks_given": chunks}
-        self.run("prefix.glsl", {"BITS": 1, "SUMS": 1}, buffers, values, items=chunks)
-        self.run("prefix.glsl", {"BITS": 1, "SCAN": 1, "LANES": self._lanes}, buffers, values, items=1)
-        self.run("prefix.glsl", {"BITS": 1, "OFFSETS": 1}, {**buffers, 3: offsets}, values, items=chunks)
+        self.run("compute/prefix.glsl", {"BITS": 1, "SUMS": 1}, buffers, values, items=chunks)
+        self.run("compute/prefix.glsl", {"BITS": 1, "SCAN": 1, "LANES": self._lanes}, buffers, values, items=1)
+        self.run("compute/prefix.glsl", {"BITS": 1, "OFFSETS": 1}, {**buffers, 3: offsets}, values, items=chunks)
 
     def prefix_of_counts(
         self, head: moderngl.Buffer, counts: moderngl.Buffer, sums: moderngl.Buffer, offsets: moderngl.Buffer
     ) -> None:
         """``offsets``: the sum of ``counts`` before each; the head says how many there are, and is told the total."""
         buffers, chunks = {0: head, 1: counts, 2: sums}, (head, CHUNKS_AT)
-        self.run("prefix.glsl", {"SUMS": 1}, buffers, {}, indirect=chunks)
-        self.run("prefix.glsl", {"SCAN": 1, "LANES": self._lanes}, buffers, {}, items=1)
-        self.run("prefix.glsl", {"OFFSETS": 1}, {**buffers, 3: offsets}, {}, indirect=chunks)
+        self.run("compute/prefix.glsl", {"SUMS": 1}, buffers, {}, indirect=chunks)
+        self.run("compute/prefix.glsl", {"SCAN": 1, "LANES": self._lanes}, buffers, {}, items=1)
+        self.run("compute/prefix.glsl", {"OFFSETS": 1}, {**buffers, 3: offsets}, {}, indirect=chunks)
 
 
 def refuse_without_compute(gl: GLContext) -> None:

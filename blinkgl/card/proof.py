@@ -42,7 +42,11 @@ def card_logs(gl: GLContext, intensity: np.ndarray, eps: float, soft_float: bool
     given, taken = gl.ctx.buffer(intensity.tobytes()), gl.ctx.buffer(reserve=intensity.nbytes)
     try:
         Kernels(gl, soft_float).run(
-            "logarithms.glsl", {}, {0: given, 1: taken}, {"eps": float(np.float32(eps))}, items=intensity.size // 4
+            "compute/logarithms.glsl",
+            {},
+            {0: given, 1: taken},
+            {"eps": float(np.float32(eps))},
+            items=intensity.size // 4,
         )
         return np.frombuffer(taken.read(), np.int32)
     finally:

@@ -261,6 +261,10 @@ def test_shipped_shaders_load(gl):
     for name in names:
         for stage in ("vertex", "fragment"):
             assert expand(name, stage).text
+    kernels = sorted(entry.name for entry in (shader_folder() / "compute").iterdir())
+    assert kernels
+    for name in kernels:
+        assert expand(f"compute/{name}", "compute").text
 
 
 def test_compute_programs(gl, folder):

@@ -167,18 +167,29 @@ def write_rows(data: h5py.Dataset, start: int, rows: np.ndarray) -> None:
     begin = start // step * step
     rows = np.ascontiguousarray(rows, data.dtype)
     if begin < start:
-        rows = np.concatenate([data[begin:start], rows])
+        rows = joined([data[begin:start], rows])
     data.resize(begin + len(rows), axis=0)
     for i in range(0, len(rows), step):
         piece = rows[i : i + step]
         if len(piece) < step:  # HDF5 stores the last chunk whole, filled with zeros
-            piece = np.concatenate([piece, np.zeros((step - len(piece), *piece.shape[1:]), piece.dtype)])
+            piece = joined([piece, np.zeros((step - len(piece), *piece.shape[1:]), piece.dtype)])
         packed = _compressed(piece)
         # As HDF5's filter does: what does not become smaller is stored as it is, and the chunk says so.
         skipped = 1 if packed is None else 0
         data.id.write_direct_chunk(
             (begin + i, *(0,) * (data.ndim - 1)), piece.tobytes() if skipped else packed, skipped
         )
+
+
+def joined(pieces: list[np.ndarray]) -> np.ndarray:
+    """One after another, in the dtype of the first: NumPy's own concatenation closes the gaps between a record's
+    fields, and a file's records keep theirs."""
+    out = np.zeros((sum(map(len, pieces)), *pieces[0].shape[1:]), pieces[0].dtype)
+    at = 0
+    for piece in pieces:
+        out[at : at + len(piece)] = piece
+        at += len(piece)
+    return out
 
 
 def _compressed(array: np.ndarray) -> bytes | None:

@@ -41,7 +41,7 @@ from blinkgl.config.labels import LabelsConfig
 from blinkgl.errors import AssetError, BlinkGLError, OutputError
 from blinkgl.events.types import Events
 from blinkgl.io import imu as imu_files
-from blinkgl.io.atomic import fsync, output_errors, remove_stale, temporary_beside
+from blinkgl.io.atomic import fsync, output_errors, refuse_existing, remove_stale, temporary_beside
 from blinkgl.io.dsec import DsecEventWriter
 from blinkgl.io.event_labels import EVENT_LABELS, EventLabelsWriter
 from blinkgl.io.frame_camera import (
@@ -365,19 +365,6 @@ class SequenceWriter:
             except Exception:  # noqa: BLE001 - a full disk refuses the flush; the file is deleted anyway
                 pass
         shutil.rmtree(self._tmp, ignore_errors=True)
-
-
-def refuse_existing(final: str | os.PathLike) -> None:
-    """OutputError unless ``final`` is free (absent, or an empty folder)."""
-    final = Path(final)
-    if final.is_dir() and not any(final.iterdir()):
-        return
-    if final.exists() or final.is_symlink():
-        raise OutputError(
-            "output folder exists" if final.is_dir() else "output path is a file",
-            where=str(final),
-            accepted="a new folder name",
-        )
 
 
 class _File(BaseModel):

@@ -44,6 +44,7 @@ def main() -> None:
         for name, lens in LENSES.items():
             config = load_run(run, [*size, "scene.objects.count=20", *lens]).sequence(2)
             renderers[name] = Renderer(gl, sequence_scene(config, 2, run.parent), config.render)
+        finer = Luminance(samples=samples_of("ssaa2"))
         passes = {
             "event frame": lambda r, t: r.luminance(t).view(),
             "event frame, ssaa2": lambda r, t: r.draw(
@@ -78,13 +79,13 @@ def _errors(renderer: Renderer) -> None:
     both = inner & frame.forward.valid & true.forward.valid
     flow = np.abs(frame.forward.flow - true.forward.flow)[both].max(axis=-1)
     depth = np.abs(frame.depth / np.where(true.hit, true.depth, 1.0) - 1.0)[inner]
+    wrong, hidden = frame.ids != true.instance, frame.forward.occluded != true.forward.occluded
+    off = f"off silhouettes, {100 * inner.mean():.0f} % of the pixels"
     print(
-        f"{'':12} off silhouettes ({100 * inner.mean():.0f} % of the pixels): flow median {np.median(flow):.1e}, 99 % "
-        f"{np.quantile(flow, 0.99):.1e}, largest {flow.max():.1e} px, over 1e-3 px in "
-        f"{100 * (flow > 1e-3).mean():.2f} % (flow up to {np.abs(true.forward.flow[both]).max():.0f} px); depth 99 % {np.quantile(depth, 0.99):.1e}; "
-        f"wrong ids {(frame.ids != true.instance)[inner].sum()}, of all pixels "
-        f"{100 * (frame.ids != true.instance).mean():.2f} %; "
-        f"masks that differ {100 * (frame.forward.occluded != true.forward.occluded)[both].mean():.3f} %"
+        f"{'':12} {off}: flow median {np.median(flow):.1e}, 99 % {np.quantile(flow, 0.99):.1e}, largest {flow.max():.1e} px, "
+        f"over 1e-3 px in {100 * (flow > 1e-3).mean():.2f} % (flow up to {np.abs(true.forward.flow[both]).max():.0f} px); "
+        f"depth 99 % {np.quantile(depth, 0.99):.1e}; wrong ids {wrong[inner].sum()}, of all pixels "
+        f"{100 * wrong.mean():.2f} %; masks that differ {100 * hidden[both].mean():.3f} %"
     )
 
 

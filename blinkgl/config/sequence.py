@@ -174,6 +174,10 @@ class OutputConfig(Config):
     first_index: int = Field(
         0, ge=0, le=10_000_000, description="number of the first; sequence n depends on the seed and n alone"
     )
+    compression: Literal["zstd", "lz4"] = Field(
+        "zstd",
+        description="of events.h5, inside Blosc: zstd as DSEC's files; lz4 writes twice as fast, 4 % larger",
+    )
 
 
 def _sensor(name: str) -> str:

@@ -15,15 +15,14 @@ count on the step of two.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from blinkgl.config.reader import to_yaml
-from blinkgl.errors import AssetError
-from blinkgl.io.dsec import identity_rectify_map, read_rectify_map, write_rectify_map
+from blinkgl.camera import CameraModel, PinHole
+from blinkgl.camera.rectified import rectify_map
+from blinkgl.io.camchain import Calibrated, cam_to_cam_yaml
+from blinkgl.io.dsec import identity_rectify_map, write_rectify_map
 from blinkgl.io.flow_png import encode_png
-from blinkgl.io.lens_files import RECTIFY_MAP
 from blinkgl.layouts.files import copy, write_bytes, write_lines
 from blinkgl.layouts.layout import Layout, Missing, needs_flow
 from blinkgl.layouts.source import Source
@@ -58,8 +57,8 @@ class Dsec(Layout):
         if source.right is not None:
             write_events(source.right, folder / "events/right")
             said += _write_disparity(source, source.right, folder / "disparity")
-        if source.K is not None:
-            write_lines(folder / "calibration/cam_to_cam.yaml", [to_yaml(cam_to_cam(source)).rstrip()])
+        if source.camera is not None:
+            write_bytes(folder / "calibration/cam_to_cam.yaml", cam_to_cam(source, source.camera).encode())
         return said
 
 
@@ -107,14 +106,11 @@ def image_times(source: Source) -> list[int]:
 def write_events(source: Source, folder: Path) -> None:
     """``events.h5``, which is in DSEC's layout as it is, and ``rectify_map.h5``."""
     copy(source.folder / "events.h5", folder / "events.h5")
-    write_rectify_map(folder / "rectify_map.h5", rectify_map(source))
-
-
-def rectify_map(source: Source) -> np.ndarray:
-    """(H, W, 2) float32: where a pixel is once the lens's distortion is taken out."""
-    if RECTIFY_MAP in source.manifest["files"]:
-        return read_rectify_map(source.folder / RECTIFY_MAP)
-    return identity_rectify_map(source.height, source.width)
+    camera = source.camera
+    flat = camera is None or isinstance(camera, PinHole)
+    write_rectify_map(
+        folder / "rectify_map.h5", identity_rectify_map(source.height, source.width) if flat else rectify_map(camera)
+    )
 
 
 def write_flow(source: Source, towards: str, folder: Path) -> None:
@@ -155,40 +151,27 @@ def _write_disparity(left: Source, right: Source, folder: Path) -> list[str]:
 
 def _pair(left: Source, right: Source) -> tuple[float, float] | None:
     """Focal length, px, and baseline, world units; None where a disparity is no f b / Z."""
-    if left.K is None or right.K is None or not np.allclose(left.K, right.K, rtol=0, atol=1e-9):
+    eyes = left.camera, right.camera
+    if eyes[0] is None or eyes[1] is None or not np.allclose(eyes[0].K, eyes[1].K, rtol=0, atol=1e-9):
         return None
     T_left_right = np.linalg.inv(left.poses["T_world_cam"]) @ right.poses["T_world_cam"]
     t = T_left_right[:, :3, 3]
     turned = np.abs(T_left_right[:, :3, :3] - np.eye(3)).max()
     aside = np.abs(t - [t[0, 0], 0, 0]).max()
     parallel = t[0, 0] > 0 and max(turned, aside) < _PARALLEL * max(1.0, t[0, 0])
-    return (float(left.K[0, 0]), float(t[0, 0])) if parallel else None
+    return (float(eyes[0].fx), float(t[0, 0])) if parallel else None
 
 
-def cam_to_cam(source: Source) -> dict[str, Any]:
+def cam_to_cam(source: Source, camera: CameraModel) -> str:
     """DSEC's calibration: cam0 and, of a stereo rig, cam3 are event cameras; ``camRectX`` is the one without
     distortion; ``T_XY`` takes points from Y to X."""
-    cameras = {0: source, **({} if source.right is None else {3: source.right})}
-    intrinsics: dict[str, Any] = {}
-    extrinsics: dict[str, Any] = {}
-    for number, one in cameras.items():
-        if one.K is None:
-            raise AssetError("no intrinsics", where=str(one.folder / "poses.npz"))
-        matrix = [float(one.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
-        plain = {"camera_matrix": matrix, "camera_model": "pinhole", "resolution": [one.width, one.height]}
-        intrinsics[f"cam{number}"] = {
-            **plain,
-            "distortion_coeffs": [0.0, 0.0, 0.0, 0.0],
-            "distortion_model": "radtan",
-        }
-        intrinsics[f"camRect{number}"] = plain
-        extrinsics[f"R_rect{number}"] = np.eye(3).tolist()
-    calibration = {"intrinsics": intrinsics, "extrinsics": extrinsics}
-    if source.right is not None:
-        T = np.linalg.inv(source.right.poses["T_world_cam"][0]) @ source.poses["T_world_cam"][0]
-        extrinsics["T_30"] = T.tolist()
-        if (pair := _pair(source, source.right)) is not None:
-            cx, cy = intrinsics["camRect0"]["camera_matrix"][2:]
-            Q = [[1.0, 0, 0, -cx], [0, 1.0, 0, -cy], [0, 0, 0, pair[0]], [0, 0, 1 / pair[1], 0]]
-            calibration["disparity_to_depth"] = {"cams_03": [[float(v) for v in row] for row in Q]}
-    return calibration
+    right = source.right
+    if right is None or right.camera is None:
+        return cam_to_cam_yaml([Calibrated(camera)])
+    T_right_left = np.linalg.inv(right.poses["T_world_cam"][0]) @ source.poses["T_world_cam"][0]
+    tables = None
+    if (pair := _pair(source, right)) is not None:
+        focal, baseline = pair
+        Q = [[1.0, 0.0, 0.0, -camera.cx], [0.0, 1.0, 0.0, -camera.cy], [0.0, 0.0, 0.0, focal]]
+        tables = {"cams_03": [[float(v) for v in row] for row in (*Q, [0.0, 0.0, 1 / baseline, 0.0])]}
+    return cam_to_cam_yaml([Calibrated(camera), Calibrated(right.camera, T_right_left)], (0, 3), tables)

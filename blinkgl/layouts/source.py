@@ -11,8 +11,10 @@ from typing import Any
 import cv2
 import numpy as np
 
+from blinkgl.camera import CameraModel, PinHole
 from blinkgl.errors import AssetError
 from blinkgl.events.types import Events
+from blinkgl.io.camchain import read_camchain
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.images import NpzReader, numpy_errors, read_image
 from blinkgl.io.index import sequence_folders
@@ -20,6 +22,8 @@ from blinkgl.io.records import read_text
 from blinkgl.io.sequence_dir import MANIFEST, read_manifest, verify_sequence
 from blinkgl.labels import LABELS, Form
 
+CALIBRATION = "cam_to_cam.yaml"
+"""In the directory of a sequence whose lens distorts."""
 LEFT, RIGHT = "left", "right"
 """Folders of a stereo rig's event cameras, each a sequence directory, in that of the rig."""
 
@@ -126,10 +130,15 @@ class Source:
         with numpy_errors(path), NpzReader(path) as arrays:
             return {name: arrays[name] for name in arrays.names}
 
-    @property
-    def K(self) -> np.ndarray | None:
-        """(3, 3) intrinsics, pixel centres at whole numbers; None where they are unknown."""
-        return self.poses.get("K")
+    @functools.cached_property
+    def camera(self) -> CameraModel | None:
+        """Its model; None where a recording says nothing of it."""
+        if self.has(CALIBRATION):  # of a lens that distorts
+            return next(iter(read_camchain(self.folder / CALIBRATION).values())).camera
+        if "K" not in self.poses:
+            return None
+        (fx, _, cx), (_, fy, cy), _ = self.poses["K"].tolist()
+        return PinHole(self.width, self.height, fx, fy, cx, cy)
 
     @functools.cached_property
     def right(self) -> Source | None:

@@ -47,9 +47,7 @@ def main() -> None:
         finer = Luminance(samples=samples_of("ssaa2"))
         passes = {
             "event frame": lambda r, t: r.luminance(t).view(),
-            "event frame, ssaa2": lambda r, t: r.draw(
-                r.seen(Luminance(samples=samples_of("ssaa2")), smooth=True), t
-            ).view(),
+            "event frame, ssaa2": lambda r, t: r.draw(r.seen(finer, smooth=True), t).view(),
             "small velocity": lambda r, t: r.velocity_of_movers(t, 4).read(),
             "labels": lambda r, t: r.labels(t, LABELS, t + SPAN),
         }
@@ -82,8 +80,8 @@ def _errors(renderer: Renderer) -> None:
     wrong, hidden = frame.ids != true.instance, frame.forward.occluded != true.forward.occluded
     off = f"off silhouettes, {100 * inner.mean():.0f} % of the pixels"
     print(
-        f"{'':12} {off}: flow median {np.median(flow):.1e}, 99 % {np.quantile(flow, 0.99):.1e}, largest {flow.max():.1e} px, "
-        f"over 1e-3 px in {100 * (flow > 1e-3).mean():.2f} % (flow up to {np.abs(true.forward.flow[both]).max():.0f} px); "
+        f"{'':12} {off}: flow median {np.median(flow):.1e}, 99 % {np.quantile(flow, 0.99):.1e}, largest {flow.max():.1e} "
+        f"px, over 1e-3 px in {100 * (flow > 1e-3).mean():.2f} % (flow up to {np.abs(true.forward.flow[both]).max():.0f} px); "
         f"depth 99 % {np.quantile(depth, 0.99):.1e}; wrong ids {wrong[inner].sum()}, of all pixels "
         f"{100 * wrong.mean():.2f} %; masks that differ {100 * hidden[both].mean():.3f} %"
     )

@@ -78,10 +78,11 @@ def _errors(renderer: Renderer) -> None:
     flow = np.abs(frame.forward.flow - true.forward.flow)[both].max(axis=-1)
     depth = np.abs(frame.depth / np.where(true.hit, true.depth, 1.0) - 1.0)[inner]
     wrong, hidden = frame.ids != true.instance, frame.forward.occluded != true.forward.occluded
+    most = np.abs(true.forward.flow[both]).max()
     off = f"off silhouettes, {100 * inner.mean():.0f} % of the pixels"
     print(
         f"{'':12} {off}: flow median {np.median(flow):.1e}, 99 % {np.quantile(flow, 0.99):.1e}, largest {flow.max():.1e} "
-        f"px, over 1e-3 px in {100 * (flow > 1e-3).mean():.2f} % (flow up to {np.abs(true.forward.flow[both]).max():.0f} px); "
+        f"px, over 1e-3 px in {100 * (flow > 1e-3).mean():.2f} % (flow up to {most:.0f} px); "
         f"depth 99 % {np.quantile(depth, 0.99):.1e}; wrong ids {wrong[inner].sum()}, of all pixels "
         f"{100 * wrong.mean():.2f} %; masks that differ {100 * hidden[both].mean():.3f} %"
     )

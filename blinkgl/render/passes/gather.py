@@ -10,6 +10,7 @@ from moderngl import LINEAR
 
 from blinkgl.camera import CameraModel, Radtan
 from blinkgl.gl import FORMATS
+from blinkgl.labels import LABELS
 from blinkgl.render.lens import steps_of
 from blinkgl.render.passes.base import Input, Output, Pass, ScreenPass, Shot
 from blinkgl.render.passes.colour import Colour
@@ -82,7 +83,8 @@ class Gather(ScreenPass):
     def every_kind(cls) -> Iterator[Pass]:
         lens = Radtan(4, 3, 4.0, 4.0, 1.5, 1.0)
         yield cls(Colour(), lens, True)
-        yield cls(Geometry(("depth", "ids"), lens.shader), lens)
+        drawn = tuple(name for name, label in LABELS.items() if label.buffer)[:8]
+        yield cls(Geometry(drawn, lens.shader), lens)
         yield cls(Velocity(4, lens=lens.shader), lens)
 
 

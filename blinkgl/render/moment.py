@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from blinkgl.camera.drawing import seen_through
 from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate, inverse_depth_bits
 from blinkgl.render.umbras import Solids
 
@@ -189,10 +190,11 @@ class Stage:
 
 
 class Moments:
-    """Gives the moments of a scene; the last few are kept. ``stage``: :class:`Stage`."""
+    """Gives the moments of a scene; the last few are kept. ``stage``: :class:`Stage`. Of a lens that distorts they are
+    those of the pin-hole camera that is drawn for it."""
 
     def __init__(self, scene: Scene, items: Sequence[DrawItem]):
-        self.stage, self.view = Stage(scene, items), View.of(scene.camera)
+        self.stage, self.view = Stage(scene, items), View.of(seen_through(scene.camera))
         paths = self.stage.paths
         self._start = np.stack([p.pose(scene.t0_ns) for p in paths]) if paths else np.zeros((0, 4, 4))
         self._kept: OrderedDict[int, Moment] = OrderedDict()
@@ -210,6 +212,6 @@ class Moments:
 
     def look_through(self, camera: CameraModel) -> None:
         """From now on through another camera on the same path."""
-        self.view = View.of(camera)
+        self.view = View.of(seen_through(camera))
         for t_ns, moment in self._kept.items():
             self._kept[t_ns] = moment.through(self.view)

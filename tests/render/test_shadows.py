@@ -16,8 +16,7 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.scene.lights import lamp_pose
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.types import Lamp, Light, Material, Part, SceneObject
-from blinkgl.tools.shadow_faults import faults
-from blinkgl.tools.shadow_faults import frame as random_frame
+from blinkgl.tools.shadow_faults import faults, frame as random_frame
 from render_scenes import LEVEL, SECOND, cube, curve, drift, quad, rig, scene, sphere, still, thing
 
 PLAIN = RenderConfig(image_antialiasing="none")

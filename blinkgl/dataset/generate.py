@@ -152,6 +152,7 @@ def manifest_info(sequence: Simulation) -> dict:
         "sequence": sequence.index,
         "split": config.output.split,
         "emulator": config.events.emulator,
+        **({} if sequence.camera is None else {"events_device": sequence.camera.emulator.device}),
         "frames": sequence.frames,
         "labels": sequence.labels,
         # between whole microseconds, as every time in the files

@@ -111,6 +111,7 @@ class RenderedSequence(Simulation):
                     kernel_seed(config.seed, index, Role.EVENTS),
                     config.timeline.reconstruction,
                     _truth_of(self.sensor, config),
+                    renderer.gl,
                 )
                 response, dynamics = emulator_of(emulator).response(emulator), scene.dynamics
                 self.timeline = make_timeline(

@@ -115,7 +115,7 @@ class Totals:
         }
 
 
-_NOT_SAID_AS_NULL = ("frames", "physics", "deform", "images", "fog")
+_NOT_SAID_AS_NULL = ("frames", "physics", "deform", "images", "fog", "rig", "sensors")
 """Keys of what came later than the first data sets: a sequence without it has the bytes that it had."""
 
 

@@ -356,7 +356,9 @@ class SequenceConfig(Config):
     def _frames_have_no_rig(sensors: bool, frames: bool):
         if sensors and frames:
             raise Refused(
-                "recorded frames were seen by one camera", where="sensors", accepted="null, or a scene instead of frames"
+                "recorded frames were seen by one camera",
+                where="sensors",
+                accepted="null, or a scene instead of frames",
             )
 
     @rule("?sensors", "scene.intrinsics")

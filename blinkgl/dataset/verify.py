@@ -201,7 +201,9 @@ def look_at_rig(folder: Path, name: str, manifest: dict[str, Any], config: Seque
         return problems
     for one in config.sensors:
         if one.sees:
-            inside = _guarded(lambda one=one: look_at_sensor(folder / one.name, read_manifest(folder / one.name), config))
+            inside = _guarded(
+                lambda one=one: look_at_sensor(folder / one.name, read_manifest(folder / one.name), config)
+            )
             problems += [f"{one.name}/{line}" for line in inside]
         elif one.imu is not None:
             inside = _guarded(lambda one=one: _check_imu(folder / one.name, config.model_copy(update={"imu": one.imu})))

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig, SceneConfig
 from blinkgl.config.rig import baseline_of
+from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig, SceneConfig
 from blinkgl.config.sequence import CameraConfig, RigSensorConfig, SequenceConfig, camera_radius
 from blinkgl.errors import ConfigError
 from blinkgl.scene.rig import Rig, Sensor

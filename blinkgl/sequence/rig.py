@@ -69,9 +69,7 @@ class RigSequence:
                     continue
                 gl = gl or stack.enter_context(create_context(config.gl.backend, config.gl.device))
                 beside = renderers[0] if renderers else None
-                renderers.append(
-                    stack.enter_context(Renderer(gl, self.scene.seen_by(k), config.render, beside=beside))
-                )
+                renderers.append(stack.enter_context(Renderer(gl, self.scene.seen_by(k), config.render, beside=beside)))
                 self.members.append(
                     RenderedSequence(
                         config.of_sensor(k),

@@ -29,8 +29,8 @@ class Role(IntEnum):
 
 
 def seed_sequence(seed: int, sequence: int, role: Role, sensor: int = 0) -> np.random.SeedSequence:
-    """Child of ``seed`` keyed by (sequence, role), and by the number of a rig's sensor beyond the first, which is what a
-    single camera is; independent of any other child drawn before it."""
+    """Child of ``seed`` keyed by (sequence, role), and by the number of a rig's sensor beyond the first, which is as a
+    single camera; independent of any other child drawn before it."""
     return np.random.SeedSequence(seed, spawn_key=(int(sequence), int(role), *((int(sensor),) if sensor else ())))
 
 

@@ -253,7 +253,7 @@ def predict(
     start_ms: Annotated[float | None, typer.Option("--start-ms", help="From this time after the first event.")] = None,
     end_ms: Annotated[float | None, typer.Option("--end-ms", help="Up to this time after the first event.")] = None,
     whole: Annotated[
-        bool, typer.Option("--whole", help="One flow: first half against second half, scaled to the whole file.")
+        bool, typer.Option("--whole", help="One flow: all of the file as one window, or its halves as a pair.")
     ] = False,
     truth: Annotated[
         str | None, typer.Option(help="Ground truth of the flow (.npy, .png, .flo): prints AEE and cosine.")

@@ -67,7 +67,8 @@ def evaluate(
     out = Path(out) if out is not None else None
     method = None if isinstance(model, FlowModel) else model
     representation = model.representation if method is None else PICTURED
-    dataset = FlowDataset([source], representation, empty=empty, raw=True)
+    reads = model.reads if method is None else ("old", "new")
+    dataset = FlowDataset([source], representation, empty=empty, raw=True, reads=reads)
     indices = [int(i) for i in np.linspace(0, len(dataset) - 1, min(limit or len(dataset), len(dataset))).round()]
     shown = (
         {indices[int(i)] for i in np.linspace(0, len(indices) - 1, min(pictures, len(indices))).round()}

@@ -180,7 +180,7 @@ def decode(data: bytes) -> np.ndarray:
 
 
 def _flows(model: FlowModel, source: FolderSource, precision: str, progress: Progress | None):
-    dataset = FlowDataset([source], model.representation, empty="error")
+    dataset = FlowDataset([source], model.representation, empty="error", reads=model.reads)
     for i in range(len(dataset)):
         flow = predict(model, collate([dataset[i]]), precision=precision).flow[0].permute(1, 2, 0).cpu().numpy()
         yield i, flow

@@ -13,22 +13,28 @@ anything is validated, so that what comes out says all by itself.
 from __future__ import annotations
 
 import copy
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from blinkgl.camera import PinHole
 from blinkgl.config.base import Config, Refused, rule
+from blinkgl.config.camera import CameraConfig
+from blinkgl.config.events import EmulatorConfig
+from blinkgl.config.images import ImagesConfig
+from blinkgl.config.imu import ImuConfig
+from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.reader import parse_yaml
+from blinkgl.config.readout import ReadoutConfig
 from blinkgl.config.scene import Position, Vector3
+from blinkgl.config.sensor import Sensor
+from blinkgl.config.tracks import TracksConfig
 from blinkgl.errors import ConfigError
-
-if TYPE_CHECKING:
-    from blinkgl.config.sequence import RigSensorConfig
 
 SECTIONS = ("camera", "sensor", "events", "readout", "labels", "images", "imu", "tracks")
 """Of a single camera's configuration, that each sensor has for itself."""
@@ -104,6 +110,45 @@ class PlaceConfig(Config):
             w, x, y, z = self.quaternion
             T[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
         return T
+
+
+def _sensor_name(name: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", name):
+        raise Refused(
+            "not a name for folders",
+            value=name,
+            accepted="a letter or digit, then letters, digits, '_' and '-', at most 64",
+        )
+    return name
+
+
+class RigSensorConfig(Config):
+    """One device on a rig: an event camera, a frame camera, an inertial unit, or several of them in one housing, which
+    then look through one lens. `events` is as at the top, unless there are `images` or an `imu` and nothing is said of
+    it: then there are no events."""
+
+    name: Annotated[str, AfterValidator(_sensor_name)] = Field(description="of its folder in the sequence's")
+    place: PlaceConfig = Field(PlaceConfig(), description="where it is on the rig; {}: where a single camera would be")
+    pair: str | None = Field(
+        None, description="name of the other eye of a rectified stereo pair, which `labels.disparity` speaks of"
+    )
+    camera: CameraConfig = Field(CameraConfig(), description="as at the top, whose keys it has where it says none")
+    sensor: Sensor | None = Field(None, description="as at the top")
+    events: EmulatorConfig | None = Field(None, description="as at the top, over whose keys it is laid; null: none")
+    readout: ReadoutConfig | None = Field(None, description="as at the top")
+    labels: LabelsConfig = Field(
+        default_factory=LabelsConfig, description="as at the top; of a camera without events none but those said here"
+    )
+    images: ImagesConfig | None = Field(None, description="a frame camera (docs/images.md); null: none")
+    imu: ImuConfig | None = Field(
+        None, description="an inertial unit, its position and rotation on the sensor's own axes; null: none"
+    )
+    tracks: TracksConfig | None = Field(None, description="points on surfaces, followed through this camera")
+
+    @property
+    def sees(self) -> bool:
+        """Whether it is a camera."""
+        return self.events is not None or self.images is not None
 
 
 def rig_names() -> tuple[str, ...]:

@@ -8,18 +8,17 @@ read (:mod:`blinkgl.config.corners`).
 from __future__ import annotations
 
 import copy
-import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, Discriminator, Field, Tag
+from pydantic import AfterValidator, Field
 
-from blinkgl.camera import CameraModel, PinHole, focal_length
 from blinkgl.config.base import Config, Refused, remembering, rule, validate, validate_field
+from blinkgl.config.camera import CameraConfig, camera_radius, with_calibrations
 from blinkgl.config.corners import Fill, corners, corners_of, sites
 from blinkgl.config.draw import draw, is_distribution
 from blinkgl.config.events import EmulatorConfig, EsimConfig, followers
@@ -35,20 +34,14 @@ from blinkgl.config.readout import ReadoutConfig, drain_us
 from blinkgl.config.recipes import with_recipes
 from blinkgl.config.rig import (
     SECTIONS,
-    PlaceConfig,
+    RigSensorConfig,
     check_pairs,
     is_rig,
     spelled_out as with_whole_sensors,
     with_sections,
 )
 from blinkgl.config.scene import RandomSceneConfig, SceneConfig
-from blinkgl.config.sensor import (
-    SensorConfig,
-    fill_sensor,
-    known_sensor,
-    sensor_names,
-    spelled_out,
-)
+from blinkgl.config.sensor import Sensor, fill_sensor, spelled_out
 from blinkgl.config.timeline import DisplacementTimeline, TimelineConfig
 from blinkgl.config.tracks import TracksConfig, check_tracks
 from blinkgl.errors import ConfigError
@@ -60,58 +53,6 @@ if TYPE_CHECKING:
 NS_PER_S = 1_000_000_000
 MAX_LABELS = 1_000_000
 """Files of a sequence have numbers of six digits."""
-
-
-class CameraConfig(Config):
-    """A pin-hole camera. Give the field of view or the focal length, not both."""
-
-    width: int = Field(346, ge=1, le=16384, description="columns, px")
-    height: int = Field(260, ge=1, le=16384, description="rows, px")
-    fov: float | None = Field(None, gt=0.01, lt=179.9, description="horizontal field of view, degrees; default 60")
-    focal: float | None = Field(None, ge=1e-3, le=1e9, description="focal length, px (fx = fy)")
-    cx: float | None = Field(
-        None, ge=-1e6, le=1e6, description="principal point x, px; default the image centre, (width - 1) / 2"
-    )
-    cy: float | None = Field(None, ge=-1e6, le=1e6, description="principal point y, px; default (height - 1) / 2")
-    near: float = Field(0.05, ge=1e-9, le=1e9, description="near plane: nothing nearer is drawn, world units")
-
-    @rule("fov", "focal")
-    def _one_of(fov, focal):
-        if fov is not None and focal is not None:
-            raise Refused("give fov or focal, not both")
-
-    @property
-    def model(self) -> PinHole:
-        """The camera that the keys describe."""
-        focal = self.focal
-        if focal is None:
-            focal = focal_length(self.width, math.radians(60.0 if self.fov is None else self.fov))
-        centred = PinHole.centred(self.width, self.height, focal, near=self.near)
-        return replace(centred, **{key: value for key in ("cx", "cy") if (value := getattr(self, key)) is not None})
-
-    def scaled(self, factor: float) -> dict[str, Any]:
-        """The keys of a camera that sees the same with ``factor`` times the pixels in x and y,
-        as near as whole pixels come to it."""
-        said = {key: (value + 0.5) * factor - 0.5 for key in ("cx", "cy") if (value := getattr(self, key)) is not None}
-        said |= (
-            {"focal": self.focal * factor}
-            if self.focal is not None
-            else {"fov": self.fov}
-            if self.fov is not None
-            else {}
-        )
-        return {
-            "width": max(1, round(self.width * factor)),
-            "height": max(1, round(self.height * factor)),
-            "near": self.near,
-            **said,
-        }
-
-
-def camera_radius(camera: CameraModel, clearance: float) -> float:
-    """How far a random world's camera keeps from everything: its clearance, or a little more
-    than the near plane's corners."""
-    return max(clearance, 1.01 * camera.near_corner)
 
 
 class TimeConfig(Config):
@@ -237,67 +178,12 @@ class OutputConfig(Config):
     )
 
 
-def _sensor_name(name: str) -> str:
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", name):
-        raise Refused(
-            "not a name for folders",
-            value=name,
-            accepted="a letter or digit, then letters, digits, '_' and '-', at most 64",
-        )
-    return name
-
-
-def _sensor(name: str) -> str:
-    if known_sensor(name) is None:
-        raise Refused(
-            "unknown sensor",
-            value=name,
-            accepted=f"one of {', '.join(sensor_names())}, or a sensor file ending in .yaml",
-        )
-    return name
-
-
-Sensor = Annotated[
-    Annotated[Annotated[str, AfterValidator(_sensor)], Tag("one by name")] | Annotated[SensorConfig, Tag("a table")],
-    Discriminator(lambda value: "a table" if isinstance(value, (dict, SensorConfig)) else "one by name"),
-]
-
-
-class RigSensorConfig(Config):
-    """One device on a rig: an event camera, a frame camera, an inertial unit, or several of them in one housing, which
-    then look through one lens. `events` is as at the top, unless there are `images` or an `imu` and nothing is said of
-    it: then there are no events."""
-
-    name: Annotated[str, AfterValidator(_sensor_name)] = Field(description="of its folder in the sequence's")
-    place: PlaceConfig = Field(PlaceConfig(), description="where it is on the rig; {}: where a single camera would be")
-    pair: str | None = Field(
-        None, description="name of the other eye of a rectified stereo pair, which `labels.disparity` speaks of"
-    )
-    camera: CameraConfig = Field(CameraConfig(), description="as at the top, whose keys it has where it says none")
-    sensor: Sensor | None = Field(None, description="as at the top")
-    events: EmulatorConfig | None = Field(None, description="as at the top, over whose keys it is laid; null: none")
-    readout: ReadoutConfig | None = Field(None, description="as at the top")
-    labels: LabelsConfig = Field(
-        default_factory=LabelsConfig, description="as at the top; of a camera without events none but those said here"
-    )
-    images: ImagesConfig | None = Field(None, description="a frame camera (docs/images.md); null: none")
-    imu: ImuConfig | None = Field(
-        None, description="an inertial unit, its position and rotation on the sensor's own axes; null: none"
-    )
-    tracks: TracksConfig | None = Field(None, description="points on surfaces, followed through this camera")
-
-    @property
-    def sees(self) -> bool:
-        """Whether it is a camera."""
-        return self.events is not None or self.images is not None
-
-
 class SequenceConfig(Config):
     """One sequence, every value plain and final."""
 
     seed: int = Field(0, ge=0, lt=2**63, description="of the whole run; 0 is a seed")
     output: OutputConfig = Field(OutputConfig(), description="where sequences go")
-    camera: CameraConfig = Field(CameraConfig(), description="resolution and intrinsics")
+    camera: CameraConfig = Field(CameraConfig(), description="resolution, intrinsics and lens")
     time: TimeConfig = Field(TimeConfig(), description="duration and label rate")
     quality: Quality | None = Field(
         None,
@@ -598,7 +484,8 @@ def load_run(path: str | Path, overrides: Sequence[str] = (), *, seed: int | Non
 
     Raises ConfigError: missing or unreadable file, bad YAML (with line and column), unknown key, bad value."""
     base = Path(path).parent
-    tree = with_recipes(with_sensors(apply_overrides(_with_scenes(read_table(path), base), overrides), base))
+    tree = with_calibrations(apply_overrides(_with_scenes(read_table(path), base), overrides), base)
+    tree = with_recipes(with_sensors(tree, base))
     if seed is not None:
         tree["seed"] = seed
     if "seed" in tree and not is_distribution(tree["seed"]):  # which check() refuses

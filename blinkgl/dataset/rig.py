@@ -1,4 +1,4 @@
-"""Generates the sequence of a rig: those of its sensors, side by side in one folder that appears whole or not at all."""
+"""Generates the sequence of a rig: those of its sensors in one folder, which appears whole or not at all."""
 
 from __future__ import annotations
 

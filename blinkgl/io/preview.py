@@ -94,8 +94,8 @@ class Panels:
         return self._ticks.due(t_us)
 
     def compose(self, t_us: int, image: np.ndarray) -> int:
-        """Draws :attr:`canvas`; how many periods have passed, for so many of which it is shown: 0 where none has. image:
-        (H, W[, 3]) float linear light, whose highlights are compressed where they exceed 1, or uint8 sRGB."""
+        """Draws :attr:`canvas`; for how many periods it is shown: those that have passed, 0 where none has.
+        image : (H, W[, 3]) float linear light, whose highlights are compressed where they exceed 1, or uint8 sRGB."""
         if not self.due(t_us):
             return 0
         small = self._fit(image)  # first: cheaper, and averages linear light where it is given
@@ -212,7 +212,8 @@ class RigPreviewWriter(_Streamed):
         self._canvas = np.empty((sum(heights), max(one.canvas.shape[1] for one in self.panels), 3), np.uint8)
         self._canvas[:] = _BACK
         self._tops = np.cumsum([0, *heights[:-1]])
-        self._video = VideoWriter(path, *self._canvas.shape[:2], fps, preset="superfast", crf=22)
+        height, width = self._canvas.shape[:2]
+        self._video = VideoWriter(path, height, width, fps, preset="superfast", crf=22)
 
     def frame(self, number: int, t_us: int, image: np.ndarray) -> None:
         """The picture of the camera of this number. When the last one's is there all are encoded."""

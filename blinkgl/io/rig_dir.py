@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 from blinkgl.config.reader import read_table, to_yaml
-from blinkgl.config.rig import baseline_of
-from blinkgl.config.sequence import RigSensorConfig
+from blinkgl.config.rig import RigSensorConfig, baseline_of
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.sequence_dir import MANIFEST, RIG, SequenceWriter, digest_of, read_manifest
 
@@ -83,14 +82,16 @@ def rig_yaml(sensors: Sequence[RigSensorConfig]) -> str:
                 "resolution": [camera.width, camera.height],
                 "camera_model": camera.kind,
                 "intrinsics": [float(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy)],
+                "distortion": [float(v) for v in camera.distortion],
             }
         if one.pair is not None:
             other = next(other for other in sensors if other.name == one.pair)
             about |= {"pair": one.pair, "baseline": baseline_of(one, other)}
         tables[one.name] = about
     return (
-        "# T_rig_sensor: from the sensor's axes to the rig's, both x right, y down, z forward; lengths in world units.\n"
-        "# intrinsics: fx, fy, cx, cy, px. baseline: along the camera's x axis to the other eye.\n"
+        "# T_rig_sensor: from the sensor's axes to the rig's, both x right, y down, z forward; in world units.\n"
+        "# intrinsics: fx, fy, cx, cy, px; distortion: coefficients of the model. baseline: along the camera's x axis\n"
+        "# to the other eye.\n"
         + to_yaml({"sensors": tables})
     )
 

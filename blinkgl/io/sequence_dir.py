@@ -30,7 +30,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import h5py
 import numpy as np
@@ -57,6 +57,7 @@ from blinkgl.io.hdf5 import blosc_dataset, write_rows
 from blinkgl.io.records import InsidePath, entries_below, open_regular, parse, read_text, shown
 from blinkgl.labels import Form, Label, label_of
 
+Self = TypeVar("Self", bound="SequenceWriter")
 MANIFEST = "manifest.json"
 RIG = "rig.yaml"
 """In the folder of a sequence of several sensors (:mod:`blinkgl.io.rig_dir`)."""
@@ -127,7 +128,7 @@ class SequenceWriter:
         self._exposures: list[ExposureLine] = []
         self._failure: list[BaseException] = []
 
-    def __enter__(self) -> SequenceWriter:
+    def __enter__(self: Self) -> Self:
         refuse_existing(self.final)
         with output_errors(self.final):
             self.final.parent.mkdir(parents=True, exist_ok=True)

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from blinkgl.config.rig import baseline_of
+from blinkgl.config.camera import CameraConfig, camera_radius
+from blinkgl.config.rig import RigSensorConfig, baseline_of
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig, SceneConfig
-from blinkgl.config.sequence import CameraConfig, RigSensorConfig, SequenceConfig, camera_radius
+from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.scene.rig import Rig, Sensor
 from blinkgl.scene.types import Fog, Scene

@@ -10,9 +10,9 @@ they share the scene, OpenGL, meshes, textures, shadow maps and the times of fra
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -106,10 +106,8 @@ class RigSequence:
         with self:
             waiting = [(iter(member), member) for member in self.members]
             heads = [next(items, None) for items, _ in waiting]
-            while any(head is not None for head in heads):
-                k = min(range(len(heads)), key=lambda k: math.inf if heads[k] is None else heads[k].t_ns)
-                head = heads[k]
-                assert head is not None
+            while there := [(head.t_ns, k, head) for k, head in enumerate(heads) if head is not None]:
+                _, k, head = min(there, key=itemgetter(0, 1))
                 yield waiting[k][1], head
                 heads[k] = next(waiting[k][0], None)
 

@@ -117,7 +117,7 @@ class FlowDataset(Dataset):
 
     raw : the RawSample itself besides, as "raw".   reads : windows that are made tensors of
     (:attr:`eflow.models.FlowModel.reads`).
-    empty : "error" refuses a sample without an event in either window; "skip" takes the next sample that has some.
+    empty : "error" refuses a sample without an event in a window that is read; "skip" takes the next that has some.
     """
 
     def __init__(
@@ -164,10 +164,11 @@ class FlowDataset(Dataset):
             return self.sources[source][index]
         for step in range(len(self.sources[source])):
             sample = self.sources[source][(index + step) % len(self.sources[source])]
-            if len(sample.old) and len(sample.new):
+            empty = [side for side in self.reads if not len(getattr(sample, side))]
+            if not empty:
                 return sample
             if self.empty == "error":
-                which = "old" if not len(sample.old) else "new"
+                which = empty[0]
                 w = getattr(sample, which)
                 raise EventDataError(
                     f"no events in the {which} window [{w.t0}, {w.t1}) µs",

@@ -1,5 +1,5 @@
-"""Rigs in data sets: a rig of one is the single camera, two eyes agree with depth, poses and float64, and a run of rigs is
-verified, resumed and read like any other."""
+"""Rigs in data sets: a rig of one is the single camera, two eyes agree with depth, poses and float64, and a run of rigs
+is verified, resumed and read like any other."""
 
 from __future__ import annotations
 

@@ -175,6 +175,24 @@ def test_windows_without_events(tmp_path):
     assert skipping[1]["name"] == "still/000000"
 
 
+def test_a_window_that_nobody_reads_may_be_empty(source):
+    from dataclasses import replace
+
+    class Beginning:
+        """Before the first label of a recording nothing has happened yet."""
+
+        has_backward = True
+        __len__ = lambda self: 1
+
+        def __getitem__(self, i):
+            return replace(source[0], old=source[0].old.take(np.zeros(len(source[0].old), bool)))
+
+    with pytest.raises(BlinkGLError, match="no events in the old window"):
+        FlowDataset([Beginning()], VoxelGrid())[0]
+    sample = FlowDataset([Beginning()], VoxelGrid(), reads=("new",))[0]
+    assert "old" not in sample and sample["new"].any()
+
+
 def test_flow_from_400_px_on_is_not_supervised(source):
     from dataclasses import replace
 

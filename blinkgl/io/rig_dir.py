@@ -91,8 +91,7 @@ def rig_yaml(sensors: Sequence[RigSensorConfig]) -> str:
     return (
         "# T_rig_sensor: from the sensor's axes to the rig's, both x right, y down, z forward; in world units.\n"
         "# intrinsics: fx, fy, cx, cy, px; distortion: coefficients of the model. baseline: along the camera's x axis\n"
-        "# to the other eye.\n"
-        + to_yaml({"sensors": tables})
+        "# to the other eye.\n" + to_yaml({"sensors": tables})
     )
 
 

@@ -246,26 +246,34 @@ def report(
     folder: Annotated[str, typer.Argument(metavar="DIR", help="Data set.")],
     out: Annotated[str | None, typer.Option("--out", "-o", help="The page (default: DIR/report.html).")] = None,
     examples: Annotated[int, typer.Option(min=0, max=100, help="Sequences shown in pictures.")] = 6,
+    card: Annotated[bool, typer.Option("--card", help="Also DIR/README.md and croissant.json, for data hubs.")] = False,
+    licence: Annotated[str | None, typer.Option("--license", help="On the card, e.g. cc-by-4.0.")] = None,
+    url: Annotated[str | None, typer.Option("--url", help="On the card: where the data set is found.")] = None,
 ) -> int:
     """Write one self-contained HTML page about a data set, and its index.jsonl."""
     from blinkgl.show import report as command
 
-    return command.run(folder, out, examples=examples)
+    return command.run(folder, out, examples=examples, card=card, licence=licence, url=url)
 
 
 @app.command()
 def export(
-    folder: Annotated[str, typer.Argument(metavar="DIR", help="Data set.")],
-    out: Annotated[str, typer.Option("--out", "-o", help="Folder for the shards: SPLIT-000000.tar …")],
-    shard_mb: Annotated[float, typer.Option("--shard-mb", min=1, help="Size of a shard.")] = 512.0,
+    folder: Annotated[str, typer.Argument(metavar="DIR", help="Data set, or one sequence of it.")],
+    out: Annotated[str, typer.Option("--out", "-o", help="Folder to write, as a whole or not at all.")],
+    layout: Annotated[
+        str,
+        typer.Option(help="webdataset (shards SPLIT-000000.tar …), dsec, eraft, blinkflow, mvsec or tapvid."),
+    ] = "webdataset",
+    shard_mb: Annotated[float | None, typer.Option("--shard-mb", min=1, help="Size of a shard (default: 512).")] = None,
     seed: Annotated[
-        int, typer.Option(min=0, help="Order of the samples; a reader then only has to shuffle shards.")
-    ] = 0,
+        int | None,
+        typer.Option(min=0, help="Order of the samples in shards; a reader then only has to shuffle shards."),
+    ] = None,
 ) -> int:
-    """Write a data set as WebDataset shards, one sample per flow label, for training from object storage."""
+    """Write a data set as WebDataset shards, one sample per flow label, or as another data set's loaders read it."""
     from blinkgl.show import export as command
 
-    return command.run(folder, out, shard_bytes=int(shard_mb * 1e6), seed=seed)
+    return command.run(folder, out, layout=layout, shard_mb=shard_mb, seed=seed)
 
 
 @app.command()
@@ -442,11 +450,14 @@ def convert(
         str,
         typer.Argument(
             metavar="IN",
-            help="Event file: DSEC/BlinkFlow/MVSEC .h5, EVT2/EVT3 .raw, .aedat4, .aedat, .txt, .csv, .npz, .npy.",
+            help="Event file: DSEC/BlinkFlow/MVSEC/Prophesee .h5, EVT2/EVT3 .raw, .aedat4, .aedat, .mcap, .txt, .csv, "
+            ".npz, .npy.",
         ),
     ],
     target: Annotated[str, typer.Argument(metavar="OUT", help="Event file; its ending names the format.")],
-    format: Annotated[str | None, typer.Option("--format", help="Where the ending leaves a choice, e.g. evt2.")] = None,
+    format: Annotated[
+        str | None, typer.Option("--format", help="Where the ending leaves a choice: evt2, prophesee.")
+    ] = None,
     size: Annotated[
         str | None, typer.Option(help="WIDTHxHEIGHT, where the file does not say (default: guessed).")
     ] = None,

@@ -176,6 +176,10 @@ class OutputConfig(Config):
     first_index: int = Field(
         0, ge=0, le=10_000_000, description="number of the first; sequence n depends on the seed and n alone"
     )
+    compression: Literal["zstd", "lz4"] = Field(
+        "zstd",
+        description="of events.h5, inside Blosc: zstd as DSEC's files; lz4 writes twice as fast, 4 % larger",
+    )
 
 
 class SequenceConfig(Config):
@@ -252,6 +256,16 @@ class SequenceConfig(Config):
         if sensors and intrinsics == "file":
             raise Refused(
                 "the cameras of a rig are not the file's", where="scene.intrinsics", value=intrinsics, accepted="config"
+            )
+
+    @rule("camera.lens", "scene.intrinsics")
+    def _one_lens(lens: str, intrinsics: str | None):
+        if lens != "pinhole" and intrinsics == "file":
+            raise Refused(
+                "the file's camera is a pin-hole camera",
+                where="scene.intrinsics",
+                value=intrinsics,
+                accepted="config, or camera.lens: pinhole",
             )
 
     @rule("timeline.reconstruction", "events.emulator", "?frames")

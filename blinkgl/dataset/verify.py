@@ -44,6 +44,7 @@ from blinkgl.io.frame_camera import (
 from blinkgl.io.hdf5 import dataset, open_hdf5
 from blinkgl.io.imu import FILES as IMU_FILES, read_imu, read_imu_csv
 from blinkgl.io.index import INDEX, entry, made_folders, read_index, sequence_folders
+from blinkgl.io.lens_files import FILES as LENS_FILES, problems_of_lens
 from blinkgl.io.records import open_regular, shown
 from blinkgl.io.sequence_dir import MANIFEST, RIG, read_manifest, verify_sequence
 from blinkgl.io.tracks import TRACKS, problem_of as problem_of_tracks, read_tracks
@@ -247,6 +248,8 @@ def contents(folder: Path, manifest: dict[str, Any], config: SequenceConfig) -> 
         problems += _guarded(lambda: _check_imu(folder, config))
     if config.tracks is not None:
         problems += _guarded(lambda: _check_tracks(folder, manifest, config))
+    if _distorts(config):
+        problems += _guarded(lambda: problems_of_lens(folder, config.camera.model))
     if config.images is not None:
         problems += _guarded(lambda: _check_images(folder, manifest, config))
     return problems
@@ -318,10 +321,16 @@ def _files_of(config: SequenceConfig, events: bool = True) -> Iterator[str]:
         yield from IMU_FILES
     if config.tracks is not None:
         yield TRACKS
+    if _distorts(config):
+        yield from LENS_FILES
     if config.images is not None:
         yield from files_of(config.images, len(_exposures_of(config)))
     if config.preview.enabled:
         yield "preview.mp4"
+
+
+def _distorts(config: SequenceConfig) -> bool:
+    return config.frames is None and config.camera.lens != "pinhole"
 
 
 def _exposures_of(config: SequenceConfig) -> list[int]:

@@ -84,20 +84,29 @@ def camchain_yaml(cameras: Mapping[str, Calibrated]) -> str:
     return to_yaml(tree)
 
 
-def cam_to_cam_yaml(cameras: Sequence[Calibrated]) -> str:
+def cam_to_cam_yaml(
+    cameras: Sequence[Calibrated],
+    numbers: Sequence[int] | None = None,
+    disparity_to_depth: Mapping[str, Any] | None = None,
+) -> str:
     """Text of DSEC's ``cam_to_cam.yaml``: the raw cameras cam0 … and the rectified ones, whose axes are theirs
-    (:func:`blinkgl.camera.rectified.rectified`)."""
+    (:func:`blinkgl.camera.rectified.rectified`).
+
+    numbers : of the cameras, where they are not 0, 1, …: DSEC's right event camera is cam3.   disparity_to_depth : the
+    table of that name, ``cams_03`` -> 4 x 4."""
+    numbers = range(len(cameras)) if numbers is None else numbers
     intrinsics: dict[str, Any] = {}
     extrinsics: dict[str, Any] = {}
-    for k, one in enumerate(cameras):
+    for place, (k, one) in enumerate(zip(numbers, cameras, strict=True)):
         intrinsics[f"cam{k}"] = _lens(one.camera, "camera_matrix")
-        if one.T_cam_before is not None and k:
-            extrinsics[f"T_{k}{k - 1}"] = one.T_cam_before.tolist()
-    for k, one in enumerate(cameras):
+        if one.T_cam_before is not None and place:
+            extrinsics[f"T_{k}{numbers[place - 1]}"] = one.T_cam_before.tolist()
+    for k, one in zip(numbers, cameras, strict=True):
         flat = _lens(rectified(one.camera), "camera_matrix")
         intrinsics[f"camRect{k}"] = {key: flat[key] for key in ("camera_matrix", "resolution")}
         extrinsics[f"R_rect{k}"] = np.eye(3).tolist()
-    return to_yaml({"intrinsics": intrinsics, "extrinsics": extrinsics})
+    more = {} if disparity_to_depth is None else {"disparity_to_depth": dict(disparity_to_depth)}
+    return to_yaml({"intrinsics": intrinsics, "extrinsics": extrinsics, **more})
 
 
 def _lens(camera: CameraModel, key: str) -> dict[str, Any]:

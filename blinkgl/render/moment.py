@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from blinkgl.camera.drawing import seen_through
 from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate, inverse_depth_bits
 
 if TYPE_CHECKING:
@@ -194,13 +195,14 @@ class Bodies:
 
 
 class Moments:
-    """Gives the moments of a scene; the last few are kept. ``stage``: :class:`Stage`.
+    """Gives the moments of a scene; the last few are kept. ``stage``: :class:`Stage`. Of a lens that distorts they are
+    those of the pin-hole camera that is drawn for it.
 
     bodies : of the same scene, that another camera looks at; None: its own."""
 
     def __init__(self, scene: Scene, items: Sequence[DrawItem], bodies: Bodies | None = None):
         self.bodies = bodies or Bodies(scene)
-        self.stage, self.view = Stage(scene, items, self.bodies), View.of(scene.camera)
+        self.stage, self.view = Stage(scene, items, self.bodies), View.of(seen_through(scene.camera))
         self._kept: OrderedDict[int, Moment] = OrderedDict()
 
     def at(self, t_ns: int) -> Moment:
@@ -214,6 +216,6 @@ class Moments:
 
     def look_through(self, camera: CameraModel) -> None:
         """From now on through another camera on the same path."""
-        self.view = View.of(camera)
+        self.view = View.of(seen_through(camera))
         for t_ns, moment in self._kept.items():
             self._kept[t_ns] = moment.through(self.view)

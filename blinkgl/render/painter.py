@@ -15,6 +15,7 @@ from blinkgl.render.matrices import linear_xyw_bytes
 if TYPE_CHECKING:
     from blinkgl.gl import GLContext, Target
     from blinkgl.render.frames import RenderStats
+    from blinkgl.render.lens import Lens
     from blinkgl.render.moment import Moment
     from blinkgl.render.passes.base import Pass, Shot
     from blinkgl.render.resources import DrawItem, Kind, SceneResources
@@ -53,11 +54,12 @@ class Painter:
     """Draws for the passes of one renderer. A subclass may look on: every method is called
     by the passes and none by another.
 
-    gl : GLContext.   resources : SceneResources.   stats : what is counted."""
+    gl : GLContext.   resources : SceneResources.   stats : what is counted.   lens : of a camera that distorts."""
 
     def __init__(self, gl: GLContext, scene: Scene, resources: SceneResources, stats: RenderStats):
         self.gl, self.scene, self.resources, self.stats = gl, scene, resources, stats
         self.lighting = Lighting(scene.light)
+        self.lens: Lens | None = None
         self._programs: dict[Pass, Programs] = {}
         self._covers: dict[Pass, tuple[Uniforms, moderngl.VertexArray]] = {}
         self._culling = False

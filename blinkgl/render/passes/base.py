@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from blinkgl.render.canvas import Frame
     from blinkgl.render.moment import Moment
     from blinkgl.render.painter import Painter, Uniforms
+    from blinkgl.render.rectangles import Rectangle
     from blinkgl.render.resources import DrawItem, Kind
     from blinkgl.scene.types import Scene
 
@@ -70,7 +71,7 @@ class Pass:
     one_channel : whether one channel of it will do, where the surface is of one colour.
     common : it is the same whoever looks, at one time of one scene, so that it is drawn once for all sensors of a rig
     and all passes that read it.
-    pointwise : each pixel comes of the inputs' pixel at the same place, so that it does
+    pointwise : each pixel comes of the inputs' pixel at the same place (or where :meth:`changed` says), so that it does
     not change where they do not."""
 
     program: ClassVar[str]
@@ -103,6 +104,10 @@ class Pass:
     def stands_still(self, whole: bool) -> bool:
         """Whether only what moves is drawn again. whole : no pass of the camera's is to be drawn so."""
         return self.still and not whole
+
+    def changed(self, painter: Painter, rectangles: list[Rectangle]) -> list[Rectangle]:
+        """Where a pass that is ``pointwise`` changes when its inputs change in these rectangles."""
+        return rectangles
 
     def seen(self, moment: Moment) -> Moment:
         """The moment as this pass looks at it: the camera's, unless it draws for another one

@@ -149,15 +149,22 @@ class ScenePass(Pass):
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
         programs = painter.programs(self)
         for item in self.items(shot.moment) if items is None else items:
-            uniforms = programs[item.kind]
-            painter.place(uniforms, item, shot.moment)
-            if item.deformer is not None:
-                painter.deform(uniforms, item, shot)
-            if "fog" in uniforms:
-                painter.fog(uniforms, shot)
-            self.bind(uniforms, shot)
-            self.set(painter, uniforms, item, shot)
-            painter.draw(uniforms, item)
+            self.draw_item(painter, shot, item, programs[item.kind])
+
+    def draw_item(self, painter: Painter, shot: Shot, item: DrawItem, uniforms: Uniforms) -> None:
+        """One of them, by the program that ``uniforms`` belong to."""
+        self.dress_item(painter, shot, item, uniforms)
+        painter.draw(uniforms, item)
+
+    def dress_item(self, painter: Painter, shot: Shot, item: DrawItem, uniforms: Uniforms) -> None:
+        """Hands a program all that it takes of an item."""
+        painter.place(uniforms, item, shot.moment)
+        if item.deformer is not None:
+            painter.deform(uniforms, item, shot)
+        if "fog" in uniforms:
+            painter.fog(uniforms, shot)
+        self.bind(uniforms, shot)
+        self.set(painter, uniforms, item, shot)
 
 
 class ScreenPass(Pass):

@@ -296,6 +296,11 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "default": NOTHING,
         "odd": {"camera": {"width": WIDTH - 1, "height": HEIGHT - 1, "focal": 30, "cx": 12.3}},
         "wide": {"camera": {"fov": 110, "near": 0.2}},
+        "radtan, rectified": {
+            "camera": {"fx": 30, "fy": 31, "cx": 15.0, "lens": "radtan", "distortion": [-0.2, 0.05, 0.001, 0]},
+            "labels": {"pixels": "rectified"},
+        },
+        "fisheye": {"camera": {"lens": "equidistant", "distortion": [0.01, 0, 0, 0], "fov": 70}},
     },
     "output": {
         "train": NOTHING,

@@ -69,6 +69,8 @@ class Pass:
     still : whether a camera that stands still has only what moves drawn again.
     lit : whether its program asks light.glsl for the light, and fog.glsl for what of it arrives.
     one_channel : whether one channel of it will do, where the surface is of one colour.
+    common : it is the same whoever looks, at one time of one scene, so that it is drawn once for all sensors of a rig
+    and all passes that read it.
     pointwise : each pixel comes of the inputs' pixel at the same place (or where :meth:`changed` says), so that it does
     not change where they do not."""
 
@@ -81,6 +83,7 @@ class Pass:
     still: ClassVar[bool] = False
     lit: ClassVar[bool] = False
     one_channel: ClassVar[bool] = False
+    common: ClassVar[bool] = False
     pointwise: ClassVar[bool] = False
 
     def size(self, width: int, height: int) -> tuple[int, int]:
@@ -146,15 +149,22 @@ class ScenePass(Pass):
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
         programs = painter.programs(self)
         for item in self.items(shot.moment) if items is None else items:
-            uniforms = programs[item.kind]
-            painter.place(uniforms, item, shot.moment)
-            if item.deformer is not None:
-                painter.deform(uniforms, item, shot)
-            if "fog" in uniforms:
-                painter.fog(uniforms, shot)
-            self.bind(uniforms, shot)
-            self.set(painter, uniforms, item, shot)
-            painter.draw(uniforms, item)
+            self.draw_item(painter, shot, item, programs[item.kind])
+
+    def draw_item(self, painter: Painter, shot: Shot, item: DrawItem, uniforms: Uniforms) -> None:
+        """One of them, by the program that ``uniforms`` belong to."""
+        self.dress_item(painter, shot, item, uniforms)
+        painter.draw(uniforms, item)
+
+    def dress_item(self, painter: Painter, shot: Shot, item: DrawItem, uniforms: Uniforms) -> None:
+        """Hands a program all that it takes of an item."""
+        painter.place(uniforms, item, shot.moment)
+        if item.deformer is not None:
+            painter.deform(uniforms, item, shot)
+        if "fog" in uniforms:
+            painter.fog(uniforms, shot)
+        self.bind(uniforms, shot)
+        self.set(painter, uniforms, item, shot)
 
 
 class ScreenPass(Pass):

@@ -160,7 +160,10 @@ class Canvas:
         if not self.pass_.pointwise or not self._used:
             return None
         parts = [frame.changed_since(self._used.get(name)) for name, frame in shot.inputs.items()]
-        return None if any(part is None for part in parts) else merged([r for part in parts for r in part])
+        if any(part is None for part in parts):
+            return None
+        around, size = self.pass_.margin, (self.target.width, self.target.height)
+        return merged([r.grown(around, *size) if around else r for part in parts for r in part])
 
     # ---- read-back -----------------------------------------------------------------------------------------------
 

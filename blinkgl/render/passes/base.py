@@ -69,7 +69,7 @@ class Pass:
     lit : whether its program asks light.glsl for the light, and fog.glsl for what of it arrives.
     one_channel : whether one channel of it will do, where the surface is of one colour.
     pointwise : each pixel comes of the inputs' pixel at the same place, so that it does
-    not change where they do not."""
+    not change where they do not.   margin : of such a pass, how many px further it looks at them."""
 
     program: ClassVar[str]
     outputs: tuple[Output, ...]
@@ -81,6 +81,7 @@ class Pass:
     lit: ClassVar[bool] = False
     one_channel: ClassVar[bool] = False
     pointwise: ClassVar[bool] = False
+    margin: ClassVar[int] = 0
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         """Of its target, px, for an image of width x height: ``samples.grid`` times as fine,

@@ -33,6 +33,7 @@ _HOMES = {
     "blinkgl.front.runs": ("Timeline", "generate", "load", "verify"),
     "blinkgl.front.sequences": ("Recording", "record", "simulate_sequence"),
     "blinkgl.front.drawing": ("Renderer", "render_frame"),
+    "blinkgl.front.online": ("OnlineSequences",),
     "blinkgl.front.sensors": ("DvsVoltmeter", "Esim", "V2e", "load_sensor"),
     "blinkgl.front.files": (
         "calibrate",
@@ -51,6 +52,8 @@ _HOMES = {
     "blinkgl.events.types": ("Events",),
     "blinkgl.sequence.items": ("CameraImage", "EventChunk", "GroundTruth", "Picture"),
     "blinkgl.labels.frames": ("Flow", "LabelFrame"),
+    "blinkgl.online.samples": ("StreamSample", "WindowSample"),
+    "blinkgl.online.stream": ("StreamStats",),
     "blinkgl.errors": ("AssetError", "BlinkGLError", "ConfigError", "EventDataError", "GLError", "OutputError"),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
@@ -73,6 +76,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see; a test compares it w
         write_flow,
         write_trajectory,
     )
+    from blinkgl.front.online import OnlineSequences
     from blinkgl.front.runs import Timeline, generate, load, verify
     from blinkgl.front.scenes import (
         Animation,
@@ -93,6 +97,8 @@ if TYPE_CHECKING:  # what a type checker and an editor see; a test compares it w
     from blinkgl.front.sensors import DvsVoltmeter, Esim, V2e, load_sensor
     from blinkgl.front.sequences import Recording, record, simulate_sequence
     from blinkgl.labels.frames import Flow, LabelFrame
+    from blinkgl.online.samples import StreamSample, WindowSample
+    from blinkgl.online.stream import StreamStats
     from blinkgl.sequence.items import CameraImage, EventChunk, GroundTruth, Picture
 
 __all__ = [
@@ -117,6 +123,7 @@ __all__ = [
     "Light",
     "Material",
     "Mesh",
+    "OnlineSequences",
     "OutputError",
     "Picture",
     "Pose",
@@ -124,10 +131,13 @@ __all__ = [
     "Recording",
     "Renderer",
     "Scene",
+    "StreamSample",
+    "StreamStats",
     "Timeline",
     "Trajectory",
     "V2e",
     "Way",
+    "WindowSample",
     "calibrate",
     "compare",
     "convert",

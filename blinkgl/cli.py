@@ -255,17 +255,22 @@ def report(
 
 @app.command()
 def export(
-    folder: Annotated[str, typer.Argument(metavar="DIR", help="Data set.")],
-    out: Annotated[str, typer.Option("--out", "-o", help="Folder for the shards: SPLIT-000000.tar …")],
-    shard_mb: Annotated[float, typer.Option("--shard-mb", min=1, help="Size of a shard.")] = 512.0,
+    folder: Annotated[str, typer.Argument(metavar="DIR", help="Data set, or one sequence of it.")],
+    out: Annotated[str, typer.Option("--out", "-o", help="Folder to write, as a whole or not at all.")],
+    layout: Annotated[
+        str,
+        typer.Option(help="webdataset (shards SPLIT-000000.tar …), dsec, eraft, blinkflow, mvsec or tapvid."),
+    ] = "webdataset",
+    shard_mb: Annotated[float | None, typer.Option("--shard-mb", min=1, help="Size of a shard (default: 512).")] = None,
     seed: Annotated[
-        int, typer.Option(min=0, help="Order of the samples; a reader then only has to shuffle shards.")
-    ] = 0,
+        int | None,
+        typer.Option(min=0, help="Order of the samples in shards; a reader then only has to shuffle shards."),
+    ] = None,
 ) -> int:
-    """Write a data set as WebDataset shards, one sample per flow label, for training from object storage."""
+    """Write a data set as WebDataset shards, one sample per flow label, or as another data set's loaders read it."""
     from blinkgl.show import export as command
 
-    return command.run(folder, out, shard_bytes=int(shard_mb * 1e6), seed=seed)
+    return command.run(folder, out, layout=layout, shard_mb=shard_mb, seed=seed)
 
 
 @app.command()
@@ -442,11 +447,14 @@ def convert(
         str,
         typer.Argument(
             metavar="IN",
-            help="Event file: DSEC/BlinkFlow/MVSEC .h5, EVT2/EVT3 .raw, .aedat4, .aedat, .txt, .csv, .npz, .npy.",
+            help="Event file: DSEC/BlinkFlow/MVSEC/Prophesee .h5, EVT2/EVT3 .raw, .aedat4, .aedat, .mcap, .txt, .csv, "
+            ".npz, .npy.",
         ),
     ],
     target: Annotated[str, typer.Argument(metavar="OUT", help="Event file; its ending names the format.")],
-    format: Annotated[str | None, typer.Option("--format", help="Where the ending leaves a choice, e.g. evt2.")] = None,
+    format: Annotated[
+        str | None, typer.Option("--format", help="Where the ending leaves a choice: evt2, prophesee.")
+    ] = None,
     size: Annotated[
         str | None, typer.Option(help="WIDTHxHEIGHT, where the file does not say (default: guessed).")
     ] = None,

@@ -1,5 +1,5 @@
 """Optical flow from events: networks, training, scores. Reads what ``blinkgl.io`` wrote, or
-what ``blinkgl.sequence`` renders meanwhile (:mod:`eflow.data.online`); never imports render or scene.
+what :mod:`blinkgl.online` renders meanwhile; never imports render or scene.
 
 In:    data sets, a YAML of eflow.config.
 Out:   a trained network, its scores, files for benchmarks.

@@ -449,7 +449,8 @@ def _weights_of(config: TrainConfig) -> tuple[dict[str, Tensor], str]:
 
 def _check_sizes(dataset: FlowDataset, model: FlowModel, crop: tuple[int, int] | None) -> None:
     """Refuses, before anything is written, what the network would refuse at the first step."""
-    firsts = [source[getattr(source, "first", 0)] for source in dataset.sources if crop is None or is_endless(source)]
+    sources = [source for source in dataset.sources if crop is None or is_endless(source)]
+    firsts = [source.first() if is_endless(source) else source[0] for source in sources]
     if crop is not None:
         sizes = {"data.crop": crop}
     else:

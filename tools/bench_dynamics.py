@@ -15,9 +15,9 @@ import time
 
 import numpy as np
 
+from blinkgl.config.camera import CameraConfig
 from blinkgl.config.physics import BodyConfig, PhysicsConfig, RandomPhysicsConfig
 from blinkgl.config.scene import ObjectsConfig, RandomSceneConfig
-from blinkgl.config.sequence import CameraConfig
 from blinkgl.machine import bench
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.geometry.primitives import cuboid, grid, icosphere

@@ -21,11 +21,11 @@ from typing import Any
 import numpy as np
 
 from blinkgl.config.base import validate
+from blinkgl.config.camera import CameraConfig
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.config.lod import LodConfig
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.config.scene import PRIMITIVE_KINDS, TEXTURE_KINDS, RandomSceneConfig
-from blinkgl.config.sequence import CameraConfig
 from blinkgl.events import Events, make_emulator
 from blinkgl.events.readout import Readout
 from blinkgl.scene.build import build_scene

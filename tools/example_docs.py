@@ -50,6 +50,7 @@ ORDER = (
     "dataset_from_yaml",
     "torch_dataloader",
     "online_windows",
+    "online_training",
     "compare_recordings",
     "convert_formats",
     "sensors",

@@ -96,11 +96,6 @@ class DistortedModel(CameraModel):
 
     @property
     @abstractmethod
-    def coefficients(self) -> tuple[str, ...]:
-        """Names of the distortion's parameters."""
-
-    @property
-    @abstractmethod
     def reach(self) -> float:
         """Radius on the image plane up to which the radial distortion grows; inf where it does for ever."""
 
@@ -115,7 +110,7 @@ class DistortedModel(CameraModel):
         return np.stack([np.stack(s, axis=-1) for s in ((x, ends[0]), (x, ends[1]), (ends[0], y), (ends[2], y))])
 
     @cached_property
-    def _edges(self) -> tuple[float, float, float, float] | None:
+    def plane_edges(self) -> tuple[float, float, float, float] | None:
         """Least and greatest X / Z, least and greatest Y / Z in the picture; None where it sees half of space."""
         rays = self.rays(self._border)
         if not (rays[..., 2] > 0).all():
@@ -150,20 +145,20 @@ class DistortedModel(CameraModel):
 
     def frustum_planes(self) -> np.ndarray:
         """(5, 3): of the narrowest pin-hole picture that holds this one; (0, 3) where this one sees half of space."""
-        if self._edges is None:
+        if self.plane_edges is None:
             return np.zeros((0, 3))
-        left, right, top, bottom = self._edges
+        left, right, top, bottom = self.plane_edges
         planes = np.array([[1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom], [0, 0, 1]], float)
         return planes / np.linalg.norm(planes, axis=1, keepdims=True)
 
     def bounds(self, points: np.ndarray) -> tuple[int, int, int, int] | None:
         """Pixels that the hull can touch: those of the rectangle that holds its picture by a pin-hole camera."""
         whole = (0, 0, self.width, self.height)
-        if self._edges is None:
+        if self.plane_edges is None:
             return whole
         if points[:, 2].min() <= self.near:
             return whole if points[:, 2].max() > self.near else None
-        left, right, top, bottom = self._edges
+        left, right, top, bottom = self.plane_edges
         flat = points[:, :2] / points[:, 2:]
         low, high = np.maximum(flat.min(axis=0), [left, top]), np.minimum(flat.max(axis=0), [right, bottom])
         if (low > high).any():

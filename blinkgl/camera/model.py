@@ -29,6 +29,8 @@ class CameraModel(ABC):
     """
 
     kind: ClassVar[str]
+    coefficients: ClassVar[tuple[str, ...]] = ()
+    """Names of its own parameters, in the order in which calibrations give them."""
 
     width: int
     height: int
@@ -118,6 +120,16 @@ class CameraModel(ABC):
         return np.where(seen, scale, 0.0)
 
     # ---- what follows ------------------------------------------------------------------------------------------
+
+    @property
+    def intrinsics(self) -> tuple[float, float, float, float]:
+        """fx, fy, cx, cy."""
+        return self.fx, self.fy, self.cx, self.cy
+
+    @property
+    def distortion(self) -> tuple[float, ...]:
+        """Values of its ``coefficients``."""
+        return tuple(getattr(self, name) for name in self.coefficients)
 
     @property
     def K(self) -> np.ndarray:

@@ -8,18 +8,17 @@ read (:mod:`blinkgl.config.corners`).
 from __future__ import annotations
 
 import copy
-import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, Discriminator, Field, Tag
 
-from blinkgl.camera import CameraModel, PinHole, focal_length
 from blinkgl.config.base import Config, Refused, remembering, rule, validate, validate_field
+from blinkgl.config.camera import CameraConfig, camera_radius, with_calibrations
 from blinkgl.config.corners import Fill, corners, corners_of, sites
 from blinkgl.config.draw import draw, is_distribution
 from blinkgl.config.events import EmulatorConfig, EsimConfig, followers
@@ -52,58 +51,6 @@ if TYPE_CHECKING:
 NS_PER_S = 1_000_000_000
 MAX_LABELS = 1_000_000
 """Files of a sequence have numbers of six digits."""
-
-
-class CameraConfig(Config):
-    """A pin-hole camera. Give the field of view or the focal length, not both."""
-
-    width: int = Field(346, ge=1, le=16384, description="columns, px")
-    height: int = Field(260, ge=1, le=16384, description="rows, px")
-    fov: float | None = Field(None, gt=0.01, lt=179.9, description="horizontal field of view, degrees; default 60")
-    focal: float | None = Field(None, ge=1e-3, le=1e9, description="focal length, px (fx = fy)")
-    cx: float | None = Field(
-        None, ge=-1e6, le=1e6, description="principal point x, px; default the image centre, (width - 1) / 2"
-    )
-    cy: float | None = Field(None, ge=-1e6, le=1e6, description="principal point y, px; default (height - 1) / 2")
-    near: float = Field(0.05, ge=1e-9, le=1e9, description="near plane: nothing nearer is drawn, world units")
-
-    @rule("fov", "focal")
-    def _one_of(fov, focal):
-        if fov is not None and focal is not None:
-            raise Refused("give fov or focal, not both")
-
-    @property
-    def model(self) -> PinHole:
-        """The camera that the keys describe."""
-        focal = self.focal
-        if focal is None:
-            focal = focal_length(self.width, math.radians(60.0 if self.fov is None else self.fov))
-        centred = PinHole.centred(self.width, self.height, focal, near=self.near)
-        return replace(centred, **{key: value for key in ("cx", "cy") if (value := getattr(self, key)) is not None})
-
-    def scaled(self, factor: float) -> dict[str, Any]:
-        """The keys of a camera that sees the same with ``factor`` times the pixels in x and y,
-        as near as whole pixels come to it."""
-        said = {key: (value + 0.5) * factor - 0.5 for key in ("cx", "cy") if (value := getattr(self, key)) is not None}
-        said |= (
-            {"focal": self.focal * factor}
-            if self.focal is not None
-            else {"fov": self.fov}
-            if self.fov is not None
-            else {}
-        )
-        return {
-            "width": max(1, round(self.width * factor)),
-            "height": max(1, round(self.height * factor)),
-            "near": self.near,
-            **said,
-        }
-
-
-def camera_radius(camera: CameraModel, clearance: float) -> float:
-    """How far a random world's camera keeps from everything: its clearance, or a little more
-    than the near plane's corners."""
-    return max(clearance, 1.01 * camera.near_corner)
 
 
 class TimeConfig(Config):
@@ -228,6 +175,10 @@ class OutputConfig(Config):
     first_index: int = Field(
         0, ge=0, le=10_000_000, description="number of the first; sequence n depends on the seed and n alone"
     )
+    compression: Literal["zstd", "lz4"] = Field(
+        "zstd",
+        description="of events.h5, inside Blosc: zstd as DSEC's files; lz4 writes twice as fast, 4 % larger",
+    )
 
 
 def _sensor(name: str) -> str:
@@ -251,7 +202,7 @@ class SequenceConfig(Config):
 
     seed: int = Field(0, ge=0, lt=2**63, description="of the whole run; 0 is a seed")
     output: OutputConfig = Field(OutputConfig(), description="where sequences go")
-    camera: CameraConfig = Field(CameraConfig(), description="resolution and intrinsics")
+    camera: CameraConfig = Field(CameraConfig(), description="resolution, intrinsics and lens")
     time: TimeConfig = Field(TimeConfig(), description="duration and label rate")
     quality: Quality | None = Field(
         None,
@@ -486,7 +437,8 @@ def load_run(path: str | Path, overrides: Sequence[str] = (), *, seed: int | Non
 
     Raises ConfigError: missing or unreadable file, bad YAML (with line and column), unknown key, bad value."""
     base = Path(path).parent
-    tree = with_recipes(with_sensors(apply_overrides(_with_scenes(read_table(path), base), overrides), base))
+    tree = with_calibrations(apply_overrides(_with_scenes(read_table(path), base), overrides), base)
+    tree = with_recipes(with_sensors(tree, base))
     if seed is not None:
         tree["seed"] = seed
     if "seed" in tree and not is_distribution(tree["seed"]):  # which check() refuses

@@ -76,6 +76,7 @@ def generate_sequence(
             t_offset_us=sequence.t0_ns // 1000,
             labels=config.labels,
             truth=sequence.tells,
+            codec=config.output.compression,
         ) as writer,
     ):
         clock, span_ns = sequence.clock, sequence.t1_ns - sequence.t0_ns

@@ -2,12 +2,14 @@
 
 One sample per flow label, its files side by side under one key:
 
-    flying_000017_000003.json        sequence, times in µs, size, polarity convention
+    flying_000017_000003.json        sequence, times in µs, size, emulator, seed; K (3x3), near and T_world_cam (4x4)
+                                     where poses are known
     flying_000017_000003.old.npz     events of the interval before the label: x, y uint16, t int64 µs, p uint8; with
                                      labels.events also instance, depth and velocity of what made them
     flying_000017_000003.new.npz     events of the label's interval [from, to)
-    flying_000017_000003.flow.png    DSEC 16-bit flow; also back.png, image.png, occlusion.png where the data set has
-                                     them: every label whose row names a ``shard``
+    flying_000017_000003.flow.png    DSEC 16-bit flow; also back.png, image.png, depth.npy, ids.png … where the data set
+                                     has them: every label whose row names a ``shard``, in each form that is a file of
+                                     its own (flow.npy, flow.flo)
     flying_000017_000003.camera.png  of a frame camera its last image whose exposure was over at the label's time, and
                                      beside it camera_sharp.png and camera_clean.png; its exposure stands in the json
 
@@ -32,6 +34,7 @@ from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.event_labels import EVENT_LABELS, with_truth
 from blinkgl.io.frame_camera import EXPOSURES, ExposureLine, picture_file, read_exposures
+from blinkgl.io.images import NpzReader, numpy_errors
 from blinkgl.io.index import sequence_folders
 from blinkgl.io.sequence_dir import read_manifest, verify_sequence
 from blinkgl.labels import LABELS
@@ -106,6 +109,7 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
         "emulator": manifest.get("emulator"),
         "seed": manifest.get("seed"),
     }
+    about.update(_camera(folder, manifest, start))
     taken = _last_image(folder, manifest, start)
     if taken is not None:
         about["camera"] = {"image": taken[0], **asdict(taken[1])}
@@ -120,11 +124,24 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
     for label in sorted(
         (label for label in LABELS.values() if label.shard), key=lambda label: (label is not _FLOW, label.shard)
     ):
-        if (path := folder / label.forms[0].file(k)).is_file():
-            yield f"{key}.{label.shard}", path.read_bytes()
+        for form in label.forms:
+            if form.rows is None and form.file(k) in manifest["files"]:
+                name = label.shard.rpartition(".")[0]
+                yield f"{key}.{name}.{form.ending}", (folder / form.file(k)).read_bytes()
     for picture in manifest["frame_camera"]["pictures"] if taken is not None else ():
         ending = "camera.png" if picture == "images" else f"camera_{picture}.png"
         yield f"{key}.{ending}", (folder / picture_file(picture, taken[0])).read_bytes()
+
+
+def _camera(folder: Path, manifest: dict[str, Any], t_us: int) -> dict[str, Any]:
+    """Intrinsics, and the camera's pose at a label's time; nothing where a sequence has no poses."""
+    path = folder / "poses.npz"
+    if "poses.npz" not in manifest["files"]:
+        return {}
+    with numpy_errors(path), NpzReader(path) as arrays:
+        times = arrays["t_ns"] // 1000
+        T_world_cam = arrays["T_world_cam"][int(np.argmin(np.abs(times - t_us)))]
+        return {"K": arrays["K"].tolist(), "near": float(arrays["near"]), "T_world_cam": T_world_cam.tolist()}
 
 
 def _last_image(folder: Path, manifest: dict[str, Any], t_us: int) -> tuple[int, ExposureLine] | None:

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from blinkgl.config.base import Config, validate
+from blinkgl.config.camera import CameraConfig, calibrated
 from blinkgl.config.deform import AnimationConfig
 from blinkgl.config.physics import BodyConfig, PhysicsConfig
 from blinkgl.config.scene import (
@@ -32,7 +33,7 @@ from blinkgl.config.scene import (
     ObjectConfig,
     PoseConfig,
 )
-from blinkgl.config.sequence import CameraConfig, RunTemplate, SequenceConfig
+from blinkgl.config.sequence import RunTemplate, SequenceConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.scene import types as data
@@ -145,30 +146,45 @@ def _motion(pose: Pose | Keyframes | Trajectory | Vector, where: str, others: st
 
 
 class Camera(_Piece):
-    """A pin-hole camera and its motion.
+    """A camera, its lens and its motion.
 
-    width, height : px.   fov : horizontal field of view, degrees (default 60), or focal : focal length, px.
+    width, height : px (default 346 x 260).   fov : horizontal field of view, degrees (default 60), or focal : focal
+    length, px, or fx, fy.
     cx, cy : principal point, px; (0, 0) is the centre of the top-left pixel; default: the image's
     centre.   near : m, nothing nearer is drawn.
+    lens : "pinhole", "radtan" with distortion=(k1, k2, p1, p2[, k3]), or "equidistant" with (k1, k2, k3, k4).
+    calibration : YAML file of Kalibr or DSEC in the place of size, intrinsics and lens; calibration_name : which camera
+    of it.
     pose : :class:`Pose`, :class:`Keyframes`, :class:`Trajectory` or a position (3,); OpenCV axes (x right, y down, z
     forward).
     Raises ConfigError."""
 
     def __init__(
         self,
-        width: int = 346,
-        height: int = 260,
+        width: int | None = None,
+        height: int | None = None,
         *,
         fov: float | None = None,
         focal: float | None = None,
+        fx: float | None = None,
+        fy: float | None = None,
         cx: float | None = None,
         cy: float | None = None,
         near: float = 0.05,
+        lens: Literal["pinhole", "radtan", "equidistant"] | None = None,
+        distortion: Sequence[float] | None = None,
+        calibration: str | os.PathLike | None = None,
+        calibration_name: str | None = None,
         pose: Pose | Keyframes | Trajectory | Vector = (0.0, 0.0, 0.0),
     ):
-        self.tree = self._checked(
-            CameraConfig, check.given(width=width, height=height, fov=fov, focal=focal, cx=cx, cy=cy, near=near)
-        )
+        given = check.given(width=width, height=height, fov=fov, focal=focal, fx=fx, fy=fy, cx=cx, cy=cy, near=near)
+        given |= check.given(lens=lens, distortion=None if distortion is None else [*distortion])
+        if calibration is None:
+            given = {"width": 346, "height": 260, **given, **check.given(calibration_name=calibration_name)}
+        else:
+            source = {"calibration": os.fspath(calibration), "calibration_name": calibration_name}
+            given = calibrated(given | source, Path.cwd())
+        self.tree = self._checked(CameraConfig, given)
         self.motion = _motion(pose, "Camera.pose")
 
 

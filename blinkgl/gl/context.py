@@ -106,6 +106,11 @@ class GLContext:
         _refuse_after_fork()
         return self.shaders.program(name, defines)
 
+    def kernel(self, name: str, defines: Mapping[str, Any] | None = None) -> moderngl.ComputeShader:
+        """The compute program of ``shaders/<name>``, as :meth:`program`."""
+        _refuse_after_fork()
+        return self.shaders.kernel(name, defines)
+
     def framebuffer(
         self, width: int, height: int, colour: tuple[str, ...] = ("RGBA8",), depth: bool | str = True, samples: int = 0
     ) -> Target:

@@ -125,3 +125,49 @@ def atomic_file(final: str | os.PathLike, *, overwrite: bool = True) -> Iterator
         if isinstance(error, OutputError) and error.where == str(temporary):
             raise OutputError(error.problem, where=str(final), accepted=error.accepted) from error
         raise
+
+
+@contextlib.contextmanager
+def atomic_folder(final: str | os.PathLike) -> Iterator[Path]:
+    """``with atomic_folder("out") as folder:`` write below ``folder``; renamed to ``out`` on success, deleted on any
+    exception. The parent folder is made.
+
+    Raises
+    ------
+    OutputError : ``final`` is there (and no empty folder), or cannot be written.
+    """
+    final = Path(final)
+    refuse_existing(final)
+    with output_errors(final):
+        final.parent.mkdir(parents=True, exist_ok=True)
+        remove_stale(final.parent)
+        temporary = temporary_beside(final)
+        temporary.mkdir()
+    try:
+        yield temporary
+        with output_errors(final):
+            for path in sorted(temporary.rglob("*"), reverse=True):  # what a folder holds comes before the folder
+                fsync(path)
+            fsync(temporary)
+            refuse_existing(final)
+            os.rename(temporary, final)
+            fsync(final.parent)
+    except BaseException as error:
+        shutil.rmtree(temporary, ignore_errors=True)
+        if isinstance(error, OutputError) and error.where and str(temporary) in error.where:
+            where = error.where.replace(str(temporary), str(final))
+            raise OutputError(error.problem, where=where, accepted=error.accepted) from error
+        raise
+
+
+def refuse_existing(final: str | os.PathLike) -> None:
+    """OutputError unless ``final`` is free (absent, or an empty folder)."""
+    final = Path(final)
+    if final.is_dir() and not any(final.iterdir()):
+        return
+    if final.exists() or final.is_symlink():
+        raise OutputError(
+            "output folder exists" if final.is_dir() else "output path is a file",
+            where=str(final),
+            accepted="a new folder name",
+        )

@@ -50,10 +50,18 @@ class DsecEventWriter:
     t_offset_us : image-clock time of relative time 0. Events before it, or 2^32 µs (71.6 minutes) or more after it, are
         refused: the format's u4 cannot hold them.
     background : False compresses in the caller's thread.
+    codec : "zstd", as the published files, or "lz4".
     """
 
     def __init__(
-        self, path: str | os.PathLike, height: int, width: int, t_offset_us: int = 0, *, background: bool = True
+        self,
+        path: str | os.PathLike,
+        height: int,
+        width: int,
+        t_offset_us: int = 0,
+        *,
+        background: bool = True,
+        codec: str = "zstd",
     ):
         if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE):
             raise EventDataError(
@@ -66,6 +74,7 @@ class DsecEventWriter:
         self.count = 0
         self.t_end_us: int | None = None  # may be set any time before close
         self._last_t = self.t_offset_us
+        self._codec = codec
         self._next_ms = 0
         self._written = 0
         self._fill = 0
@@ -76,9 +85,10 @@ class DsecEventWriter:
             # Whole chunks only: no cache, a full disk shows at once.
             self._file = h5py.File(self.path, "w", rdcc_nbytes=0)
             self._columns = {
-                k: blosc_dataset(self._file, f"events/{k}", (0,), dtype, (BLOCK,)) for k, dtype in _COLUMNS.items()
+                k: blosc_dataset(self._file, f"events/{k}", (0,), dtype, (BLOCK,), codec)
+                for k, dtype in _COLUMNS.items()
             }
-            self._ms_to_idx = blosc_dataset(self._file, "ms_to_idx", (0,), np.uint64, (1 << 13,))
+            self._ms_to_idx = blosc_dataset(self._file, "ms_to_idx", (0,), np.uint64, (1 << 13,), codec)
             self._file.create_dataset("t_offset", data=np.int64(self.t_offset_us), track_times=False)
             self._file.attrs["height"], self._file.attrs["width"] = self.height, self.width
         self._queue: queue.Queue | None = None
@@ -182,7 +192,9 @@ class DsecEventWriter:
         """The first events say whether there are causes."""
         if self.count == 0 and events.cause is not None:
             with output_errors(self.path):
-                self._columns["cause"] = blosc_dataset(self._file, "events/cause", (0,), np.uint8, (BLOCK,))
+                self._columns["cause"] = blosc_dataset(
+                    self._file, "events/cause", (0,), np.uint8, (BLOCK,), self._codec
+                )
             self._block = _new_block(self._columns)
         if (events.cause is not None) != ("cause" in self._columns):
             raise EventDataError("some events have causes and some do not", where=str(self.path))

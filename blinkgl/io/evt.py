@@ -154,6 +154,18 @@ class EvtReader:
             raise AssetError(f"{state[-1]} events and no TIME_HIGH word, so no times", where=str(self.path))
 
 
+def decode_evt3(data: bytes, state: np.ndarray, where: str) -> Events:
+    """Events of EVT3 words without a header. state : (7,) int64, [-1, 0, 0, 0, 0, 0, 0] at first, goes on from call to
+    call. Raises AssetError: a word that the format does not have."""
+    raw = np.frombuffer(data[: len(data) // 2 * 2], _WORD["evt3"])
+    x, y, p = (np.empty(12 * len(raw), dtype) for dtype in (np.uint16, np.uint16, np.uint8))
+    t = np.empty(12 * len(raw), np.int64)
+    n, bad = _decode_evt3(raw, state, x, y, t, p)
+    if bad >= 0:
+        raise AssetError("damaged: no EVT3 word can stand here", where=where, value=f"0x{int(raw[bad]):04x}")
+    return Events(x[:n].copy(), y[:n].copy(), t[:n].copy(), p[:n].copy())
+
+
 def _read_header(path: Path) -> tuple[str, int]:
     lines = []
     try:

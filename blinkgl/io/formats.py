@@ -4,6 +4,8 @@
 |---|---|---|---|
 | dsec (also BlinkFlow's h5) | .h5 .hdf5 | x | x |
 | mvsec | .hdf5 .h5 | x | |
+| prophesee (not packed with ECF) | .hdf5 .h5 | x | x (by name) |
+| mcap (extra [exchange]) | .mcap | x | x |
 | evt3, evt2 | .raw | x | x (.raw is EVT3; EVT2 by name) |
 | aedat4 (extra [formats]) | .aedat4 | x | x |
 | aedat2 (jAER, DAVIS cameras) | .aedat | x | |
@@ -34,6 +36,7 @@ ENDINGS = {
     ".raw": "evt3",
     ".aedat4": "aedat4",
     ".aedat": "aedat2",
+    ".mcap": "mcap",
     ".txt": "text",
     ".csv": "csv",
     ".npz": "npz",
@@ -41,7 +44,7 @@ ENDINGS = {
 }
 WITH_CAUSES = ("dsec", "npz", "npy")
 """Formats with a place for what caused each event; the others refuse events that have causes."""
-WRITABLE = ("dsec", "evt3", "evt2", "aedat4", "text", "csv", "npz", "npy")
+WRITABLE = ("dsec", "evt3", "evt2", "aedat4", "mcap", "prophesee", "text", "csv", "npz", "npy")
 SENSORS = ((180, 240), (240, 304), (260, 346), (320, 320), (480, 640), (720, 1280), (1080, 1920))
 """(height, width) of event cameras, smallest first: the guess for files that do not say."""
 
@@ -147,11 +150,12 @@ def open_events(path: str | os.PathLike) -> EventFile:
     if kind == "dsec":
         from blinkgl.io.dsec import DsecEventReader
         from blinkgl.io.hdf5 import hdf5_errors, open_hdf5
-        from blinkgl.io.mvsec import DATASET, MvsecReader
+        from blinkgl.io.mvsec import DATASET as MVSEC, MvsecReader
+        from blinkgl.io.prophesee import DATASET as PROPHESEE, PropheseeReader
 
         with open_hdf5(path) as file, hdf5_errors(path):
-            kind = "mvsec" if DATASET in file else "dsec"
-        reader = MvsecReader(path) if kind == "mvsec" else DsecEventReader(path)
+            kind = "mvsec" if MVSEC in file else "prophesee" if PROPHESEE in file else "dsec"
+        reader = {"mvsec": MvsecReader, "prophesee": PropheseeReader, "dsec": DsecEventReader}[kind](path)
     elif kind == "evt3":
         from blinkgl.io.evt import EvtReader
 
@@ -161,6 +165,10 @@ def open_events(path: str | os.PathLike) -> EventFile:
         from blinkgl.io.aedat4 import Aedat4Reader
 
         reader = Aedat4Reader(path)
+    elif kind == "mcap":
+        from blinkgl.io.mcap import McapReader
+
+        reader = McapReader(path)
     elif kind == "aedat2":
         from blinkgl.io.aedat2 import Aedat2Reader
 
@@ -210,6 +218,14 @@ def _writer(path: Path, kind: str, height: int, width: int, t_offset_us: int, ti
         from blinkgl.io.aedat4 import Aedat4Writer
 
         return Aedat4Writer(path, height, width)
+    if kind == "mcap":
+        from blinkgl.io.mcap import McapWriter
+
+        return McapWriter(path, height, width)
+    if kind == "prophesee":
+        from blinkgl.io.prophesee import PropheseeWriter
+
+        return PropheseeWriter(path, height, width)
     if kind in ("text", "csv"):
         from blinkgl.io.text import TextWriter
 

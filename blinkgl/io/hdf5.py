@@ -27,6 +27,9 @@ _MAX_CHUNK_BYTES = 1 << 28
 """HDF5 unpacks a chunk whole, however little of it is asked for."""
 
 _LEVEL, _BIT_SHUFFLE = 1, hdf5plugin.Blosc.BITSHUFFLE
+CODECS = {"zstd": 5, "lz4": 1}
+"""What Blosc packs with -> its number in the filter's parameters."""
+_NAMES = {number: name.encode() for name, number in CODECS.items()}
 _BLOSC_VALUES = 4
 """Parameters that Blosc's filter reads without asking how many there are; with fewer it crashes."""
 
@@ -147,13 +150,18 @@ def dataset(
 
 
 def blosc_dataset(
-    file: h5py.File, name: str, shape: tuple[int, ...], dtype: DTypeLike, chunks: tuple[int, ...]
+    file: h5py.File,
+    name: str,
+    shape: tuple[int, ...],
+    dtype: DTypeLike,
+    chunks: tuple[int, ...],
+    codec: str = "zstd",
 ) -> h5py.Dataset:
-    """A new data set that grows along its first axis: Blosc-zstd level 1 with bit shuffle
-    (filter 32001), as in DSEC's files."""
-    codec = hdf5plugin.Blosc(cname="zstd", clevel=_LEVEL, shuffle=_BIT_SHUFFLE)
+    """A new data set that grows along its first axis: Blosc level 1 with bit shuffle (filter 32001). codec : of
+    :data:`CODECS`; zstd as in DSEC's files."""
+    packed = hdf5plugin.Blosc(cname=codec, clevel=_LEVEL, shuffle=_BIT_SHUFFLE)
     return file.create_dataset(
-        name, shape, dtype, maxshape=(None, *shape[1:]), chunks=chunks, track_times=False, compression=codec
+        name, shape, dtype, maxshape=(None, *shape[1:]), chunks=chunks, track_times=False, compression=packed
     )
 
 
@@ -163,17 +171,17 @@ def write_rows(data: h5py.Dataset, start: int, rows: np.ndarray) -> None:
     Chunks are compressed here, each by one thread, instead of inside HDF5. There Blosc would take the user's
     ``BLOSC_NTHREADS``, and with more than one thread stores its blocks in the order they finish:
     bytes would differ from run to run."""
-    step = data.chunks[0]
+    step, codec = data.chunks[0], data.id.get_create_plist().get_filter(0)[2][6]
     begin = start // step * step
     rows = np.ascontiguousarray(rows, data.dtype)
     if begin < start:
-        rows = np.concatenate([data[begin:start], rows])
+        rows = joined([data[begin:start], rows])
     data.resize(begin + len(rows), axis=0)
     for i in range(0, len(rows), step):
         piece = rows[i : i + step]
         if len(piece) < step:  # HDF5 stores the last chunk whole, filled with zeros
-            piece = np.concatenate([piece, np.zeros((step - len(piece), *piece.shape[1:]), piece.dtype)])
-        packed = _compressed(piece)
+            piece = joined([piece, np.zeros((step - len(piece), *piece.shape[1:]), piece.dtype)])
+        packed = _compressed(piece, _NAMES[codec])
         # As HDF5's filter does: what does not become smaller is stored as it is, and the chunk says so.
         skipped = 1 if packed is None else 0
         data.id.write_direct_chunk(
@@ -181,7 +189,18 @@ def write_rows(data: h5py.Dataset, start: int, rows: np.ndarray) -> None:
         )
 
 
-def _compressed(array: np.ndarray) -> bytes | None:
+def joined(pieces: list[np.ndarray]) -> np.ndarray:
+    """One after another, in the dtype of the first: NumPy's own concatenation closes the gaps between a record's
+    fields, and a file's records keep theirs."""
+    out = np.zeros((sum(map(len, pieces)), *pieces[0].shape[1:]), pieces[0].dtype)
+    at = 0
+    for piece in pieces:
+        out[at : at + len(piece)] = piece
+        at += len(piece)
+    return out
+
+
+def _compressed(array: np.ndarray, codec: bytes) -> bytes | None:
     """One Blosc buffer; None when it is not smaller than the array."""
     out, size = ctypes.create_string_buffer(array.nbytes), ctypes.c_size_t
     n = _blosc().blosc_compress_ctx(
@@ -192,7 +211,7 @@ def _compressed(array: np.ndarray) -> bytes | None:
         array.ctypes.data_as(ctypes.c_void_p),
         out,
         size(array.nbytes),
-        b"zstd",
+        codec,
         size(0),
         1,
     )

@@ -41,7 +41,7 @@ from blinkgl.config.labels import LabelsConfig
 from blinkgl.errors import AssetError, BlinkGLError, OutputError
 from blinkgl.events.types import Events
 from blinkgl.io import imu as imu_files
-from blinkgl.io.atomic import fsync, output_errors, remove_stale, temporary_beside
+from blinkgl.io.atomic import fsync, output_errors, refuse_existing, remove_stale, temporary_beside
 from blinkgl.io.dsec import DsecEventWriter
 from blinkgl.io.event_labels import EVENT_LABELS, EventLabelsWriter
 from blinkgl.io.frame_camera import (
@@ -79,6 +79,7 @@ class SequenceWriter:
     labels : ``labels:``, which says in which forms labels are written; None: each in its first.
     events : False makes no ``events.h5``.
     truth : True makes ``event_labels.h5`` beside it, of events that say what made them.
+    codec : of ``events.h5``, "zstd" or "lz4".
 
     Attributes
     ----------
@@ -102,6 +103,7 @@ class SequenceWriter:
         labels: LabelsConfig | None = None,
         events: bool = True,
         truth: bool = False,
+        codec: str = "zstd",
     ):
         self.final = Path(final)
         self.height, self.width, self.config_yaml, self.t_offset_us = (
@@ -114,7 +116,7 @@ class SequenceWriter:
         self.info: dict[str, Any] = {}
         self.t_end_us: int | None = None
         self.lost: dict[str, int] = {}
-        self._with_events, self._with_truth = events, truth
+        self._with_events, self._with_truth, self._codec = events, truth, codec
         self._files: dict[str, dict[str, Any]] = {}
         self._promised = {name for name, on in (("events.h5", events), (EVENT_LABELS, truth)) if on}
         self._timestamps: dict[str, list[str]] = {}
@@ -136,7 +138,7 @@ class SequenceWriter:
             if self._with_truth:
                 self._truth = EventLabelsWriter(self._tmp / EVENT_LABELS)
             self._events = (
-                DsecEventWriter(self._tmp / "events.h5", self.height, self.width, self.t_offset_us)
+                DsecEventWriter(self._tmp / "events.h5", self.height, self.width, self.t_offset_us, codec=self._codec)
                 if self._with_events
                 else None
             )
@@ -365,19 +367,6 @@ class SequenceWriter:
             except Exception:  # noqa: BLE001 - a full disk refuses the flush; the file is deleted anyway
                 pass
         shutil.rmtree(self._tmp, ignore_errors=True)
-
-
-def refuse_existing(final: str | os.PathLike) -> None:
-    """OutputError unless ``final`` is free (absent, or an empty folder)."""
-    final = Path(final)
-    if final.is_dir() and not any(final.iterdir()):
-        return
-    if final.exists() or final.is_symlink():
-        raise OutputError(
-            "output folder exists" if final.is_dir() else "output path is a file",
-            where=str(final),
-            accepted="a new folder name",
-        )
 
 
 class _File(BaseModel):

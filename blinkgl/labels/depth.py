@@ -22,6 +22,7 @@ class Depth(Label):
 
     name, about = "depth", "float32 .npy, world units along the optical axis"
     unit, kind = "world units", "depth"
+    shard = "depth.npy"
     buffer = "R32F"
     judged_in, tolerance, error = "relative", 1e-5, staticmethod(grading.relative)
 

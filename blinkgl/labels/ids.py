@@ -21,6 +21,7 @@ class Ids(Label):
 
     name, about = "ids", "instance ids, 16-bit PNG"
     title, unit, kind = "instance ids", "0: nothing hit", "ids"
+    shard = "ids.png"
     buffer, dtype = "R32UI", np.uint32
 
     def uniforms(self, shot: Shot) -> dict[str, np.ndarray]:

@@ -19,6 +19,7 @@ class Normals(Label):
 
     name, about = "normals", "unit normals in camera axes, float32 .npy"
     unit, kind = "camera axes", "unit"
+    shard = "normals.npy"
     buffer, varyings, channels = "RGBA32F", ("normal",), 3
     judged_in, tolerance = "of a unit vector", 1e-3
 

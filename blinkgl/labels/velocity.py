@@ -20,6 +20,7 @@ class Velocity(Label):
 
     name, about = "velocity", "instantaneous image velocity, px/s, float32 .npy"
     title, unit, kind = "velocity label", "px/s", "motion"
+    shard = "velocity.npy"
     buffer, varyings, channels = "RG32F", ("local", "rate"), 2
     judged_in, tolerance, error = "px per label interval", 1e-2, staticmethod(grading.motion_per_interval)
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from blinkgl.config.camera import CameraConfig
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig, SceneConfig
-from blinkgl.config.sequence import CameraConfig, SequenceConfig
+from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.scene.types import Fog, Scene
 from blinkgl.scene.worlds.explicit import check_primitive, explicit_scene

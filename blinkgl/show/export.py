@@ -1,16 +1,33 @@
-"""``blinkgl export``: how many samples went into how many shards."""
+"""``blinkgl export``: what was written, and what to know of it."""
 
 from __future__ import annotations
 
 from blinkgl.dataset.shards import export_shards
+from blinkgl.errors import ConfigError
+from blinkgl.layouts import export_layout, layout_of
 from blinkgl.show.terminal import plain_console, say
 
+SHARDS = "webdataset"
 
-def run(root: str, out: str, *, shard_bytes: int, seed: int) -> int:
-    """Arguments: of :func:`~blinkgl.dataset.shards.export_shards`."""
+
+def run(root: str, out: str, *, layout: str, shard_mb: float | None, seed: int | None) -> int:
+    """layout : "webdataset", or one of :data:`~blinkgl.layouts.LAYOUTS`; the others are of
+    :func:`~blinkgl.dataset.shards.export_shards`. Raises ConfigError and as the two do."""
     console = plain_console()
-    with console.status("writing shards"):
-        written = export_shards(root, out, shard_bytes=shard_bytes, seed=seed)
-    for split, counts in written.items():
-        say(console, f"{out}/{split}-*.tar: {sum(counts):,} samples in {len(counts)} shard{'s' * (len(counts) != 1)}")
+    if layout == SHARDS:
+        with console.status("writing shards"):
+            written = export_shards(root, out, shard_bytes=int((shard_mb or 512.0) * 1e6), seed=seed or 0)
+        for split, counts in written.items():
+            shards = f"{len(counts)} shard{'s' * (len(counts) != 1)}"
+            say(console, f"{out}/{split}-*.tar: {sum(counts):,} samples in {shards}")
+        return 0
+    row = layout_of(layout)
+    for name, value in (("--shard-mb", shard_mb), ("--seed", seed)):
+        if value is not None:
+            raise ConfigError(f"layout '{layout}' has no shards", where=name, value=value, accepted=f"it with {SHARDS}")
+    with console.status(f"writing {layout}"):
+        done = export_layout(root, out, layout)
+    for line in done.said:
+        say(console, line)
+    say(console, f"{out}: {done.sequences:,} sequence{'s' * (done.sequences != 1)} for {row.about}")
     return 0

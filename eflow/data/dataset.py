@@ -342,11 +342,7 @@ def batches(dataset: FlowDataset, sampler: StepSampler, workers: int, pin: bool 
         generator=torch.Generator(),  # else each start would draw from torch's global one
         multiprocessing_context="forkserver" if workers else None,
     )
-    endless = [i for i, source in enumerate(dataset.sources) if is_endless(source)]
-    for keys, batch in zip(sampler, loader, strict=True):
+    for batch in loader:
         if isinstance(batch, BlinkGLError):
             raise batch
-        for i in endless:
-            if used := [key.index for key in keys if key.source == i]:
-                dataset.sources[i].taken(max(used) + 1)
         yield batch

@@ -15,55 +15,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from blinkgl.errors import AssetError
+from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors, remove_stale, temporary_beside
 from blinkgl.io.sequence_dir import refuse_existing
-from eflow.data.window import RawSample, Window
+from blinkgl.online.samples import read_sample
+from eflow.data.window import RawSample, raw_sample
 
 if TYPE_CHECKING:
     from eflow.data.online import OnlineSource
 
 ABOUT = "windows.json"
 _VERSION = 1
-_COLUMNS = ("x", "y", "t", "p")
-
-
-def write_window(path: Path, sample: RawSample, name: str) -> None:
-    """One sample as ``path`` (.npz), whole or not at all: who waits for the name finds all of it. Its two windows meet
-    at ``sample.new.t0`` and are equally long; ``name``: the sequence's."""
-    arrays = {f"{side}_{c}": getattr(getattr(sample, side), c) for side in ("old", "new") for c in _COLUMNS}
-    arrays |= {"flow": sample.flow, "valid": sample.valid}
-    if sample.backward is not None:
-        arrays |= {"backward": sample.backward, "backward_valid": sample.backward_valid}
-    t, span = sample.new.t0, sample.new.t1 - sample.new.t0
-    temporary = path.with_suffix(f".{os.getpid()}")
-    with open(temporary, "wb") as file:
-        np.savez(file, name=np.array(f"{name}/{t}us+{span}us"), t=np.array(t), span=np.array(span), **arrays)
-    os.replace(temporary, path)
-
-
-def read_window(path: Path) -> RawSample:
-    """What :func:`write_window` wrote. Raises FileNotFoundError."""
-    with np.load(path, allow_pickle=False) as z:
-        arrays = {key: z[key] for key in z.files}
-    t, span, name = int(arrays["t"]), int(arrays["span"]), str(arrays["name"])
-    old, new = (
-        Window(*(arrays[f"{side}_{c}"] for c in _COLUMNS), t0, t0 + span)
-        for side, t0 in (("old", t - span), ("new", t))
-    )
-    return RawSample(
-        old,
-        new,
-        *arrays["valid"].shape,
-        name=name,
-        scene=name.split("/")[0],
-        flow=arrays["flow"],
-        valid=arrays["valid"],
-        backward=arrays.get("backward"),
-        backward_valid=arrays.get("backward_valid"),
-    )
 
 
 class PoolSource:
@@ -85,8 +47,8 @@ class PoolSource:
     def __getitem__(self, index: int) -> RawSample:
         path = self.root / f"{index:07d}.npz"
         try:
-            return read_window(path)
-        except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
+            return raw_sample(read_sample(path))
+        except (OSError, ValueError, KeyError, TypeError, EOFError, EventDataError) as error:
             raise AssetError(f"not a window of eflow render: {error}", where=str(path)) from None
         except Exception as error:  # zipfile and zlib have errors of their own
             if type(error).__module__ not in ("zipfile", "zlib"):
@@ -133,11 +95,9 @@ def render_pool(
     try:
         try:
             for n in range(count):
-                made = source.path(n)
                 with output_errors(final):
-                    shutil.copyfile(made, temporary / f"{n:07d}.npz")
+                    source.move(n, temporary / f"{n:07d}.npz")
                 done = n + 1
-                source.taken(done)
                 progress(done)
         except KeyboardInterrupt:
             if done == 0:

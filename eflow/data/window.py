@@ -10,6 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from blinkgl.events.types import Events
+from blinkgl.online.samples import WindowSample
+
 
 @dataclass(frozen=True, eq=False)
 class Window:
@@ -161,3 +164,24 @@ class RawSample:
             )
 
         return replace(self, old=add(self.old), new=add(self.new))
+
+
+def raw_sample(s: WindowSample) -> RawSample:
+    """The same, as everything in eflow takes it."""
+    t, span = s.t_us, s.span_us
+    return RawSample(
+        _of(s.old, t - span, t),
+        _of(s.new, t, t + span),
+        s.height,
+        s.width,
+        name=s.name,
+        scene=s.name.split("/")[0],
+        flow=s.flow,
+        valid=s.valid,
+        backward=s.backward,
+        backward_valid=s.backward_valid,
+    )
+
+
+def _of(e: Events, t0: int, t1: int) -> Window:
+    return Window(e.x, e.y, e.t, e.p, t0, t1)

@@ -6,8 +6,9 @@ from importlib import resources
 import pytest
 
 from blinkgl.camera import PinHole
+from blinkgl.config.camera import CameraConfig
 from blinkgl.config.recipe import all_groups
-from blinkgl.config.sequence import CameraConfig, SequenceConfig, TimeConfig, load_run
+from blinkgl.config.sequence import SequenceConfig, TimeConfig, load_run
 from blinkgl.errors import ConfigError
 
 

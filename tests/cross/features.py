@@ -297,7 +297,10 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "odd": {"camera": {"width": WIDTH - 1, "height": HEIGHT - 1, "focal": 30, "cx": 12.3}},
         "wide": {"camera": {"fov": 110, "near": 0.2}},
     },
-    "output": {"train": NOTHING, "test": {"output": {"split": "test", "name": "probe", "first_index": 1}}},
+    "output": {
+        "train": NOTHING,
+        "test": {"output": {"split": "test", "name": "probe", "first_index": 1, "compression": "lz4"}},
+    },
     "seed": {"the group's": NOTHING, "its own": {"seed": 2**62 + 1}},
 }
 RUN_LEVEL = {"gl": "one OpenGL for all groups of a run; tests/gl tries the backends"}

@@ -23,7 +23,11 @@ from runs import recipe_file
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data")
-    run_dataset(load_run(recipe_file(folder)), folder / "out", num=2)
+    run_dataset(
+        load_run(recipe_file(folder, labels={"flow": ["forward"], "float_flow": ["npy"], "ids": True, "depth": True})),
+        folder / "out",
+        num=2,
+    )
     return folder / "out"
 
 
@@ -52,6 +56,13 @@ def test_shards_hold_every_label_once(data, tmp_path):
             folder = data / split / about["sequence"]
             assert contents[f"{key}.flow.png"] == (folder / f"flow/forward/{about['label']:06d}.png").read_bytes()
             assert cv2.imdecode(np.frombuffer(contents[f"{key}.image.png"], np.uint8), 1).shape == (48, 64, 3)
+            for ending, file in (("ids.png", "ids/{:06d}.png"), ("depth.npy", "depth/{:06d}.npy"),
+                                 ("flow.npy", "flow/forward_npy/{:06d}.npy")):  # fmt: skip
+                assert contents[f"{key}.{ending}"] == (folder / file.format(about["label"])).read_bytes()
+            with np.load(folder / "poses.npz") as poses:
+                assert poses["t_ns"][about["label"] + 1] // 1000 == about["from_us"] and about["near"] == poses["near"]
+                np.testing.assert_array_equal(about["K"], poses["K"])
+                np.testing.assert_array_equal(about["T_world_cam"], poses["T_world_cam"][about["label"] + 1])
             span = about["to_us"] - about["from_us"]
             with DsecEventReader(folder / "events.h5") as reader:
                 for window, start in (("old", about["from_us"] - span), ("new", about["from_us"])):
@@ -84,7 +95,7 @@ def test_a_shard_that_could_not_be_finished_is_not_there(data, tmp_path, monkeyp
 
     monkeypatch.setattr(shards, "sample", full)
     with pytest.raises(OutputError, match="no space"):
-        export_shards(data / "train", tmp_path / "a", shard_bytes=60_000)
+        export_shards(data / "train", tmp_path / "a", shard_bytes=100_000)
     left = [p.name for p in (tmp_path / "a").iterdir()]
     assert left and all(name.startswith("train-") for name in left), "those before it are whole"
     assert len({name.partition(".")[0] for name, _ in members(tmp_path / "a", "train")}) < 5

@@ -190,3 +190,24 @@ def test_unreadable_files(tmp_path, damage, message):
             file["something"] = 1
     with pytest.raises(AssetError, match=message):
         DsecEventReader(path)
+
+
+def test_lz4_holds_the_same_events_and_says_so(tmp_path):
+    rng = np.random.default_rng(1)
+    n = 200_000
+    events = Events(
+        rng.integers(0, 640, n).astype(np.uint16),
+        rng.integers(0, 480, n).astype(np.uint16),
+        np.sort(rng.integers(0, 90_000, n)),
+        rng.integers(0, 2, n).astype(np.uint8),
+    )
+    for codec in ("zstd", "lz4"):
+        with DsecEventWriter(tmp_path / f"{codec}.h5", 480, 640, codec=codec) as writer:
+            writer.append(events)
+        with h5py.File(tmp_path / f"{codec}.h5") as file:
+            number = file["events/x"].id.get_create_plist().get_filter(0)[2][6]
+            assert number == {"zstd": 5, "lz4": 1}[codec]  # Blosc's own numbers of its codecs
+        with DsecEventReader(tmp_path / f"{codec}.h5") as reader:
+            (read,) = list(reader.chunks())
+        assert all(np.array_equal(getattr(read, k), getattr(events, k)) for k in "xytp")
+    assert (tmp_path / "lz4.h5").read_bytes() != (tmp_path / "zstd.h5").read_bytes()

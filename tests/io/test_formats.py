@@ -25,6 +25,8 @@ FILES = {
     "npz": "e.npz",
     "npy": "e.npy",
     "aedat4": "e.aedat4",
+    "mcap": "e.mcap",
+    "prophesee": "e.hdf5",
 }
 
 
@@ -59,6 +61,8 @@ def same(a: Events, b: Events) -> bool:
 def need(kind):
     if kind == "aedat4":
         pytest.importorskip("dv_processing", reason="optional extra [formats]")
+    if kind == "mcap":
+        pytest.importorskip("mcap", reason="optional extra [exchange]")
 
 
 @pytest.mark.parametrize("kind", FILES)
@@ -81,8 +85,9 @@ def test_no_events_at_all(tmp_path, kind):
     assert len(open_events(tmp_path / FILES[kind]).read()) == 0
 
 
-@pytest.mark.parametrize("kind", ["evt2", "evt3", "text", "csv"])
+@pytest.mark.parametrize("kind", ["evt2", "evt3", "mcap", "prophesee", "text", "csv"])
 def test_bytes_do_not_depend_on_chunking(tmp_path, kind):
+    need(kind)
     events = random_events(3000)
     for i in range(2):
         write_events(tmp_path / f"{i}.x", pieces(events, i), H, W, format=kind)

@@ -12,7 +12,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from blinkgl.config.sequence import CameraConfig
+from blinkgl.config.camera import CameraConfig
 from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.mesh_files import load_asset

@@ -7,8 +7,8 @@ import pytest
 import trimesh
 from PIL import Image
 
+from blinkgl.config.camera import CameraConfig
 from blinkgl.config.scene import PoolConfig
-from blinkgl.config.sequence import CameraConfig
 from blinkgl.errors import AssetError
 from blinkgl.scene.importing.mesh_files import load_asset
 from blinkgl.scene.motion.paths import StaticPath

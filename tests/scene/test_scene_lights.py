@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from blinkgl.config.base import validate
+from blinkgl.config.camera import CameraConfig
 from blinkgl.config.scene import ExplicitSceneConfig, LightConfig, RandomLightsConfig, RandomSceneConfig
-from blinkgl.config.sequence import CameraConfig
 from blinkgl.errors import ConfigError
 from blinkgl.rng import Role, generator
 from blinkgl.scene.build import build_scene

@@ -18,10 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import CameraModel
 from blinkgl.config.base import tag_of
+from blinkgl.config.camera import camera_radius
 from blinkgl.config.deform import AnimationConfig, DeformConfig, RandomDeformConfig
 from blinkgl.config.physics import BodyConfig, RandomPhysicsConfig
 from blinkgl.config.scene import RandomSceneConfig, SkyConfig, WallsConfig
-from blinkgl.config.sequence import camera_radius
 from blinkgl.errors import ConfigError
 from blinkgl.rng import Role, generator
 from blinkgl.scene.geometry.deforming import deforming

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from blinkgl.config.base import validate
+from blinkgl.config.camera import CameraConfig
 from blinkgl.config.scene import ExplicitSceneConfig, RandomSceneConfig
-from blinkgl.config.sequence import CameraConfig, load_run
+from blinkgl.config.sequence import load_run
 from blinkgl.errors import ConfigError
 from blinkgl.scene.build import build_scene, sequence_scene
 

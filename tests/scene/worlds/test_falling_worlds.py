@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from blinkgl.config.base import validate
+from blinkgl.config.camera import CameraConfig, camera_radius
 from blinkgl.config.physics import RandomPhysicsConfig
 from blinkgl.config.scene import ExplicitSceneConfig, ObjectsConfig, PoolConfig, RandomSceneConfig, TexturesConfig
-from blinkgl.config.sequence import CameraConfig, camera_radius
 from blinkgl.errors import ConfigError
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.motion.paths import HermitePath

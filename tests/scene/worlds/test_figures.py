@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from shared_data import shared
 
 from blinkgl.config.base import validate
+from blinkgl.config.camera import CameraConfig
 from blinkgl.config.deform import AnimationConfig, ClipConfig
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig
-from blinkgl.config.sequence import CameraConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.geometry.primitives import BUILDERS

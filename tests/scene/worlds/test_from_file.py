@@ -10,8 +10,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from blinkgl.config.base import validate
+from blinkgl.config.camera import CameraConfig
 from blinkgl.config.scene import FileSceneConfig
-from blinkgl.config.sequence import CameraConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.importing import gltf

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from blinkgl.config.base import validate
+from blinkgl.config.camera import CameraConfig
 from blinkgl.config.scene import (
     ExplicitSceneConfig,
     LightConfig,
@@ -17,7 +18,6 @@ from blinkgl.config.scene import (
     TexturesConfig,
     WallsConfig,
 )
-from blinkgl.config.sequence import CameraConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene, check_assets
 from blinkgl.scene.lights import make_light

@@ -1,0 +1,66 @@
+"""The pin-hole picture out of which a lens's picture is made: rasterisers draw nothing else."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+
+from blinkgl.camera.distorted import DistortedModel
+from blinkgl.camera.model import CameraModel
+from blinkgl.camera.pinhole import PinHole
+from blinkgl.errors import ConfigError
+
+DENSITY = 1.5
+"""Pixels of the pin-hole picture per pixel of the lens's, along the direction and at the place where there are fewest.
+Above the square root of 2, so that no two pixels have the same nearest one."""
+WIDEST = math.radians(70)
+"""Largest angle off the optical axis. A pin-hole picture grows with its tangent."""
+LARGEST = 16384
+"""Pixels along a side of the pin-hole picture."""
+MARGIN = 2
+"""Its pixels on every side beyond what the lens shows: neighbours are looked at."""
+
+
+def seen_through(camera: CameraModel) -> PinHole:
+    """The pin-hole camera that is drawn for ``camera``, at the same place: ``camera`` itself, or one that sees all that
+    a lens shows, at :data:`DENSITY` at least.
+
+    Raises ConfigError for a lens that shows too much for one flat picture."""
+    if isinstance(camera, PinHole):
+        return camera
+    assert isinstance(camera, DistortedModel)
+    return _seen_through(camera)
+
+
+@lru_cache(maxsize=32)
+def _seen_through(camera: DistortedModel) -> PinHole:
+    x, y = np.linspace(-0.5, camera.width - 0.5, 65), np.linspace(-0.5, camera.height - 0.5, 65)
+    xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    rays = camera.rays(xy)
+    angle = float(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]).max())
+    if angle > WIDEST:
+        raise ConfigError(
+            f"the lens sees {math.degrees(angle):.1f} degrees off its axis, too much for the one flat picture that is "
+            "drawn",
+            value=list(camera.distortion),
+            accepted=f"at most {math.degrees(WIDEST):.0f} degrees: a longer focal length, or fewer pixels",
+        )
+    edges = camera.plane_edges
+    assert edges is not None  # it sees less than half of space
+    # d(X / Z, Y / Z) / d px; the derivative's smallest singular value says where pixels are closest to each other.
+    z = rays[:, 2, None]
+    slopes = camera.ray_jacobian(xy)
+    slopes = (slopes[:, :2] - rays[:, :2, None] / z[..., None] * slopes[:, 2:]) / z[..., None]
+    focal = DENSITY / float(np.linalg.svd(slopes, compute_uv=False)[:, 1].min())
+    left, right, top, bottom = edges
+    x0, x1 = math.floor(left * focal) - MARGIN, math.ceil(right * focal) + MARGIN
+    y0, y1 = math.floor(top * focal) - MARGIN, math.ceil(bottom * focal) + MARGIN
+    if max(x1 - x0, y1 - y0) > LARGEST:
+        raise ConfigError(
+            f"the flat picture that is drawn for this lens would have {x1 - x0}x{y1 - y0} px",
+            value=list(camera.distortion),
+            accepted=f"at most {LARGEST} along a side: less distortion, or fewer pixels",
+        )
+    return PinHole(x1 - x0, y1 - y0, focal, focal, -x0 - 0.5, -y0 - 0.5, camera.near)

@@ -1,0 +1,10 @@
+"""Events made on the card: the emulators' kernels as compute shaders, the same events bit for bit.
+
+In:    frames and the emulators' configurations (``blinkgl.events``), a context (``blinkgl.gl``).
+Out:   an ``Emulator`` whose state lies on the card.
+Start: esim.py; the kernels are shaders/compute/events_*.glsl.
+"""
+
+from blinkgl.card.esim import CardEsim
+
+__all__ = ["CardEsim"]

@@ -1,0 +1,87 @@
+"""Running compute shaders: buffers bound by number, uniforms set at every run, prefix sums."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import moderngl
+
+from blinkgl.card.arith import includes
+from blinkgl.errors import GLError
+from blinkgl.gl.shader import MADE
+
+if TYPE_CHECKING:
+    from blinkgl.gl import GLContext
+
+MADE.append(includes)
+WORD, BLOCK_WORDS, LOCAL, PIXELS_PER_GROUP = 32, 32, 64, 256
+"""As in shaders/include/events.glsl: pixels of a word of marks, words of a block, invocations of a group."""
+HEAD_BYTES, PIXELS_AT, CHUNKS_AT = 48, 0, 12
+"""Size of the head of a list, and where in it the two triples for indirect dispatches stand."""
+
+
+class Kernels:
+    """Compute programs of one context. soft_float : logarithms in whole numbers, see :mod:`blinkgl.card.proof`."""
+
+    def __init__(self, gl: GLContext, soft_float: bool = False):
+        self.gl = gl
+        self._soft = {"SOFT_FLOAT": 1} if soft_float else {}
+        self._lanes = 64 if gl.is_software else 1024  # of the one group that adds up sums
+
+    def run(
+        self,
+        name: str,
+        defines: Mapping[str, Any],
+        buffers: Mapping[int, moderngl.Buffer],
+        values: Mapping[str, Any],
+        *,
+        items: int = 0,
+        local: int = LOCAL,
+        indirect: tuple[moderngl.Buffer, int] | None = None,
+    ) -> None:
+        """``items`` invocations in groups of ``local``, or as many groups as the three words at an offset of a buffer
+        say. buffers : by binding.   values : of uniforms; those that the variant does not have are left out."""
+        kernel = self.gl.kernel(name, {**defines, **self._soft})
+        for binding, buffer in buffers.items():
+            buffer.bind_to_storage_buffer(binding)
+        for key, value in values.items():
+            member = kernel.get(key, None)
+            if isinstance(member, moderngl.Uniform):
+                member.value = value
+        if indirect is not None:
+            kernel.run_indirect(*indirect)
+        else:
+            kernel.run(-(-items // local))
+        self.gl.ctx.memory_barrier()
+
+    def prefix_of_bits(
+        self, head: moderngl.Buffer, words: moderngl.Buffer, sums: moderngl.Buffer, offsets: moderngl.Buffer, count: int
+    ) -> None:
+        """``offsets``: how many bits are set before each word; ``sums``: before each block of 32 words, and at the end
+        all, which the head is told. count : of words, a multiple of 32."""
+        chunks = count // BLOCK_WORDS
+        buffers, values = {0: head, 1: words, 2: sums}, {"chunks_given": chunks}
+        self.run("compute/prefix.glsl", {"BITS": 1, "SUMS": 1}, buffers, values, items=chunks)
+        self.run("compute/prefix.glsl", {"BITS": 1, "SCAN": 1, "LANES": self._lanes}, buffers, values, items=1)
+        self.run("compute/prefix.glsl", {"BITS": 1, "OFFSETS": 1}, {**buffers, 3: offsets}, values, items=chunks)
+
+    def prefix_of_counts(
+        self, head: moderngl.Buffer, counts: moderngl.Buffer, sums: moderngl.Buffer, offsets: moderngl.Buffer
+    ) -> None:
+        """``offsets``: the sum of ``counts`` before each; the head says how many there are, and is told the total."""
+        buffers, chunks = {0: head, 1: counts, 2: sums}, (head, CHUNKS_AT)
+        self.run("compute/prefix.glsl", {"SUMS": 1}, buffers, {}, indirect=chunks)
+        self.run("compute/prefix.glsl", {"SCAN": 1, "LANES": self._lanes}, buffers, {}, items=1)
+        self.run("compute/prefix.glsl", {"OFFSETS": 1}, {**buffers, 3: offsets}, {}, indirect=chunks)
+
+
+def refuse_without_compute(gl: GLContext) -> None:
+    """Raises GLError, one line, where this OpenGL has no compute shaders that can do the work."""
+    if gl.ctx.version_code < 430:
+        raise GLError(
+            "no compute shaders",
+            where="events.device",
+            value=f"OpenGL {gl.version} of {gl.renderer}",
+            accepted="OpenGL 4.3, or events.device: cpu",
+        )

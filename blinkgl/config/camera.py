@@ -1,0 +1,200 @@
+"""``camera:`` of the YAML: size, intrinsics and lens.
+
+camera: {width: 346, height: 260, fov: 60}                       # a pin-hole camera
+camera: {width: 640, height: 480, focal: 560, lens: radtan, distortion: [-0.37, 0.19, 1.0e-4, -2.0e-4]}
+camera: {calibration: camchain.yaml, calibration_name: cam1}     # Kalibr's, or DSEC's cam_to_cam.yaml
+
+A calibration is read where the run is read and becomes the keys that it stands for, so that a sequence says all by
+itself.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+
+from blinkgl.camera import CAMERA_MODELS, CameraModel, focal_length
+from blinkgl.camera.drawing import seen_through
+from blinkgl.config.base import Config, Refused, rule
+from blinkgl.config.draw import is_distribution
+from blinkgl.errors import ConfigError
+
+_KEYS = ("width", "height", "lens", "distortion", "fov", "focal", "fx", "fy", "cx", "cy", "near")
+_OF_A_CALIBRATION = ("lens", "distortion", "fov", "focal", "fx", "fy", "cx", "cy")
+COUNTS = {"pinhole": (0,), "radtan": (4, 5), "equidistant": (4,)}
+"""How many coefficients a lens has."""
+
+
+class CameraConfig(Config):
+    """One camera, and its lens. Give the field of view, the focal length, or one for each axis."""
+
+    width: int = Field(346, ge=1, le=16384, description="columns, px")
+    height: int = Field(260, ge=1, le=16384, description="rows, px")
+    fov: float | None = Field(
+        None,
+        gt=0.01,
+        lt=179.9,
+        description="horizontal field of view, degrees, as it would be with all of `distortion` 0; default 60",
+    )
+    focal: float | None = Field(None, ge=1e-3, le=1e9, description="focal length, px (fx = fy)")
+    fx: float | None = Field(None, ge=1e-3, le=1e9, description="focal length along x, px; with fy")
+    fy: float | None = Field(None, ge=1e-3, le=1e9, description="focal length along y, px; with fx")
+    cx: float | None = Field(
+        None, ge=-1e6, le=1e6, description="principal point x, px; default the image centre, (width - 1) / 2"
+    )
+    cy: float | None = Field(None, ge=-1e6, le=1e6, description="principal point y, px; default (height - 1) / 2")
+    near: float = Field(0.05, ge=1e-9, le=1e9, description="near plane: nothing nearer is drawn, world units")
+    lens: Literal["pinhole", "radtan", "equidistant"] = Field(
+        "pinhole",
+        description="radtan: OpenCV's and Kalibr's plumb bob; equidistant: their fisheye (docs/cameras.md)",
+    )
+    distortion: tuple[float, ...] = Field(
+        (), max_length=8, description="of radtan k1, k2, p1, p2 and, if there is one, k3; of equidistant k1 to k4"
+    )
+    calibration: str | None = Field(
+        None,
+        description="YAML file of Kalibr (camchain) or DSEC (cam_to_cam): gives size, lens, distortion, fx, fy, cx "
+        "and cy, which it becomes when the run is read",
+    )
+    calibration_name: str | None = Field(
+        None, description="which camera of the calibration; default its only one, or cam0"
+    )
+
+    @rule("fov", "focal", "fx", "fy")
+    def _one_of(fov: float | None, focal: float | None, fx: float | None, fy: float | None):
+        if (fx is None) != (fy is None):
+            raise Refused("fx and fy come together; focal is both", where="fx" if fx is None else "fy", accepted="px")
+        if sum(value is not None for value in (fov, focal, fx)) > 1:
+            raise Refused("give fov or focal, not both" if fx is None else "give fov, focal, or fx and fy")
+
+    @rule("calibration", "calibration_name")
+    def _was_read(calibration: str | None, name: str | None):
+        if calibration is not None:
+            raise Refused(
+                "a calibration is read with the run's file", where="calibration", value=calibration, accepted="load()"
+            )
+        if name is not None:
+            raise Refused(
+                "the name of a camera of a file", where="calibration_name", value=name, accepted="calibration"
+            )
+
+    @rule("lens", "distortion")
+    def _coefficients(lens: str, distortion: tuple[float, ...]):
+        if len(distortion) not in COUNTS[lens]:
+            raise Refused(
+                f"{lens} has other coefficients" if COUNTS[lens] != (0,) else "a pin-hole camera does not distort",
+                where="distortion",
+                value=list(distortion),
+                accepted={
+                    "radtan": "4 or 5 of them, k1 k2 p1 p2 [k3]",
+                    "equidistant": "4 of them, k1 k2 k3 k4",
+                    "pinhole": "none, or lens: radtan or equidistant",
+                }[lens],
+            )
+
+    @rule(*_KEYS)
+    def _can_be_drawn(width: int, height: int, lens: str, distortion: tuple[float, ...], *rest: Any):
+        if lens == "pinhole" or len(distortion) not in COUNTS[lens]:  # of which its own rule speaks
+            return
+        try:
+            seen_through(_model(width, height, lens, distortion, *rest))
+        except ConfigError as error:
+            raise Refused(error.problem, where="distortion", value=error.value, accepted=error.accepted) from None
+
+    @property
+    def model(self) -> CameraModel:
+        """The camera that the keys describe."""
+        return _model(*(getattr(self, key) for key in _KEYS))
+
+    def scaled(self, factor: float) -> dict[str, Any]:
+        """The keys of a camera that sees the same with ``factor`` times the pixels in x and y,
+        as near as whole pixels come to it."""
+        said = {key: (value + 0.5) * factor - 0.5 for key in ("cx", "cy") if (value := getattr(self, key)) is not None}
+        said |= {key: value * factor for key in ("focal", "fx", "fy") if (value := getattr(self, key)) is not None}
+        said |= {"fov": self.fov} if self.fov is not None else {}
+        said |= {"lens": self.lens, "distortion": list(self.distortion)} if self.lens != "pinhole" else {}
+        return {
+            "width": max(1, round(self.width * factor)),
+            "height": max(1, round(self.height * factor)),
+            "near": self.near,
+            **said,
+        }
+
+
+def _model(width, height, lens, distortion, fov, focal, fx, fy, cx, cy, near) -> CameraModel:
+    kind = CAMERA_MODELS[lens]
+    if fx is None:
+        if focal is None:
+            angle = math.radians(60.0 if fov is None else fov)
+            focal = width / angle if lens == "equidistant" else focal_length(width, angle)
+        fx = fy = focal
+    cx, cy = (width - 1) / 2 if cx is None else cx, (height - 1) / 2 if cy is None else cy
+    return kind(width, height, fx, fy, cx, cy, near, **dict(zip(kind.coefficients, distortion)))
+
+
+def camera_radius(camera: CameraModel, clearance: float) -> float:
+    """How far a random world's camera keeps from everything: its clearance, or a little more
+    than the near plane's corners."""
+    return max(clearance, 1.01 * camera.near_corner)
+
+
+def with_calibrations(tree: dict[str, Any], base: Path) -> dict[str, Any]:
+    """A run's ``tree`` with every ``camera: {calibration: FILE}``, at the top and in groups, read from ``base`` and
+    replaced by what it says. Raises ConfigError."""
+    tree, groups = dict(tree), tree.get("groups")
+    if isinstance(groups, dict):
+        tree["groups"] = {
+            name: with_calibrations(group, base) if isinstance(group, dict) and "groups" not in group else group
+            for name, group in groups.items()
+        }
+    if isinstance(tree.get("camera"), dict) and tree["camera"].get("calibration") is not None:
+        tree["camera"] = calibrated(tree["camera"], base)
+    return tree
+
+
+def calibrated(camera: dict[str, Any], base: Path) -> dict[str, Any]:
+    """A ``camera:`` table with the keys of its calibration in that one's place. Raises ConfigError."""
+    from blinkgl.io.camchain import read_camchain
+
+    own = {key: value for key, value in camera.items() if key not in ("calibration", "calibration_name")}
+    given, name = camera["calibration"], camera.get("calibration_name")
+    for key, value in (("calibration", given), ("calibration_name", name)):
+        if is_distribution(value) or not isinstance(value, (str, type(None))):
+            raise ConfigError("not a text", where=f"camera.{key}", value=value, accepted="one, of a whole run")
+    if twice := [key for key in _OF_A_CALIBRATION if own.get(key) is not None]:
+        raise ConfigError(
+            "the calibration says that",
+            where=f"camera.{twice[0]}",
+            value=own[twice[0]],
+            accepted="either camera.calibration or the key",
+        )
+    chain = read_camchain(base / given)
+    if name is None:
+        name = next(iter(chain)) if len(chain) == 1 else "cam0"
+    if name not in chain:
+        raise ConfigError(
+            "no such camera in the calibration",
+            where="camera.calibration_name",
+            value=name,
+            accepted=f"one of {', '.join(chain)}",
+        )
+    seen = chain[name].camera
+    for key in ("width", "height"):
+        if own.get(key) is not None and own[key] != getattr(seen, key):
+            raise ConfigError(
+                f"the calibration is of another resolution, {seen.width}x{seen.height} px",
+                where=f"camera.{key}",
+                value=own[key],
+                accepted=f"{getattr(seen, key)}, or nothing",
+            )
+    return {**own, **camera_keys(seen)}
+
+
+def camera_keys(camera: CameraModel) -> dict[str, Any]:
+    """The keys of ``camera:`` that describe a camera model, without ``near``."""
+    said: dict[str, Any] = {"width": camera.width, "height": camera.height}
+    said |= zip(("fx", "fy", "cx", "cy"), camera.intrinsics)
+    return said | ({"lens": camera.kind, "distortion": list(camera.distortion)} if camera.coefficients else {})

@@ -1,0 +1,159 @@
+"""Sequences rendered while they are used: samples for training, without files."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+from blinkgl.config.recipe import derived_seed
+from blinkgl.config.sequence import RunTemplate
+from blinkgl.errors import ConfigError
+from blinkgl.front import arguments as check
+from blinkgl.front.runs import load
+from blinkgl.online.cuts import CUTS
+from blinkgl.online.job import StreamJob, stream_seed
+from blinkgl.online.samples import StreamSample, WindowSample
+from blinkgl.online.stream import SampleStream, StreamStats
+
+if TYPE_CHECKING:
+    from blinkgl.online.loader import Batches
+
+MAX_WINDOW_MS = 60_000
+
+
+class OnlineSequences:
+    """Samples of a recipe without an end, rendered by worker processes while you use them; no file is kept.
+
+        with OnlineSequences("recipe.yaml", window_ms=(5, 50), workers=2) as sequences:
+            for sample in sequences:                 # the process that trains, or
+                sample.new, sample.flow              # Events, (H, W, 2) float32 px
+            for batch in DataLoader(sequences.batches(8, collate), batch_size=None, num_workers=2):
+                ...                                  # torch: the same batches whatever num_workers
+
+    source : a recipe's path, or what :func:`load` gave of one. Groups are drawn by their numbers of sequences; each
+        sequence is drawn anew, so a recipe without anything to draw gives other windows of one scene.
+    kind : "windows" gives :class:`WindowSample`, two windows that meet and the flow over each; "streams" gives
+        :class:`StreamSample`, ``steps`` windows that follow each other and the flow over each.
+    window_ms : (shortest, longest) or one length, drawn log-uniformly for each sample; default: the recipe's label
+        interval.   steps : windows of a sample of kind "streams".
+    per_sequence : samples out of one sequence, mixed with those of seven others.
+    min_events : fewest events in each window.   max_flow : longest median of a sample's flow, px.   min_density :
+        fewest events per pixel of a window and px of its mean flow.   split : "train" or "test" groups.
+    workers : rendering processes, each with an OpenGL context and one thread; 0: this process, when asked.
+    seed : of everything.   rank : process of a distributed training; each has sequences of its own.
+    first : the sample to go on with; samples before it are not rendered, but for those mixed with it.
+
+    Sample n is a function of (recipe, seed, rank, n): not of workers, of who takes it, or of what came before. Every
+    sample is given once. Two blocks (of ``block`` samples, from eight sequences) are rendered ahead, then rendering
+    waits. Workers that die are replaced, sequences that fail are replaced by the next in a fixed order, and counted;
+    when half fail, the next sample raises. Memory does not grow with the number of samples.
+
+    stats : :class:`StreamStats`.   block : samples that are mixed with each other.   stream : what is below, a
+        :class:`~blinkgl.online.stream.SampleStream`.
+    Raises ConfigError (a bad recipe, or bad arguments here; a recipe that gives no samples, at the sample), AssetError,
+    GLError; EventDataError: a sample that was taken before, or after :meth:`close`."""
+
+    def __init__(
+        self,
+        source: str | RunTemplate,
+        *,
+        kind: str = "windows",
+        window_ms: float | Sequence[float] | None = None,
+        steps: int = 8,
+        per_sequence: int = 8,
+        min_events: int = 1,
+        max_flow: float = 400.0,
+        min_density: float = 0.0,
+        split: str = "train",
+        workers: int = 1,
+        seed: int = 0,
+        rank: int = 0,
+        first: int = 0,
+    ):
+        template = source if isinstance(source, RunTemplate) else load(source)
+        seed = check.seed(seed)
+        if check.whole(rank, "rank", 0, 1_000_000):
+            seed = derived_seed(seed, f"rank {rank}")
+        if kind not in CUTS:
+            raise ConfigError("unknown kind", where="kind", value=kind, accepted=", ".join(CUTS))
+        if split not in ("train", "test"):
+            raise ConfigError("unknown split", where="split", value=split, accepted="train, test")
+        job = StreamJob(
+            "",
+            "",
+            "",
+            kind,
+            check.whole(per_sequence, "per_sequence", 1, 1000),
+            _window_us(window_ms),
+            check.whole(steps, "steps", 1, 10_000),
+            check.whole(min_events, "min_events", 0, 1_000_000_000),
+            check.number(max_flow, "max_flow", above=0),
+            check.number(min_density, "min_density", least=0),
+            split,
+            seed,
+        )
+        self.first = check.whole(first, "first", 0, 2**62)
+        template = RunTemplate({**template.tree, "seed": stream_seed(template.seed, seed)}, template.base)
+        self.stream = SampleStream.of(template, job, workers=check.whole(workers, "workers", 0, 1024), first=self.first)
+
+    @property
+    def stats(self) -> StreamStats:
+        return self.stream.stats
+
+    @property
+    def block(self) -> int:
+        return self.stream.block
+
+    def __getitem__(self, n: int) -> WindowSample | StreamSample:
+        """Sample n, waited for; it is given once."""
+        return self.stream.take(check.whole(n, "n", self.first, 2**62))
+
+    def __iter__(self) -> Iterator[WindowSample | StreamSample]:
+        """Samples from ``first`` on, without an end."""
+        return (self.stream.take(n) for n in itertools.count(self.first))
+
+    def batches(self, size: int, collate: Callable[[list], Any] = list, *, count: int | None = None) -> Batches:
+        """A ``torch.utils.data.IterableDataset`` of batches: batch k is ``collate`` of the samples from
+        first + k · size on. For ``DataLoader(…, batch_size=None, num_workers=N)``: ``collate`` runs in the loader's
+        processes, and the batches and their order are the same whatever N.
+
+        collate : list of samples -> what a training step takes; of a module, so that loader processes find it.
+        count : how many batches; None: no end.   Raises ConfigError: torch is not installed."""
+        size = check.whole(size, "size", 1, 1_000_000)
+        count = None if count is None else check.whole(count, "count", 0, 2**62)
+        try:
+            from blinkgl.online.loader import Batches
+        except ImportError:
+            raise ConfigError(
+                "torch is not installed",
+                where="batches",
+                accepted="pip install 'blinkgl[learn]', or iterate without it",
+            ) from None
+        return Batches(self.stream, self.first, size, collate, count)
+
+    def close(self) -> None:
+        """Ends the workers and leaves nothing behind."""
+        self.stream.close()
+
+    def __enter__(self) -> OnlineSequences:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _window_us(given: float | Sequence[float] | None) -> tuple[int, int] | None:
+    if given is None:
+        return None
+    ends = list(check.plain(given)) if isinstance(check.plain(given), list) else [given, given]
+    if len(ends) != 2:
+        raise ConfigError(
+            "not lengths of windows", where="window_ms", value=given, accepted="a number of ms, or (shortest, longest)"
+        )
+    low, high = (check.number(end, "window_ms", least=0.001, most=MAX_WINDOW_MS) for end in ends)
+    if low > high:
+        raise ConfigError(
+            "the shortest is longer than the longest", where="window_ms", value=given, accepted="(shortest, longest)"
+        )
+    return round(1000 * low), round(1000 * high)

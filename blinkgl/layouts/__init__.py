@@ -1,0 +1,13 @@
+"""A data set as the loaders of other people's data sets expect it: their files, names, shapes, scales and clocks.
+
+In:    sequence directories
+Out:   folders that DSEC's, E-RAFT's, BlinkFlow's, MVSEC's, TAP-Vid's and MultiFlow's loaders open
+Start: export.py, then layout.py: a row of the table is a layout
+"""
+
+from blinkgl.layouts.export import export_layout
+from blinkgl.layouts.layout import Layout, Missing
+from blinkgl.layouts.source import Source
+from blinkgl.layouts.table import LAYOUTS, layout_of
+
+__all__ = ["LAYOUTS", "Layout", "Missing", "Source", "export_layout", "layout_of"]

@@ -1,0 +1,177 @@
+"""DSEC's folders (Gehrig et al., RA-L 2021, and the format page of the data set), and those that E-RAFT's loader opens.
+
+    <split>/<sequence>/
+      events/left/events.h5, rectify_map.h5        events/right/ likewise, of a stereo rig
+      flow/forward/%06d.png, forward_timestamps.txt    backward likewise
+      images/timestamps.txt                        two lines a label interval, as DSEC's images are
+      images/left/ev_inf/%06d.png                  what the event camera's own lens sees, at the flow's times
+      disparity/event/%06d.png, timestamps.txt     of a stereo rig with depth
+      calibration/cam_to_cam.yaml
+
+A file's number is its line in ``images/timestamps.txt``, so flow k is file 2k, as in the published sequences: loaders
+count on the step of two.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from blinkgl.camera import CameraModel, PinHole
+from blinkgl.camera.rectified import rectify_map
+from blinkgl.io.camchain import Calibrated, cam_to_cam_yaml
+from blinkgl.io.dsec import identity_rectify_map, write_rectify_map
+from blinkgl.io.flow_png import encode_png
+from blinkgl.layouts.files import copy, write_bytes, write_lines
+from blinkgl.layouts.layout import Layout, Missing, needs_flow
+from blinkgl.layouts.source import Source
+
+DISPARITY_SCALE = 256.0
+_PARALLEL = 1e-6
+"""By how much two cameras' axes and rows may differ for a disparity to be f b / Z."""
+_INTERVAL_US = 100_000
+"""E-RAFT's windows, written into its loader."""
+
+
+class Dsec(Layout):
+    """Training sequences with flow, and of a stereo rig with disparity."""
+
+    name = "dsec"
+    about = "DSEC's provider and event slicer, bflow, E-RAFT's training loaders, eflow"
+    size = (480, 640)
+
+    def missing(self, source: Source) -> list[Missing]:
+        return needs_flow(source)
+
+    def write(self, source: Source, folder: Path) -> list[str]:
+        said: list[str] = []
+        write_events(source, folder / "events/left")
+        for towards in ("forward", "backward"):
+            write_flow(source, towards, folder / "flow")
+        times = image_times(source)
+        write_lines(folder / "images/timestamps.txt", times)
+        for k, t in enumerate(source.image_times):
+            if t in times:
+                copy(source.file("images", k), folder / f"images/left/ev_inf/{times.index(t):06d}.png")
+        if source.right is not None:
+            write_events(source.right, folder / "events/right")
+            said += _write_disparity(source, source.right, folder / "disparity")
+        if source.camera is not None:
+            write_bytes(folder / "calibration/cam_to_cam.yaml", cam_to_cam(source, source.camera).encode())
+        return said
+
+
+class ERaft(Layout):
+    """Its loader reads a folder ``test`` alone, takes every second line of ``image_timestamps.txt`` but the first and
+    the last, and 100 ms of events on both sides of each."""
+
+    name = "eraft"
+    about = "E-RAFT's DSEC loader (test sequences, standard and warm start)"
+    size = (480, 640)
+
+    def missing(self, source: Source) -> list[Missing]:
+        found = needs_flow(source)
+        if found:
+            return found
+        times = source.flow_times("forward")
+        if any(b - a != _INTERVAL_US for a, b in times):
+            rate = 1e6 / (times[0][1] - times[0][0])
+            found.append(Missing(f"flow over 100 ms (labels come at {rate:g} Hz)", "time: {label_rate: 10}"))
+        if len(times) < 3:
+            found.append(Missing("a third label", "time: {duration: 0.3, label_rate: 10}"))
+        return found
+
+    def folder(self, source: Source) -> str:
+        return f"test/{source.name}"
+
+    def write(self, source: Source, folder: Path) -> list[str]:
+        write_events(source, folder / "events_left")
+        write_lines(folder / "image_timestamps.txt", image_times(source))
+        rows = [f"{a}, {b}, {2 * k}" for k, (a, b) in enumerate(source.flow_times("forward"))]
+        header = "# from_timestamp_us, to_timestamp_us, file_index"
+        write_lines(
+            folder / "test_forward_flow_timestamps.csv", [header, *rows[1:]]
+        )  # of label 0 its loader makes no sample
+        write_flow(source, "forward", folder / "flow")
+        return []
+
+
+def image_times(source: Source) -> list[int]:
+    """Times of DSEC's images, µs: those of the flow labels, the end of the last, and the middle between any two."""
+    times = source.flow_times("forward")
+    return [t for a, b in times for t in (a, (a + b) // 2)] + [times[-1][1]]
+
+
+def write_events(source: Source, folder: Path) -> None:
+    """``events.h5``, which is in DSEC's layout as it is, and ``rectify_map.h5``."""
+    copy(source.folder / "events.h5", folder / "events.h5")
+    camera = source.camera
+    flat = camera is None or isinstance(camera, PinHole)
+    write_rectify_map(
+        folder / "rectify_map.h5", identity_rectify_map(source.height, source.width) if flat else rectify_map(camera)
+    )
+
+
+def write_flow(source: Source, towards: str, folder: Path) -> None:
+    """``forward`` or ``backward``: PNGs by number, and their times."""
+    times = source.flow_times(towards)
+    if not times:
+        return
+    for k in range(len(times)):
+        copy(source.file(f"flow_{towards}", k), folder / f"{towards}/{2 * k:06d}.png")
+    write_lines(
+        folder / f"{towards}_timestamps.txt",
+        ["# from_timestamp_us, to_timestamp_us", *(f"{a}, {b}" for a, b in times)],
+    )
+
+
+def encode_disparity(disparity: np.ndarray) -> bytes:
+    """(H, W) px, not finite or <= 0: none. 16-bit PNG of round(256 d); what rounds to 0, or is 256 px and more, has no
+    code and becomes 0, "none"."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        code = np.rint(np.asarray(disparity, np.float64) * DISPARITY_SCALE)
+        holds = np.isfinite(code) & (code >= 1) & (code <= 65535)
+    return encode_png(np.where(holds, code, 0).astype(np.uint16))
+
+
+def _write_disparity(left: Source, right: Source, folder: Path) -> list[str]:
+    pair = _pair(left, right)
+    if pair is None:
+        return [f"{left.name}: no disparity: its cameras are not parallel, side by side and alike"]
+    times = left.flow_times("forward")
+    if left.count("depth") < len(times):
+        return [f"{left.name}: no disparity without 'labels: {{depth: true}}'"]
+    for k in range(len(times)):
+        disparity = pair[0] * pair[1] / left.value("depth", k)
+        write_bytes(folder / f"event/{2 * k:06d}.png", encode_disparity(disparity))
+    write_lines(folder / "timestamps.txt", [a for a, _ in times])
+    return []
+
+
+def _pair(left: Source, right: Source) -> tuple[float, float] | None:
+    """Focal length, px, and baseline, world units; None where a disparity is no f b / Z."""
+    eyes = left.camera, right.camera
+    if eyes[0] is None or eyes[1] is None or not np.allclose(eyes[0].K, eyes[1].K, rtol=0, atol=1e-9):
+        return None
+    T_left_right = np.linalg.inv(left.poses["T_world_cam"]) @ right.poses["T_world_cam"]
+    t = T_left_right[:, :3, 3]
+    turned = np.abs(T_left_right[:, :3, :3] - np.eye(3)).max()
+    aside = np.abs(t - [t[0, 0], 0, 0]).max()
+    parallel = t[0, 0] > 0 and max(turned, aside) < _PARALLEL * max(1.0, t[0, 0])
+    return (float(eyes[0].fx), float(t[0, 0])) if parallel else None
+
+
+def cam_to_cam(source: Source, camera: CameraModel) -> str:
+    """DSEC's calibration: cam0 and, of a stereo rig, cam3 are event cameras; ``camRectX`` is the one without
+    distortion; ``T_XY`` takes points from Y to X."""
+    right = source.right
+    if right is None or right.camera is None:
+        return cam_to_cam_yaml([Calibrated(camera)])
+    T_right_left = np.linalg.inv(right.poses["T_world_cam"][0]) @ source.poses["T_world_cam"][0]
+    tables = None
+    if (pair := _pair(source, right)) is not None:
+        focal, baseline = pair
+        Q = [[1.0, 0.0, 0.0, -camera.cx], [0.0, 1.0, 0.0, -camera.cy], [0.0, 0.0, 0.0, focal]]
+        tables = {"cams_03": [[float(v) for v in row] for row in (*Q, [0.0, 0.0, 1 / baseline, 0.0])]}
+    return cam_to_cam_yaml([Calibrated(camera), Calibrated(right.camera, T_right_left)], (0, 3), tables)

@@ -1,0 +1,69 @@
+"""A whole data set in another layout: it is there in full or not at all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from blinkgl.errors import AssetError, OutputError
+from blinkgl.io.atomic import atomic_folder
+from blinkgl.layouts.layout import Layout
+from blinkgl.layouts.source import Source, sources_of
+from blinkgl.layouts.table import layout_of
+
+
+@dataclass(frozen=True)
+class Exported:
+    """sequences : how many.   said : what a person should know of, a line each."""
+
+    sequences: int
+    said: tuple[str, ...]
+
+
+def export_layout(root: str | Path, out: str | Path, layout: str) -> Exported:
+    """Writes the data set (or the one sequence) ``root`` as the folder ``out``, in a layout of the table.
+
+    Raises, before anything is written, ConfigError: no such layout; AssetError: no sequences, a damaged one, or what
+    one lacks, with the YAML that makes it; OutputError: ``out`` exists or cannot be written, two sequences in one
+    place."""
+    row, root, out = layout_of(layout), Path(root), Path(out)
+    if not root.is_dir():
+        raise AssetError("no such data set", where=str(root), accepted="a folder of sequences")
+    sources = sources_of(root)
+    if not sources:
+        raise AssetError("no sequences found", where=str(root), accepted="a folder that 'blinkgl generate' wrote")
+    for source in sources:
+        _refuse_what_lacks(row, source)
+    places = _places(row, sources)
+    said = _size(row, sources)
+    with atomic_folder(out) as folder:
+        for source, place in zip(sources, places):
+            (folder / place).mkdir(parents=True, exist_ok=True)
+            said += row.write(source, folder / place)
+    return Exported(len(sources), tuple(said))
+
+
+def _refuse_what_lacks(row: Layout, source: Source) -> None:
+    if missing := row.missing(source):
+        raise AssetError(
+            f"layout '{row.name}' takes {' and '.join(m.what for m in missing)}, which this sequence does not have",
+            where=str(source.folder),
+            accepted="a data set made with " + ", ".join(f"'{m.yaml}'" for m in missing),
+        )
+
+
+def _places(row: Layout, sources: list[Source]) -> list[str]:
+    places = [f"{row.folder(source)}/{source.name}" for source in sources]
+    if twice := [place for place in places if places.count(place) > 1]:
+        raise OutputError("two sequences would be written to one place", where=f"layout '{row.name}'", value=twice[0])
+    return [row.folder(source) for source in sources]
+
+
+def _size(row: Layout, sources: list[Source]) -> list[str]:
+    if row.size is None:
+        return []
+    height, width = row.size
+    seen = ", ".join(f"{w}x{h}" for w, h in sorted({(s.width, s.height) for s in sources} - {(width, height)}))
+    if not seen:
+        return []
+    return [f"its published loaders expect {width}x{height} px, and this is {seen}: theirs have to be told"]

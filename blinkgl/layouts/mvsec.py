@@ -1,0 +1,102 @@
+"""MVSEC's files (Zhu et al., RA-L 2018; flow: RSS 2018).
+
+    <split>/<sequence>_data.hdf5         davis/left/events (N, 4) f8 = x, y, t [s], ±1; image_raw (n, H, W) u1,
+                                         image_raw_ts (n,) f8 s, image_raw_event_inds (n,) i8; imu (m, 6), imu_ts
+    <split>/<sequence>_gt.hdf5           davis/left/depth_image_raw, depth_image_rect (n, H, W) f4, NaN: nothing;
+                                         depth_image_raw_ts …; pose (n, 4, 4), pose_ts
+    <split>/<sequence>_gt_flow_dist.npz  timestamps (n,) s; x_flow_dist, y_flow_dist (n, H, W) px from one to the next
+
+``davis/right`` likewise, of a stereo rig. Without distortion raw and rectified images are the same. MVSEC has no mask:
+(0, 0) says that there is no flow, so a valid flow of exactly 0 is written as 1e-6 px.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from blinkgl.io.atomic import output_errors
+from blinkgl.io.imu import H5 as IMU, read_imu
+from blinkgl.layouts.files import append, growing
+from blinkgl.layouts.layout import Layout, Missing, needs_flow
+from blinkgl.layouts.source import Source
+
+_ALMOST_NOTHING = np.float32(1e-6)
+
+
+class Mvsec(Layout):
+    """Events, grey images, depth, poses and flow of DAVIS cameras."""
+
+    name = "mvsec"
+    about = "EV-FlowNet's and later loaders of MVSEC (hdf5 and *_gt_flow_dist.npz), eflow"
+    size = (260, 346)
+
+    def missing(self, source: Source) -> list[Missing]:
+        found = needs_flow(source)
+        if not source.image_times:
+            found.append(Missing("images", "labels: {images: true}"))
+        return found
+
+    def folder(self, source: Source) -> str:
+        return source.split
+
+    def write(self, source: Source, folder: Path) -> list[str]:
+        eyes = {"left": source, **({} if source.right is None else {"right": source.right})}
+        for ending, write in (("data", _data), ("gt", _truth)):
+            path = folder / f"{source.name}_{ending}.hdf5"
+            with output_errors(path), h5py.File(path, "w") as file:
+                for eye, one in eyes.items():
+                    write(one, file, f"davis/{eye}")
+        _flow(source, folder / f"{source.name}_gt_flow_dist.npz")
+        return []
+
+
+def _data(source: Source, file: h5py.File, group: str) -> None:
+    rows = growing(file, f"{group}/events", np.float64, (4,))
+    images = np.array(source.image_times, np.int64)
+    first = np.zeros(len(images), np.int64)  # number of the first event that is not before the image
+    for events in source.events():
+        append(rows, np.stack([events.x, events.y, events.t * 1e-6, events.p * 2.0 - 1], axis=1))
+        first += np.searchsorted(events.t, images, side="left")
+    pictures = growing(file, f"{group}/image_raw", np.uint8, (source.height, source.width), rows=1)
+    for k in range(len(images)):
+        append(pictures, source.grey(k)[None])
+    _keep(file, f"{group}/image_raw_ts", images * 1e-6)
+    _keep(file, f"{group}/image_raw_event_inds", np.minimum(first, len(rows) - 1))
+    if source.has(IMU):
+        imu = read_imu(source.folder)
+        _keep(file, f"{group}/imu", np.hstack([imu["acceleration"], imu["rate"]]))
+        _keep(file, f"{group}/imu_ts", imu["t_ns"] * 1e-9)
+
+
+def _truth(source: Source, file: h5py.File, group: str) -> None:
+    times = source.flow_times("forward")
+    if 0 < len(times) <= source.count("depth"):
+        for name in ("depth_image_raw", "depth_image_rect"):
+            maps = growing(file, f"{group}/{name}", np.float32, (source.height, source.width), rows=1)
+            for k in range(len(times)):
+                depth = source.value("depth", k)
+                append(maps, np.where(np.isfinite(depth), depth, np.float32(np.nan))[None])
+            _keep(file, f"{group}/{name}_ts", np.array([a * 1e-6 for a, _ in times]))
+    if "T_world_cam" in source.poses:
+        poses = source.poses["T_world_cam"]
+        _keep(file, f"{group}/pose", np.linalg.inv(poses[0]) @ poses)  # of the camera, in its first one's axes
+        _keep(file, f"{group}/pose_ts", source.poses["t_ns"] * 1e-9)
+
+
+def _flow(source: Source, path: Path) -> None:
+    times = source.flow_times("forward")
+    x, y = np.zeros((2, len(times), source.height, source.width), np.float32)
+    for k in range(len(times)):
+        flow, valid = source.flow("forward", k)
+        still = valid & (flow == 0).all(-1)
+        x[k] = np.where(still, _ALMOST_NOTHING, np.where(valid, flow[..., 0], 0))
+        y[k] = np.where(valid, flow[..., 1], 0)
+    with output_errors(path), open(path, "wb") as file:
+        np.savez(file, timestamps=np.array([a * 1e-6 for a, _ in times]), x_flow_dist=x, y_flow_dist=y)
+
+
+def _keep(file: h5py.File, name: str, array: np.ndarray) -> None:
+    file.create_dataset(name, data=array, track_times=False)

@@ -1,0 +1,182 @@
+"""A sequence directory as layouts look at it."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from blinkgl.camera import CameraModel, PinHole
+from blinkgl.errors import AssetError
+from blinkgl.events.types import Events
+from blinkgl.io.camchain import read_camchain
+from blinkgl.io.dsec import DsecEventReader
+from blinkgl.io.images import NpzReader, numpy_errors, read_image
+from blinkgl.io.index import sequence_folders
+from blinkgl.io.records import read_text
+from blinkgl.io.sequence_dir import MANIFEST, read_manifest, verify_sequence
+from blinkgl.labels import LABELS, Form
+
+CALIBRATION = "cam_to_cam.yaml"
+"""In the directory of a sequence whose lens distorts."""
+LEFT, RIGHT = "left", "right"
+"""Folders of a stereo rig's event cameras, each a sequence directory, in that of the rig."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """One sequence. Times are µs on its own clock; the events of :meth:`events` are on it, too.
+
+    folder : its directory.   manifest : what stands in there.   name : the directory's, or that of the rig it is on."""
+
+    folder: Path
+    manifest: dict[str, Any]
+    name: str
+
+    @classmethod
+    def open(cls, folder: Path, name: str | None = None) -> Source:
+        """Raises AssetError: no sequence, or files are missing or cut."""
+        if problems := verify_sequence(folder, checksums=False):
+            raise AssetError(
+                f"damaged sequence: {problems[0]}",
+                where=str(folder),
+                accepted="a data set that 'blinkgl verify' passes",
+            )
+        return cls(folder, read_manifest(folder), name or folder.name)
+
+    @property
+    def split(self) -> str:
+        return str(self.manifest.get("split") or "train")
+
+    @property
+    def height(self) -> int:
+        return self.manifest["height"]
+
+    @property
+    def width(self) -> int:
+        return self.manifest["width"]
+
+    @property
+    def start_us(self) -> int:
+        """When the recording begins: an interval before the first label."""
+        return self.manifest["t_offset_us"]
+
+    @property
+    def end_us(self) -> int:
+        """When it ends."""
+        return self.start_us + int(self.manifest.get("duration_us") or 0)
+
+    def has(self, name: str) -> bool:
+        """Whether the file ``name`` belongs to it."""
+        return name in self.manifest["files"]
+
+    def count(self, label: str) -> int:
+        """How many files of a label's first form there are."""
+        return sum(map(LABELS[label].forms[0].holds, self.manifest["files"]))
+
+    def flow_times(self, towards: str) -> list[tuple[int, int]]:
+        """(from, to) of every flow label; empty: there is none."""
+        stamps = _stamps(f"flow_{towards}")
+        return self._pairs(stamps) if self.has(stamps) else []
+
+    @functools.cached_property
+    def image_times(self) -> list[int]:
+        """Of the sRGB images; empty: there are none."""
+        stamps = _stamps("images")
+        return [int(line) for line in self._lines(stamps)] if self.has(stamps) else []
+
+    def file(self, label: str, k: int) -> Path:
+        """The ``k``-th file of a label, in its first form."""
+        return self.folder / LABELS[label].forms[0].file(k)
+
+    def flow(self, towards: str, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """(H, W, 2) float32 px and (H, W) bool, from the most exact form that there is. Raises AssetError."""
+        forms = {form.ending: form for form in LABELS[f"flow_{towards}"].forms}
+        for form in (forms["npy"], forms["flo"], forms["png"]):
+            if self.has(form.file(k)):
+                value = _read(form, self.folder / form.file(k))
+                return value.flow, value.valid
+        raise AssetError("no flow of this number", where=str(self.folder), value=k)
+
+    def image(self, k: int) -> np.ndarray:
+        """(H, W, 3) uint8 sRGB."""
+        image = read_image(self.file("images", k))
+        return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
+
+    def grey(self, k: int) -> np.ndarray:
+        """(H, W) uint8."""
+        return cv2.cvtColor(self.image(k), cv2.COLOR_RGB2GRAY)
+
+    def value(self, label: str, k: int) -> np.ndarray:
+        """The ``k``-th value of a label that is one array, (H, W[, C]); depth is inf where nothing is. AssetError."""
+        return _read(LABELS[label].forms[0], self.file(label, k))
+
+    def events(self, chunk: int = 1 << 20) -> Iterator[Events]:
+        """All events, in order, in pieces."""
+        with DsecEventReader(self.folder / "events.h5") as reader:
+            yield from reader.chunks(chunk)
+
+    @functools.cached_property
+    def poses(self) -> dict[str, np.ndarray]:
+        """The arrays of ``poses.npz``; none where a recording has no poses."""
+        path = self.folder / "poses.npz"
+        if not self.has("poses.npz"):
+            return {}
+        with numpy_errors(path), NpzReader(path) as arrays:
+            return {name: arrays[name] for name in arrays.names}
+
+    @functools.cached_property
+    def camera(self) -> CameraModel | None:
+        """Its model; None where a recording says nothing of it."""
+        if self.has(CALIBRATION):  # of a lens that distorts
+            return next(iter(read_camchain(self.folder / CALIBRATION).values())).camera
+        if "K" not in self.poses:
+            return None
+        (fx, _, cx), (_, fy, cy), _ = self.poses["K"].tolist()
+        return PinHole(self.width, self.height, fx, fy, cx, cy)
+
+    @functools.cached_property
+    def right(self) -> Source | None:
+        """The right event camera's sequence, where this is the left one's of a stereo rig. Raises as :meth:`open`."""
+        folder = self.folder.parent / RIGHT
+        there = self.folder.name == LEFT and (folder / MANIFEST).is_file()
+        return Source.open(folder, self.name) if there else None
+
+    def _lines(self, name: str) -> list[str]:
+        lines = read_text(self.folder / name).splitlines()
+        return [line for line in lines if line.strip() and not line.startswith("#")]
+
+    def _pairs(self, name: str) -> list[tuple[int, int]]:
+        try:
+            return [(int(a), int(b)) for a, b in (line.split(",") for line in self._lines(name))]
+        except ValueError:
+            raise AssetError("not pairs of times, µs", where=str(self.folder / name)) from None
+
+
+def _stamps(label: str) -> str:
+    stamps = LABELS[label].stamps
+    assert stamps is not None, label
+    return stamps
+
+
+def _read(form: Form, path: Path) -> Any:
+    assert form.read is not None, form.folder
+    return form.read(path)
+
+
+def sources_of(root: Path) -> list[Source]:
+    """The sequences of a data set, or ``root`` itself; of a stereo rig its left camera's. Raises as
+    :meth:`Source.open`."""
+    rigs = [
+        manifest.parents[1]
+        for pattern in ("", "*/", "*/*/")
+        for manifest in sorted(root.glob(f"{pattern}{LEFT}/{MANIFEST}"))
+        if not any(part.startswith(".") for part in manifest.relative_to(root).parts)
+    ]
+    alone = [f for f in sequence_folders(root) if f not in rigs and f.parent not in rigs]
+    return [*(Source.open(rig / LEFT, rig.name) for rig in rigs), *map(Source.open, alone)]

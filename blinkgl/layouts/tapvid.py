@@ -1,0 +1,57 @@
+"""TAP-Vid's pickles (Doersch et al., NeurIPS 2022), in the form of its DAVIS file: a table of one video.
+
+    <split>/<sequence>.pkl   {sequence: {"video": (T, H, W, 3) u1, "points": (N, T, 2) f4, "occluded": (N, T) bool}}
+
+Points are x, y as shares of width and height, counted from the image's corner. A time is there when it has an image.
+"""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+
+from blinkgl.io.tracks import TRACKS, read_tracks
+from blinkgl.layouts.files import write_bytes
+from blinkgl.layouts.layout import Layout, Missing
+from blinkgl.layouts.source import Source
+
+
+class TapVid(Layout):
+    """Videos with the tracks of points."""
+
+    name = "tapvid"
+    about = "TAP-Vid's DAVIS reader (TAPIR, CoTracker, BootsTAP: a pickle of NumPy arrays)"
+
+    def missing(self, source: Source) -> list[Missing]:
+        found = [] if source.has(TRACKS) else [Missing("point tracks", "tracks: {points: 256}")]
+        if not source.image_times:
+            found.append(Missing("images", "labels: {images: true}"))
+        if not found and len(_common(source, read_tracks(source.folder)["t_us"])[0]) < 2:
+            found.append(Missing("tracks at the images' times", "tracks: {points: 256}, without a rate"))
+        return found
+
+    def folder(self, source: Source) -> str:
+        return source.split
+
+    def write(self, source: Source, folder: Path) -> list[str]:
+        tracks = read_tracks(source.folder)
+        at, images = _common(source, tracks["t_us"])
+        hidden = tracks["occluded"][:, at]
+        ever = ~hidden.all(axis=1)  # what no frame shows cannot be asked for
+        share = (tracks["target_points"][:, at] + 0.5) / [source.width, source.height]
+        table = {
+            "video": np.stack([source.image(k) for k in images]),
+            "points": share[ever].astype(np.float32),
+            "occluded": hidden[ever],
+        }
+        write_bytes(folder / f"{source.name}.pkl", pickle.dumps({source.name: table}, protocol=4))
+        left = len(tracks["t_us"]) - len(at)
+        return [f"{source.name}: {left} of {len(tracks['t_us'])} times of the tracks have no image"] if left else []
+
+
+def _common(source: Source, t_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of the tracks' times at which there is an image, and of those images."""
+    _, at, images = np.intersect1d(t_us, source.image_times, return_indices=True)
+    return at, images

@@ -1,0 +1,120 @@
+"""What is cut out of a sequence: samples that have something to say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from typing import cast
+
+import numpy as np
+
+from blinkgl.errors import ConfigError
+from blinkgl.events.types import Events
+from blinkgl.labels.frames import Flow
+from blinkgl.online.job import StreamJob
+from blinkgl.online.samples import StreamSample, WindowSample
+from blinkgl.sequence import Simulation
+
+_LEAST_PX = 0.3  # shorter flow counts as so long where density is asked for
+_CANDIDATES = 6  # places drawn for each sample that is wanted
+
+Sample = WindowSample | StreamSample
+Cut = Callable[[Simulation, StreamJob, str, int, np.random.Generator], Iterator[Sample]]
+"""(sequence, job, name of the sequence, how many are wanted at most, dice) -> samples."""
+
+
+def windows(
+    sequence: Simulation, job: StreamJob, name: str, wanted: int, dice: np.random.Generator
+) -> Iterator[WindowSample]:
+    """Pairs of windows at times and of lengths of their own."""
+    events = sequence.gather()
+    for start, span in _places(sequence, job, 2, wanted, dice):
+        t = start + span
+        old, new = events.window(start, t), events.window(t, t + span)
+        if min(len(old), len(new)) < job.min_events:
+            continue
+        truth = sequence.truth(t * 1000, span * 1000).frame
+        forward, backward = cast(Flow, truth.forward), truth.backward
+        if not _moves_as_asked(job, forward.flow[forward.valid], forward.valid.size, [new]):
+            continue
+        yield WindowSample(
+            old,
+            new,
+            t,
+            span,
+            forward.flow,
+            forward.valid,
+            None if backward is None else backward.flow,
+            None if backward is None else backward.valid,
+            f"{name}/{t}us+{span}us",
+        )
+        wanted -= 1
+        if wanted == 0:
+            return
+
+
+def streams(
+    sequence: Simulation, job: StreamJob, name: str, wanted: int, dice: np.random.Generator
+) -> Iterator[StreamSample]:
+    """Stretches of ``job.steps`` windows that follow each other."""
+    events = sequence.gather()
+    for start, span in _places(sequence, job, job.steps, wanted, dice):
+        edges = start + span * np.arange(job.steps + 1, dtype=np.int64)
+        parts = [events.window(int(a), int(b)) for a, b in pairwise(edges)]
+        if min(len(part) for part in parts) < job.min_events:
+            continue
+        frames = [sequence.truth(int(t) * 1000, span * 1000).frame.forward for t in edges[:-1]]
+        flow, valid = (np.stack([getattr(frame, key) for frame in frames]) for key in ("flow", "valid"))
+        if not _moves_as_asked(job, flow[valid], valid[0].size, parts):
+            continue
+        yield StreamSample(tuple(parts), edges, flow, valid, f"{name}/{start}us+{job.steps}x{span}us")
+        wanted -= 1
+        if wanted == 0:
+            return
+
+
+CUTS: dict[str, Cut] = {"windows": windows, "streams": streams}
+
+
+def _moves_as_asked(job: StreamJob, flow: np.ndarray, pixels: int, parts: list[Events]) -> bool:
+    """Whether flow is there, not too long, and every px of it has its share of events."""
+    lengths = np.hypot(*flow[::7].T)
+    if not len(lengths) or np.median(lengths) > job.max_flow:
+        return False
+    events = sum(len(part) for part in parts)
+    return events >= job.min_density * len(parts) * pixels * max(float(lengths.mean()), _LEAST_PX)
+
+
+def _places(
+    sequence: Simulation, job: StreamJob, steps: int, wanted: int, dice: np.random.Generator
+) -> list[tuple[int, int]]:
+    drawn = drawn_spans(
+        dice,
+        -(-sequence.t0_ns // 1000),
+        sequence.t1_ns // 1000,
+        _CANDIDATES * wanted,
+        job.window_us or (sequence.config.time.interval_ns // 1000,) * 2,
+        steps,
+    )
+    return list(dict.fromkeys(drawn))  # a short sequence has few places, and none is a sample twice
+
+
+def drawn_spans(
+    rng: np.random.Generator, t0_us: int, t1_us: int, count: int, window_us: tuple[int, int], steps: int = 2
+) -> list[tuple[int, int]]:
+    """``count`` beginnings and lengths (t, span), µs, with [t, t + steps · span) inside [t0, t1]: lengths log-uniform
+    in ``window_us``, as far as the sequence is long enough, places uniform.
+
+    Raises ConfigError: a sequence that is shorter than ``steps`` of the shortest."""
+    longest = min(window_us[1], (t1_us - t0_us) // steps)
+    if longest < window_us[0]:
+        raise ConfigError(
+            f"a sequence of {(t1_us - t0_us) / 1000:g} ms holds no {'two' if steps == 2 else steps} windows of "
+            f"{window_us[0] / 1000:g} ms",
+            where="time.duration",
+            accepted="a longer one, or shorter window_ms",
+        )
+    spans = np.rint(np.exp(rng.uniform(np.log(window_us[0]), np.log(longest), count))).astype(np.int64)
+    spans = np.clip(spans, window_us[0], longest)
+    times = t0_us + np.floor(rng.random(count) * (t1_us - t0_us - steps * spans + 1)).astype(np.int64)
+    return [(int(t), int(span)) for t, span in zip(times, spans, strict=True)]

@@ -1,0 +1,81 @@
+"""What a stream is made of, in plain data, so that worker processes can be told."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+from blinkgl.config.reader import parse_yaml
+from blinkgl.config.recipe import Group, derived_seed
+from blinkgl.config.sequence import RunTemplate
+from blinkgl.dataset.plan import Plan
+from blinkgl.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class StreamJob:
+    """What is rendered.
+
+    recipe : YAML text, its seed already the stream's (:func:`stream_seed`).   base : folder that its paths start from.
+    kind : what a sample is, a key of :data:`blinkgl.online.cuts.CUTS`.   samples : of a slot.
+    window_us : shortest and longest window, µs, drawn log-uniformly for each sample; None: the recipe's label interval.
+    steps : windows of a sample of kind "streams".   min_events : fewest events in each window.
+    max_flow : longest median of the flow in a sample, px.   min_density : fewest events per pixel of a window and px of
+    its mean flow.   split : which groups.   seed : of windows and their order.   out : the spool folder."""
+
+    out: str
+    base: str
+    recipe: str
+    kind: str = "windows"
+    samples: int = 8
+    window_us: tuple[int, int] | None = None
+    steps: int = 8
+    min_events: int = 1
+    max_flow: float = 400.0
+    min_density: float = 0.0
+    split: str = "train"
+    seed: int = 0
+    maker: ClassVar[str] = "blinkgl.online.maker:SlotMaker"
+
+    def plan(self) -> Plan:
+        """Raises ConfigError: a bad recipe, or one without groups of the split."""
+        return _plan(self.recipe, self.base, self.split)
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+@lru_cache(maxsize=8)
+def _plan(recipe: str, base: str, split: str) -> Plan:
+    tree = parse_yaml(recipe, "recipe")
+    of_split = [g for g in RunTemplate(tree, Path(base)).groups if g.enabled and _split_of(g) == split]
+    if not of_split:
+        raise ConfigError(f"the recipe has nothing of split '{split}'", where="output.split")
+    if "groups" in tree:
+        names = {group.name for group in of_split}
+        for name, group in tree["groups"].items():
+            group["enabled"] = name in names
+    plan = Plan.of(RunTemplate(tree, Path(base)))
+    for group in plan.used:
+        if group.template.check().frames is not None:
+            raise ConfigError("recorded frames are not rendered", where="frames", accepted="blinkgl generate, and path")
+        if "forward" not in (flow := flow_labels(group)):
+            raise ConfigError("no flow to learn from", where="labels.flow", value=flow)
+    return plan
+
+
+def flow_labels(group: Group) -> list[str]:
+    """``labels.flow`` of a group."""
+    return list(group.template.check().labels.model_dump()["flow"])
+
+
+def _split_of(group: Group) -> str:
+    return group.template.check().output.split
+
+
+def stream_seed(recipe_seed: int, seed: int) -> int:
+    """The recipe's seed in a stream of seed ``seed``: other sequences than ``blinkgl generate`` makes of the recipe,
+    unless it is told ``--seed`` of this."""
+    return derived_seed(recipe_seed, f"online/{seed}")

@@ -1,0 +1,98 @@
+"""Slots, rendered: what a worker process does for a stream."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from blinkgl.config.recipe import Group
+from blinkgl.dataset.plan import sequence_name
+from blinkgl.dataset.work import Maker, Message, failed
+from blinkgl.errors import may_pass
+from blinkgl.online.cuts import CUTS
+from blinkgl.online.job import StreamJob
+from blinkgl.sequence import simulate_sequence
+
+TRIES = 8
+"""Sequences of a slot that may give nothing, before it is given up."""
+_APART = 1_000_000  # between numbers of a slot's sequences
+
+
+class SlotMaker(Maker):
+    """Makes slots: ``samples`` files each in the spool folder. The "done" says how many sequences that took
+    ("sequences"), how many of them failed ("failures"), and with what ("last")."""
+
+    job: StreamJob
+
+    @classmethod
+    def of(cls, job: Mapping[str, Any], device: int | None) -> SlotMaker:
+        window = job["window_us"]
+        return cls(StreamJob(**{**job, "window_us": None if window is None else tuple(window)}), device)
+
+    def __init__(self, job: StreamJob, device: int | None = None):
+        super().__init__(job, device)
+        self._driver = os.getppid()
+
+    def __exit__(self, *_: object) -> None:
+        super().__exit__()
+        if os.getppid() != self._driver:  # it was killed, and nobody else tidies up
+            shutil.rmtree(self.job.out, ignore_errors=True)
+
+    def make(self, number: int, attempt: int, tell: Any) -> Message:
+        """The slot of this number. Only KeyboardInterrupt and SystemExit get out."""
+        job, began, made, failures, barren, last, tried = self.job, time.process_time(), 0, 0, 0, "", 0
+        while made < job.samples and barren < TRIES:
+            tried, before = tried + 1, made
+            index = number + (tried - 1) * _APART
+            group = self._group(number, tried)
+            try:
+                config = group.template.sequence(index)
+                name = sequence_name(config.output, index).split("/")[1]
+                with simulate_sequence(config, index, self.gl, base=Path(job.base), labels=False) as sequence:
+                    for sample in CUTS[job.kind](sequence, job, name, job.samples - made, self._dice(number, tried, 1)):
+                        sample.write(sample_file(Path(job.out), number, made))
+                        made += 1
+            except Exception as error:  # noqa: BLE001 - whatever it is, the next sequence goes on
+                message = failed(number, error)
+                if may_pass(error) or message["stop"]:
+                    return message  # the machine's trouble: somebody else tries the same again
+                failures, last = failures + 1, f"{_name_of(group, index)}: {message['error']}"
+            if made == before:
+                barren += 1
+                last = last or f"{_name_of(group, index)}: no window as asked for, with {job.min_events} events"
+        report = {
+            "task": number,
+            "sequences": tried,
+            "failures": failures,
+            "last": last,
+            "cpu_s": time.process_time() - began,
+        }
+        if made == job.samples:
+            return {"kind": "done", **report}
+        error = f"{tried} sequences gave {made} of {job.samples} samples; the first that gave none: {last}"
+        return {"kind": "failed", "error": error, "expected": True, "final": True, "stop": False, **report}
+
+    def _group(self, slot: int, tried: int) -> Group:
+        """By the groups' numbers of sequences. (By dice, not in turn: what ``shares`` deals out goes in turn.)"""
+        used = self.plan.used
+        counts = np.array([self.plan.counts[group.name] for group in used], float)
+        return used[int(self._dice(slot, tried, 0).choice(len(used), p=counts / counts.sum()))]
+
+    def _dice(self, slot: int, tried: int, what: int) -> np.random.Generator:
+        return np.random.default_rng(np.random.SeedSequence(self.job.seed, spawn_key=(4, slot, tried, what)))
+
+
+def sample_file(spool: Path, slot: int, item: int) -> Path:
+    """Where a sample lies in the spool folder."""
+    return spool / f"{slot:09d}_{item:03d}.npz"
+
+
+def _name_of(group: Group, index: int) -> str:
+    """ "davis240_000017"."""
+    return f"{group.name or 'sequence'}_{index:06d}"

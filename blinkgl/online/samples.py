@@ -1,0 +1,121 @@
+"""What a stream gives, and how it lies in the spool folder for a moment."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from blinkgl.events.types import Events
+
+_COLUMNS = ("x", "y", "t", "p")
+
+
+@dataclass(frozen=True, eq=False)
+class WindowSample:
+    """Two windows of events that meet, and the flow over each.
+
+    old, new : events of [t - Δ, t) and [t, t + Δ), µs of the sequence's clock.   t_us, span_us : t and Δ.
+    flow : (H, W, 2) float32 px, t -> t + Δ at reference t, +x right, +y down.   valid : (H, W) bool.
+    backward, backward_valid : the same of t -> t - Δ, where the recipe has that label; else None.
+    name : "davis240_000017/31250us+20000us": group and number of the sequence, t and Δ."""
+
+    old: Events
+    new: Events
+    t_us: int
+    span_us: int
+    flow: np.ndarray
+    valid: np.ndarray
+    backward: np.ndarray | None
+    backward_valid: np.ndarray | None
+    name: str
+
+    @property
+    def height(self) -> int:
+        return self.valid.shape[0]
+
+    @property
+    def width(self) -> int:
+        return self.valid.shape[1]
+
+    def write(self, path: Path) -> None:
+        """``path`` (.npz), whole or not at all: who waits for the name finds all of it."""
+        arrays = _columns(old=self.old, new=self.new) | {"flow": self.flow, "valid": self.valid}
+        if self.backward is not None:
+            arrays |= {"backward": self.backward, "backward_valid": self.backward_valid}
+        _save(path, name=np.array(self.name), t=np.array(self.t_us), span=np.array(self.span_us), **arrays)
+
+
+@dataclass(frozen=True, eq=False)
+class StreamSample:
+    """Windows of one sequence that follow each other, for networks with a memory.
+
+    windows : K times the events of [t_k, t_k+1).   t_us : (K + 1,) int64 µs of the sequence's clock, evenly spaced.
+    flow : (K, H, W, 2) float32 px, t_k -> t_k+1 at reference t_k.   valid : (K, H, W) bool.
+    name : "davis240_000017/31250us+8x20000us": group and number of the sequence, first time, windows."""
+
+    windows: tuple[Events, ...]
+    t_us: np.ndarray
+    flow: np.ndarray
+    valid: np.ndarray
+    name: str
+
+    @property
+    def height(self) -> int:
+        return self.valid.shape[1]
+
+    @property
+    def width(self) -> int:
+        return self.valid.shape[2]
+
+    def write(self, path: Path) -> None:
+        """As :meth:`WindowSample.write`."""
+        arrays = _columns(all=Events.concatenate(self.windows))
+        counts = np.array([len(window) for window in self.windows])
+        _save(
+            path, name=np.array(self.name), times=self.t_us, counts=counts, flow=self.flow, valid=self.valid, **arrays
+        )
+
+
+def read_sample(path: Path) -> WindowSample | StreamSample:
+    """What either ``write`` wrote. Raises FileNotFoundError; ValueError, KeyError: another file."""
+    with np.load(path, allow_pickle=False) as z:
+        arrays = {key: z[key] for key in z.files}
+    name = str(arrays["name"])
+    if "times" in arrays:
+        events = _events(arrays, "all")
+        ends = np.cumsum(arrays["counts"])
+        windows = tuple(
+            Events(*(getattr(events, c)[start:end] for c in _COLUMNS))
+            for start, end in zip(ends - arrays["counts"], ends, strict=True)
+        )
+        return StreamSample(windows, arrays["times"], arrays["flow"], arrays["valid"], name)
+    return WindowSample(
+        _events(arrays, "old"),
+        _events(arrays, "new"),
+        int(arrays["t"]),
+        int(arrays["span"]),
+        arrays["flow"],
+        arrays["valid"],
+        arrays.get("backward"),
+        arrays.get("backward_valid"),
+        name,
+    )
+
+
+def _columns(**events: Events) -> dict[str, np.ndarray]:
+    return {f"{side}_{c}": getattr(e, c) for side, e in events.items() for c in _COLUMNS}
+
+
+def _events(arrays: dict[str, np.ndarray], side: str) -> Events:
+    return Events(*(arrays[f"{side}_{c}"] for c in _COLUMNS))
+
+
+def _save(path: Path, **arrays: Any) -> None:
+    temporary = path.with_suffix(f".{os.getpid()}")
+    with open(temporary, "wb") as file:
+        np.savez(file, **arrays)
+    os.replace(temporary, path)

@@ -1,0 +1,289 @@
+"""Samples that are rendered while they are used, in their order.
+
+Worker processes (:class:`~blinkgl.dataset.executor.Local`'s, each with an OpenGL context of its own and one thread)
+render sequences and cut several samples out of each. What comes of it lies for a moment in a spool folder in memory,
+from where the process that asked, or loader processes that it started, take it.
+
+*Reproducible*: sample n is item ``n % samples`` of slot ``n // samples``, after the slots' samples have been mixed
+block by block; a slot is a pure function of (recipe, seed, number of the slot), whoever makes it, and always has as
+many samples. Where a sequence fails, or gives too few, others of the same slot fill it up, in a fixed order. No sample
+comes twice. *Back-pressure*: slots are ordered up to a block ahead of what has been taken, and no further.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from blinkgl.config.reader import to_yaml
+from blinkgl.config.sequence import RunTemplate
+from blinkgl.dataset.executor import Executor, Inline, Local
+from blinkgl.dataset.work import Message
+from blinkgl.errors import BlinkGLError, ConfigError, EventDataError
+from blinkgl.online.cuts import Sample
+from blinkgl.online.job import StreamJob, flow_labels
+from blinkgl.online.maker import sample_file
+from blinkgl.online.samples import read_sample
+
+MIX = 8
+"""Slots whose samples are mixed: a batch then has samples of different sequences."""
+_ATTEMPTS = 3  # at a slot whose worker died
+_SLOT_S = 900.0  # longest for a slot
+_FREE_FAILURES, _FAILURE_SHARE = 10, 0.5
+_SPOOL_FREE = 2**30
+_ERROR = "error"
+_GONE = ".gone"  # instead of .npz: this sample was taken
+_BASE = "base"  # first slot that is still wanted, for takers in other processes
+
+
+@dataclass
+class StreamStats:
+    """slots, samples, sequences, failures : made so far.   cpu_s : processor seconds of the workers for them.
+    replaced : workers that died.   waited_s : wall seconds that :meth:`SampleStream.take` has waited in this process,
+    of ``open_s`` wall seconds since the stream was opened."""
+
+    slots: int = 0
+    samples: int = 0
+    sequences: int = 0
+    failures: int = 0
+    replaced: int = 0
+    cpu_s: float = 0.0
+    waited_s: float = 0.0
+    opened: float = 0.0
+
+    @property
+    def open_s(self) -> float:
+        return time.monotonic() - self.opened
+
+
+class SampleStream:
+    """Samples without an end. Sample n is the same whoever asks; :meth:`take` gives it once.
+
+    workers : rendering processes; 0 renders in this process, when a sample is asked for. (A copy in a loader process
+    takes what the owner's workers make.)   first : sample that is taken first, when a run is resumed.
+    ahead : blocks that are rendered before they are asked for.   block : samples that are mixed with each other.
+    stats : :class:`StreamStats`.   spool : folder where samples lie for a moment.
+    Raises BlinkGLError: a recipe that cannot be rendered here. :meth:`take` raises ConfigError: one that gives no
+    samples; EventDataError: a sample that was taken, and after :meth:`close`."""
+
+    def __init__(self, job: StreamJob, workers: int = 1, first: int = 0, ahead: int = 1):
+        plan = job.plan()
+        self.has_backward = all("backward" in flow_labels(group) for group in plan.used)
+        self.block = MIX * job.samples
+        self.stats = StreamStats(opened=time.monotonic())
+        self.first = first
+        self.spool = Path(_spool_folder())
+        self.job = replace(job, out=str(self.spool))
+        self._owner, self._ahead, self._workers = os.getpid(), ahead, workers
+        self._base = first // self.block * MIX  # first slot that is still wanted
+        self._next, self._stop, self._thread = self._base, False, None
+        self._executor: Executor | None = None
+        try:
+            for n in range(first // self.block * self.block, first):
+                self._mark(*self._place(n))
+            self._executor = Inline() if workers == 0 else Local(workers, cores=workers)
+            self._executor.open(self.job)
+        except BaseException:
+            self.close()
+            raise
+        if workers:
+            self._thread = threading.Thread(target=self._drive, name="online", daemon=True)
+            self._thread.start()
+
+    @classmethod
+    def of(cls, template: RunTemplate, job: StreamJob, **how: Any) -> SampleStream:
+        """The stream of a recipe: ``job`` with ``template`` filled in. Raises as the class."""
+        text = to_yaml(template.tree)
+        return cls(replace(job, base=str(template.base.resolve()), recipe=text), **how)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A taker from the spool, without the workers."""
+        return {**self.__dict__, "_executor": None, "_thread": None}
+
+    def take(self, n: int) -> Sample:
+        """Sample n, waited for; nobody else gets it."""
+        sample = self.peek(n)
+        self._mark(*self._place(n))
+        return sample
+
+    def peek(self, n: int) -> Sample:
+        """Sample n, waited for; it stays."""
+        return read_sample(self._wait(n))
+
+    def move(self, n: int, to: Path) -> None:
+        """Sample n as the file ``to``, which must not exist; as :meth:`take`. Raises OSError."""
+        shutil.copyfile(self._wait(n), to)
+        self._mark(*self._place(n))
+
+    def _wait(self, n: int) -> Path:
+        slot, item = self._place(n)
+        path = sample_file(self.spool, slot, item)
+        began = time.monotonic()
+        while self._refused(slot, path) or not path.is_file():
+            if not self._workers:
+                if os.getpid() != self._owner or self._executor is None:
+                    raise EventDataError(
+                        "loader processes do not render", where="workers", value=0, accepted="1 or more"
+                    )
+                self._make(slot)
+            else:
+                time.sleep(0.003)
+            self.stats.waited_s += time.monotonic() - began
+            began = time.monotonic()
+        return path
+
+    def _place(self, n: int) -> tuple[int, int]:
+        """Slot and item of sample n: the samples of a block, shuffled."""
+        block, place = divmod(n, self.block)
+        mixed = int(_order(self.job.seed, block, self.block)[place])
+        return block * MIX + mixed // self.job.samples, mixed % self.job.samples
+
+    def _mark(self, slot: int, item: int) -> None:
+        path = sample_file(self.spool, slot, item)
+        path.with_suffix(_GONE).touch()
+        path.unlink(missing_ok=True)
+        if self._thread is None and os.getpid() == self._owner:
+            self._advance()
+
+    def _refused(self, slot: int, path: Path) -> bool:
+        """Raises what keeps the sample from ever coming; else False."""
+        mine = os.getpid() == self._owner
+        if path.with_suffix(_GONE).exists() or slot < (self._base if mine else self._told_base()):
+            raise EventDataError("this sample was taken", where=f"slot {slot}")
+        try:
+            said = (self.spool / _ERROR).read_text(encoding="utf-8")
+        except OSError:
+            if not self.spool.is_dir():
+                raise EventDataError("the online source is closed", where=f"slot {slot}") from None
+            return False
+        if path.is_file():  # what was there before is good
+            return False
+        raise ConfigError(said, where="recipe")
+
+    def _told_base(self) -> int:
+        with suppress(OSError, ValueError):
+            return int((self.spool / _BASE).read_text())
+        return 0
+
+    def close(self) -> None:
+        """Ends the workers and leaves nothing behind. Harmless when repeated, and in a taker."""
+        if os.getpid() != self._owner:
+            return
+        self._stop = True
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        elif self._executor is not None:
+            self._executor.close()
+        self._executor = None
+        shutil.rmtree(self.spool, ignore_errors=True)
+
+    def __enter__(self) -> SampleStream:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # -- the owner's side --
+
+    def _advance(self) -> None:
+        """Forgets the blocks all of whose samples were taken; more may be rendered then."""
+        while True:
+            if not all(mark.exists() for mark in self._marks()):
+                return
+            marks = list(self._marks())
+            self._base += MIX
+            (self.spool / _BASE).write_text(str(self._base))  # before the marks go: who asks again has to be told
+            for mark in marks:
+                mark.unlink()
+
+    def _marks(self) -> Iterator[Path]:
+        """Where the block that is wanted first has its marks, when all was taken."""
+        for slot in range(self._base, self._base + MIX):
+            for item in range(self.job.samples):
+                yield sample_file(self.spool, slot, item).with_suffix(_GONE)
+
+    def _drive(self) -> None:
+        """Keeps the workers at slots up to a block ahead; the only thread that talks to them."""
+        executor, again = cast(Executor, self._executor), []
+        running: dict[int, tuple[int, float]] = {}  # slot -> attempt, since when
+        try:
+            while not self._stop:
+                self._advance()
+                while executor.free() and (again or self._next < self._base + MIX * (1 + self._ahead)):
+                    slot, attempt = again.pop() if again else (self._next, 1)
+                    self._next = max(self._next, slot + 1)
+                    running[slot] = attempt, time.monotonic()
+                    executor.submit(slot, attempt)
+                for message in executor.poll(0.05):
+                    if message["kind"] in ("done", "failed"):
+                        slot = message["task"]
+                        attempt, _ = running.pop(slot)
+                        if self._counted(message, attempt):
+                            again.append((slot, attempt + 1))
+                for slot, (_, since) in running.items():
+                    if time.monotonic() - since > _SLOT_S:
+                        executor.kill(slot, f"a slot took longer than {_SLOT_S:.0f} s")
+        except BlinkGLError as error:
+            self._give_up(str(error))
+        except Exception as error:  # noqa: BLE001 - whoever waits for samples has to hear of it
+            self._give_up(f"{type(error).__name__}: {error}")
+        finally:
+            with suppress(Exception):
+                executor.close()
+
+    def _make(self, slot: int) -> None:
+        executor = cast(Executor, self._executor)
+        executor.submit(slot, _ATTEMPTS)
+        for message in executor.poll(0.0):
+            self._counted(message, _ATTEMPTS)
+
+    def _counted(self, message: Message, attempt: int) -> bool:
+        """Takes note of a slot's end; whether it has to be tried again."""
+        stats = self.stats
+        stats.sequences += message.get("sequences", 0)
+        stats.failures += message.get("failures", 0)
+        stats.cpu_s += message.get("cpu_s", 0.0)
+        if message["kind"] == "done":
+            stats.slots, stats.samples = stats.slots + 1, stats.samples + self.job.samples
+            if stats.failures > _FREE_FAILURES + _FAILURE_SHARE * stats.sequences:
+                self._give_up(f"{stats.failures} of {stats.sequences} sequences failed, the last: {message['last']}")
+            return False
+        died = "expected" not in message
+        stats.replaced += died
+        if not message["final"] and not message["stop"] and attempt < _ATTEMPTS:
+            return True
+        self._give_up(message["error"] + (f" ({attempt} times)" if died else ""))
+        return False
+
+    def _give_up(self, said: str) -> None:
+        self._stop = True
+        temporary = self.spool / (_ERROR + ".tmp")
+        with suppress(OSError):
+            temporary.write_text(said, encoding="utf-8")
+            os.replace(temporary, self.spool / _ERROR)
+
+
+@lru_cache(maxsize=4)
+def _order(seed: int, block: int, size: int) -> np.ndarray:
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(5, block))).permutation(size)
+
+
+def _spool_folder() -> str:
+    """In memory where there is room, else where temporary files go."""
+    shared = Path("/dev/shm")
+    with suppress(OSError):
+        if os.access(shared, os.W_OK) and shutil.disk_usage(shared).free > _SPOOL_FREE:
+            return tempfile.mkdtemp(prefix="blinkgl-online-", dir=shared)
+    return tempfile.mkdtemp(prefix="blinkgl-online-")

@@ -1,0 +1,156 @@
+"""``camera:``: lenses, calibrations, and what is said of those that cannot be drawn."""
+
+import math
+
+import numpy as np
+import pytest
+
+import blinkgl
+from blinkgl.camera import Equidistant, PinHole, Radtan
+from blinkgl.camera.drawing import DENSITY, seen_through
+from blinkgl.config.base import validate
+from blinkgl.config.camera import CameraConfig, camera_keys
+from blinkgl.config.sequence import load_run
+from blinkgl.errors import ConfigError
+from blinkgl.io.camchain import Calibrated, cam_to_cam_yaml, camchain_yaml, read_camchain
+
+RADTAN = {"width": 120, "height": 90, "fx": 95.0, "fy": 99.0, "cx": 60.5, "cy": 43.0, "lens": "radtan"}
+RADTAN["distortion"] = [-0.32, 0.11, 1e-3, -2e-3]
+
+
+def camera(**keys):
+    return validate(CameraConfig, keys, where="camera")
+
+
+def test_the_keys_are_the_models():
+    assert camera(**RADTAN).model == Radtan(120, 90, 95.0, 99.0, 60.5, 43.0, 0.05, -0.32, 0.11, 1e-3, -2e-3)
+    assert camera(**RADTAN | {"distortion": [0, 0, 0, 0, 0.1]}).model.k3 == 0.1
+    fish = camera(width=100, height=80, fov=90, lens="equidistant", distortion=(0.01, 0, 0, 0)).model
+    assert fish == Equidistant(100, 80, 200 / math.pi, 200 / math.pi, 49.5, 39.5, 0.05, 0.01)
+    assert camera(width=80, height=60, fx=70, fy=75).model == PinHole(80, 60, 70, 75, 39.5, 29.5)
+    for one in (camera(**RADTAN), camera(width=80, height=60, fx=70, fy=75)):
+        assert camera(**camera_keys(one.model)).model == one.model
+    assert camera(**camera(**RADTAN).scaled(2)).model == camera(**RADTAN).model.resized(240, 180)
+
+
+@pytest.mark.parametrize(
+    "keys, said",
+    [
+        ({"lens": "fisheye62"}, "camera.lens: unknown choice"),
+        ({"lens": "radtan", "distortion": [0.1]}, "camera.distortion: radtan has other coefficients"),
+        ({"lens": "equidistant", "distortion": [0.1] * 5}, "expected 4 of them, k1 k2 k3 k4"),
+        ({"distortion": [0.1, 0, 0, 0]}, "camera.distortion: a pin-hole camera does not distort"),
+        ({"lens": "radtan", "distortion": [math.nan, 0, 0, 0]}, "camera.distortion.0: not a finite number"),
+        # r (1 - 0.8 r²) is largest at r = 0.645, where it is 0.4303 of a focal length of 173 px
+        ({"lens": "radtan", "fov": 90, "distortion": [-0.8, 0, 0, 0]}, "turns back inside the picture (got '74.4 px"),
+        ({"lens": "equidistant", "fov": 150, "distortion": [0] * 4}, "the lens sees 93.8 degrees off its axis"),
+        ({"fx": 100}, "camera.fy: fx and fy come together"),
+        ({"fx": 100, "fy": 100, "focal": 100}, "give fov, focal, or fx and fy"),
+        ({"fx": -100, "fy": 100}, "camera.fx: too small"),
+        ({"calibration": "a.yaml"}, "camera.calibration: a calibration is read with the run's file"),
+        ({"calibration_name": "cam1"}, "camera.calibration_name: the name of a camera of a file"),
+    ],
+)
+def test_what_cannot_be(keys, said):
+    with pytest.raises(ConfigError) as caught:
+        camera(**keys)
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("keys", [RADTAN, RADTAN | {"lens": "equidistant", "distortion": [-0.02, 0.005, 0, 0.001]}])
+def test_the_picture_that_is_drawn_holds_the_lens_s(keys):
+    lens = camera(**keys).model
+    flat = seen_through(lens)
+    assert seen_through(flat) is flat
+    x, y = np.meshgrid(np.arange(120.0), np.arange(90.0))
+    at = flat.project(lens.rays(np.stack([x, y], axis=-1)))
+    assert (at > 1).all() and (at < [flat.width - 2, flat.height - 2]).all()
+    apart = min(np.linalg.norm(np.diff(at, axis=axis), axis=-1).min() for axis in (0, 1))
+    assert DENSITY * 0.99 <= apart < DENSITY * 1.1
+    nearest = np.rint(at).astype(int).reshape(-1, 2)
+    assert len(np.unique(nearest, axis=0)) == len(nearest)
+
+
+# ---- calibrations ---------------------------------------------------------------------------------------------------
+
+
+def test_a_calibration_goes_out_and_comes_in_again(tmp_path):
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]], [0.1, 0, 0.02]
+    models = [camera(**RADTAN).model, PinHole(64, 48, 50.0, 51.0, 31.5, 23.0), Radtan(64, 48, 50, 51, 31, 23, k3=0.01)]
+    models += [Equidistant(64, 48, 50.0, 51.0, 31.5, 23.0, 0.05, 0.1, 0.02, 0.003, 0.0004)]
+    chain = {f"cam{k}": Calibrated(m, T if k else None) for k, m in enumerate(models)}
+    for text in (camchain_yaml(chain), cam_to_cam_yaml([*chain.values()])):
+        (tmp_path / "c.yaml").write_text(text, encoding="utf-8")
+        again = read_camchain(tmp_path / "c.yaml")
+        assert list(again) == list(chain)
+        assert [one.camera for one in again.values()] == models
+        assert again["cam0"].T_cam_before is None
+        np.testing.assert_array_equal(again["cam2"].T_cam_before, T)
+
+
+KALIBR = """cam0:
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: [-0.32, 0.11, 0.001, -0.002]
+  distortion_model: radtan
+  intrinsics: [95.0, 99.0, 60.5, 43.0]
+  resolution: [120, 90]
+  rostopic: /dvs/image_raw
+cam1:
+  T_cn_cnm1:
+  - [1.0, 0.0, 0.0, -0.1]
+  - [0.0, 1.0, 0.0, 0.0]
+  - [0.0, 0.0, 1.0, 0.0]
+  - [0.0, 0.0, 0.0, 1.0]
+  camera_model: pinhole
+  distortion_coeffs: [0.01, 0.0, 0.0, 0.0]
+  distortion_model: equidistant
+  intrinsics: [50.0, 50.0, 31.5, 23.5]
+  resolution: [64, 48]
+"""
+
+
+def test_a_run_takes_its_camera_from_kalibr(tmp_path, monkeypatch):
+    (tmp_path / "k.yaml").write_text(KALIBR, encoding="utf-8")
+    (tmp_path / "run.yaml").write_text("camera: {calibration: k.yaml, near: 0.1}", encoding="utf-8")
+    run = load_run(tmp_path / "run.yaml")
+    config = run.sequence(0).camera
+    assert config.model == camera(**RADTAN, near=0.1).model and config.calibration is None
+    other = load_run(tmp_path / "run.yaml", ["camera.calibration_name=cam1"]).sequence(0).camera.model
+    assert other.kind == "equidistant" and other.width == 64
+    monkeypatch.chdir(tmp_path)
+    in_python = blinkgl.Camera(calibration="k.yaml", near=0.1)
+    assert validate(CameraConfig, in_python.tree).model == config.model
+
+
+@pytest.mark.parametrize(
+    "change, keys, said",
+    [
+        (
+            ("", ""),
+            {"calibration_name": "cam7"},
+            "camera.calibration_name: no such camera in the calibration (got 'cam7')",
+        ),
+        (("", ""), {"width": 121}, "camera.width: the calibration is of another resolution, 120x90 px (got 121)"),
+        (("", ""), {"fov": 60}, "camera.fov: the calibration says that"),
+        (("[95.0, 99.0", "[-95.0, 99.0"), {}, "k.yaml: cam0: not a length (got -95.0)"),
+        (("-0.32", ".nan"), {}, "k.yaml: cam0.distortion_coeffs: not finite"),
+        (("-0.32, ", ""), {}, "expected a list of 4 or 5 numbers"),
+        (("-0.32", "-3.2"), {}, "k.yaml: cam0: the distortion turns back inside the picture"),
+        (("radtan", "fov"), {}, "k.yaml: cam0.distortion_model: unknown distortion model (got 'fov')"),
+        (("pinhole", "omni"), {}, "k.yaml: cam0.camera_model: a camera model that is not drawn (got 'omni')"),
+        (("[1.0, 0.0, 0.0, -0.1]", "[1.0, 0.5, 0.0, -0.1]"), {}, "k.yaml: cam1.T_cn_cnm1: not a rigid transform"),
+        (("[120, 90]", "120x90"), {}, "k.yaml: cam0.resolution: not its numbers"),
+        (("cam", "eye"), {}, "no such camera in the calibration (got 'cam0'); expected one of eye0, eye1"),
+        ((KALIBR, "a: 1"), {}, "k.yaml: no camera in it"),
+        (("cam0:", "cam0: ]"), {}, "not valid YAML"),
+    ],
+)
+def test_calibrations_that_cannot_be(tmp_path, change, keys, said):
+    (tmp_path / "k.yaml").write_text(KALIBR.replace(*change), encoding="utf-8")
+    tree = {"calibration": "k.yaml", **keys}
+    (tmp_path / "run.yaml").write_text(f"camera: {tree}", encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load_run(tmp_path / "run.yaml")
+    assert said in str(caught.value) and "\n" not in str(caught.value)

@@ -1,0 +1,318 @@
+"""`blinkgl export --layout`: what other people's loaders ask for, restated in loaders.py, and what they then hold."""
+
+import errno
+import shutil
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+import yaml
+
+from blinkgl import read_events
+from blinkgl.cli import run
+from blinkgl.config.sequence import load_run
+from blinkgl.dataset.run import run_dataset
+from blinkgl.errors import AssetError, ConfigError, OutputError
+from blinkgl.io.flow import read_flow_npy
+from blinkgl.io.formats import open_events
+from blinkgl.io.imu import read_imu
+from blinkgl.io.tracks import read_tracks
+from blinkgl.layouts import LAYOUTS, export as exporting, export_layout
+from loaders import (
+    blinkflow_sequence,
+    dsec_disparity,
+    dsec_flow,
+    dsec_sequence,
+    eraft_sequence,
+    tapvid,
+)
+
+HEIGHT, WIDTH = 24, 32
+RECIPE = {
+    "seed": 5,
+    "camera": {"width": WIDTH, "height": HEIGHT},
+    "time": {"duration": 0.4, "label_rate": 10, "start": 7.0},
+    "timeline": {"kind": "uniform", "fps": 60},
+    "scene": {
+        "kind": "random",
+        "objects": {"count": 2},
+        "pool": {"primitives": ["cuboid"], "variants": 4, "urdfs": False},
+        "textures": {"procedural": ["checks", "fbm"], "variants": 4, "photographs": False, "max_size": 64},
+    },
+    "events": {"emulator": "esim", "contrast_threshold": 0.1},
+    "labels": {"flow": ["forward", "backward"], "float_flow": ["npy"], "depth": True, "occlusion": True},
+    "tracks": {"points": 30},
+    "imu": {"preset": "ideal", "rate": 100},
+    "preview": {"enabled": False},
+}
+
+
+def generate(folder, recipe, num=1):
+    path = folder / "recipe.yaml"
+    path.write_text(yaml.safe_dump(recipe))
+    run_dataset(load_run(path), folder / "out", num=num)
+    return folder / "out"
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return generate(tmp_path_factory.mktemp("data"), RECIPE)
+
+
+@pytest.fixture(scope="module")
+def sequence(data):
+    return data / "train/sequence_000000"
+
+
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory):
+    """Made with nothing to learn from."""
+    recipe = {**RECIPE, "time": {"duration": 0.1}, "labels": {"flow": [], "images": False}}
+    return generate(tmp_path_factory.mktemp("bare"), {k: v for k, v in recipe.items() if k not in ("tracks", "imu")})
+
+
+def exported(data, tmp_path, layout):
+    assert export_layout(data, tmp_path / layout, layout).sequences == 1
+    return tmp_path / layout
+
+
+def label_times(sequence):
+    return np.loadtxt(sequence / "flow/forward_timestamps.txt", dtype="int64", delimiter=",")
+
+
+def same(columns, events):
+    for got, name in zip(columns, "xytp", strict=True):
+        np.testing.assert_array_equal(got, getattr(events, name))
+
+
+def test_dsec(data, sequence, tmp_path):
+    folder = exported(data, tmp_path, "dsec") / "train/sequence_000000"
+    assert list((tmp_path / "dsec/train").iterdir()) == [folder], "their provider takes every entry for a sequence"
+    events, found = read_events(sequence / "events.h5"), list(dsec_sequence(folder, HEIGHT, WIDTH))
+    assert len(found) == 4
+    for (number, start, end, flow, valid, before, during), k in zip(found, range(4)):
+        assert (number, start, end) == (2 * k, *label_times(sequence)[k])
+        same(before, events.window(2 * start - end, start))
+        same(during, events.window(start, end))
+        true, _ = read_flow_npy(sequence / f"flow/forward_npy/{k:06d}.npy")
+        assert valid.any() and np.abs(flow - true)[valid].max() <= 0.5 / 128
+        image = cv2.imread(str(folder / f"images/left/ev_inf/{number:06d}.png"))
+        np.testing.assert_array_equal(image, cv2.imread(str(sequence / f"images/{k:06d}.png")))
+        back, _ = dsec_flow(folder / f"flow/backward/{number:06d}.png")
+        assert back.shape == (HEIGHT, WIDTH, 2)
+    backward = np.loadtxt(folder / "flow/backward_timestamps.txt", dtype="int64", delimiter=",")
+    np.testing.assert_array_equal(backward[1:], label_times(sequence)[:-1, ::-1])
+    calibration = yaml.safe_load((folder / "calibration/cam_to_cam.yaml").read_text())
+    K = np.load(sequence / "poses.npz")["K"]
+    assert calibration["intrinsics"]["cam0"]["camera_matrix"] == [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+    assert calibration["intrinsics"]["camRect0"]["resolution"] == [WIDTH, HEIGHT]
+    assert not (folder / "disparity").exists() and not (folder / "events/right").exists()
+
+
+def test_eraft(data, sequence, tmp_path):
+    folder = exported(data, tmp_path, "eraft") / "test/sequence_000000"
+    events, found = read_events(sequence / "events.h5"), list(eraft_sequence(folder, HEIGHT, WIDTH))
+    assert [number for number, *_ in found] == [2, 4, 6]
+    for number, t, before, after in found:
+        assert t == label_times(sequence)[number // 2, 0]
+        same(before, events.window(t - 100_000, t))
+        same(after, events.window(t, t + 100_000))
+        assert (folder / f"flow/forward/{number:06d}.png").is_file()
+
+
+def test_blinkflow(data, sequence, tmp_path):
+    folder = exported(data, tmp_path, "blinkflow") / "training/sequence/000000"
+    events, found = read_events(sequence / "events.h5"), list(blinkflow_sequence(folder))
+    assert [i for i, *_ in found] == [1, 2, 3, 4]
+    start_us = 7_000_000
+    for i, t, flow, before, during in found:
+        assert t + start_us == label_times(sequence)[i - 1, 0]
+        for columns, (a, b) in ((before, (t - 100_000, t)), (during, (t, t + 100_000))):
+            expected = events.window(start_us + a, start_us + b)
+            same([*columns[:2], columns[2].astype("i8") + start_us, columns[3]], expected)
+        true = np.load(sequence / f"flow/forward_npy/{i - 1:06d}.npy")
+        hidden = cv2.imread(str(sequence / f"occlusion/forward/{i - 1:06d}.png"), -1) > 0
+        np.testing.assert_array_equal(flow[..., :2], true[..., :2])
+        np.testing.assert_array_equal(flow[..., 2], (true[..., 2] > 0) & ~hidden)
+        back = np.load(folder / f"backward_flow/{i - 1:06d}.npy")
+        np.testing.assert_array_equal(back, np.load(sequence / f"flow/backward_npy/{i - 1:06d}.npy"))
+
+
+def test_mvsec(data, sequence, tmp_path):
+    stem = exported(data, tmp_path, "mvsec") / "train/sequence_000000"
+    events = read_events(sequence / "events.h5")
+    images = np.loadtxt(sequence / "images/timestamps.txt", dtype="int64")
+    with h5py.File(f"{stem}_data.hdf5") as file:
+        left = file["davis/left"]
+        assert left["events"].dtype == np.float64 and left["events"].shape == (len(events), 4)
+        np.testing.assert_array_equal(left["events"][:, :2], np.stack([events.x, events.y], 1))
+        np.testing.assert_allclose(left["events"][:, 2], events.t * 1e-6, rtol=0, atol=1e-9)
+        np.testing.assert_array_equal(left["events"][:, 3], np.where(events.p, 1, -1))
+        assert left["image_raw"].shape == (5, HEIGHT, WIDTH) and left["image_raw"].dtype == np.uint8
+        np.testing.assert_allclose(left["image_raw_ts"], images * 1e-6)
+        first = np.searchsorted(events.t, images)
+        np.testing.assert_array_equal(left["image_raw_event_inds"], np.minimum(first, len(events) - 1))
+        np.testing.assert_array_equal(left["imu"][:, :3], read_imu(sequence)["acceleration"])
+        np.testing.assert_allclose(left["imu_ts"], read_imu(sequence)["t_ns"] * 1e-9)
+    with h5py.File(f"{stem}_gt.hdf5") as file:
+        depth = np.load(sequence / "depth/000001.npy")
+        np.testing.assert_array_equal(
+            file["davis/left/depth_image_raw"][1], np.where(np.isfinite(depth), depth, np.nan)
+        )
+        np.testing.assert_allclose(file["davis/left/pose"][0], np.eye(4), atol=1e-12)
+    with np.load(f"{stem}_gt_flow_dist.npz", allow_pickle=False) as flow:
+        np.testing.assert_allclose(flow["timestamps"], label_times(sequence)[:, 0] * 1e-6)
+        true = np.load(sequence / "flow/forward_npy/000002.npy")
+        got = np.stack([flow["x_flow_dist"][2], flow["y_flow_dist"][2]], -1)
+        np.testing.assert_array_equal((got != 0).any(-1), true[..., 2] > 0)
+        np.testing.assert_allclose(got, true[..., :2], atol=2e-6)
+    with open_events(f"{stem}_data.hdf5") as file:
+        assert file.format == "mvsec"
+
+
+def test_tapvid(data, sequence, tmp_path):
+    folder = exported(data, tmp_path, "tapvid")
+    (name, video), *others = tapvid(folder / "train/sequence_000000.pkl").items()
+    tracks = read_tracks(sequence)
+    assert name == "sequence_000000" and not others
+    np.testing.assert_array_equal(video["occluded"], tracks["occluded"])
+    raster = video["points"] * [WIDTH, HEIGHT] - 0.5  # a reader multiplies by the size of its video
+    np.testing.assert_allclose(raster, tracks["target_points"], atol=1e-4)
+    for k, frame in enumerate(video["video"]):
+        np.testing.assert_array_equal(frame[..., ::-1], cv2.imread(str(sequence / f"images/{k:06d}.png")))
+
+
+@pytest.mark.parametrize("layout", ["dsec", "eraft", "blinkflow"])
+def test_eflow_trains_on_it_as_on_the_sequences_themselves(layout, data, tmp_path):
+    pytest.importorskip("torch")
+    from eflow.data.sources import find_blinkflow, find_blinkgl, find_dsec
+
+    folder = exported(data, tmp_path, layout)
+    (ours,) = find_blinkgl(data)
+    (theirs,) = (find_blinkflow if layout == "blinkflow" else find_dsec)(folder)
+    shift = 7_000_000 if layout == "blinkflow" else 0
+    assert [(e.from_us + shift, e.to_us + shift) for e in theirs.entries] == [
+        (e.from_us, e.to_us) for e in ours.entries
+    ]
+
+
+@pytest.mark.parametrize(
+    "layout, lines",
+    [
+        ("dsec", ["labels: {flow: [forward]}"]),
+        ("eraft", ["labels: {flow: [forward]}"]),
+        ("blinkflow", ["labels: {flow: [forward]}"]),
+        ("mvsec", ["labels: {flow: [forward]}", "labels: {images: true}"]),
+        ("tapvid", ["tracks: {points: 256}", "labels: {images: true}"]),
+    ],
+)
+def test_what_lacks_is_named_with_the_yaml_that_makes_it(layout, lines, bare, tmp_path, capsys):
+    assert run(["export", str(bare), "--layout", layout, "--out", str(tmp_path / "there")]) == 2
+    error = capsys.readouterr().err.strip()
+    assert "\n" not in error and all(line in error for line in lines), error
+    assert list(tmp_path.iterdir()) == [], "nothing is written"
+
+
+def test_flow_over_another_time_than_the_loaders_windows(data, tmp_path):
+    other = generate(
+        tmp_path, {**RECIPE, "time": {"duration": 0.06, "label_rate": 30}, "tracks": {"points": 4, "rate": 7}}
+    )
+    for layout, line in (
+        ("eraft", "time: {label_rate: 10}"),
+        ("blinkflow", "time: {label_rate: 25}"),
+        ("tapvid", "without a rate"),
+    ):
+        with pytest.raises(AssetError, match=line.replace("{", "\\{")):
+            export_layout(other, tmp_path / "there", layout)
+    assert not (tmp_path / "there").exists()
+
+
+def test_refusals(data, sequence, tmp_path):
+    for arguments, error, said in (
+        ((data, tmp_path / "new", "cityscapes"), ConfigError, "webdataset, dsec"),
+        ((tmp_path / "none", tmp_path / "new", "dsec"), AssetError, "no such data set"),
+        ((tmp_path, tmp_path / "new", "dsec"), AssetError, "no sequences found"),
+        ((data, data, "dsec"), OutputError, "output folder exists"),
+    ):
+        with pytest.raises(error, match=said):
+            export_layout(*arguments)
+    shutil.copytree(sequence, tmp_path / "cut/train/a")
+    (tmp_path / "cut/train/a/flow/forward/000001.png").unlink()
+    with pytest.raises(AssetError, match="damaged sequence: flow/forward/000001.png: missing"):
+        export_layout(tmp_path / "cut", tmp_path / "new", "dsec")
+    shutil.copytree(sequence, tmp_path / "twice/train/a")
+    shutil.copytree(sequence, tmp_path / "twice/test/a")
+    with pytest.raises(OutputError, match="two sequences would be written to one place"):
+        export_layout(tmp_path / "twice", tmp_path / "new", "eraft")
+    assert not (tmp_path / "new").exists()
+    assert run(["export", str(data), "--layout", "dsec", "--seed", "3", "--out", str(tmp_path / "new")]) == 2
+
+
+def test_a_full_disk_leaves_nothing(data, tmp_path, monkeypatch):
+    def full(source, folder):
+        (folder / "half").write_text("")
+        raise OSError(errno.ENOSPC, "full")
+
+    monkeypatch.setattr("blinkgl.layouts.dsec.write_rectify_map", lambda path, found: full(None, path.parent))
+    with pytest.raises(OSError):
+        export_layout(data, tmp_path / "out", "dsec")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_another_size_is_said_and_one_sequence_is_enough(sequence, tmp_path, capsys):
+    assert run(["export", str(sequence), "--layout", "dsec", "--out", str(tmp_path / "a")]) == 0
+    said = capsys.readouterr().out
+    assert "640x480" in said and "32x24" in said and "1 sequence for DSEC" in said
+    assert exporting._size(LAYOUTS["tapvid"], []) == []
+
+
+STEREO = {
+    **{k: v for k, v in RECIPE.items() if k not in ("tracks", "imu", "scene")},
+    "time": {"duration": 0.2, "label_rate": 10},
+    "labels": {"flow": ["forward"], "depth": True},
+}
+
+
+@pytest.fixture(scope="module")
+def stereo(tmp_path_factory):
+    """A wall seen by two cameras 0.1 m apart that approach it; what a stereo rig writes."""
+    folders = []
+    for name, y in (("left", 0.05), ("right", -0.05)):  # they look along x, with z up: to the right is -y
+        pose = lambda time, x, y=y: {"time": time, "position": [x, y, 0], "look_at": [x + 1, y, 0]}
+        scene = {
+            "kind": "explicit",
+            "meshes": {"wall": {"primitive": "cuboid", "parameters": {"extents": [1, 20, 20]}}},
+            "materials": {"checked": {"procedural": "checks", "uv_scale": [20, 20]}},
+            "objects": [{"mesh": "wall", "material": "checked", "position": [2.5, 0, 0]}],
+            "camera": {"keyframes": [pose(0, 0), pose(1, 0.5)]},
+        }
+        folders.append(generate(tmp_path_factory.mktemp(name), {**STEREO, "scene": scene}) / "train/sequence_000000")
+    rig = tmp_path_factory.mktemp("stereo") / "out/train/rig_000000"
+    for name, folder in zip(("left", "right"), folders):
+        shutil.copytree(folder, rig / name)
+    return rig
+
+
+def test_a_stereo_rig_has_a_right_eye_disparity_and_a_calibration(stereo, tmp_path):
+    folder = exported(stereo.parents[1], tmp_path, "dsec") / "train/rig_000000"
+    poses = np.load(stereo / "left/poses.npz")
+    eyes = {eye: read_events(stereo / eye / "events.h5") for eye in ("left", "right")}
+    found = list(dsec_disparity(folder, HEIGHT, WIDTH))
+    assert len(found) == 1
+    for disparity, windows in found:
+        t = label_times(stereo / "left")[1, 0]
+        depth = 2.0 - poses["T_world_cam"][2, 0, 3]  # the wall's face is at x = 2
+        assert disparity == pytest.approx(poses["K"][0, 0] * 0.1 / depth, abs=0.5 / 256 + 1e-5)
+        for eye, window in windows.items():
+            same(window, eyes[eye].window(t - 50_000, t))
+    assert list(dsec_sequence(folder, HEIGHT, WIDTH))
+    calibration = yaml.safe_load((folder / "calibration/cam_to_cam.yaml").read_text())
+    T_30 = np.array(calibration["extrinsics"]["T_30"])  # a point of the left camera, seen from the right
+    np.testing.assert_allclose(T_30[:3], np.array([[1, 0, 0, -0.1], [0, 1, 0, 0], [0, 0, 1, 0]]), atol=1e-9)
+    Q = np.array(calibration["disparity_to_depth"]["cams_03"])
+    point = Q @ [10.0, 12.0, disparity[12, 10], 1.0]
+    quantum = depth**2 / (poses["K"][0, 0] * 0.1) / 256
+    assert point[2] / point[3] == pytest.approx(depth, abs=0.6 * quantum)
+    with h5py.File(exported(stereo, tmp_path, "mvsec") / "train/rig_000000_data.hdf5") as file:
+        assert len(file["davis/right/events"]) == len(eyes["right"])

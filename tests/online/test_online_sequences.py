@@ -1,0 +1,178 @@
+"""OnlineSequences: the same samples whoever renders and whoever takes them; two kinds; batches for torch."""
+
+import os
+import signal
+from itertools import islice, pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from blinkgl import ConfigError, EventDataError, OnlineSequences, StreamSample, WindowSample, load
+from blinkgl.online.stream import MIX
+
+RECIPE = {
+    "seed": 3,
+    "camera": {"width": 32, "height": 32},
+    "time": {"duration": 0.05, "label_rate": 20},
+    "timeline": {"kind": "displacement", "max_px": 2.0},
+    "scene": {
+        "objects": {"count": 2},
+        "textures": {"photographs": False, "procedural": ["checks"], "variants": 2, "max_size": 32},
+        "pool": {"primitives": ["cuboid"], "variants": 2, "test_fraction": 0.5},
+        "object_motion": {"kind": "static"},
+        "camera_motion": {"speed": 2, "rotation_rate": 90},
+    },
+    "labels": {"images": False, "flow": ["forward"], "occlusion": False},
+    "preview": {"enabled": False},
+    "output": {"sequences": 3},
+}
+
+
+@pytest.fixture(scope="module")
+def recipe(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("online") / "recipe.yaml"
+    path.write_text(yaml.safe_dump(RECIPE))
+    return path
+
+
+def told(sample: WindowSample | StreamSample) -> tuple:
+    """Everything of a sample, comparable."""
+    parts = (sample.old, sample.new) if isinstance(sample, WindowSample) else sample.windows
+    columns = [getattr(part, c).tobytes() for part in parts for c in "xytp"]
+    return sample.name, sample.flow.tobytes(), sample.valid.tobytes(), *columns
+
+
+def test_who_renders_makes_no_difference_nor_does_a_worker_that_dies(recipe):
+    """(Of "windows", tests/eflow/test_online.py shows it.)"""
+    how = {"kind": "streams", "steps": 3, "window_ms": (3, 8), "per_sequence": 2, "seed": 4}
+    count = 2 * MIX + 3  # into the second block
+    with OnlineSequences(recipe, workers=0, **how) as sequences:
+        alone = [told(s) for s in islice(sequences, count)]
+    assert len({sample[0] for sample in alone}) == count, "no sample twice"
+    with OnlineSequences(recipe, workers=1, **how) as sequences:
+        os.kill(sequences.stream._executor._processes[0].popen.pid, signal.SIGKILL)
+        assert [told(s) for s in islice(sequences, count)] == alone
+        assert sequences.stats.replaced == 1 and sequences.stats.failures == 0
+        assert sequences.stats.samples >= count and 0 < sequences.stats.waited_s <= sequences.stats.open_s
+        spool = sequences.stream.spool
+        assert len(list(spool.glob("*.npz"))) <= 2 * sequences.block
+    assert not spool.exists()
+    with OnlineSequences(recipe, workers=0, first=count - 1, **how) as sequences:
+        assert told(next(iter(sequences))) == alone[-1], "resumed"
+        with pytest.raises(EventDataError, match="this sample was taken"):
+            sequences[count - 1]
+        with pytest.raises(ConfigError, match=f"n: .*expected {count - 1} to"):
+            sequences[0]
+
+
+def test_windows_of_a_stream_follow_each_other(recipe):
+    with OnlineSequences(load(recipe), kind="streams", steps=4, window_ms=5, workers=0) as sequences:
+        sample = next(iter(sequences))
+    assert (sample.height, sample.width) == (32, 32)
+    assert sample.flow.shape == (4, 32, 32, 2) and sample.valid.shape == (4, 32, 32)
+    assert np.array_equal(np.diff(sample.t_us), [5000] * 4) and len(sample.windows) == 4
+    for (t0, t1), window in zip(pairwise(sample.t_us), sample.windows, strict=True):
+        assert len(window) and t0 <= window.t[0] and window.t[-1] < t1
+    # Little changes within 5 ms: the flow of one window is nearly that of the next.
+    lengths = [np.linalg.norm(f[v], axis=-1).mean() for f, v in zip(sample.flow, sample.valid, strict=True)]
+    assert min(lengths) > 0 and max(lengths) < 1.5 * min(lengths)
+
+
+def test_seeds_and_ranks_have_sequences_of_their_own(recipe):
+    def flows(**how):
+        with OnlineSequences(recipe, workers=0, per_sequence=2, **how) as sequences:
+            return {s.flow.tobytes() for s in islice(sequences, 3)}
+
+    there = [flows(), flows(seed=1), flows(rank=1), flows(seed=1, rank=1)]
+    assert len(set.union(*there)) == 12 and flows(rank=1) == there[2]
+
+
+def voxels(samples: list[WindowSample]):
+    """Counts and flow of a batch, and its names."""
+    torch = pytest.importorskip("torch")
+    counts = np.zeros((len(samples), 32, 32), np.float32)
+    for k, sample in enumerate(samples):
+        np.add.at(counts[k], (sample.new.y, sample.new.x), 1)
+    flow = np.stack([sample.flow for sample in samples])
+    return torch.from_numpy(counts), torch.from_numpy(flow), [sample.name for sample in samples]
+
+
+def test_batches_are_the_same_however_many_loader_processes(recipe):
+    data = pytest.importorskip("torch.utils.data")
+    found = []
+    for processes in (0, 2):
+        with OnlineSequences(recipe, workers=1, per_sequence=2, seed=4) as sequences:
+            loader = data.DataLoader(sequences.batches(3, voxels, count=5), batch_size=None, num_workers=processes)
+            found.append([(c.numpy().tobytes(), f.numpy().tobytes(), names) for c, f, names in loader])
+            if not processes:
+                with pytest.raises(EventDataError, match="this sample was taken"):
+                    next(iter(sequences))
+    assert found[0] == found[1] and len(found[0]) == 5
+    names = [name for _, _, batch in found[0] for name in batch]
+    assert len(set(names)) == 15
+
+
+def test_loader_processes_do_not_render(recipe):
+    data = pytest.importorskip("torch.utils.data")
+    with OnlineSequences(recipe, workers=0) as sequences:
+        loader = data.DataLoader(sequences.batches(2, voxels, count=1), batch_size=None, num_workers=1)
+        with pytest.raises(EventDataError, match="loader processes do not render"):
+            list(loader)
+
+
+def test_the_sparse_and_the_fast_are_left_out(recipe):
+    def lengths(**how):
+        with OnlineSequences(recipe, workers=0, window_ms=(4, 20), **how) as sequences:
+            found = list(islice(sequences, 8))
+        medians = [np.median(np.linalg.norm(s.flow[s.valid], axis=-1)) for s in found]
+        return medians, [min(len(s.old), len(s.new)) for s in found]
+
+    medians, counts = lengths()
+    limit, least = float(np.quantile(medians, 0.8)), int(np.quantile(counts, 0.3))
+    medians, counts = lengths(max_flow=limit, min_events=least)
+    assert max(medians) <= 1.2 * limit and min(counts) >= least  # the rule looks at every seventh pixel
+
+
+def test_the_end(recipe):
+    sequences = OnlineSequences(recipe, workers=1)
+    samples = iter(sequences)
+    next(samples)
+    sequences.close()
+    sequences.close()
+    with pytest.raises(EventDataError, match="closed"):
+        next(samples)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"kind": "frames"}, "kind: unknown kind (got 'frames'); expected windows, streams"),
+        ({"window_ms": (20, 5)}, "window_ms: the shortest is longer than the longest"),
+        ({"window_ms": (1, 2, 3)}, "window_ms: not lengths of windows"),
+        ({"window_ms": float("nan")}, "window_ms: not a finite number"),
+        ({"steps": 0, "kind": "streams"}, "steps: not a whole number in range"),
+        ({"split": "val"}, "split: unknown split (got 'val'); expected train, test"),
+        ({"split": "test"}, "the recipe has nothing of split 'test'"),
+        ({"workers": -1}, "workers: not a whole number in range"),
+        ({"first": 1.5}, "first: not a whole number in range"),
+    ],
+)
+def test_bad_arguments(recipe, arguments, said):
+    with pytest.raises(ConfigError) as caught:
+        OnlineSequences(recipe, **{"workers": 0, **arguments})
+    assert said in str(caught.value)
+
+
+def test_a_recipe_that_gives_nothing_is_one_line(tmp_path):
+    with pytest.raises(ConfigError, match="not readable|no such file|does not exist|not found"):
+        OnlineSequences(tmp_path / "none.yaml", workers=0)
+    still = {**RECIPE, "scene": {**RECIPE["scene"], "camera_motion": {"kind": "static"}}}
+    (tmp_path / "still.yaml").write_text(yaml.safe_dump(still))
+    with OnlineSequences(tmp_path / "still.yaml", workers=0) as sequences, pytest.raises(ConfigError) as caught:
+        next(iter(sequences))
+    assert "gave 0 of 8 samples" in str(caught.value) and "\n" not in str(caught.value)
+    with OnlineSequences(tmp_path / "still.yaml", kind="streams", steps=200, window_ms=1, workers=0) as sequences:
+        with pytest.raises(ConfigError, match="holds no 200 windows of 1 ms"):
+            next(iter(sequences))

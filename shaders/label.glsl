@@ -7,6 +7,7 @@
 // A label is a function label_<name>(), which may look at
 //   local        object-local position, and uniform vec2 image_size (include/image_size.glsl), px of the target
 //   facing()     normal in the object's axes, on the camera's side, not normalised
+//   INVERSE_DEPTH, FRAGMENT_XY   gl_FragCoord.w and .xy of the ray that is looked along (include/along_ray.glsl)
 // TWO_SIDED: as in luminance.glsl.
 
 #include "labels_need.glsl"
@@ -14,6 +15,7 @@
 
 #ifdef FRAGMENT_SHADER
 #include "guard.glsl"
+#include "along_ray.glsl"
 #ifdef NEEDS_NORMAL
 vec3 facing()
 {
@@ -28,6 +30,9 @@ vec3 facing()
 
 void main()
 {
+#ifdef LENS_CLAIMS
+    look_along_ray();
+#endif
     write_labels();
     drop_artefact();
 }

@@ -4,15 +4,24 @@
 #include "vertex.glsl"
 
 #ifdef FRAGMENT_SHADER
-#include "guard.glsl"
-
+#ifdef PARALLEL
 // Parallel light has no perspective by which drop_artefact() could tell: a triangle without width has any depth.
 const float SHEER = 0.25; // of the map's whole depth, per texel
+#else
+#include "guard.glsl"
+#endif
 
 void main()
 {
-    if (fwidth(gl_FragCoord.z) > SHEER)
+#ifdef PARALLEL
+    if (floatBitsToUint(fwidth(gl_FragCoord.z)) > floatBitsToUint(SHEER)) // NaN, too
         discard;
+#ifdef MASKED
+    if (is_hole())
+        discard;
+#endif
+#else
     drop_artefact();
+#endif
 }
 #endif

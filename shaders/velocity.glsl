@@ -1,6 +1,7 @@
 #version 430 core
 // Velocity pass: image velocity, px/s, for the time sampling and the preview. SMALL: the target is a small picture of
-// the image, whose pixels are image_scale px of the image apart; velocity is still the image's.
+// the image, whose pixels are image_scale px of the image apart; velocity is still the image's. LENS: it is that of the
+// picture of a lens.
 
 #define NEEDS_LOCAL
 #define NEEDS_RATE
@@ -10,7 +11,7 @@
 layout(location = 0) out vec2 image_velocity;
 uniform vec2 image_size;
 uniform mat4x3 rate;
-#ifdef SMALL
+#if defined(SMALL) && !defined(LENS)
 uniform vec2 image_scale;
 #endif
 #include "motion.glsl"
@@ -19,7 +20,7 @@ uniform vec2 image_scale;
 void main()
 {
     image_velocity = velocity(rate, local, image_size);
-#ifdef SMALL
+#if defined(SMALL) && !defined(LENS)
     image_velocity *= image_scale;
 #endif
     drop_artefact();

@@ -99,6 +99,11 @@ class DistortedModel(CameraModel):
     def reach(self) -> float:
         """Radius on the image plane up to which the radial distortion grows; inf where it does for ever."""
 
+    @property
+    def plane_limit(self) -> float:
+        """Largest hypot(X, Y) / Z that is seen; a very large number where there is no limit."""
+        return 1e18
+
     # ---- the border of the picture -----------------------------------------------------------------------------
 
     @cached_property

@@ -12,7 +12,7 @@ from blinkgl.camera.model import CameraModel
 from blinkgl.camera.pinhole import PinHole
 from blinkgl.errors import ConfigError
 
-DENSITY = 1.5
+DENSITY = 1.42
 """Pixels of the pin-hole picture per pixel of the lens's, along the direction and at the place where there are fewest.
 Above the square root of 2, so that no two pixels have the same nearest one."""
 WIDEST = math.radians(70)
@@ -27,9 +27,11 @@ def seen_through(camera: CameraModel) -> PinHole:
     """The pin-hole camera that is drawn for ``camera``, at the same place: ``camera`` itself, or one that sees all that
     a lens shows, at :data:`DENSITY` at least.
 
-    Raises ConfigError for a lens that shows too much for one flat picture."""
+    Raises ConfigError for a lens that shows too much for one flat picture, and for models that no shader knows."""
     if isinstance(camera, PinHole):
         return camera
+    if not camera.shader:
+        camera.clip_from_cam()  # says that there is none
     assert isinstance(camera, DistortedModel)
     return _seen_through(camera)
 

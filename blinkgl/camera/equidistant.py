@@ -26,6 +26,7 @@ class Equidistant(DistortedModel):
     """Coefficients without unit: k1 … k4. Rays are unit vectors, and Z <= 0 in them beyond 90 degrees."""
 
     kind: ClassVar[str] = "equidistant"
+    shader: ClassVar[str] = "EQUIDISTANT"
     sample: ClassVar[dict[str, float]] = {"k1": -0.02, "k2": 0.005, "k3": -0.003, "k4": 0.0005}
     coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4")
 
@@ -42,6 +43,10 @@ class Equidistant(DistortedModel):
     def _limit(self) -> float:
         """Largest angle, rad."""
         return min(math.pi, radius_limit(self._k))
+
+    @property
+    def plane_limit(self) -> float:
+        return min(math.tan(self._limit), 1e18) if self._limit < math.pi / 2 else 1e18
 
     @property
     def reach(self) -> float:

@@ -31,6 +31,8 @@ class CameraModel(ABC):
     kind: ClassVar[str]
     coefficients: ClassVar[tuple[str, ...]] = ()
     """Names of its own parameters, in the order in which calibrations give them."""
+    shader: ClassVar[str] = ""
+    """The macro by which ``shaders/include/lens.glsl`` knows a model that distorts; "": it is not drawn."""
 
     width: int
     height: int
@@ -106,6 +108,11 @@ class CameraModel(ABC):
         touch, with a pixel to spare on
         every side. The whole image where the hull meets the near plane; None when it is out of the picture."""
 
+    @property
+    def px_per_slope(self) -> float:
+        """How far, px, the image of a point moves at most when (X / Z, Y / Z) changes by a step of length 1."""
+        return self.magnification
+
     def pixels_per_unit(self, centres: np.ndarray, radius: float) -> np.ndarray:
         """(n,) pixels in the image per unit of length on any surface in spheres about (n, 3) centres, at most: 0 for
         a sphere out of the picture,
@@ -144,9 +151,13 @@ class CameraModel(ABC):
     def clip_from_cam(self) -> np.ndarray:
         """(4, 4) float64 from camera axes to clip space (:mod:`blinkgl.render.matrices`).
 
-        Raises ConfigError: only a pin-hole image is a matrix's work, so only that is drawn."""
+        Raises ConfigError: only a pin-hole image is a matrix's work; for a lens one is drawn
+        (:func:`blinkgl.camera.drawing.seen_through`)."""
         raise ConfigError(
-            "this camera model cannot be drawn", where="camera", value=self.kind, accepted="a pin-hole camera"
+            "this camera model cannot be drawn",
+            where="camera",
+            value=self.kind,
+            accepted="a pin-hole camera, or a lens that the shaders know",
         )
 
     def displacement(self, rays: np.ndarray, depth: np.ndarray, change: np.ndarray) -> np.ndarray:

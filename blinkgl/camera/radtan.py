@@ -26,6 +26,7 @@ class Radtan(DistortedModel):
     """Coefficients without unit, in OpenCV's order: k1, k2, p1, p2, k3. Rays have Z = 1."""
 
     kind: ClassVar[str] = "radtan"
+    shader: ClassVar[str] = "RADTAN"
     sample: ClassVar[dict[str, float]] = {"k1": -0.3, "k2": 0.1, "p1": 0.002, "p2": -0.001, "k3": 0.02}
     coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "p1", "p2", "k3")
 
@@ -38,6 +39,10 @@ class Radtan(DistortedModel):
     @cached_property
     def _limit(self) -> float:
         return radius_limit((self.k1, self.k2, self.k3))
+
+    @property
+    def plane_limit(self) -> float:
+        return min(self._limit, 1e18)
 
     @property
     def reach(self) -> float:

@@ -3,7 +3,7 @@ registered has its key here from then on. What is no picture of a label's time h
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -18,6 +18,11 @@ class LabelsConfig(Growing):
         False,
         description="what made each event: instance, depth and image velocity of the surface, and the cause "
         "(`events.causes` is then true unless that is said), in event_labels.h5, a row per event; docs/formats.md",
+    )
+    pixels: Literal["sensor", "rectified"] = Field(
+        "sensor",
+        description="of a lens that distorts: whether labels at label times and tracks are in the sensor's own pixels, "
+        "as the events are, or in those of the rectified pin-hole picture (docs/cameras.md)",
     )
 
 

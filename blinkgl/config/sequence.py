@@ -240,6 +240,16 @@ class SequenceConfig(Config):
     preview: PreviewConfig = Field(PreviewConfig(), description="preview.mp4")
     gl: GLConfig = Field(GLConfig(), description="which OpenGL to use")
 
+    @rule("camera.lens", "scene.intrinsics")
+    def _one_lens(lens: str, intrinsics: str | None):
+        if lens != "pinhole" and intrinsics == "file":
+            raise Refused(
+                "the file's camera is a pin-hole camera",
+                where="scene.intrinsics",
+                value=intrinsics,
+                accepted="config, or camera.lens: pinhole",
+            )
+
     @rule("timeline.reconstruction", "events.emulator", "?frames")
     def _the_emulator_follows(path: str, emulator: str, frames: bool):
         able = followers(path)

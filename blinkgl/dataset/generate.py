@@ -19,6 +19,7 @@ from blinkgl.dataset.report import Progress, SequenceReport, config_yaml, losses
 from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging.metering import decibels
 from blinkgl.io.frame_camera import ExposureLine
+from blinkgl.io.lens_files import write_lens
 from blinkgl.io.sequence_dir import SequenceWriter, refuse_existing
 from blinkgl.io.tracks import TRACKS
 from blinkgl.labels import LABELS
@@ -101,6 +102,8 @@ def generate_sequence(
         with clock("write"):
             if poses := sequence.poses():
                 writer.poses(**poses)
+            if (camera := sequence.lens) is not None:
+                write_lens(writer, camera)
             if (inertial := sequence.imu()) is not None:
                 writer.imu(config.imu, vars(inertial))
             if (tracks := sequence.tracks()) is not None:

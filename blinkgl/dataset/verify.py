@@ -44,6 +44,7 @@ from blinkgl.io.frame_camera import (
 from blinkgl.io.hdf5 import dataset, open_hdf5
 from blinkgl.io.imu import FILES as IMU_FILES, read_imu, read_imu_csv
 from blinkgl.io.index import INDEX, entry, read_index, sequence_folders
+from blinkgl.io.lens_files import FILES as LENS_FILES, problems_of_lens
 from blinkgl.io.records import open_regular, shown
 from blinkgl.io.sequence_dir import MANIFEST, read_manifest, verify_sequence
 from blinkgl.io.tracks import TRACKS, problem_of as problem_of_tracks, read_tracks
@@ -190,6 +191,8 @@ def _look(folder: Path, name: str) -> tuple[list[str], _Known | None]:
             problems += _guarded(lambda: _check_imu(folder, config))
         if config.tracks is not None:
             problems += _guarded(lambda: _check_tracks(folder, manifest, config))
+        if _distorts(config):
+            problems += _guarded(lambda: problems_of_lens(folder, config.camera.model))
         if config.images is not None:
             problems += _guarded(lambda: _check_images(folder, manifest, config))
         if not problems:
@@ -251,10 +254,16 @@ def _files_of(config: SequenceConfig) -> Iterator[str]:
         yield from IMU_FILES
     if config.tracks is not None:
         yield TRACKS
+    if _distorts(config):
+        yield from LENS_FILES
     if config.images is not None:
         yield from files_of(config.images, len(_exposures_of(config)))
     if config.preview.enabled:
         yield "preview.mp4"
+
+
+def _distorts(config: SequenceConfig) -> bool:
+    return config.frames is None and config.camera.lens != "pinhole"
 
 
 def _exposures_of(config: SequenceConfig) -> list[int]:

@@ -24,7 +24,6 @@ from blinkgl.imaging.sensor import mosaic, readings
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.colour import LUMA
 from blinkgl.render.moment import View
-from blinkgl.render.passes import Geometry
 from blinkgl.timeline.speed import largest_speed
 
 if TYPE_CHECKING:
@@ -176,7 +175,7 @@ class FrameCamera:
         for i, t_ns in enumerate(cells):
             moment = draw.moment(t_ns)
             if lens is not None and aperture is not None:
-                seen = thin_lens.through(draw.scene.camera, aperture[i], lens.focus)
+                seen = thin_lens.through(moment.view.camera, aperture[i], lens.focus)
                 moment = moment.from_place(View.of(seen), thin_lens.at_point(moment.T_world_cam, aperture[i]))
             accumulate(total, draw.colour(moment).view(), weights[i])
         return self._at(total), count, speed * (exposure.end_ns - exposure.start_ns) * 1e-9 / count
@@ -186,7 +185,7 @@ class FrameCamera:
         lens = self.config.lens
         if lens is None:
             return 1
-        depth = self.renderer.draw(Geometry(("depth",)), t_ns).read("depth")
+        depth = self.renderer.draw(self.renderer.geometry(("depth",)), t_ns).read("depth")
         depth = np.where(depth > 0, depth, np.inf)
         largest = float(thin_lens.blur_px(lens, self.renderer.scene.camera, depth).max())
         return thin_lens.samples(largest, LENS_SPACING * self.config.max_px)

@@ -4,6 +4,7 @@ Through the point (a, b) of the lens a scene point (X, Y, Z), camera axes, is se
 point meets the plane in focus, depth F: for a pin-hole camera at (a, b, 0) that is its own picture, moved by fx a / F
 and fy b / F pixels, so that what lies at F does not move whatever the point. The mean over all points of the lens is
 the image; a point at depth Z is spread over a disc of diameter ``aperture * f * |1 / Z - 1 / F|`` (fx wide, fy high).
+Of a camera that distorts this is done in the flat picture that is drawn for it (:mod:`blinkgl.render.lens`).
 """
 
 from __future__ import annotations
@@ -19,9 +20,7 @@ from blinkgl.config.images import LensConfig
 def blur_px(lens: LensConfig, camera: CameraModel, depth: np.ndarray) -> np.ndarray:
     """(…) diameter, px, of the disc that a point at (…) depth Z > 0 becomes; inf is a depth."""
     with np.errstate(divide="ignore"):
-        return (
-            lens.aperture * _drawn(camera).px_per_slope * np.abs(1.0 / np.asarray(depth, np.float64) - 1.0 / lens.focus)
-        )
+        return lens.aperture * camera.px_per_slope * np.abs(1.0 / np.asarray(depth, np.float64) - 1.0 / lens.focus)
 
 
 def samples(largest_px: float, spacing_px: float) -> int:

@@ -162,8 +162,7 @@ class Canvas:
         parts = [frame.changed_since(self._used.get(name)) for name, frame in shot.inputs.items()]
         if any(part is None for part in parts):
             return None
-        around, size = self.pass_.margin, (self.target.width, self.target.height)
-        return merged([r.grown(around, *size) if around else r for part in parts for r in part])
+        return self.pass_.changed(self.painter, merged([r for part in parts for r in part]))
 
     # ---- read-back -----------------------------------------------------------------------------------------------
 

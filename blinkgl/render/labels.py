@@ -9,9 +9,12 @@ import numpy as np
 
 from blinkgl.labels import LABELS, Label, LabelFrame, LabelRequest
 from blinkgl.machine.compiling import working_clock
+from blinkgl.render.moment import Moment, View
 from blinkgl.render.passes import Geometry
 
 if TYPE_CHECKING:
+    from blinkgl.camera import PinHole
+    from blinkgl.render.canvas import Frame
     from blinkgl.render.renderer import Renderer
     from blinkgl.scene.types import Scene
 
@@ -20,10 +23,11 @@ KEPT = 3
 
 
 class Labels:
-    """Makes the label frames of one renderer."""
+    """Makes the label frames of one renderer. camera : of another picture at the same place; None: of the scene's."""
 
-    def __init__(self, renderer: Renderer):
-        self._renderer = renderer
+    def __init__(self, renderer: Renderer, camera: PinHole | None = None):
+        self._renderer, self._view = renderer, None if camera is None else View.of(camera)
+        self.scene = renderer.scene if camera is None else renderer.scene.with_camera(camera)
         self._kept: dict[tuple[int, tuple[str, ...]], dict[str, np.ndarray]] = {}
 
     def frame(self, t_ns: int, request: LabelRequest, forward_ns: int | None, backward_ns: int | None) -> LabelFrame:
@@ -42,12 +46,13 @@ class Labels:
         }
         drawn: dict[str, np.ndarray] = {}
         if names := request.buffers:
-            frame = draw.draw(Geometry(names), t_ns, ends)
+            frame = self._drawn(names, t_ns, ends)
             drawn = {name: frame.read(name) for name in names}
         values: dict[str, Any] = {}
         for name in request:
             if LABELS[name].anti_aliased:
-                values[name] = draw.colour(t_ns).read()
+                at = self._moment(t_ns)
+                values[name] = (draw.colour(t_ns) if self._view is None else draw.flat_colour(at)).read()
         started = working_clock()
         for name in request:
             self._finished(name, drawn, ends, there, values)
@@ -63,18 +68,19 @@ class Labels:
         values: dict[str, Any],
     ) -> Any:
         if name not in values:
-            label, draw = LABELS[name], self._renderer
+            label = LABELS[name]
             value = label.finish(
                 _Drawn(
                     label,
-                    draw.scene,
+                    self.scene,
                     ends.get(label.towards),
                     drawn,
                     there.get(label.towards, {}),
                     lambda other: self._finished(other, drawn, ends, there, values),
                 )
             )
-            if (wrong := label.wrong(value, draw.height, draw.width)) is not None:
+            camera = self.scene.camera
+            if (wrong := label.wrong(value, camera.height, camera.width)) is not None:
                 raise TypeError(f"label '{name}': `finish` gives {wrong}")
             values[name] = value
         return values[name]
@@ -89,15 +95,20 @@ class Labels:
         ]
         return names[0] if names else "the background"
 
-    def forget(self) -> None:
-        """Nothing of what was drawn before is used again."""
-        self._kept = {}
+    def _moment(self, t_ns: int) -> Moment:
+        moment = self._renderer.moment(t_ns)
+        return moment if self._view is None else moment.through(self._view)
+
+    def _drawn(self, names: tuple[str, ...], t_ns: int, ends: dict[str, int]) -> Frame:
+        draw = self._renderer
+        pass_ = draw.geometry(names) if self._view is None else Geometry(names)
+        return draw.draw(pass_, self._moment(t_ns), {name: self._moment(t) for name, t in ends.items()})
 
     def _buffers(self, t_ns: int, names: tuple[str, ...]) -> dict[str, np.ndarray]:
         """Buffers of these labels at a time, as the shader wrote them."""
         key = (t_ns, names)
         if key not in self._kept:
-            frame = self._renderer.draw(Geometry(names), t_ns)
+            frame = self._drawn(names, t_ns, {})
             self._kept[key] = {name: frame.read(name) for name in names}
             while len(self._kept) > KEPT:
                 self._kept.pop(next(iter(self._kept)))

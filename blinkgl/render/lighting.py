@@ -6,6 +6,7 @@ shaders/include/light.glsl without LIGHTS, and :meth:`Painter.place` sets their 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,10 +40,12 @@ _PLACED = {
 
 
 class Lighting:
-    """Of one scene. lamps : in the order of the shaders' arrays.   coloured : whether any of it is not white."""
+    """Of one scene. lamps : in the order of the shaders' arrays.   coloured : whether any of it is not white.
+    plain : whether a white sun and sky are all of it, but for shadows, which it ``casts`` or not."""
 
     def __init__(self, light: Light):
-        self.plain, self.coloured, self.lamps = light.plain, is_coloured(light), lamps_of(light)
+        self.plain, self.coloured, self.lamps = replace(light, shadows="off").plain, is_coloured(light), lamps_of(light)
+        self.casts = light.shadows != "off"
         self._suns = sum(lamp.kind == "sun" for lamp in self.lamps)
         self._spots = sum(lamp.kind == "spot" for lamp in self.lamps)
         self._quadric = quadric_of(light)
@@ -64,7 +67,7 @@ class Lighting:
         hued = {"HUED": 1} if kind.hued and pass_.one_channel else {}
         if not (kind.lit and pass_.lit):
             return hued if pass_.lit else {}
-        if self.plain and not kind.whole:
+        if self.plain and not kind.whole and not getattr(pass_, "shadows", ()):
             return {}
         counts = {"SUNS": self._suns, "LAMPS": len(self.lamps) - self._suns, "SPOTS": self._spots}
         ambient = 2 if self._quadric[:, :3, :3].any() else 1
@@ -84,7 +87,7 @@ class Lighting:
 
     def place(self, uniforms: Uniforms, item: DrawItem, moment: Moment) -> None:
         """Sets what lights.glsl asks for, of whichever variant the program is."""
-        if self.plain and not item.kind.whole:
+        if "sun_direction" in uniforms or (self.plain and not self.casts and not item.kind.whole):
             return
         index, channel = item.object_index, item.material.base_color
         for name, per_channel in _FIXED.items():

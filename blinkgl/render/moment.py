@@ -9,12 +9,14 @@ Computed once, shared by all passes.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from blinkgl.camera.drawing import seen_through
 from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate, inverse_depth_bits
+from blinkgl.render.umbras import Solids
 
 if TYPE_CHECKING:
     from blinkgl.camera import CameraModel
@@ -67,7 +69,10 @@ class Moment:
     """All objects of a scene at t_ns. What nobody asks for is not computed; what somebody did is not computed again.
 
     T_world_cam : (4, 4) float64.   T_world_obj, T_cam_obj : (n, 4, 4) float64, a row per object of the scene.
-    view : :class:`View` of the camera.   Arrays per item have a row per part that is drawn, ``DrawItem.number``."""
+    view : :class:`View` of the camera.   Arrays per item have a row per part that is drawn, ``DrawItem.number``.
+    looker : of a lamp's: whose picture its shadows are for; those that are not seen there need not be drawn."""
+
+    looker: Moment | None = None
 
     def __init__(self, t_ns: int, view: View, T_world_cam: np.ndarray, T_world_obj: np.ndarray, stage: Stage):
         self.t_ns, self.view, self.T_world_cam, self.T_world_obj, self._stage = (
@@ -77,6 +82,18 @@ class Moment:
             T_world_obj,
             stage,
         )
+
+    @property
+    def stage(self) -> Stage:
+        """What of the scene is the same at all times."""
+        return self._stage
+
+    def once(self, key: Hashable, compute: Callable[[], Any]) -> Any:
+        """What ``compute`` gives, by a key of the caller's, computed when first asked for."""
+        kept = self.__dict__.setdefault("_others", {})
+        if key not in kept:
+            kept[key] = compute()
+        return kept[key]
 
     def through(self, view: View) -> Moment:
         """The same instant through another camera at the same place."""
@@ -166,12 +183,18 @@ class Stage:
         self.item_radius = np.array([i.radius for i in items])
         self.item_layer = np.array([i.layer for i in items])
 
+    @_once
+    def solids(self) -> Solids:
+        """Boxes of the items, for shadows."""
+        return Solids(self.items)
+
 
 class Moments:
-    """Gives the moments of a scene; the last few are kept. ``stage``: :class:`Stage`."""
+    """Gives the moments of a scene; the last few are kept. ``stage``: :class:`Stage`. Of a lens that distorts they are
+    those of the pin-hole camera that is drawn for it."""
 
     def __init__(self, scene: Scene, items: Sequence[DrawItem]):
-        self.stage, self.view = Stage(scene, items), View.of(scene.camera)
+        self.stage, self.view = Stage(scene, items), View.of(seen_through(scene.camera))
         paths = self.stage.paths
         self._start = np.stack([p.pose(scene.t0_ns) for p in paths]) if paths else np.zeros((0, 4, 4))
         self._kept: OrderedDict[int, Moment] = OrderedDict()
@@ -189,6 +212,6 @@ class Moments:
 
     def look_through(self, camera: CameraModel) -> None:
         """From now on through another camera on the same path."""
-        self.view = View.of(camera)
+        self.view = View.of(seen_through(camera))
         for t_ns, moment in self._kept.items():
             self._kept[t_ns] = moment.through(self.view)

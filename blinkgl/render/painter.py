@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +19,10 @@ from blinkgl.render.strokes import Strokes
 if TYPE_CHECKING:
     from blinkgl.gl import GLContext, Target
     from blinkgl.render.frames import RenderStats
+    from blinkgl.render.lens import Lens
     from blinkgl.render.moment import Moment
     from blinkgl.render.passes.base import Pass, Shot
+    from blinkgl.render.rectangles import Rectangle
     from blinkgl.render.resources import DrawItem, Kind, SceneResources
     from blinkgl.scene.types import Map, Scene
 
@@ -54,11 +59,13 @@ class Painter:
     """Draws for the passes of one renderer. A subclass may look on: every method is called
     by the passes and none by another.
 
-    gl : GLContext.   resources : SceneResources.   stats : what is counted.   strokes : lines to be drawn."""
+    gl : GLContext.   resources : SceneResources.   stats : what is counted.   lens : of a camera that distorts.
+    strokes : lines to be drawn."""
 
     def __init__(self, gl: GLContext, scene: Scene, resources: SceneResources, stats: RenderStats):
         self.gl, self.scene, self.resources, self.stats = gl, scene, resources, stats
         self.lighting = Lighting(scene.light)
+        self.lens: Lens | None = None
         self._programs: dict[Pass, Programs] = {}
         self._covers: dict[Pass, tuple[Uniforms, moderngl.VertexArray]] = {}
         self._culling = False
@@ -82,6 +89,20 @@ class Painter:
         ctx.cull_face = "back"
         self._culling = False
 
+    @contextmanager
+    def only(self, place: Rectangle, shot: Shot) -> Iterator[None]:
+        """Draws into a rectangle of the picture, px, alone, of what may be drawn into."""
+        ctx, camera, (width, height) = self.gl.ctx, shot.moment.view.camera, shot.size
+        across, down = width / camera.width, height / camera.height
+        x, y, w, h = before = ctx.scissor or (0, 0, width, height)
+        x0, y0 = max(x, math.floor(place.x0 * across)), max(y, math.floor(place.y0 * down))
+        x1, y1 = min(x + w, math.ceil(place.x1 * across)), min(y + h, math.ceil(place.y1 * down))
+        ctx.scissor = (x0, y0, max(x1 - x0, 0), max(y1 - y0, 0))
+        try:
+            yield
+        finally:
+            ctx.scissor = None if before == (0, 0, width, height) else before
+
     def programs(self, pass_: Pass) -> Programs:
         programs = self._programs.get(pass_)
         if programs is None:
@@ -96,7 +117,8 @@ class Painter:
         """Sets what every program that draws the scene takes: matrices, depths and, where it has them, the light."""
         index = item.object_index
         uniforms["mvp"].write(moment.mvp_columns[index])
-        uniforms["inverse_depths"].write(moment.inverse_depths[item.number])
+        if "inverse_depths" in uniforms:
+            uniforms["inverse_depths"].write(moment.inverse_depths[item.number])
         if "sun_direction" in uniforms:
             # Every time: the context's programs are shared with other renderers, their uniforms included.
             light = self.scene.light

@@ -86,7 +86,7 @@ class Flow:
     """Where the points of some :class:`Hits` are at t_ns (t').
 
     flow : (..., 2) px, +x right, +y down, t -> t'; nan where not valid.
-    valid : hit, and in front of the camera at t' (Z' > 0).
+    valid : hit, and in front of the camera at t' (Z' > 0), where its model sees it.
     occluded : valid, but not visible at t': hidden by a surface, seen from its own culled side, outside the image or in
     front of the near plane.   outside : valid, and not inside the image at t'.
     depth : (...) Z' at t'.   hidden_by : (..., 2) int32 (part, triangle) of the nearest thing in the way, or -1.
@@ -333,6 +333,7 @@ def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
     valid = hits.hit & (depth > 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         flow = np.where(valid[:, None], camera.displacement(_rays(camera, hits.xy), hits.depth, change), np.nan)
+        valid &= np.isfinite(flow).all(axis=1)  # a lens may not see it there
         there = hits.xy + flow
         inside = valid & ((there >= -0.5) & (there < [camera.width - 0.5, camera.height - 0.5])).all(axis=1)
 

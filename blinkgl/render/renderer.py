@@ -23,16 +23,29 @@ from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.canvas import Canvas, Frame
 from blinkgl.render.frames import RenderStats
 from blinkgl.render.labels import Labels
+from blinkgl.render.lens import Lens
 from blinkgl.render.moment import Moment, Moments
 from blinkgl.render.painter import Painter
-from blinkgl.render.passes import Brightness, Colour, Luminance, Pass, Shot, Velocity, filtered, shadow_maps
+from blinkgl.render.passes import (
+    Brightness,
+    Colour,
+    Gather,
+    Geometry,
+    Luminance,
+    Pass,
+    Shot,
+    Velocity,
+    filtered,
+    one_value,
+    shadow_maps,
+)
 from blinkgl.render.resources import DrawItem, SceneResources
 from blinkgl.render.still import StillCanvas
 from blinkgl.scene.geometry.lod import at_level_of_detail
 from blinkgl.scene.geometry.meshes import without_collapsed_faces
 
 if TYPE_CHECKING:
-    from blinkgl.camera import CameraModel
+    from blinkgl.camera import CameraModel, PinHole
     from blinkgl.config.sequence import RenderConfig
     from blinkgl.gl import GLContext
     from blinkgl.scene.types import Scene
@@ -62,9 +75,10 @@ class Renderer:
         self._samples = samples_of(config.antialiasing)
         self._image_samples = samples_of(config.image_antialiasing, "render.image_antialiasing")
         self._painter = painter(gl, scene, SceneResources(gl, scene, config.anisotropy, config.mip_bias), self.stats)
+        self._painter.lens = Lens.of(gl, scene.camera)
         self._moments = Moments(scene, self.items)
-        self._canvases: dict[Pass, Canvas] = {}
-        self._labels = Labels(self)
+        self._canvases: dict[tuple[Pass, int, int], Canvas] = {}
+        self._labels: dict[PinHole | None, Labels] = {}
         # Worth it when something stands still besides the camera; a scene of movers alone is drawn whole.
         some_stand = any(o.is_static for o in scene.objects)
         lamps_stand = all(lamp.path.is_static for lamp in scene.light.lamps)
@@ -84,6 +98,8 @@ class Renderer:
             return
         with self.gl.borrowed():
             self.forget()
+            if self._painter.lens is not None:
+                self._painter.lens.release()
             self._painter.resources.release()
 
     def forget(self) -> None:
@@ -92,7 +108,7 @@ class Renderer:
         for canvas in self._canvases.values():
             canvas.release()
         self._canvases = {}
-        self._labels.forget()
+        self._labels = {}
         self._painter.forget()
 
     def look_through(self, camera: CameraModel) -> None:
@@ -100,10 +116,14 @@ class Renderer:
         cost. Nothing of what was drawn before is used again, and frames are drawn whole."""
         self.scene = self.scene.with_camera(camera)
         self._moments.look_through(camera)
-        self._labels.forget()
+        self._labels = {}
         self.whole = True  # what stands still in one picture is no backdrop of the other
-        for pass_ in [p for p, canvas in self._canvases.items() if isinstance(canvas, StillCanvas)]:
-            self._canvases.pop(pass_).release()
+        lens, new = self._painter.lens, Lens.of(self.gl, camera)
+        if lens is not None:
+            lens.release()
+        self._painter.lens = new
+        for key in [k for k, c in self._canvases.items() if lens is not new or isinstance(c, StillCanvas)]:
+            self._canvases.pop(key).release()
 
     @property
     def items(self) -> Sequence[DrawItem]:
@@ -121,25 +141,48 @@ class Renderer:
 
     # ---- drawing -------------------------------------------------------------------------------------------------
 
-    def draw(self, pass_: Pass, at: int | Moment, ends_ns: Mapping[str, int] | None = None) -> Frame:
+    def draw(self, pass_: Pass, at: int | Moment, ends_ns: Mapping[str, int | Moment] | None = None) -> Frame:
         """The frame of any pass at a time, ns, or of a moment as it is seen from elsewhere (``moment.from_place``); the
         passes that it reads are drawn before it.
 
-        ends_ns : other times that it looks at, by name: {"forward": t1_ns}."""
+        ends_ns : other times that it looks at, by name: {"forward": t1_ns}. A pass that draws the scene draws the flat
+        picture of a lens that distorts; :meth:`seen` is what the lens makes of it."""
         started = working_clock()
-        ends = {name: self.moment(t) for name, t in (ends_ns or {}).items()}
-        frame = self._drawn(pass_, at if isinstance(at, Moment) else self.moment(at), ends, {})
+        ends = {name: self._moment(t) for name, t in (ends_ns or {}).items()}
+        frame = self._drawn(pass_, self._moment(at), ends, {})
         self.stats.render_s += working_clock() - started
         return frame
+
+    def _moment(self, at: int | Moment) -> Moment:
+        return at if isinstance(at, Moment) else self.moment(at)
+
+    def seen(self, pass_: Pass, smooth: bool = False) -> Pass:
+        """A pass that draws the scene as the scene's camera sees it: itself, or what a lens makes of it.
+
+        smooth : light, which is averaged over pixels; else each looks at one."""
+        if self.lens == "":
+            return filtered(pass_) if smooth else pass_
+        return Gather(one_value(pass_) if smooth else pass_, self.scene.camera, smooth)
+
+    @property
+    def lens(self) -> str:
+        """Macro of the camera's model where it distorts; "" for a pin-hole camera."""
+        return "" if self._painter.lens is None else self.scene.camera.shader
+
+    def geometry(self, names: tuple[str, ...]) -> Pass:
+        """What the label shader writes of labels of these names, in the pixels of the scene's camera."""
+        return self.seen(Geometry(names, self.lens))
 
     def _drawn(self, pass_: Pass, moment: Moment, ends: Mapping[str, Moment], done: dict[Pass, Frame]) -> Frame:
         frame = done.get(pass_)
         if frame is None:
             inputs = {one.sampler: self._drawn(one.of, moment, ends, done) for one in pass_.inputs}
-            canvas = self._canvases.get(pass_)
+            seen = moment.view.camera  # labels may be of another picture than the rest
+            key = (pass_, seen.width, seen.height)
+            canvas = self._canvases.get(key)
             if canvas is None:
                 kind = StillCanvas if pass_.stands_still(self.whole) else Canvas
-                canvas = self._canvases[pass_] = kind(pass_, self._painter, self.width, self.height)
+                canvas = self._canvases[key] = kind(pass_, self._painter, seen.width, seen.height)
             frame = done[pass_] = canvas.draw(Shot(pass_.seen(moment), canvas.target, self.scene, ends, inputs))
         return frame
 
@@ -148,36 +191,52 @@ class Renderer:
     def luminance(self, t_ns: int, rate: bool = False) -> Frame:
         """Linear luminance at t_ns, (H, W) float32; with ``rate`` beside it "rate", d(luminance)/dt per second of each
         pixel, as the surface it shows moves (edges that pass are not in it)."""
-        return self.draw(filtered(Luminance(rate, self._samples, self._shadows)), t_ns)
+        return self.draw(self.seen(Luminance(rate, self._samples, self._shadows), smooth=True), t_ns)
 
     def brightness(self, t_ns: int, every: int = 1) -> Frame:
         """Luminance and d(luminance)/dt per second, (h, w, 2) float32, on every n-th pixel in x and y, textures
         filtered as for the whole image. h = max(1, H // every), w likewise: the small picture covers the whole image,
         so that its pixels are H / h and W / w pixels apart, a little more than ``every`` where that is no divisor."""
-        return self.draw(Brightness(every, self._shadows), t_ns)
+        return self.draw(self.seen(Brightness(every, self._shadows)), t_ns)
 
     def velocity(self, t_ns: int, every: int = 1) -> Frame:
         """Image velocity at t_ns in px/s (of the full-size image), (h, w, 2) float32, 0 where nothing is hit, h and w
         as for :meth:`brightness`: a few pixels are enough to find the largest motion."""
-        return self.draw(Velocity(every), t_ns)
+        return self.draw(self.seen(Velocity(every, lens=self.lens)), t_ns)
 
     def velocity_of_movers(self, t_ns: int, every: int = 1) -> Frame:
         """:meth:`velocity` of what moves, for the time sampling: with a still camera of the moving objects alone, those
         behind something included: still a bound."""
-        return self.draw(Velocity(every, moving_only=not self.whole), t_ns)
+        return self.draw(self.seen(Velocity(every, not self.whole, self.lens)), t_ns)
 
     def colour(self, at: int | Moment, antialiasing: str | None = None) -> Frame:
         """Linear radiance at a time, ns, or of a moment, (H, W, 3) float32; ``antialiasing`` overrides the
         configuration's."""
         samples = self._image_samples if antialiasing is None else samples_of(antialiasing)
-        return self.draw(filtered(Colour(samples, self._shadows)), at)
+        return self.draw(self.seen(Colour(samples, self._shadows), smooth=True), at)
+
+    def flat_colour(self, at: Moment) -> Frame:
+        """:meth:`colour` of a moment that a pin-hole camera sees, whatever the scene's camera is."""
+        return self.draw(filtered(Colour(self._image_samples, self._shadows)), at)
 
     def labels(
-        self, t_ns: int, request: LabelRequest, t_forward_ns: int | None = None, t_backward_ns: int | None = None
+        self,
+        t_ns: int,
+        request: LabelRequest,
+        t_forward_ns: int | None = None,
+        t_backward_ns: int | None = None,
+        camera: PinHole | None = None,
     ) -> LabelFrame:
-        """Ground truth at t_ns: flow_forward runs from t_ns to t_forward_ns, flow_backward to t_backward_ns."""
-        return self._labels.frame(t_ns, request, t_forward_ns, t_backward_ns)
+        """Ground truth at t_ns: flow_forward runs from t_ns to t_forward_ns, flow_backward to t_backward_ns.
+
+        camera : in whose pixels, at the place of the scene's camera; None: in that one's own."""
+        return self._labels_in(camera).frame(t_ns, request, t_forward_ns, t_backward_ns)
+
+    def _labels_in(self, camera: PinHole | None) -> Labels:
+        if camera not in self._labels:
+            self._labels[camera] = Labels(self, camera)
+        return self._labels[camera]
 
     def shown_at(self, x: int, y: int, t_ns: int) -> str:
         """What is seen at the centre of pixel (x, y) at t_ns, in words, for messages."""
-        return self._labels.shown_at(x, y, t_ns)
+        return self._labels_in(None).shown_at(x, y, t_ns)

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from blinkgl.camera import CameraModel, PinHole
+from blinkgl.camera.rectified import rectified
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.config.tracks import track_times
 from blinkgl.errors import EventDataError
@@ -173,7 +175,7 @@ class RenderedSequence(Simulation):
         return self._truth_over(-1, t_ns, span_ns, asked_for(self.sensor.labels), False)
 
     def _truth_over(self, k: int, t_ns: int, span_ns: int, request: LabelRequest, last: bool) -> GroundTruth:
-        frame = self.renderer.labels(t_ns, request, t_ns + span_ns, t_ns - span_ns)
+        frame = self.renderer.labels(t_ns, request, t_ns + span_ns, t_ns - span_ns, self._rectified)
         camera, objects = poses_at(self.scene, [t_ns])
         leads_to = (None, None) if last else (t_ns + span_ns, t_ns - span_ns)
         return GroundTruth(k, t_ns, frame, *leads_to, camera[0], objects[:, 0])
@@ -192,7 +194,8 @@ class RenderedSequence(Simulation):
 
     def poses(self) -> dict[str, np.ndarray]:
         """t_ns (M,) int64, the start and every label's time; T_world_cam (M, 4, 4) float64; T_world_obj (n, M, 4, 4)
-        float64 in the order of object_ids (n,) and object_names (n,); K (3, 3); resolution (width, height); near."""
+        float64 in the order of object_ids (n,) and object_names (n,); K (3, 3); resolution (width, height); near; of a
+        camera that distorts lens, its kind, and distortion (k,)."""
         scene, times = self.scene, [self.config.time.t0_ns, *self.config.time.label_times_ns]
         T_world_cam, T_world_obj = poses_at(scene, times)
         return {
@@ -205,7 +208,18 @@ class RenderedSequence(Simulation):
             "K": scene.camera.K,
             "resolution": np.array([scene.camera.width, scene.camera.height], np.int64),
             "near": np.array(scene.camera.near),
+            **({} if self.lens is None else {"lens": np.array(self.lens.kind), "distortion": self.lens.distortion}),
         }
+
+    @property
+    def lens(self) -> CameraModel | None:
+        return self.scene.camera if self.scene.camera.coefficients else None
+
+    @property
+    def _rectified(self) -> PinHole | None:
+        """The camera in whose pixels labels are; None: the sensor's own."""
+        asked = self.sensor.labels is not None and self.sensor.labels.pixels == "rectified"
+        return rectified(self.scene.camera) if asked and self.lens is not None else None
 
     def imu(self) -> Inertial | None:
         if self.config.imu is None:
@@ -219,7 +233,9 @@ class RenderedSequence(Simulation):
             return None
         times = track_times(config.rate, time.label_times_ns[0], time.t1_ns, time.interval_ns)
         # of the scene as it is drawn: its labels are of the same triangles
-        return track_points(self.renderer.scene, config, times, generator(self.config.seed, self.index, Role.TRACKS))
+        scene, flat = self.renderer.scene, self._rectified
+        scene = scene if flat is None else scene.with_camera(flat)
+        return track_points(scene, config, times, generator(self.config.seed, self.index, Role.TRACKS))
 
     def facts(self) -> dict[str, Any]:
         gl, scene, timeline = self.renderer.gl, self.renderer.scene, self.config.timeline

@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from blinkgl.camera import CameraModel
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.events.camera import EventCamera
@@ -265,6 +266,11 @@ class Simulation(ABC):
     @abstractmethod
     def poses(self) -> dict[str, np.ndarray]:
         """What poses.npz holds; empty where nobody knows."""
+
+    @property
+    def lens(self) -> CameraModel | None:
+        """The camera, where it distorts."""
+        return None
 
     def imu(self) -> Inertial | None:
         """What the inertial unit of ``imu:`` measures; None: there is none. Raises ConfigError where the camera's

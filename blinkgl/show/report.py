@@ -1,12 +1,30 @@
-"""``blinkgl report``: where the page is."""
+"""``blinkgl report``: where the page is, and the card."""
 
 from __future__ import annotations
 
+from blinkgl.errors import ConfigError
 from blinkgl.report import write_report
+from blinkgl.report.card import write_card
 from blinkgl.show.terminal import plain_console, say
 
 
-def run(folder: str, out: str | None = None, *, examples: int = 6) -> int:
-    """Arguments: of :func:`~blinkgl.report.write_report`."""
-    say(plain_console(), f"written to {write_report(folder, out, examples=examples)}")
+def run(
+    folder: str,
+    out: str | None = None,
+    *,
+    examples: int = 6,
+    card: bool = False,
+    licence: str | None = None,
+    url: str | None = None,
+) -> int:
+    """Arguments: of :func:`~blinkgl.report.write_report` and, with ``card``, of
+    :func:`~blinkgl.report.card.write_card`. Raises ConfigError: a licence or address without a card."""
+    for name, value in (("--license", licence), ("--url", url)):
+        if value is not None and not card:
+            raise ConfigError("is said on the card", where=name, value=value, accepted="it with --card")
+    console = plain_console()
+    if card:
+        for path in write_card(folder, licence=licence, url=url):
+            say(console, f"written to {path}")
+    say(console, f"written to {write_report(folder, out, examples=examples)}")
     return 0

@@ -5,11 +5,18 @@
 // Subtracting two projected positions instead (c1/w1 - c0/w0) leaves float32 rounding of the positions, 1e-4 px,
 // in the result however small the motion is. ndc comes from gl_FragCoord, which is exact.
 
+//
+// LENS: in pixels of a lens that distorts (lens.glsl), not in those of the flat picture that is drawn.
+#include "along_ray.glsl"
+#ifdef LENS
+#include "lens.glsl"
+#endif
+
 const float BEYOND = 1e37; // px, px/s: further than anything that is told apart from infinity
 
 vec2 ndc_of_fragment(vec2 image_size)
 {
-    return gl_FragCoord.xy / image_size * 2.0 - 1.0;
+    return FRAGMENT_XY / image_size * 2.0 - 1.0;
 }
 
 // Of a shape that changes, q is in the place of p, and its own change comes on top: d = D * q + MVP' * (q' - q), the
@@ -19,9 +26,16 @@ vec2 ndc_of_fragment(vec2 image_size)
 // flow is beyond float32; u = v = 0 then.
 vec3 displacement(vec3 d, vec2 image_size)
 {
-    float w_next = 1.0 / gl_FragCoord.w + d.z;
+    float w_next = 1.0 / INVERSE_DEPTH + d.z;
+#ifdef LENS
+    vec2 ndc = ndc_of_fragment(image_size), place = on_plane(ndc);
+    vec2 change = (d.xy - ndc * d.z) / w_next * lens_plane.xy;
+    vec2 flow = lens_difference(place, change) * lens_focal;
+    bool usable = w_next > 0.0 && max(abs(flow.x), abs(flow.y)) < BEYOND && lens_sees(place + change);
+#else
     vec2 flow = (d.xy - ndc_of_fragment(image_size) * d.z) / w_next * 0.5 * image_size;
     bool usable = w_next > 0.0 && max(abs(flow.x), abs(flow.y)) < BEYOND;
+#endif
     return usable ? vec3(flow, w_next) : vec3(0.0, 0.0, min(w_next, 0.0));
 }
 
@@ -40,6 +54,11 @@ vec2 velocity(mat4x3 rate, vec3 local, vec2 image_size)
 #if defined(DEFORM) && defined(NEEDS_RATE)
     d += shape_rate;
 #endif
-    vec2 v = (d.xy - ndc_of_fragment(image_size) * d.z) * gl_FragCoord.w * 0.5 * image_size;
+#ifdef LENS
+    vec2 ndc = ndc_of_fragment(image_size);
+    vec2 v = lens_slope(on_plane(ndc)) * ((d.xy - ndc * d.z) * INVERSE_DEPTH * lens_plane.xy) * lens_focal;
+#else
+    vec2 v = (d.xy - ndc_of_fragment(image_size) * d.z) * INVERSE_DEPTH * 0.5 * image_size;
+#endif
     return clamp(v, -BEYOND, BEYOND);
 }

@@ -34,10 +34,13 @@ const float SPARE = 0.25, FARTHEST = 16.0; // texels towards the lamp: always, a
 const float WIDEST = 24.0; // texels, radius of what is looked at
 const int TAPS = 16;
 
+const float ANGLE = 2.39996323;
+const vec2 TURN = vec2(cos(ANGLE), sin(ANGLE));
+
 // Of a disc of radius 1, as evenly as sunflower seeds; the same for every pixel: no noise, which would be events.
 vec2 seed(int i)
 {
-    float angle = float(i) * 2.39996323;
+    float angle = float(i) * ANGLE;
     return sqrt((float(i) + 0.5) / float(TAPS)) * vec2(cos(angle), sin(angle));
 }
 
@@ -67,18 +70,20 @@ float seen_share(SHADOW_MAP map, vec3 at, vec2 slope, float unit, float texel, v
             count += 1.0;
         }
     }
-    if (count == 0.0)
-        return 1.0;
-    float blocker = sum / count;
+    // llvmpipe computes both sides of an if, and a loop whose length is known; this one it leaves with the last pixel that stays.
+    int taps = count > 0.0 ? TAPS : 0;
+    float blocker = sum / max(count, 1.0);
     float width = sun ? scale.w * (blocker - at.z) / scale.z : scale.w * max(blocker / at.z - 1.0, 0.0);
     vec2 radius = clamp(0.5 * width / texel, 0.5, WIDEST) * one;
     float lit = 0.0;
-    for (int i = 0; i < TAPS; ++i)
+    vec2 way = vec2(1.0, 0.0); // seed(i) by turning
+    for (int i = 0; i < taps; ++i)
     {
-        vec2 aside = seed(i) * radius;
+        vec2 aside = sqrt((float(i) + 0.5) / float(TAPS)) * way * radius;
         lit += nearer(map, at.xy + aside, max(at.z + clamp(least + dot(slope, aside), -most, most), 0.0));
+        way = mat2(TURN.x, TURN.y, -TURN.y, TURN.x) * way;
     }
-    return lit / float(TAPS);
+    return taps > 0 ? lit / float(TAPS) : 1.0;
 }
 #endif
 

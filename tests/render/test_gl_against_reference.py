@@ -442,7 +442,7 @@ def test_random_world_of_real_meshes_and_photographs(gl):
         ),
         ("include/motion.glsl", "* d.z) / w_next", "* d.z)"),
         ("include/motion.glsl", "* d.z) / w_next", "* d.z) * gl_FragCoord.w"),
-        ("include/labels/depth.glsl", "1.0 / gl_FragCoord.w", "1.0 / gl_FragCoord.w - 0.05"),
+        ("include/labels/depth.glsl", "1.0 / INVERSE_DEPTH", "1.0 / INVERSE_DEPTH - 0.05"),
     ],
     ids=["sign of the flow", "no perspective division", "division by the old depth", "depth off by the near plane"],
 )

@@ -8,13 +8,14 @@ Start: base.py, then luminance.py.
 from blinkgl.render.passes.base import Input, Output, Pass, ScenePass, ScreenPass, Shot
 from blinkgl.render.passes.colour import Colour
 from blinkgl.render.passes.edged import Edged, filtered
+from blinkgl.render.passes.gather import Gather, one_value
 from blinkgl.render.passes.geometry import Geometry
 from blinkgl.render.passes.luminance import Brightness, Luminance
 from blinkgl.render.passes.mean import Mean
 from blinkgl.render.passes.shadow import Shaded, ShadowMap, shadow_maps
 from blinkgl.render.passes.velocity import Velocity
 
-PASSES: tuple[type[Pass], ...] = (Luminance, Brightness, Velocity, Colour, Geometry, Mean, Edged, ShadowMap)
+PASSES: tuple[type[Pass], ...] = (Luminance, Brightness, Velocity, Colour, Geometry, Mean, Edged, Gather, ShadowMap)
 """Those that a renderer draws of itself."""
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "Brightness",
     "Colour",
     "Edged",
+    "Gather",
     "Geometry",
     "Input",
     "Luminance",
@@ -35,5 +37,6 @@ __all__ = [
     "Shot",
     "Velocity",
     "filtered",
+    "one_value",
     "shadow_maps",
 ]

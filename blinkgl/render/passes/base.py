@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from blinkgl.render.canvas import Frame
     from blinkgl.render.moment import Moment
     from blinkgl.render.painter import Painter, Uniforms
+    from blinkgl.render.rectangles import Rectangle
     from blinkgl.render.resources import DrawItem, Kind
     from blinkgl.scene.types import Scene
 
@@ -68,8 +69,8 @@ class Pass:
     still : whether a camera that stands still has only what moves drawn again.
     lit : whether its program asks light.glsl for the light, and fog.glsl for what of it arrives.
     one_channel : whether one channel of it will do, where the surface is of one colour.
-    pointwise : each pixel comes of the inputs' pixel at the same place, so that it does
-    not change where they do not.   margin : of such a pass, how many px further it looks at them."""
+    pointwise : each pixel comes of the inputs' pixel at the same place (or where :meth:`changed` says), so that it does
+    not change where they do not."""
 
     program: ClassVar[str]
     outputs: tuple[Output, ...]
@@ -81,7 +82,6 @@ class Pass:
     lit: ClassVar[bool] = False
     one_channel: ClassVar[bool] = False
     pointwise: ClassVar[bool] = False
-    margin: ClassVar[int] = 0
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         """Of its target, px, for an image of width x height: ``samples.grid`` times as fine,
@@ -101,6 +101,10 @@ class Pass:
     def stands_still(self, whole: bool) -> bool:
         """Whether only what moves is drawn again. whole : no pass of the camera's is to be drawn so."""
         return self.still and not whole
+
+    def changed(self, painter: Painter, rectangles: list[Rectangle]) -> list[Rectangle]:
+        """Where a pass that is ``pointwise`` changes when its inputs change in these rectangles."""
+        return rectangles
 
     def seen(self, moment: Moment) -> Moment:
         """The moment as this pass looks at it: the camera's, unless it draws for another one
@@ -142,15 +146,22 @@ class ScenePass(Pass):
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
         programs = painter.programs(self)
         for item in self.items(shot.moment) if items is None else items:
-            uniforms = programs[item.kind]
-            painter.place(uniforms, item, shot.moment)
-            if item.deformer is not None:
-                painter.deform(uniforms, item, shot)
-            if "fog" in uniforms:
-                painter.fog(uniforms, shot)
-            self.bind(uniforms, shot)
-            self.set(painter, uniforms, item, shot)
-            painter.draw(uniforms, item)
+            self.draw_item(painter, shot, item, programs[item.kind])
+
+    def draw_item(self, painter: Painter, shot: Shot, item: DrawItem, uniforms: Uniforms) -> None:
+        """One of them, by the program that ``uniforms`` belong to."""
+        self.dress_item(painter, shot, item, uniforms)
+        painter.draw(uniforms, item)
+
+    def dress_item(self, painter: Painter, shot: Shot, item: DrawItem, uniforms: Uniforms) -> None:
+        """Hands a program all that it takes of an item."""
+        painter.place(uniforms, item, shot.moment)
+        if item.deformer is not None:
+            painter.deform(uniforms, item, shot)
+        if "fog" in uniforms:
+            painter.fog(uniforms, shot)
+        self.bind(uniforms, shot)
+        self.set(painter, uniforms, item, shot)
 
 
 class ScreenPass(Pass):

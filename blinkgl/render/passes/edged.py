@@ -12,6 +12,7 @@ from blinkgl.render.antialiasing import Samples
 from blinkgl.render.canvas import DEPTH_BUFFER
 from blinkgl.render.passes.base import Input, Output, Pass, Shot
 from blinkgl.render.passes.mean import Mean
+from blinkgl.render.rectangles import Rectangle, merged
 
 if TYPE_CHECKING:
     from blinkgl.render.painter import Painter
@@ -39,7 +40,6 @@ class Edged(Pass):
     program: ClassVar[str] = "edges.glsl"
     depth: ClassVar[bool | str] = False
     pointwise: ClassVar[bool] = True
-    margin: ClassVar[int] = 1
 
     @property
     def inputs(self) -> tuple[Input, ...]:
@@ -52,6 +52,10 @@ class Edged(Pass):
     @property
     def every(self) -> int:
         return self.of.every
+
+    def changed(self, painter: Painter, rectangles: list[Rectangle]) -> list[Rectangle]:
+        seen = painter.scene.camera if painter.lens is None else painter.lens.flat
+        return merged([r.grown(1, seen.width, seen.height) for r in rectangles])  # it looks at the pixels beside it
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
         # Light is not negative; its rate may be anything.

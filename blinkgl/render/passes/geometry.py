@@ -19,8 +19,11 @@ if TYPE_CHECKING:
     from blinkgl.render.resources import DrawItem, Kind
 
 MADE.append(includes)
+LENS_UNIT = 7
+"""Texture unit of what a lens's pixels look at."""
 _OF_THE_PASS = {
     "", "mvp", "inverse_depths", "image_size", "clip_rate", "clip_forward", "clip_backward", "coverage", "cutoff",
+    "lens_claims", "lens_plane", "lens_focal", "lens_limit", "lens_k",
 }  # fmt: skip
 
 
@@ -29,9 +32,13 @@ class Geometry(ScenePass):
     """Outputs by the names of their labels, as the shader writes them; 0 where nothing is hit. One sample, at the
     pixel's centre. Labels that lead to another time want the moment there, "forward" or "backward".
 
+    lens : macro of the camera model that the flat picture is drawn for: fragments are evaluated where its pixels' rays
+    pass (:mod:`blinkgl.render.lens`), and motion is in its pixels; "": a pin-hole camera's own picture.
+
     Raises TypeError, at the first frame, for a label whose ``uniforms`` are not those of its ``glsl``."""
 
     names: tuple[str, ...] = ("depth",)
+    lens: str = ""
     program: ClassVar[str] = "label.glsl"
 
     @property
@@ -39,7 +46,8 @@ class Geometry(ScenePass):
         return tuple(Output(name, LABELS[name].buffer) for name in self.names)
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
-        return {define_of(name): i for i, name in enumerate(self.names)}
+        through = {"LENS": 1, "LENS_CLAIMS": 1, self.lens: 1} if self.lens else {}
+        return {define_of(name): i for i, name in enumerate(self.names)} | through
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
         programs, values = painter.programs(self), self._values(shot)
@@ -54,6 +62,8 @@ class Geometry(ScenePass):
                 painter.deform(uniforms, item, shot)
             if "image_size" in uniforms:
                 uniforms["image_size"].value = shot.size
+            if self.lens and painter.lens is not None:
+                painter.lens.set(uniforms, shot, LENS_UNIT)
             for name, (_, rows) in values.items():
                 uniforms[name].write(rows[item.object_index])
             painter.draw(uniforms, item)
@@ -101,4 +111,5 @@ class Geometry(ScenePass):
     @classmethod
     def every_kind(cls) -> Iterator[Pass]:
         drawn = [name for name, label in LABELS.items() if label.buffer]
-        return (cls(names) for count in range(1, len(drawn) + 1) for names in combinations(drawn, count))
+        yield from (cls(names) for count in range(1, len(drawn) + 1) for names in combinations(drawn, count))
+        yield from (cls(tuple(drawn[:8]), lens) for lens in ("RADTAN", "EQUIDISTANT"))

@@ -1,0 +1,146 @@
+"""A lens's picture out of a flat one.
+
+A rasteriser draws what a pin-hole camera sees. For a lens that distorts the flat picture that holds all of its own
+(:func:`blinkgl.camera.drawing.seen_through`) is drawn, at 1.42 px a pixel or more, and each pixel of the lens's picture
+looks where its ray meets that:
+
+- light is the mean over the pixel, by area, of the flat picture's pixels;
+- labels are not interpolated. Each pixel claims the one of the flat picture whose centre is nearest to its ray; no two
+  claim the same one. That fragment is evaluated where the ray passes it, not at its centre (``along_ray.glsl``), so a
+  label is of the surface that is seen at the flat pixel's centre, at most half a pixel of the lens's beside the
+  ray, and there exact.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from blinkgl.camera.drawing import seen_through
+from blinkgl.render.rectangles import Rectangle
+
+if TYPE_CHECKING:
+    import moderngl
+
+    from blinkgl.camera import CameraModel, PinHole
+    from blinkgl.gl import GLContext
+    from blinkgl.render.painter import Uniforms
+    from blinkgl.render.passes.base import Shot
+
+
+class Places(NamedTuple):
+    """Where the pixels of a picture, of every n-th pixel of a lens's, are in the flat one.
+
+    places : (h, w, 2) float32 px from the flat picture's corner (its first pixel is [0, 1)).
+    slopes : (h, w, 4) float32 d(place) / d(px), of a pixel to the right and of one downwards."""
+
+    places: np.ndarray
+    slopes: np.ndarray
+
+
+@lru_cache(maxsize=16)
+def places_of(camera: CameraModel, flat: PinHole, width: int, height: int) -> Places:
+    """Of a picture of the whole of ``camera``'s, width x height px."""
+    fine = camera if (width, height) == (camera.width, camera.height) else camera.resized(width, height)
+    x, y = np.meshgrid(np.arange(float(width)), np.arange(float(height)))
+    xy = np.stack([x, y], axis=-1)
+    rays = fine.rays(xy)
+    slopes = flat.jacobian(rays) @ fine.ray_jacobian(xy)
+    across = np.ascontiguousarray(np.swapaxes(slopes, -1, -2), np.float32).reshape(height, width, 4)
+    return Places((flat.project(rays) + 0.5).astype(np.float32), across)
+
+
+@lru_cache(maxsize=8)
+def claims_of(camera: CameraModel, flat: PinHole) -> np.ndarray:
+    """(h, w, 2) float32 of the flat picture: px from each pixel's centre to the ray of the pixel that claims it; 0
+    where none does."""
+    places = places_of(camera, flat, camera.width, camera.height).places
+    claims = np.zeros((flat.height, flat.width, 2), np.float32)
+    nearest = np.floor(places).astype(np.intp)
+    claims[nearest[..., 1], nearest[..., 0]] = places - (nearest + np.float32(0.5))
+    return claims
+
+
+_SPARED = 0.4
+"""px of the flat picture: places are at most 1 + this over their number apart."""
+_MOST = 16
+
+
+@lru_cache(maxsize=32)
+def steps_of(camera: CameraModel, finer: int) -> tuple[int, int]:
+    """Places in a pixel, along x and y, between which a flat picture that is so many times finer has one pixel or a
+    little more, wherever in the picture."""
+    slopes = places_of(camera, seen_through(camera), camera.width, camera.height).slopes  # type: ignore[bad-argument-type]
+    lengths = np.hypot(slopes[..., ::2], slopes[..., 1::2]).max(axis=(0, 1)) * finer
+    columns, rows = np.clip(np.ceil(lengths - _SPARED), 1, _MOST).astype(int)
+    return int(columns), int(rows)
+
+
+class Lens:
+    """Of one renderer: the textures that its passes look at.
+
+    camera : the lens's.   flat : the pin-hole camera that is drawn."""
+
+    def __init__(self, gl: GLContext, camera: CameraModel, flat: PinHole):
+        self.camera, self.flat, self._gl = camera, flat, gl
+        self._textures: dict[tuple, moderngl.Texture] = {}
+
+    @classmethod
+    def of(cls, gl: GLContext, camera: CameraModel) -> Lens | None:
+        """None for a pin-hole camera."""
+        flat = seen_through(camera)
+        return None if flat is camera else cls(gl, camera, flat)
+
+    def places(self, width: int, height: int) -> moderngl.Texture:
+        """Of a picture of this size."""
+        return self._texture(("places", width, height), lambda: places_of(self.camera, self.flat, width, height).places)
+
+    def slopes(self, width: int, height: int) -> moderngl.Texture:
+        return self._texture(("slopes", width, height), lambda: places_of(self.camera, self.flat, width, height).slopes)
+
+    @property
+    def claims(self) -> moderngl.Texture:
+        return self._texture(("claims",), lambda: claims_of(self.camera, self.flat))
+
+    def _texture(self, key: tuple, make) -> moderngl.Texture:
+        if key not in self._textures:
+            array = np.ascontiguousarray(make(), np.float32)
+            height, width, components = array.shape
+            texture = self._gl.ctx.texture((width, height), components, array.tobytes(), dtype="f4")
+            texture.filter = self._gl.ctx.NEAREST, self._gl.ctx.NEAREST
+            self._textures[key] = texture
+        return self._textures[key]
+
+    @cached_property
+    def _numbers(self) -> tuple[float, ...]:
+        return (*self.camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
+
+    def set(self, uniforms: Uniforms, shot: Shot, unit: int) -> None:
+        """What lens.glsl and along_ray.glsl take. unit : a free texture unit."""
+        if "lens_claims" in uniforms:
+            self.claims.use(unit)
+            uniforms["lens_claims"].value = unit
+        if "lens_plane" in uniforms:
+            P = shot.moment.view.projection
+            uniforms["lens_plane"].value = 1 / P[0, 0], 1 / P[1, 1], -P[0, 2] / P[0, 0], -P[1, 2] / P[1, 1]
+        if "lens_focal" in uniforms:
+            uniforms["lens_focal"].value = self.camera.intrinsics[:2]
+        if "lens_limit" in uniforms:
+            uniforms["lens_limit"].value = self.camera.plane_limit  # type: ignore[missing-attribute]
+        if "lens_k" in uniforms:
+            uniforms["lens_k"].value = self._numbers[: uniforms["lens_k"].array_length]
+
+    def rectangle(self, flat: Rectangle) -> Rectangle | None:
+        """Pixels of the lens's picture that can look at these of the flat one."""
+        x, y = np.array([flat.x0, flat.x1, flat.x0, flat.x1]), np.array([flat.y0, flat.y0, flat.y1, flat.y1])
+        step = np.array([[-1.5, -1.5], [0.5, -1.5], [-1.5, 0.5], [0.5, 0.5]])  # neighbours are looked at
+        rays = self.flat.rays(np.stack([x, y], axis=1) + step)
+        bounds = self.camera.bounds(rays * (2 * self.camera.near))
+        return None if bounds is None else Rectangle(*bounds)
+
+    def release(self) -> None:
+        for texture in self._textures.values():
+            texture.release()
+        self._textures = {}

@@ -1,0 +1,94 @@
+"""A lens's picture out of the flat one that was drawn (:mod:`blinkgl.render.lens`)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from moderngl import LINEAR
+
+from blinkgl.camera import CameraModel, Radtan
+from blinkgl.gl import FORMATS
+from blinkgl.labels import LABELS
+from blinkgl.render.lens import steps_of
+from blinkgl.render.passes.base import Input, Output, Pass, ScreenPass, Shot
+from blinkgl.render.passes.colour import Colour
+from blinkgl.render.passes.edged import filtered
+from blinkgl.render.passes.geometry import Geometry
+from blinkgl.render.passes.velocity import Velocity
+from blinkgl.render.rectangles import Rectangle, merged
+
+if TYPE_CHECKING:
+    from blinkgl.render.painter import Painter
+    from blinkgl.render.resources import DrawItem, Kind
+
+_FREE_UNIT = 8
+
+
+@dataclass(frozen=True)
+class Gather(ScreenPass):
+    """What each pixel of a lens's picture sees of another pass, all of whose outputs it has: of its nearest pixel or,
+    ``smooth``, of one output, the mean over its own area. At every n-th pixel where the other has every n-th."""
+
+    of: Pass
+    camera: CameraModel
+    smooth: bool = False
+    program: ClassVar[str] = "gather.glsl"
+    pointwise: ClassVar[bool] = True
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        return tuple(Input(f"picked_{k}", self.of, output.name) for k, output in enumerate(self.of.outputs))
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        return self.of.outputs
+
+    def size(self, width: int, height: int) -> tuple[int, int]:
+        every = self.of.every
+        return max(1, self.camera.width // every), max(1, self.camera.height // every)
+
+    def changed(self, painter: Painter, rectangles: list[Rectangle]) -> list[Rectangle]:
+        assert painter.lens is not None
+        seen = [painter.lens.rectangle(r) for r in rectangles]
+        return merged([r for r in seen if r is not None])
+
+    def defines(self, kind: Kind | None) -> dict[str, Any]:
+        defines: dict[str, Any] = {}
+        if self.smooth:
+            columns, rows = steps_of(self.camera, self.of.samples.grid)
+            defines = {"SMOOTH": 1, "COLUMNS": columns, "ROWS": rows}
+        for k, output in enumerate(self.outputs):
+            whole = FORMATS[output.format].numpy.kind == "u"
+            prefix = "u" if whole else ""
+            defines |= {f"SAMPLER_{k}": f"{prefix}sampler2D", f"TEXEL_{k}": f"{prefix}vec4"}
+        return defines
+
+    def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
+        lens, (uniforms, array) = painter.lens, painter.cover(self)
+        assert lens is not None
+        self.bind(uniforms, shot)
+        if self.smooth:
+            texture = shot.inputs["picked_0"].texture(self.inputs[0].output)
+            texture.filter, texture.repeat_x, texture.repeat_y = (LINEAR, LINEAR), False, False
+            lens.slopes(*shot.size).use(_FREE_UNIT + 3)
+            uniforms["slopes"].value = _FREE_UNIT + 3
+        lens.places(*shot.size).use(_FREE_UNIT + 2)
+        uniforms["places"].value = _FREE_UNIT + 2
+        uniforms["flat_size"].value = lens.flat.width, lens.flat.height
+        painter.fill(array, shot.target)
+
+    @classmethod
+    def every_kind(cls) -> Iterator[Pass]:
+        lens = Radtan(4, 3, 4.0, 4.0, 1.5, 1.0)
+        yield cls(Colour(), lens, True)
+        drawn = tuple(name for name, label in LABELS.items() if label.buffer)[:8]
+        yield cls(Geometry(drawn, lens.shader), lens)
+        yield cls(Velocity(4, lens=lens.shader), lens)
+
+
+def one_value(pass_: Pass) -> Pass:
+    """``pass_``, with the samples of each of its pixels resolved and its edges filtered, but not the mean of a finer
+    grid: a gathering pass is a mean over that anyway."""
+    return filtered(pass_) if pass_.samples.multi or pass_.samples.edges else pass_

@@ -1,0 +1,91 @@
+#version 430 core
+// A lens's picture out of a flat one (blinkgl/render/lens.py): what of the flat picture is nearest to each pixel's ray, or
+// (SMOOTH) its mean over the pixel.
+//
+// SAMPLER_k, TEXEL_k   types of the k-th output, its sampler's and its own
+// COLUMNS, ROWS        SMOOTH: places in a pixel. Counts that a pixel finds for itself cost five times as much.
+
+#include "cover.glsl"
+
+#ifdef FRAGMENT_SHADER
+uniform sampler2D places;   // where each pixel's centre is in the flat picture, px from its corner
+uniform vec2 flat_size;     // px of the flat picture in which places are
+#ifdef SMOOTH
+uniform sampler2D slopes;   // d(place) / d(px), columns
+#endif
+
+#define PICKED(k, SAMPLER, TEXEL) uniform SAMPLER picked_##k; layout(location = k) out TEXEL out_##k;
+#ifdef SAMPLER_0
+PICKED(0, SAMPLER_0, TEXEL_0)
+#endif
+#ifdef SAMPLER_1
+PICKED(1, SAMPLER_1, TEXEL_1)
+#endif
+#ifdef SAMPLER_2
+PICKED(2, SAMPLER_2, TEXEL_2)
+#endif
+#ifdef SAMPLER_3
+PICKED(3, SAMPLER_3, TEXEL_3)
+#endif
+#ifdef SAMPLER_4
+PICKED(4, SAMPLER_4, TEXEL_4)
+#endif
+#ifdef SAMPLER_5
+PICKED(5, SAMPLER_5, TEXEL_5)
+#endif
+#ifdef SAMPLER_6
+PICKED(6, SAMPLER_6, TEXEL_6)
+#endif
+#ifdef SAMPLER_7
+PICKED(7, SAMPLER_7, TEXEL_7)
+#endif
+
+void main()
+{
+    ivec2 pixel = ivec2(gl_FragCoord.xy);
+    vec2 size = vec2(textureSize(picked_0, 0)), scale = size / flat_size;
+    vec2 place = texelFetch(places, pixel, 0).xy * scale;
+#ifdef SMOOTH
+    // As many places as a pixel has pixels of the flat picture where it has most, each between the four around it: what
+    // every one of them has of the pixel's area.
+    vec4 slope = texelFetch(slopes, pixel, 0);
+    vec2 right = slope.xy * scale, down = slope.zw * scale;
+    vec4 sum = vec4(0.0);
+    for (int y = 0; y < ROWS; ++y)
+        for (int x = 0; x < COLUMNS; ++x)
+        {
+            vec2 at = vec2(x, y) + 0.5;
+            vec2 there = place + right * (at.x / float(COLUMNS) - 0.5) + down * (at.y / float(ROWS) - 0.5);
+            sum += textureLod(picked_0, there / size, 0.0);
+        }
+    out_0 = sum / float(ROWS * COLUMNS);
+#else
+    ivec2 nearest = min(ivec2(place), ivec2(size) - 1);
+#define PICK(k) out_##k = texelFetch(picked_##k, nearest, 0);
+#ifdef SAMPLER_0
+    PICK(0)
+#endif
+#ifdef SAMPLER_1
+    PICK(1)
+#endif
+#ifdef SAMPLER_2
+    PICK(2)
+#endif
+#ifdef SAMPLER_3
+    PICK(3)
+#endif
+#ifdef SAMPLER_4
+    PICK(4)
+#endif
+#ifdef SAMPLER_5
+    PICK(5)
+#endif
+#ifdef SAMPLER_6
+    PICK(6)
+#endif
+#ifdef SAMPLER_7
+    PICK(7)
+#endif
+#endif
+}
+#endif

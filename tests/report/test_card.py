@@ -1,0 +1,104 @@
+"""The card of a data set, and its Croissant metadata, which mlcroissant checks and reads."""
+
+import hashlib
+import json
+
+import numpy as np
+import pytest
+import yaml
+
+from blinkgl.cli import run
+from blinkgl.config.sequence import load_run
+from blinkgl.dataset.run import run_dataset
+from blinkgl.errors import AssetError
+from blinkgl.io.flow_png import read_flow_png
+from blinkgl.io.index import read_index
+from blinkgl.report.card import write_card
+
+RECIPE = {
+    "seed": 2,
+    "camera": {"width": 24, "height": 16},
+    "time": {"duration": 0.1, "label_rate": 20},
+    "timeline": {"kind": "uniform", "fps": 60},
+    "scene": {
+        "kind": "random",
+        "objects": {"count": 1},
+        "pool": {"primitives": ["cuboid"], "variants": 2, "urdfs": False},
+        "textures": {"procedural": ["checks"], "variants": 2, "photographs": False, "max_size": 64},
+    },
+    "labels": {"flow": ["forward"], "depth": True},
+    "preview": {"enabled": False},
+}
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("card")
+    (folder / "recipe.yaml").write_text(yaml.safe_dump(RECIPE))
+    run_dataset(load_run(folder / "recipe.yaml"), folder / "tiny", num=2)
+    assert run(["report", str(folder / "tiny"), "--card", "--license", "cc-by-4.0", "--url", "here.invalid"]) == 0
+    return folder / "tiny"
+
+
+def described(data):
+    return json.loads((data / "croissant.json").read_text())
+
+
+def test_its_figures_are_those_of_the_files(data):
+    facts = {f["name"]: f["value"] for f in described(data)["variableMeasured"]}
+    lines = read_index(data)
+    seconds = sum(line["duration_us"] for line in lines) / 1e6
+    events = sum(line["events"] for line in lines)
+    assert facts["labels a second"] == pytest.approx(20) and facts["sequences"] == 2
+    assert facts["events a second"] == pytest.approx(events / seconds)
+    rates = [line["events"] / (line["duration_us"] * 1e-6) / (24 * 16) for line in lines]
+    assert facts["events a pixel and second, median"] == pytest.approx(np.median(rates))
+    assert facts["events a pixel and label interval, mean"] == pytest.approx(np.mean(rates) / 20)
+    speeds = []
+    for path in sorted(data.glob("train/*/flow/forward/*.png")):
+        flow, valid = read_flow_png(path)
+        speeds.append(np.hypot(*np.moveaxis(flow, -1, 0))[::8, ::8][valid[::8, ::8]])
+    assert facts["flow over a label interval, median"] == pytest.approx(np.median(np.concatenate(speeds)), rel=1e-6)
+    assert facts["events a pixel and px of flow"] == pytest.approx(
+        facts["events a pixel and second, median"] / facts["image speed, median"]
+    )
+
+
+def test_the_card_says_it_in_words(data):
+    text = (data / "README.md").read_text()
+    head = yaml.safe_load(text.split("---")[1])
+    assert head["license"] == "cc-by-4.0" and "event-camera" in head["tags"] and head["size_categories"] == ["n<1K"]
+    for said in ("| train | 2 | 24x16 | esim |", "events a pixel and second, median", "hdf5plugin", "here.invalid"):
+        assert said in text
+
+
+def test_every_set_of_files_is_there(data):
+    """Without mlcroissant: what Croissant 1.0 demands of a description."""
+    tree = described(data)
+    assert tree["@type"] == "sc:Dataset" and tree["conformsTo"] == "http://mlcommons.org/croissant/1.0"
+    index, *sets = tree["distribution"]
+    assert index["sha256"] == hashlib.sha256((data / index["contentUrl"]).read_bytes()).hexdigest()
+    found = {one["@id"]: list(data.glob(one["includes"])) for one in sets}
+    assert all(found.values()) and len(found["events"]) == 2 and len(found["flow_forward.png"]) == 4
+    assert {"depth.npy", "poses", "manifests"} <= set(found)
+    columns = {f["source"]["extract"]["column"] for f in tree["recordSet"][0]["field"]}
+    assert columns <= set(read_index(data)[0])
+
+
+def test_mlcroissant_accepts_and_reads_it(data):
+    croissant = pytest.importorskip("mlcroissant", reason="optional extra [exchange]")
+    found = croissant.Dataset(jsonld=str(data / "croissant.json"))
+    assert not found.metadata.issues.errors
+    rows = list(found.records("sequences"))
+    for row, line in zip(rows, read_index(data), strict=True):
+        assert row["sequences/path"].decode() == line["path"] and row["sequences/events"] == line["events"]
+
+
+def test_somebody_elses_page_is_left_alone(data, tmp_path, capsys):
+    (tmp_path / "train").symlink_to(data / "train")
+    (tmp_path / "README.md").write_text("# My notes\n")
+    with pytest.raises(AssetError, match="did not write"):
+        write_card(tmp_path)
+    assert (tmp_path / "README.md").read_text() == "# My notes\n" and not (tmp_path / "croissant.json").exists()
+    assert run(["report", str(data), "--license", "mit"]) == 2
+    assert "--card" in capsys.readouterr().err

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from blinkgl.camera import PinHole
+from blinkgl.camera import PinHole, Radtan
 from blinkgl.config.deform import WaveConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.render.contours import FLOATS, Contour, Lines
@@ -272,3 +272,12 @@ def test_the_pass_is_the_unfiltered_one_with_its_depth_kept():
 
     pass_ = filtered(Luminance(False, samples_of("edges")))
     assert isinstance(pass_, Edged) and pass_.of.depth == "texture" and Luminance().depth is True
+
+
+def test_through_a_lens(gl):
+    """The lines are those of the flat picture, which the lens's is a mean of."""
+    world = mixed_scene(80, 60)
+    lens = Radtan(80, 60, 75.0, 75.0, 39.5, 29.5, k1=-0.2, k2=0.05)
+    seen = world.with_camera(lens)
+    true, plain, edged = (luminance(gl, seen, name, SECOND // 3) for name in ("ssaa4", "none", "edges"))
+    assert rmse(edged, true) < 0.8 * rmse(plain, true)

@@ -72,7 +72,7 @@ class RenderedSequence(Simulation):
 
     scene : as it was built.   renderer : what draws it, at its level of detail.
     sensor : what is recorded, and through which camera. A scene that was made already is
-    recorded as the configuration says."""
+    recorded as the configuration says.   number : of the sensor on its rig, by which noise differs."""
 
     def __init__(
         self,
@@ -87,7 +87,9 @@ class RenderedSequence(Simulation):
         scene: Scene | None,
         renderer: Renderer | None,
         window_ns: tuple[int, int] | None,
+        number: int = 0,
     ):
+        self.number = number
         clock = StageClock()
         scene = scene or (renderer.scene if renderer is not None else None)
         if scene is None:
@@ -102,6 +104,7 @@ class RenderedSequence(Simulation):
             if scene.dynamics is not None:
                 self.libraries = {scene.dynamics.engine: scene.dynamics.version}
             self.sensor = recording(scene, config).sensors[0]
+            self.name = self.sensor.folder
             self.triangles, self._before = renderer.triangles, (renderer.stats.render_s, renderer.stats.readback_s)
             camera = None
             if events:
@@ -110,7 +113,7 @@ class RenderedSequence(Simulation):
                     emulator,
                     readout,
                     *size,
-                    kernel_seed(config.seed, index, Role.EVENTS),
+                    kernel_seed(config.seed, index, Role.EVENTS, number),
                     config.timeline.reconstruction,
                     _truth_of(self.sensor, config),
                 )
@@ -119,7 +122,7 @@ class RenderedSequence(Simulation):
                     config.timeline, *span_ns, renderer, response, dynamics.impacts_ns if dynamics is not None else ()
                 )
             if labels and config.images is not None:
-                seed = kernel_seed(config.seed, index, Role.IMAGES)
+                seed = kernel_seed(config.seed, index, Role.IMAGES, number)
                 self.frame_camera = FrameCamera(renderer, config.images, seed, span_ns)
             super().__init__(
                 config,
@@ -224,7 +227,7 @@ class RenderedSequence(Simulation):
     def imu(self) -> Inertial | None:
         if self.config.imu is None:
             return None
-        rng = generator(self.config.seed, self.index, Role.IMU)
+        rng = generator(self.config.seed, self.index, Role.IMU, self.number)
         return measured(self.scene.camera_path, self.config.imu, self.config.time.t0_ns, self.config.time.t1_ns, rng)
 
     def tracks(self) -> Tracks | None:
@@ -235,7 +238,8 @@ class RenderedSequence(Simulation):
         # of the scene as it is drawn: its labels are of the same triangles
         scene, flat = self.renderer.scene, self._rectified
         scene = scene if flat is None else scene.with_camera(flat)
-        return track_points(scene, config, times, generator(self.config.seed, self.index, Role.TRACKS))
+        rng = generator(self.config.seed, self.index, Role.TRACKS, self.number)
+        return track_points(scene, config, times, rng)
 
     def facts(self) -> dict[str, Any]:
         gl, scene, timeline = self.renderer.gl, self.renderer.scene, self.config.timeline

@@ -283,6 +283,16 @@ class SequenceConfig(Config):
                 accepted=f"{', '.join(own)}, or events.emulator: {' or '.join(able)}",
             )
 
+    @rule("timeline.reconstruction", "events.device", "?frames")
+    def _the_card_follows(path: str, device: str | None, frames: bool):
+        if device == "gl" and path != "linear" and not frames:
+            raise Refused(
+                "the card follows straight lines between frames alone",
+                where="timeline.reconstruction",
+                value=path,
+                accepted="linear, or events.device: auto or cpu",
+            )
+
     @rule("time.duration", "time.label_rate", "readout.events_per_second", "readout.row_ns", "readout.queue_events")
     def _late_events_fit(duration: float, label_rate: float, rate: float | None, row_ns: float, queue: int):
         if rate is not None and span_s(duration, label_rate) + 1e-6 * drain_us(rate, row_ns, queue) > MAX_SPAN_S:

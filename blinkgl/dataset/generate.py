@@ -163,7 +163,11 @@ def manifest_info(sequence: Simulation) -> dict:
     opencv = {} if config.frames is None else {"opencv": cv2.__version__}
     return {
         **made_by(config, sequence.index, {**opencv, **sequence.libraries}),
-        **({} if sequence.camera is None else {"emulator": config.events.emulator}),
+        **(
+            {}
+            if (camera := sequence.camera) is None
+            else {"emulator": config.events.emulator, "events_device": camera.emulator.device}
+        ),
         "frames": sequence.frames,
         "labels": sequence.labels,
         # between whole microseconds, as every time in the files

@@ -28,7 +28,7 @@ from blinkgl.render.tracks import Tracks, track_points
 from blinkgl.rng import Role, generator, kernel_seed
 from blinkgl.scene.build import recording, sequence_scene
 from blinkgl.scene.rig import Sensor
-from blinkgl.scene.types import Dynamics, Scene
+from blinkgl.scene.types import Dynamics, Scene, SceneObject
 from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.inertial import Inertial, measured
 from blinkgl.sequence.items import GroundTruth, Picture
@@ -116,6 +116,7 @@ class RenderedSequence(Simulation):
                     kernel_seed(config.seed, index, Role.EVENTS, number),
                     config.timeline.reconstruction,
                     _truth_of(self.sensor, config),
+                    renderer.gl,
                 )
                 response, dynamics = emulator_of(emulator).response(emulator), scene.dynamics
                 self.timeline = make_timeline(
@@ -247,20 +248,38 @@ class RenderedSequence(Simulation):
             "opengl": {"renderer": gl.renderer, "version": gl.version, "vendor": gl.vendor, "backend": gl.backend},
             "timeline": {"kind": timeline.kind, "reconstruction": timeline.reconstruction, **self.achieved},
             "triangles": self.triangles,
-            "objects": [
-                {
-                    "name": o.name,
-                    "id": o.instance_id,
-                    "category": o.category,
-                    "source_hashes": sorted({p.mesh.source_hash for p in o.parts}),
-                }
-                for o in scene.objects
-            ],
+            "objects": [_described(o) for o in scene.objects],
             "scene_log": list(scene.log),
             "not_drawn": list(scene.omissions),
             **({} if scene.dynamics is None else {"dynamics": _facts_of(scene.dynamics)}),
             **({} if self.frame_camera is None else {"frame_camera": self.frame_camera.facts()}),
         }
+
+
+def _described(one: SceneObject) -> dict[str, Any]:
+    """What a body is, for who has no scene: its box at rest in its own axes, and of each part the mesh that it was
+    made from and the material on it."""
+    corners = np.concatenate([part.mesh.vertices for part in one.parts]) if one.parts else np.zeros((1, 3))
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    return {
+        "name": one.name,
+        "id": one.instance_id,
+        "category": one.category,
+        "source_hashes": sorted({part.mesh.source_hash for part in one.parts}),
+        "box": [low.tolist(), high.tolist()],
+        "parts": [
+            {
+                "mesh": part.mesh.name,
+                "mesh_hash": part.mesh.source_hash,
+                "triangles": len(part.mesh.faces),
+                "texture": None if part.material.texture is None else part.material.texture.name,
+                "texture_hash": None if part.material.texture is None else part.material.texture.source_hash,
+                "base_color": list(part.material.base_color),
+                "uv_scale": list(part.material.uv_scale),
+            }
+            for part in one.parts
+        ],
+    }
 
 
 def _facts_of(dynamics: Dynamics) -> dict[str, Any]:

@@ -169,6 +169,8 @@ class Simulation(ABC):
 
     def close(self) -> None:
         """Lets go of OpenGL. Harmless when repeated."""
+        if self.camera is not None:
+            self.camera.release()
         self._stack.close()
 
     def __iter__(self) -> Iterator[Item]:

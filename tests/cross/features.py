@@ -201,10 +201,10 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         },
     },
     "anti-aliasing": {
-        name: {"render": {"antialiasing": name}} for name in ("none", "msaa4", "taps4", "ssaa2", "ssaa4")
+        name: {"render": {"antialiasing": name}} for name in ("none", "msaa4", "taps4", "edges", "ssaa2", "ssaa4")
     },
     "images": {
-        **{name: {"render": {"image_antialiasing": name}} for name in ("none", "msaa4", "ssaa2", "ssaa4")},
+        **{name: {"render": {"image_antialiasing": name}} for name in ("none", "msaa4", "edges", "ssaa2", "ssaa4")},
         "no images": {"labels": {"images": False}},
     },
     "frame camera": {

@@ -259,21 +259,27 @@ def report(
 @app.command()
 def export(
     folder: Annotated[str, typer.Argument(metavar="DIR", help="Data set, or one sequence of it.")],
-    out: Annotated[str, typer.Option("--out", "-o", help="Folder to write, as a whole or not at all.")],
+    out: Annotated[str | None, typer.Option("--out", "-o", help="Folder to write, as a whole or not at all.")] = None,
     layout: Annotated[
-        str,
-        typer.Option(help="webdataset (shards SPLIT-000000.tar …), dsec, eraft, blinkflow, mvsec or tapvid."),
-    ] = "webdataset",
+        str | None,
+        typer.Option(
+            help="webdataset (shards SPLIT-000000.tar …, the default), dsec, eraft, blinkflow, mvsec or tapvid."
+        ),
+    ] = None,
     shard_mb: Annotated[float | None, typer.Option("--shard-mb", min=1, help="Size of a shard (default: 512).")] = None,
     seed: Annotated[
         int | None,
         typer.Option(min=0, help="Order of the samples in shards; a reader then only has to shuffle shards."),
     ] = None,
+    scene: Annotated[
+        str | None,
+        typer.Option("--scene", metavar="OUT.glb", help="Instead: one sequence as an animated glTF, for viewers."),
+    ] = None,
 ) -> int:
     """Write a data set as WebDataset shards, one sample per flow label, or as another data set's loaders read it."""
     from blinkgl.show import export as command
 
-    return command.run(folder, out, layout=layout, shard_mb=shard_mb, seed=seed)
+    return command.run(folder, out, layout=layout, shard_mb=shard_mb, seed=seed, scene=scene)
 
 
 @app.command()

@@ -28,16 +28,17 @@ class Role(IntEnum):
     TRACKS = 10
 
 
-def seed_sequence(seed: int, sequence: int, role: Role) -> np.random.SeedSequence:
-    """Child of ``seed`` keyed by (sequence, role); independent of any other child drawn before it."""
-    return np.random.SeedSequence(seed, spawn_key=(int(sequence), int(role)))
+def seed_sequence(seed: int, sequence: int, role: Role, sensor: int = 0) -> np.random.SeedSequence:
+    """Child of ``seed`` keyed by (sequence, role), and by the number of a rig's sensor beyond the first, which is as a
+    single camera; independent of any other child drawn before it."""
+    return np.random.SeedSequence(seed, spawn_key=(int(sequence), int(role), *((int(sensor),) if sensor else ())))
 
 
-def generator(seed: int, sequence: int, role: Role) -> np.random.Generator:
+def generator(seed: int, sequence: int, role: Role, sensor: int = 0) -> np.random.Generator:
     """PCG64 generator on :func:`seed_sequence`."""
-    return np.random.default_rng(seed_sequence(seed, sequence, role))
+    return np.random.default_rng(seed_sequence(seed, sequence, role, sensor))
 
 
-def kernel_seed(seed: int, sequence: int, role: Role) -> int:
+def kernel_seed(seed: int, sequence: int, role: Role, sensor: int = 0) -> int:
     """64-bit key for the counter-based generators inside numba kernels."""
-    return int(seed_sequence(seed, sequence, role).generate_state(1, np.uint64)[0])
+    return int(seed_sequence(seed, sequence, role, sensor).generate_state(1, np.uint64)[0])

@@ -4,6 +4,7 @@
 // Variants   TEXTURED   albedo luminance from a one-channel texture, else the uniform alone
 //            LIT        Lambert, of the light of light.glsl: a white sun and sky; else unlit
 //            TAPS4      four texture lookups per pixel instead of one, each one mip level finer
+//            STRETCHED  with TAPS4: they lie along the way in which the surface is foreshortened
 //            TWO_SIDED  the normal is turned towards the camera on back faces
 //            RATE       (luminance, its rate of change per second at this pixel) into an RG32F target
 //            EVERY n    the target holds every n-th pixel of the image: textures are filtered for the whole image's
@@ -123,6 +124,28 @@ void main()
 #endif
 #ifdef TEXTURED
 #ifdef TAPS4
+#ifdef STRETCHED
+    // The longer way of the pixel over the surface, and the shorter: four taps in a square where they are alike, in a row
+    // along the longer one where the surface is seen at a grazing angle, and all between; each of the level that fits.
+    vec2 right = 0.25 * dFdx(uv), down = 0.25 * dFdy(uv), texels = vec2(textureSize(albedo, 0));
+    float across = dot(right * texels, right * texels), along = dot(down * texels, down * texels);
+    if (across > along) {
+        vec2 other = right;
+        right = down;
+        down = other;
+        other.x = across;
+        across = along;
+        along = other.x;
+    }
+    float row = clamp(along / max(4.0 * across, 1e-3 * along + 1e-20) - 0.5, 0.0, 1.0);
+    right = mix(right, 0.5 * down, row);
+    // Squares of the spacing of the taps over the surface, two and one texel apart: half of log2 is the level.
+    float level = 0.5 * log2(max(mix(4.0 * along, max(along, 16.0 * across), row), 1e-30));
+    ALBEDO luminance = 0.25 * (textureLod(albedo, uv - right - down, level).CHANNELS
+                             + textureLod(albedo, uv + right - down, level).CHANNELS
+                             + textureLod(albedo, uv - right + down, level).CHANNELS
+                             + textureLod(albedo, uv + right + down, level).CHANNELS);
+#else
     // At the centres of the pixel's four quarters, each filtered for a quarter: a box of two by two samples of the
     // texture.
     vec2 right = 0.25 * dFdx(uv), down = 0.25 * dFdy(uv);
@@ -130,6 +153,7 @@ void main()
                              + texture(albedo, uv + right - down, -1.0).CHANNELS
                              + texture(albedo, uv - right + down, -1.0).CHANNELS
                              + texture(albedo, uv + right + down, -1.0).CHANNELS);
+#endif
 #elif defined(EVERY)
     // Neighbours in the target are n px of the image apart; the level is chosen as if they were one.
     ALBEDO luminance = texture(albedo, uv, -log2(every)).CHANNELS;

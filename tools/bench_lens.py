@@ -81,8 +81,8 @@ def _errors(renderer: Renderer) -> None:
     most = np.abs(true.forward.flow[both]).max()
     off = f"off silhouettes, {100 * inner.mean():.0f} % of the pixels"
     print(
-        f"{'':12} {off}: flow median {np.median(flow):.1e}, 99 % {np.quantile(flow, 0.99):.1e}, largest {flow.max():.1e} "
-        f"px, over 1e-3 px in {100 * (flow > 1e-3).mean():.2f} % (flow up to {most:.0f} px); "
+        f"{'':12} {off}: flow median {np.median(flow):.1e}, 99 % {np.quantile(flow, 0.99):.1e}, largest "
+        f"{flow.max():.1e} px, over 1e-3 px in {100 * (flow > 1e-3).mean():.2f} % (flow up to {most:.0f} px); "
         f"depth 99 % {np.quantile(depth, 0.99):.1e}; wrong ids {wrong[inner].sum()}, of all pixels "
         f"{100 * wrong.mean():.2f} %; masks that differ {100 * hidden[both].mean():.3f} %"
     )

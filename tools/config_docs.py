@@ -19,6 +19,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from blinkgl.config.base import is_model, members, tag_of
+from blinkgl.config.rig import SECTIONS, RigSensorConfig
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.scene.geometry.primitives import BUILDERS, PARAMETERS, parameters
 from eflow.config import TrainConfig
@@ -90,7 +91,8 @@ def _section(model: type[BaseModel], path: str, done: set, note: str = "") -> li
         inner = f"{path}.{name}" if path else name
         meaning = (info.description or _about(info)).replace("``", "`").replace("|", "\\|")
         rows.append(f"| `{name}` | {_type(info)} | {_default(info)} | {meaning} |\n")
-        children = _models(info.annotation)
+        # a sensor's sections are those of a single camera, and have been described
+        children = [] if model is RigSensorConfig and name in SECTIONS else _models(info.annotation)
         tagged = [c for c in children if tag_of(c)]
         for child in children:
             suffix = f" with `{tag_of(child)[0]}: {tag_of(child)[1]}`" if child in tagged and len(children) > 1 else ""

@@ -50,8 +50,11 @@ class CardEsim(Esim):
 
     gl : where it runs; made current at every step.   soft_float : logarithms in whole numbers; None: where the card's
     own rounding is not that of IEEE 754.
+    owns_gl : release the context with it.
     State on the card: 16 bytes per pixel, spread thresholds 8 more, jitter or a refractory period 16.
     Raises EventDataError for a configuration that it does not do, GLError: no compute shaders, or not enough memory."""
+
+    device = "gl"
 
     def __init__(
         self,
@@ -62,14 +65,15 @@ class CardEsim(Esim):
         reconstruction: str = "linear",
         *,
         gl: GLContext,
+        owns_gl: bool = False,
         soft_float: bool | None = None,
     ):
         config = config or EsimConfig()
-        if problem := unfit(config, reconstruction):
+        if problem := self.unfit(config, reconstruction):
             raise problem
         refuse_without_compute(gl)
         super().__init__(height, width, config, seed, reconstruction)
-        self.gl = gl
+        self.gl, self._owns_gl = gl, owns_gl
         gl.resume()
         self._kernels = Kernels(gl, not rounds_like_ieee(gl) if soft_float is None else soft_float)
         self._room = _Room(gl, self.height, self.width, self._on.size > 0, self._has_more)
@@ -84,7 +88,38 @@ class CardEsim(Esim):
         }
         if self._on.size:
             self._room.put("thresholds", np.stack([self._on, self._off], axis=1))
-        self._before_is_log = False
+        self._before_is_log, self._stays = False, False
+        self._made = 0, 0  # events of the last step, and the microsecond before it
+
+    @classmethod
+    def unfit(cls, config: EsimConfig, reconstruction: str = "linear") -> EventDataError | None:
+        """Why the card's kernel does not do this, naming the key; None: it does."""
+        if reconstruction != "linear":
+            return EventDataError(
+                "the card follows straight lines between frames only",
+                where="timeline.reconstruction",
+                value=reconstruction,
+                accepted="linear, or events.device: cpu",
+            )
+        largest = max(config.contrast_threshold, config.contrast_threshold_off or 0.0)
+        largest = 10.0 if config.threshold_sigma else largest
+        if config.threshold_jitter and largest + 8.6 * config.threshold_jitter > _LARGEST_STEP:
+            return EventDataError(
+                "thresholds with so much jitter do not fit the card's whole numbers",
+                where="events.threshold_jitter",
+                value=config.threshold_jitter,
+                accepted=f"at most {(_LARGEST_STEP - largest) / 8.6:.3g}, or events.device: cpu",
+            )
+        return None
+
+    @classmethod
+    def trial(cls, config: EsimConfig) -> EsimConfig:
+        """What tells whether a card runs the same kernels as for this configuration right."""
+        return EsimConfig(
+            threshold_sigma=0.03 if config.threshold_sigma else 0.0,
+            threshold_jitter=0.03 if config.threshold_jitter else 0.0,
+            refractory_us=150.0 if config.refractory_us else 0.0,
+        )
 
     @property
     def _has_more(self) -> bool:
@@ -95,10 +130,28 @@ class CardEsim(Esim):
         if not self.gl.released:
             with self.gl.borrowed():
                 self._room.release()
+            if self._owns_gl:
+                self.gl.release()
 
     # -- steps ----------------------------------------------------------------------------------------------
+    def advance(self, luminance: np.ndarray, t_ns: int) -> int:
+        """As ``step``, but the events stay on the card, for :mod:`blinkgl.card.sinks`; how many there are."""
+        self._stays = True
+        try:
+            self.step(luminance, t_ns)
+        finally:
+            self._stays = False
+        return self._made[0]
+
+    @property
+    def on_card(self) -> tuple[moderngl.Buffer, int, int]:
+        """Packed events of the last step as they were emitted, not sorted by time; how many; the microsecond that their
+        times count from."""
+        return self._room["packed"], *self._made
+
     def _start(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
         events = super()._start(frame, t_ns, rate)
+        self._made = 0, t_ns // 1000
         self.gl.resume()
         self._room.turn()
         self._room.put("now", self._intensity(frame))
@@ -119,11 +172,12 @@ class CardEsim(Esim):
         head = np.frombuffer(room["listed"].read(HEAD_BYTES), np.uint32)
         count, cut = int(head[7]), int(head[8])
         self.saturated += cut
-        if not count:
-            return Events.empty()
+        self._made = count, before_us
         if count > room.capacity:
             room.grow(count)
             self._emit(t_ns)
+        if not count or self._stays:
+            return Events.empty()
         return self._sorted(count, before_us, t_ns // 1000 - before_us)
 
     def _fire(self, t_ns: int) -> None:
@@ -233,27 +287,6 @@ class CardEsim(Esim):
         self._room.put("now", self._log)
         self._before_is_log = True
         self._put_state()
-
-
-def unfit(config: EsimConfig, reconstruction: str = "linear") -> EventDataError | None:
-    """Why the card's kernel does not do this, naming the key; None: it does."""
-    if reconstruction != "linear":
-        return EventDataError(
-            "the card follows straight lines between frames only",
-            where="timeline.reconstruction",
-            value=reconstruction,
-            accepted="linear, or events.device: cpu",
-        )
-    largest = max(config.contrast_threshold, config.contrast_threshold_off or 0.0)
-    largest = 10.0 if config.threshold_sigma else largest
-    if config.threshold_jitter and largest + 8.6 * config.threshold_jitter > _LARGEST_STEP:
-        return EventDataError(
-            "thresholds with so much jitter do not fit the card's whole numbers",
-            where="events.threshold_jitter",
-            value=config.threshold_jitter,
-            accepted=f"at most {(_LARGEST_STEP - largest) / 8.6:.3g}, or events.device: cpu",
-        )
-    return None
 
 
 class _Room:

@@ -144,6 +144,8 @@ def camera_radius(camera: CameraModel, clearance: float) -> float:
 def with_calibrations(tree: dict[str, Any], base: Path) -> dict[str, Any]:
     """A run's ``tree`` with every ``camera: {calibration: FILE}``, at the top and in groups, read from ``base`` and
     replaced by what it says. Raises ConfigError."""
+    from blinkgl.config.rig import with_sections  # whose sensors have cameras
+
     tree, groups = dict(tree), tree.get("groups")
     if isinstance(groups, dict):
         tree["groups"] = {
@@ -152,7 +154,7 @@ def with_calibrations(tree: dict[str, Any], base: Path) -> dict[str, Any]:
         }
     if isinstance(tree.get("camera"), dict) and tree["camera"].get("calibration") is not None:
         tree["camera"] = calibrated(tree["camera"], base)
-    return tree
+    return with_sections(tree, lambda one: with_calibrations(one, base))
 
 
 def calibrated(camera: dict[str, Any], base: Path) -> dict[str, Any]:

@@ -207,6 +207,12 @@ class EsimConfig(_TwoThresholds, EmulatorConfig):
     )
     max_events_per_step: int = _MAX_EVENTS
     causes: bool = _CAUSES
+    device: Literal["auto", "cpu", "gl"] = Field(
+        "auto",
+        description="Where events are made: by the processor, or by compute shaders of the OpenGL that draws the "
+        "frames (straight lines between frames alone). The events are the same. `auto`: `gl` where a graphics card "
+        "draws them and can do it, else `cpu`, and so wherever OpenGL is drawn by the processor.",
+    )
 
     @classmethod
     def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:

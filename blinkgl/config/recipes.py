@@ -18,6 +18,7 @@ from pydantic import Field
 from blinkgl.config.base import Config, validate
 from blinkgl.config.draw import is_distribution
 from blinkgl.config.reader import parse_yaml
+from blinkgl.config.rig import with_sections
 from blinkgl.errors import ConfigError
 
 
@@ -63,7 +64,7 @@ def with_recipes(tree: dict[str, Any]) -> dict[str, Any]:
         }
     if "events" in tree:
         tree["events"] = _spelled_out(tree["events"])
-    return tree
+    return with_sections(tree, lambda one: {**one, "events": _spelled_out(one["events"])} if "events" in one else one)
 
 
 def _spelled_out(events: Any) -> Any:

@@ -28,7 +28,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Discriminator, Field, Tag
 
 from blinkgl.config.base import Config, Refused, rule, validate
 from blinkgl.config.corners import corners
@@ -235,3 +235,19 @@ def fill_sensor(sensor: Any, emulator: Any) -> dict[str, Any]:
         "events": camera.values(EmulatorConfig.members.default if emulator is None else emulator),
     }
     return said if camera.readout is None else {**said, "readout": camera.readout.model_dump()}
+
+
+def _sensor(name: str) -> str:
+    if known_sensor(name) is None:
+        raise Refused(
+            "unknown sensor",
+            value=name,
+            accepted=f"one of {', '.join(sensor_names())}, or a sensor file ending in .yaml",
+        )
+    return name
+
+
+Sensor = Annotated[
+    Annotated[Annotated[str, AfterValidator(_sensor)], Tag("one by name")] | Annotated[SensorConfig, Tag("a table")],
+    Discriminator(lambda value: "a table" if isinstance(value, (dict, SensorConfig)) else "one by name"),
+]

@@ -15,7 +15,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, Discriminator, Field, Tag
+from pydantic import AfterValidator, Field
 
 from blinkgl.config.base import Config, Refused, remembering, rule, validate, validate_field
 from blinkgl.config.camera import CameraConfig, camera_radius, with_calibrations
@@ -32,14 +32,16 @@ from blinkgl.config.quality import Quality, fill_quality
 from blinkgl.config.reader import parse_yaml, read_table
 from blinkgl.config.readout import ReadoutConfig, drain_us
 from blinkgl.config.recipes import with_recipes
-from blinkgl.config.scene import RandomSceneConfig, SceneConfig
-from blinkgl.config.sensor import (
-    SensorConfig,
-    fill_sensor,
-    known_sensor,
-    sensor_names,
-    spelled_out,
+from blinkgl.config.rig import (
+    SECTIONS,
+    RigSensorConfig,
+    check_pairs,
+    is_rig,
+    spelled_out as with_whole_sensors,
+    with_sections,
 )
+from blinkgl.config.scene import RandomSceneConfig, SceneConfig
+from blinkgl.config.sensor import Sensor, fill_sensor, spelled_out
 from blinkgl.config.timeline import DisplacementTimeline, TimelineConfig
 from blinkgl.config.tracks import TracksConfig, check_tracks
 from blinkgl.errors import ConfigError
@@ -119,8 +121,8 @@ def span_s(duration: float, label_rate: float) -> float:
     return duration + 1 / label_rate
 
 
-Antialiasing = Literal["none", "msaa4", "taps4", "ssaa2", "ssaa4"]
-ImageAntialiasing = Literal["none", "msaa4", "ssaa2", "ssaa4"]
+Antialiasing = Literal["none", "msaa4", "taps4", "edges", "ssaa2", "ssaa4"]
+ImageAntialiasing = Literal["none", "msaa4", "edges", "ssaa2", "ssaa4"]
 
 
 class RenderConfig(Config):
@@ -129,7 +131,8 @@ class RenderConfig(Config):
     antialiasing: Antialiasing = Field(
         "none",
         description="event frames: msaa4 filters silhouettes (4 coverage samples a pixel), taps4 textures (4 lookups a "
-        "pixel); ssaa2 and ssaa4 draw 2 x 2 and 4 x 4 finer and average everything. Labels are never filtered. "
+        "pixel), edges both: silhouettes by the areas of their surfaces, lookups along the way of foreshortening; "
+        "ssaa2 and ssaa4 draw 2 x 2 and 4 x 4 finer and average everything. Labels are never filtered. "
         "Costs: docs/results.md",
     )
     image_antialiasing: ImageAntialiasing = Field("ssaa2", description="the same for the colour images at label times")
@@ -180,22 +183,6 @@ class OutputConfig(Config):
     )
 
 
-def _sensor(name: str) -> str:
-    if known_sensor(name) is None:
-        raise Refused(
-            "unknown sensor",
-            value=name,
-            accepted=f"one of {', '.join(sensor_names())}, or a sensor file ending in .yaml",
-        )
-    return name
-
-
-Sensor = Annotated[
-    Annotated[Annotated[str, AfterValidator(_sensor)], Tag("one by name")] | Annotated[SensorConfig, Tag("a table")],
-    Discriminator(lambda value: "a table" if isinstance(value, (dict, SensorConfig)) else "one by name"),
-]
-
-
 class SequenceConfig(Config):
     """One sequence, every value plain and final."""
 
@@ -236,8 +223,41 @@ class SequenceConfig(Config):
     tracks: TracksConfig | None = Field(
         None, description="points on surfaces, followed through the sequence (docs/over_time.md); null: none"
     )
+    rig: Literal["davis", "dsec", "mvsec", "stereo"] | None = Field(
+        None, description="sensors of a known rig (docs/rigs.md); what `sensors` says beside it wins, name by name"
+    )
+    sensors: tuple[RigSensorConfig, ...] | None = Field(
+        None, min_length=1, description="several sensors on one rig that moves (docs/rigs.md); null: a single camera"
+    )
     preview: PreviewConfig = Field(PreviewConfig(), description="preview.mp4")
     gl: GLConfig = Field(GLConfig(), description="which OpenGL to use")
+
+    def of_sensor(self, number: int) -> SequenceConfig:
+        """What a single camera would have to say to be the rig's sensor of this number at the rig's origin, without a
+        preview: that one is the rig's. Of a sensor without events `events` is as at the top, which nobody asks."""
+        assert self.sensors is not None
+        one = self.sensors[number]
+        own: dict[str, Any] = {key: getattr(one, key) for key in SECTIONS}
+        if one.events is None:
+            own["events"] = self.events
+        preview = self.preview.model_copy(update={"enabled": False})
+        return self.model_copy(update={**own, "rig": None, "sensors": None, "preview": preview})
+
+    @rule("?sensors", "?frames")
+    def _frames_have_no_rig(sensors: bool, frames: bool):
+        if sensors and frames:
+            raise Refused(
+                "recorded frames were seen by one camera",
+                where="sensors",
+                accepted="null, or a scene instead of frames",
+            )
+
+    @rule("?sensors", "scene.intrinsics")
+    def _own_intrinsics(sensors: bool, intrinsics: str | None):
+        if sensors and intrinsics == "file":
+            raise Refused(
+                "the cameras of a rig are not the file's", where="scene.intrinsics", value=intrinsics, accepted="config"
+            )
 
     @rule("camera.lens", "scene.intrinsics")
     def _one_lens(lens: str, intrinsics: str | None):
@@ -261,6 +281,16 @@ class SequenceConfig(Config):
                 where="timeline.reconstruction",
                 value=path,
                 accepted=f"{', '.join(own)}, or events.emulator: {' or '.join(able)}",
+            )
+
+    @rule("timeline.reconstruction", "events.device", "?frames")
+    def _the_card_follows(path: str, device: str | None, frames: bool):
+        if device == "gl" and path != "linear" and not frames:
+            raise Refused(
+                "the card follows straight lines between frames alone",
+                where="timeline.reconstruction",
+                value=path,
+                accepted="linear, or events.device: auto or cpu",
             )
 
     @rule("time.duration", "time.label_rate", "readout.events_per_second", "readout.row_ns", "readout.queue_events")
@@ -435,9 +465,42 @@ class RunTemplate:
 def _validated(tree: dict[str, Any]) -> SequenceConfig:
     """SequenceConfig of plain data, with the values of a named quality and sensor filled in
     where the tree says nothing."""
+    if is_rig(tree):
+        return _validated_rig(tree)
     for fill in FILLS:
         tree = fill(tree)
-    return validate(SequenceConfig, tree)
+    config = validate(SequenceConfig, tree)
+    if config.labels.disparity:  # type: ignore[missing-attribute]
+        raise ConfigError(
+            "a single camera has no other eye",
+            where="labels.disparity",
+            accepted="false, or rig: stereo, or sensors with a `pair` (docs/rigs.md)",
+        )
+    return config
+
+
+def _validated_rig(tree: dict[str, Any]) -> SequenceConfig:
+    """The same of a rig: each sensor is validated as the single camera that it would be, by the same rules."""
+    tree = with_whole_sensors(tree, FILLS)
+    for fill in FILLS:
+        tree = fill(tree)
+    config = validate(SequenceConfig, tree)
+    common = {key: value for key, value in tree.items() if key not in ("rig", "sensors", *SECTIONS)}
+    for k, one in enumerate(tree["sensors"]):
+        own = {key: one[key] for key in SECTIONS if one.get(key) is not None}
+        try:
+            validate(SequenceConfig, {**common, **own})
+        except ConfigError as error:
+            inside = (error.where or "").split(".")[0] in SECTIONS
+            where = f"sensors.{k}.{error.where}" if inside else error.where
+            raise ConfigError(
+                error.problem if inside else f"{error.problem} (of sensor '{one.get('name')}')",
+                where=where,
+                value=error.value,
+                accepted=error.accepted,
+            ) from None
+    check_pairs(config.sensors or ())
+    return config
 
 
 def load_run(path: str | Path, overrides: Sequence[str] = (), *, seed: int | None = None) -> RunTemplate:
@@ -492,7 +555,9 @@ def with_sensors(tree: dict[str, Any], base: Path) -> dict[str, Any]:
         }
     if "sensor" in tree:
         tree["sensor"] = spelled_out(tree["sensor"], base)
-    return tree
+    return with_sections(
+        tree, lambda one: {**one, "sensor": spelled_out(one["sensor"], base)} if "sensor" in one else one
+    )
 
 
 def apply_overrides(tree: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:

@@ -10,8 +10,8 @@ import math
 import platform
 import time
 from collections import Counter
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -80,16 +80,42 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
         return _explain_frames(config, index, template.base)
     with create_context(config.gl.backend, config.gl.device) as gl:
         scene = sequence_scene(config, index, template.base)
-        with Renderer(gl, scene, config.render) as renderer:
-            result = Explanation(machine=gl.renderer)
-            result.scene = _describe(renderer.scene, renderer)
-            _passes(config, index, scene, renderer, gl, result)
-            _left_out(config, scene, result)
-            result.effects = effects_of(renderer.scene)
+        result = Explanation(machine=gl.renderer)
+        for name, own, seen, events in _cameras(config, scene):
+            with Renderer(gl, seen, config.render) as renderer:
+                one = Explanation(scene=_describe(renderer.scene, renderer))
+                if events:
+                    _passes(own, index, seen, renderer, gl, one)
+                elif own.images is not None:
+                    one.passes.append(_frame_camera(own.images, renderer, seen))
+                _left_out(own, seen, one)
+                one.effects = effects_of(renderer.scene)
+            _join(result, name, one)
     simulated = (scene.t1_ns - scene.t0_ns) * 1e-9
     result.seconds = sum(p.seconds for p in result.passes)
     result.seconds_per_simulated_second = result.seconds / simulated
     return result
+
+
+def _cameras(config: SequenceConfig, scene: Scene) -> Iterator[tuple[str, SequenceConfig, Scene, bool]]:
+    """(name, its own configuration, the scene as it sees it, whether it gives events) of every camera."""
+    if config.sensors is None:
+        yield "", config, scene, True
+    for k, one in enumerate(config.sensors or ()):
+        if one.sees:
+            own = config.of_sensor(k).model_copy(update={"preview": config.preview})
+            yield one.name, own, scene.seen_by(k), one.events is not None
+
+
+def _join(result: Explanation, name: str, one: Explanation) -> None:
+    """What is said of one camera, to what is said of those before it; all sensors have the times of one."""
+    prefix = f"{name}: " if name else ""
+    same = {key: value for key, value in result.scene.items() if one.scene.get(key) == value}
+    result.scene |= {key if key in same or not prefix else prefix + key: v for key, v in one.scene.items()}
+    result.passes += [replace(p, name=prefix + p.name) for p in one.passes]
+    result.left_out += [pair for pair in one.left_out if pair not in result.left_out]
+    result.frames = max(result.frames, one.frames)
+    result.effects, result.frame_s = one.effects, max(result.frame_s, one.frame_s)  # one light for all
 
 
 def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanation:

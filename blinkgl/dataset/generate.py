@@ -4,7 +4,7 @@ and the plainest loop around it."""
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from blinkgl.io.lens_files import write_lens
 from blinkgl.io.sequence_dir import SequenceWriter, refuse_existing
 from blinkgl.io.tracks import TRACKS
 from blinkgl.labels import LABELS
-from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Simulation, simulate_sequence
+from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Item, Picture, Simulation, simulate_sequence
 from blinkgl.sequence.clock import StageClock
 
 
@@ -64,52 +64,27 @@ def generate_sequence(
     gl : context to draw with; not looked at (None) for a sequence that is converted from frames.
     base : folder that relative paths in the configuration start from.
     Raises BlinkGLError for anything the user or the machine caused."""
+    if config.sensors is not None:
+        from blinkgl.dataset.rig import generate_rig  # which writes each of its sensors as is done here
+
+        return generate_rig(config, index, out, gl, base=base, progress=progress)
     report = SequenceReport(index, Path(out) / sequence_name(config.output, index))
     with (
         simulate_sequence(
             config, index, gl, base=base, pictures_hz=config.preview.rate if config.preview.enabled else None
         ) as sequence,
-        SequenceWriter(
-            report.path,
-            sequence.height,
-            sequence.width,
-            config_yaml=config_yaml(sequence.config, index),
-            t_offset_us=sequence.t0_ns // 1000,
-            labels=config.labels,
-            truth=sequence.tells,
-            codec=config.output.compression,
-        ) as writer,
+        writer_of(sequence, report.path, config_yaml(sequence.config, index)) as writer,
     ):
         clock, span_ns = sequence.clock, sequence.t1_ns - sequence.t0_ns
-        with PreviewRecorder(config.preview, sequence, writer) as preview:
+        with PreviewRecorder(config.preview, [sequence], writer) as preview:
             for item in sequence:
-                if isinstance(item, EventChunk):
-                    with clock("write"):
-                        writer.append_events(item.events)
-                    preview.add_events(item.events)
-                    if progress is not None:
-                        report.count(sequence)
-                        progress(report, (item.t_ns - sequence.t0_ns) / span_ns)
-                elif isinstance(item, GroundTruth):
-                    with clock("write"):
-                        _write_labels(writer, item)
-                elif isinstance(item, CameraImage):
-                    with clock("write"):
-                        writer.image(item.pictures, exposure_line(item))
-                else:
-                    preview.show(item)
+                write_item(writer, sequence, item)
+                preview.take(sequence, item)
+                if isinstance(item, EventChunk) and progress is not None:
+                    report.count(sequence)
+                    progress(report, (item.t_ns - sequence.t0_ns) / span_ns)
         report.count(sequence)
-        with clock("write"):
-            if poses := sequence.poses():
-                writer.poses(**poses)
-            if (camera := sequence.lens) is not None:
-                write_lens(writer, camera)
-            if (inertial := sequence.imu()) is not None:
-                writer.imu(config.imu, vars(inertial))
-            if (tracks := sequence.tracks()) is not None:
-                writer.arrays(TRACKS, **vars(tracks))
-            writer.t_end_us = sequence.t1_ns // 1000
-            writer.info.update(manifest_info(sequence))
+        write_end(writer, sequence)
         flushing = StageClock()  # leaving the block waits for the writers' threads and syncs the files
     report.count(sequence)
     report.seconds["write"] += flushing.total
@@ -117,6 +92,50 @@ def generate_sequence(
     report.triangles, report.omissions = sequence.triangles, sequence.omissions
     report.total_s, report.compile_s = clock.total, clock.compile_s
     return report
+
+
+def writer_of(sequence: Simulation, path: Path, config_text: str) -> SequenceWriter:
+    """What writes a sequence to ``path``. config_text : of its config.yaml."""
+    return SequenceWriter(
+        path,
+        sequence.height,
+        sequence.width,
+        config_yaml=config_text,
+        t_offset_us=sequence.t0_ns // 1000,
+        labels=sequence.config.labels,
+        events=sequence.camera is not None,
+        truth=sequence.tells,
+        codec=sequence.config.output.compression,
+    )
+
+
+def write_item(writer: SequenceWriter, sequence: Simulation, item: Item) -> None:
+    """Writes what has happened, but pictures for those who watch."""
+    if isinstance(item, Picture):
+        return
+    with sequence.clock("write"):
+        if isinstance(item, EventChunk):
+            if sequence.camera is not None:
+                writer.append_events(item.events)
+        elif isinstance(item, GroundTruth):
+            _write_labels(writer, item)
+        else:
+            writer.image(item.pictures, exposure_line(item))
+
+
+def write_end(writer: SequenceWriter, sequence: Simulation) -> None:
+    """Writes what is known when all has happened."""
+    with sequence.clock("write"):
+        if poses := sequence.poses():
+            writer.poses(**poses)
+        if (camera := sequence.lens) is not None:
+            write_lens(writer, camera)
+        if (inertial := sequence.imu()) is not None:
+            writer.imu(sequence.config.imu, vars(inertial))
+        if (tracks := sequence.tracks()) is not None:
+            writer.arrays(TRACKS, **vars(tracks))
+        writer.t_end_us = sequence.t1_ns // 1000
+        writer.info.update(manifest_info(sequence))
 
 
 def _write_labels(writer: SequenceWriter, truth: GroundTruth) -> None:
@@ -140,21 +159,15 @@ def exposure_line(image: CameraImage) -> ExposureLine:
 
 def manifest_info(sequence: Simulation) -> dict:
     """What a person needs to know where the sequence came from; no clock times (same seed, same manifest)."""
-    import numba
-
     config = sequence.config
-    versions = {"python": platform.python_version(), "numpy": np.__version__, "numba": numba.__version__}
+    opencv = {} if config.frames is None else {"opencv": cv2.__version__}
     return {
-        "blinkgl": blinkgl.__version__,
-        "versions": {
-            **versions,
-            **({} if config.frames is None else {"opencv": cv2.__version__}),
-            **sequence.libraries,
-        },
-        "seed": config.seed,
-        "sequence": sequence.index,
-        "split": config.output.split,
-        "emulator": config.events.emulator,
+        **made_by(config, sequence.index, {**opencv, **sequence.libraries}),
+        **(
+            {}
+            if (camera := sequence.camera) is None
+            else {"emulator": config.events.emulator, "events_device": camera.emulator.device}
+        ),
         "frames": sequence.frames,
         "labels": sequence.labels,
         # between whole microseconds, as every time in the files
@@ -162,4 +175,18 @@ def manifest_info(sequence: Simulation) -> dict:
         **losses(*sequence.losses, sequence.filtered),
         **({"events_by_cause": sequence.causes} if sequence.causes else {}),
         **sequence.facts(),
+    }
+
+
+def made_by(config: SequenceConfig, index: int, libraries: Mapping[str, str]) -> dict:
+    """Of a manifest: which sequence it is, and by what it was made. libraries : versions beside those always used."""
+    import numba
+
+    versions = {"python": platform.python_version(), "numpy": np.__version__, "numba": numba.__version__}
+    return {
+        "blinkgl": blinkgl.__version__,
+        "versions": {**versions, **libraries},
+        "seed": config.seed,
+        "sequence": index,
+        "split": config.output.split,
     }

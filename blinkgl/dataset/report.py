@@ -14,6 +14,7 @@ from blinkgl.config.sequence import SequenceConfig
 
 if TYPE_CHECKING:
     from blinkgl.sequence import Simulation
+    from blinkgl.sequence.rig import RigSequence
 
 STAGES = ("scene", "render", "read-back", "events", "images", "write", "preview")
 """What the seconds of a sequence are told apart by; the rest is "other"."""
@@ -44,7 +45,7 @@ class SequenceReport:
     omissions: tuple[str, ...] = ()
     """what files of the scene ask for and is not drawn, a line per file"""
 
-    def count(self, sequence: Simulation) -> None:
+    def count(self, sequence: Simulation | RigSequence) -> None:
         """What there is of it so far."""
         self.frames, self.events, self.labels, self.seconds = (
             sequence.frames,
@@ -115,7 +116,7 @@ class Totals:
         }
 
 
-_NOT_SAID_AS_NULL = ("frames", "physics", "deform", "images", "fog")
+_NOT_SAID_AS_NULL = ("frames", "physics", "deform", "images", "fog", "rig", "sensors")
 """Keys of what came later than the first data sets: a sequence without it has the bytes that it had."""
 
 

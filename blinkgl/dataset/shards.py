@@ -95,12 +95,13 @@ def _write(out: Path, split: str, entries: Iterator[tuple[Path, int]], shard_byt
 
 def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
     """(member name, bytes) of the ``k``-th label of a sequence."""
-    key = f"{folder.name}_{k:06d}"
+    manifest = read_manifest(folder)
+    called = folder.name if "sensor" not in manifest else f"{folder.parent.name}-{folder.name}"
+    key = f"{called}_{k:06d}"
     lines = [line for line in (folder / _FLOW.stamps).read_text().splitlines() if not line.startswith("#")]
     start, end = (int(v) for v in lines[k].split(","))
-    manifest = read_manifest(folder)
     about: dict[str, Any] = {
-        "sequence": folder.name,
+        "sequence": called,
         "label": k,
         "from_us": start,
         "to_us": end,

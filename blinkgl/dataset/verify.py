@@ -43,10 +43,10 @@ from blinkgl.io.frame_camera import (
 )
 from blinkgl.io.hdf5 import dataset, open_hdf5
 from blinkgl.io.imu import FILES as IMU_FILES, read_imu, read_imu_csv
-from blinkgl.io.index import INDEX, entry, read_index, sequence_folders
+from blinkgl.io.index import INDEX, entry, made_folders, read_index, sequence_folders
 from blinkgl.io.lens_files import FILES as LENS_FILES, problems_of_lens
 from blinkgl.io.records import open_regular, shown
-from blinkgl.io.sequence_dir import MANIFEST, read_manifest, verify_sequence
+from blinkgl.io.sequence_dir import MANIFEST, RIG, read_manifest, verify_sequence
 from blinkgl.io.tracks import TRACKS, problem_of as problem_of_tracks, read_tracks
 from blinkgl.labels import LABELS, Label, asked_for
 
@@ -123,7 +123,7 @@ def verify_dataset(
     if not root.is_dir():
         raise AssetError("no such data set", where=str(root), accepted="a folder of sequences")
     result = Verification()
-    folders = list(sequence_folders(root))
+    folders = list(made_folders(root))
     if not folders and not (root / RUN_FOLDER).is_dir():
         raise AssetError("no sequence found", where=str(root), accepted="a folder that 'blinkgl generate' wrote")
     known: dict[str, _Known] = {}
@@ -138,7 +138,7 @@ def verify_dataset(
     result.sequences = len(folders)
     if not (root / MANIFEST).is_file():
         result.add(".", _guarded(lambda: _between(root, folders)))
-        result.add(".", _guarded(lambda: _index(root, folders)))
+        result.add(".", _guarded(lambda: _index(root, list(sequence_folders(root)))))
         for name, lines in _twins(known, result).items():
             result.add(name, lines)
         result.add(".", _guarded(lambda: _against_run(root, folders, known, result)))
@@ -178,23 +178,12 @@ def _look(folder: Path, name: str) -> tuple[list[str], _Known | None]:
         if "config.yaml" not in manifest["files"]:
             return ["config.yaml: missing"]
         config = load_run(folder / "config.yaml").sequence(manifest["sequence"])
-        if problems := _bound(name, manifest, config):
-            return problems
-        problems = (
-            _guarded(lambda: check_events(folder / "events.h5", manifest)) if "events.h5" in manifest["files"] else []
-        )
-        problems = [line if line.startswith("events.h5") else f"events.h5: {line}" for line in problems]
-        if EVENT_LABELS in manifest["files"]:
-            problems += _guarded(lambda: _check_truth(folder, manifest))
-        problems += _guarded(lambda: _check_labels(folder, manifest))
-        if config.imu is not None:
-            problems += _guarded(lambda: _check_imu(folder, config))
-        if config.tracks is not None:
-            problems += _guarded(lambda: _check_tracks(folder, manifest, config))
-        if _distorts(config):
-            problems += _guarded(lambda: problems_of_lens(folder, config.camera.model))
-        if config.images is not None:
-            problems += _guarded(lambda: _check_images(folder, manifest, config))
+        if manifest["format"] == "blinkgl-rig":
+            problems = look_at_rig(folder, name, manifest, config)
+        elif config.sensors is not None:
+            problems = look_at_sensor(folder, manifest, config)
+        else:
+            problems = _bound(name, manifest, config) or contents(folder, manifest, config)
         if not problems:
             found.append(_Known(folder, manifest, config))
         return problems
@@ -202,48 +191,126 @@ def _look(folder: Path, name: str) -> tuple[list[str], _Known | None]:
     return _guarded(check), found[0] if found else None
 
 
-def _bound(name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
+def look_at_rig(folder: Path, name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
+    """Problems of a rig's folder whose files are whole: of itself, and of each camera's in it."""
+    if config.sensors is None:
+        return ["config.yaml: a single camera's, but the manifest is a rig's"]
+    said = [("sensors", [one.name for one in config.sensors]), *_said_of(config), *_times_of(config)]
+    if problems := [*_unlike(manifest, said), *_misnamed(name, manifest, config)]:
+        return problems
+    if problems := _not_asked_for(set(_files_of_rig(config)), manifest):
+        return problems
+    for one in config.sensors:
+        if one.sees:
+            inside = _guarded(
+                lambda one=one: look_at_sensor(folder / one.name, read_manifest(folder / one.name), config)
+            )
+            problems += [f"{one.name}/{line}" for line in inside]
+        elif one.imu is not None:
+            inside = _guarded(lambda one=one: _check_imu(folder / one.name, config.model_copy(update={"imu": one.imu})))
+            problems += [f"{one.name}/{line}" for line in inside]
+    total = sum(read_manifest(folder / one.name)["events"] for one in config.sensors if one.sees)
+    return problems or _unlike(manifest, [("events", total)])
+
+
+def look_at_sensor(folder: Path, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
+    """Problems of the folder of one camera of a rig, whose configuration is the rig's."""
+    number = {one.name: k for k, one in enumerate(config.sensors or ()) if one.sees}.get(str(manifest.get("sensor")))
+    if number is None or config.sensors is None:
+        return [f"{MANIFEST}: sensor is {shown(manifest.get('sensor'))}, of which config.yaml says nothing"]
+    own, events = config.of_sensor(number), config.sensors[number].events is not None
+    return _bound(".", manifest, own, events) or contents(folder, manifest, own)
+
+
+def _files_of_rig(config: SequenceConfig) -> Iterator[str]:
+    """Names of the files of a rig's sequence, its manifest left out."""
+    yield from ("config.yaml", RIG)
+    for k, one in enumerate(config.sensors or ()):
+        if one.sees:
+            yield f"{one.name}/{MANIFEST}"
+            yield from (f"{one.name}/{file}" for file in _files_of(config.of_sensor(k), one.events is not None))
+        elif one.imu is not None:
+            yield from (f"{one.name}/{file}" for file in IMU_FILES)
+    if config.preview.enabled and any(one.events is not None for one in config.sensors or ()):
+        yield "preview.mp4"
+
+
+def contents(folder: Path, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
+    """Problems of what the files of one camera's sequence hold."""
+    problems = (
+        _guarded(lambda: check_events(folder / "events.h5", manifest)) if "events.h5" in manifest["files"] else []
+    )
+    problems = [line if line.startswith("events.h5") else f"events.h5: {line}" for line in problems]
+    if EVENT_LABELS in manifest["files"]:
+        problems += _guarded(lambda: _check_truth(folder, manifest))
+    problems += _guarded(lambda: _check_labels(folder, manifest))
+    if config.imu is not None:
+        problems += _guarded(lambda: _check_imu(folder, config))
+    if config.tracks is not None:
+        problems += _guarded(lambda: _check_tracks(folder, manifest, config))
+    if _distorts(config):
+        problems += _guarded(lambda: problems_of_lens(folder, config.camera.model))
+    if config.images is not None:
+        problems += _guarded(lambda: _check_images(folder, manifest, config))
+    return problems
+
+
+def _said_of(config: SequenceConfig) -> list[tuple[str, Any]]:
+    return [("split", config.output.split), ("seed", config.seed), ("sequence", config.output.first_index)]
+
+
+def _times_of(config: SequenceConfig) -> list[tuple[str, Any]]:
+    t0, t1 = config.time.t0_ns // 1000, config.time.t1_ns // 1000
+    return [("t_offset_us", t0), ("duration_us", t1 - t0)]
+
+
+def _bound(name: str, manifest: dict[str, Any], config: SequenceConfig, events: bool = True) -> list[str]:
     """Do the folder's name, the manifest and the sequence's own configuration speak of the same
-    sequence, and is there what it asks for?"""
-    index, output = manifest["sequence"], config.output
-    path = sequence_name(output, index)
-    said = [
-        ("split", output.split),
-        ("seed", config.seed),
-        ("sequence", output.first_index),
-        ("emulator", config.events.emulator),
-    ]
+    sequence, and is there what it asks for?   events : whether there are some."""
+    said = [*_said_of(config), ("emulator", config.events.emulator if events else None)]
     if config.frames is None:
-        t0, t1 = config.time.t0_ns // 1000, config.time.t1_ns // 1000
         said += [
             ("height", config.camera.height),
             ("width", config.camera.width),
-            ("t_offset_us", t0),
-            ("duration_us", t1 - t0),
+            *_times_of(config),
             ("labels", config.time.label_count),
         ]
-    told = bool(getattr(config.events, "causes", False))
+    told = events and bool(getattr(config.events, "causes", False))
     if ("events_by_cause" in manifest) != told:
         said.append(("events_by_cause", "that there are some" if told else None))
-    problems = [
+    problems = [*_unlike(manifest, said), *_misnamed(name, manifest, config)]
+    if config.frames is None and not problems:
+        problems += _not_asked_for(set(_files_of(config, events)), manifest)
+    return problems
+
+
+def _unlike(manifest: dict[str, Any], said: list[tuple[str, Any]]) -> list[str]:
+    return [
         f"{MANIFEST}: {key} is {shown(manifest.get(key))}, config.yaml says {value}"
         for key, value in said
         if manifest.get(key) != value
     ]
-    if name != "." and name != (path if "/" in name else path.split("/")[1]):
-        problems.append(f"the folder is called {shown(name)}, but holds {path}")
-    if config.frames is None and not problems:
-        wanted, there = set(_files_of(config)), set(manifest["files"])
-        problems += [f"{file}: missing, config.yaml asks for it" for file in sorted(wanted - there)[:5]]
-        problems += [f"{shown(file)}: config.yaml does not ask for it" for file in sorted(there - wanted)[:5]]
-    return problems
 
 
-def _files_of(config: SequenceConfig) -> Iterator[str]:
-    """Names of the files of a generated sequence, the manifest left out."""
-    yield from ("events.h5", "poses.npz", "config.yaml")
-    if config.labels.events:
-        yield EVENT_LABELS
+def _misnamed(name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
+    path = sequence_name(config.output, manifest["sequence"])
+    wrong = name != "." and name != (path if "/" in name else path.split("/")[1])
+    return [f"the folder is called {shown(name)}, but holds {path}"] if wrong else []
+
+
+def _not_asked_for(wanted: set[str], manifest: dict[str, Any]) -> list[str]:
+    there = set(manifest["files"])
+    missing = [f"{file}: missing, config.yaml asks for it" for file in sorted(wanted - there)[:5]]
+    return missing + [f"{shown(file)}: config.yaml does not ask for it" for file in sorted(there - wanted)[:5]]
+
+
+def _files_of(config: SequenceConfig, events: bool = True) -> Iterator[str]:
+    """Names of the files of a generated sequence, the manifest left out.   events : whether there are some."""
+    yield from ("poses.npz", "config.yaml")
+    if events:
+        yield "events.h5"
+        if config.labels.events:
+            yield EVENT_LABELS
     for name in asked_for(config.labels):
         label = LABELS[name]
         if label.stamps is not None:
@@ -504,7 +571,7 @@ def _twins(known: dict[str, _Known], result: Verification) -> dict[str, list[str
     seen: dict[tuple[str, str], str] = {}
     problems: dict[str, list[str]] = {}
     for name, one in known.items():
-        files, config = one.manifest["files"], one.config
+        files, config = _files_of_first(one.manifest), one.config
         random_scene = config.frames is None and config.scene.kind == "random"
         looked = [
             f
@@ -527,8 +594,18 @@ def _twins(known: dict[str, _Known], result: Verification) -> dict[str, list[str
     return problems
 
 
+def _files_of_first(manifest: dict[str, Any]) -> dict[str, Any]:
+    """Files of a sequence, of a rig's first camera alone."""
+    if not manifest.get("cameras"):
+        return manifest["files"]
+    own = manifest["cameras"][0] + "/"
+    return {name.removeprefix(own): file for name, file in manifest["files"].items() if name.startswith(own)}
+
+
 def _noisy(config: SequenceConfig) -> bool:
     """Whether two seeds give two pixel arrays."""
+    if config.sensors is not None:
+        return any(_noisy(config.of_sensor(k)) for k, one in enumerate(config.sensors) if one.events is not None)
     drawn = (
         "threshold_sigma",
         "threshold_jitter",
@@ -690,7 +767,11 @@ def _compared(name: str, one: _Known, made: Path, result: Verification) -> list[
     depend = []
     for file in sorted(set(one.manifest["files"]) & set(manifest["files"])):
         if one.manifest["files"][file]["sha256"] != manifest["files"][file]["sha256"]:
-            if (_moved_otherwise(one.manifest, manifest) and _follows_poses(file)) or _agrees(file, one.folder, made):
+            inside = next((camera for camera in manifest.get("cameras", ()) if file.startswith(camera + "/")), None)
+            below, name_ = ("", file) if inside is None else (inside, file.removeprefix(inside + "/"))
+            if (_moved_otherwise(one.manifest, manifest) and _follows_poses(name_)) or _agrees(
+                name_, one.folder / below, made / below
+            ):
                 depend.append(file)
             else:
                 problems.append(f"made again, {file}: differs by more than a renderer can")

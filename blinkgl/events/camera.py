@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,9 @@ from blinkgl.events.readout import Readout
 from blinkgl.events.table import make_emulator
 from blinkgl.events.truth import Surfaces, SurfaceTruth
 from blinkgl.events.types import Events
+
+if TYPE_CHECKING:
+    from blinkgl.gl import GLContext
 
 _NOTHING = nullcontext()
 
@@ -49,6 +52,7 @@ class EventCamera:
     far as the configuration has them. readout : None: none of it.   seed : of the draws.
     reconstruction : the path between frames, see :class:`Emulator`.   emulator : the :class:`Emulator` itself.
     truth : says what made each event, of frames that come with their ``surfaces``; None: nobody asks.
+    gl : context that draws the frames, on whose card the emulator may be; None: none.
     Raises EventDataError: size, or a path that the emulator cannot follow."""
 
     def __init__(
@@ -60,9 +64,10 @@ class EventCamera:
         seed: int,
         reconstruction: str = "linear",
         truth: SurfaceTruth | None = None,
+        gl: GLContext | None = None,
     ):
         self._truth = truth
-        self.emulator = make_emulator(config, height, width, seed, reconstruction)
+        self.emulator = make_emulator(config, height, width, seed, reconstruction, gl)
         self._pixels, self._latency, self._readout, self._filters = None, None, None, ()
         self._luminance: np.ndarray | None = None
         if readout is not None:
@@ -72,6 +77,10 @@ class EventCamera:
                 self._latency = Latency(readout.latency, height, width, seed)
             self._readout = Readout(readout)
             self._filters = tuple(make_filter(one, height, width) for one in readout.filters)
+
+    def release(self) -> None:
+        """Lets go of what lies on a card. Harmless when repeated."""
+        self.emulator.release()
 
     @property
     def tells(self) -> bool:

@@ -15,7 +15,7 @@ docs/extending.md has the whole of one. What configuration needs is in ``Config`
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from blinkgl.config.base import tag_of, validate
 from blinkgl.config.events import EmulatorConfig
@@ -23,6 +23,9 @@ from blinkgl.config.readout import ReadoutConfig
 from blinkgl.config.sensor import SensorConfig
 from blinkgl.events.emulator import Emulator
 from blinkgl.events.response import Response
+
+if TYPE_CHECKING:
+    from blinkgl.gl import GLContext
 
 EMULATORS: dict[str, type[Emulator]] = {}
 """By ``Config``'s key ``emulator``."""
@@ -71,10 +74,22 @@ def emulator_of(config: EmulatorConfig) -> type[Emulator]:
 
 
 def make_emulator(
-    config: EmulatorConfig, height: int, width: int, seed: int = 0, reconstruction: str = "linear"
+    config: EmulatorConfig,
+    height: int,
+    width: int,
+    seed: int = 0,
+    reconstruction: str = "linear",
+    gl: GLContext | None = None,
 ) -> Emulator:
-    """The emulator a config asks for; ``reconstruction``: its path between frames, see :class:`Emulator`."""
-    return emulator_of(config)(height, width, config, seed, reconstruction)
+    """The emulator a config asks for; ``reconstruction``: its path between frames, see :class:`Emulator`.
+
+    gl : context that draws the frames, on whose card it may be (``events.device``); None: none."""
+    kind, device = emulator_of(config), getattr(config, "device", "cpu")
+    if device == "cpu" or (device == "auto" and gl is None):
+        return kind(height, width, config, seed, reconstruction)
+    from blinkgl.card.choice import emulator_on  # above this room; nobody loads it who does not ask for a card
+
+    return emulator_on(kind, config, height, width, seed, reconstruction, gl)
 
 
 def _checked(emulator: Any) -> str:

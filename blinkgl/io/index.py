@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter
 from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.records import HereOrInside, parse, read_text, shown
-from blinkgl.io.sequence_dir import MANIFEST, read_manifest
+from blinkgl.io.sequence_dir import MANIFEST, is_rig_folder, read_manifest
 
 INDEX = "index.jsonl"
 _PART = 20_000
@@ -47,18 +47,33 @@ _KEYS = (
 
 def sequence_folders(root: str | Path) -> Iterator[Path]:
     """Folders <root>/<split>/<sequence> with a manifest, or ``root`` itself when it is a
-    sequence; hidden ones are not looked at."""
+    sequence; of a rig those of its cameras, <root>/<split>/<sequence>/<sensor>. Hidden ones are not looked at."""
+    for folder in made_folders(root):
+        yield from _of_cameras(folder)
+
+
+def _of_cameras(folder: Path) -> Iterator[Path]:
+    """The folder itself, or of a rig those of its cameras."""
+    if is_rig_folder(folder):
+        yield from (manifest.parent for manifest in sorted(folder.glob(f"*/{MANIFEST}")))
+    else:
+        yield folder
+
+
+def made_folders(root: str | Path) -> Iterator[Path]:
+    """The same, but of a rig its own: what a run makes, one a task."""
     root = Path(root)
     if (root / MANIFEST).is_file():
         yield root
         return
     for pattern in ("*", "*/*"):
         for manifest in sorted(root.glob(f"{pattern}/{MANIFEST}")):
-            if not any(part.startswith(".") for part in manifest.relative_to(root).parts):
+            inside = pattern == "*/*" and is_rig_folder(manifest.parent.parent)
+            if not inside and not any(part.startswith(".") for part in manifest.relative_to(root).parts):
                 yield manifest.parent
 
 
-_SOMETIMES = ("events_by_cause",)
+_SOMETIMES = ("events_by_cause", "sensor")
 """Keys of manifests that only some have."""
 
 
@@ -67,7 +82,7 @@ def entry(root: Path, folder: Path) -> dict[str, Any]:
     manifest = read_manifest(folder)
     return {
         "path": folder.relative_to(root).as_posix(),
-        "name": folder.name,
+        "name": folder.name if "sensor" not in manifest else f"{folder.parent.name}/{folder.name}",
         **{key: manifest.get(key) for key in _KEYS},
         **{key: manifest[key] for key in _SOMETIMES if key in manifest},
         "bytes": sum(file["bytes"] for file in manifest["files"].values()),
@@ -114,14 +129,15 @@ def _path_of(line: str) -> str:
 def _unsorted(root: Path) -> Iterator[Path]:
     """The same as :func:`sequence_folders`, in no order, and without a list of them all."""
     if (root / MANIFEST).is_file():
-        yield root
+        yield from _of_cameras(root)
         return
     for top in _visible(root):
         if (top / MANIFEST).is_file():
-            yield top
+            yield from _of_cameras(top)
+            continue
         for folder in _visible(top):
             if (folder / MANIFEST).is_file():
-                yield folder
+                yield from _of_cameras(folder)
 
 
 def _visible(folder: Path) -> Iterator[Path]:

@@ -4,6 +4,8 @@ sequence is being generated."""
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -15,6 +17,7 @@ from blinkgl.io.video import VideoWriter
 from blinkgl.srgb import to_srgb8, tone_mapped
 from blinkgl.timeline.sampling import Ticks
 
+Self = TypeVar("Self", bound="_Streamed")
 _BAR = 30
 _GAP = 4
 _BACK, _TEXT, _DIM = (22, 24, 28), (235, 238, 242), (150, 156, 166)
@@ -22,26 +25,15 @@ _MAX_PANEL_HEIGHT = 360
 _LEGEND = 27
 
 
-class PreviewWriter:
-    """Streams a side-by-side video. Frames are taken at ``rate_hz`` of simulated time and played at ``fps``, i.e.
-    slowed by ``rate_hz / fps``; memory does not grow with the sequence.
+class Panels:
+    """Of one camera: frame, events and flow side by side. Frames are taken at ``rate_hz`` of simulated time and played
+    at ``fps``, i.e. slowed by ``rate_hz / fps``.
 
-        preview.add_events(events)              every chunk
-        preview.set_flow(flow, valid)           whenever a label exists; shown until the next
-        if preview.due(t_us):                   ask first: making the picture may cost something
-            preview.frame(t_us, image)
-
-    Parameters
-    ----------
-    path : ending decides the container, .mp4 usually. height, width : sensor size, px.
-    t0_us : start. flow : False leaves the flow panel out. rate_hz, fps : see above.
-
-    Raises OutputError when the video cannot be written.
-    """
+    height, width : sensor size, px.   t0_us : start.   flow : False leaves the flow panel out.   label : of the frame.
+    canvas : (h, w, 3) uint8, all as it is shown."""
 
     def __init__(
         self,
-        path: str | os.PathLike,
         height: int,
         width: int,
         *,
@@ -70,7 +62,10 @@ class PreviewWriter:
         if flow:
             self._panel_view(2)[:] = (32, 34, 38)
             self._caption(2, "")
-        self._video = VideoWriter(path, *self._canvas.shape[:2], fps, preset="superfast", crf=22)
+
+    @property
+    def canvas(self) -> np.ndarray:
+        return self._canvas
 
     def add_events(self, events: Events) -> None:
         """Collected until the next frame."""
@@ -98,11 +93,11 @@ class PreviewWriter:
         """Whether :meth:`frame` at this time would be shown."""
         return self._ticks.due(t_us)
 
-    def frame(self, t_us: int, image: np.ndarray) -> None:
-        """Composes and encodes one picture (several times when more than one period has passed). image: (H, W[, 3])
-        float linear light, whose highlights are compressed where they exceed 1, or uint8 sRGB."""
+    def compose(self, t_us: int, image: np.ndarray) -> int:
+        """Draws :attr:`canvas`; for how many periods it is shown: those that have passed, 0 where none has.
+        image : (H, W[, 3]) float linear light, whose highlights are compressed where they exceed 1, or uint8 sRGB."""
         if not self.due(t_us):
-            return
+            return 0
         small = self._fit(image)  # first: cheaper, and averages linear light where it is given
         small = self._toned(small) if small.dtype.kind == "f" else small
         self._panel_view(0)[:] = small[..., None] if small.ndim == 2 else small
@@ -112,20 +107,7 @@ class PreviewWriter:
         self._caption(1, f"ON blue, OFF red   {self._pending:,}{share}")
         self._counts[:] = 0
         self._pending, self._noise = 0, None if self._noise is None else 0
-        for _ in range(self._ticks.passed(t_us)):
-            self._video.write(self._canvas)
-
-    def close(self) -> None:
-        self._video.close()
-
-    def abort(self) -> None:
-        self._video.abort()
-
-    def __enter__(self) -> PreviewWriter:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self.close() if kind is None else self.abort()
+        return self._ticks.passed(t_us)
 
     def _toned(self, image: np.ndarray) -> np.ndarray:
         """uint8 sRGB in which nothing clips. What counts as the brightest follows the picture's at once when it rises
@@ -164,3 +146,82 @@ class PreviewWriter:
         ring = np.clip(1.5 - np.abs(np.hypot(x, y) - _LEGEND), 0, 1)[..., None]
         mixed = corner * (1 - inside) + wheel * inside
         corner[:] = mixed * (1 - ring) + 60 * ring
+
+
+class _Streamed:
+    """Context manager around a video that is kept when all went well."""
+
+    _video: VideoWriter
+
+    def close(self) -> None:
+        self._video.close()
+
+    def abort(self) -> None:
+        self._video.abort()
+
+    def __enter__(self: Self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self.close() if kind is None else self.abort()
+
+
+class PreviewWriter(Panels, _Streamed):
+    """Streams a side-by-side video of one camera; memory does not grow with the sequence.
+
+        preview.add_events(events)              every chunk
+        preview.set_flow(flow, valid)           whenever a label exists; shown until the next
+        if preview.due(t_us):                   ask first: making the picture may cost something
+            preview.frame(t_us, image)
+
+    path : ending decides the container, .mp4 usually.   The others are those of :class:`Panels`.
+
+    Raises OutputError when the video cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike,
+        height: int,
+        width: int,
+        *,
+        t0_us: int = 0,
+        flow: bool = True,
+        rate_hz: float = 40,
+        fps: float = 20,
+        label: str = "frame",
+    ):
+        super().__init__(height, width, t0_us=t0_us, flow=flow, rate_hz=rate_hz, fps=fps, label=label)
+        self._video = VideoWriter(path, *self._canvas.shape[:2], fps, preset="superfast", crf=22)
+
+    def frame(self, t_us: int, image: np.ndarray) -> None:
+        """Composes and encodes one picture (several times when more than one period has passed), as of
+        :meth:`Panels.compose`."""
+        for _ in range(self.compose(t_us, image)):
+            self._video.write(self._canvas)
+
+
+class RigPreviewWriter(_Streamed):
+    """The same of several cameras, one below the other. panels : of each, of one ``rate_hz`` and ``fps``.
+
+    Raises OutputError when the video cannot be written."""
+
+    def __init__(self, path: str | os.PathLike, panels: Sequence[Panels], fps: float):
+        self.panels = tuple(panels)
+        heights = [one.canvas.shape[0] for one in self.panels]
+        self._canvas = np.empty((sum(heights), max(one.canvas.shape[1] for one in self.panels), 3), np.uint8)
+        self._canvas[:] = _BACK
+        self._tops = np.cumsum([0, *heights[:-1]])
+        height, width = self._canvas.shape[:2]
+        self._video = VideoWriter(path, height, width, fps, preset="superfast", crf=22)
+
+    def frame(self, number: int, t_us: int, image: np.ndarray) -> None:
+        """The picture of the camera of this number. When the last one's is there all are encoded."""
+        one, top = self.panels[number], self._tops[number]
+        count = one.compose(t_us, image)
+        if count:
+            height, width = one.canvas.shape[:2]
+            self._canvas[top : top + height, :width] = one.canvas
+        if number == len(self.panels) - 1:
+            for _ in range(count):
+                self._video.write(self._canvas)

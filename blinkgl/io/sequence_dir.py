@@ -30,7 +30,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import h5py
 import numpy as np
@@ -57,7 +57,10 @@ from blinkgl.io.hdf5 import blosc_dataset, write_rows
 from blinkgl.io.records import InsidePath, entries_below, open_regular, parse, read_text, shown
 from blinkgl.labels import Form, Label, label_of
 
+Self = TypeVar("Self", bound="SequenceWriter")
 MANIFEST = "manifest.json"
+RIG = "rig.yaml"
+"""In the folder of a sequence of several sensors (:mod:`blinkgl.io.rig_dir`)."""
 _LARGEST = 2**62
 _IN_FLIGHT = 8
 """Labels waiting for the encoder thread: bounds memory at a few tens of MB."""
@@ -92,6 +95,9 @@ class SequenceWriter:
     OutputError : the directory exists, or cannot be written.
     """
 
+    kind = "blinkgl-sequence"
+    """``format`` of the manifest."""
+
     def __init__(
         self,
         final: str | os.PathLike,
@@ -124,7 +130,7 @@ class SequenceWriter:
         self._exposures: list[ExposureLine] = []
         self._failure: list[BaseException] = []
 
-    def __enter__(self) -> SequenceWriter:
+    def __enter__(self: Self) -> Self:
         refuse_existing(self.final)
         with output_errors(self.final):
             self.final.parent.mkdir(parents=True, exist_ok=True)
@@ -205,17 +211,17 @@ class SequenceWriter:
 
         self.external(name, save)
 
-    def imu(self, config: ImuConfig, measured: Mapping[str, np.ndarray]) -> None:
+    def imu(self, config: ImuConfig, measured: Mapping[str, np.ndarray], folder: str = "") -> None:
         """``imu/``: what an inertial unit measured, the arrays of :class:`~blinkgl.sequence.inertial.Inertial` by
-        name."""
+        name.   folder : that it stands in, of a rig's unit by itself, with a "/" at its end."""
         noisy, ideal = (
             tuple(measured[name] for name in names)
             for names in (("t_ns", "rate", "acceleration"), ("t_ns", "ideal_rate", "ideal_acceleration"))
         )
-        self.text(imu_files.CSV, imu_files.imu_csv(*noisy))
-        self.text(imu_files.IDEAL, imu_files.imu_csv(*ideal))
-        self._write(imu_files.H5, partial(imu_files.imu_h5, measured))
-        self.text(imu_files.KALIBR, imu_files.kalibr_yaml(config, measured["T_cam_imu"]))
+        self.text(folder + imu_files.CSV, imu_files.imu_csv(*noisy))
+        self.text(folder + imu_files.IDEAL, imu_files.imu_csv(*ideal))
+        self._write(folder + imu_files.H5, partial(imu_files.imu_h5, measured))
+        self.text(folder + imu_files.KALIBR, imu_files.kalibr_yaml(config, measured["T_cam_imu"]))
 
     def image(self, pictures: Mapping[str, np.ndarray], exposure: ExposureLine) -> None:
         """The next image of the frame camera: codes of "images" and what is written beside it
@@ -319,15 +325,11 @@ class SequenceWriter:
                 name = path.relative_to(self._tmp).as_posix()
                 if path.is_file() and name not in self._files:
                     fsync(path)
-                    self._files[name] = _digest(path)
+                    self._files[name] = digest_of(path)
             manifest = {
-                "format": "blinkgl-sequence",
+                "format": self.kind,
                 "format_version": 1,
-                "height": self.height,
-                "width": self.width,
-                "t_offset_us": self.t_offset_us,
-                "events": self._events.count if self._events is not None else 0,
-                "flow_pixels_out_of_range": self.lost,
+                **self._about(),
                 **self.info,
                 "files": self._files,
             }
@@ -339,6 +341,16 @@ class SequenceWriter:
             refuse_existing(self.final)
             os.rename(self._tmp, self.final)
             fsync(self.final.parent)
+
+    def _about(self) -> dict[str, Any]:
+        """What a manifest of this kind says of it."""
+        return {
+            "height": self.height,
+            "width": self.width,
+            "t_offset_us": self.t_offset_us,
+            "events": self._events.count if self._events is not None else 0,
+            "flow_pixels_out_of_range": self.lost,
+        }
 
     def _check_untouched(self) -> None:
         """OutputError when a file that was written is gone or cut: somebody tidied up under us.
@@ -367,6 +379,11 @@ class SequenceWriter:
             except Exception:  # noqa: BLE001 - a full disk refuses the flush; the file is deleted anyway
                 pass
         shutil.rmtree(self._tmp, ignore_errors=True)
+
+
+def is_rig_folder(folder: str | os.PathLike) -> bool:
+    """Whether a folder is the sequence of a rig, with those of its cameras in it."""
+    return (Path(folder) / RIG).is_file()
 
 
 class _File(BaseModel):
@@ -401,7 +418,29 @@ class Manifest(BaseModel):
     files: dict[InsidePath, _File]
 
 
-_MODEL = TypeAdapter(Manifest)
+class RigManifest(BaseModel):
+    """The same of a rig's sequence (:mod:`blinkgl.io.rig_dir`), whose ``files`` are those of all sensors."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+    format: Literal["blinkgl-rig"]
+    format_version: Literal[1]
+    events: int = Field(ge=0, le=_LARGEST)
+    t_offset_us: int = Field(ge=-_LARGEST, le=_LARGEST)
+    duration_us: int | None = Field(None, ge=0, le=_LARGEST)
+    seed: int | None = Field(None, ge=0, lt=2**63)
+    sequence: int | None = Field(None, ge=0, le=_LARGEST)
+    split: str | None = Field(None, max_length=255)
+    blinkgl: str | None = Field(None, max_length=255)
+    labels: int | None = Field(None, ge=0, le=_LARGEST)
+    frames: int | None = Field(None, ge=0, le=_LARGEST)
+    opengl: dict[str, str] | None = None
+    versions: dict[str, str] | None = None
+    sensors: list[InsidePath]
+    cameras: list[InsidePath]
+    files: dict[InsidePath, _File]
+
+
+_MODEL, _RIG_MODEL = TypeAdapter(Manifest), TypeAdapter(RigManifest)
 
 
 def verify_sequence(folder: str | os.PathLike, *, checksums: bool = True) -> list[str]:
@@ -427,7 +466,7 @@ def verify_sequence(folder: str | os.PathLike, *, checksums: bool = True) -> lis
             problems.append(f"{shown(name)}: {size} bytes, manifest says {expected['bytes']}")
         elif checksums:
             try:
-                if _digest(folder / name)["sha256"] != expected["sha256"]:
+                if digest_of(folder / name)["sha256"] != expected["sha256"]:
                     problems.append(f"{shown(name)}: checksum differs")
             except (OSError, BlinkGLError) as error:
                 problems.append(f"{shown(name)}: cannot be read: {getattr(error, 'strerror', error)}")
@@ -440,17 +479,22 @@ def verify_sequence(folder: str | os.PathLike, *, checksums: bool = True) -> lis
 
 
 def read_manifest(folder: str | os.PathLike) -> dict[str, Any]:
-    """The manifest, of the shape :class:`Manifest` describes; AssetError when there is none or it is damaged."""
+    """The manifest, of the shape :class:`Manifest` describes, or :class:`RigManifest`; AssetError when there is none
+    or it is damaged."""
     path = Path(folder) / MANIFEST
     try:
-        return parse(read_text(path), _MODEL)
+        text = read_text(path)
+        data = parse(text)
+        rig = isinstance(data, dict) and data.get("format") == "blinkgl-rig"
+        return parse(text, _RIG_MODEL if rig else _MODEL)
     except FileNotFoundError:
         raise AssetError("no manifest", where=str(path)) from None
     except ValueError as error:
         raise AssetError(f"damaged manifest: {error}", where=str(path)) from None
 
 
-def _digest(path: Path) -> dict[str, Any]:
+def digest_of(path: Path) -> dict[str, Any]:
+    """A file's line in a manifest."""
     digest, size = hashlib.sha256(), 0
     with open(open_regular(path), "rb") as file:
         while block := file.read(1 << 20):

@@ -8,6 +8,7 @@ imported here: a YAML is read by it.
 """
 
 from blinkgl.labels.depth import Depth
+from blinkgl.labels.disparity import Disparity
 from blinkgl.labels.files import Form
 from blinkgl.labels.flow import FlowTo
 from blinkgl.labels.frames import Flow, LabelFrame, LabelRequest
@@ -22,6 +23,7 @@ from blinkgl.labels.velocity import Velocity
 for _row in (
     Images(),
     Depth(),
+    Disparity(),
     Ids(),
     Normals(),
     Velocity(),

@@ -62,6 +62,11 @@ def _try(section: str, name: str, action: Callable[[], str], remedy: str) -> Che
         return Check(section, name, "missing", " ".join(f"{type(error).__name__}: {error}".split())[:200], remedy)
 
 
+def _optional(check: Check) -> Check:
+    """It may be missing."""
+    return check if check.status == "ok" else Check(check.section, check.name, "absent", check.value, check.remedy)
+
+
 # --- system -----------------------------------------------------------------------------------------------------------
 
 
@@ -130,8 +135,21 @@ def _opengl(backend: str, device: int) -> Iterator[Check]:
         for name in ("R32F", "RG32F", "RGBA32F", "R32UI", "R16F", "RGBA8"):
             yield _try(section, f"{name} target", lambda name=name: _draw_exactly(gl, name), driver)
         yield _try(section, "32F depth, reversed-Z", lambda: _draw_depth(gl), driver)
+        yield _optional(_try(section, "compute shaders", lambda: _make_events(gl), driver))
         timer = _try(section, "timer queries", lambda: _time_a_draw(gl), "")
-        yield timer if timer.status == "ok" else Check(section, timer.name, "absent", timer.value)
+        yield _optional(timer)
+
+
+def _make_events(gl) -> str:
+    """A short clip's events by the card and by the processor."""
+    from blinkgl.card.choice import same_events
+    from blinkgl.card.proof import rounds_like_ieee
+
+    if not same_events(gl):
+        raise RuntimeError("other events than the processor's; events.device: auto stays on the processor")
+    how = "in hardware" if rounds_like_ieee(gl) else "in whole numbers: the card rounds otherwise"
+    limit = gl.ctx.info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"] / 2**20
+    return f"ESIM's events bit for bit, logarithms {how}; buffers up to {limit:.0f} MiB"
 
 
 _TRIANGLE = """#version 430 core

@@ -16,11 +16,15 @@ class Samples(NamedTuple):
             and triangle); 0: one, at the pixel's centre.
     taps  : 1, or 4: texture lookups of a drawn pixel, spread over the pixel, each one mip level finer. The texture is
             super-sampled, the light and the silhouettes are not. Event frames only: colour
-            is not worth a shader variant."""
+            is not worth a shader variant.
+    edges : whether silhouettes and creases, and no other pixels, are given the means over the areas of their surfaces
+            (:class:`~blinkgl.render.passes.edged.Edged`). The taps, where there are four, then lie along the way in
+            which a surface is foreshortened."""
 
     grid: int = 1
     multi: int = 0
     taps: int = 1
+    edges: bool = False
 
     @property
     def stored(self) -> int:
@@ -32,6 +36,7 @@ ANTIALIASING = {
     "none": Samples(),
     "msaa4": Samples(multi=4),
     "taps4": Samples(taps=4),
+    "edges": Samples(taps=4, edges=True),
     "ssaa2": Samples(grid=2),
     "ssaa4": Samples(grid=4),
 }

@@ -135,10 +135,7 @@ class Moment:
 
     @_once
     def rates(self) -> Rates:
-        stage = self._stage
-        dT_world_obj = np.zeros_like(self.T_world_obj)
-        for i in stage.moving:
-            dT_world_obj[i] = stage.paths[i].derivative(self.t_ns)
+        dT_world_obj = self._stage.bodies.rates(self.t_ns)
         dT_cam_obj = cam_from_obj_rate(self.T_world_cam, self.dT_world_cam, self.T_world_obj, dT_world_obj)
         return Rates(self.view.projection @ dT_cam_obj, dT_world_obj)
 
@@ -173,11 +170,9 @@ _OF_THE_PLACE = ("T_cam_obj", "dT_world_cam", "centres")
 class Stage:
     """What of a scene is the same at all times, as arrays: paths of its objects, bounding spheres of its items."""
 
-    def __init__(self, scene: Scene, items: Sequence[DrawItem]):
-        self.items = items
+    def __init__(self, scene: Scene, items: Sequence[DrawItem], bodies: Bodies):
+        self.items, self.bodies = items, bodies
         self.camera_path: PosePath = scene.camera_path
-        self.paths: list[PosePath] = [o.path for o in scene.objects]
-        self.moving = [i for i, path in enumerate(self.paths) if not path.is_static]
         self.item_object = np.array([i.object_index for i in items], np.intp)
         self.item_centre = np.array([i.centre for i in items]).reshape(-1, 3)
         self.item_radius = np.array([i.radius for i in items])
@@ -189,22 +184,52 @@ class Stage:
         return Solids(self.items)
 
 
+class Bodies:
+    """Where the objects of a scene are, whoever looks; the last few times are kept."""
+
+    def __init__(self, scene: Scene):
+        self.paths: list[PosePath] = [o.path for o in scene.objects]
+        self.moving = [i for i, path in enumerate(self.paths) if not path.is_static]
+        self._start = np.stack([p.pose(scene.t0_ns) for p in self.paths]) if self.paths else np.zeros((0, 4, 4))
+        self._poses: OrderedDict[int, np.ndarray] = OrderedDict()
+        self._rates: OrderedDict[int, np.ndarray] = OrderedDict()
+
+    def poses(self, t_ns: int) -> np.ndarray:
+        """(n, 4, 4) float64 T_world_obj."""
+        return self._kept(self._poses, t_ns, self._start, lambda path: path.pose(t_ns))
+
+    def rates(self, t_ns: int) -> np.ndarray:
+        """(n, 4, 4) float64 d(T_world_obj)/dt, 1/s."""
+        return self._kept(self._rates, t_ns, np.zeros_like(self._start), lambda path: path.derivative(t_ns))
+
+    def _kept(
+        self, kept: OrderedDict[int, np.ndarray], t_ns: int, start: np.ndarray, of: Callable[[PosePath], np.ndarray]
+    ) -> np.ndarray:
+        if (found := kept.get(t_ns)) is not None:
+            return found
+        made = kept[t_ns] = start.copy()
+        for i in self.moving:
+            made[i] = of(self.paths[i])
+        if len(kept) > KEPT:
+            kept.popitem(last=False)
+        return made
+
+
 class Moments:
     """Gives the moments of a scene; the last few are kept. ``stage``: :class:`Stage`. Of a lens that distorts they are
-    those of the pin-hole camera that is drawn for it."""
+    those of the pin-hole camera that is drawn for it.
 
-    def __init__(self, scene: Scene, items: Sequence[DrawItem]):
-        self.stage, self.view = Stage(scene, items), View.of(seen_through(scene.camera))
-        paths = self.stage.paths
-        self._start = np.stack([p.pose(scene.t0_ns) for p in paths]) if paths else np.zeros((0, 4, 4))
+    bodies : of the same scene, that another camera looks at; None: its own."""
+
+    def __init__(self, scene: Scene, items: Sequence[DrawItem], bodies: Bodies | None = None):
+        self.bodies = bodies or Bodies(scene)
+        self.stage, self.view = Stage(scene, items, self.bodies), View.of(seen_through(scene.camera))
         self._kept: OrderedDict[int, Moment] = OrderedDict()
 
     def at(self, t_ns: int) -> Moment:
         if (moment := self._kept.get(t_ns)) is not None:
             return moment
-        stage, T_world_obj = self.stage, self._start.copy()
-        for i in stage.moving:
-            T_world_obj[i] = stage.paths[i].pose(t_ns)
+        stage, T_world_obj = self.stage, self.bodies.poses(t_ns)
         moment = self._kept[t_ns] = Moment(t_ns, self.view, stage.camera_path.pose(t_ns), T_world_obj, stage)
         if len(self._kept) > KEPT:
             self._kept.popitem(last=False)

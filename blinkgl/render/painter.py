@@ -14,6 +14,7 @@ import numpy as np
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.lighting import Lighting
 from blinkgl.render.matrices import linear_xyw_bytes
+from blinkgl.render.strokes import Strokes
 
 if TYPE_CHECKING:
     from blinkgl.gl import GLContext, Target
@@ -58,7 +59,8 @@ class Painter:
     """Draws for the passes of one renderer. A subclass may look on: every method is called
     by the passes and none by another.
 
-    gl : GLContext.   resources : SceneResources.   stats : what is counted.   lens : of a camera that distorts."""
+    gl : GLContext.   resources : SceneResources.   stats : what is counted.   lens : of a camera that distorts.
+    strokes : lines to be drawn."""
 
     def __init__(self, gl: GLContext, scene: Scene, resources: SceneResources, stats: RenderStats):
         self.gl, self.scene, self.resources, self.stats = gl, scene, resources, stats
@@ -67,6 +69,7 @@ class Painter:
         self._programs: dict[Pass, Programs] = {}
         self._covers: dict[Pass, tuple[Uniforms, moderngl.VertexArray]] = {}
         self._culling = False
+        self.strokes = Strokes(gl)
 
     def begin(self, target: Target, background: tuple[float, ...] = ()) -> None:
         """Draw into ``target`` from now on, which is cleared: the first attachment to
@@ -236,4 +239,5 @@ class Painter:
         for _, array in self._covers.values():
             array.release()
         self._programs, self._covers = {}, {}
+        self.strokes.release()
         self.resources.forget_vertex_arrays()

@@ -23,6 +23,15 @@ class Rectangle(NamedTuple):
     def union(self, other: Rectangle) -> Rectangle:
         return Rectangle(min(self.x0, other.x0), min(self.y0, other.y0), max(self.x1, other.x1), max(self.y1, other.y1))
 
+    def grown(self, margin: int, width: int, height: int) -> Rectangle:
+        """With ``margin`` px more on every side, as far as a picture of this size reaches."""
+        return Rectangle(
+            max(0, self.x0 - margin),
+            max(0, self.y0 - margin),
+            min(width, self.x1 + margin),
+            min(height, self.y1 + margin),
+        )
+
     def scaled(self, factor: int) -> Rectangle:
         return Rectangle(self.x0 * factor, self.y0 * factor, self.x1 * factor, self.y1 * factor)
 

@@ -15,6 +15,7 @@ the variants the scene's materials need.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from blinkgl.labels import LabelFrame, LabelRequest
@@ -58,6 +59,8 @@ class Renderer:
     without triangles that are lines in float32.   width, height : of the image, px.   stats : RenderStats.
     whole : frames are always drawn whole; otherwise a camera that stands still has only what
     moves drawn again, to the same pixels.
+    beside : of the same scene seen by another sensor: meshes, textures, poses and shadow maps are then its own, but
+    where levels of detail are asked for, which hang on the camera. It has to be released last.
     painter : class that issues the draw calls; a subclass may look on."""
 
     def __init__(
@@ -67,17 +70,29 @@ class Renderer:
         config: RenderConfig,
         *,
         whole: bool = False,
+        beside: Renderer | None = None,
         painter: type[Painter] = Painter,
     ):
-        scene = without_collapsed_faces(at_level_of_detail(scene, config.lod))
+        if beside is not None and not config.lod.enabled:
+            scene = replace(beside.scene, rig=scene.rig)
+        else:
+            scene, beside = without_collapsed_faces(at_level_of_detail(scene, config.lod)), None
         self.gl, self.scene, self.config, self.stats = gl, scene, config, RenderStats()
         self.width, self.height = scene.camera.width, scene.camera.height
         self._samples = samples_of(config.antialiasing)
         self._image_samples = samples_of(config.image_antialiasing, "render.image_antialiasing")
-        self._painter = painter(gl, scene, SceneResources(gl, scene, config.anisotropy, config.mip_bias), self.stats)
+        self._beside = beside
+        resources = (
+            SceneResources(gl, scene, config.anisotropy, config.mip_bias)
+            if beside is None
+            else beside._painter.resources  # noqa: SLF001 - another of its own kind
+        )
+        self._painter = painter(gl, scene, resources, self.stats)
         self._painter.lens = Lens.of(gl, scene.camera)
-        self._moments = Moments(scene, self.items)
+        self._moments = Moments(scene, self.items, None if beside is None else beside._moments.bodies)  # noqa: SLF001
         self._canvases: dict[tuple[Pass, int, int], Canvas] = {}
+        self._common: dict[tuple[Pass, int, int], Canvas] = {} if beside is None else beside._common  # noqa: SLF001
+        self._last: dict[Pass, Frame] = {} if beside is None else beside._last  # noqa: SLF001
         self._labels: dict[PinHole | None, Labels] = {}
         # Worth it when something stands still besides the camera; a scene of movers alone is drawn whole.
         some_stand = any(o.is_static for o in scene.objects)
@@ -100,14 +115,17 @@ class Renderer:
             self.forget()
             if self._painter.lens is not None:
                 self._painter.lens.release()
-            self._painter.resources.release()
+            if self._beside is None:
+                self._painter.resources.release()
 
     def forget(self) -> None:
         """Nothing of what was drawn or compiled before is used again: to be called when the
         context's programs are to be replaced."""
-        for canvas in self._canvases.values():
+        for canvas in (*self._canvases.values(), *self._common.values()):
             canvas.release()
         self._canvases = {}
+        self._common.clear()
+        self._last.clear()
         self._labels = {}
         self._painter.forget()
 
@@ -176,14 +194,20 @@ class Renderer:
     def _drawn(self, pass_: Pass, moment: Moment, ends: Mapping[str, Moment], done: dict[Pass, Frame]) -> Frame:
         frame = done.get(pass_)
         if frame is None:
+            if pass_.common and (last := self._last.get(pass_)) is not None and last.t_ns == moment.t_ns:
+                done[pass_] = last
+                return last
             inputs = {one.sampler: self._drawn(one.of, moment, ends, done) for one in pass_.inputs}
             seen = moment.view.camera  # labels may be of another picture than the rest
-            key = (pass_, seen.width, seen.height)
-            canvas = self._canvases.get(key)
+            canvases = self._common if pass_.common else self._canvases
+            key = (pass_, 0, 0) if pass_.common else (pass_, seen.width, seen.height)
+            canvas = canvases.get(key)
             if canvas is None:
                 kind = StillCanvas if pass_.stands_still(self.whole) else Canvas
-                canvas = self._canvases[key] = kind(pass_, self._painter, seen.width, seen.height)
+                canvas = canvases[key] = kind(pass_, self._painter, seen.width, seen.height)
             frame = done[pass_] = canvas.draw(Shot(pass_.seen(moment), canvas.target, self.scene, ends, inputs))
+            if pass_.common:
+                self._last[pass_] = frame
         return frame
 
     # ---- frames --------------------------------------------------------------------------------------------------

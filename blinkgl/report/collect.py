@@ -4,7 +4,7 @@ configuration for the parameters."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -69,6 +69,12 @@ class Collected:
     unreadable: list[str] = field(default_factory=list)
     damaged: set[str] = field(default_factory=set)
     """paths of sequences that are not what their manifests say: counted, but no file of theirs is opened"""
+
+
+def task_of(line: dict[str, Any]) -> str:
+    """Folder that a task has made, of a line of the index: that of the rig where it is of one of its cameras."""
+    path = PurePosixPath(line["path"])
+    return str(path.parent if "sensor" in line else path)
 
 
 def collect(root: str | Path, *, examples: int = 6, seed: int = 0) -> Collected:
@@ -258,7 +264,7 @@ def _parameters(found: Collected, rng: np.random.Generator) -> None:
     """Every distribution of the recipe with the values drawn, as the sequences' own config.yaml say."""
     if found.plan is None:
         return
-    here = {s["path"] for s in found.sequences} - found.damaged
+    here = {task_of(s) for s in found.sequences if s["path"] not in found.damaged}
     tasks = [task for task in found.plan.tasks if task.name in here]
     tasks = [tasks[i] for i in sorted(rng.permutation(len(tasks))[:MAX_CONFIGS])]
     configs: dict[str, list[dict]] = {}

@@ -12,7 +12,7 @@ import numpy as np
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.index import write_index
 from blinkgl.report.charts import histogram, number, size
-from blinkgl.report.collect import Collected, Example, Parameter, collect
+from blinkgl.report.collect import Collected, Example, Parameter, collect, task_of
 from blinkgl.report.markup import png, render
 
 _MAX_PICTURE_PX = 360
@@ -77,7 +77,7 @@ def _groups(found: Collected) -> list[tuple[str, int, int]]:
     """(group, sequences made, asked for)"""
     if found.plan is None:
         return []
-    paths = {x["path"] for x in found.sequences}
+    paths = {task_of(x) for x in found.sequences}
     planned = Counter(task.group for task in found.plan.tasks)
     here = Counter(task.group for task in found.plan.tasks if task.name in paths)
     return [(name or "all", here[name], planned[name]) for name in planned]

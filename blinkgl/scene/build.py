@@ -5,10 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from blinkgl.config.camera import CameraConfig
+import numpy as np
+
+from blinkgl.config.camera import CameraConfig, camera_radius
+from blinkgl.config.rig import RigSensorConfig, baseline_of
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig, SceneConfig
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
+from blinkgl.scene.rig import Rig, Sensor
 from blinkgl.scene.types import Fog, Scene
 from blinkgl.scene.worlds.explicit import check_primitive, explicit_scene
 from blinkgl.scene.worlds.from_file import scene_from_file
@@ -58,11 +62,13 @@ def in_fog(scene: Scene, config: SceneConfig) -> Scene:
 def sequence_scene(config: SequenceConfig, index: int, base: Path | str = ".") -> Scene:
     """The scene of sequence ``index`` of a run, with the sensor that records what the configuration asks for.
 
+    Of a rig: with all of its sensors, each recording what its own sections ask for.
+
     base : folder that the configuration's relative paths start from. Raises ConfigError and AssetError."""
     time, seed = config.time, config.seed
     scene = build_scene(
-        config.scene,
-        config.camera,
+        _with_room(config) if config.sensors else config.scene,
+        _cameras(config)[0] if config.sensors else config.camera,
         time.t0_ns,
         time.t1_ns,
         split=config.output.split,
@@ -70,7 +76,40 @@ def sequence_scene(config: SequenceConfig, index: int, base: Path | str = ".") -
         sequence=index,
         base=base,
     )
-    return recording(scene, config)
+    if config.sensors is None:
+        return recording(scene, config)
+    return replace(scene, rig=Rig(scene.rig.path, tuple(_on_rig(one, config.sensors) for one in config.sensors)))
+
+
+def _cameras(config: SequenceConfig) -> list[CameraConfig]:
+    """Of the rig's cameras; where it has none, that of the top, by which random worlds are laid out."""
+    return [one.camera for one in config.sensors or () if one.sees] or [config.camera]
+
+
+def _on_rig(one: RigSensorConfig, all_: tuple[RigSensorConfig, ...]) -> Sensor:
+    other = next((other for other in all_ if other.name == one.pair), None)
+    return Sensor(
+        one.camera.model,
+        one.place.T,
+        one.events,
+        one.readout,
+        one.labels,
+        one.name,
+        None if other is None else baseline_of(one, other),
+    )
+
+
+def _with_room(config: SequenceConfig) -> SceneConfig:
+    """The scene's configuration, in which a random world keeps clear of every camera of the rig, wherever it is."""
+    scene = config.scene
+    if not isinstance(scene, RandomSceneConfig):
+        return scene
+    reach = [
+        float(np.linalg.norm(one.place.T[:3, 3])) + camera_radius(one.camera.model, scene.camera_clearance)
+        for one in config.sensors or ()
+        if one.sees
+    ]
+    return scene.model_copy(update={"camera_clearance": max([scene.camera_clearance, *reach])})
 
 
 def recording(scene: Scene, config: SequenceConfig) -> Scene:

@@ -28,6 +28,7 @@ class Sensor:
     emulator, readout : how frames become events; emulator None: no events are recorded; readout None: no limit.
     labels : ground truth and pictures that are recorded with it; None: none.
     folder : of its files below the sequence's directory; "": that directory itself.
+    baseline : world units along the camera's x axis to the other eye of a rectified pair; None: it has none.
     """
 
     camera: CameraModel
@@ -36,6 +37,7 @@ class Sensor:
     readout: ReadoutConfig | None = None
     labels: LabelsConfig | None = None
     folder: str = ""
+    baseline: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

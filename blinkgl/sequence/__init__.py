@@ -2,7 +2,7 @@
 
 In: the configuration of one sequence, and OpenGL where a scene is drawn.
 Out: its events, ground truth, the frame camera's images and pictures, in the order of time.
-Start: simulate.py; rendered.py and recorded.py are its two sources.
+Start: simulate.py; rendered.py and recorded.py are its two sources, rig.py merges several.
 """
 
 from blinkgl.sequence.items import CameraImage, EventChunk, GroundTruth, Item, Picture

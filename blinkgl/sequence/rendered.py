@@ -28,7 +28,7 @@ from blinkgl.render.tracks import Tracks, track_points
 from blinkgl.rng import Role, generator, kernel_seed
 from blinkgl.scene.build import recording, sequence_scene
 from blinkgl.scene.rig import Sensor
-from blinkgl.scene.types import Dynamics, Scene
+from blinkgl.scene.types import Dynamics, Scene, SceneObject
 from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.inertial import Inertial, measured
 from blinkgl.sequence.items import GroundTruth, Picture
@@ -72,7 +72,7 @@ class RenderedSequence(Simulation):
 
     scene : as it was built.   renderer : what draws it, at its level of detail.
     sensor : what is recorded, and through which camera. A scene that was made already is
-    recorded as the configuration says."""
+    recorded as the configuration says.   number : of the sensor on its rig, by which noise differs."""
 
     def __init__(
         self,
@@ -87,7 +87,9 @@ class RenderedSequence(Simulation):
         scene: Scene | None,
         renderer: Renderer | None,
         window_ns: tuple[int, int] | None,
+        number: int = 0,
     ):
+        self.number = number
         clock = StageClock()
         scene = scene or (renderer.scene if renderer is not None else None)
         if scene is None:
@@ -102,6 +104,7 @@ class RenderedSequence(Simulation):
             if scene.dynamics is not None:
                 self.libraries = {scene.dynamics.engine: scene.dynamics.version}
             self.sensor = recording(scene, config).sensors[0]
+            self.name = self.sensor.folder
             self.triangles, self._before = renderer.triangles, (renderer.stats.render_s, renderer.stats.readback_s)
             camera = None
             if events:
@@ -110,16 +113,17 @@ class RenderedSequence(Simulation):
                     emulator,
                     readout,
                     *size,
-                    kernel_seed(config.seed, index, Role.EVENTS),
+                    kernel_seed(config.seed, index, Role.EVENTS, number),
                     config.timeline.reconstruction,
                     _truth_of(self.sensor, config),
+                    renderer.gl,
                 )
                 response, dynamics = emulator_of(emulator).response(emulator), scene.dynamics
                 self.timeline = make_timeline(
                     config.timeline, *span_ns, renderer, response, dynamics.impacts_ns if dynamics is not None else ()
                 )
             if labels and config.images is not None:
-                seed = kernel_seed(config.seed, index, Role.IMAGES)
+                seed = kernel_seed(config.seed, index, Role.IMAGES, number)
                 self.frame_camera = FrameCamera(renderer, config.images, seed, span_ns)
             super().__init__(
                 config,
@@ -224,7 +228,7 @@ class RenderedSequence(Simulation):
     def imu(self) -> Inertial | None:
         if self.config.imu is None:
             return None
-        rng = generator(self.config.seed, self.index, Role.IMU)
+        rng = generator(self.config.seed, self.index, Role.IMU, self.number)
         return measured(self.scene.camera_path, self.config.imu, self.config.time.t0_ns, self.config.time.t1_ns, rng)
 
     def tracks(self) -> Tracks | None:
@@ -235,7 +239,8 @@ class RenderedSequence(Simulation):
         # of the scene as it is drawn: its labels are of the same triangles
         scene, flat = self.renderer.scene, self._rectified
         scene = scene if flat is None else scene.with_camera(flat)
-        return track_points(scene, config, times, generator(self.config.seed, self.index, Role.TRACKS))
+        rng = generator(self.config.seed, self.index, Role.TRACKS, self.number)
+        return track_points(scene, config, times, rng)
 
     def facts(self) -> dict[str, Any]:
         gl, scene, timeline = self.renderer.gl, self.renderer.scene, self.config.timeline
@@ -243,20 +248,38 @@ class RenderedSequence(Simulation):
             "opengl": {"renderer": gl.renderer, "version": gl.version, "vendor": gl.vendor, "backend": gl.backend},
             "timeline": {"kind": timeline.kind, "reconstruction": timeline.reconstruction, **self.achieved},
             "triangles": self.triangles,
-            "objects": [
-                {
-                    "name": o.name,
-                    "id": o.instance_id,
-                    "category": o.category,
-                    "source_hashes": sorted({p.mesh.source_hash for p in o.parts}),
-                }
-                for o in scene.objects
-            ],
+            "objects": [_described(o) for o in scene.objects],
             "scene_log": list(scene.log),
             "not_drawn": list(scene.omissions),
             **({} if scene.dynamics is None else {"dynamics": _facts_of(scene.dynamics)}),
             **({} if self.frame_camera is None else {"frame_camera": self.frame_camera.facts()}),
         }
+
+
+def _described(one: SceneObject) -> dict[str, Any]:
+    """What a body is, for who has no scene: its box at rest in its own axes, and of each part the mesh that it was
+    made from and the material on it."""
+    corners = np.concatenate([part.mesh.vertices for part in one.parts]) if one.parts else np.zeros((1, 3))
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    return {
+        "name": one.name,
+        "id": one.instance_id,
+        "category": one.category,
+        "source_hashes": sorted({part.mesh.source_hash for part in one.parts}),
+        "box": [low.tolist(), high.tolist()],
+        "parts": [
+            {
+                "mesh": part.mesh.name,
+                "mesh_hash": part.mesh.source_hash,
+                "triangles": len(part.mesh.faces),
+                "texture": None if part.material.texture is None else part.material.texture.name,
+                "texture_hash": None if part.material.texture is None else part.material.texture.source_hash,
+                "base_color": list(part.material.base_color),
+                "uv_scale": list(part.material.uv_scale),
+            }
+            for part in one.parts
+        ],
+    }
 
 
 def _facts_of(dynamics: Dynamics) -> dict[str, Any]:

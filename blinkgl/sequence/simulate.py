@@ -73,6 +73,13 @@ def simulate_sequence(
             value=pictures_hz,
             accepted="None, or events=True",
         )
+    if config.sensors is not None:
+        raise ConfigError(
+            "several sensors are simulated together, not as one camera",
+            where="sensors",
+            value=[one.name for one in config.sensors],
+            accepted="simulate_rig, or a configuration of a single camera",
+        )
     # They import this module, for what they share.
     from blinkgl.sequence.recorded import RecordedSequence
     from blinkgl.sequence.rendered import RenderedSequence
@@ -117,6 +124,7 @@ class Simulation(ABC):
     """One sequence in time: iterate over it once. It holds OpenGL until its end, however the
     loop ends, or that of its ``with`` block.
 
+    name : of the sensor on a rig; "" of a single camera.
     config : every value as drawn.   index : number of the sequence.   height, width : px.
     t0_ns, t1_ns : first and last time, ns.   pictures_hz : that it gives, or None.
     clock : wall seconds per stage.   camera : emulator and read-out, None when no events were asked for.
@@ -127,6 +135,7 @@ class Simulation(ABC):
     omissions : what files of the scene ask for and is not drawn, a line per file.
     libraries : versions of those that have a say in this sequence and not in every one."""
 
+    name = ""
     triangles = 0
     timeline: Timeline | None = None
     frame_camera: FrameCamera | None = None
@@ -160,6 +169,8 @@ class Simulation(ABC):
 
     def close(self) -> None:
         """Lets go of OpenGL. Harmless when repeated."""
+        if self.camera is not None:
+            self.camera.release()
         self._stack.close()
 
     def __iter__(self) -> Iterator[Item]:

@@ -8,5 +8,6 @@ interpolate.py invents frames of a video.
 
 from blinkgl.timeline.sampling import Ticks, bounded_times, displacement_times, uniform_times
 from blinkgl.timeline.strategy import Timeline, make_timeline
+from blinkgl.timeline.together import together
 
-__all__ = ["Ticks", "Timeline", "bounded_times", "displacement_times", "make_timeline", "uniform_times"]
+__all__ = ["Ticks", "Timeline", "bounded_times", "displacement_times", "make_timeline", "together", "uniform_times"]

@@ -53,6 +53,8 @@ class Timeline:
         self.stops_ns = stops_ns
         self.looks = 0
         """Small pictures asked for so far."""
+        self.others: tuple[Timeline, ...] = ()
+        """Of other cameras, whose pace is kept, too (:mod:`blinkgl.timeline.together`)."""
 
     def __iter__(self) -> Iterator[int]:
         c = self.config
@@ -65,7 +67,7 @@ class Timeline:
 
     def _counted(self, t_ns: int) -> float:
         self.looks += 1
-        return self.pace(t_ns)
+        return max([self.pace(t_ns), *(other.pace(t_ns) for other in self.others)])
 
     def observe(self, t_ns: int, luminance: np.ndarray, rate: np.ndarray | None = None) -> None:
         """To be told every frame that was drawn, in order."""

@@ -7,7 +7,14 @@ import math
 
 import numpy as np
 
-COLOURS = {"none": "#d9552f", "msaa4": "#e0a526", "taps4": "#8a5fc0", "ssaa2": "#3d6bd6", "ssaa4": "#2a9d8f"}
+COLOURS = {
+    "none": "#d9552f",
+    "msaa4": "#e0a526",
+    "taps4": "#8a5fc0",
+    "edges": "#b0307a",
+    "ssaa2": "#3d6bd6",
+    "ssaa4": "#2a9d8f",
+}
 MARKERS = {"linear": "o", "pchip": "^", "hermite": "s"}
 COSTS = {"wall_s": "seconds of computing per simulated second", "cpu_s": "processor seconds per simulated second"}
 PANELS = (

@@ -37,7 +37,9 @@ RECONSTRUCTIONS = {
     "pchip": ("timeline.reconstruction=pchip",),
     "hermite": ("timeline.reconstruction=hermite",),
 }
-ANTIALIASINGS = {name: (f"render.antialiasing={name}",) for name in ("none", "msaa4", "taps4", "ssaa2", "ssaa4")}
+ANTIALIASINGS = {
+    name: (f"render.antialiasing={name}",) for name in ("none", "msaa4", "taps4", "edges", "ssaa2", "ssaa4")
+}
 OTHERS = {
     "": (),
     "mip bias -0.5": ("render.mip_bias=-0.5",),

@@ -197,26 +197,33 @@ def find_blinkgl(root: Path) -> list[Sequence]:
         else [m.parent for m in sorted(root.rglob("manifest.json"))]
     )
     for folder in folders:
-        if any(part.startswith(".") for part in folder.relative_to(root).parts) or not (folder / "events.h5").is_file():
+        if any(part.startswith(".") for part in folder.relative_to(root).parts):
             continue
-        there, back = LABELS["flow_forward"], LABELS["flow_backward"]
-        stamps = folder / there.stamps
-        forward, backward = (sorted((folder / label.forms[0].folder).glob("*.png")) for label in (there, back))
-        # Made without flow: there is nothing to learn from it, and nothing wrong with it.
-        if not forward and not stamps.exists():
-            continue
-        times = read_times(stamps)
-        _same_count(folder / there.forms[0].folder, forward, times)
-        if backward:
-            _same_count(folder / back.forms[0].folder, backward, times)
-        entries = tuple(
-            Entry(int(f.stem), t0, t1, f, backward[i] if backward else None)
-            for i, (f, (t0, t1)) in enumerate(zip(forward, times, strict=True))
-        )
         name = folder.relative_to(root).as_posix()
-        name = folder.name if name == "." else name
-        found.append(Sequence(name, name, folder / "events.h5", entries))
+        if (sequence := blinkgl_sequence(folder, folder.name if name == "." else name)) is not None:
+            found.append(sequence)
     return found
+
+
+def blinkgl_sequence(folder: Path, name: str) -> Sequence | None:
+    """A sequence directory; None where it has no events, or no forward flow. Raises AssetError: files are missing."""
+    if not (folder / "events.h5").is_file():
+        return None
+    there, back = LABELS["flow_forward"], LABELS["flow_backward"]
+    stamps = folder / there.stamps
+    forward, backward = (sorted((folder / label.forms[0].folder).glob("*.png")) for label in (there, back))
+    # Made without flow: there is nothing to learn from it, and nothing wrong with it.
+    if not forward and not stamps.exists():
+        return None
+    times = read_times(stamps)
+    _same_count(folder / there.forms[0].folder, forward, times)
+    if backward:
+        _same_count(folder / back.forms[0].folder, backward, times)
+    entries = tuple(
+        Entry(int(f.stem), t0, t1, f, backward[i] if backward else None)
+        for i, (f, (t0, t1)) in enumerate(zip(forward, times, strict=True))
+    )
+    return Sequence(name, name, folder / "events.h5", entries)
 
 
 def find_dsec(root: Path) -> list[Sequence]:

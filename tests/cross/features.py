@@ -201,10 +201,10 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         },
     },
     "anti-aliasing": {
-        name: {"render": {"antialiasing": name}} for name in ("none", "msaa4", "taps4", "ssaa2", "ssaa4")
+        name: {"render": {"antialiasing": name}} for name in ("none", "msaa4", "taps4", "edges", "ssaa2", "ssaa4")
     },
     "images": {
-        **{name: {"render": {"image_antialiasing": name}} for name in ("none", "msaa4", "ssaa2", "ssaa4")},
+        **{name: {"render": {"image_antialiasing": name}} for name in ("none", "msaa4", "edges", "ssaa2", "ssaa4")},
         "no images": {"labels": {"images": False}},
     },
     "frame camera": {
@@ -296,6 +296,11 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "default": NOTHING,
         "odd": {"camera": {"width": WIDTH - 1, "height": HEIGHT - 1, "focal": 30, "cx": 12.3}},
         "wide": {"camera": {"fov": 110, "near": 0.2}},
+        "radtan, rectified": {
+            "camera": {"fx": 30, "fy": 31, "cx": 15.0, "lens": "radtan", "distortion": [-0.2, 0.05, 0.001, 0]},
+            "labels": {"pixels": "rectified"},
+        },
+        "fisheye": {"camera": {"lens": "equidistant", "distortion": [0.01, 0, 0, 0], "fov": 70}},
     },
     "output": {
         "train": NOTHING,

@@ -20,7 +20,7 @@ from blinkgl.dataset import verify as verify_module
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import AssetError
-from blinkgl.io.sequence_dir import _digest
+from blinkgl.io.sequence_dir import digest_of
 from runs import NAMES, recipe_file
 
 
@@ -41,7 +41,7 @@ def forge(folder: Path, name: str, **changes) -> None:
     path = folder / "manifest.json"
     manifest = json.loads(path.read_text())
     if name:
-        manifest["files"][name] = _digest(folder / name)
+        manifest["files"][name] = digest_of(folder / name)
     path.write_text(json.dumps({**manifest, **changes}))
 
 

@@ -22,7 +22,7 @@ from blinkgl.dataset.report import STAGES, SequenceReport, Totals
 from blinkgl.dataset.sockets import Listening, descendants, listening
 from blinkgl.dataset.work import Job, Maker, SequenceLog, environment_differences, thread_environment
 from blinkgl.errors import ConfigError, OutputError, may_pass
-from blinkgl.sequence import Picture
+from blinkgl.sequence import EventChunk, Picture
 from blinkgl.sequence.clock import StageClock
 
 # --- workers ----------------------------------------------------------------------------------------------------------
@@ -211,22 +211,32 @@ def test_the_preview_is_fed_and_ended(monkeypatch, rate, recorded, fails):
     calls = []
 
     class Video:
-        def __init__(self, path, height, width, **given):
-            calls.append(("made", path, height, width, given))
+        def __init__(self, path, panels, fps):
+            calls.append(("made", path, panels[0].about, fps))
+            self.panels = panels
 
         def __getattr__(self, name):
             return lambda *given: calls.append((name, *given))
 
-    monkeypatch.setattr(preview_module, "PreviewWriter", Video)
+    class Panels:
+        def __init__(self, height, width, **given):
+            self.about = (height, width, given)
+
+        def __getattr__(self, name):
+            return lambda *given: calls.append((name, *given))
+
+    monkeypatch.setattr(preview_module, "RigPreviewWriter", Video)
+    monkeypatch.setattr(preview_module, "Panels", Panels)
     sequence = SimpleNamespace(
-        clock=StageClock(), pictures_hz=rate, height=3, width=4, t0_ns=2_500_000, t1_ns=10**9,
+        name="", clock=StageClock(), pictures_hz=rate, height=3, width=4, t0_ns=2_500_000, t1_ns=10**9,
         config=SimpleNamespace(time=SimpleNamespace(interval_ns=50_000_000), frames=object() if recorded else None),
     )  # fmt: skip
     velocity = np.full((3, 4, 2), 40, np.float32)
     try:
-        with PreviewRecorder(PreviewConfig(slowdown=4), sequence, SimpleNamespace(path=lambda name: name)) as recorder:
-            recorder.add_events("events")
-            recorder.show(Picture(7_999_999, "image", None if recorded else velocity))
+        folder = SimpleNamespace(path=lambda name: name)
+        with PreviewRecorder(PreviewConfig(slowdown=4), [sequence], folder) as recorder:
+            recorder.take(sequence, EventChunk(7_000_000, "events"))
+            recorder.take(sequence, Picture(7_999_999, "image", None if recorded else velocity))
             if fails:
                 raise KeyError
     except KeyError:
@@ -234,12 +244,11 @@ def test_the_preview_is_fed_and_ended(monkeypatch, rate, recorded, fails):
     if rate is None:
         assert calls == [] and "preview" not in sequence.clock.seconds
         return
-    assert calls[0] == (
-        "made", "preview.mp4", 3, 4, {"t0_us": 2500, "flow": not recorded, "rate_hz": 50.0, "fps": 12.5}
-    )  # fmt: skip
+    about = {"t0_us": 2500, "flow": not recorded, "rate_hz": 50.0, "fps": 12.5, "label": "frame"}
+    assert calls[0] == ("made", "preview.mp4", (3, 4, about), 12.5)
     names = [name for name, *_ in calls[1:]]
     assert names == ["add_events", *([] if recorded else ["set_flow"]), "frame", "abort" if fails else "close"]
-    assert calls[-2][1:] == (7999, "image") and sequence.clock.seconds["preview"] >= 0
+    assert calls[-2][1:] == (0, 7999, "image") and sequence.clock.seconds["preview"] >= 0
     if not recorded:
         assert (calls[2][1] == 2).all(), "px in a label interval"
 

@@ -107,7 +107,7 @@ def raw_buffers(renderer) -> dict[str, np.ndarray]:
     }
 
 
-@pytest.mark.parametrize("antialiasing", ["none", "taps4", "msaa4", "ssaa2"])
+@pytest.mark.parametrize("antialiasing", ["none", "taps4", "edges", "msaa4", "ssaa2"])
 @pytest.mark.parametrize("textured", [True, False])
 @pytest.mark.parametrize("lines_drawn", [True, False])
 def test_every_pass_of_a_nasty_mesh_is_finite(gl, monkeypatch, antialiasing, textured, lines_drawn):
@@ -170,7 +170,7 @@ def test_what_is_seen_from_its_edge_is_not_seen(gl, seed):
 
 
 @pytest.mark.parametrize("unlit", [True, False])
-@pytest.mark.parametrize("antialiasing", ["none", "taps4"])
+@pytest.mark.parametrize("antialiasing", ["none", "taps4", "edges"])
 def test_a_neighbour_on_the_horizon_has_no_texture_coordinates(gl, antialiasing, unlit):
     """A ground that ends half a pixel below the horizon: in powers of two 1/w is exactly 0 in the row above its last,
     and derivatives of texture coordinates and normals between those rows are infinite."""
@@ -188,6 +188,8 @@ def test_a_neighbour_on_the_horizon_has_no_texture_coordinates(gl, antialiasing,
         buffers = raw_buffers(renderer)
     last = buffers["ids"][33] > 0
     assert last.sum() > 100 and not buffers["ids"][:33].any()
+    if antialiasing == "edges":
+        last[np.flatnonzero(last)[-1]] = False  # the ground ends in that pixel, which has what is behind in it
     for name, buffer in buffers.items():
         assert np.isfinite(buffer).all(), name
     mean = paint.image.mean(axis=(0, 1)) @ (0.2126, 0.7152, 0.0722)

@@ -91,7 +91,7 @@ def test_labels_are_never_filtered(gl):
     world = mixed_scene()
     request = LabelRequest("depth", "ids", "flow_forward")
     frames = []
-    for antialiasing in ("none", "msaa4", "ssaa4"):
+    for antialiasing in ("none", "msaa4", "edges", "ssaa4"):
         with Renderer(gl, world, RenderConfig(antialiasing=antialiasing, image_antialiasing="msaa4")) as renderer:
             renderer.luminance(0).read()
             frames.append(renderer.labels(0, request, SECOND // 10))

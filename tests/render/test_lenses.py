@@ -242,3 +242,14 @@ def test_a_lens_that_sees_too_much(gl):
     assert wide.half_angle > math.radians(70)
     with pytest.raises(blinkgl.ConfigError, match="degrees off its axis, too much for the one flat picture"):
         Renderer(gl, scene.with_camera(wide), RenderConfig())
+
+
+def test_the_shader_debugger_looks_at_the_flat_picture(tmp_path):
+    from blinkgl.tools.shader_debugger.session import open_subject
+
+    config = tmp_path / "run.yaml"
+    config.write_text(
+        "camera: {width: 32, height: 24, lens: radtan, distortion: [-0.2, 0, 0, 0]}\nscene: {objects: {count: 1}}"
+    )
+    camera = open_subject(str(config)).scene.camera
+    assert isinstance(camera, PinHole) and camera.width > 45

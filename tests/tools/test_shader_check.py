@@ -24,7 +24,7 @@ from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment
 from blinkgl.tools.shader_debugger.session import DebugRenderer, moment, open_folder, open_subject
 from debugger_scene import copy_shaders, edit
 
-PRODUCTION = ("luminance.glsl", "velocity.glsl", "colour.glsl", "label.glsl", "downsample.glsl")
+PRODUCTION = ("luminance.glsl", "velocity.glsl", "colour.glsl", "label.glsl", "downsample.glsl", "edges.glsl")
 
 
 def scene_of(config, **camera):
@@ -43,6 +43,7 @@ def test_everything_compiles_and_nothing_is_unused(shader):
         "colour.glsl": 118,
         "debug.glsl": 14,
         "downsample.glsl": 2,
+        "edges.glsl": 4,
         "label.glsl": 882,
         "luminance.glsl": 364,
         "shadow.glsl": 28,
@@ -69,7 +70,9 @@ def test_the_table_of_variants_is_what_the_renderer_asks_for(gl, config, monkeyp
     with Renderer(gl, world, RenderConfig(antialiasing="ssaa2", image_antialiasing="ssaa4")) as renderer:
         renderer.luminance(t), renderer.colour(t), renderer.velocity(t), renderer.velocity(t, 4)
         with Renderer(gl, world, RenderConfig(antialiasing="taps4")) as tapped:
-            tapped.luminance(t), tapped.luminance(t, rate=True)
+            tapped.luminance(t, rate=True)
+        with Renderer(gl, world, RenderConfig(antialiasing="edges")) as edged:
+            edged.luminance(t, rate=True)
         renderer.luminance(t, rate=True)
         renderer.brightness(t, 4)
         for count in range(1, len(fields) + 1):

@@ -15,7 +15,7 @@ from blinkgl.config.sequence import RunTemplate, apply_overrides, load_run
 from blinkgl.trade.measure import Bench, Options
 from blinkgl.trade.settings import Setting
 
-SAMPLES = {"none": 1, "msaa4": 4, "taps4": 4, "ssaa2": 4, "ssaa4": 16}
+SAMPLES = {"none": 1, "msaa4": 4, "taps4": 4, "edges": 4, "ssaa2": 4, "ssaa4": 16}
 
 
 @pytest.fixture(scope="module")

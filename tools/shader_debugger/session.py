@@ -12,6 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from blinkgl.camera.drawing import seen_through
 from blinkgl.config.lod import LodConfig
 from blinkgl.config.sequence import NS_PER_S, SequenceConfig, load_run
 from blinkgl.errors import ConfigError, GLError
@@ -68,7 +69,7 @@ def open_subject(
     config: str, *, seed: int | None = None, sequence: int | None = None, overrides: list[str] | tuple = ()
 ) -> Subject:
     """The sequence that ``blinkgl generate CONFIG --seed SEED`` would make under number
-    ``sequence`` (default: its first).
+    ``sequence`` (default: its first). Of a lens that distorts it is the flat picture that is drawn for it.
 
     Raises ConfigError and AssetError."""
     template = load_run(config, overrides, seed=seed)
@@ -76,6 +77,7 @@ def open_subject(
     one = template.sequence(index)
     check_assets(one.scene, template.base, one.output.split)
     scene = sequence_scene(one, index, template.base)
+    scene = scene.with_camera(seen_through(scene.camera))
     # Here, and not in each renderer: the rays of the reference have to meet the triangles that are drawn.
     scene = at_level_of_detail(scene, one.render.lod)
     one = one.model_copy(update={"render": one.render.model_copy(update={"lod": LodConfig()})})

@@ -7,20 +7,22 @@ Start: base.py, then luminance.py.
 
 from blinkgl.render.passes.base import Input, Output, Pass, ScenePass, ScreenPass, Shot
 from blinkgl.render.passes.colour import Colour
+from blinkgl.render.passes.edged import Edged, filtered
 from blinkgl.render.passes.gather import Gather, one_value
 from blinkgl.render.passes.geometry import Geometry
 from blinkgl.render.passes.luminance import Brightness, Luminance
-from blinkgl.render.passes.mean import Mean, filtered
+from blinkgl.render.passes.mean import Mean
 from blinkgl.render.passes.shadow import Shaded, ShadowMap, shadow_maps
 from blinkgl.render.passes.velocity import Velocity
 
-PASSES: tuple[type[Pass], ...] = (Luminance, Brightness, Velocity, Colour, Geometry, Mean, Gather, ShadowMap)
+PASSES: tuple[type[Pass], ...] = (Luminance, Brightness, Velocity, Colour, Geometry, Mean, Edged, Gather, ShadowMap)
 """Those that a renderer draws of itself."""
 
 __all__ = [
     "PASSES",
     "Brightness",
     "Colour",
+    "Edged",
     "Gather",
     "Geometry",
     "Input",

@@ -69,6 +69,8 @@ class Pass:
     still : whether a camera that stands still has only what moves drawn again.
     lit : whether its program asks light.glsl for the light, and fog.glsl for what of it arrives.
     one_channel : whether one channel of it will do, where the surface is of one colour.
+    common : it is the same whoever looks, at one time of one scene, so that it is drawn once for all sensors of a rig
+    and all passes that read it.
     pointwise : each pixel comes of the inputs' pixel at the same place (or where :meth:`changed` says), so that it does
     not change where they do not."""
 
@@ -81,6 +83,7 @@ class Pass:
     still: ClassVar[bool] = False
     lit: ClassVar[bool] = False
     one_channel: ClassVar[bool] = False
+    common: ClassVar[bool] = False
     pointwise: ClassVar[bool] = False
 
     def size(self, width: int, height: int) -> tuple[int, int]:

@@ -24,6 +24,10 @@ class Colour(Shaded):
     program: ClassVar[str] = "colour.glsl"
     outputs: ClassVar[tuple[Output, ...]] = (Output("colour", "RGBA32F", components=3),)
 
+    @property
+    def depth(self) -> bool | str:
+        return "texture" if self.samples.edges else True
+
     def background(self, scene: Scene) -> tuple[float, ...]:
         return (scene.backdrop,) * 3
 

@@ -57,17 +57,24 @@ class Luminance(_Luminance):
     still: ClassVar[bool] = True
 
     @property
+    def depth(self) -> bool | str:
+        return "texture" if self.samples.edges else True
+
+    @property
     def outputs(self) -> tuple[Output, ...]:
         return (
             Output("luminance", "RG32F", planes=("luminance", "rate")) if self.rate else Output("luminance", "R32F"),
         )
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
-        return ({"RATE": 1} if self.rate else {}) | ({"TAPS4": 1} if self.samples.taps == 4 and kind.textured else {})
+        taps = {"TAPS4": 1} if self.samples.taps == 4 and kind.textured else {}
+        return ({"RATE": 1} if self.rate else {}) | taps | ({"STRETCHED": 1} if taps and self.samples.edges else {})
 
     @classmethod
     def every_kind(cls) -> Iterator[Pass]:
-        return (cls(rate, Samples(taps=taps)) for rate in (False, True) for taps in (1, 4))
+        # What a rate and taps are to each other is the same for both kinds of taps.
+        plain, taps, edges = Samples(), Samples(taps=4), Samples(taps=4, edges=True)
+        return (cls(rate, one) for rate, one in ((False, plain), (True, plain), (True, taps), (True, edges)))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""One value per pixel of a picture that was drawn finer: the last part of anti-aliasing."""
+"""One value per pixel of a picture that was drawn finer."""
 
 from __future__ import annotations
 
@@ -48,8 +48,3 @@ class Mean(ScreenPass):
         from blinkgl.render.passes.colour import Colour
 
         return (cls(Colour(Samples(grid=factor))) for factor in (2, 4))
-
-
-def filtered(pass_: Pass) -> Pass:
-    """A pass that gives one value per pixel: ``pass_`` itself, or the mean of its samples."""
-    return pass_ if pass_.samples.stored == 1 else Mean(pass_)

@@ -42,6 +42,7 @@ class ShadowMap(ScenePass):
     program: ClassVar[str] = "shadow.glsl"
     outputs: ClassVar[tuple[Output, ...]] = ()
     depth: ClassVar[str] = "texture"
+    common: ClassVar[bool] = True
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         return self.texels, self.texels

@@ -1,0 +1,296 @@
+"""``rig:`` and ``sensors:`` of the YAML: several sensors on one body that moves.
+
+    rig: stereo                                   # a preset: its sensors, and what is said beside them
+    sensors:
+      - {name: right, place: {position: [0.2, 0, 0]}}       # laid over the preset's sensor of this name
+      - {name: imu, imu: {rate: 400}}                       # one more
+
+A sensor's table has the sections of a single camera's configuration (:data:`SECTIONS`); what it does not say of
+:data:`INHERITED` is as at the top. Everything here works on plain trees, after what is drawn has been drawn and before
+anything is validated, so that what comes out says all by itself.
+"""
+
+from __future__ import annotations
+
+import copy
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from importlib import resources
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import AfterValidator, Field
+
+from blinkgl.camera import PinHole
+from blinkgl.config.base import Config, Refused, rule
+from blinkgl.config.camera import CameraConfig
+from blinkgl.config.events import EmulatorConfig
+from blinkgl.config.images import ImagesConfig
+from blinkgl.config.imu import ImuConfig
+from blinkgl.config.labels import LabelsConfig
+from blinkgl.config.reader import parse_yaml
+from blinkgl.config.readout import ReadoutConfig
+from blinkgl.config.scene import Position, Vector3
+from blinkgl.config.sensor import Sensor
+from blinkgl.config.tracks import TracksConfig
+from blinkgl.errors import ConfigError
+
+SECTIONS = ("camera", "sensor", "events", "readout", "labels", "images", "imu", "tracks")
+"""Of a single camera's configuration, that each sensor has for itself."""
+INHERITED = ("camera", "sensor", "events", "readout", "labels")
+"""What a sensor has as the top says it, where it says nothing. The others are nobody's until a sensor asks."""
+_SHARED = ("time", "timeline")
+_RIGID = 1e-4
+_Row = tuple[float, float, float, float]
+
+
+class PlaceConfig(Config):
+    """Where a sensor is on its rig: T_rig_sensor, from the sensor's axes to the rig's. Both are OpenCV's, x right, y
+    down, z forward, and the rig's are where a single camera would be: ``scene.camera`` moves the rig."""
+
+    position: Position = Field((0.0, 0.0, 0.0), description="m, on the rig's axes: x right, y down, z forward")
+    euler: Vector3 | None = Field(None, description="degrees about the rig's x, y, z axes, applied in this order")
+    quaternion: tuple[float, float, float, float] | None = Field(
+        None, description="[w, x, y, z], need not be normalised"
+    )
+    matrix: tuple[_Row, _Row, _Row, _Row] | None = Field(
+        None,
+        description="T_rig_sensor, four rows of four, in place of the others. Rounded rotations are made exact. "
+        "(Kalibr's T_cn_cnm1 is the inverse of one camera's place on the camera before)",
+    )
+
+    @rule("euler", "quaternion", "matrix", "position")
+    def _one_place(euler, quaternion, matrix, position):
+        turned = [k for k, v in (("euler", euler), ("quaternion", quaternion), ("matrix", matrix)) if v is not None]
+        if len(turned) > 1:
+            raise Refused("only one of euler, quaternion, matrix may be given, not " + " and ".join(turned))
+        if matrix is not None and any(position):
+            raise Refused("the matrix has a position already", where="position", value=list(position))
+
+    @rule("quaternion")
+    def _some_rotation(quaternion: tuple[float, ...] | None):
+        if quaternion is not None and sum(q * q for q in quaternion) < 1e-12:
+            raise Refused("a quaternion must not be zero", where="quaternion", value=list(quaternion))
+
+    @rule("matrix")
+    def _rigid(matrix):
+        if matrix is None:
+            return
+        T = np.array(matrix, np.float64)
+        R = T[:3, :3]
+        if not np.abs(T[3] - [0, 0, 0, 1]).max() < 1e-9:
+            raise Refused("the last row of a pose is not 0, 0, 0, 1", where="matrix", value=T[3].tolist())
+        if not (np.abs(R @ R.T - np.eye(3)).max() < _RIGID and np.linalg.det(R) > 0):
+            mirrored = np.abs(R @ R.T - np.eye(3)).max() < _RIGID
+            raise Refused(
+                "the matrix mirrors, which no place does" if mirrored else "the matrix is no rotation",
+                where="matrix",
+                value=np.round(R, 6).tolist(),
+                accepted=f"R Rᵀ = 1 to {_RIGID:g} and determinant +1",
+            )
+
+    @property
+    def T(self) -> np.ndarray:
+        """(4, 4) float64 T_rig_sensor."""
+        from scipy.spatial.transform import Rotation
+
+        T = np.eye(4)
+        T[:3, 3] = self.position
+        if self.matrix is not None:
+            T = np.array(self.matrix, np.float64)
+            u, _, v = np.linalg.svd(T[:3, :3])
+            nearest = u @ v
+            if np.abs(nearest - T[:3, :3]).max() > 1e-12:
+                T[:3, :3] = nearest
+            T[3] = [0, 0, 0, 1]
+        elif self.euler is not None:
+            T[:3, :3] = Rotation.from_euler("xyz", self.euler, degrees=True).as_matrix()
+        elif self.quaternion is not None:
+            w, x, y, z = self.quaternion
+            T[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
+        return T
+
+
+def _sensor_name(name: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", name):
+        raise Refused(
+            "not a name for folders",
+            value=name,
+            accepted="a letter or digit, then letters, digits, '_' and '-', at most 64",
+        )
+    return name
+
+
+class RigSensorConfig(Config):
+    """One device on a rig: an event camera, a frame camera, an inertial unit, or several of them in one housing, which
+    then look through one lens. `events` is as at the top, unless there are `images` or an `imu` and nothing is said of
+    it: then there are no events."""
+
+    name: Annotated[str, AfterValidator(_sensor_name)] = Field(description="of its folder in the sequence's")
+    place: PlaceConfig = Field(PlaceConfig(), description="where it is on the rig; {}: where a single camera would be")
+    pair: str | None = Field(
+        None, description="name of the other eye of a rectified stereo pair, which `labels.disparity` speaks of"
+    )
+    camera: CameraConfig = Field(CameraConfig(), description="as at the top, whose keys it has where it says none")
+    sensor: Sensor | None = Field(None, description="as at the top")
+    events: EmulatorConfig | None = Field(None, description="as at the top, over whose keys it is laid; null: none")
+    readout: ReadoutConfig | None = Field(None, description="as at the top")
+    labels: LabelsConfig = Field(
+        default_factory=LabelsConfig, description="as at the top; of a camera without events none but those said here"
+    )
+    images: ImagesConfig | None = Field(None, description="a frame camera (docs/images.md); null: none")
+    imu: ImuConfig | None = Field(
+        None, description="an inertial unit, its position and rotation on the sensor's own axes; null: none"
+    )
+    tracks: TracksConfig | None = Field(None, description="points on surfaces, followed through this camera")
+
+    @property
+    def sees(self) -> bool:
+        """Whether it is a camera."""
+        return self.events is not None or self.images is not None
+
+
+def rig_names() -> tuple[str, ...]:
+    """Names of the shipped rigs, ``rig:``."""
+    found = resources.files("blinkgl.configs").joinpath("rigs").iterdir()
+    return tuple(sorted(file.name.removesuffix(".yaml") for file in found if file.name.endswith(".yaml")))
+
+
+def load_rig(name: Any) -> list[dict[str, Any]]:
+    """Sensors of a shipped rig, as plain trees. Raises ConfigError for an unknown one."""
+    if name not in rig_names():
+        raise ConfigError("unknown rig", where="rig", value=name, accepted=f"one of {', '.join(rig_names())}")
+    text = resources.files("blinkgl.configs").joinpath(f"rigs/{name}.yaml").read_text(encoding="utf-8")
+    return parse_yaml(text, f"rigs/{name}.yaml")["sensors"]
+
+
+def is_rig(tree: Any) -> bool:
+    """Whether a configuration is of several sensors."""
+    return isinstance(tree, dict) and (tree.get("rig") is not None or tree.get("sensors") is not None)
+
+
+def tables_of(tree: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
+    """The tables that ``sensors:`` lists, with their numbers; what is no table is left to validation."""
+    given = tree.get("sensors")
+    return [(k, one) for k, one in enumerate(given) if isinstance(one, dict)] if isinstance(given, list) else []
+
+
+def with_sections(tree: dict[str, Any], change: Callable[[dict[str, Any]], dict[str, Any]]) -> dict[str, Any]:
+    """``tree`` with every sensor's table changed."""
+    if not tables_of(tree):
+        return tree
+    return {**tree, "sensors": [change(one) if isinstance(one, dict) else one for one in tree["sensors"]]}
+
+
+def spelled_out(tree: dict[str, Any], fills: Iterable[Callable[[dict[str, Any]], dict[str, Any]]]) -> dict[str, Any]:
+    """``tree`` with every sensor of its rig complete: a preset's under what is said, the top's sections under both,
+    then what ``fills`` make of a single camera's sections. Doing it again changes nothing.
+
+    Raises ConfigError: an unknown rig, none or no list of sensors, two of one name, sections that are no sensor's."""
+    given = tree.get("sensors")
+    own = [] if given is None else given
+    if not isinstance(own, list):
+        raise ConfigError("not a list", where="sensors", value=own, accepted="- {name: left, …}")
+    for k, one in enumerate(own):
+        if not isinstance(one, dict):
+            raise ConfigError("not a table of keys", where=f"sensors.{k}", value=one, accepted="{name: left, …}")
+    for key in ("images", "imu", "tracks"):
+        if tree.get(key) is not None:
+            raise ConfigError(
+                "a rig's sensors have it, not the rig",
+                where=key,
+                accepted=f"{key} in one of `sensors`",
+            )
+    base = [] if tree.get("rig") is None else copy.deepcopy(load_rig(tree["rig"]))
+    tables = _laid(own, base)
+    if not tables:
+        raise ConfigError("a rig without a sensor", where="sensors", value=own, accepted="one or more")
+    return {**tree, "sensors": [_complete(one, k, tree, fills) for k, one in enumerate(tables)]}
+
+
+def _laid(own: list[dict[str, Any]], base: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A preset's sensors under those of the same names, in its order; then the others."""
+    from blinkgl.config.recipe import merge
+
+    said: dict[Any, dict[str, Any]] = {}
+    for k, one in enumerate(own):
+        name = one.get("name")
+        low = name.lower() if isinstance(name, str) else k
+        if low in said:
+            raise ConfigError(
+                "two sensors have one name", where=f"sensors.{k}.name", value=name, accepted="a name each, in any case"
+            )
+        said[low] = one
+    under = {one["name"]: one for one in base}
+    return [
+        *(merge(one, said[name]) if name in said else one for name, one in under.items()),
+        *(copy.deepcopy(one) for name, one in said.items() if name not in under),
+    ]
+
+
+def _complete(
+    own: dict[str, Any], number: int, tree: dict[str, Any], fills: Iterable[Callable[[dict[str, Any]], dict[str, Any]]]
+) -> dict[str, Any]:
+    from blinkgl.config.recipe import merge
+
+    for key in _SHARED:
+        if key in own:
+            raise ConfigError(
+                "the sensors of a rig share one clock and one timeline",
+                where=f"sensors.{number}.{key}",
+                accepted=f"{key} at the top",
+            )
+    other = own.get("images") is not None or own.get("imu") is not None
+    events = own["events"] is not None if "events" in own else not other
+    camera = events or own.get("images") is not None
+    keys = [key for key in INHERITED if key in tree and (events or key in ("camera", "sensor"))]
+    sections = {key: own[key] for key in SECTIONS if key in own and (events or key not in ("events", "readout"))}
+    sections = merge({key: copy.deepcopy(tree[key]) for key in keys if camera}, sections)
+    if not events and "labels" not in own:
+        sections["labels"] = {"images": False, "flow": []}
+    if events:
+        sections.setdefault("events", {})
+    for fill in fills:
+        sections = fill(sections)
+    if not events:
+        sections |= {"events": None, "readout": None}
+    rest = {key: value for key, value in own.items() if key not in SECTIONS}
+    return {**rest, **{key: sections[key] for key in SECTIONS if key in sections}}
+
+
+def check_pairs(sensors: Sequence[RigSensorConfig]) -> None:
+    """Raises ConfigError where a sensor's `pair` is none of the cameras, or no other eye: two eyes of a rectified pair
+    have one camera model and differ in place along the x axis that they share."""
+    for k, one in enumerate(sensors):
+        where = f"sensors.{k}.pair"
+        if one.pair is None:
+            if one.sees and getattr(one.labels, "disparity", False):
+                raise ConfigError(
+                    "this sensor has no other eye",
+                    where=f"sensors.{k}.labels.disparity",
+                    accepted=f"false, or a `pair` for '{one.name}'",
+                )
+            continue
+        others = {other.name: other for other in sensors if other is not one and other.sees}
+        if one.pair not in others or not one.sees:
+            raise ConfigError("no such camera on the rig", where=where, value=one.pair, accepted=", ".join(others))
+        if baseline_of(one, others[one.pair]) is None:
+            raise ConfigError(
+                "the two are not a rectified pair",
+                where=where,
+                value=one.pair,
+                accepted="equal `camera` keys without distortion, equal rotations, and places that differ along the "
+                "cameras' x axis alone",
+            )
+
+
+def baseline_of(one: RigSensorConfig, other: RigSensorConfig) -> float | None:
+    """m along the x axis of ``one`` to ``other``; None: the two are not a rectified pair."""
+    a, b = one.camera.model, other.camera.model
+    if a != replace(b, near=a.near) or not isinstance(a, PinHole):
+        return None
+    away = np.linalg.inv(one.place.T) @ other.place.T
+    apart = float(away[0, 3])
+    straight = np.abs(away[:3, :3] - np.eye(3)).max() < 1e-9 and np.abs(away[1:3, 3]).max() <= 1e-9 * abs(apart)
+    return apart if straight and apart else None

@@ -1,0 +1,50 @@
+"""How far apart the two eyes of a rectified pair see a point."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from blinkgl.labels import grading
+from blinkgl.labels.label import Drawn, Label
+
+if TYPE_CHECKING:
+    from blinkgl.render.reference import ReferenceFrame
+    from blinkgl.scene.types import Scene
+
+_SHARE = 0.95
+"""Of the pixels, that two renderers agree on: silhouettes may fall on either side."""
+
+
+class Disparity(Label):
+    """(H, W) float32 px, f b / Z >= 0: x in the left eye less x in the right, whichever eye's picture it is of; 0 where
+    nothing is hit, and everywhere where a sensor has no other eye. Hidden points have theirs, too."""
+
+    name = "disparity"
+    about = (
+        "float32 .npy, px: x in the left eye less x in the right of a stereo pair, 0 where nothing is hit "
+        "(docs/rigs.md)"
+    )
+    unit, kind = "px", "scalar"
+    needs = ("depth",)
+    judged_in, tolerance, error = "relative", 1e-5, staticmethod(grading.relative)
+
+    def finish(self, drawn: Drawn) -> np.ndarray:
+        return _of(drawn.scene, drawn.raw("depth")).astype(np.float32)
+
+    def problem(self, value: np.ndarray) -> str | None:
+        return None if (value >= 0).all() and np.isfinite(value).all() else "a disparity that is negative or no number"
+
+    def agrees(self, one: np.ndarray, other: np.ndarray) -> bool:
+        return one.shape == other.shape and bool(np.isclose(one, other, rtol=1e-4).mean() >= _SHARE)
+
+    def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
+        return _of(scene, np.where(np.isfinite(frame.depth), frame.depth, 0.0))
+
+
+def _of(scene: Scene, depth: np.ndarray) -> np.ndarray:
+    """(H, W) float64; depth is 0 where nothing is hit."""
+    baseline = scene.sensors[0].baseline or 0.0
+    there = depth > 0
+    return np.where(there, scene.camera.fx * abs(baseline) / np.where(there, depth, 1.0), 0.0)

@@ -1,0 +1,195 @@
+"""Where one surface ends in front of another: the edges of meshes that a picture shows as steps, as lines in it.
+
+    lines = Lines(scene)
+    quads = lines.of(moment, items, width, height)      # what passes/edges.py draws
+
+An edge of a mesh is seen when the surface turns away from the camera there (a silhouette), when it ends there (a
+border), or when two of its faces meet at an angle (a crease). Which ones that are is decided in float64, in the mesh's
+own axes: the camera comes to the mesh, as in raycast.py.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numba as nb
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from blinkgl.render.moment import Moment
+    from blinkgl.render.resources import DrawItem
+    from blinkgl.scene.types import Mesh
+
+FLOATS = 9
+"""Of a vertex of :meth:`Lines.of`: its place, px; both ends of its line, px and depth; 1 where it is a crease."""
+CREASE = np.cos(np.radians(20.0))
+"""Of the angle between two faces that meet, above which light and texture are expected to jump."""
+REACH = 0.7072
+"""Half a pixel's diagonal: how far beside a line, and behind its ends, the pixels that it crosses have their
+centres, px."""
+
+
+class Contour:
+    """The edges of one mesh. Vertices at the same place are one.
+
+    corners : (V,) int64 where in ``mesh.vertices`` each place is.   faces : (F, 3) int32 places.
+    edges : (E, 4) int32: two places in the order of the first face, the first face, the second or -1.
+    sharp : (E,) bool, whether its faces meet at an angle.   planes : (F, 4) float64 of a mesh that does not deform:
+    normal, any length, and its product with a point of the face."""
+
+    def __init__(self, mesh: Mesh):
+        _, self.corners, place = np.unique(
+            np.ascontiguousarray(mesh.vertices, np.float64) + 0.0, axis=0, return_index=True, return_inverse=True
+        )
+        self.faces = np.ascontiguousarray(place.reshape(-1)[mesh.faces], np.int32).reshape(-1, 3)
+        self.rest = np.ascontiguousarray(mesh.vertices[self.corners], np.float64)
+        self.planes = _planes(self.rest, self.faces)
+        self.edges = _edges(self.faces, len(self.corners))
+        unit = self.planes[:, :3] / np.maximum(np.linalg.norm(self.planes[:, :3], axis=1, keepdims=True), 1e-300)
+        first, second = self.edges[:, 2], self.edges[:, 3]
+        self.sharp = (second >= 0) & ((unit[first] * unit[second]).sum(axis=1) < CREASE)
+
+
+def _edges(faces: np.ndarray, places: int) -> np.ndarray:
+    """(E, 4) int32, see :class:`Contour`. Where more than two faces meet, those behind the second are borders."""
+    count = len(faces)
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    face = np.tile(np.arange(count), 3)
+    there = ends[:, 0] != ends[:, 1]
+    ends, face = ends[there], face[there]
+    key = ends.min(axis=1) * places + ends.max(axis=1)
+    order = np.argsort(key, kind="stable")
+    key, ends, face = key[order], ends[order], face[order]
+    first = np.flatnonzero(np.r_[True, key[1:] != key[:-1]]) if len(key) else np.zeros(0, np.int64)
+    rank = np.arange(len(key)) - np.repeat(first, np.diff(np.r_[first, len(key)]))
+    lead = np.flatnonzero(rank != 1)
+    second = np.full(len(lead), -1)
+    paired = (rank[lead] == 0) & (lead + 1 < len(key))
+    paired[paired] = key[lead[paired] + 1] == key[lead[paired]]
+    second[paired] = face[lead[paired] + 1]
+    return np.ascontiguousarray(np.column_stack([ends[lead], face[lead], second]), np.int32)
+
+
+class Lines:
+    """The contours of a scene's meshes; each is made when it is first drawn, and kept."""
+
+    def __init__(self) -> None:
+        self._contours: dict[int, Contour] = {}
+        self._quads = np.empty((1024 * 4, FLOATS), np.float32)
+
+    def of(self, moment: Moment, items: Iterable[DrawItem], width: int, height: int) -> np.ndarray:
+        """(lines, 4, FLOATS) float32: the corners of a rectangle around each line of these items that is in a picture
+        of ``width`` x ``height`` px, those that something hides included; valid until the next call."""
+        count = 0
+        for item in items:
+            contour = self._contours.get(id(item.mesh))
+            if contour is None:
+                contour = self._contours[id(item.mesh)] = Contour(item.mesh)
+            if item.mesh.deformer is None:
+                places, planes = contour.rest, contour.planes
+            else:
+                places = np.ascontiguousarray(
+                    item.mesh.deformer.positions(item.mesh, moment.t_ns)[contour.corners], np.float64
+                )
+                planes = _planes(places, contour.faces)
+            T = moment.T_cam_obj[item.object_index]
+            eye = -T[:3, 3] @ T[:3, :3]
+            if 4 * (count + len(contour.edges)) > len(self._quads):
+                more = np.empty((2 * 4 * (count + len(contour.edges)), FLOATS), np.float32)
+                more[: 4 * count] = self._quads[: 4 * count]
+                self._quads = more
+            count = _emit(
+                eye, moment.mvp[item.object_index], places, planes, contour.edges, contour.sharp, not item.two_sided,
+                float(width), float(height), self._quads, count,
+            )  # fmt: skip
+        return self._quads[: 4 * count].reshape(count, 4, FLOATS)
+
+
+@nb.njit(cache=True, nogil=True)
+def _planes(places: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(F, 4) float64, see :class:`Contour`."""
+    out = np.empty((len(faces), 4))
+    for f in range(len(faces)):
+        a, b, c = places[faces[f, 0]], places[faces[f, 1]], places[faces[f, 2]]
+        ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+        vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+        x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        out[f, 0], out[f, 1], out[f, 2] = x, y, z
+        out[f, 3] = x * a[0] + y * a[1] + z * a[2]
+    return out
+
+
+@nb.njit(cache=True, nogil=True)
+def _emit(eye, mvp, places, planes, edges, sharp, culled, width, height, out, count):
+    """Writes the rectangles of one item's lines behind the first ``count``; their number then."""
+    front = np.empty(len(planes), np.bool_)
+    for f in range(len(planes)):
+        front[f] = planes[f, 0] * eye[0] + planes[f, 1] * eye[1] + planes[f, 2] * eye[2] > planes[f, 3]
+    ends = np.empty((2, 4))
+    for e in range(len(edges)):
+        v0, v1, towards, crease = edges[e, 0], edges[e, 1], front[edges[e, 2]], False
+        if edges[e, 3] >= 0:
+            other = front[edges[e, 3]]
+            if towards == other:
+                if not sharp[e] or (culled and not towards):
+                    continue
+                crease = True
+            elif culled and not towards:  # as the face that is seen has it: the other way round
+                v0, v1, towards = v1, v0, True
+        elif culled and not towards:
+            continue
+        if towards:  # the surface lies to the left of its line, x to the right and y down
+            v0, v1 = v1, v0
+        for k in range(2):
+            p = places[v0] if k == 0 else places[v1]
+            for r in range(4):
+                ends[k, r] = mvp[r, 0] * p[0] + mvp[r, 1] * p[1] + mvp[r, 2] * p[2] + mvp[r, 3]
+        # In front of the near plane: z <= w.
+        r0, r1 = ends[0, 3] - ends[0, 2], ends[1, 3] - ends[1, 2]
+        if r0 <= 0 and r1 <= 0:
+            continue
+        if r0 <= 0 or r1 <= 0:
+            t = r0 / (r0 - r1)
+            k = 0 if r0 <= 0 else 1
+            for r in range(4):
+                ends[k, r] = ends[0, r] + t * (ends[1, r] - ends[0, r])
+        if not (ends[0, 3] > 0 and ends[1, 3] > 0):
+            continue
+        ax = (ends[0, 0] / ends[0, 3] + 1) * 0.5 * width
+        ay = (ends[0, 1] / ends[0, 3] + 1) * 0.5 * height
+        bx = (ends[1, 0] / ends[1, 3] + 1) * 0.5 * width
+        by = (ends[1, 1] / ends[1, 3] + 1) * 0.5 * height
+        ad, bd = ends[0, 2] / ends[0, 3], ends[1, 2] / ends[1, 3]
+        # Inside of the picture and a pixel more: float32 places lines well there.
+        low, high, dx, dy = 0.0, 1.0, bx - ax, by - ay
+        for k in range(4):
+            d = -dx if k == 0 else dx if k == 1 else -dy if k == 2 else dy
+            room = ax + 1 if k == 0 else width + 1 - ax if k == 1 else ay + 1 if k == 2 else height + 1 - ay
+            if d > 0:
+                high = min(high, room / d)
+            elif d < 0:
+                low = max(low, room / d)
+            elif room < 0:
+                high = -1.0
+        if not low < high:
+            continue
+        length = np.sqrt(dx * dx + dy * dy) * (high - low)
+        if not length > 1e-9:
+            continue
+        cx, cy, cd = ax, ay, ad
+        ax, ay, ad = cx + low * dx, cy + low * dy, cd + low * (bd - cd)
+        bx, by, bd = cx + high * dx, cy + high * dy, cd + high * (bd - cd)
+        ux, uy = (bx - ax) / length * REACH, (by - ay) / length * REACH
+        for k in range(4):
+            along = -1.0 if k < 2 else 1.0
+            across = -1.0 if k % 2 == 0 else 1.0
+            row = 4 * count + k
+            out[row, 0] = (ax if k < 2 else bx) + along * ux - across * uy
+            out[row, 1] = (ay if k < 2 else by) + along * uy + across * ux
+            out[row, 2], out[row, 3], out[row, 4] = ax, ay, ad
+            out[row, 5], out[row, 6], out[row, 7] = bx, by, bd
+            out[row, 8] = 1.0 if crease else 0.0
+        count += 1
+    return count

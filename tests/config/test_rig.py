@@ -1,0 +1,185 @@
+"""`rig:` and `sensors:`: what a sensor has of the top, of its preset and of itself, and what is refused in one line."""
+
+from __future__ import annotations
+
+from importlib import resources
+
+import numpy as np
+import pytest
+
+from blinkgl.config.base import validate
+from blinkgl.config.reader import parse_yaml
+from blinkgl.config.recipes import load_recipe, recipe_names
+from blinkgl.config.rig import PlaceConfig, rig_names
+from blinkgl.config.sequence import RunTemplate, SequenceConfig, load_run
+from blinkgl.dataset.report import config_yaml
+from blinkgl.errors import ConfigError
+
+
+def read(text: str) -> SequenceConfig:
+    return RunTemplate(parse_yaml(text, "test"), None).sequence(0)  # type: ignore[bad-argument-type]
+
+
+def refusal(text: str) -> str:
+    with pytest.raises(ConfigError) as caught:
+        read(text)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("name", rig_names())
+def test_every_preset_is_a_rig(name):
+    config = read(f"rig: {name}")
+    assert config.sensors and any(one.events for one in config.sensors)
+    assert validate(SequenceConfig, {"rig": name}).rig == name, "the schema knows the names of the files"
+
+
+def test_presets_say_what_their_data_sets_have():
+    left, right, *frames = read("rig: dsec").sensors
+    assert [(s.camera.width, s.camera.height) for s in (left, right)] == [(640, 480)] * 2
+    assert right.place.T[0, 3] - left.place.T[0, 3] == pytest.approx(0.6)
+    assert [(f.camera.width, f.camera.height, f.events, bool(f.images)) for f in frames] == [
+        (1440, 1080, None, True)
+    ] * 2
+    left, right = read("rig: mvsec").sensors
+    assert left.camera.model.fx == pytest.approx(199.653012) and left.imu.rate == 1000
+    assert 199.6530123165822 * right.place.T[0, 3] == pytest.approx(19.941771812941038), "its projection matrix"
+    (davis,) = read("rig: davis").sensors
+    assert (davis.camera.width, davis.camera.height) == (346, 260)
+    assert davis.events is not None and davis.images is not None and davis.imu is not None
+
+
+def test_a_sensor_has_what_the_top_says_and_what_it_says_itself():
+    config = read(
+        "{camera: {width: 40, fov: 50}, events: {emulator: v2e, cutoff_hz: 30}, labels: {depth: true}, sensors: ["
+        "{name: a}, {name: b, camera: {width: 20}, events: {cutoff_hz: 90}}, {name: c, events: {emulator: esim}},"
+        "{name: f, images: {}}, {name: i, imu: {rate: 50}}]}"
+    )
+    a, b, c, f, i = config.sensors
+    assert [s.camera.width for s in (a, b, c, f)] == [40, 20, 40, 40] and b.camera.fov == 50
+    assert (a.events.cutoff_hz, b.events.cutoff_hz, c.events.emulator) == (30, 90, "esim")
+    assert a.labels.depth and a.labels.flow and f.events is None and i.events is None
+    assert not f.labels.depth and not f.labels.flow and not f.labels.images, "a frame camera has the labels it asks for"
+    assert [s.sees for s in config.sensors] == [True, True, True, True, False]
+    own = config.of_sensor(1)
+    assert own.camera == b.camera and own.events == b.events and own.sensors is None and not own.preview.enabled
+
+
+def test_data_sheets_fill_in_each_sensor_by_itself():
+    one, other = read("{sensor: davis346, sensors: [{name: a}, {name: b, sensor: davis240c}]}").sensors
+    assert (one.camera.width, other.camera.width) == (346, 240) and one.readout != other.readout
+
+
+def test_what_is_drawn_at_the_top_is_drawn_once_and_beside_it_each():
+    text = (
+        "{seed: 3, events: {contrast_threshold: {uniform: [0.1, 0.5]}}, sensors: [{name: a}, {name: b},"
+        " {name: c, events: {contrast_threshold: {uniform: [0.1, 0.5]}}}]}"
+    )
+    a, b, c = (s.events.contrast_threshold for s in read(text).sensors)
+    assert a == b != c
+
+
+def test_presets_are_laid_under_what_is_said_by_name():
+    left, right, imu = read(
+        "{rig: stereo, sensors: [{name: imu, imu: {}}, {name: right, place: {position: [0.25, 0, 0]}}]}"
+    ).sensors
+    assert (left.name, right.name, imu.name) == ("left", "right", "imu") and right.place.T[0, 3] == 0.25
+    assert left.pair == "right" and right.pair == "left"
+
+
+@pytest.mark.parametrize("name", ["stereo", "davis", "dsec"])
+def test_a_sequences_own_configuration_says_it_again(name):
+    config = read(f"{{rig: {name}, labels: {{depth: true}}}}")
+    assert read(config_yaml(config, 0)) == config
+
+
+def test_a_single_camera_says_nothing_of_rigs():
+    assert "sensors" not in (text := config_yaml(read("{}"), 0)) and "rig" not in parse_yaml(text, "test")
+
+
+def test_files_of_sensors_are_found_beside_the_run(tmp_path):
+    (tmp_path / "mine.yaml").write_text(
+        resources.files("blinkgl.configs").joinpath("sensors/davis240c.yaml").read_text()
+    )
+    run, recipe = tmp_path / "run.yaml", recipe_names()[0]
+    run.write_text(f"sensors: [{{name: a, sensor: mine.yaml}}, {{name: b, events: {{recipe: {recipe}}}}}]")
+    a, b = load_run(run).sequence(0).sensors
+    assert a.camera.width == 240 and b.events.emulator == load_recipe(recipe).events["emulator"]
+    run.write_text("sensors: [{name: b, events: {recipe: none}}]")
+    with pytest.raises(ConfigError, match="recipe"):
+        load_run(run)
+
+
+def test_places():
+    turned = PlaceConfig(position=(1, 2, 3), euler=(0, 0, 90)).T
+    assert np.allclose(turned[:3, :3] @ [1, 0, 0], [0, 1, 0]) and turned[:3, 3].tolist() == [1, 2, 3]
+    assert np.allclose(PlaceConfig(quaternion=(2, 0, 0, 2)).T[:3, :3], turned[:3, :3])
+    rows = [[0.0, -1.000004, 0, 1], [1, 0.0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+    T = PlaceConfig(matrix=rows).T
+    assert np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() < 1e-15 and np.allclose(T, turned, atol=1e-5)
+    exact = PlaceConfig(matrix=turned.round(15).tolist()).T
+    assert np.abs(exact - turned).max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("rig: kitti", "rig: unknown rig (got 'kitti'); expected one of davis, dsec, mvsec, stereo"),
+        ("sensors: []", "sensors: a rig without a sensor"),
+        ("sensors: {a: {}}", "sensors: not a list"),
+        ("sensors: [left]", "sensors.0: not a table of keys (got 'left')"),
+        ("sensors: [{}]", "sensors.0.name: is required"),
+        ("sensors: [{name: left}, {name: Left}]", "sensors.1.name: two sensors have one name (got 'Left')"),
+        ("sensors: [{name: a/b}]", "sensors.0.name: not a name for folders (got 'a/b')"),
+        ("sensors: [{name: ..}]", "sensors.0.name: not a name for folders"),
+        ("sensors: [{name: rig.yaml}]", "sensors.0.name: not a name for folders"),
+        ("sensors: [{name: a, timeline: {kind: uniform}}]", "sensors.0.timeline: the sensors of a rig share one clock"),
+        ("sensors: [{name: a, time: {start: 3}}]", "sensors.0.time: the sensors of a rig share one clock"),
+        (
+            "{timeline: {reconstruction: pchip}, sensors: [{name: a}, {name: b, events: {emulator: v2e}}]}",
+            "timeline.reconstruction: v2e follows straight lines alone (of sensor 'b')",
+        ),
+        ("sensors: [{name: a, images: {rate: 10, times: [7]}}]", "sensors.0.images.times: "),
+        ("sensors: [{name: a, camera: {width: 0}}]", "sensors.0.camera.width: too small"),
+        ("sensors: [{name: a, gain: 1}]", "sensors.0.gain: unknown key"),
+        ("{sensors: [{name: a}], imu: {}}", "imu: a rig's sensors have it, not the rig"),
+        ("{sensors: [{name: a}], images: {}}", "images: a rig's sensors have it, not the rig"),
+        ("{sensors: [{name: a}], frames: {folders: x}}", "sensors: recorded frames were seen by one camera"),
+        (
+            "{sensors: [{name: a}], scene: {kind: file, path: x.glb, intrinsics: file}}",
+            "scene.intrinsics: the cameras of a rig are not the file's",
+        ),
+        ("labels: {disparity: true}", "labels.disparity: a single camera has no other eye"),
+        (
+            "{labels: {disparity: true}, rig: stereo, sensors: [{name: c}]}",
+            "sensors.2.labels.disparity: this sensor has no other eye",
+        ),
+        ("sensors: [{name: a, pair: b}]", "sensors.0.pair: no such camera on the rig (got 'b')"),
+        ("sensors: [{name: a, pair: b}, {name: b, imu: {}}]", "sensors.0.pair: no such camera on the rig (got 'b')"),
+        ("sensors: [{name: a, pair: b}, {name: b}]", "sensors.0.pair: the two are not a rectified pair"),
+    ],
+)
+def test_one_clear_line(text, said):
+    assert said in refusal(text)
+
+
+@pytest.mark.parametrize(
+    ("place", "said"),
+    [
+        ("{position: [.nan, 0, 0]}", "position.0: not a finite number"),
+        ("{matrix: [[1,0,0,0],[0,1,0,0],[0,0,.inf,0],[0,0,0,1]]}", "matrix.2.2: not a finite number"),
+        ("{matrix: [[1,0,0,0],[0,1,0,0],[0,0,2,0],[0,0,0,1]]}", "matrix: the matrix is no rotation"),
+        ("{matrix: [[1,0,0,0],[0,1,0,0],[0,0,-1,0],[0,0,0,1]]}", "matrix: the matrix mirrors"),
+        ("{matrix: [[1,0,0,0],[0,1,0,0],[0,0,1,0],[1,0,0,1]]}", "matrix: the last row of a pose is not 0, 0, 0, 1"),
+        ("{matrix: [[1,0,0,0],[0,1,0,0],[0,0,1,0]]}", "matrix: too few entries"),
+        ("{quaternion: [0, 0, 0, 0]}", "quaternion: a quaternion must not be zero"),
+        ("{euler: [0, 0, 1], quaternion: [1, 0, 0, 0]}", "only one of euler, quaternion, matrix"),
+        (
+            "{position: [1, 0, 0], matrix: [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}",
+            "position: the matrix has a position already",
+        ),
+    ],
+)
+def test_places_that_are_none(place, said):
+    line = refusal(f"sensors: [{{name: a, place: {place}}}]")
+    assert "sensors.0.place" in line and said in line

@@ -1,0 +1,266 @@
+"""Rigs in data sets: a rig of one is the single camera, two eyes agree with depth, poses and float64, and a run of rigs
+is verified, resumed and read like any other."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from blinkgl.config.sequence import load_run
+from blinkgl.dataset.executor import Inline, Local
+from blinkgl.dataset.run import run_dataset
+from blinkgl.dataset.verify import differences, verify_dataset
+from blinkgl.errors import ConfigError, OutputError
+from blinkgl.gl import create_context
+from blinkgl.io.imu import read_imu
+from blinkgl.io.index import made_folders, read_index, sequence_folders
+from blinkgl.io.rig_dir import read_rig
+from blinkgl.io.sequence_dir import read_manifest
+from blinkgl.render.reference import render as by_reference
+from blinkgl.scene.build import sequence_scene
+from blinkgl.sequence import simulate_sequence
+from blinkgl.sequence.rig import simulate_rig
+
+WAY = [
+    {"time": t, "position": [-2.5, y, 0.3], "look_at": [0, 0.3 * y, 0]} for t, y in ((-0.2, -0.4), (0, 0), (0.4, 0.8))
+]
+ONE = {
+    "seed": 4,
+    "camera": {"width": 64, "height": 48, "fov": 70},
+    "time": {"duration": 0.1, "label_rate": 20},
+    "timeline": {"kind": "displacement", "max_px": 1.5},
+    "events": {"threshold_jitter": 0.02},
+    "scene": {
+        "kind": "explicit",
+        "meshes": {
+            "box": {"primitive": "cuboid"},
+            "far": {"primitive": "grid", "parameters": {"width": 12, "depth": 12}},
+        },
+        "materials": {"m": {"procedural": "fbm", "max_size": 64}},
+        "objects": [
+            {
+                "mesh": "box",
+                "material": "m",
+                "keyframes": [
+                    {"time": -0.2, "position": [0, -0.3, 0]},
+                    {"time": 0.1, "position": [0, 0, 0.1], "euler": [0, 10, 20]},
+                    {"time": 0.4, "position": [0, 0.4, 0], "euler": [0, 20, 40]},
+                ],
+            },
+            {"mesh": "far", "material": "m", "position": [4, 0, 0], "euler": [0, -90, 0]},
+        ],
+        "camera": {"keyframes": WAY},
+    },
+    "labels": {"depth": True, "ids": True, "float_flow": ["npy"]},
+    "preview": {"enabled": False},
+}
+BOTH = {"images": {"rate": 20}, "imu": {"preset": "adis16448"}, "tracks": {"points": 9}}
+PAIR = {
+    **ONE,
+    "labels": {**ONE["labels"], "disparity": True},
+    "rig": "stereo",
+    "sensors": [
+        {"name": "rgb", "camera": {"width": 32, "height": 24}, "images": {"rate": 10}, "place": {"euler": [0, 15, 0]}},
+        {"name": "unit", "imu": {"rate": 100}, "place": {"position": [0, 0.05, 0]}},
+    ],
+    "preview": {"enabled": True},
+}
+
+
+def recipe_file(folder, **tree):
+    path = folder / "recipe.yaml"
+    path.write_text(yaml.safe_dump(tree))
+    return path
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory):
+    """Folder with ``out``, two sequences of a stereo rig with a frame camera and an inertial unit."""
+    folder = tmp_path_factory.mktemp("pair")
+    run_dataset(load_run(recipe_file(folder, **PAIR, output={"sequences": 2})), folder / "out", Inline())
+    return folder
+
+
+def config_of(folder):
+    return load_run(folder / "recipe.yaml").sequence(0)
+
+
+def test_a_rig_of_one_is_the_single_camera(tmp_path):
+    single, rig = tmp_path / "single", tmp_path / "rig"
+    for folder in (single, rig):
+        folder.mkdir()
+    own = {"labels": {**ONE["labels"], "images": True}}
+    run_dataset(load_run(recipe_file(single, **{**ONE, **BOTH, **own})), single / "out")
+    alone = {**ONE, **own, "sensors": [{"name": "cam", "events": {}, **BOTH, "labels": {"images": True}}]}
+    run_dataset(load_run(recipe_file(rig, **alone)), rig / "out")
+    a, b = single / "out/train/sequence_000000", rig / "out/train/sequence_000000/cam"
+    assert sorted(differences(a, b)) == ["config.yaml: differs", "manifest.json: differs"]
+    one, other = read_manifest(a), read_manifest(b)
+    assert other.pop("sensor") == "cam"
+    del one["files"], other["files"]
+    assert one == other
+    assert verify_dataset(rig / "out").clean
+
+
+def test_what_lies_on_disk(pair):
+    out = pair / "out"
+    assert [f.name for f in made_folders(out)] == ["sequence_000000", "sequence_000001"]
+    names = [f.relative_to(out).as_posix() for f in sequence_folders(out)]
+    assert names == [f"train/sequence_00000{k}/{eye}" for k in (0, 1) for eye in ("left", "rgb", "right")]
+    assert [(line["path"], line["sensor"]) for line in read_index(out)] == [(n, n.split("/")[-1]) for n in names]
+    folder = out / "train/sequence_000000"
+    rig, manifest = read_rig(folder), read_manifest(folder)
+    assert list(rig) == manifest["sensors"] == ["left", "right", "rgb", "unit"]
+    assert manifest["cameras"] == ["left", "right", "rgb"] and manifest["format"] == "blinkgl-rig"
+    assert manifest["events"] == sum(read_manifest(folder / eye)["events"] for eye in ("left", "right")) > 1000
+    assert rig["right"]["baseline"] == -0.1 and rig["right"]["T_rig_sensor"][0, 3] == 0.1
+    assert rig["rgb"]["records"] == ["images"] and not (folder / "rgb/events.h5").exists()
+    assert not (folder / "rgb/flow").exists() and (folder / "rgb/frame_camera/images/000000.png").is_file()
+    assert len(read_imu(folder / "unit")["t_ns"]) == 16 and (folder / "preview.mp4").stat().st_size > 1000
+    assert read_manifest(folder / "left")["frames"] == read_manifest(folder / "right")["frames"] > 5
+
+
+def test_places_and_poses_agree(pair):
+    folder = pair / "out/train/sequence_000001"
+    poses = {eye: np.load(folder / eye / "poses.npz")["T_world_cam"] for eye in ("left", "right", "rgb")}
+    for eye, one in read_rig(folder).items():
+        if eye in poses:
+            assert np.abs(poses["left"] @ one["T_rig_sensor"] - poses[eye]).max() < 1e-12
+
+
+def test_disparity_is_f_b_over_z(pair):
+    config, folder = config_of(pair), pair / "out/train/sequence_000000"
+    scene, worst = sequence_scene(config, 0, pair), []
+    for number, eye in enumerate(("left", "right")):
+        drawn = np.load(folder / eye / "disparity/000000.npy")
+        seen = scene.seen_by(number)
+        true = by_reference(seen, config.time.label_times_ns[0])
+        f, b = seen.camera.fx, 0.1
+        same = (true.depth > 0) & np.isfinite(true.depth) & _inside(true.instance)
+        worst.append(np.abs(drawn - f * b / np.where(same, true.depth, np.inf))[same].max())
+        assert same.mean() > 0.5 and drawn[same].min() > 0.3
+    assert max(worst) < 1e-4, "px"
+
+
+def test_what_one_eye_sees_the_other_sees_a_disparity_away(pair):
+    """Points of the left eye that the right one sees, too: there both say one disparity."""
+    config = config_of(pair)
+    scene, t_ns = sequence_scene(config, 0, pair), config.time.label_times_ns[0]
+    left, right = (by_reference(scene.seen_by(k), t_ns) for k in (0, 1))
+    folder = pair / "out/train/sequence_000000"
+    mine, theirs = (np.load(folder / eye / "disparity/000000.npy") for eye in ("left", "right"))
+    y, x = np.nonzero(_inside(left.instance))
+    there = x - mine[y, x]
+    whole = np.rint(there).astype(int)
+    ok = (whole >= 0) & (whole < 64)
+    y, x, there, whole = y[ok], x[ok], there[ok], whole[ok]
+    same = (right.instance[y, whole] == left.instance[y, x]) & _inside(right.instance)[y, whole]
+    assert same.sum() > 500
+    assert np.abs(theirs[y, whole] - mine[y, x])[same].max() < 0.3, "px, between neighbours' centres"
+
+
+def test_flow_of_both_eyes_is_that_of_depth_and_poses(pair):
+    folder = pair / "out/train/sequence_000000"
+    for eye in ("left", "right"):
+        poses = np.load(folder / eye / "poses.npz")
+        flow = np.load(folder / eye / "flow/forward_npy/000000.npy")
+        depth = np.load(folder / eye / "depth/000000.npy").astype(np.float64)
+        ids = cv2.imread(str(folder / eye / "ids/000000.png"), cv2.IMREAD_UNCHANGED)
+        y, x = np.mgrid[:48, :64]
+        K, (t, later) = poses["K"], (1, 2)
+        rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1) * depth[..., None]
+        for row, number in enumerate(poses["object_ids"]):
+            on = (ids == number) & (flow[..., 2] > 0)
+            assert on.sum() > 100
+            points = np.concatenate([rays[on], np.ones((on.sum(), 1))], 1)
+            move = (
+                np.linalg.inv(poses["T_world_cam"][later])
+                @ poses["T_world_obj"][row, later]
+                @ np.linalg.inv(poses["T_world_obj"][row, t])
+                @ poses["T_world_cam"][t]
+            )
+            moved = points @ move.T
+            seen = moved[:, :2] / moved[:, 2:3] * [K[0, 0], K[1, 1]] + K[:2, 2]
+            assert np.abs(seen - np.stack([x, y], -1)[on] - flow[on][:, :2]).max() < 2e-3, "px"
+
+
+def test_verify_looks_at_every_sensor(pair, tmp_path):
+    out = pair / "out"
+    found = verify_dataset(out, deep=1)
+    assert found.clean and found.sequences == 2 and len(found.deep) == 1, found.problems
+    for eye in ("left", "rgb"):
+        assert verify_dataset(out / "train/sequence_000000" / eye).clean
+    copy = tmp_path / "out"
+    shutil.copytree(out, copy)
+    (copy / "train/sequence_000000/right/depth/000000.npy").write_bytes(b"x")
+    events = copy / "train/sequence_000001/left"
+    manifest = json.loads((events / "manifest.json").read_text())
+    (events / "manifest.json").write_text(json.dumps({**manifest, "sensor": "middle"}))
+    problems = verify_dataset(copy).problems
+    assert "right/depth/000000.npy" in problems["train/sequence_000000"][0]
+    assert "left/manifest.json" in problems["train/sequence_000001"][0]
+
+
+def test_a_damaged_eye_is_made_again_with_its_rig(pair, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(pair / "out", out)
+    shutil.rmtree(out / "train/sequence_000001/right")
+    template = load_run(pair / "recipe.yaml")
+    with pytest.raises(OutputError, match="output folder exists"):
+        run_dataset(template, out)
+    outcome = run_dataset(template, out, Local(workers=1), resume=True)
+    assert outcome.found == 1 and len(outcome.made) == 1 and list(outcome.damaged) == ["train/sequence_000001"]
+    for k in (0, 1):
+        name = f"train/sequence_00000{k}"
+        assert differences(pair / "out" / name, out / name) == [], "another process makes the same bytes"
+
+
+def test_items_come_in_the_order_of_time(pair):
+    config = config_of(pair)
+    with create_context() as gl, simulate_rig(config, 0, gl, base=pair) as rig:
+        seen = [(item.t_ns, member.name) for member, item in rig]
+        frames = {member.name: member.frames for member in rig.members}
+    assert [t for t, _ in seen] == sorted(t for t, _ in seen) and {n for _, n in seen} == {"left", "right", "rgb"}
+    assert frames["left"] == frames["right"] > 5 and frames["rgb"] == 0
+
+
+def test_one_door_for_several_sensors(pair):
+    with pytest.raises(ConfigError, match="several sensors are simulated together"):
+        simulate_sequence(config_of(pair))
+
+
+def test_a_sensor_moves_no_other(pair, tmp_path):
+    """What one eye records is the same whether or not there are others, at the same times of frames."""
+    alone = {**PAIR, "timeline": {"kind": "uniform", "fps": 60}, "preview": {"enabled": False}}
+    both, one = (load_run(recipe_file(tmp_path, **{**alone, **more})).sequence(0) for more in ({}, _without_right()))
+    left = [_events(config, pair) for config in (both, one)]
+    assert len(left[0]) > 500 and all(np.array_equal(getattr(left[0], k), getattr(left[1], k)) for k in "xytp")
+
+
+def _without_right():
+    labels = {key: value for key, value in PAIR["labels"].items() if key != "disparity"}
+    return {"rig": None, "labels": labels, "sensors": [{"name": "left"}, *PAIR["sensors"]]}
+
+
+def _events(config, base):
+    from blinkgl.events.types import Events
+    from blinkgl.sequence import EventChunk
+
+    with create_context() as gl, simulate_rig(config, 0, gl, base=base) as rig:
+        return Events.concatenate([i.events for m, i in rig if m.name == "left" and isinstance(i, EventChunk)])
+
+
+def _inside(ids: np.ndarray) -> np.ndarray:
+    """Pixels whose neighbours show the same object."""
+    same = ids > 0
+    for axis in (0, 1):
+        for step in (1, -1):
+            same &= np.roll(ids, step, axis) == ids
+    same[[0, -1]] = False
+    same[:, [0, -1]] = False
+    return same

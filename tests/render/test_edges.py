@@ -1,0 +1,283 @@
+"""`antialiasing: edges`: silhouettes and creases by the areas of their surfaces, taps along the foreshortening."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from blinkgl.camera import PinHole, Radtan
+from blinkgl.config.deform import WaveConfig
+from blinkgl.config.sequence import RenderConfig
+from blinkgl.render.contours import FLOATS, Contour, Lines
+from blinkgl.render.passes import filtered
+from blinkgl.render.renderer import Renderer
+from blinkgl.scene.rig import Rig
+from blinkgl.scene.shapes.closed_forms import Wave
+from blinkgl.scene.types import Light, Material, Texture
+from render_scenes import (
+    LEVEL,
+    SECOND,
+    cube,
+    drift,
+    mesh,
+    mixed_scene,
+    quad,
+    rig,
+    scene,
+    sphere,
+    still,
+    thing,
+)
+from test_antialiasing import half_plane
+
+EDGES = RenderConfig(antialiasing="edges", image_antialiasing="edges")
+WHITE = Material(unlit=True, double_sided=True)
+
+
+def luminance(gl, world, antialiasing: str, t_ns: int = 0) -> np.ndarray:
+    with Renderer(gl, world, RenderConfig(antialiasing=antialiasing)) as renderer:
+        return renderer.luminance(t_ns).read()
+
+
+def finest(gl, world, factor: int = 16, t_ns: int = 0) -> np.ndarray:
+    """By factor x factor samples a pixel."""
+    camera = world.camera
+    fine = world.with_camera(camera.resized(camera.width * factor, camera.height * factor))
+    image = luminance(gl, fine, "none", t_ns)
+    return image.reshape(camera.height, factor, camera.width, factor).mean(axis=(1, 3))
+
+
+def rmse(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.sqrt(np.mean((a - b) ** 2)))
+
+
+def polygon(corners: np.ndarray, depth: float, name: str = "card", number: int = 1, paint: Material = WHITE):
+    """A fan of triangles, corners (N, 2) px of a 48 x 48 picture from its middle, in front of a camera of 48 px focal
+    length that stands in the origin."""
+    points = np.column_stack([np.asarray(corners, float) * depth / 48, np.full(len(corners), depth)])
+    faces = [[0, k, k + 1] for k in range(1, len(points) - 1)]
+    return thing(name, number, mesh(points, faces), still(), paint)
+
+
+EYE = Rig.alone(PinHole(48, 48, 48, 48, 23.5, 23.5), still())
+
+
+def looked_at(*things):
+    return scene(list(things), EYE)
+
+
+def test_a_straight_edge_is_as_bright_as_it_covers_the_pixel(gl):
+    """To a 256th of a pixel, to which corners are snapped where it is drawn; in colour, too."""
+    for angle in (0.0, 0.3, 1.0, 2.2, 4.0):
+        for offset in (0.0, 0.21, 0.5):
+            world, coverage = half_plane(angle, offset)
+            with Renderer(gl, world, EDGES) as renderer:
+                image, colour = renderer.luminance(0).read(), renderer.colour(0).read()
+            np.testing.assert_allclose(image, coverage, atol=2e-3)
+            np.testing.assert_allclose(colour, np.repeat(image[..., None], 3, axis=2), atol=1e-6)
+
+
+@pytest.mark.parametrize("corners", [3, 4, 7])
+def test_corners_and_ends_of_lines(gl, corners):
+    """A polygon of any number of corners: every pixel, those with corners in them included."""
+    angles = 0.37 + 2 * np.pi * np.arange(corners) / corners
+    world = looked_at(polygon(15.3 * np.column_stack([np.cos(angles), np.sin(angles)]) + (0.2, -0.4), 3.0))
+    true, image = finest(gl, world), luminance(gl, world, "edges")
+    assert np.abs(image - true).max() < 0.02
+    assert image.sum() == pytest.approx(true.sum(), rel=1e-3)
+
+
+def test_a_surface_narrower_than_a_pixel(gl):
+    """A wire of 0.6 px: its two edges are in the same pixels, and their changes add up."""
+    for turn in (0.1, 0.5, 1.2):
+        along, across = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
+        sides = [along * a * 20 + across * b * 0.3 for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+        world = looked_at(polygon(np.array(sides), 3.0))
+        true = finest(gl, world)
+        error = {name: rmse(luminance(gl, world, name), true) for name in ("none", "ssaa2", "edges")}
+        assert error["edges"] < 0.1 * error["ssaa2"] < 0.1 * error["none"]
+
+
+def test_what_is_hidden_does_not_show_through(gl):
+    card = polygon(np.array([(-9.3, -7.2), (8.1, -7.9), (9.7, 8.4), (-8.8, 6.9)]), 5.0)
+    wall = polygon(
+        np.array([(-30, -30), (30, -30), (30, 30), (-30, 30)]), 3.0, "wall", 2, replace(WHITE, base_color=(0.3,) * 3)
+    )
+    np.testing.assert_array_equal(
+        luminance(gl, looked_at(card, wall), "edges"), luminance(gl, looked_at(card, wall), "none")
+    )
+    half = polygon(
+        np.array([(0.3, -30), (30, -30), (30, 30), (0.3, 30)]), 3.0, "wall", 2, replace(WHITE, base_color=(0.3,) * 3)
+    )
+    world = looked_at(card, half)
+    error = np.abs(luminance(gl, world, "edges") - finest(gl, world))
+    assert error.max() < 0.15 and (error > 0.02).sum() <= 4  # where three surfaces meet in a pixel
+
+
+def test_creases(gl):
+    """The edges of a cube that does not end there: two sides in different light."""
+    turned = Rotation.from_euler("xyz", (20, 35, 10), degrees=True)
+    world = scene([thing("box", 1, cube(0.7), still((0, 4, 0), turned))], rig(80, 60, 75.0), Light(sun=1.0, sky=0.2))
+    true = finest(gl, world)
+    error = {name: np.abs(luminance(gl, world, name) - true) for name in ("none", "ssaa2", "edges")}
+    inside = np.s_[14:26, 36:54]  # along a crease, away from the silhouette's corners
+    assert error["edges"][inside].max() < 0.03 < error["ssaa2"][inside].max()
+    assert rmse(error["edges"], 0) < 0.7 * rmse(error["ssaa2"], 0)
+
+
+def test_a_scene_of_everything_is_nearer_to_the_finest_than_with_four_samples(gl):
+    """Textures, spheres, cubes, a ground, moving camera and bodies."""
+    world, t = mixed_scene(), SECOND // 3
+    true = finest(gl, world, 8, t)
+    error = {
+        name: rmse(np.log(luminance(gl, world, name, t) + 0.01), np.log(true + 0.01))
+        for name in ("none", "ssaa2", "edges")
+    }
+    assert error["edges"] < 0.6 * error["ssaa2"] < 0.6 * error["none"]
+
+
+def test_bodies_that_deform_have_their_lines_where_they_are_drawn(gl):
+    shape = quad(1.0, 1.0, 24)
+    waving = Wave.of(WaveConfig(amplitude=0.1, period=0.7), shape.vertices.min(axis=0), shape.vertices.max(axis=0))
+    body = replace(shape, deformer=waving)
+    world = scene(
+        [thing("flag", 1, body, still((0, 4, 0), LEVEL), WHITE)],
+        rig(80, 60, 75.0, drift((0, 0, 0), (0.3, 0, 0.1), LEVEL)),
+    )
+    for t in (0, SECOND // 3):
+        true = finest(gl, world, 8, t)
+        assert rmse(luminance(gl, world, "edges", t), true) < 0.3 * rmse(luminance(gl, world, "none", t), true)
+
+
+def test_four_taps_keep_what_grazing_angles_hide(gl):
+    """Stripes that run into the distance: a pixel is as wide as ever and very long."""
+    image = np.zeros((64, 64, 3), np.float32)
+    image[:, (np.arange(64) // 8) % 2 == 0] = 1.0
+    ground = thing(
+        "ground", 1, quad(40, 40, 8), still((0, 0, -1.0)), Material(Texture(image), uv_scale=(10.0, 10.0), unlit=True)
+    )
+    world = scene([ground], Rig.alone(PinHole(96, 64, 90.0, 90.0, 47.5, 8.0), still(rotation=LEVEL)))
+    true = finest(gl, world)[20:60]
+    error = {name: rmse(luminance(gl, world, name)[20:60], true) for name in ("taps4", "edges", "ssaa2")}
+    assert error["edges"] < 0.7 * error["taps4"]
+
+
+def test_taps_of_a_linear_texture_are_one(gl):
+    ramp = np.repeat(np.linspace(0, 1, 256, dtype=np.float32)[None, :, None], 256, axis=0).repeat(3, axis=2)
+    body = thing(
+        "card",
+        1,
+        quad(2, 2),
+        still((0, 4, 0), Rotation.from_euler("x", 90, degrees=True)),
+        Material(Texture(ramp), unlit=True, double_sided=True),
+    )
+    world = scene([body], Rig.alone(PinHole(64, 64, 150, 150, 31.5, 31.5), still((0, 0, 0), LEVEL)))
+    np.testing.assert_allclose(
+        luminance(gl, world, "edges")[8:-8, 8:-8], luminance(gl, world, "none")[8:-8, 8:-8], atol=2e-3
+    )
+
+
+def test_rates_are_shared_out_as_luminance_is(gl):
+    """d(luminance)/dt is that of the surfaces in a pixel, by their areas, of either sign; luminance is what it is
+    without."""
+    world = mixed_scene()
+    with Renderer(gl, world, EDGES) as edged, Renderer(gl, world, RenderConfig(antialiasing="taps4")) as plain:
+        both, alone = edged.luminance(SECOND // 5, rate=True), edged.luminance(SECOND // 5)
+        np.testing.assert_array_equal(both.read("luminance"), alone.read())
+        rate, unfiltered = both.read("rate"), plain.luminance(SECOND // 5, rate=True).read("rate")
+    assert np.isfinite(rate).all() and (rate < 0).any() and (rate > 0).any()
+    assert np.median(np.abs(rate - unfiltered)) < 0.05 * np.abs(unfiltered).mean()
+
+
+def test_light_is_never_negative(gl):
+    """Small bright things in front of each other, more lines than pixels."""
+    rng = np.random.default_rng(1)
+    cards = [
+        polygon(
+            rng.uniform(-20, 20, 2) + rng.normal(0, 1.2, (3, 2)),
+            3.0 + 0.01 * k,
+            f"card{k}",
+            k + 1,
+            replace(WHITE, base_color=(float(rng.choice([0.0, 1.0, 50.0])),) * 3),
+        )
+        for k in range(150)
+    ]
+    image = luminance(gl, looked_at(*cards), "edges")
+    assert np.isfinite(image).all() and image.min() >= 0
+
+
+def test_the_same_bits_by_any_renderer_and_after_any_other_frame(gl):
+    world = mixed_scene()
+    with Renderer(gl, world, EDGES) as one, Renderer(gl, world, EDGES) as other:
+        other.luminance(0).read()
+        other.colour(SECOND // 2).read()
+        for t in (SECOND // 7, SECOND // 2):
+            np.testing.assert_array_equal(one.luminance(t).read(), other.luminance(t).read())
+
+
+# ---- lines -------------------------------------------------------------------------------------------------------
+
+
+def lines_of(gl, world, t_ns: int = 0) -> np.ndarray:
+    """(lines, FLOATS), the last column: whether it is a crease."""
+    with Renderer(gl, world, EDGES) as renderer:
+        moment = renderer.moment(t_ns)
+        return Lines().of(moment, moment.visible, renderer.width, renderer.height)[:, 0].copy()
+
+
+@pytest.mark.parametrize("turn, silhouette, creases", [((0, 0, 0), 4, 0), ((0, 0, 30), 6, 1), ((25, 10, 30), 6, 3)])
+def test_lines_of_a_cube(gl, turn, silhouette, creases):
+    world = scene([thing("box", 1, cube(0.5), still((0, 4, 0), Rotation.from_euler("xyz", turn, degrees=True)))])
+    found = lines_of(gl, world)
+    assert found.shape[1] == FLOATS
+    assert ((found[:, 8] == 0).sum(), (found[:, 8] == 1).sum()) == (silhouette, creases)
+
+
+def test_faces_that_share_places_but_no_vertices_are_neighbours():
+    """A cube has 24 vertices, and 12 edges besides the diagonals of its sides."""
+    contour = Contour(cube())
+    assert len(contour.corners) == 8 and len(contour.edges) == 18 and contour.sharp.sum() == 12
+    assert (contour.edges[:, 3] >= 0).all()
+
+
+def test_three_faces_at_an_edge_and_faces_without_area():
+    """The third has a border there; a triangle whose corners are one place has no edges."""
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, 0]], float)
+    contour = Contour(mesh(points, [[0, 1, 2], [1, 0, 3], [0, 1, 4], [0, 5, 0]]))
+    at = contour.edges[(np.sort(contour.edges[:, :2], axis=1) == np.sort(contour.faces[0, :2])).all(axis=1)]
+    assert sorted(at[:, 3] >= 0) == [False, True]
+    assert (contour.edges[:, 0] != contour.edges[:, 1]).all()
+
+
+def test_lines_end_at_the_near_plane_and_beside_the_picture(gl):
+    """A card from behind the camera to far ahead: all that is left is in front and within a pixel of the picture."""
+    card = mesh([[-1, -5, -0.5], [1, -5, -0.5], [1, 50, -0.5], [-1, 50, -0.5]], [[0, 1, 2], [0, 2, 3]])
+    found = lines_of(gl, scene([thing("card", 1, card, still(), WHITE)]))
+    x, y, depth = found[:, [2, 5]], found[:, [3, 6]], found[:, [4, 7]]
+    assert len(found) == 3 and np.isfinite(found).all()
+    assert ((x >= -1.01) & (x <= 161.01) & (y >= -1.01) & (y <= 121.01) & (depth > 0) & (depth <= 1)).all()
+
+
+def test_nothing_to_draw(gl):
+    world = scene([thing("ball", 1, sphere(0.5), still((0, -4, 0)))])  # behind the camera
+    np.testing.assert_array_equal(luminance(gl, world, "edges"), luminance(gl, world, "none"))
+
+
+def test_the_pass_is_the_unfiltered_one_with_its_depth_kept():
+    from blinkgl.render.antialiasing import samples_of
+    from blinkgl.render.passes import Edged, Luminance
+
+    pass_ = filtered(Luminance(False, samples_of("edges")))
+    assert isinstance(pass_, Edged) and pass_.of.depth == "texture" and Luminance().depth is True
+
+
+def test_through_a_lens(gl):
+    """The lines are those of the flat picture, which the lens's is a mean of."""
+    world = mixed_scene(80, 60)
+    lens = Radtan(80, 60, 75.0, 75.0, 39.5, 29.5, k1=-0.2, k2=0.05)
+    seen = world.with_camera(lens)
+    true, plain, edged = (luminance(gl, seen, name, SECOND // 3) for name in ("ssaa4", "none", "edges"))
+    assert rmse(edged, true) < 0.8 * rmse(plain, true)

@@ -3,24 +3,7 @@
 // TINTED, EMISSIVE, GLOSSY, BUMPED, GLOSS_MAP, MASKED.
 // SHOW_LOOKUP, the shader debugger's: also writes what was looked up, see lookup.glsl.
 
-#if defined(LIT) && (defined(GLOSSY) || defined(BUMPED))
-#define SURFACED
-#endif
-#ifdef LIT
-#define NEEDS_NORMAL
-#endif
-#if defined(TEXTURED) || defined(EMISSION_MAP) || defined(GLOSS_MAP) || defined(BUMPED)
-#define NEEDS_UV
-#endif
-#ifdef TINTED
-#define NEEDS_TINT
-#endif
-#ifdef BUMPED
-#define NEEDS_TANGENT
-#endif
-#if defined(LAMPS) || defined(SHADOWS) || defined(GLOSSY)
-#define NEEDS_LOCAL
-#endif
+#include "needs.glsl"
 #include "vertex.glsl"
 
 #ifdef FRAGMENT_SHADER
@@ -66,18 +49,9 @@ void main()
     radiance *= tint;
 #endif
 #ifdef SURFACED
-#ifdef TWO_SIDED
-    float side = gl_FrontFacing ? 1.0 : -1.0;
-#else
-    const float side = 1.0;
-#endif
+    float side = SIDE;
 #elif defined(LIT)
-#ifdef TWO_SIDED
-    vec3 facing = gl_FrontFacing ? normal : -normal;
-#else
-    vec3 facing = normal;
-#endif
-    ILLUMINANT light = irradiance(facing);
+    ILLUMINANT light = irradiance(TURNED(normal));
 #else
     const float light = 1.0;
 #endif

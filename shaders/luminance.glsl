@@ -21,25 +21,7 @@
 #if defined(RATE) && (defined(TEXTURED) || defined(LIT) || defined(FOG) || defined(TINTED))
 #define CHANGES
 #endif
-#if defined(LIT) && (defined(GLOSSY) || defined(BUMPED))
-#define SURFACED
-#endif
-
-#if defined(TEXTURED) || defined(EMISSION_MAP) || defined(GLOSS_MAP) || defined(BUMPED)
-#define NEEDS_UV
-#endif
-#ifdef LIT
-#define NEEDS_NORMAL
-#endif
-#ifdef TINTED
-#define NEEDS_TINT
-#endif
-#ifdef BUMPED
-#define NEEDS_TANGENT
-#endif
-#if defined(CHANGES) || defined(LAMPS) || defined(SHADOWS) || defined(GLOSSY)
-#define NEEDS_LOCAL
-#endif
+#include "needs.glsl"
 #ifdef CHANGES
 #define NEEDS_RATE
 #ifdef LIT
@@ -189,11 +171,7 @@ void main()
     ALBEDO unlit = luminance;
 #ifdef LIT
 #ifdef SURFACED
-#ifdef TWO_SIDED
-    float side = gl_FrontFacing ? 1.0 : -1.0;
-#else
-    const float side = 1.0;
-#endif
+    float side = SIDE;
     Spot spot = Spot(unlit / WEIGHTS, normal, vec4(0.0), vec3(0.0), vec2(0.0));
 #ifdef BUMPED
     spot.along = tangent;
@@ -233,11 +211,7 @@ void main()
     change = radiated_rate(spot, spot_change, side, length(motion)) * WEIGHTS;
 #endif
 #else
-#ifdef TWO_SIDED
-    vec3 facing = gl_FrontFacing ? normal : -normal;
-#else
-    vec3 facing = normal;
-#endif
+    vec3 facing = TURNED(normal);
     ILLUMINANT light = irradiance(facing);
 #ifdef CHANGES
     // L = albedo E(n): the product rule. ``luminance`` is still the albedo here, and the normal seen changes as the
@@ -245,11 +219,7 @@ void main()
     vec3 facing_rate = seen_rate(facing, motion);
 #ifdef DEFORM
     // and as the surface itself turns
-#ifdef TWO_SIDED
-    facing_rate += gl_FrontFacing ? normal_rate : -normal_rate;
-#else
-    facing_rate += normal_rate;
-#endif
+    facing_rate += TURNED(normal_rate);
 #endif
 #ifdef LIGHTS
 #ifdef LAMPS

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -233,7 +234,7 @@ def test_adaptive_steps_are_bounded_in_the_lens_s_pixels(gl, lens):
         times = [*make_timeline(config, T, T + 60_000_000, renderer, None, ())]
         assert len(times) > 4
         moved = []
-        for a, b in zip(times, times[1:]):
+        for a, b in pairwise(times):
             flow = renderer.labels(a, LabelRequest("flow_forward"), b).forward
             moved.append(np.linalg.norm(flow.flow[flow.valid], axis=-1).max())
     assert 0.3 < max(moved[:-1]) <= 0.4 * 1.12  # velocities are of a place up to half a pixel away

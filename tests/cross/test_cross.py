@@ -24,8 +24,8 @@ from blinkgl.dataset.work import report_of
 from features import (
     ELSEWHERE,
     FEATURES,
-    REFUSED,
     OF_PAIRS,
+    REFUSED,
     RUN_LEVEL,
     all_pairs,
     configuration,

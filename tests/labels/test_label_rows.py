@@ -101,6 +101,11 @@ def test_where_labels_lie():
         "flow_forward": "flow.png",
         "flow_backward": "back.png",
         "occlusion_forward": "occlusion.png",
+        "depth": "depth.npy",
+        "disparity": "disparity.npy",
+        "ids": "ids.png",
+        "normals": "normals.npy",
+        "velocity": "velocity.npy",
     }
 
 

@@ -66,7 +66,8 @@ Copy one and change it:
 ```
 
 This page is made by `python -m blinkgl.tools.example_docs`, outputs included; do not edit.
-`examples/demo.ipynb` is a notebook that walks through the demo. All names come from `import blinkgl`; what they take is
+`examples/demo.ipynb` is a notebook that walks through the demo, `examples/flow.ipynb` one that lets a network say how
+things move. All names come from `import blinkgl`; what they take is
 in their docstrings (`help(blinkgl.Scene)`).
 """
 

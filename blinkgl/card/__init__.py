@@ -1,10 +1,11 @@
 """Events made on the card: the emulators' kernels as compute shaders, the same events bit for bit.
 
 In:    frames and the emulators' configurations (``blinkgl.events``), a context (``blinkgl.gl``).
-Out:   an ``Emulator`` whose state lies on the card.
+Out:   an ``Emulator`` whose state lies on the card; tensors of events that stay there.
 Start: esim.py; the kernels are shaders/compute/events_*.glsl.
 """
 
 from blinkgl.card.esim import CardEsim
+from blinkgl.card.sinks import Counts, Latest, Voxels
 
-__all__ = ["CardEsim"]
+__all__ = ["CardEsim", "Counts", "Latest", "Voxels"]

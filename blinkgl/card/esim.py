@@ -88,7 +88,8 @@ class CardEsim(Esim):
         }
         if self._on.size:
             self._room.put("thresholds", np.stack([self._on, self._off], axis=1))
-        self._before_is_log = False
+        self._before_is_log, self._stays = False, False
+        self._made = 0, 0  # events of the last step, and the microsecond before it
 
     @classmethod
     def unfit(cls, config: EsimConfig, reconstruction: str = "linear") -> EventDataError | None:
@@ -133,8 +134,24 @@ class CardEsim(Esim):
                 self.gl.release()
 
     # -- steps ----------------------------------------------------------------------------------------------
+    def advance(self, luminance: np.ndarray, t_ns: int) -> int:
+        """As ``step``, but the events stay on the card, for :mod:`blinkgl.card.sinks`; how many there are."""
+        self._stays = True
+        try:
+            self.step(luminance, t_ns)
+        finally:
+            self._stays = False
+        return self._made[0]
+
+    @property
+    def on_card(self) -> tuple[moderngl.Buffer, int, int]:
+        """Packed events of the last step as they were emitted, not sorted by time; how many; the microsecond that their
+        times count from."""
+        return self._room["packed"], *self._made
+
     def _start(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
         events = super()._start(frame, t_ns, rate)
+        self._made = 0, t_ns // 1000
         self.gl.resume()
         self._room.turn()
         self._room.put("now", self._intensity(frame))
@@ -155,11 +172,12 @@ class CardEsim(Esim):
         head = np.frombuffer(room["listed"].read(HEAD_BYTES), np.uint32)
         count, cut = int(head[7]), int(head[8])
         self.saturated += cut
-        if not count:
-            return Events.empty()
+        self._made = count, before_us
         if count > room.capacity:
             room.grow(count)
             self._emit(t_ns)
+        if not count or self._stays:
+            return Events.empty()
         return self._sorted(count, before_us, t_ns // 1000 - before_us)
 
     def _fire(self, t_ns: int) -> None:

@@ -42,7 +42,7 @@ class Dsec(Layout):
     size = (480, 640)
 
     def missing(self, source: Source) -> list[Missing]:
-        return needs_flow(source)
+        return needs_flow(source) + _needs_rectified(source)
 
     def write(self, source: Source, folder: Path) -> list[str]:
         said: list[str] = []
@@ -74,6 +74,7 @@ class ERaft(Layout):
         found = needs_flow(source)
         if found:
             return found
+        found = _needs_rectified(source)
         times = source.flow_times("forward")
         if any(b - a != _INTERVAL_US for a, b in times):
             rate = 1e6 / (times[0][1] - times[0][0])
@@ -95,6 +96,12 @@ class ERaft(Layout):
         )  # of label 0 its loader makes no sample
         write_flow(source, "forward", folder / "flow")
         return []
+
+
+def _needs_rectified(source: Source) -> list[Missing]:
+    """DSEC's truth lies in the rectified picture; its loaders rectify the events alone."""
+    there = source.camera is None or source.rectified
+    return [] if there else [Missing("labels in rectified pixels", "labels: {pixels: rectified}")]
 
 
 def image_times(source: Source) -> list[int]:
@@ -140,10 +147,11 @@ def _write_disparity(left: Source, right: Source, folder: Path) -> list[str]:
     if pair is None:
         return [f"{left.name}: no disparity: its cameras are not parallel, side by side and alike"]
     times = left.flow_times("forward")
-    if left.count("depth") < len(times):
-        return [f"{left.name}: no disparity without 'labels: {{depth: true}}'"]
+    labelled = left.count("disparity") >= len(times)
+    if not labelled and left.count("depth") < len(times):
+        return [f"{left.name}: no disparity without 'labels: {{disparity: true}}'"]
     for k in range(len(times)):
-        disparity = pair[0] * pair[1] / left.value("depth", k)
+        disparity = left.value("disparity", k) if labelled else pair[0] * pair[1] / left.value("depth", k)
         write_bytes(folder / f"event/{2 * k:06d}.png", encode_disparity(disparity))
     write_lines(folder / "timestamps.txt", [a for a, _ in times])
     return []

@@ -12,34 +12,34 @@ import cv2
 import numpy as np
 
 from blinkgl.camera import CameraModel, PinHole
+from blinkgl.config.reader import read_table
 from blinkgl.errors import AssetError
 from blinkgl.events.types import Events
 from blinkgl.io.camchain import read_camchain
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.images import NpzReader, numpy_errors, read_image
-from blinkgl.io.index import sequence_folders
+from blinkgl.io.index import made_folders
+from blinkgl.io.lens_files import CAM_TO_CAM
 from blinkgl.io.records import read_text
-from blinkgl.io.sequence_dir import MANIFEST, read_manifest, verify_sequence
+from blinkgl.io.rig_dir import read_rig
+from blinkgl.io.sequence_dir import is_rig_folder, read_manifest, verify_sequence
 from blinkgl.labels import LABELS, Form
-
-CALIBRATION = "cam_to_cam.yaml"
-"""In the directory of a sequence whose lens distorts."""
-LEFT, RIGHT = "left", "right"
-"""Folders of a stereo rig's event cameras, each a sequence directory, in that of the rig."""
 
 
 @dataclass(frozen=True)
 class Source:
     """One sequence. Times are µs on its own clock; the events of :meth:`events` are on it, too.
 
-    folder : its directory.   manifest : what stands in there.   name : the directory's, or that of the rig it is on."""
+    folder : its directory.   manifest : what stands in there.   name : the directory's, or that of the rig it is on.
+    beside : the directory of the right eye, where this is the left one of a stereo pair."""
 
     folder: Path
     manifest: dict[str, Any]
     name: str
+    beside: Path | None = None
 
     @classmethod
-    def open(cls, folder: Path, name: str | None = None) -> Source:
+    def open(cls, folder: Path, name: str | None = None, beside: Path | None = None) -> Source:
         """Raises AssetError: no sequence, or files are missing or cut."""
         if problems := verify_sequence(folder, checksums=False):
             raise AssetError(
@@ -47,7 +47,7 @@ class Source:
                 where=str(folder),
                 accepted="a data set that 'blinkgl verify' passes",
             )
-        return cls(folder, read_manifest(folder), name or folder.name)
+        return cls(folder, read_manifest(folder), name or folder.name, beside)
 
     @property
     def split(self) -> str:
@@ -133,8 +133,8 @@ class Source:
     @functools.cached_property
     def camera(self) -> CameraModel | None:
         """Its model; None where a recording says nothing of it."""
-        if self.has(CALIBRATION):  # of a lens that distorts
-            return next(iter(read_camchain(self.folder / CALIBRATION).values())).camera
+        if self.has(CAM_TO_CAM):  # of a lens that distorts
+            return next(iter(read_camchain(self.folder / CAM_TO_CAM).values())).camera
         if "K" not in self.poses:
             return None
         (fx, _, cx), (_, fy, cy), _ = self.poses["K"].tolist()
@@ -142,10 +142,14 @@ class Source:
 
     @functools.cached_property
     def right(self) -> Source | None:
-        """The right event camera's sequence, where this is the left one's of a stereo rig. Raises as :meth:`open`."""
-        folder = self.folder.parent / RIGHT
-        there = self.folder.name == LEFT and (folder / MANIFEST).is_file()
-        return Source.open(folder, self.name) if there else None
+        """The right eye's sequence, of a stereo pair. Raises as :meth:`open`."""
+        return None if self.beside is None else Source.open(self.beside, self.name)
+
+    @property
+    def rectified(self) -> bool:
+        """Whether labels are in the pixels of the rectified picture: of a lens that distorts, on request."""
+        labels = read_table(self.folder / "config.yaml").get("labels") or {}
+        return isinstance(self.camera, PinHole) or labels.get("pixels") == "rectified"
 
     def _lines(self, name: str) -> list[str]:
         lines = read_text(self.folder / name).splitlines()
@@ -170,13 +174,18 @@ def _read(form: Form, path: Path) -> Any:
 
 
 def sources_of(root: Path) -> list[Source]:
-    """The sequences of a data set, or ``root`` itself; of a stereo rig its left camera's. Raises as
-    :meth:`Source.open`."""
-    rigs = [
-        manifest.parents[1]
-        for pattern in ("", "*/", "*/*/")
-        for manifest in sorted(root.glob(f"{pattern}{LEFT}/{MANIFEST}"))
-        if not any(part.startswith(".") for part in manifest.relative_to(root).parts)
-    ]
-    alone = [f for f in sequence_folders(root) if f not in rigs and f.parent not in rigs]
-    return [*(Source.open(rig / LEFT, rig.name) for rig in rigs), *map(Source.open, alone)]
+    """The sequences of a data set, or ``root`` itself; of a rig its first event camera's, of a pair the left one's.
+    Raises as :meth:`Source.open`, and AssetError: a rig without an event camera."""
+    return [_of_rig(f) if is_rig_folder(f) else Source.open(f) for f in made_folders(root)]
+
+
+def _of_rig(folder: Path) -> Source:
+    tables = read_rig(folder)
+    cameras = [name for name, one in tables.items() if "events" in one["records"]]
+    if not cameras:
+        raise AssetError("a rig without an event camera", where=str(folder))
+    one, other = cameras[0], tables[cameras[0]].get("pair")
+    if other not in cameras:
+        return Source.open(folder / one, folder.name)
+    left, right = (one, other) if tables[one]["baseline"] > 0 else (other, one)
+    return Source.open(folder / left, folder.name, folder / right)

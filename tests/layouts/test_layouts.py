@@ -25,6 +25,7 @@ from loaders import (
     dsec_flow,
     dsec_sequence,
     eraft_sequence,
+    rectify_map,
     tapvid,
 )
 
@@ -49,6 +50,7 @@ RECIPE = {
 
 
 def generate(folder, recipe, num=1):
+    folder.mkdir(exist_ok=True)
     path = folder / "recipe.yaml"
     path.write_text(yaml.safe_dump(recipe))
     run_dataset(load_run(path), folder / "out", num=num)
@@ -276,26 +278,22 @@ STEREO = {
 
 @pytest.fixture(scope="module")
 def stereo(tmp_path_factory):
-    """A wall seen by two cameras 0.1 m apart that approach it; what a stereo rig writes."""
-    folders = []
-    for name, y in (("left", 0.05), ("right", -0.05)):  # they look along x, with z up: to the right is -y
-        pose = lambda time, x, y=y: {"time": time, "position": [x, y, 0], "look_at": [x + 1, y, 0]}
-        scene = {
-            "kind": "explicit",
-            "meshes": {"wall": {"primitive": "cuboid", "parameters": {"extents": [1, 20, 20]}}},
-            "materials": {"checked": {"procedural": "checks", "uv_scale": [20, 20]}},
-            "objects": [{"mesh": "wall", "material": "checked", "position": [2.5, 0, 0]}],
-            "camera": {"keyframes": [pose(0, 0), pose(1, 0.5)]},
-        }
-        folders.append(generate(tmp_path_factory.mktemp(name), {**STEREO, "scene": scene}) / "train/sequence_000000")
-    rig = tmp_path_factory.mktemp("stereo") / "out/train/rig_000000"
-    for name, folder in zip(("left", "right"), folders):
-        shutil.copytree(folder, rig / name)
-    return rig
+    """A wall seen by two cameras 0.1 m apart that approach it."""
+    pose = lambda time, x: {"time": time, "position": [x, 0.05, 0], "look_at": [x + 1, 0.05, 0]}
+    scene = {
+        "kind": "explicit",
+        "meshes": {"wall": {"primitive": "cuboid", "parameters": {"extents": [1, 20, 20]}}},
+        "materials": {"checked": {"procedural": "checks", "uv_scale": [20, 20]}},
+        "objects": [{"mesh": "wall", "material": "checked", "position": [2.5, 0, 0]}],
+        "camera": {"keyframes": [pose(0, 0), pose(1, 0.5)]},
+    }
+    return (
+        generate(tmp_path_factory.mktemp("rig"), {**STEREO, "scene": scene, "rig": "stereo"}) / "train/sequence_000000"
+    )
 
 
 def test_a_stereo_rig_has_a_right_eye_disparity_and_a_calibration(stereo, tmp_path):
-    folder = exported(stereo.parents[1], tmp_path, "dsec") / "train/rig_000000"
+    folder = exported(stereo.parents[1], tmp_path, "dsec") / "train/sequence_000000"
     poses = np.load(stereo / "left/poses.npz")
     eyes = {eye: read_events(stereo / eye / "events.h5") for eye in ("left", "right")}
     found = list(dsec_disparity(folder, HEIGHT, WIDTH))
@@ -314,5 +312,27 @@ def test_a_stereo_rig_has_a_right_eye_disparity_and_a_calibration(stereo, tmp_pa
     point = Q @ [10.0, 12.0, disparity[12, 10], 1.0]
     quantum = depth**2 / (poses["K"][0, 0] * 0.1) / 256
     assert point[2] / point[3] == pytest.approx(depth, abs=0.6 * quantum)
-    with h5py.File(exported(stereo, tmp_path, "mvsec") / "train/rig_000000_data.hdf5") as file:
+    with h5py.File(exported(stereo, tmp_path, "mvsec") / "train/sequence_000000_data.hdf5") as file:
         assert len(file["davis/right/events"]) == len(eyes["right"])
+
+
+LENS = {
+    **{k: v for k, v in STEREO.items() if k != "camera"},
+    "scene": RECIPE["scene"],
+    "camera": {"width": WIDTH, "height": HEIGHT, "fov": 60, "lens": "radtan", "distortion": [-0.2, 0.05, 0, 0]},
+}
+
+
+def test_a_lens_that_distorts_has_its_rectify_map_and_truth_that_is_rectified(tmp_path):
+    raw = generate(tmp_path / "raw", LENS)
+    with pytest.raises(AssetError, match="labels: {pixels: rectified}"):
+        export_layout(raw, tmp_path / "there", "dsec")
+    flat = generate(tmp_path / "flat", {**LENS, "labels": {**LENS["labels"], "pixels": "rectified"}})
+    folder = exported(flat, tmp_path, "dsec") / "train/sequence_000000"
+    table = rectify_map(folder / "events/left/rectify_map.h5", HEIGHT, WIDTH)
+    K = np.load(flat / "train/sequence_000000/poses.npz")["K"]
+    rays = cv2.undistortPoints(np.array([[[3.0, 4.0]]]), K, np.array(LENS["camera"]["distortion"]), R=np.eye(3), P=K)
+    np.testing.assert_allclose(table[4, 3], rays[0, 0], atol=1e-2)
+    calibration = yaml.safe_load((folder / "calibration/cam_to_cam.yaml").read_text())
+    assert calibration["intrinsics"]["cam0"]["distortion_coeffs"] == pytest.approx([-0.2, 0.05, 0, 0])
+    assert list(dsec_sequence(folder, HEIGHT, WIDTH))

@@ -1,0 +1,129 @@
+"""Tensors of events that never leave the card: voxel grids, counts, time surfaces.
+
+    sink = Voxels(card, bins=5)
+    sink.begin(t0_us, t1_us)
+    for frame, t_ns in frames:
+        card.advance(frame, t_ns)     # as `step`, but no event is read back
+        sink.add()
+    grid = sink.read()
+
+Everything is added up in whole numbers, so that the order in which a card does it leaves no trace: the same events are
+the same tensor, bit for bit, on any card and on the processor (:mod:`tests.card.test_sinks` has the twins).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from blinkgl.card.kernels import PIXELS_PER_GROUP, Kernels
+from blinkgl.errors import EventDataError
+
+if TYPE_CHECKING:
+    from blinkgl.card.esim import CardEsim
+
+ONE = 2**16
+"""An event, in a voxel grid."""
+MAX_WINDOW_US = 2**30
+MAX_BINS = 256
+
+
+class _Sink:
+    """Of one emulator on a card. shape : of what :meth:`read` gives."""
+
+    define: ClassVar[str]
+
+    def __init__(self, card: CardEsim, planes: int):
+        self._card, self.shape = card, (planes, card.height, card.width)
+        card.gl.resume()
+        self._kernels = Kernels(card.gl)
+        self._buffer = card.gl.ctx.buffer(reserve=4 * planes * card.height * card.width)
+        self._window_us = (0, 1)
+
+    def begin(self, t0_us: int, t1_us: int) -> None:
+        """A new window [t0_us, t1_us), empty. Raises EventDataError: no length, or over 17 minutes."""
+        if not 0 < t1_us - t0_us <= MAX_WINDOW_US:
+            raise EventDataError(
+                "a window has an end after its start",
+                where="window",
+                value=f"{t0_us} to {t1_us} us",
+                accepted=f"up to {MAX_WINDOW_US} us",
+            )
+        self._card.gl.resume()
+        self._window_us = (t0_us, t1_us)
+        self._buffer.clear()
+
+    def add(self) -> None:
+        """The events of the card's last step, those outside of the window left out."""
+        card, (t0_us, t1_us) = self._card, self._window_us
+        packed, count, base_us = card.on_card
+        if not count or base_us >= t1_us or base_us - t0_us < -(2**31):
+            return
+        card.gl.resume()
+        values = {
+            "count": count,
+            "width": card.width,
+            "pixels": card.height * card.width,
+            "shift_us": base_us - t0_us,
+            "span_us": t1_us - t0_us,
+            "bins": self.shape[0],
+        }
+        buffers = {0: packed, 1: self._buffer}
+        self._kernels.run(
+            "compute/events_sink.glsl", {self.define: 1}, buffers, values, items=count, local=PIXELS_PER_GROUP
+        )
+
+    def whole(self) -> np.ndarray:
+        """What has been added up, int32, as it lies on the card."""
+        self._card.gl.resume()
+        return np.frombuffer(self._buffer.read(), np.int32).reshape(self.shape)
+
+    def release(self) -> None:
+        """Frees the buffer. Harmless when repeated."""
+        if not self._card.gl.released:
+            with self._card.gl.borrowed():
+                self._buffer.release()
+
+
+class Voxels(_Sink):
+    """(bins, H, W) float32: +1 for ON, -1 for OFF, shared linearly in time between the two nearest bins, which stand
+    from the window's start to its end; in steps of 2^-16, and up to 32,767 events in one place."""
+
+    define = "VOXELS"
+
+    def __init__(self, card: CardEsim, bins: int = 5):
+        if not 1 <= bins <= MAX_BINS:
+            raise EventDataError("number of bins out of range", where="bins", value=bins, accepted=f"1 to {MAX_BINS}")
+        super().__init__(card, bins)
+
+    def read(self) -> np.ndarray:
+        """The grid of the window so far."""
+        return self.whole().astype(np.float32) / np.float32(ONE)
+
+
+class Counts(_Sink):
+    """(2, H, W) int32: OFF and ON events."""
+
+    define = "COUNTS"
+
+    def __init__(self, card: CardEsim):
+        super().__init__(card, 2)
+
+    def read(self) -> np.ndarray:
+        """The counts of the window so far."""
+        return self.whole().copy()
+
+
+class Latest(_Sink):
+    """(2, H, W) int64 µs: time of the last OFF and ON event, -1: there is none (a time surface before it decays)."""
+
+    define = "LATEST"
+
+    def __init__(self, card: CardEsim):
+        super().__init__(card, 2)
+
+    def read(self) -> np.ndarray:
+        """The times of the window so far."""
+        since = self.whole().astype(np.int64)
+        return np.where(since > 0, since - 1 + self._window_us[0], -1)

@@ -1,0 +1,115 @@
+"""ESIM by compute shaders against the numba kernel, and what the shaders move in memory.
+
+    python -m blinkgl.tools.bench_card [--quick] [--traffic]
+
+Processor time of both, in turns, frame by frame, on `bench_events`' clips and on a still picture; the events of both
+are compared. On OpenGL that the processor draws, this is the price of the detour; on a graphics card look at the wall
+time. ``--traffic``: no measurement, but a table computed from the sizes of the buffers: bytes per pixel and frame and
+per pixel that fires, and what a card of a given memory bandwidth makes of them at most.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import numba
+import numpy as np
+
+from blinkgl.card import CardEsim
+from blinkgl.config.events import EsimConfig
+from blinkgl.events import Esim
+from blinkgl.gl import GLContext, create_context
+from blinkgl.machine import bench
+from blinkgl.tools.bench_events import HEIGHT, WIDTH, clip
+
+VARIANTS = {
+    "default": EsimConfig(),
+    "refractory": EsimConfig(refractory_us=100.0),
+    "jitter": EsimConfig(threshold_jitter=0.02),
+}
+CARDS = {"H100 SXM (HBM3)": 3350.0, "RTX 4090": 1008.0}
+"""Memory bandwidth by the vendor's data sheets, GB/s."""
+MARK = {"intensity": 4, "levels": 8, "bits, written and read three times": 4 * 4 / 32}
+"""Bytes per pixel and frame, whether or not anything fires."""
+UPLOAD = {"copy of the frame into the kernel's buffer, read and written": 8}
+FIRE = {
+    "list, written and read twice": 3 * 8,
+    "intensity, now and before": 8,
+    "levels, read and written": 16,
+    "thresholds": 8,
+    "record, written and read": 32,
+    "count, written and read three times": 16,
+    "place, written and read": 8,
+}
+"""Bytes per pixel that fires; of the default kernel."""
+EVENT = {"packed event": 8}
+
+
+def main() -> None:
+    """See the module."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="fewer frames")
+    parser.add_argument("--traffic", action="store_true", help="the computed table alone")
+    arguments = parser.parse_args()
+    if not arguments.traffic:
+        with create_context() as gl:
+            measure(gl, 12 if arguments.quick else 40)
+    traffic()
+
+
+def measure(gl: GLContext, frames: int) -> None:
+    """Prints processor and wall ms a frame, in turns, median over ``frames``."""
+    numba.set_num_threads(1)
+    print(bench.machine_line(f"{gl.renderer}"))
+    print("| clip | kernel | events per pixel and frame | numba, ms | card, ms | ratio | card, wall ms |")
+    print("|---|---|---|---|---|---|---|")
+    for name in ("still", "mid", "dense"):
+        pictures = np.zeros((frames + 4, HEIGHT, WIDTH), np.uint8) if name == "still" else clip(name, frames + 4)[0]
+        pictures = (pictures / 255.0).astype(np.float32)
+        for variant, config in VARIANTS.items():
+            both = Esim(HEIGHT, WIDTH, config, 1), CardEsim(HEIGHT, WIDTH, config, 1, gl=gl)
+            spent: tuple[list[float], ...] = ([], [], [])
+            count = 0
+            for k, picture in enumerate(pictures):
+                made = []
+                for j, emulator in enumerate(both):
+                    started, wall = time.process_time(), time.perf_counter()
+                    made.append(emulator.step(picture, k * 1_000_000))
+                    gl.ctx.finish()
+                    if k >= 4:
+                        spent[j].append(time.process_time() - started)
+                        spent[2].append(time.perf_counter() - wall)
+                same = all(np.array_equal(getattr(made[0], c), getattr(made[1], c)) for c in made[0].columns)
+                if not same:
+                    raise SystemExit(f"{name}, {variant}: other events in frame {k}")
+                count += len(made[0]) if k >= 4 else 0
+            both[1].release()
+            mine, card = (1e3 * float(np.median(s)) for s in spent[:2])
+            per_pixel = count / frames / pictures[0].size
+            print(
+                f"| {name} | {variant} | {per_pixel:.3f} | {mine:.2f} | {card:.2f} | {card / mine:.2f} | "
+                f"{1e3 * float(np.median(spent[2][1::2])):.2f} |"
+            )
+
+
+def traffic() -> None:
+    """Prints the computed table."""
+    quiet, copy, fire, event = (sum(table.values()) for table in (MARK, UPLOAD, FIRE, EVENT))
+    print(f"\nper pixel and frame {quiet:.1f} B, {copy} B more where frames are copied; ", end="")
+    print(f"per pixel that fires {fire} B; per event {event} B, and {event} B over the bus")
+    print("| 640x480 | " + " | ".join(f"{card}, {rate:.0f} GB/s" for card, rate in CARDS.items()) + " |")
+    print("|---|" + "---|" * len(CARDS))
+    pixels = HEIGHT * WIDTH
+    for density in (0.0, 0.07, 0.31, 1.0):
+        firing = min(density, 0.6)  # several events a pixel where it is dense
+        moved = pixels * (quiet + copy + firing * fire + density * event)
+        cells = []
+        for rate in CARDS.values():
+            frames = rate * 1e9 / moved
+            cells.append(f"{frames:,.0f} frames/s, {frames * density * pixels / 1e6:,.0f} M events/s")
+        print(f"| {density} events per pixel and frame: {moved / 1e6:.1f} MB | " + " | ".join(cells) + " |")
+
+
+if __name__ == "__main__":
+    main()

@@ -13,6 +13,8 @@ from blinkgl.config.sequence import load_run
 from blinkgl.dataset.explain import explain
 from blinkgl.dataset.generate import generate_run
 from blinkgl.errors import ConfigError
+from blinkgl.show.explain import show
+from blinkgl.show.terminal import plain_console
 
 SMALL = {
     "camera": {"width": 64, "height": 48},
@@ -190,3 +192,23 @@ def test_explain_in_plain_ascii(tmp_path):
     (tmp_path / "run.yaml").write_text("frames: {folders: [P0], images: images, flow: null}")
     done = command(["-m", "blinkgl.cli", "explain", str(tmp_path / "run.yaml")], ENVIRONMENTS[0])
     assert done.returncode == 0 and done.stderr == b"" and b"u0.png ... u2.png" in done.stdout
+
+
+def test_effects_of_light_and_materials(tmp_path, capsys):
+    """Which of them a scene asks for, and what that costs; without any, what it would."""
+    assert not any(one.asked for one in explain(template(tmp_path)).effects)
+    lit = {
+        "kind": "explicit",
+        "light": {"shadows": "hard", "sky_color": [0.5, 0.7, 1.0]},
+        "materials": {"lamp": {"color": [0.1, 0.1, 0.1], "emission": [1, 1, 1]}},
+        "meshes": {"die": {"primitive": "cuboid"}},
+        "objects": [{"mesh": "die", "material": "lamp", "position": [0, 3, 0]}],
+        "camera": {"keyframes": [{"time": 0, "position": [0, 0, 0]}, {"time": 0.2, "position": [0.1, 0, 0]}]},
+    }
+    told = explain(template(tmp_path, scene=lit))
+    assert {one.name for one in told.effects if one.asked} == {"coloured light", "hard shadows", "light of their own"}
+    shadows, soft = (next(one for one in told.effects if one.name == f"{kind} shadows") for kind in ("hard", "soft"))
+    assert shadows.cost(1.53) == pytest.approx(0.53) and soft.cost(1.0) == pytest.approx(soft.times - 1)
+    assert all(one.labels == 0 for one in told.effects if one.name != "holes")
+    show(told, plain_console())
+    assert "608.7 %" in (out := capsys.readouterr().out) and "measured" in out  # a table, whatever its width

@@ -289,7 +289,8 @@ def test_a_label_that_shows_itself_in_its_own_way_needs_no_reference():
 
 
 def test_two_renderers_need_not_agree_but_in_what_is_measured():
-    """Colours, numbers of objects, normals and velocities may differ in every pixel; depth, disparity and flow may not."""
+    """Colours, numbers of objects, normals and velocities may differ in every pixel; depth, disparity and flow may
+    not."""
     zero, one = np.zeros((H, W), np.float32), np.ones((H, W), np.float32)
     free = {name for name, label in LABELS.items() if not name.startswith("flow") and label.agrees(zero, one)}
     assert free == set(LABELS) - {"depth", "disparity", "flow_forward", "flow_backward"}

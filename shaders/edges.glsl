@@ -58,9 +58,9 @@ uniform vec2 image_size;
 
 const float HALF = 0.5;
 // Of a line's depth (near / Z): by how much the pixel beside it may differ and still be of its surface, and how much
-// nearer the one behind it may seem than it is.
+// nearer what is behind it may be where they meet.
 const float SAME = 0.25;
-const float NEARER = 0.01;
+const float NEARER = 0.001;
 const int ALONG = 12; // px, less one
 const float SNAP = 1.0 / 128.0; // px: rasterisers place corners on a grid of 1/256
 
@@ -107,14 +107,22 @@ void main()
         back = here;
         back_depth = own;
     }
-    // Something else hides the line.
-    if (crease > 0.5 ? !(abs(back_depth - depth) < SAME * depth) : !(back_depth < depth * (1.0 + NEARER)))
+    // Something else hides the line: what lies behind it, continued as a plane to the line, is nearer. (A floor that a body
+    // stands on is nearer beside it, and is not where they meet.)
+    float beyond = texelFetch(depths, inside_picture(back - aside), 0).r;
+    float steps_off = clamp(inside ? 1.0 - room : -room, 0.0, 1.0);
+    float continued = back_depth + (back_depth - beyond) * steps_off;
+    if (crease > 0.5 ? !(abs(back_depth - depth) < SAME * depth)
+                     : !(min(continued, back_depth) < depth * (1.0 + NEARER)))
         discard;
     // At corners, and where it is narrower than a pixel, the surface is only in some other pixel around; or in none of
     // those: it is then between all centres for a while, and seen further along.
     vec2 onwards = way / max(abs(way.x), abs(way.y));
     float further = (end.z - start.z) / max(abs(way.x), abs(way.y));
-    bool known = abs(front_depth - depth) < SAME * depth;
+    // Of a plane that ends at the horizon the depth beside the line is another one altogether; continued, it is the line's.
+    float within = texelFetch(depths, inside_picture(front + aside), 0).r;
+    float reached = front_depth + (front_depth - within) * clamp(inside ? room : 1.0 + room, 0.0, 1.0);
+    bool known = abs(front_depth - depth) < SAME * depth || abs(reached - depth) < SAME * depth;
     for (int k = 0; k < 8 + 2 * ALONG && !known; ++k) {
         int steps = k < 8 ? 0 : (k % 2 * 2 - 1) * (k / 2 - 2);
         ivec2 beside = inside_picture(

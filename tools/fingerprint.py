@@ -39,7 +39,11 @@ BASE = {
     },
     "labels": {
         "flow": ["forward", "backward"],
-        **{name: True for name, info in LabelsConfig.model_fields.items() if info.annotation is bool},
+        **{
+            name: True
+            for name, info in LabelsConfig.model_fields.items()
+            if info.annotation is bool and name != "disparity"  # which needs another eye
+        },
     },
 }
 STILL = "scene.camera_motion={speed: 0, rotation_rate: 0}"

@@ -179,7 +179,8 @@ class OutputConfig(Config):
     )
     compression: Literal["zstd", "lz4"] = Field(
         "zstd",
-        description="of events.h5, inside Blosc: zstd as DSEC's files; lz4 writes twice as fast, 4 % larger",
+        description="of events.h5, inside Blosc: zstd as DSEC's files; lz4 is written faster and some percent larger "
+        "(docs/results.md)",
     )
 
 

@@ -28,6 +28,7 @@ class Disparity(Label):
     )
     unit, kind = "px", "scalar"
     needs = ("depth",)
+    shard = "disparity.npy"
     judged_in, tolerance, error = "relative", 1e-5, staticmethod(grading.relative)
 
     def finish(self, drawn: Drawn) -> np.ndarray:

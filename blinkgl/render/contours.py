@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 FLOATS = 9
 """Of a vertex of :meth:`Lines.of`: its place, px; both ends of its line, px and depth; 1 where it is a crease."""
 CREASE = np.cos(np.radians(20.0))
-"""Of the angle between two faces that meet, above which light and texture are expected to jump."""
+"""Of the angle between the normals of two faces where they meet, above which light is expected to jump."""
 REACH = 0.7072
 """Half a pixel's diagonal: how far beside a line, and behind its ends, the pixels that it crosses have their
 centres, px."""
@@ -47,9 +47,20 @@ class Contour:
         self.rest = np.ascontiguousarray(mesh.vertices[self.corners], np.float64)
         self.planes = _planes(self.rest, self.faces)
         self.edges = _edges(self.faces, len(self.corners))
-        unit = self.planes[:, :3] / np.maximum(np.linalg.norm(self.planes[:, :3], axis=1, keepdims=True), 1e-300)
+        self.sharp = self._sharp(mesh)
+
+    def _sharp(self, mesh: Mesh) -> np.ndarray:
+        """(E,) bool: its two faces have other normals at both of its ends. A surface that is bent there and lit as if
+        it were round shows no step."""
         first, second = self.edges[:, 2], self.edges[:, 3]
-        self.sharp = (second >= 0) & ((unit[first] * unit[second]).sum(axis=1) < CREASE)
+        sharp = second >= 0
+        for end in (0, 1):
+            normals = [
+                mesh.normals[mesh.faces[face, (self.faces[face] == self.edges[:, end, None]).argmax(axis=1)]]
+                for face in (first, second)
+            ]
+            sharp &= (normals[0] * normals[1]).sum(axis=1) < CREASE
+        return sharp
 
 
 def _edges(faces: np.ndarray, places: int) -> np.ndarray:

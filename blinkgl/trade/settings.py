@@ -93,7 +93,7 @@ def design(quick: bool, random_scene: bool = True) -> tuple[Setting, ...]:
     if quick:
         points = [Setting(s, antialiasing=a) for s in displacement(2, 1, 0.5) for a in ("none", "ssaa2")]
         points += [Setting(s, r, "ssaa2") for s in displacement(2, 1) for r in curves]
-        points += [Setting(displacement(1)[0], antialiasing=a) for a in ("msaa4", "taps4", "ssaa4")]
+        points += [Setting(displacement(1)[0], antialiasing=a) for a in ("msaa4", "taps4", "edges", "ssaa4")]
         points += [Setting(s, antialiasing="ssaa2") for s in uniform(100, 400)]
         points += [Setting(s, "pchip", "ssaa2") for s in extra[1::3]]
         points += [Setting(displacement(1)[0], antialiasing=a, other=sharper[0]) for a in ("none", "ssaa2")]
@@ -126,7 +126,7 @@ def design(quick: bool, random_scene: bool = True) -> tuple[Setting, ...]:
         points += [
             Setting(s, antialiasing=a, other=o)
             for s in displacement(2, 1, 0.5)
-            for a in ("none", "taps4", "ssaa2", "ssaa4")
+            for a in ("none", "taps4", "edges", "ssaa2", "ssaa4")
             for o in sharper
         ]
         points += [Setting(s, antialiasing="ssaa2") for s in uniform(100, 200, 400, 800)]

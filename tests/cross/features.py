@@ -22,6 +22,8 @@ from blinkgl.config.quality import QUALITIES
 from blinkgl.config.sequence import LabelsConfig, SequenceConfig
 
 WIDTH, HEIGHT, FPS = 32, 24, 100
+OF_PAIRS = ("disparity",)
+"""Labels of stereo pairs: tests/dataset/test_rig_runs.py."""
 _POOLS = {
     "pool": {"primitives": ["cuboid", "sphere"], "variants": 8, "urdfs": False, "test_fraction": 0.3},
     "textures": {
@@ -276,7 +278,13 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
     "float flow": {"none": NOTHING, **{name: {"labels": {"float_flow": [name]}} for name in ("npy", "flo", "h5")}},
     "labels": {
         "default": NOTHING,
-        "all": {"labels": {name: True for name, info in LabelsConfig.model_fields.items() if info.annotation is bool}},
+        "all": {
+            "labels": {
+                name: True
+                for name, info in LabelsConfig.model_fields.items()
+                if info.annotation is bool and name not in OF_PAIRS
+            }
+        },
         "fewest": {"labels": {"occlusion": False}},
     },
     "over time": {
@@ -308,7 +316,12 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
     },
     "seed": {"the group's": NOTHING, "its own": {"seed": 2**62 + 1}},
 }
-RUN_LEVEL = {"gl": "one OpenGL for all groups of a run; tests/gl tries the backends"}
+_RIGS = "every row may be a rig's sensor: tests/dataset/test_rig_runs.py, tests/config/test_rig.py"
+RUN_LEVEL = {
+    "gl": "one OpenGL for all groups of a run; tests/gl tries the backends",
+    "rig": _RIGS,
+    "sensors": _RIGS,
+}
 """Top-level keys that are no feature of a sequence."""
 
 Kind = tuple[str, str]
@@ -352,7 +365,7 @@ ELSEWHERE = {
     "camera moves, and what moves by itself",
     "images": "tests/config/test_images.py, tests/imaging: every preset, every choice; here what is written and read",
     "imu": "tests/sequence/test_inertial.py, tests/dataset/test_over_time.py; here what is written and read",
-    "gl": RUN_LEVEL["gl"],
+    **RUN_LEVEL,
 }
 _SCENE_HERE = {"scene.kind", "scene.light.unlit", "scene.camera_motion.kind"}
 

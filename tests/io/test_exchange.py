@@ -146,3 +146,15 @@ def test_from_a_sequences_file_to_each(tmp_path):
         convert(tmp_path / "e.h5", tmp_path / name, format=kind)
         file = open_events(tmp_path / name)
         assert (file.format, file.height, file.width) == (kind, H, W) and same(file.read(), events)
+
+
+@pytest.mark.parametrize("name, kind", [("e.raw", "evt3"), ("e.raw", "evt2"), ("e.h5", "dsec")])
+def test_evlib_reads_what_we_write(tmp_path, name, kind):
+    evlib = pytest.importorskip("evlib", reason="not an extra of ours: pip install evlib")
+    events = some_events(t0=0, gap_us=50_000)
+    write_events(tmp_path / name, events, H, W, format=kind)
+    table = evlib.load_events(str(tmp_path / name)).collect()
+    np.testing.assert_array_equal(table["t"].dt.total_microseconds().to_numpy(), events.t)
+    for column, ours in (("x", events.x), ("y", events.y)):
+        np.testing.assert_array_equal(table[column].to_numpy(), ours)
+    np.testing.assert_array_equal(table["polarity"].to_numpy() > 0, events.p > 0)

@@ -81,6 +81,7 @@ FILES = {
     "occlusion_forward": ["occlusion/forward/000007.png"],
     "occlusion_backward": ["occlusion/backward/000007.png"],
     "depth": ["depth/000007.npy"],
+    "disparity": ["disparity/000007.npy"],
     "ids": ["ids/000007.png"],
     "normals": ["normals/000007.npy"],
     "velocity": ["velocity/000007.npy"],
@@ -100,6 +101,11 @@ def test_where_labels_lie():
         "flow_forward": "flow.png",
         "flow_backward": "back.png",
         "occlusion_forward": "occlusion.png",
+        "depth": "depth.npy",
+        "disparity": "disparity.npy",
+        "ids": "ids.png",
+        "normals": "normals.npy",
+        "velocity": "velocity.npy",
     }
 
 
@@ -260,6 +266,7 @@ def test_how_strictly_each_is_judged():
     judged = {v.name: (v.tolerance, v.statistic, v.judged_in) for label in LABELS.values() for v in label.views}
     assert judged == {
         "depth": (1e-5, "max", "relative"),
+        "disparity": (1e-5, "max", "relative"),
         "id": (0.0, "max", "mismatch"),
         "normals": (1e-3, "max", "of a unit vector"),
         "velocity": (1e-2, "max", "px per label interval"),
@@ -282,10 +289,11 @@ def test_a_label_that_shows_itself_in_its_own_way_needs_no_reference():
 
 
 def test_two_renderers_need_not_agree_but_in_what_is_measured():
-    """Colours, numbers of objects, normals and velocities may differ in every pixel; depth and flow may not."""
+    """Colours, numbers of objects, normals and velocities may differ in every pixel; depth, disparity and flow may
+    not."""
     zero, one = np.zeros((H, W), np.float32), np.ones((H, W), np.float32)
     free = {name for name, label in LABELS.items() if not name.startswith("flow") and label.agrees(zero, one)}
-    assert free == set(LABELS) - {"depth", "flow_forward", "flow_backward"}
+    assert free == set(LABELS) - {"depth", "disparity", "flow_forward", "flow_backward"}
     assert LABELS["depth"].agrees(one, one) and not LABELS["depth"].agrees(one, one[:, :3])
 
 
@@ -302,3 +310,19 @@ def test_flow_of_two_renderers_agrees_to_two_quanta_in_nearly_all_pixels(axis, o
     other.valid.flat[: round(200 * share)] = False
     assert label.agrees(one, other) is (share < 0.06)
     assert not label.agrees(one, Flow(one.flow[:5], one.valid[:5]))
+
+
+def test_disparity_is_f_b_over_z_of_any_sign_of_b():
+    """Without another eye it is 0, and 0 where nothing is hit."""
+    depth = np.array([[0.0, 2.0, 4.0]], np.float32)
+
+    def of(baseline):
+        scene = SimpleNamespace(camera=SimpleNamespace(fx=80.0), sensors=[SimpleNamespace(baseline=baseline)])
+        drawn = SimpleNamespace(scene=scene, raw=lambda name: depth)
+        return LABELS["disparity"].finish(drawn), LABELS["disparity"].reference(scene, SimpleNamespace(depth=depth))
+
+    for baseline in (0.1, -0.1):
+        drawn, true = of(baseline)
+        assert drawn.dtype == np.float32 and drawn.tolist() == [[0, 4, 2]] and true.tolist() == [[0, 4, 2]]
+        assert LABELS["disparity"].problem(drawn) is None
+    assert not of(None)[0].any() and "negative" in LABELS["disparity"].problem(-drawn)

@@ -35,6 +35,7 @@ from test_antialiasing import half_plane
 
 EDGES = RenderConfig(antialiasing="edges", image_antialiasing="edges")
 WHITE = Material(unlit=True, double_sided=True)
+GREY = replace(WHITE, base_color=(0.3,) * 3)
 
 
 def luminance(gl, world, antialiasing: str, t_ns: int = 0) -> np.ndarray:
@@ -103,18 +104,39 @@ def test_a_surface_narrower_than_a_pixel(gl):
 
 def test_what_is_hidden_does_not_show_through(gl):
     card = polygon(np.array([(-9.3, -7.2), (8.1, -7.9), (9.7, 8.4), (-8.8, 6.9)]), 5.0)
-    wall = polygon(
-        np.array([(-30, -30), (30, -30), (30, 30), (-30, 30)]), 3.0, "wall", 2, replace(WHITE, base_color=(0.3,) * 3)
-    )
+    wall = polygon(np.array([(-30, -30), (30, -30), (30, 30), (-30, 30)]), 3.0, "wall", 2, GREY)
     np.testing.assert_array_equal(
         luminance(gl, looked_at(card, wall), "edges"), luminance(gl, looked_at(card, wall), "none")
     )
-    half = polygon(
-        np.array([(0.3, -30), (30, -30), (30, 30), (0.3, 30)]), 3.0, "wall", 2, replace(WHITE, base_color=(0.3,) * 3)
-    )
+    half = polygon(np.array([(0.3, -30), (30, -30), (30, 30), (0.3, 30)]), 3.0, "wall", 2, GREY)
     world = looked_at(card, half)
     error = np.abs(luminance(gl, world, "edges") - finest(gl, world))
     assert error.max() < 0.15 and (error > 0.02).sum() <= 4  # where three surfaces meet in a pixel
+
+
+def test_what_lies_just_under_a_surface_does_not_show_through(gl):
+    """A body inside of another one, half a hundredth of its distance below the surface."""
+    wall = polygon(np.array([(-30, -30), (30, -30), (30, 30), (-30, 30)]), 3.0, "wall", 2, GREY)
+    card = polygon(np.array([(-9.3, -7.2), (8.1, -7.9), (9.7, 8.4), (-8.8, 6.9)]), 3.015)
+    slope = replace(wall.parts[0].mesh, uvs=wall.parts[0].mesh.vertices[:, :2].astype(np.float32))
+    ramp = np.linspace(0, 1, 64, dtype=np.float32)[None, :, None].repeat(64, axis=0).repeat(3, axis=2)
+    wall = thing("wall", 2, slope, still(), Material(Texture(ramp), unlit=True, double_sided=True))
+    np.testing.assert_array_equal(
+        luminance(gl, looked_at(card, wall), "edges"), luminance(gl, looked_at(wall), "edges")
+    )
+
+
+def test_the_horizon(gl):
+    """Where a floor ends, a pixel in front of the line is nearer by more than a half."""
+    floor = thing("floor", 2, quad(400, 400, 4), still((0, 10, -1.0)), GREY)
+    world = scene([floor], rig(80, 60, 75.0))
+    true = finest(gl, world, 8)
+    error = {name: rmse(luminance(gl, world, name), true) for name in ("ssaa2", "edges")}
+    assert error["edges"] < 0.5 * error["ssaa2"]
+
+
+def test_a_bent_surface_that_is_lit_as_if_it_were_round_has_no_creases():
+    assert not Contour(sphere(1.0, 1)).sharp.any()  # 80 faces, 30 degrees and more between them
 
 
 def test_creases(gl):

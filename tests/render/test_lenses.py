@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -11,11 +12,13 @@ from blinkgl.camera import PinHole
 from blinkgl.camera.drawing import seen_through
 from blinkgl.camera.rectified import rectified
 from blinkgl.config.sequence import RenderConfig
+from blinkgl.config.timeline import DisplacementTimeline
 from blinkgl.gl import create_context
 from blinkgl.labels import LABELS, LabelRequest
 from blinkgl.render import reference
 from blinkgl.render.lens import places_of
 from blinkgl.render.renderer import Renderer
+from blinkgl.timeline import make_timeline
 
 LENSES = {
     "radtan": {
@@ -222,6 +225,19 @@ def test_small_pictures_and_rates(gl):
         )
         assert np.abs(slope[inner]).max() > 0.2
         assert np.quantile(np.abs(rate - slope)[inner], 0.95) < 0.05 * np.abs(slope[inner]).max()
+
+
+@pytest.mark.parametrize("lens", ["pincushion", "fisheye"])
+def test_adaptive_steps_are_bounded_in_the_lens_s_pixels(gl, lens):
+    config = DisplacementTimeline(max_px=0.4, sample_every=1, min_step_us=10, percentile=100)
+    with Renderer(gl, scene_with(LENSES[lens]), RenderConfig()) as renderer:
+        times = [*make_timeline(config, T, T + 60_000_000, renderer, None, ())]
+        assert len(times) > 4
+        moved = []
+        for a, b in pairwise(times):
+            flow = renderer.labels(a, LabelRequest("flow_forward"), b).forward
+            moved.append(np.linalg.norm(flow.flow[flow.valid], axis=-1).max())
+    assert 0.3 < max(moved[:-1]) <= 0.4 * 1.12  # velocities are of a place up to half a pixel away
 
 
 def test_another_part_of_the_same_lens(gl):

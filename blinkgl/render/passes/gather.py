@@ -38,11 +38,11 @@ class Gather(ScreenPass):
     pointwise: ClassVar[bool] = True
 
     @property
-    def inputs(self) -> tuple[Input, ...]:
+    def inputs(self) -> tuple[Input, ...]:  # type: ignore[bad-override]
         return tuple(Input(f"picked_{k}", self.of, output.name) for k, output in enumerate(self.of.outputs))
 
     @property
-    def outputs(self) -> tuple[Output, ...]:
+    def outputs(self) -> tuple[Output, ...]:  # type: ignore[bad-override]
         return self.of.outputs
 
     def size(self, width: int, height: int) -> tuple[int, int]:

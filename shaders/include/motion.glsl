@@ -19,32 +19,6 @@ vec2 ndc_of_fragment(vec2 image_size)
     return FRAGMENT_XY / image_size * 2.0 - 1.0;
 }
 
-// Of a shape that changes, q is in the place of p, and its own change comes on top: d = D * q + MVP' * (q' - q), the
-// second term from the vertex stage.
-//
-// d: rows x, y, w.  Returns (u, v in px, w' in world units).  w' <= 0: behind the camera, or so near to its plane that the
-// flow is beyond float32; u = v = 0 then.
-vec3 displacement(vec3 d, vec2 image_size)
-{
-    float w_next = 1.0 / INVERSE_DEPTH + d.z;
-#ifdef LENS
-    vec2 ndc = ndc_of_fragment(image_size), place = on_plane(ndc);
-    vec2 change = (d.xy - ndc * d.z) / w_next * lens_plane.xy;
-    vec2 flow = lens_difference(place, change) * lens_focal;
-    bool usable = w_next > 0.0 && max(abs(flow.x), abs(flow.y)) < BEYOND && lens_sees(place + change);
-#else
-    vec2 flow = (d.xy - ndc_of_fragment(image_size) * d.z) / w_next * 0.5 * image_size;
-    bool usable = w_next > 0.0 && max(abs(flow.x), abs(flow.y)) < BEYOND;
-#endif
-    return usable ? vec3(flow, w_next) : vec3(0.0, 0.0, min(w_next, 0.0));
-}
-
-// The same of a rigid body. difference: rows x, y, w of D.
-vec3 displacement(mat4x3 difference, vec3 local, vec2 image_size)
-{
-    return displacement(difference * vec4(local, 1.0), image_size);
-}
-
 // In the limit: d(ndc)/dt = (d.xy - ndc.xy * d.w) / w with d = d(MVP)/dt * p (of a shape that changes: d(MVP)/dt * q + MVP *
 // dq/dt); half the image is one unit of ndc.
 // rate: rows x, y, w of d(MVP)/dt.  Returns px/s, at most BEYOND, whose square is infinite.

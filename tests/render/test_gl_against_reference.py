@@ -436,12 +436,12 @@ def test_random_world_of_real_meshes_and_photographs(gl):
     "file, right, wrong",
     [
         (
-            "include/motion.glsl",
+            "include/displacement.glsl",
             "(d.xy - ndc_of_fragment(image_size) * d.z) / w_next",
             "(ndc_of_fragment(image_size) * d.z - d.xy) / w_next",
         ),
-        ("include/motion.glsl", "* d.z) / w_next", "* d.z)"),
-        ("include/motion.glsl", "* d.z) / w_next", "* d.z) * gl_FragCoord.w"),
+        ("include/displacement.glsl", "* d.z) / w_next", "* d.z)"),
+        ("include/displacement.glsl", "* d.z) / w_next", "* d.z) * gl_FragCoord.w"),
         ("include/labels/depth.glsl", "1.0 / INVERSE_DEPTH", "1.0 / INVERSE_DEPTH - 0.05"),
     ],
     ids=["sign of the flow", "no perspective division", "division by the old depth", "depth off by the near plane"],

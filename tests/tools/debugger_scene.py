@@ -73,12 +73,12 @@ def edit(path: Path, right: str, wrong: str) -> None:
 
 MISTAKES = {
     "sign of the flow": (
-        "include/motion.glsl",
+        "include/displacement.glsl",
         "(d.xy - ndc_of_fragment(image_size) * d.z) / w_next",
         "(ndc_of_fragment(image_size) * d.z - d.xy) / w_next",
     ),
-    "no perspective division": ("include/motion.glsl", "* d.z) / w_next", "* d.z)"),
-    "depth off by near": ("include/labels/depth.glsl", "1.0 / gl_FragCoord.w", "1.0 / gl_FragCoord.w - 0.05"),
+    "no perspective division": ("include/displacement.glsl", "* d.z) / w_next", "* d.z)"),
+    "depth off by near": ("include/labels/depth.glsl", "1.0 / INVERSE_DEPTH", "1.0 / INVERSE_DEPTH - 0.05"),
 }
 
 _UV = "ALBEDO luminance = texture(albedo, uv).CHANNELS;"
@@ -132,7 +132,7 @@ LOOKUP_MISTAKES = {
         {"ball"},
     ),
     "width and height exchanged": (
-        [("include/motion.glsl", "* gl_FragCoord.w * 0.5 * image_size;", "* gl_FragCoord.w * 0.5 * image_size.yx;")],
+        [("include/motion.glsl", "* INVERSE_DEPTH * 0.5 * image_size;", "* INVERSE_DEPTH * 0.5 * image_size.yx;")],
         "velocity",
         "x is 0.75 times, y 1.333 times",
         {"floor", "ball", "box", "passing"},

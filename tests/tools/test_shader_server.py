@@ -321,21 +321,21 @@ def test_edits_are_taken_errors_keep_the_last_good_program(served):
     state = as_json(server, "/state")
     before = depth_at(server)
 
-    edit(label, "1.0 / gl_FragCoord.w", "2.0 / gl_FragCoord.w")
+    edit(label, "1.0 / INVERSE_DEPTH", "2.0 / INVERSE_DEPTH")
     now = next_version(server, state["version"])
     assert now["errors"] == [] and now["generation"] == state["generation"] + 1
     assert depth_at(server) == pytest.approx(2 * before, rel=1e-6)
     occluded = next(b for b in as_json(server, "/probe?t=0.1&x=35&y=40")["buffers"] if b["name"] == "occluded_forward")
     assert occluded["gpu"] in (True, False)
 
-    edit(label, "2.0 / gl_FragCoord.w", "2.0 / gl_FragCord.w")
+    edit(label, "2.0 / INVERSE_DEPTH", "2.0 / INVERSE_DEPHT")
     broken = next_version(server, now["version"])
-    line = next(i for i, text in enumerate(label.read_text().splitlines(), 1) if "gl_FragCord" in text)
+    line = next(i for i, text in enumerate(label.read_text().splitlines(), 1) if "INVERSE_DEPHT" in text)
     error = broken["errors"][0]
     assert broken["generation"] == now["generation"]
     assert (
         error["where"].startswith(f"include/labels/depth.glsl:{line}:")
-        and "gl_FragCord" in error["text"]
+        and "INVERSE_DEPHT" in error["text"]
         and "^" in error["excerpt"]
     )
     assert depth_at(server) == pytest.approx(2 * before, rel=1e-6)  # the last good program
@@ -511,8 +511,8 @@ def test_the_page_in_chromium(served, shader, config, tmp_path):
         good = (folder / "include/motion.glsl").read_text()
         edit(
             folder / "include/motion.glsl",
-            "return gl_FragCoord.xy / image_size * 2.0 - 1.0;",
-            "return gl_FragCoord.xy / imagesize * 2.0 - 1.0;",
+            "return FRAGMENT_XY / image_size * 2.0 - 1.0;",
+            "return FRAGMENT_XY / imagesize * 2.0 - 1.0;",
         )
         started = time.monotonic()
         error = page.wait("const e = document.querySelector('#errors'); return !e.hidden && e.textContent", timeout=20)

@@ -1,6 +1,6 @@
 // u, v in px, Z at the other time; 0 in .w of pixels that nothing writes.
 #include "image_size.glsl"
-#include "motion.glsl"
+#include "displacement.glsl"
 uniform mat4x3 difference_backward;
 
 vec4 label_flow_backward()

@@ -17,10 +17,10 @@ def absolute(drawn: np.ndarray, true: np.ndarray, interval_s: float) -> np.ndarr
 
 
 def relative(drawn: np.ndarray, true: np.ndarray, interval_s: float) -> np.ndarray:
-    """Of (H, W)."""
+    """Of (H, W). Equal is no error, also where both are 0 or infinite."""
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.abs(drawn / true - 1.0)
-    return np.where(np.isinf(drawn) & np.isinf(true), 0.0, error)
+    return np.where(drawn == true, 0.0, error)
 
 
 def different(drawn: np.ndarray, true: np.ndarray, interval_s: float) -> np.ndarray:

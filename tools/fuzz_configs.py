@@ -134,6 +134,10 @@ SMALL = {
     "images.also": lambda r: r.choice([[], ["clean"], {"choice": [["sharp"], ["clean", "sharp"]]}]),
     "images.auto_exposure": lambda r: r.choice([None, {"longest_us": 5000, "lag": {"uniform": [0, 1]}}]),
 }
+_TOGETHER = ("lens", "distortion", "fx", "fy", "calibration", "calibration_name")
+"""Keys of a camera that make sense beside each other only."""
+_RIG = ("rig", "sensors")
+"""Keys beside which most others belong elsewhere."""
 SMALL_TIMELINE = {
     "uniform": {"fps": lambda r: r.choice([20, 200, {"uniform": [50, 400]}])},
     None: {
@@ -204,6 +208,10 @@ class Maker:
             if len(said) > 1 and self.rng.random() < 0.9:
                 for key in said[1:]:
                     del tree[key]
+        for group in (_RIG, _TOGETHER):
+            if self.rng.random() < 0.9:
+                for key in group:
+                    tree.pop(key, None)
         for low, high in (("min_step_us", "max_step_us"),):
             if all(isinstance(tree.get(k), (int, float)) for k in (low, high)) and self.rng.random() < 0.9:
                 tree[low], tree[high] = sorted((tree[low], tree[high]))

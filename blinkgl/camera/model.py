@@ -128,6 +128,11 @@ class CameraModel(ABC):
 
     # ---- what follows ------------------------------------------------------------------------------------------
 
+    def disparity(self, depth: np.ndarray, baseline: float) -> np.ndarray:
+        """px of the flat picture between the two eyes of a rectified pair, ``baseline`` world units apart: f b / Z of
+        ``depth`` (…), world units."""
+        return self.fx * baseline / depth
+
     @property
     def intrinsics(self) -> tuple[float, float, float, float]:
         """fx, fy, cx, cy."""

@@ -371,14 +371,12 @@ def write_rectify_map(path: str | os.PathLike, rectify_map: np.ndarray) -> None:
 
 def read_rectify_map(path: str | os.PathLike) -> np.ndarray:
     """(H, W, 2) float32 of a file of :func:`write_rectify_map`, or DSEC's own. Raises AssetError."""
-    try:
-        with h5py.File(path, "r") as file:
-            given = file.get("rectify_map")
-            right = isinstance(given, h5py.Dataset) and given.ndim == 3 and given.shape[2] == 2
-            if right and given.dtype.kind == "f":
-                return np.asarray(given[()], np.float32)
-    except OSError as error:
-        raise AssetError(f"cannot be read: {' '.join(str(error).split())[:120]}", where=str(path)) from None
+    path = Path(path)
+    with open_hdf5(path) as file, hdf5_errors(path, file):
+        given = file.get("rectify_map")
+        right = isinstance(given, h5py.Dataset) and given.ndim == 3 and given.shape[2] == 2
+        if right and given.dtype.kind == "f":
+            return np.asarray(given[()], np.float32)
     raise AssetError("no rectify map", where=str(path), accepted="rectify_map, (H, W, 2) float32")
 
 

@@ -48,4 +48,4 @@ def _of(scene: Scene, depth: np.ndarray) -> np.ndarray:
     """(H, W) float64; depth is 0 where nothing is hit."""
     baseline = scene.sensors[0].baseline or 0.0
     there = depth > 0
-    return np.where(there, scene.camera.fx * abs(baseline) / np.where(there, depth, 1.0), 0.0)
+    return np.where(there, scene.camera.disparity(np.where(there, depth, 1.0), abs(baseline)), 0.0)

@@ -6,12 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from blinkgl.camera import CAMERA_MODELS, PinHole
+from blinkgl.camera import CAMERA_MODELS
 from blinkgl.config.scene import RandomSceneConfig
-from blinkgl.config.sequence import RenderConfig
-from blinkgl.errors import ConfigError
 from blinkgl.render import reference
-from blinkgl.render.renderer import Renderer
 from blinkgl.scene.geometry.lod import largest_scale
 from blinkgl.scene.geometry.primitives import grid
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
@@ -64,12 +61,3 @@ def test_a_random_world_places_in_its_view(camera, tmp_path):
     config = RandomSceneConfig(objects={"count": 3, "in_view": 1.0}, textures={"photographs": False})
     scene = random_world(config, camera, 0, SECOND // 10, "train", 1, 0, tmp_path)
     assert scene.camera is camera and len(scene.objects) > 3
-
-
-@pytest.mark.parametrize("camera", [c for c in CAMERAS if not isinstance(c, PinHole)], ids=lambda c: c.kind)
-def test_a_renderer_refuses_what_it_cannot_draw(gl, camera):
-    with pytest.raises(
-        ConfigError,
-        match=f"^camera: this camera model cannot be drawn \\(got '{camera.kind}'\\); expected a pin-hole camera",
-    ):
-        Renderer(gl, wall(camera), RenderConfig())

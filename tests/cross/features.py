@@ -316,7 +316,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
     },
     "seed": {"the group's": NOTHING, "its own": {"seed": 2**62 + 1}},
 }
-_RIGS = "every row may be a rig's sensor: tests/dataset/test_rig_runs.py, tests/config/test_rig.py"
+_RIGS = "every row may be a rig's sensor: tests/dataset/test_rig_runs.py, tests/config/test_rig_keys.py"
 RUN_LEVEL = {
     "gl": "one OpenGL for all groups of a run; tests/gl tries the backends",
     "rig": _RIGS,
@@ -364,6 +364,7 @@ ELSEWHERE = {
     "scene": "tests/scene: what a scene is made of; here only where it comes from, whether it is lit, whether the "
     "camera moves, and what moves by itself",
     "images": "tests/config/test_images.py, tests/imaging: every preset, every choice; here what is written and read",
+    "events.device": "tests/card/test_choice.py: either device writes the same files",
     "imu": "tests/sequence/test_inertial.py, tests/dataset/test_over_time.py; here what is written and read",
     **RUN_LEVEL,
 }
@@ -476,7 +477,11 @@ def options_of_the_schema() -> set[tuple[str, Any]]:
             literals(field.annotation, f"{path}.{name}" if path else name)
 
     model(SequenceConfig, "")
-    return {(path, option) for path, option in found if path.split(".")[0] not in ELSEWHERE or path in _SCENE_HERE}
+    return {
+        (path, option)
+        for path, option in found
+        if not {path, path.split(".")[0]} & ELSEWHERE.keys() or path in _SCENE_HERE
+    }
 
 
 def options_of_the_table() -> set[tuple[str, Any]]:

@@ -356,7 +356,12 @@ def known(
     **noise,
 ):
     config = SimpleNamespace(
-        frames=frames, scene=SimpleNamespace(kind=kind), seed=seed, events=SimpleNamespace(**noise), readout=None
+        frames=frames,
+        scene=SimpleNamespace(kind=kind),
+        seed=seed,
+        events=SimpleNamespace(**noise),
+        readout=None,
+        sensors=None,
     )
     return name, verify._Known(
         Path(name),
@@ -422,7 +427,7 @@ def test_twins(first, second, problems, notes):
     ["threshold_sigma", "threshold_jitter", "leak_rate_hz", "shot_noise_rate_hz", "hot_pixel_fraction", "k3", "k6"],
 )
 def test_what_makes_two_seeds_differ(key):
-    of = lambda **keys: SimpleNamespace(events=SimpleNamespace(**keys), readout=None)
+    of = lambda **keys: SimpleNamespace(events=SimpleNamespace(**keys), readout=None, sensors=None)
     assert verify._noisy(of(**{key: 0.1}))
     assert not verify._noisy(of(**{key: 0.0})) and not verify._noisy(of())
 
@@ -430,7 +435,7 @@ def test_what_makes_two_seeds_differ(key):
 @pytest.mark.parametrize(("key", "differ"), [("pixels", True), ("latency", True), ("filters", False)])
 def test_a_read_out_may_make_two_seeds_differ(key, differ):
     readout = SimpleNamespace(**{"pixels": None, "latency": None, key: object()})
-    assert verify._noisy(SimpleNamespace(events=SimpleNamespace(), readout=readout)) is differ
+    assert verify._noisy(SimpleNamespace(events=SimpleNamespace(), readout=readout, sensors=None)) is differ
 
 
 def test_a_check_that_stops_is_a_line():

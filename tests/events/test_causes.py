@@ -153,7 +153,9 @@ def test_files_keep_causes(tmp_path, name):
 @pytest.mark.parametrize("kind", sorted(set(WRITABLE) - set(WITH_CAUSES) - {"aedat4"}))
 def test_other_formats_say_that_they_cannot(tmp_path, kind, capsys):
     events = events_with_causes()
-    ending = {"text": "txt", "csv": "csv", "evt2": "raw", "evt3": "raw"}[kind]
+    ending = {"text": "txt", "csv": "csv", "evt2": "raw", "evt3": "raw", "mcap": "mcap", "prophesee": "h5"}[kind]
+    if kind == "mcap":
+        pytest.importorskip("mcap")
     target = tmp_path / f"b.{ending}"
     with (
         pytest.raises(OutputError, match="cannot hold the causes of events"),

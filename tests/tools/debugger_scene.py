@@ -138,7 +138,7 @@ LOOKUP_MISTAKES = {
         {"floor", "ball", "box", "passing"},
     ),
     "two-sided normal reversed": (
-        [("luminance.glsl", "gl_FrontFacing ? normal : -normal", "gl_FrontFacing ? -normal : normal")],
+        [("include/needs.glsl", "gl_FrontFacing ? (way) : -(way)", "gl_FrontFacing ? -(way) : (way)")],
         "luminance_light",
         "the normal points the other way",
         {"floor"},

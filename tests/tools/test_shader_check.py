@@ -171,7 +171,9 @@ def test_an_error_is_shown_at_its_own_line_through_the_includes(shader, shaders)
         "    float w_next = depht / INVERSE_DEPTH + d.z;",
     )
     line = next(
-        i for i, text in enumerate((shaders / "include/displacement.glsl").read_text().splitlines(), 1) if "depht" in text
+        i
+        for i, text in enumerate((shaders / "include/displacement.glsl").read_text().splitlines(), 1)
+        if "depht" in text
     )
     status, out, err = shader("check", shaders / "include/displacement.glsl", "--shaders", shaders)
     assert status == 1 and err == ""

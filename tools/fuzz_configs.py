@@ -208,10 +208,9 @@ class Maker:
             if len(said) > 1 and self.rng.random() < 0.9:
                 for key in said[1:]:
                     del tree[key]
-        for group in (_RIG, _TOGETHER):
-            if self.rng.random() < 0.9:
-                for key in group:
-                    tree.pop(key, None)
+        if self.rng.random() < 0.97:
+            for key in _TOGETHER:
+                tree.pop(key, None)
         for low, high in (("min_step_us", "max_step_us"),):
             if all(isinstance(tree.get(k), (int, float)) for k in (low, high)) and self.rng.random() < 0.9:
                 tree[low], tree[high] = sorted((tree[low], tree[high]))
@@ -324,6 +323,9 @@ def make(seed: int, what: str, number: int) -> Case:
                 if models and rng.random() < 0.85
                 else maker.value(name, info.annotation, info.metadata)
             )
+    if rng.random() < 0.97:
+        for name in _RIG:
+            tree.pop(name, None)
     for name in ("seed", "gl", "output"):
         if _has_distribution(tree.get(name)):
             del tree[name]

@@ -263,7 +263,7 @@ def of_explanation(told: Explanation, config: SequenceConfig, report: SequenceRe
         # An estimate, from the pace at a few moments of a clip of 40 ms; of a budget a prior until it has measured.
         low, high = sorted((told.frames, manifest["frames"]))
         found.expect(
-            high <= 10 + (12 if config.timeline.kind == "budget" else 6) * low,
+            high <= 10 + (14 if config.timeline.kind == "budget" else 6) * low,
             f"event frames: explain {told.frames}, made {manifest['frames']}",
         )
     for what, off in (

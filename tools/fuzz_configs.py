@@ -313,7 +313,11 @@ def make(seed: int, what: str, number: int) -> Case:
     tree: dict[str, Any] = {}
     for name, info in SequenceConfig.model_fields.items():
         if rng.random() < (
-            0.15 if name in ("frames", "quality", "sensor", "readout", "gl", "output", "images") else 0.5
+            0.02
+            if name in _RIG
+            else 0.15
+            if name in ("frames", "quality", "sensor", "readout", "gl", "output", "images", "imu", "tracks")
+            else 0.5
         ):
             models = [m for m in members(info.annotation) if is_model(m)]
             if name == "scene" and rng.random() < 0.7:
@@ -323,9 +327,6 @@ def make(seed: int, what: str, number: int) -> Case:
                 if models and rng.random() < 0.85
                 else maker.value(name, info.annotation, info.metadata)
             )
-    if rng.random() < 0.97:
-        for name in _RIG:
-            tree.pop(name, None)
     for name in ("seed", "gl", "output"):
         if _has_distribution(tree.get(name)):
             del tree[name]

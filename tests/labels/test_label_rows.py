@@ -317,7 +317,9 @@ def test_disparity_is_f_b_over_z_of_any_sign_of_b():
     depth = np.array([[0.0, 2.0, 4.0]], np.float32)
 
     def of(baseline):
-        scene = SimpleNamespace(camera=SimpleNamespace(fx=80.0), sensors=[SimpleNamespace(baseline=baseline)])
+        scene = SimpleNamespace(
+            camera=SimpleNamespace(disparity=lambda z, b: 80.0 * b / z), sensors=[SimpleNamespace(baseline=baseline)]
+        )
         drawn = SimpleNamespace(scene=scene, raw=lambda name: depth)
         return LABELS["disparity"].finish(drawn), LABELS["disparity"].reference(scene, SimpleNamespace(depth=depth))
 

@@ -31,6 +31,8 @@ FILES = {
     "both.yaml": "camera: {fov: 60, focal: 300}\n",
     "kind.yaml": "timeline: {kind: sometimes}\n",
     "flow.yaml": "labels: {flow: both}\n",
+    "interval.yaml": "labels: {flow: [1/100, 1/0]}\n",
+    "far_interval.yaml": "labels: {flow: [0.1, 5]}\ntime: {duration: 2}\n",
     "emulator.yaml": "events: {emulator: magic}\n",
     "curve.yaml": "events: {emulator: v2e}\ntimeline: {kind: uniform, reconstruction: pchip}\n",
     "sensor.yaml": "sensor: davis1000\n",

@@ -51,12 +51,14 @@ class Geometry(ScenePass):
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
         programs, values = painter.programs(self), self._values(shot)
+        of_shapes = {name for label in self.names for name in LABELS[label].of_shapes}
         checked = set()
         for item in self.items(shot.moment) if items is None else items:
             uniforms = programs[item.kind]
             if item.kind not in checked:
                 checked.add(item.kind)
-                self._check(uniforms, values, item)
+                given = {k: v for k, v in values.items() if item.deformer is not None or k not in of_shapes}
+                self._check(uniforms, given, item)
             painter.place(uniforms, item, shot.moment)
             if item.deformer is not None:
                 painter.deform(uniforms, item, shot)
@@ -65,6 +67,8 @@ class Geometry(ScenePass):
             if self.lens and painter.lens is not None:
                 painter.lens.set(uniforms, shot, LENS_UNIT)
             for name, (_, rows) in values.items():
+                if item.deformer is None and name in of_shapes:
+                    continue
                 uniforms[name].write(rows[item.object_index])
             painter.draw(uniforms, item)
 
@@ -110,6 +114,7 @@ class Geometry(ScenePass):
 
     @classmethod
     def every_kind(cls) -> Iterator[Pass]:
+        # None looks at what another one writes, so that each alone, any two beside each other and all of them will do.
         drawn = [name for name, label in LABELS.items() if label.buffer]
-        yield from (cls(names) for count in range(1, len(drawn) + 1) for names in combinations(drawn, count))
+        yield from (cls(names) for count in {1, 2, len(drawn)} for names in combinations(drawn, count))
         yield from (cls(tuple(drawn[:8]), lens) for lens in ("RADTAN", "EQUIDISTANT"))

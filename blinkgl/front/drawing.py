@@ -12,7 +12,8 @@ from blinkgl.config.base import validate
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
-from blinkgl.front.runs import MAX_INDEX, OF_EVENTS, Source, configured, label_names, labels_tree, scene_of
+from blinkgl.front.runs import MAX_INDEX, Source, configured, scene_of
+from blinkgl.front.sections import OF_EVENTS, label_names, labels_tree
 from blinkgl.gl import create_context
 from blinkgl.labels import LabelFrame, asked_for
 from blinkgl.render.renderer import Renderer as SceneRenderer

@@ -85,6 +85,8 @@ COMMANDS = [
     "generate both.yaml --out out",
     "generate kind.yaml --out out",
     "generate flow.yaml --out out",
+    "generate interval.yaml --out out",
+    "generate far_interval.yaml --out out",
     "generate emulator.yaml --out out",
     "generate curve.yaml --out out",
     "generate sensor.yaml --out out",

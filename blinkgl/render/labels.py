@@ -103,7 +103,7 @@ class Labels:
         return self._kept[key]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Seen:
     """All that was drawn of one time. drawn : buffers.   ends : where labels lead, ns, by ``towards``.
     there : buffers at those times.   leading : frames of labels that lead over intervals, by those."""

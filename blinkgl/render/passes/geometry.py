@@ -52,12 +52,14 @@ class Geometry(ScenePass):
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
         programs, values = painter.programs(self), self._values(shot)
+        of_shapes = {name for label in self.names for name in LABELS[label].of_shapes}
         checked = set()
         for item in self.items(shot.moment) if items is None else items:
             uniforms = programs[item.kind]
             if item.kind not in checked:
                 checked.add(item.kind)
-                self._check(uniforms, values, item)
+                given = {k: v for k, v in values.items() if item.deformer is not None or k not in of_shapes}
+                self._check(uniforms, given, item)
             painter.place(uniforms, item, shot.moment)
             if item.deformer is not None:
                 painter.deform(uniforms, item, shot)
@@ -66,6 +68,8 @@ class Geometry(ScenePass):
             if self.lens and painter.lens is not None:
                 painter.lens.set(uniforms, shot, LENS_UNIT)
             for name, (_, rows) in values.items():
+                if item.deformer is None and name in of_shapes:
+                    continue
                 uniforms[name].write(rows[item.object_index])
             painter.draw(uniforms, item)
 

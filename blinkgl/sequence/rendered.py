@@ -183,7 +183,7 @@ class RenderedSequence(Simulation):
         request, interval = asked_for(self.sensor.labels), self.config.time.interval_ns
         last = k == self.config.time.label_count
         if last:
-            request = LabelRequest(*(name for name in request if LABELS[name].at_last))
+            request = request.only(name for name in request if LABELS[name].at_last)
         return self._truth_over(k, t_ns, interval, request, last)
 
     def truth(self, t_ns: int, span_ns: int) -> GroundTruth:
@@ -191,6 +191,7 @@ class RenderedSequence(Simulation):
         return self._truth_over(-1, t_ns, span_ns, asked_for(self.sensor.labels), False)
 
     def _truth_over(self, k: int, t_ns: int, span_ns: int, request: LabelRequest, last: bool) -> GroundTruth:
+        request = request.within(self.scene.t0_ns - t_ns, self.scene.t1_ns - t_ns)
         frame = self.renderer.labels(t_ns, request, t_ns + span_ns, t_ns - span_ns, self._rectified)
         camera, objects = poses_at(self.scene, [t_ns])
         leads_to = (None, None) if last else (t_ns + span_ns, t_ns - span_ns)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from itertools import combinations
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -21,6 +20,8 @@ if TYPE_CHECKING:
 MADE.append(includes)
 LENS_UNIT = 7
 """Texture unit of what a lens's pixels look at."""
+MOST_BUFFERS = 8
+"""Outputs that every OpenGL 4 has (GL_MAX_DRAW_BUFFERS)."""
 _OF_THE_PASS = {
     "", "mvp", "inverse_depths", "image_size", "clip_rate", "clip_forward", "clip_backward", "coverage", "cutoff",
     "lens_claims", "lens_plane", "lens_focal", "lens_limit", "lens_k",
@@ -114,7 +115,9 @@ class Geometry(ScenePass):
 
     @classmethod
     def every_kind(cls) -> Iterator[Pass]:
-        # None looks at what another one writes, so that each alone, any two beside each other and all of them will do.
+        """Each label alone, which lacks what it leaves to another, and all at once, where two get in each other's way:
+        of subsets there are twice as many with every label more."""
         drawn = [name for name, label in LABELS.items() if label.buffer]
-        yield from (cls(names) for count in {1, 2, len(drawn)} for names in combinations(drawn, count))
-        yield from (cls(tuple(drawn[:8]), lens) for lens in ("RADTAN", "EQUIDISTANT"))
+        yield from (cls((name,)) for name in drawn)
+        yield cls(tuple(drawn[:MOST_BUFFERS]))
+        yield from (cls(tuple(drawn[:MOST_BUFFERS]), lens) for lens in ("RADTAN", "EQUIDISTANT"))

@@ -116,8 +116,8 @@ def unused(sources: dict[str, ShaderSource], members: set[str]) -> list[Diagnost
     text = {stage: active_lines(source.text) for stage, source in sources.items()}
     words = {stage: re.findall(r"\w+", "\n".join(line for _, line in lines)) for stage, lines in text.items()}
     inputs = {name for kind, name, *_ in _declarations(text["fragment"]) if kind == "in"}
-    if GEOMETRY in text:  # which declares what it hands on by macros
-        inputs |= set(words[GEOMETRY])
+    if GEOMETRY in sources:  # which declares what it hands on by macros
+        inputs |= set(re.findall(r"\w+", sources[GEOMETRY].text))
     for stage, lines in text.items():
         for kind, name, number, column in _declarations(lines):
             mentioned = words[stage].count(name) > 1

@@ -27,6 +27,7 @@ from blinkgl.config.tracks import track_times
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.dataset.plan import Plan, sequence_name
 from blinkgl.dataset.run_folder import RunFolder
+from blinkgl.dataset.verify_labels import problems_of_asked
 from blinkgl.dataset.work import RUN_FOLDER
 from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.events.types import Cause
@@ -244,6 +245,7 @@ def contents(folder: Path, manifest: dict[str, Any], config: SequenceConfig) -> 
     if EVENT_LABELS in manifest["files"]:
         problems += _guarded(lambda: _check_truth(folder, manifest))
     problems += _guarded(lambda: _check_labels(folder, manifest))
+    problems += _guarded(lambda: problems_of_asked(folder, manifest, config))
     if config.imu is not None:
         problems += _guarded(lambda: _check_imu(folder, config))
     if config.tracks is not None:

@@ -28,7 +28,7 @@ def simulate_rig(
     sensor: str | None = None,
     timeline: Timeline | None = None,
     quality: str | None = None,
-    labels: Sequence[str] | None = None,
+    labels: Sequence[str | float] | None = None,
 ) -> RigSequence:
     """What happens at the sensors of one rig, in the order of time; nothing is written and nothing kept:
 
@@ -85,7 +85,7 @@ def record_rig(
     sensor: str | None = None,
     timeline: Timeline | None = None,
     quality: str | None = None,
-    labels: Sequence[str] | None = None,
+    labels: Sequence[str | float] | None = None,
 ) -> RigRecording:
     """What all sensors of a rig record of one sequence, as arrays: what :func:`generate` writes, held in memory.
 

@@ -66,7 +66,7 @@ class RigSensor(Piece):
         emulator: EmulatorSettings | None = None,
         sensor: str | os.PathLike | None = None,
         readout: Mapping[str, Any] | Config | None = None,
-        labels: Sequence[str] | None = None,
+        labels: Sequence[str | float] | None = None,
         images: ImageSettings | None = None,
         imu: ImuSettings | None = None,
         tracks: TrackSettings | None = None,

@@ -82,17 +82,22 @@ OF_EVENTS = ("events",)
 """Labels that are of events and not of a time."""
 
 
-def label_names(labels: Sequence[str]) -> set[str]:
-    """Raises ConfigError: no such label (:mod:`blinkgl.labels`)."""
+def label_names(labels: Sequence[str | float]) -> set[str | float]:
+    """Names, and intervals of flow, s. Raises ConfigError: no such label (:mod:`blinkgl.labels`)."""
     known = [*dict.fromkeys(label.said for label in LABELS.values()), *OF_EVENTS]
     wanted = check.one_of(labels, "labels", (list, tuple, set, frozenset), "a list of names of labels")
     for name in wanted:
-        if name not in known:
+        if name not in known and not is_interval(name):
             raise ConfigError("unknown label", where="labels", value=name, accepted=", ".join(known))
     return set(wanted)
 
 
-def labels_tree(labels: Sequence[str]) -> dict[str, Any]:
+def is_interval(label: Any) -> bool:
+    """Whether a label is the interval of a flow, s; which ones there may be says ``labels.flow``."""
+    return isinstance(label, (int, float)) and not isinstance(label, bool)
+
+
+def labels_tree(labels: Sequence[str | float]) -> dict[str, Any]:
     """``labels:`` that asks for these and no others. Raises ConfigError as :func:`label_names`."""
     wanted = label_names(labels)
     everything: dict[str, Any] = {}
@@ -101,5 +106,7 @@ def labels_tree(labels: Sequence[str]) -> dict[str, Any]:
         label.ask(everything)
         if label.said in wanted:
             label.ask(asked)
+    if intervals := [float(one) for one in wanted if is_interval(one)]:
+        asked["flow"] = [*asked.get("flow", ()), *sorted(intervals)]
     tree = {key: asked.get(key, [] if isinstance(value, list) else False) for key, value in everything.items()}
     return {**tree, **{name: name in wanted for name in OF_EVENTS}}

@@ -34,7 +34,7 @@ def simulate_sequence(
     sensor: str | None = None,
     timeline: Timeline | None = None,
     quality: str | None = None,
-    labels: Sequence[str] | None = None,
+    labels: Sequence[str | float] | None = None,
     images: ImageSettings | None = None,
     imu: ImuSettings | None = None,
     tracks: TrackSettings | None = None,
@@ -145,7 +145,7 @@ def record(
     sensor: str | None = None,
     timeline: Timeline | None = None,
     quality: str | None = None,
-    labels: Sequence[str] | None = None,
+    labels: Sequence[str | float] | None = None,
     images: ImageSettings | None = None,
     imu: ImuSettings | None = None,
     tracks: TrackSettings | None = None,
@@ -158,7 +158,8 @@ def record(
     timeline : :class:`Timeline`.
     quality : "fast", "balanced", "accurate" or "reference".
     labels : names of labels, such as images, flow, flow_backward, occlusion, depth
-    (docs/configuration.md has all); "events": what made each event, ``events.truth``; default: the source's.
+    (docs/configuration.md has all), and numbers: intervals of ``flow_intervals``, s; "events": what made each
+    event, ``events.truth``; default: the source's.
     images : a frame camera: the name of a preset, "deblurring", or a table of ``images:``, ``{"exposure_us": 10000}``.
     imu : an inertial unit: the name of a preset, "adis16448", or a table of ``imu:``, ``{"rate": 400}``.
     tracks : points on surfaces, followed: "grid", "random", "surface", or a table of ``tracks:``, ``{"points": 100}``.

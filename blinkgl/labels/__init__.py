@@ -14,9 +14,11 @@ from blinkgl.labels.flow import FlowTo
 from blinkgl.labels.frames import Flow, LabelFrame, LabelRequest
 from blinkgl.labels.ids import Ids
 from blinkgl.labels.images import Images
+from blinkgl.labels.intervals import FlowIntervals, Flows, OcclusionIntervals, Occlusions
 from blinkgl.labels.label import Label
 from blinkgl.labels.normals import Normals
 from blinkgl.labels.occlusion import OcclusionAt
+from blinkgl.labels.scene_flow import SceneFlow
 from blinkgl.labels.table import LABELS, asked_for, label_of, register, unregister
 from blinkgl.labels.velocity import Velocity
 
@@ -31,16 +33,21 @@ for _row in (
     FlowTo("backward"),
     OcclusionAt("forward"),
     OcclusionAt("backward"),
+    SceneFlow(),
+    FlowIntervals(),
+    OcclusionIntervals(),
 ):
     register(_row)
 
 __all__ = [
     "LABELS",
     "Flow",
+    "Flows",
     "Form",
     "Label",
     "LabelFrame",
     "LabelRequest",
+    "Occlusions",
     "asked_for",
     "label_of",
     "register",

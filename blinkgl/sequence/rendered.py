@@ -40,13 +40,19 @@ SURFACES = LabelRequest("ids", "depth", "velocity")
 
 
 def drawn(
-    renderer: Renderer, times: Iterable[int], rates: bool = False, surfaces: bool = False
+    renderer: Renderer, times: Iterable[int], rates: bool = False, surfaces: bool = False, textures: bool = False
 ) -> Iterator[EventFrame]:
     """The frames of the event pass at ``times``, ns; a :class:`Timeline` is told every one.
-    rates : with d(luminance)/dt.   surfaces : with what every pixel shows."""
+    rates : with d(luminance)/dt.   surfaces : with what every pixel shows.   textures : as they lie on the card, where
+    the timeline does not look at them; without rates then."""
     observe, frame = times.observe if isinstance(times, Timeline) else None, None
+    textures = textures and not rates and not (isinstance(times, Timeline) and times.looks_at_frames)
     for t_ns in times:
         before, frame = frame, renderer.luminance(t_ns, rate=rates)
+        if textures:
+            shown = surfaces_at(renderer, t_ns) if surfaces else None
+            yield EventFrame(t_ns, frame.texture(), None, frame.rows_changed_since(before), shown)
+            continue
         luminance, rate = frame.view(), frame.view("rate") if rates else None
         if observe is not None:
             observe(t_ns, luminance, rate)
@@ -143,7 +149,13 @@ class RenderedSequence(Simulation):
     def _event_pass(self) -> Iterator[tuple[int, Events]]:
         try:
             yield from emulate(
-                drawn(self.renderer, self.timeline, self.camera.emulator.needs_rate, self.camera.tells),
+                drawn(
+                    self.renderer,
+                    self.timeline,
+                    self.camera.emulator.needs_rate,
+                    self.camera.tells,
+                    self.camera.takes_textures(self.renderer.gl),
+                ),
                 self.camera,
                 self.clock,
             )
@@ -171,7 +183,7 @@ class RenderedSequence(Simulation):
         request, interval = asked_for(self.sensor.labels), self.config.time.interval_ns
         last = k == self.config.time.label_count
         if last:
-            request = LabelRequest(*(name for name in request if LABELS[name].at_last))
+            request = request.only(name for name in request if LABELS[name].at_last)
         return self._truth_over(k, t_ns, interval, request, last)
 
     def truth(self, t_ns: int, span_ns: int) -> GroundTruth:
@@ -179,6 +191,7 @@ class RenderedSequence(Simulation):
         return self._truth_over(-1, t_ns, span_ns, asked_for(self.sensor.labels), False)
 
     def _truth_over(self, k: int, t_ns: int, span_ns: int, request: LabelRequest, last: bool) -> GroundTruth:
+        request = request.within(self.scene.t0_ns - t_ns, self.scene.t1_ns - t_ns)
         frame = self.renderer.labels(t_ns, request, t_ns + span_ns, t_ns - span_ns, self._rectified)
         camera, objects = poses_at(self.scene, [t_ns])
         leads_to = (None, None) if last else (t_ns + span_ns, t_ns - span_ns)

@@ -271,7 +271,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
     },
     "flow": {
         "forward": NOTHING,
-        "both": {"labels": {"flow": ["forward", "backward"]}},
+        "all ways": {"labels": {"flow": ["forward", "backward", 0.004, -0.01]}},
         "backward": {"labels": {"flow": ["backward"]}},
         "none": {"labels": {"flow": []}},
     },

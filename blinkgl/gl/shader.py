@@ -278,7 +278,11 @@ class ShaderLoader:
     def _compile(self, name: str, defines: Mapping[str, Any] | None) -> moderngl.Program:
         sources = {stage: expand(name, stage, defines, self.folder) for stage in stages_of(defines)}
         try:
-            program = self.ctx.program(**{f"{stage}_shader": source.text for stage, source in sources.items()})
+            program = self.ctx.program(
+                vertex_shader=sources["vertex"].text,
+                geometry_shader=sources[GEOMETRY].text if GEOMETRY in sources else None,
+                fragment_shader=sources["fragment"].text,
+            )
         except moderngl.Error as error:
             raise translate(str(error), sources) from None
         self._made[name, normalised(defines)] = {

@@ -94,7 +94,7 @@ def sources(folder=None) -> dict[str, str]:
     out = {}
     for name in PRODUCTION:
         for defines in variants.variants(name):
-            for stage in STAGES:
+            for stage in stages_of(defines):
                 out[f"{name} {stage} {normalised(defines)}"] = hashlib.sha256(
                     expand(name, stage, defines, folder).text.encode()
                 ).hexdigest()

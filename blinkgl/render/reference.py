@@ -525,14 +525,15 @@ def shone(
     part = gloss.energy_at(nv, roughness)
     lost = (1.0 / part.sum(axis=1) - 1.0)[:, None]
     mix = metallic[:, None]
-    clear, metal = 1.0 + gloss.DIELECTRIC * lost, 1.0 + albedo * lost
+    clear = 1.0 + gloss.several(np.full((1, 1), gloss.DIELECTRIC), roughness) * lost
+    metal = 1.0 + gloss.several(albedo, roughness) * lost
     even_clear = clear * (gloss.DIELECTRIC * part[:, :1] + part[:, 1:])
     even_metal = metal * (albedo * part[:, :1] + part[:, 1:])
     away = 2.0 * (normal * eye).sum(axis=1, keepdims=True) * normal - eye
     if id(scene.light) not in _surroundings:
         _surroundings.clear()
         _surroundings[id(scene.light)] = scene.light, surroundings_of(scene.light)
-    around = gloss.mirrored(_surroundings[id(scene.light)][1], away, roughness)
+    around = gloss.mirrored(_surroundings[id(scene.light)][1], gloss.looked_at(normal, away, roughness), roughness)
     out = around * (even_clear * (1 - mix) + even_metal * mix)
     for k, lamp in enumerate(lamps_of(scene.light)):
         towards, _ = beam(lamp, lamp.path.pose(t_ns), points)

@@ -324,7 +324,8 @@ def _map(config: MaterialConfig, key: str, base: Path, where: str, maps: Mapping
         return None
     data = _image(resolve(given, base), f"{where}.{key}", given)
     decode = decode_image if key == "emission_map" else decode_numbers
-    return Map(Texture(decode(data, config.max_size, given), Path(given).name, content_hash(data)))
+    pixels = decode(data, config.max_size, f"{where}.{key}: {given}")
+    return Map(Texture(pixels, Path(given).name, content_hash(data)))
 
 
 def _mask(config: MaterialConfig, base: Path, where: str, maps: Mapping[str, np.ndarray]) -> Mask | None:
@@ -334,15 +335,16 @@ def _mask(config: MaterialConfig, base: Path, where: str, maps: Mapping[str, np.
         return None
     if alpha is None:
         data = _image(resolve(config.mask, base), f"{where}.mask", config.mask)
-        alpha = decode_alpha(data, config.max_size, config.mask)
+        said = f"{where}.mask: {config.mask}"
+        alpha = decode_alpha(data, config.max_size, said)
         if alpha is None:
-            alpha = decode_numbers(data, config.max_size, config.mask).mean(axis=2).round().astype(np.uint8)
+            alpha = decode_numbers(data, config.max_size, said).mean(axis=2).round().astype(np.uint8)
     if alpha.max() < 255 * config.cutoff:
         raise ConfigError(
             "nothing of the surface is left",
             where=f"{where}.cutoff",
             value=config.cutoff,
-            accepted=f"at most {alpha.max() / 255:.3g}, the mask's largest value",
+            accepted=f"a mask that reaches it; its largest value is {alpha.max() / 255:.3g}",
         )
     return Mask(alpha, cutoff=config.cutoff) if alpha.min() < 255 * config.cutoff else None
 

@@ -294,8 +294,9 @@ def make_light(bpy, scene, job: dict, panorama: np.ndarray | None, sky: float) -
     world = scene.world = bpy.data.worlds.new("world")
     world.use_nodes = True
     # The surface's own cosine distribution finds a dome best; a panorama is looked for where it is bright, by rays that
-    # what casts shadows would stop.
-    by_brightness = panorama is not None and not job["settings"]["shadows"]
+    # what casts shadows would stop; what mirrors finds it in its mirror.
+    smooth = any(paint["gloss"] is not None and paint["gloss"][1] < 0.3 for paint in job["materials"])
+    by_brightness = panorama is not None and not job["settings"]["shadows"] and not smooth
     world.cycles.sampling_method = "AUTOMATIC" if by_brightness else "NONE"
     tree = world.node_tree
     tree.nodes.clear()

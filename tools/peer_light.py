@@ -92,8 +92,8 @@ def matt(light: Light, size=(128, 96), **paint) -> Scene:
     )
 
 
-def metal(light: Light, size=(160, 64)) -> Scene:
-    """Five balls of metal, of :data:`ROUGHNESSES`."""
+def metal(light: Light, smooth: bool, size=(160, 64)) -> Scene:
+    """Balls of metal, of the smooth ones of :data:`ROUGHNESSES` or of the others."""
     ball = sphere(radius=0.42, segments=128, rings=64)
     balls = [
         _body(
@@ -103,6 +103,7 @@ def metal(light: Light, size=(160, 64)) -> Scene:
             Material(base_color=(1.0, 0.77, 0.34), gloss=Gloss(1.0, roughness)),
         )
         for k, roughness in enumerate(ROUGHNESSES)
+        if (roughness < 0.3) is smooth
     ]
     scene = _seen(balls, light, size)
     return scene.with_camera(replace(scene.camera, fx=0.9 * size[0], fy=0.9 * size[0]))
@@ -159,11 +160,13 @@ def cases(panoramas: Path | None) -> Iterator[Case]:
     yield Case("light of its own", matt(plain, emission=(0.3, 0.2, 0.5)), (2, 3, 4))
     yield Case("holes", matt(plain, mask=lattice()), every)
     yield Case("colours of vertices", tinted(matt(plain)), (2, 3, 4))
-    yield Case("metal, sun and sky", metal(plain), (1, 2, 3, 4, 5))
+    for smooth in (True, False):
+        yield Case("metal, sun and sky", metal(plain, smooth), (1, 2, 3, 4, 5))
     for file in sorted(panoramas.glob("*.hdr")) if panoramas is not None else ():
         light = panorama_light(file, 0.0, 1.0, Light(), file.name)
         yield Case(f"panorama {file.stem}", matt(light), every)
-        yield Case(f"metal, panorama {file.stem}", metal(light), (1, 2, 3, 4, 5))
+        for smooth in (True, False):
+            yield Case(f"metal, panorama {file.stem}", metal(light, smooth), (1, 2, 3, 4, 5))
 
 
 def compared(gl, case: Case, samples: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, reference.ReferenceFrame]:
@@ -199,6 +202,7 @@ def main() -> None:
             rows = [(case.name, graded)]
             if case.name.startswith("metal"):
                 rows = [(f"{case.name}, {r:g}", graded & (true.instance == k + 1)) for k, r in enumerate(ROUGHNESSES)]
+                rows = [(name, on) for name, on in rows if on.any()]
             for name, on in rows:
                 median, most = (100 * np.quantile(error[on], q) for q in (0.5, 0.95))
                 print(f"{name:34} {on.sum():7} {median:7.2f}% {most:7.2f}%", flush=True)

@@ -533,7 +533,8 @@ def shone(
     if id(scene.light) not in _surroundings:
         _surroundings.clear()
         _surroundings[id(scene.light)] = scene.light, surroundings_of(scene.light)
-    around = gloss.mirrored(_surroundings[id(scene.light)][1], gloss.looked_at(normal, away, roughness), roughness)
+    there = gloss.looked_at(normal, away, nv, roughness)
+    around = gloss.mirrored(_surroundings[id(scene.light)][1], *there)
     out = around * (even_clear * (1 - mix) + even_metal * mix)
     for k, lamp in enumerate(lamps_of(scene.light)):
         towards, _ = beam(lamp, lamp.path.pose(t_ns), points)

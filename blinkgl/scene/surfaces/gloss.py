@@ -84,12 +84,15 @@ def several(F0: np.ndarray, roughness: np.ndarray) -> np.ndarray:
     return F * E / (1.0 - F * (1.0 - E))
 
 
-def looked_at(normal: np.ndarray, away: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """(N, 3) unit directions in which surroundings are looked up of surfaces that mirror towards ``away``: the lobe of
-    a rough one leans towards the normal. Fitted against a path tracer (docs/results.md)."""
-    share = (1.0 - roughness**2.5)[:, None]
+def looked_at(
+    normal: np.ndarray, away: np.ndarray, cosine: np.ndarray, roughness: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 3) unit directions and (N,) roughnesses at which surroundings are looked up of surfaces that mirror towards
+    ``away``: the lobe of a rough one leans towards the normal, and is narrower where the eye, at (N,) cosines, looks
+    along the surface, than :func:`blurred` has it. Fitted against a path tracer (docs/results.md)."""
+    share = ((1.0 - roughness**2) * (0.8 + 0.4 * cosine))[:, None]
     way = share * away + (1.0 - share) * normal
-    return way / np.linalg.norm(way, axis=1, keepdims=True)
+    return way / np.linalg.norm(way, axis=1, keepdims=True), roughness * (0.875 + 0.25 * cosine)
 
 
 def energy_at(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:

@@ -81,7 +81,10 @@ def test_every_map_is_among_the_files_that_workers_compare(folder):
     "material, words",
     [
         ({"normal_map": "no.png"}, r"scene\.materials\.m\.normal_map: no such file .got 'no\.png'.; expected an image"),
-        ({"normal_map": "bright.hdr"}, r"materials\.m\.normal_map: bright\.hdr: a map of numbers has high dynamic range"),
+        (
+            {"normal_map": "bright.hdr"},
+            r"materials\.m\.normal_map: bright\.hdr: a map of numbers has high dynamic range",
+        ),
         ({"mask": "black.png"}, r"materials\.m\.cutoff: nothing of the surface is left .got 0\.5.; expected a mask"),
         ({"mask": "mask.png", "cutoff": 0}, r"materials\.m\.cutoff: too small"),
         ({"emission_map": "mask.png"}, r"materials\.m\.emission: a map of light that is none"),

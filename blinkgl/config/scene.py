@@ -17,6 +17,7 @@ from blinkgl.config.base import Config, Refused, one_of, rule
 from blinkgl.config.deform import AnimationConfig, DeformConfig, RandomDeformConfig
 from blinkgl.config.materials import TEXTURE_KINDS, MaterialConfig, Radiance, TextureKind
 from blinkgl.config.physics import BodyConfig, PhysicsConfig, RandomPhysicsConfig
+from blinkgl.config.places import Matrix, check_rigid
 from blinkgl.config.trajectory import CameraMotion, ObjectMotion
 
 PRIMITIVE_KINDS = ("cuboid", "cylinder", "sphere", "icosphere", "cone", "torus", "capsule", "prism", "pyramid")
@@ -498,6 +499,16 @@ class TrajectoryConfig(Config):
         description="each pose becomes the mean of those within so many s before and after, weighed by a triangle; 0: "
         "the spline passes them all",
     )
+    T_body_sensor: str | Matrix | None = Field(
+        None,
+        description="where this camera or object is on the body whose poses the file has, from its axes to the body's: "
+        "EuRoC's sensor.yaml, whose T_BS that is, or four rows of four; null: it is that body",
+    )
+
+    @rule("T_body_sensor")
+    def _a_place(place):
+        if place is not None and not isinstance(place, str):
+            check_rigid(place, "T_body_sensor")
 
 
 class KeyedMotionConfig(PoseConfig):

@@ -45,7 +45,7 @@ from blinkgl.scene.worlds.explicit import InMemory, explicit_scene, primitive_me
 Vector = Sequence[float] | np.ndarray
 
 
-class _Piece:
+class Piece:
     """A value that is checked when it is made. ``tree``: itself as plain data, as the YAML has it."""
 
     tree: dict[str, Any]
@@ -67,7 +67,7 @@ class _Piece:
         return f"{type(self).__name__}({', '.join(f'{k}={v!r}' for k, v in self.tree.items())})"
 
 
-class Pose(_Piece):
+class Pose(Piece):
     """Where a body or a camera is, and at most one way to say how it is turned.
 
     position : (3,) m.   euler : (3,) degrees about the world's x, then y, then z.   quaternion : (4,) w, x, y, z.
@@ -94,7 +94,7 @@ def look_at(position: Vector, target: Vector) -> Pose:
     return Pose(position, look_at=target)
 
 
-class Keyframes(_Piece):
+class Keyframes(Piece):
     """A motion through poses: ``Keyframes({0.0: Pose(…), 1.5: Pose(…)})``, held before
     the first time and after the last.
 
@@ -115,12 +115,13 @@ class Keyframes(_Piece):
         )
 
 
-class Trajectory(_Piece):
+class Trajectory(Piece):
     """A motion from a file, TUM's or EuRoC's, by a spline: ``Camera(pose=Trajectory("flight.txt"))``.
 
     file : path.   form : "tum", "euroc"; "auto": EuRoC's where lines have commas.   start : s on the file's clock that
     are 0 s on the scene's; None: its first pose is where the sequence begins.   smooth : s, each pose becomes the mean
-    of those within it.
+    of those within it.   T_body_sensor : where the camera or body that follows it is on the body whose poses these are:
+    (4, 4), or the path of EuRoC's sensor.yaml, whose T_BS that is; None: it is that body.
     Raises ConfigError; a file that does not cover the sequence is found when the scene is built."""
 
     def __init__(
@@ -130,8 +131,14 @@ class Trajectory(_Piece):
         form: Literal["auto", "tum", "euroc"] = "auto",
         start: float | None = None,
         smooth: float = 0.0,
+        T_body_sensor: ArrayLike | str | os.PathLike | None = None,
     ):
         tree = check.given(file=os.fspath(check.path(file, "file").absolute()), form=form, start=start, smooth=smooth)
+        if isinstance(T_body_sensor, (str, os.PathLike)):
+            tree["T_body_sensor"] = os.fspath(check.path(T_body_sensor, "T_body_sensor").absolute())
+        elif T_body_sensor is not None:
+            place = check.array(T_body_sensor, "Trajectory.T_body_sensor", (4, 4), "a file, or an array (4, 4)")
+            tree["T_body_sensor"] = check.plain(place)
         self.tree = self._checked(KeyedMotionConfig, {"trajectory": tree}, trajectory="")
 
 
@@ -145,7 +152,7 @@ def _motion(pose: Pose | Keyframes | Trajectory | Vector, where: str, others: st
     return Pose(pose).tree
 
 
-class Camera(_Piece):
+class Camera(Piece):
     """A camera, its lens and its motion.
 
     width, height : px (default 346 x 260).   fov : horizontal field of view, degrees (default 60), or focal : focal
@@ -188,7 +195,7 @@ class Camera(_Piece):
         self.motion = _motion(pose, "Camera.pose")
 
 
-class Light(_Piece):
+class Light(Piece):
     """A sun and a sky: a white surface with normal n has radiance sun * max(0, n . s) + sky * (0.5 + 0.5 n_z); and
     lights beside them.
 
@@ -239,7 +246,7 @@ class Light(_Piece):
         self.tree = self._checked(LightConfig, tree, sun_elevation="elevation", sun_azimuth="azimuth")
 
 
-class Material(_Piece):
+class Material(Piece):
     """A surface: ``color`` times at most one texture, matt or with a gloss, and light of its own.
 
     image : an image file (sRGB; .hdr is linear), or an array: (h, w, 3) uint8 sRGB, or
@@ -344,7 +351,7 @@ def _texture(image: Any) -> data.Texture:
     return data.Texture(pixels, "image", content_hash(str((pixels.dtype, pixels.shape)).encode(), pixels.tobytes()))
 
 
-class Body(_Piece):
+class Body(Piece):
     """What falls, or is fallen on: ``Primitive("cuboid", body=Body(velocity=(1, 0, 2)))`` (docs/scenes.md, "Dynamics").
 
     kind : "dynamic" falls; "fixed" stays, or goes its way, whatever hits it; "none" is not there.
@@ -381,7 +388,7 @@ class Body(_Piece):
         self.tree = self._checked(BodyConfig, tree)
 
 
-class Deform(_Piece):
+class Deform(Piece):
     """How a body's shape changes with time, by formula: ``Mesh("tree.glb", deform=Deform("bend", angle=10))``.
 
     kind : "wave", "flag", "twist", "bend", "breathe", or that of a deformer of your own.
@@ -395,7 +402,7 @@ class Deform(_Piece):
         self.tree = tree
 
 
-class Animation(_Piece):
+class Animation(Piece):
     """A clip that a glTF file's skins, morph targets and nodes play, or two at once: ``Mesh("ann.glb",
     animation=Animation("Walk", speed=1.2))``.
 
@@ -428,7 +435,7 @@ class Animation(_Piece):
         self.tree = self._checked(AnimationConfig, tree)
 
 
-class Way(_Piece):
+class Way(Piece):
     """A curve that a body follows at one speed, its x axis ahead: the ``pose`` of a figure that walks.
 
     points : (N, 3) m, two or more, which the curve passes smoothly; beyond its ends it goes straight on.
@@ -451,7 +458,7 @@ class Way(_Piece):
         self.tree = tree
 
 
-class _Object(_Piece):
+class _Object(Piece):
     """What primitives and meshes share: an object of the scene, its mesh and its material."""
 
     mesh: dict[str, Any]
@@ -595,7 +602,7 @@ def _triangles(vertices: ArrayLike, faces: ArrayLike, uvs: ArrayLike | None) -> 
         raise ConfigError(error.problem, where="Mesh.vertices", value=error.value, accepted=error.accepted) from None
 
 
-class Scene(_Piece):
+class Scene(Piece):
     """Bodies before a camera, for a time. ``scene + body`` is a scene with one more.
 
     camera : :class:`Camera`.   objects : :class:`Primitive` and :class:`Mesh`; ids count from 1 in this order.
@@ -713,8 +720,8 @@ class Scene(_Piece):
 
     def build(self, config: SequenceConfig) -> data.Scene:
         """What the renderer draws. Raises ConfigError and AssetError: files."""
-        from blinkgl.scene.build import in_fog
+        from blinkgl.scene.build import equipped, in_fog, seen_by
 
         span_ns = config.time.t0_ns, config.time.t1_ns
-        made = explicit_scene(config.scene, config.camera.model, *span_ns, Path.cwd(), self._memory)
-        return in_fog(made, config.scene)
+        made = explicit_scene(config.scene, seen_by(config).model, *span_ns, Path.cwd(), self._memory)
+        return equipped(in_fog(made, config.scene), config)

@@ -345,6 +345,15 @@ def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
     return Flow(int(t_ns), flow, valid, occluded, valid & ~inside, depth, hidden_by)
 
 
+def moved_in_space(scene: Scene, hits: Hits, t_ns: int) -> np.ndarray:
+    """(N, 3) how far every hit point moves in the world from ``hits.t_ns`` to t_ns, in the camera's axes at
+    ``hits.t_ns``; nan where nothing is hit."""
+    own = replace(hits, local=local_at(scene, hits, t_ns) - hits.local)
+    carried = applied(scene, hits, lambda thing: (thing.path.pose(t_ns) - thing.path.pose(hits.t_ns))[:3])
+    changed = applied(scene, own, lambda thing: np.c_[thing.path.pose(t_ns)[:3, :3], np.zeros(3)])
+    return (carried + changed) @ scene.camera_path.pose(hits.t_ns)[:3, :3]
+
+
 def is_seen(
     scene: Scene, hits: Hits, t_ns: int, moved: np.ndarray, candidate: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:

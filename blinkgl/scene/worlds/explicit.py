@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from blinkgl.camera import CameraModel
 from blinkgl.config.deform import AnimationConfig, animation_of
 from blinkgl.config.materials import MaterialConfig
+from blinkgl.config.places import rigid_matrix
 from blinkgl.config.scene import (
     LIVING_KINDS,
     ExplicitSceneConfig,
@@ -33,7 +34,7 @@ from blinkgl.scene.importing.mesh_files import Asset, load_asset
 from blinkgl.scene.lights import make_light
 from blinkgl.scene.motion.collision import resolve_collisions
 from blinkgl.scene.motion.dynamics import simulate
-from blinkgl.scene.motion.paths import KeyframePath, StaticPath, smoothed
+from blinkgl.scene.motion.paths import KeyframePath, OffsetPath, StaticPath, smoothed
 from blinkgl.scene.motion.trajectories import look_rotation
 from blinkgl.scene.motion.ways import way_path
 from blinkgl.scene.reading import contents
@@ -168,13 +169,13 @@ def motion_path(
 
 def trajectory_path(config: TrajectoryConfig, t0_ns: int, t1_ns: int, where: str, base: Path) -> PosePath:
     """A C2 spline through the poses of a file. Raises AssetError, as :func:`read_trajectory`, and ConfigError where the
-    file does not cover [t0, t1]."""
+    file does not cover [t0, t1], or does not say where on its body the sensor is."""
     from blinkgl.io.trajectories import read_trajectory
 
-    path = resolve(config.file, base)
-    if not path.is_file():
+    file = resolve(config.file, base)
+    if not file.is_file():
         raise ConfigError("no such file", where=f"{where}.file", value=config.file, accepted="a trajectory")
-    t_ns, poses = read_trajectory(path, None if config.form == "auto" else config.form)
+    t_ns, poses = read_trajectory(file, None if config.form == "auto" else config.form)
     t_ns = t_ns - (t_ns[0] - t0_ns if config.start is None else round(config.start * 1e9))
     if t_ns[0] > t0_ns or t_ns[-1] < t1_ns:
         raise ConfigError(
@@ -188,7 +189,20 @@ def trajectory_path(config: TrajectoryConfig, t0_ns: int, t1_ns: int, where: str
     last = int(np.searchsorted(t_ns, t1_ns + aside)) + _BEYOND
     t_ns, poses = t_ns[first:last], poses[first:last]
     positions, rotations = smoothed(t_ns, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]), aside)
-    return KeyframePath(t_ns, positions, rotations, "spline", where)
+    path = KeyframePath(t_ns, positions, rotations, "spline", where)
+    return path if config.T_body_sensor is None else OffsetPath(path, _on_body(config.T_body_sensor, where, base))
+
+
+def _on_body(given: Any, where: str, base: Path) -> np.ndarray:
+    """(4, 4) T_body_sensor, of a matrix or of EuRoC's sensor.yaml."""
+    from blinkgl.io.camchain import read_place_on_body
+
+    if not isinstance(given, str):
+        return rigid_matrix(given)
+    file = resolve(given, base)
+    if not file.is_file():
+        raise ConfigError("no such file", where=f"{where}.T_body_sensor", value=given, accepted="EuRoC's sensor.yaml")
+    return read_place_on_body(file)
 
 
 _BEYOND = 8

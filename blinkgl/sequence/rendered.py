@@ -111,6 +111,9 @@ class RenderedSequence(Simulation):
                 self.libraries = {scene.dynamics.engine: scene.dynamics.version}
             self.sensor = recording(scene, config).sensors[0]
             self.name = self.sensor.folder
+            if labels and self.sensor.labels is not None:
+                for name in asked_for(self.sensor.labels):
+                    LABELS[name].check(scene, self.sensor.labels)
             self.triangles, self._before = renderer.triangles, (renderer.stats.render_s, renderer.stats.readback_s)
             camera = None
             if events:
@@ -255,6 +258,12 @@ class RenderedSequence(Simulation):
         rng = generator(self.config.seed, self.index, Role.TRACKS, self.number)
         return track_points(scene, config, times, rng)
 
+    def _facts_of_labels(self) -> dict[str, Any]:
+        labels, facts = self.sensor.labels, {}
+        for name in () if labels is None else asked_for(labels):
+            facts.update(LABELS[name].facts(self.renderer.scene, labels))
+        return facts
+
     def facts(self) -> dict[str, Any]:
         gl, scene, timeline = self.renderer.gl, self.renderer.scene, self.config.timeline
         return {
@@ -262,6 +271,7 @@ class RenderedSequence(Simulation):
             "timeline": {"kind": timeline.kind, "reconstruction": timeline.reconstruction, **self.achieved},
             "triangles": self.triangles,
             "objects": [_described(o) for o in scene.objects],
+            **self._facts_of_labels(),
             "scene_log": list(scene.log),
             "not_drawn": list(scene.omissions),
             **({} if scene.dynamics is None else {"dynamics": _facts_of(scene.dynamics)}),

@@ -19,7 +19,7 @@ from blinkgl.render.painter import Painter
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.tools.shader_debugger import check, diagnostics, preprocess, timing, variants
-from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment
+from blinkgl.tools.shader_debugger.moments import GpuMoment, buffers_of
 from blinkgl.tools.shader_debugger.session import DebugRenderer, moment, open_folder, open_subject
 from debugger_scene import copy_shaders, edit
 
@@ -120,7 +120,7 @@ def test_production_programs_are_the_same_without_the_debugger(tmp_path, gl, con
     try:
         with DebugRenderer(gl, subject.scene, RenderConfig(image_antialiasing="none")) as renderer:
             made = GpuMoment(renderer, moment(subject), 1e-3)
-            for name in PASSES:
+            for name in buffers_of(subject.scene):
                 made[name]
         gl.shaders.clear()
     finally:

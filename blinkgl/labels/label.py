@@ -213,6 +213,10 @@ class Label:
         """Asks for it in a tree of ``labels:``."""
         tree[self.name] = True
 
+    def can_be_of(self, scene: Scene) -> bool:
+        """Whether it says anything of a scene: where it does not the shader debugger leaves it out."""
+        return True
+
     # ---- the shader and the CPU ----------------------------------------------------------------------------------
 
     def uniforms(self, shot: Shot) -> Mapping[str, np.ndarray]:

@@ -1,5 +1,5 @@
-"""What labels cost: processor time of each at label times one after another, drawn, read back and finished, in ms and in
-luminance frames; and of writing it.
+"""What labels cost: processor time of each at label times one after another, drawn, read back and finished, in ms and
+in luminance frames; and of writing it.
 
     python -m blinkgl.tools.bench_labels [configs/demo.yaml] [--size 640x480] [--rate 100] [--times 24]
 """

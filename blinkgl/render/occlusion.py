@@ -114,9 +114,9 @@ def occlusion_mask(
 
 @nb.njit(cache=True, nogil=True)
 def undecided(verdict: np.ndarray, flow: np.ndarray, z_there: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of the points of which ``verdict`` is UNDECIDED, row by row: (N,) number of the pixel, (N, 2) float64 px where they
-    are then, (N,) float64 how far away."""
-    height, width = verdict.shape
+    """Of the points of which ``verdict`` is UNDECIDED, row by row: (N,) number of the pixel, (N, 2) float64 px where
+    they are then, (N,) float64 how far away."""
+    width = verdict.shape[1]
     flat = verdict.reshape(-1)
     count = 0
     for k in range(len(flat)):
@@ -136,12 +136,14 @@ def undecided(verdict: np.ndarray, flow: np.ndarray, z_there: np.ndarray) -> tup
 
 @nb.njit(cache=True, nogil=True)
 def flow_and_reach(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W, 2) float32 px and (H, W) bool of the shader's (H, W, 4): u, v, and whether Z at the other time is above 0.
-    Elsewhere the shader has written no flow, and where nothing is hit there is nothing but 0."""
+    """(H, W, 2) float32 px, 0 where not valid, and (H, W) bool of the shader's (H, W, 4): u, v, Z at the other time,
+    which is to be above 0, and whether something is hit."""
     height, width = raw.shape[:2]
     flow, valid = np.empty((height, width, 2), np.float32), np.empty((height, width), np.bool_)
     for y in range(height):
         for x in range(width):
-            flow[y, x, 0], flow[y, x, 1] = raw[y, x, 0], raw[y, x, 1]
-            valid[y, x] = raw[y, x, 2] > 0.0
+            there = raw[y, x, 3] > 0.0 and raw[y, x, 2] > 0.0
+            valid[y, x] = there
+            flow[y, x, 0] = raw[y, x, 0] if there else 0.0
+            flow[y, x, 1] = raw[y, x, 1] if there else 0.0
     return flow, valid

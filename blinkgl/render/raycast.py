@@ -251,8 +251,8 @@ def _local_ray(axes, rx, ry, d):
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _balls(forest, origins, axes):
     """Balls round the parts, a little too large, camera axes: (P, 3) middles, (P,) radii, and (P,) the square of the
-    length of the tangents from the camera's centre, a little too short; <= 0: it is inside. Most rays pass most parts by,
-    and a ball says so for a tenth of what the first boxes of a tree cost."""
+    length of the tangents from the camera's centre, a little too short; <= 0: it is inside. Most rays pass most parts
+    by, and a ball says so before a ray is turned into a part's axes."""
     count = forest.root.shape[0]
     centre, radius, outside = np.empty((count, 3)), np.empty(count), np.empty(count)
     for p in range(count):

@@ -177,10 +177,25 @@ def qualify(
 
 @app.command()
 def trade(
-    config: Annotated[str, typer.Argument(help="YAML file; see configs/ for examples.")],
+    config: Annotated[
+        str | None, typer.Argument(help="YAML file; see configs/ for examples. With --suite: a folder of your scenes.")
+    ] = None,
     out: Annotated[
-        str, typer.Option("--out", "-o", help="Folder for trade.json, trade.csv, pareto.png and trade.html.")
+        str,
+        typer.Option(
+            "--out", "-o", help="Folder for trade.json, trade.csv, pareto.png and trade.html (--suite: suite.*)."
+        ),
     ] = "trade",
+    suite: Annotated[
+        bool, typer.Option("--suite", help="The shipped scenes, each hard in another way, in place of one.")
+    ] = False,
+    scene: Annotated[
+        list[str] | None,
+        typer.Option("--scene", metavar="TEXT", help="--suite: only scenes whose name contains this; may be repeated."),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="--suite: keep the scenes that --out holds already.")
+    ] = False,
     quick: Annotated[
         bool, typer.Option("--quick", help="Fewer settings, fewer pixels, a shorter clip: minutes.")
     ] = False,
@@ -210,7 +225,10 @@ def trade(
         float | None,
         typer.Option(min=0.1, help="Give up on further rounds and finer references after about this long."),
     ] = None,
-    cost: Annotated[str, typer.Option(help="What the front is drawn over: wall, or cpu on a busy machine.")] = "wall",
+    cost: Annotated[
+        str | None,
+        typer.Option(help="What the front is drawn over: wall (default), or cpu on a busy machine (--suite: cpu)."),
+    ] = None,
     reference: Annotated[
         str,
         typer.Option(
@@ -223,9 +241,33 @@ def trade(
     as a table, a plot and a page."""
     from blinkgl.show import trade as command
 
+    if suite:
+        from blinkgl.show import suite as suite_command
+
+        return suite_command.run(
+            config,
+            out,
+            overrides=overrides or [],
+            only=only or [],
+            skip=skip or [],
+            scenes=scene or [],
+            resume=resume,
+            limit_ms=limit_ms,
+            rounds=rounds,
+            minutes=minutes,
+            cost=cost or "cpu",
+            others={
+                "--quick": quick,
+                "--seed": seed is not None,
+                "--sequence": sequence is not None,
+                "--clip": clip is not None,
+                "--reference": reference != "raster",
+            },
+        )
     return command.run(
         config,
         out,
+        suite_options=[name for name, given in (("--scene", scene), ("--resume", resume)) if given],
         overrides=overrides or [],
         quick=quick,
         only=only or [],
@@ -235,7 +277,7 @@ def trade(
         limit_ms=limit_ms,
         rounds=rounds,
         minutes=minutes,
-        cost=cost,
+        cost=cost or "wall",
         reference=reference,
         seed=seed,
     )

@@ -30,6 +30,8 @@ _HOMES = {
         "Way",
         "look_at",
     ),
+    "blinkgl.front.rigs": ("Rig", "RigSensor"),
+    "blinkgl.front.rig_sequences": ("RigRecording", "record_rig", "simulate_rig"),
     "blinkgl.front.runs": ("Timeline", "generate", "load", "verify"),
     "blinkgl.front.sequences": ("Recording", "record", "simulate_sequence"),
     "blinkgl.front.drawing": ("Renderer", "render_frame"),
@@ -77,6 +79,8 @@ if TYPE_CHECKING:  # what a type checker and an editor see; a test compares it w
         write_trajectory,
     )
     from blinkgl.front.online import OnlineSequences
+    from blinkgl.front.rig_sequences import RigRecording, record_rig, simulate_rig
+    from blinkgl.front.rigs import Rig, RigSensor
     from blinkgl.front.runs import Timeline, generate, load, verify
     from blinkgl.front.scenes import (
         Animation,
@@ -130,6 +134,9 @@ __all__ = [
     "Primitive",
     "Recording",
     "Renderer",
+    "Rig",
+    "RigRecording",
+    "RigSensor",
     "Scene",
     "StreamSample",
     "StreamStats",
@@ -150,9 +157,11 @@ __all__ = [
     "read_flow",
     "read_trajectory",
     "record",
+    "record_rig",
     "render_frame",
     "simulate",
     "simulate_file",
+    "simulate_rig",
     "simulate_sequence",
     "verify",
     "write_events",

@@ -13,7 +13,6 @@ import difflib
 import hashlib
 import os
 import re
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
@@ -24,7 +23,7 @@ from blinkgl import __version__
 from blinkgl.config.base import Config, validate
 from blinkgl.config.reader import read_table, to_yaml
 from blinkgl.errors import AssetError, ConfigError
-from blinkgl.io.atomic import fsync, output_errors, remove_stale, temporary_beside
+from blinkgl.io.atomic import atomic_folder, output_errors
 from blinkgl.io.sequence_dir import refuse_existing
 from eflow.methods.table import METHODS
 
@@ -181,16 +180,11 @@ def pack(
             value=f"{size / 1e6:.1f} MB",
             accepted=f"at most {LARGEST / 1e6:g} MB" + (": --store fp16" if size / 2 <= LARGEST else ""),
         )
-    with output_errors(final):
-        final.parent.mkdir(parents=True, exist_ok=True)
-        remove_stale(final.parent)
-        temporary = temporary_beside(final)
-        temporary.mkdir()
-    try:
-        write_tensors(temporary / WEIGHTS, tensors, metadata_of(model))
-        (temporary / WEIGHTS).chmod(0o644)  # of an installation that others use
-        again = load_model(temporary / WEIGHTS, expected=model.config)
-        read = (temporary / WEIGHTS).read_bytes()
+    with atomic_folder(final) as folder:
+        write_tensors(folder / WEIGHTS, tensors, metadata_of(model))
+        (folder / WEIGHTS).chmod(0o644)  # of an installation that others use
+        again = load_model(folder / WEIGHTS, expected=model.config)
+        read = (folder / WEIGHTS).read_bytes()
         full = Card(
             **text.model_dump(),
             name=name,
@@ -203,15 +197,8 @@ def pack(
             sha256=hashlib.sha256(read).hexdigest(),
             version=__version__,
         )
-        with output_errors(final):
-            (temporary / CARD).write_text(to_yaml(full.model_dump(mode="json")), encoding="utf-8")
-            fsync(temporary / CARD)
-            refuse_existing(final)
-            os.rename(temporary, final)
-            fsync(final.parent)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
+        with output_errors(folder):
+            (folder / CARD).write_text(to_yaml(full.model_dump(mode="json")), encoding="utf-8")
     return final, full
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import posixpath
 import re
 import shutil
 import subprocess
@@ -117,6 +118,7 @@ def problems(site: Path) -> list[str]:
     }
     pages.pop(ERROR_PAGE, None)
     found, led_to = [], {name: set() for name in pages}
+    files = {path.relative_to(site).as_posix() for path in site.rglob("*") if path.is_file()}
     for name, page in pages.items():
         for link in [*page.links, *page.loads]:
             parts = urlsplit(link)
@@ -126,15 +128,12 @@ def problems(site: Path) -> list[str]:
                 if link in page.loads:
                     found.append(f"{name}: loads {link}")
                 continue
-            target = (
-                (site / name).parent.joinpath(unquote(parts.path)).resolve() if parts.path else site.resolve() / name
-            )
-            try:
-                inside = target.relative_to(site.resolve()).as_posix()
-            except ValueError:
+            inside = posixpath.normpath(posixpath.join(posixpath.dirname(name), unquote(parts.path)))
+            if not parts.path:
+                inside = name
+            if inside.startswith(("..", "/")):
                 found.append(f"{name}: {link} leads out of the site")
-                continue
-            if not target.is_file():
+            elif inside not in files:
                 found.append(f"{name}: {link} leads nowhere")
             elif inside in pages:
                 led_to[name].add(inside)

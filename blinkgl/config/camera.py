@@ -56,8 +56,8 @@ class CameraConfig(Config):
     )
     calibration: str | None = Field(
         None,
-        description="YAML file of Kalibr (camchain) or DSEC (cam_to_cam): gives size, lens, distortion, fx, fy, cx "
-        "and cy, which it becomes when the run is read",
+        description="YAML file of Kalibr (camchain), DSEC (cam_to_cam) or EuRoC (sensor): gives size, lens, "
+        "distortion, fx, fy, cx and cy, which it becomes when the run is read",
     )
     calibration_name: str | None = Field(
         None, description="which camera of the calibration; default its only one, or cam0"

@@ -29,6 +29,7 @@ from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.images import ImagesConfig
 from blinkgl.config.imu import ImuConfig
 from blinkgl.config.labels import LabelsConfig
+from blinkgl.config.places import Matrix, check_rigid, rigid_matrix
 from blinkgl.config.reader import parse_yaml
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.config.scene import Position, Vector3
@@ -41,8 +42,6 @@ SECTIONS = ("camera", "sensor", "events", "readout", "labels", "images", "imu", 
 INHERITED = ("camera", "sensor", "events", "readout", "labels")
 """What a sensor has as the top says it, where it says nothing. The others are nobody's until a sensor asks."""
 _SHARED = ("time", "timeline")
-_RIGID = 1e-4
-_Row = tuple[float, float, float, float]
 
 
 class PlaceConfig(Config):
@@ -54,7 +53,7 @@ class PlaceConfig(Config):
     quaternion: tuple[float, float, float, float] | None = Field(
         None, description="[w, x, y, z], need not be normalised"
     )
-    matrix: tuple[_Row, _Row, _Row, _Row] | None = Field(
+    matrix: Matrix | None = Field(
         None,
         description="T_rig_sensor, four rows of four, in place of the others. Rounded rotations are made exact. "
         "(Kalibr's T_cn_cnm1 is the inverse of one camera's place on the camera before)",
@@ -75,36 +74,19 @@ class PlaceConfig(Config):
 
     @rule("matrix")
     def _rigid(matrix):
-        if matrix is None:
-            return
-        T = np.array(matrix, np.float64)
-        R = T[:3, :3]
-        if not np.abs(T[3] - [0, 0, 0, 1]).max() < 1e-9:
-            raise Refused("the last row of a pose is not 0, 0, 0, 1", where="matrix", value=T[3].tolist())
-        if not (np.abs(R @ R.T - np.eye(3)).max() < _RIGID and np.linalg.det(R) > 0):
-            mirrored = np.abs(R @ R.T - np.eye(3)).max() < _RIGID
-            raise Refused(
-                "the matrix mirrors, which no place does" if mirrored else "the matrix is no rotation",
-                where="matrix",
-                value=np.round(R, 6).tolist(),
-                accepted=f"R Rᵀ = 1 to {_RIGID:g} and determinant +1",
-            )
+        if matrix is not None:
+            check_rigid(matrix, "matrix")
 
     @property
     def T(self) -> np.ndarray:
         """(4, 4) float64 T_rig_sensor."""
         from scipy.spatial.transform import Rotation
 
+        if self.matrix is not None:
+            return rigid_matrix(self.matrix)
         T = np.eye(4)
         T[:3, 3] = self.position
-        if self.matrix is not None:
-            T = np.array(self.matrix, np.float64)
-            u, _, v = np.linalg.svd(T[:3, :3])
-            nearest = u @ v
-            if np.abs(nearest - T[:3, :3]).max() > 1e-12:
-                T[:3, :3] = nearest
-            T[3] = [0, 0, 0, 1]
-        elif self.euler is not None:
+        if self.euler is not None:
             T[:3, :3] = Rotation.from_euler("xyz", self.euler, degrees=True).as_matrix()
         elif self.quaternion is not None:
             w, x, y, z = self.quaternion

@@ -315,6 +315,18 @@ class SequenceConfig(Config):
                 accepted="at most 8000000",
             )
 
+    @rule("labels.flow", "time.duration", "time.label_rate", "?frames")
+    def _flow_ends_in_the_sequence(flow: tuple[str | float, ...], duration: float, rate: float, frames: bool):
+        most = int(duration * rate + 1e-9) / rate  # from the first label to the end, and from the last to the beginning
+        for one in () if frames else flow:
+            if isinstance(one, float) and abs(one) > most + 1e-6:
+                raise Refused(
+                    "no label's flow leads so far: it would end outside the sequence",
+                    where="labels.flow",
+                    value=one,
+                    accepted=f"intervals of at most {most:.6g} s, or a longer time.duration",
+                )
+
     @rule("?images", "?frames")
     def _frames_have_no_camera(images: bool, frames: bool):
         if images and frames:

@@ -26,7 +26,7 @@ from blinkgl.dataset.choices import quality_in_words
 from blinkgl.dataset.effects import Effect, effects_of
 from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging import FrameCamera
-from blinkgl.labels import LABELS, asked_for
+from blinkgl.labels import LABELS, LabelRequest, asked_for
 from blinkgl.labels.label import BUFFERS
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import Renderer
@@ -343,7 +343,7 @@ def _passes(
         result.passes.append(
             Pass(
                 "labels",
-                ", ".join(request),
+                ", ".join(request) + _over_intervals(request, config),
                 ("geometry",),
                 pixels * (sum(BUFFERS[LABELS[name].buffer].bytes for name in request.buffers) + DEPTH_BYTES),
                 labels,
@@ -404,6 +404,19 @@ def _passes(
             each * result.frames,
         )
     )
+
+
+def _over_intervals(request: LabelRequest, config: SequenceConfig) -> str:
+    """How many of the labels lead to all times that intervals of ``labels.flow`` ask for; "" where none do."""
+    if not request.each:
+        return ""
+    intervals, time = request.intervals_ns, config.time
+    whole = sum(
+        len(request.within(time.t0_ns - t, time.t1_ns - t).intervals_ns) == len(intervals)
+        for t in time.label_times_ns[: time.label_count]
+    )
+    said = ", ".join(f"{ns * 1e-9:.6g}" for ns in intervals)
+    return f" (flow over {said} s: all of them inside the sequence for {whole} of {time.label_count} labels)"
 
 
 def _frame_camera(images: ImagesConfig, renderer: Renderer, scene: Scene) -> Pass:

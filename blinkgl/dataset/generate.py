@@ -75,7 +75,7 @@ def generate_sequence(
         ) as sequence,
         writer_of(sequence, report.path, config_yaml(sequence.config, index)) as writer,
     ):
-        clock, span_ns = sequence.clock, sequence.t1_ns - sequence.t0_ns
+        span_ns = sequence.t1_ns - sequence.t0_ns
         with PreviewRecorder(config.preview, [sequence], writer) as preview:
             for item in sequence:
                 write_item(writer, sequence, item)
@@ -86,11 +86,7 @@ def generate_sequence(
         report.count(sequence)
         write_end(writer, sequence)
         flushing = StageClock()  # leaving the block waits for the writers' threads and syncs the files
-    report.count(sequence)
-    report.seconds["write"] += flushing.total
-    report.simulated_s, report.timeline = span_ns * 1e-9, sequence.achieved
-    report.triangles, report.omissions = sequence.triangles, sequence.omissions
-    report.total_s, report.compile_s = clock.total, clock.compile_s
+    report.finish(sequence, flushing.total)
     return report
 
 

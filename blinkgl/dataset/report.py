@@ -55,6 +55,14 @@ class SequenceReport:
         )
         self.causes = sequence.causes
 
+    def finish(self, sequence: Simulation | RigSequence, flushed_s: float) -> None:
+        """All there is, now that its files are. flushed_s : what closing them took."""
+        self.count(sequence)
+        self.seconds["write"] += flushed_s
+        self.simulated_s, self.timeline = (sequence.t1_ns - sequence.t0_ns) * 1e-9, sequence.achieved
+        self.triangles, self.omissions = sequence.triangles, sequence.omissions
+        self.total_s, self.compile_s = sequence.clock.total, sequence.clock.compile_s
+
 
 def losses(saturated: int, dropped: int, late: int, filtered: int | None = None) -> dict[str, int]:
     """The manifest's figures of events that were made and are not in the file; see docs/formats.md."""

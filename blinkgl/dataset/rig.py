@@ -57,11 +57,7 @@ def generate_rig(
             writer.info.update(_manifest_info(rig))
         report.count(rig)
         flushing = StageClock()
-    report.count(rig)
-    report.seconds["write"] += flushing.total
-    report.simulated_s, report.timeline = span_ns * 1e-9, rig.achieved
-    report.triangles, report.omissions = rig.triangles, rig.omissions
-    report.total_s, report.compile_s = rig.clock.total, rig.clock.compile_s
+    report.finish(rig, flushing.total)
     return report
 
 

@@ -27,6 +27,7 @@ from blinkgl.config.tracks import track_times
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.dataset.plan import Plan, sequence_name
 from blinkgl.dataset.run_folder import RunFolder
+from blinkgl.dataset.verify_labels import problems_of_asked
 from blinkgl.dataset.work import RUN_FOLDER
 from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.events.types import Cause
@@ -244,6 +245,7 @@ def contents(folder: Path, manifest: dict[str, Any], config: SequenceConfig) -> 
     if EVENT_LABELS in manifest["files"]:
         problems += _guarded(lambda: _check_truth(folder, manifest))
     problems += _guarded(lambda: _check_labels(folder, manifest))
+    problems += _guarded(lambda: problems_of_asked(folder, manifest, config))
     if config.imu is not None:
         problems += _guarded(lambda: _check_imu(folder, config))
     if config.tracks is not None:
@@ -809,6 +811,8 @@ def _agrees(file: str, one: Path, other: Path) -> bool:
     if file == "config.yaml":
         configs = [load_run(path) for path in (a, b)]
         return not _first_difference(*(_comparable(c.sequence(c.check().output.first_index)) for c in configs))
+    if any(form.holds(file) for label in LABELS.values() for form in label.forms[1:]):
+        return True  # says again what the first form does
     if file.endswith(".txt"):
         return False
     if file == "poses.npz":

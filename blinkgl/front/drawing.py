@@ -8,12 +8,14 @@ from contextlib import ExitStack
 
 import numpy as np
 
+from blinkgl.config.base import validate
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
-from blinkgl.front.runs import MAX_INDEX, OF_EVENTS, Source, configured, label_names, labels_tree, scene_of
+from blinkgl.front.runs import MAX_INDEX, Source, configured, scene_of
+from blinkgl.front.sections import OF_EVENTS, label_names, labels_tree
 from blinkgl.gl import create_context
-from blinkgl.labels import LabelFrame, asked_for
+from blinkgl.labels import LABELS, LabelFrame, asked_for
 from blinkgl.render.renderer import Renderer as SceneRenderer
 from blinkgl.srgb import to_srgb8
 
@@ -60,7 +62,12 @@ class Renderer:
         return to_srgb8(self._renderer.colour(_ns(t, "t")).read())
 
     def frame(
-        self, t: float, labels: Sequence[str] = ("images",), *, to: float | None = None, back_to: float | None = None
+        self,
+        t: float,
+        labels: Sequence[str | float] = ("images",),
+        *,
+        to: float | None = None,
+        back_to: float | None = None,
     ) -> LabelFrame:
         """:class:`LabelFrame` at t s with the named buffers; "images" is its ``colour``, (H, W, 3) float32 linear.
 
@@ -68,7 +75,10 @@ class Renderer:
         to, back_to : s, where flow and flow_backward lead; default: one label interval on and back."""
         if of_events := [name for name in OF_EVENTS if name in label_names(labels)]:
             raise ConfigError("is of events and not of a time", where="labels", value=of_events[0], accepted="record()")
-        request = asked_for(LabelsConfig.model_validate(labels_tree(labels)))
+        asked = validate(LabelsConfig, labels_tree(labels), where="labels")
+        request = asked_for(asked)
+        for name in request:
+            LABELS[name].check(self._renderer.scene, asked)
         t_ns, interval = _ns(t, "t"), self.config.time.interval_ns
         return self._renderer.labels(
             t_ns,
@@ -83,7 +93,7 @@ def _ns(seconds: float, where: str) -> int:
 
 
 def render_frame(
-    source: Source, t: float, labels: Sequence[str] = ("images",), *, index: int = 0, to: float | None = None
+    source: Source, t: float, labels: Sequence[str | float] = ("images",), *, index: int = 0, to: float | None = None
 ) -> LabelFrame:
     """One :class:`LabelFrame` at t s; for many, a :class:`Renderer` saves making OpenGL's context each time.
 

@@ -11,7 +11,7 @@ import numpy as np
 from blinkgl.errors import ConfigError, EventDataError
 from blinkgl.events.types import Events
 from blinkgl.front import arguments as check
-from blinkgl.front.runs import EmulatorSettings, events_tree
+from blinkgl.front.sections import EmulatorSettings, events_tree
 from blinkgl.io import flow as flow_files, formats, trajectories
 from blinkgl.io.formats import EventFile
 

@@ -3,19 +3,30 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from blinkgl.config.base import Config, validate_field
+from blinkgl.config.base import validate_field
 from blinkgl.config.draw import middle
 from blinkgl.config.recipe import merge
 from blinkgl.config.recipes import with_recipes
 from blinkgl.config.sequence import RunTemplate, SequenceConfig, load_run, with_sensors
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
+from blinkgl.front.rigs import Rig, rig_of
 from blinkgl.front.scenes import Scene
-from blinkgl.labels import LABELS
+from blinkgl.front.sections import (
+    EmulatorSettings,
+    ImageSettings,
+    ImuSettings,
+    TrackSettings,
+    events_tree,
+    images_tree,
+    imu_tree,
+    labels_tree,
+    tracks_tree,
+)
 
 if TYPE_CHECKING:
     from blinkgl.dataset.run import Outcome
@@ -24,10 +35,6 @@ if TYPE_CHECKING:
 
 MAX_INDEX = 10_000_000
 Source = Scene | RunTemplate
-EmulatorSettings = str | Mapping[str, Any] | Config
-ImageSettings = str | Mapping[str, Any] | Config
-ImuSettings = str | Mapping[str, Any] | Config
-TrackSettings = str | Mapping[str, Any] | Config
 
 
 class Timeline:
@@ -73,17 +80,18 @@ def generate(
     sensor: str | None = None,
     timeline: Timeline | None = None,
     quality: str | None = None,
-    labels: Sequence[str] | None = None,
+    labels: Sequence[str | float] | None = None,
     images: ImageSettings | None = None,
     imu: ImuSettings | None = None,
     tracks: TrackSettings | None = None,
+    rig: Rig | str | None = None,
 ) -> Outcome:
     """Makes a data set below the folder ``out``, as ``blinkgl generate`` does: the same files, bit for bit.
 
     source : :class:`Scene` or what :func:`load` gave.   num : how many sequences (of each group at
     most).   workers : processes; 1: this one.
     resume : go on where ``out`` holds sequences of this run.   emulator, sensor, timeline,
-    quality, labels, images, imu, tracks : as of :func:`record`.
+    quality, labels, images, imu, tracks : as of :func:`record`.   rig : as of :func:`record_rig`.
     Returns what was made (``made.events``, ``made.labels`` …) and what was set aside.
     Raises BlinkGLError: ConfigError (also a scene with arrays in it: save them to files
     first), AssetError, GLError, OutputError."""
@@ -100,6 +108,7 @@ def generate(
         images=images,
         imu=imu,
         tracks=tracks,
+        rig=rig,
     )
     if isinstance(source, Scene) and not source.on_disk:
         raise ConfigError(
@@ -130,10 +139,11 @@ def configured(
     sensor: str | None = None,
     timeline: Timeline | None = None,
     quality: str | None = None,
-    labels: Sequence[str] | None = None,
+    labels: Sequence[str | float] | None = None,
     images: ImageSettings | None = None,
     imu: ImuSettings | None = None,
     tracks: TrackSettings | None = None,
+    rig: Rig | str | None = None,
 ) -> RunTemplate:
     """``source`` as a run, with what is given here laid over it. Raises ConfigError."""
     check.one_of(source, "source", (Scene, RunTemplate), "a Scene, or what load() gives")
@@ -148,13 +158,11 @@ def configured(
     if images is not None:
         own["images"] = images_tree(images)
     if imu is not None:
-        own["imu"] = section_tree(
-            "imu", imu, "preset", "an inertial unit", "a preset's name, or a table such as {'rate': 400}"
-        )
+        own["imu"] = imu_tree(imu)
     if tracks is not None:
-        own["tracks"] = section_tree(
-            "tracks", tracks, "choose", "point tracks", "grid, random, surface, or a table such as {'points': 100}"
-        )
+        own["tracks"] = tracks_tree(tracks)
+    if rig is not None:
+        own |= rig_of(rig).tree
     own = with_recipes(with_sensors(own, Path.cwd()))
     if "quality" in own:
         validate_field(SequenceConfig, "quality", own["quality"])
@@ -170,79 +178,3 @@ def scene_of(source: Source, config: SequenceConfig, index: int) -> SceneData:
     from blinkgl.scene.build import sequence_scene
 
     return sequence_scene(config, index, source.base)
-
-
-def events_tree(emulator: EmulatorSettings) -> dict[str, Any]:
-    """``events:`` of a name, a table with ``emulator``, or a configuration. Raises ConfigError."""
-    from blinkgl.recordings.simulation import emulator_config
-
-    if not isinstance(emulator, (str, Mapping, Config)):
-        raise ConfigError(
-            "not an emulator",
-            where="emulator",
-            value=emulator,
-            accepted="a name, or a table such as {'emulator': 'v2e', 'cutoff_hz': 200}",
-        )
-    tree = (
-        emulator.model_dump()
-        if isinstance(emulator, Config)
-        else {"emulator": emulator}
-        if isinstance(emulator, str)
-        else check.plain(emulator)
-    )
-    emulator_config(tree)
-    return tree
-
-
-def images_tree(images: ImageSettings) -> dict[str, Any]:
-    """``images:`` of a preset's name, a table, or a configuration. Raises ConfigError."""
-    return section_tree(
-        "images",
-        images,
-        "preset",
-        "a frame camera",
-        "a preset's name, or a table such as {'exposure_us': 10000, 'photon_noise': True}",
-    )
-
-
-def section_tree(key: str, given: Any, named: str, what: str, accepted: str) -> dict[str, Any]:
-    """A section of a configuration of a table, a configuration, or a text, which is its key ``named``.
-    Raises ConfigError."""
-    if not isinstance(given, (str, Mapping, Config)):
-        raise ConfigError(f"not {what}", where=key, value=given, accepted=accepted)
-    tree = (
-        given.model_dump(exclude_unset=True)
-        if isinstance(given, Config)
-        else {named: given}
-        if isinstance(given, str)
-        else check.plain(given)
-    )
-    validate_field(SequenceConfig, key, tree)
-    return tree
-
-
-OF_EVENTS = ("events",)
-"""Labels that are of events and not of a time."""
-
-
-def label_names(labels: Sequence[str]) -> set[str]:
-    """Raises ConfigError: no such label (:mod:`blinkgl.labels`)."""
-    known = [*dict.fromkeys(label.said for label in LABELS.values()), *OF_EVENTS]
-    wanted = check.one_of(labels, "labels", (list, tuple, set, frozenset), "a list of names of labels")
-    for name in wanted:
-        if name not in known:
-            raise ConfigError("unknown label", where="labels", value=name, accepted=", ".join(known))
-    return set(wanted)
-
-
-def labels_tree(labels: Sequence[str]) -> dict[str, Any]:
-    """``labels:`` that asks for these and no others. Raises ConfigError as :func:`label_names`."""
-    wanted = label_names(labels)
-    everything: dict[str, Any] = {}
-    asked: dict[str, Any] = {}
-    for label in LABELS.values():
-        label.ask(everything)
-        if label.said in wanted:
-            label.ask(asked)
-    tree = {key: asked.get(key, [] if isinstance(value, list) else False) for key, value in everything.items()}
-    return {**tree, **{name: name in wanted for name in OF_EVENTS}}

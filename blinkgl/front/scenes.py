@@ -23,12 +23,12 @@ from numpy.typing import ArrayLike
 from blinkgl.config.base import Config, validate
 from blinkgl.config.camera import CameraConfig, calibrated
 from blinkgl.config.deform import AnimationConfig
+from blinkgl.config.materials import MaterialConfig
 from blinkgl.config.physics import BodyConfig, PhysicsConfig
 from blinkgl.config.scene import (
     ExplicitSceneConfig,
     KeyedMotionConfig,
     LightConfig,
-    MaterialConfig,
     MeshConfig,
     ObjectConfig,
     PoseConfig,
@@ -45,7 +45,7 @@ from blinkgl.scene.worlds.explicit import InMemory, explicit_scene, primitive_me
 Vector = Sequence[float] | np.ndarray
 
 
-class _Piece:
+class Piece:
     """A value that is checked when it is made. ``tree``: itself as plain data, as the YAML has it."""
 
     tree: dict[str, Any]
@@ -67,7 +67,7 @@ class _Piece:
         return f"{type(self).__name__}({', '.join(f'{k}={v!r}' for k, v in self.tree.items())})"
 
 
-class Pose(_Piece):
+class Pose(Piece):
     """Where a body or a camera is, and at most one way to say how it is turned.
 
     position : (3,) m.   euler : (3,) degrees about the world's x, then y, then z.   quaternion : (4,) w, x, y, z.
@@ -94,7 +94,7 @@ def look_at(position: Vector, target: Vector) -> Pose:
     return Pose(position, look_at=target)
 
 
-class Keyframes(_Piece):
+class Keyframes(Piece):
     """A motion through poses: ``Keyframes({0.0: Pose(…), 1.5: Pose(…)})``, held before
     the first time and after the last.
 
@@ -115,12 +115,13 @@ class Keyframes(_Piece):
         )
 
 
-class Trajectory(_Piece):
+class Trajectory(Piece):
     """A motion from a file, TUM's or EuRoC's, by a spline: ``Camera(pose=Trajectory("flight.txt"))``.
 
     file : path.   form : "tum", "euroc"; "auto": EuRoC's where lines have commas.   start : s on the file's clock that
     are 0 s on the scene's; None: its first pose is where the sequence begins.   smooth : s, each pose becomes the mean
-    of those within it.
+    of those within it.   T_body_sensor : where the camera or body that follows it is on the body whose poses these are:
+    (4, 4), or the path of EuRoC's sensor.yaml, whose T_BS that is; None: it is that body.
     Raises ConfigError; a file that does not cover the sequence is found when the scene is built."""
 
     def __init__(
@@ -130,8 +131,14 @@ class Trajectory(_Piece):
         form: Literal["auto", "tum", "euroc"] = "auto",
         start: float | None = None,
         smooth: float = 0.0,
+        T_body_sensor: ArrayLike | str | os.PathLike | None = None,
     ):
         tree = check.given(file=os.fspath(check.path(file, "file").absolute()), form=form, start=start, smooth=smooth)
+        if isinstance(T_body_sensor, (str, os.PathLike)):
+            tree["T_body_sensor"] = os.fspath(check.path(T_body_sensor, "T_body_sensor").absolute())
+        elif T_body_sensor is not None:
+            place = check.array(T_body_sensor, "Trajectory.T_body_sensor", (4, 4), "a file, or an array (4, 4)")
+            tree["T_body_sensor"] = check.plain(place)
         self.tree = self._checked(KeyedMotionConfig, {"trajectory": tree}, trajectory="")
 
 
@@ -145,7 +152,7 @@ def _motion(pose: Pose | Keyframes | Trajectory | Vector, where: str, others: st
     return Pose(pose).tree
 
 
-class Camera(_Piece):
+class Camera(Piece):
     """A camera, its lens and its motion.
 
     width, height : px (default 346 x 260).   fov : horizontal field of view, degrees (default 60), or focal : focal
@@ -188,7 +195,7 @@ class Camera(_Piece):
         self.motion = _motion(pose, "Camera.pose")
 
 
-class Light(_Piece):
+class Light(Piece):
     """A sun and a sky: a white surface with normal n has radiance sun * max(0, n . s) + sky * (0.5 + 0.5 n_z); and
     lights beside them.
 
@@ -239,7 +246,7 @@ class Light(_Piece):
         self.tree = self._checked(LightConfig, tree, sun_elevation="elevation", sun_azimuth="azimuth")
 
 
-class Material(_Piece):
+class Material(Piece):
     """A surface: ``color`` times at most one texture, matt or with a gloss, and light of its own.
 
     image : an image file (sRGB; .hdr is linear), or an array: (h, w, 3) uint8 sRGB, or
@@ -248,7 +255,11 @@ class Material(_Piece):
     photograph : one that scikit-image brings, such as "astronaut".   uv_scale : (2,) repeats.
     max_size : px, longer sides of a file are reduced.
     unlit : radiance = albedo, whatever the light.   double_sided : draw back faces.
-    metallic, roughness : 0 to 1; 0 and 1 are matt.   emission : (3,) linear radiance of its own.
+    metallic, roughness : 0 to 1; 0 and 1 are matt; times ``metallic_roughness_map``, its blue and its green.
+    emission : (3,) linear radiance of its own; times ``emission_map``, sRGB.
+    normal_map : x to the right in the picture, y up, z outwards, 0 to 255 for -1 to 1; ``normal_scale`` times its x, y.
+    mask : what is there: holes where it is below ``cutoff`` (0 to 1).
+    Maps are files, or arrays (h, w, 3) uint8, of the mask (h, w) uint8.
     Raises ConfigError; a missing file is found when the scene is built."""
 
     def __init__(
@@ -266,7 +277,21 @@ class Material(_Piece):
         metallic: float = 0.0,
         roughness: float = 1.0,
         emission: Vector = (0.0, 0.0, 0.0),
+        metallic_roughness_map: str | os.PathLike | np.ndarray | None = None,
+        normal_map: str | os.PathLike | np.ndarray | None = None,
+        normal_scale: float = 1.0,
+        emission_map: str | os.PathLike | np.ndarray | None = None,
+        mask: str | os.PathLike | np.ndarray | None = None,
+        cutoff: float = 0.5,
     ):
+        given = {
+            "metallic_roughness_map": metallic_roughness_map,
+            "normal_map": normal_map,
+            "emission_map": emission_map,
+            "mask": mask,
+        }
+        self.maps = {key: _map(map_, key) for key, map_ in given.items() if map_ is not None and not _is_file(map_)}
+        files = {key: map_ if _is_file(map_) or map_ is None else f"<{key}>" for key, map_ in given.items()}
         self.image: data.Texture | None = None
         if image is not None and not isinstance(image, (str, os.PathLike)):
             self.image, image = _texture(image), None
@@ -285,8 +310,28 @@ class Material(_Piece):
             metallic=metallic,
             roughness=roughness,
             emission=emission,
+            normal_scale=normal_scale,
+            cutoff=cutoff,
+            **files,
         )
         self.tree = self._checked(MaterialConfig, tree, texture="image")
+
+
+def _is_file(given: Any) -> bool:
+    return isinstance(given, (str, os.PathLike))
+
+
+def _map(given: Any, key: str) -> np.ndarray:
+    """(h, w, 3) uint8, of a mask (h, w)."""
+    shape = (None, None) if key == "mask" else (None, None, 3)
+    accepted = f"a file, or an array ({'h, w' if key == 'mask' else 'h, w, 3'}), uint8"
+    where = f"Material.{key}"
+    numbers = check.array(given, where, shape, accepted)
+    if not numbers.size or max(numbers.shape) > 16384:
+        raise ConfigError("size out of range", where=where, value=numbers.shape, accepted="1 to 16384 rows and columns")
+    if numbers.dtype != np.uint8:
+        raise ConfigError("pixels cannot be used", where=where, value=str(numbers.dtype), accepted=accepted)
+    return np.array(numbers, order="C")
 
 
 def _texture(image: Any) -> data.Texture:
@@ -306,7 +351,7 @@ def _texture(image: Any) -> data.Texture:
     return data.Texture(pixels, "image", content_hash(str((pixels.dtype, pixels.shape)).encode(), pixels.tobytes()))
 
 
-class Body(_Piece):
+class Body(Piece):
     """What falls, or is fallen on: ``Primitive("cuboid", body=Body(velocity=(1, 0, 2)))`` (docs/scenes.md, "Dynamics").
 
     kind : "dynamic" falls; "fixed" stays, or goes its way, whatever hits it; "none" is not there.
@@ -343,7 +388,7 @@ class Body(_Piece):
         self.tree = self._checked(BodyConfig, tree)
 
 
-class Deform(_Piece):
+class Deform(Piece):
     """How a body's shape changes with time, by formula: ``Mesh("tree.glb", deform=Deform("bend", angle=10))``.
 
     kind : "wave", "flag", "twist", "bend", "breathe", or that of a deformer of your own.
@@ -357,7 +402,7 @@ class Deform(_Piece):
         self.tree = tree
 
 
-class Animation(_Piece):
+class Animation(Piece):
     """A clip that a glTF file's skins, morph targets and nodes play, or two at once: ``Mesh("ann.glb",
     animation=Animation("Walk", speed=1.2))``.
 
@@ -390,7 +435,7 @@ class Animation(_Piece):
         self.tree = self._checked(AnimationConfig, tree)
 
 
-class Way(_Piece):
+class Way(Piece):
     """A curve that a body follows at one speed, its x axis ahead: the ``pose`` of a figure that walks.
 
     points : (N, 3) m, two or more, which the curve passes smoothly; beyond its ends it goes straight on.
@@ -413,7 +458,7 @@ class Way(_Piece):
         self.tree = tree
 
 
-class _Object(_Piece):
+class _Object(Piece):
     """What primitives and meshes share: an object of the scene, its mesh and its material."""
 
     mesh: dict[str, Any]
@@ -557,7 +602,7 @@ def _triangles(vertices: ArrayLike, faces: ArrayLike, uvs: ArrayLike | None) -> 
         raise ConfigError(error.problem, where="Mesh.vertices", value=error.value, accepted=error.accepted) from None
 
 
-class Scene(_Piece):
+class Scene(Piece):
     """Bodies before a camera, for a time. ``scene + body`` is a scene with one more.
 
     camera : :class:`Camera`.   objects : :class:`Primitive` and :class:`Mesh`; ids count from 1 in this order.
@@ -620,6 +665,8 @@ class Scene(_Piece):
             if body.material is not None:
                 item["material"] = f"material{k}"
                 materials[f"material{k}"] = body.material.tree
+                if body.material.maps:
+                    self._memory.maps[f"material{k}"] = body.material.maps
                 if body.material.image is not None:
                     self._memory.textures[f"material{k}"] = body.material.image
             named.append(item)
@@ -673,8 +720,8 @@ class Scene(_Piece):
 
     def build(self, config: SequenceConfig) -> data.Scene:
         """What the renderer draws. Raises ConfigError and AssetError: files."""
-        from blinkgl.scene.build import in_fog
+        from blinkgl.scene.build import equipped, in_fog, seen_by
 
         span_ns = config.time.t0_ns, config.time.t1_ns
-        made = explicit_scene(config.scene, config.camera.model, *span_ns, Path.cwd(), self._memory)
-        return in_fog(made, config.scene)
+        made = explicit_scene(config.scene, seen_by(config).model, *span_ns, Path.cwd(), self._memory)
+        return equipped(in_fog(made, config.scene), config)

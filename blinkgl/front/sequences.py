@@ -13,18 +13,15 @@ from blinkgl.events.types import Events
 from blinkgl.front import arguments as check
 from blinkgl.front.runs import (
     MAX_INDEX,
-    EmulatorSettings,
-    ImageSettings,
-    ImuSettings,
     Source,
     Timeline,
-    TrackSettings,
     configured,
 )
 from blinkgl.front.scenes import Scene
+from blinkgl.front.sections import EmulatorSettings, ImageSettings, ImuSettings, TrackSettings
 from blinkgl.labels import Flow, LabelFrame
 from blinkgl.render.tracks import Tracks
-from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Simulation, simulate as core
+from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Item, Simulation, simulate as core
 from blinkgl.sequence.inertial import Inertial
 from blinkgl.srgb import to_srgb8
 
@@ -37,7 +34,7 @@ def simulate_sequence(
     sensor: str | None = None,
     timeline: Timeline | None = None,
     quality: str | None = None,
-    labels: Sequence[str] | None = None,
+    labels: Sequence[str | float] | None = None,
     images: ImageSettings | None = None,
     imu: ImuSettings | None = None,
     tracks: TrackSettings | None = None,
@@ -148,7 +145,7 @@ def record(
     sensor: str | None = None,
     timeline: Timeline | None = None,
     quality: str | None = None,
-    labels: Sequence[str] | None = None,
+    labels: Sequence[str | float] | None = None,
     images: ImageSettings | None = None,
     imu: ImuSettings | None = None,
     tracks: TrackSettings | None = None,
@@ -161,7 +158,8 @@ def record(
     timeline : :class:`Timeline`.
     quality : "fast", "balanced" (the default), "accurate" or "reference".
     labels : names of labels, such as images, flow, flow_backward, occlusion, depth
-    (docs/configuration.md has all); "events": what made each event, ``events.truth``; default: the source's.
+    (docs/configuration.md has all), and numbers: intervals of ``flow_intervals``, s; "events": what made each
+    event, ``events.truth``; default: the source's.
     images : a frame camera: the name of a preset, "deblurring", or a table of ``images:``, ``{"exposure_us": 10000}``.
     imu : an inertial unit: the name of a preset, "adis16448", or a table of ``imu:``, ``{"rate": 400}``.
     tracks : points on surfaces, followed: "grid", "random", "surface", or a table of ``tracks:``, ``{"points": 100}``.
@@ -178,31 +176,49 @@ def record(
         imu=imu,
         tracks=tracks,
     )
-    pictures, frames, chunks, times, taken = [], [], [], [], []
+    gathered = Gathered()
     with _simulation(source, config, index) as sequence:
         for item in sequence:
-            if isinstance(item, EventChunk):
-                chunks.append(item.events)
-            elif isinstance(item, GroundTruth):
-                image = item.frame.values.pop("images", None)
-                if image is not None:
-                    pictures.append(to_srgb8(image) if image.dtype.kind == "f" else image)
-                frames.append(item.frame)
-                times.append(item.t_ns // 1000)
-            elif isinstance(item, CameraImage):
-                taken.append(item)
-        inertial, followed = sequence.imu(), sequence.tracks()
-    t_us = np.array(times, np.int64)
-    return Recording(
-        Events.concatenate(chunks),
-        t_us[:-1],
-        tuple(frames[:-1]),
-        t_us,
-        np.stack(pictures) if pictures else None,
-        sequence.config,
-        sequence.frames,
-        sum(sequence.losses[:2]),
-        tuple(taken),
-        inertial,
-        followed,
-    )
+            gathered.take(item)
+        return gathered.recording(sequence)
+
+
+class Gathered:
+    """What has happened in one sequence so far, to become a :class:`Recording`."""
+
+    def __init__(self) -> None:
+        self._events: list[Events] = []
+        self._t_us: list[int] = []
+        self._labels: list[LabelFrame] = []
+        self._pictures: list[np.ndarray] = []
+        self._images: list[CameraImage] = []
+
+    def take(self, item: Item) -> None:
+        """Pictures for those who watch are not kept."""
+        if isinstance(item, EventChunk):
+            self._events.append(item.events)
+        elif isinstance(item, GroundTruth):
+            image = item.frame.values.pop("images", None)
+            if image is not None:
+                self._pictures.append(to_srgb8(image) if image.dtype.kind == "f" else image)
+            self._labels.append(item.frame)
+            self._t_us.append(item.t_ns // 1000)
+        elif isinstance(item, CameraImage):
+            self._images.append(item)
+
+    def recording(self, sequence: Simulation) -> Recording:
+        """Of the sequence that all items were of."""
+        t_us = np.array(self._t_us, np.int64)
+        return Recording(
+            Events.concatenate(self._events),
+            t_us[:-1],
+            tuple(self._labels[:-1]),
+            t_us,
+            np.stack(self._pictures) if self._pictures else None,
+            sequence.config,
+            sequence.frames,
+            sum(sequence.losses[:2]),
+            tuple(self._images),
+            sequence.imu(),
+            sequence.tracks(),
+        )

@@ -13,6 +13,7 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -146,7 +147,7 @@ class _Expansion:
         if shown in chain:
             raise ShaderError("include cycle: " + " -> ".join([*chain[chain.index(shown) :], shown]), where=included_at)
         try:
-            text = path.read_text(encoding="utf-8")
+            text = self.files[shown] if shown in self.files else path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
             name = shown.removeprefix("include/")
             if isinstance(error, UnicodeDecodeError) or name == shown or name not in (made := made_includes()):
@@ -157,23 +158,16 @@ class _Expansion:
             text = made[name]
             self.made[name] = None
         self.files[shown] = text
-        in_comment = False
-        for number, line in enumerate(text.splitlines(), 1):
-            origin = (shown, number)
-            include = None if in_comment else _INCLUDE.match(line)
-            if include:
-                self._include(include["argument"], (*chain, shown), f"{shown}:{number}")
-            elif not in_comment and _VERSION.match(line):
+        for lines, end, argument in _parts(shown, text):
+            self.lines += lines
+            if argument is None:
                 if chain:
                     raise ShaderError(
-                        "#version belongs into the program's own file, not into an include", where=f"{shown}:{number}"
+                        "#version belongs into the program's own file, not into an include", where=f"{shown}:{end}"
                     )
-                self.version = line.strip()
-                self.lines.append(("", origin))
-            else:
-                # Left over: includes in comments, which moderngl's own resolver would try to follow.
-                self.lines.append((line.replace("#include", "# include"), origin))
-            in_comment = _ends_in_comment(line, in_comment)
+                self.version = text.splitlines()[end - 1].strip()
+            elif end:
+                self._include(argument, (*chain, shown), f"{shown}:{end}")
 
     def _include(self, argument: str, chain: tuple[str, ...], at: str) -> None:
         quoted = _QUOTED.match(argument)
@@ -197,6 +191,27 @@ class _Expansion:
         except OSError:
             return None
         return "one of " + ", ".join(names) if names else None
+
+
+@lru_cache(maxsize=256)
+def _parts(shown: str, text: str) -> tuple[tuple[tuple[tuple[str, tuple[str, int]], ...], int, str | None], ...]:
+    """A file in pieces: ((line, origin) pairs, number of the line that ends them, what that line includes; None where
+    it is a #version). The last one ends at 0. Kept, since every program of a scene includes the same dozen files."""
+    parts, lines = [], []
+    in_comment = False
+    for number, line in enumerate(text.splitlines(), 1):
+        include = None if in_comment else _INCLUDE.match(line)
+        if include:
+            parts.append((tuple(lines), number, include["argument"]))
+            lines = []
+        elif not in_comment and _VERSION.match(line):
+            parts.append((tuple(lines), number, None))
+            lines = [("", (shown, number))]
+        else:
+            # Left over: includes in comments, which moderngl's own resolver would try to follow.
+            lines.append((line.replace("#include", "# include"), (shown, number)))
+        in_comment = _ends_in_comment(line, in_comment)
+    return (*parts, (tuple(lines), 0, ""))
 
 
 def _ends_in_comment(line: str, inside: bool) -> bool:

@@ -10,6 +10,9 @@ Kalibr, one table a camera, each with its place beside the one before::
       resolution: [640, 480]
     cam1: {…, T_cn_cnm1: 4 x 4, from the axes of cam0 to those of cam1}
 
+EuRoC has a file of one camera, its ``sensor.yaml``, whose distortion is called radial-tangential, and whose ``T_BS`` is
+its place on the body that the trajectory is of.
+
 DSEC has the tables under ``intrinsics``, with ``camera_matrix`` for ``intrinsics``, and those of the rectified pictures
 (``camRect0`` …) beside them. Both count pixels as BlinkGL does: (0, 0) is the centre of the top-left one.
 """
@@ -26,12 +29,14 @@ import numpy as np
 
 from blinkgl.camera import CAMERA_MODELS, CameraModel, PinHole
 from blinkgl.camera.rectified import rectified
+from blinkgl.config.places import rigid_matrix
 from blinkgl.config.reader import read_table, to_yaml
 from blinkgl.errors import ConfigError
 
 _RIGID = 1e-4
 _NONE = ("none", "None", "", None)
 _COUNTS = {"radtan": (4, 5), "equidistant": (4,)}
+_EUROC = {"radial-tangential": "radtan"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,14 +49,15 @@ class Calibrated:
 
 
 def read_camchain(path: str | Path) -> dict[str, Calibrated]:
-    """The cameras of a calibration in either form, by name, in the file's order; of DSEC's the raw ones alone.
+    """The cameras of a calibration in any of the forms, by name, in the file's order; of DSEC's the raw ones alone, of
+    EuRoC's ``cam0``.
 
     Raises ConfigError naming file, camera and key: what is no such file, models that are not drawn, a wrong number of
     coefficients, values that no camera has, distortion that folds inside the picture, places that are not rigid."""
     where = str(path)
     tree = read_table(path, "a calibration: cam0, cam1, …")
     dsec = isinstance(tree.get("intrinsics"), dict)
-    tables = tree["intrinsics"] if dsec else tree
+    tables = tree["intrinsics"] if dsec else {"cam0": tree} if isinstance(tree.get("intrinsics"), list) else tree
     places = tree.get("extrinsics") if dsec else None
     found = {
         str(name): _camera(table, f"{where}: {name}", "camera_matrix" if dsec else "intrinsics")
@@ -71,6 +77,16 @@ def read_camchain(path: str | Path) -> dict[str, Calibrated]:
         if given is not None:
             found[name] = Calibrated(one.camera, _rigid(given, f"{where}: {name}.{key}"))
     return found
+
+
+def read_place_on_body(path: str | Path) -> np.ndarray:
+    """(4, 4) float64 T_body_sensor, the ``T_BS`` of EuRoC's ``sensor.yaml``, its rounded rotation made exact.
+    Raises ConfigError."""
+    given = read_table(path, "EuRoC's sensor.yaml").get("T_BS")
+    data = given.get("data") if isinstance(given, dict) else given
+    if isinstance(data, list) and len(data) == 16:
+        data = [data[k : k + 4] for k in range(0, 16, 4)]
+    return rigid_matrix(_rigid(data, f"{path}: T_BS"))
 
 
 def camchain_yaml(cameras: Mapping[str, Calibrated]) -> str:
@@ -135,7 +151,8 @@ def _camera(table: dict[str, Any], where: str, key: str) -> Calibrated:
         raise ConfigError("not a size", where=f"{where}.resolution", value=size, accepted="[width, height], whole px")
     intrinsics = _numbers(table, key, (4,), where)
     lens = table.get("distortion_model")
-    kind = "pinhole" if lens in _NONE else str(lens)
+    kind = "pinhole" if lens in _NONE else _EUROC.get(str(lens), str(lens))
+    numbers = "distortion_coefficients" if "distortion_coefficients" in table else "distortion_coeffs"
     if kind not in ("pinhole", *_COUNTS):
         raise ConfigError(
             "unknown distortion model",
@@ -143,7 +160,7 @@ def _camera(table: dict[str, Any], where: str, key: str) -> Calibrated:
             value=lens,
             accepted=f"one of {', '.join(_COUNTS)}, none",
         )
-    given = [] if kind == "pinhole" else _numbers(table, "distortion_coeffs", _COUNTS[kind], where)
+    given = [] if kind == "pinhole" else _numbers(table, numbers, _COUNTS[kind], where)
     try:
         made = CAMERA_MODELS[kind](
             int(size[0]), int(size[1]), *intrinsics, **dict(zip(CAMERA_MODELS[kind].coefficients, given))

@@ -81,7 +81,7 @@ def rig_yaml(sensors: Sequence[RigSensorConfig]) -> str:
             about |= {
                 "resolution": [camera.width, camera.height],
                 "camera_model": camera.kind,
-                "intrinsics": [float(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy)],
+                "intrinsics": [float(v) for v in camera.intrinsics],
                 "distortion": [float(v) for v in camera.distortion],
             }
         if one.pair is not None:

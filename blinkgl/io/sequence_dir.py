@@ -8,6 +8,7 @@
       flow/forward_npy/%06d.npy      float32 (H, W, 3) = u, v, valid    (as BlinkFlow's; on request)
       flow/forward_flo/%06d.flo, flow/forward.h5                        (on request)
       flow/backward…                 the same, from > to
+      flow/intervals/%06d.h5         flow over intervals of one's own; occlusion/intervals/   (on request)
       occlusion/{forward,backward}/%06d.png   255 where the point is hidden at the other end
       depth/%06d.npy  velocity/%06d.npy  normals/%06d.npy  ids/%06d.png
       frame_camera/                  images with exposure and noise (blinkgl.io.frame_camera)   (on request)

@@ -7,6 +7,7 @@ Start: label.py, which says what a row holds, and depth.py, the plainest of them
 imported here: a YAML is read by it.
 """
 
+from blinkgl.labels.boxes import ObjectBoxes
 from blinkgl.labels.depth import Depth
 from blinkgl.labels.disparity import Disparity
 from blinkgl.labels.files import Form
@@ -14,9 +15,12 @@ from blinkgl.labels.flow import FlowTo
 from blinkgl.labels.frames import Flow, LabelFrame, LabelRequest
 from blinkgl.labels.ids import Ids
 from blinkgl.labels.images import Images
+from blinkgl.labels.intervals import FlowIntervals, Flows, OcclusionIntervals, Occlusions
 from blinkgl.labels.label import Label
 from blinkgl.labels.normals import Normals
 from blinkgl.labels.occlusion import OcclusionAt
+from blinkgl.labels.scene_flow import SceneFlow
+from blinkgl.labels.semantics import Semantics
 from blinkgl.labels.table import LABELS, asked_for, label_of, register, unregister
 from blinkgl.labels.velocity import Velocity
 
@@ -31,16 +35,23 @@ for _row in (
     FlowTo("backward"),
     OcclusionAt("forward"),
     OcclusionAt("backward"),
+    SceneFlow(),
+    Semantics(),
+    ObjectBoxes(),
+    FlowIntervals(),
+    OcclusionIntervals(),
 ):
     register(_row)
 
 __all__ = [
     "LABELS",
     "Flow",
+    "Flows",
     "Form",
     "Label",
     "LabelFrame",
     "LabelRequest",
+    "Occlusions",
     "asked_for",
     "label_of",
     "register",

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import os
-from typing import TYPE_CHECKING, Any, Literal
+from fractions import Fraction
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
+from blinkgl.config.base import Refused
 from blinkgl.labels import grading
 from blinkgl.labels.files import Form
 from blinkgl.labels.frames import Flow
@@ -17,16 +20,61 @@ if TYPE_CHECKING:
     from blinkgl.config.labels import LabelsConfig
     from blinkgl.render.passes import Shot
 
-_KEYS = {
-    "flow": Key(
-        tuple[Literal["forward", "backward"], ...],
-        Field(("forward",), description="directions of optical flow, DSEC 16-bit PNG"),
-        "depth",
+_ACCEPTED = (
+    "forward, backward, or an interval in s: a number or a fraction such as 1/100, from 1e-6 to 4300, negative: back"
+)
+
+
+def _where_to(value: Any) -> str | float:
+    """An entry of ``labels.flow``: a direction, or seconds, which may be written as a fraction. Raises Refused."""
+    if isinstance(value, str) and value in ("forward", "backward"):
+        return value
+    try:
+        seconds = math.nan if isinstance(value, bool) else float(Fraction(value) if isinstance(value, str) else value)
+    except (ValueError, TypeError, ZeroDivisionError, OverflowError):
+        seconds = math.nan
+    if not 1e-6 <= abs(seconds) <= 4300:
+        raise Refused("no direction, and no interval", value=value, accepted=_ACCEPTED)
+    return seconds
+
+
+def _each_once(flow: tuple[str | float, ...]) -> tuple[str | float, ...]:
+    """Raises Refused for an interval that is there twice."""
+    known: set[int] = set()
+    for one in (one for one in flow if isinstance(one, float)):
+        if round(one * 1e6) in known:
+            raise Refused("an interval twice", value=one, accepted="each once")
+        known.add(round(one * 1e6))
+    return flow
+
+
+FLOW_KEY = Key(
+    Annotated[
+        tuple[Annotated[Literal["forward", "backward"] | float, BeforeValidator(_where_to)], ...],
+        AfterValidator(_each_once),
+    ],
+    Field(
+        ("forward",),
+        max_length=1000,
+        description="optical flow: forward to the next label and backward to the one before, DSEC 16-bit PNG; numbers "
+        "are intervals of one's own, s, from each label's time on (`0.01`, `1/30`; negative: back), float32 .h5 "
+        "(docs/over_time.md)",
     ),
+    "depth",
+)
+_KEYS = {
+    "flow": FLOW_KEY,
     "float_flow": Key(
         tuple[Literal["npy", "flo", "h5"], ...], Field((), description="float32 flow besides the PNG"), "depth"
     ),
 }
+
+
+def seconds_of(labels: LabelsConfig) -> tuple[float, ...]:
+    """The intervals among ``labels.flow``, s."""
+    return tuple(one for one in labels.flow if isinstance(one, float))
+
+
 _PX, _SHARE = 2 / 128, 0.95
 """Flow drawn by two renderers: agrees to two quanta of the PNG in so large a share of the
 pixels. Silhouettes may fall on either side."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,11 +15,14 @@ class LabelRequest:
     """Which labels :meth:`Renderer.labels` returns, by name:
     ``LabelRequest("depth", "flow_forward")``; what is not asked for is not computed.
 
+    intervals_ns : how far those lead that lead to several times, "flow_intervals".
+    categories : pattern of names and number of the category, for those that tell objects apart by them.
     Iterating gives the names in the order of the table. Raises KeyError: no such label."""
 
-    def __init__(self, *names: str):
+    def __init__(self, *names: str, intervals_ns: Iterable[int] = (), categories: tuple[tuple[str, int], ...] = ()):
         asked = {label_of(name).name for name in names}
         self.names = tuple(name for name in LABELS if name in asked)
+        self.intervals_ns, self.categories = tuple(intervals_ns), categories
 
     @property
     def buffers(self) -> tuple[str, ...]:
@@ -33,8 +36,22 @@ class LabelRequest:
         drawn = {other for name in self.names for other in LABELS[name].there}
         return tuple(name for name in LABELS if name in drawn)
 
+    @property
+    def each(self) -> LabelRequest:
+        """Labels that are drawn once per interval."""
+        return LabelRequest(*(other for name in self.names for other in LABELS[name].each))
+
+    def only(self, names: Iterable[str]) -> LabelRequest:
+        """Of these names alone."""
+        return LabelRequest(*names, intervals_ns=self.intervals_ns, categories=self.categories)
+
     def without(self, *names: str) -> LabelRequest:
-        return LabelRequest(*(name for name in self.names if name not in names))
+        return self.only(name for name in self.names if name not in names)
+
+    def within(self, before_ns: int, after_ns: int) -> LabelRequest:
+        """With those intervals alone that end in [before_ns, after_ns], as :func:`ending_within` has it."""
+        there = ending_within(self.intervals_ns, before_ns, after_ns)
+        return LabelRequest(*self.names, intervals_ns=there, categories=self.categories)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.names)
@@ -45,14 +62,26 @@ class LabelRequest:
     def __bool__(self) -> bool:
         return bool(self.names)
 
+    @property
+    def _said(self) -> tuple:
+        return self.names, self.intervals_ns, self.categories
+
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, LabelRequest) and self.names == other.names
+        return isinstance(other, LabelRequest) and self._said == other._said
 
     def __hash__(self) -> int:
-        return hash(self.names)
+        return hash(self._said)
 
     def __repr__(self) -> str:
-        return f"LabelRequest({', '.join(map(repr, self.names))})"
+        said = [repr(name) for name in self.names]
+        return f"LabelRequest({', '.join([*said, f'intervals_ns={self.intervals_ns}'] if self.intervals_ns else said)})"
+
+
+def ending_within(intervals_ns: Iterable[int], before_ns: int, after_ns: int) -> list[int]:
+    """Those intervals that end in [before_ns, after_ns]. One that ends less than 1 µs outside ends there: label times
+    are rounded to ns, and a multiple of 1/30 s is not that of the label interval."""
+    there = {min(max(ns, before_ns), after_ns) for ns in intervals_ns if before_ns - 1000 < ns < after_ns + 1000}
+    return sorted(there - {0})
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +102,7 @@ class LabelFrame:
     depth : (H, W) float32 Z along the optical axis; inf: nothing hit.   ids : (H, W) uint32; 0: nothing hit.
     normals : (H, W, 3) float32 unit, camera axes (OpenCV), facing the camera.
     velocity : (H, W, 2) float32 px/s at t.
+    flow_intervals : :class:`~blinkgl.labels.intervals.Flows` over intervals of one's own.
     forward, backward : :class:`Flow`, with the occlusion mask where that was asked for.
     values : all of them by the name of the label."""
 

@@ -19,6 +19,7 @@ from blinkgl.labels.files import Form
 
 if TYPE_CHECKING:
     from blinkgl.config.labels import LabelsConfig
+    from blinkgl.labels.frames import LabelFrame
     from blinkgl.render.passes import Shot
     from blinkgl.render.reference import ReferenceFrame
     from blinkgl.scene.types import Scene
@@ -88,11 +89,16 @@ class Drawn(Protocol):
     """What :meth:`Label.finish` is given: the buffers of one time as the shader wrote them.
 
     scene : as it is drawn.   end_ns : the time that this label leads to; None: it is of one time.
+    categories : pattern of names and number of the category, in order.
+    t_ns : the time.   leading : of a label that says ``each``, interval in ns -> frame of those labels, leading so far.
     raw(name) : (H, W[, C]) buffer of a label, its own or one of ``needs``.   value(name) : what that label made of its.
     there(name) : buffer of a label among its ``there``, at the time that this label leads to."""
 
     scene: Scene
+    t_ns: int
     end_ns: int | None
+    categories: tuple[tuple[str, int], ...]
+    leading: Mapping[int, LabelFrame]
 
     def raw(self, name: str) -> np.ndarray: ...
 
@@ -119,9 +125,12 @@ class Label:
         where ``varyings`` names "local" or "normal", and ``#include``; None: it stands in
         ``shaders/include/labels/NAME.glsl``. "rate", "forward", "backward": how a shape that changes with time moves
         (``DEFORM`` is defined then), as ``shaders/include/vertex.glsl`` says; "rate" is all that ``velocity()`` needs.
+        of_shapes : uniforms that its ``glsl`` has of shapes that change (``DEFORM``) alone.
         needs : labels whose buffers are drawn with it.   there : labels whose buffers it reads at the other time.
         towards : "forward" or "backward": it leads from one label's time to the next or the
         one before; None: it is of one time.
+        each : labels that lead forward, and are drawn for it once per interval of the request instead
+        (:meth:`intervals`).
         anti_aliased : drawn by the colour pass instead, by the configuration's filter.   at_last :
         there at the end of the last interval, too.
 
@@ -147,9 +156,11 @@ class Label:
     buffer: str | None = None
     glsl: str | None = None
     varyings: tuple[str, ...] = ()
+    of_shapes: tuple[str, ...] = ()
     needs: tuple[str, ...] = ()
     there: tuple[str, ...] = ()
     towards: Towards | None = None
+    each: tuple[str, ...] = ()
     anti_aliased: bool = False
     at_last: bool = False
 
@@ -183,9 +194,28 @@ class Label:
         """Its name in Python calls, ``labels=["depth", …]``."""
         return self.name
 
+    def intervals(self, labels: LabelsConfig) -> tuple[int, ...]:
+        """Of a label that says ``each``: how far each leads from the label's time, ns, increasing."""
+        return ()
+
+    def categories(self, labels: LabelsConfig) -> tuple[tuple[str, int], ...]:
+        """Of a label that tells kinds of objects apart: pattern of names and number, in order."""
+        return ()
+
+    def check(self, scene: Scene, labels: LabelsConfig) -> None:
+        """Raises ConfigError for what ``labels:`` asks for and a scene cannot give."""
+
+    def facts(self, scene: Scene, labels: LabelsConfig) -> dict[str, Any]:
+        """What the manifest says of it besides, by key: plain values."""
+        return {}
+
     def ask(self, tree: dict[str, Any]) -> None:
         """Asks for it in a tree of ``labels:``."""
         tree[self.name] = True
+
+    def can_be_of(self, scene: Scene) -> bool:
+        """Whether it says anything of a scene: where it does not the shader debugger leaves it out."""
+        return True
 
     # ---- the shader and the CPU ----------------------------------------------------------------------------------
 
@@ -235,9 +265,18 @@ class Label:
         """What cannot be in a value that was read back; None: nothing."""
         return None
 
+    def unlike(self, value: Any, labels: LabelsConfig, before_ns: int, after_ns: int) -> str | None:
+        """What of a value that was read back is not as ``labels:`` asks; None: nothing. before_ns, after_ns : from its
+        time to the sequence's begin (negative) and end."""
+        return None
+
     def agrees(self, one: Any, other: Any) -> bool:
         """Whether two machines may have drawn these for one moment. True: a renderer may change every pixel."""
         return True
+
+    def drawn_on(self, picture: np.ndarray, value: Any) -> np.ndarray | None:
+        """(H, W, 3) uint8: the value drawn over a picture, of a label that is no picture itself; else None."""
+        return None
 
     # ---- the reference -------------------------------------------------------------------------------------------
 

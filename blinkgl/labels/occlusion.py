@@ -14,11 +14,9 @@ from blinkgl.labels.label import Drawn, Key, Label, Towards, View
 if TYPE_CHECKING:
     from blinkgl.config.labels import LabelsConfig
 
-_KEYS = {
-    "occlusion": Key(
-        bool, Field(True, description="masks of pixels that are not visible at the flow's other end"), "depth"
-    )
-}
+OCCLUSION_KEY = Key(
+    bool, Field(True, description="masks of pixels that are not visible at the flow's other end"), "depth"
+)
 
 
 class OcclusionAt(Label):
@@ -37,7 +35,7 @@ class OcclusionAt(Label):
         self.needs, self.there = (f"flow_{towards}", "ids"), ("depth", "ids")
         self.shard = "occlusion.png" if towards == "forward" else None
 
-    keys = property(lambda self: _KEYS)
+    keys = property(lambda self: {"occlusion": OCCLUSION_KEY})
     said = property(lambda self: "occlusion")
 
     def asked(self, labels: LabelsConfig) -> bool:

@@ -63,7 +63,10 @@ def asked_for(labels: LabelsConfig) -> LabelRequest:
     """What ``labels:`` asks for."""
     from blinkgl.labels.frames import LabelRequest
 
-    return LabelRequest(*(name for name, label in LABELS.items() if label.asked(labels)))
+    asked = [name for name, label in LABELS.items() if label.asked(labels)]
+    intervals = {ns for name in asked for ns in LABELS[name].intervals(labels)}
+    categories = next((found for name in asked if (found := LABELS[name].categories(labels))), ())
+    return LabelRequest(*asked, intervals_ns=sorted(intervals), categories=categories)
 
 
 def _checked(label: Any) -> dict[str, Key]:
@@ -113,7 +116,7 @@ def _checked(label: Any) -> dict[str, Key]:
             "glsl",
             f"does not define {head}",
         )
-    for part, known in (("varyings", VARYINGS), ("needs", LABELS), ("there", LABELS)):
+    for part, known in (("varyings", VARYINGS), ("needs", LABELS), ("there", LABELS), ("each", LABELS)):
         there = getattr(label, part)
         unless(
             isinstance(there, tuple) and set(there) <= {*known},

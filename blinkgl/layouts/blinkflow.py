@@ -21,8 +21,26 @@ from blinkgl.io.atomic import output_errors
 from blinkgl.io.flow import encode_flow_npy
 from blinkgl.io.images import encode_npy
 from blinkgl.layouts.files import append, growing, write_bytes
-from blinkgl.layouts.layout import Layout, Missing, needs_flow
+from blinkgl.layouts.layout import Layout, Missing, forward_flow
 from blinkgl.layouts.source import Source
+
+
+def _divided_second(source: Source) -> Missing | None:
+    if not source.flow_times("forward"):
+        return None
+    interval = _interval_us(source)
+    if interval % 1000 == 0 and 1_000_000 % interval == 0:
+        return None
+    rate = max(r for r in (1, 2, 4, 5, 8, 10, 20, 25, 40, 50, 100) if r <= max(1, 1e6 / interval))
+    said = f"flow over whole ms that divide a second (labels come at {1e6 / interval:g} Hz)"
+    return Missing(said, f"time: {{label_rate: {rate}}}")
+
+
+def _events_before(source: Source) -> Missing | None:
+    times = source.flow_times("forward")
+    if not times or times[0][0] == source.start_us + _interval_us(source):
+        return None
+    return Missing("a recording that begins a label interval before the first label", "time: {start: 0}")
 
 
 class BlinkFlow(Layout):
@@ -31,19 +49,7 @@ class BlinkFlow(Layout):
     name = "blinkflow"
     about = "BlinkFlow's PyTorch loader, E-FlowFormer's training, eflow"
     size = (480, 640)
-
-    def missing(self, source: Source) -> list[Missing]:
-        found = needs_flow(source)
-        if found:
-            return found
-        interval = _interval_us(source)
-        if interval % 1000 or 1_000_000 % interval:
-            rate = max(r for r in (1, 2, 4, 5, 8, 10, 20, 25, 40, 50, 100) if r <= max(1, 1e6 / interval))
-            said = f"flow over whole ms that divide a second (labels come at {1e6 / interval:g} Hz)"
-            return [Missing(said, f"time: {{label_rate: {rate}}}")]
-        if source.flow_times("forward")[0][0] != source.start_us + interval:
-            return [Missing("a recording that begins a label interval before the first label", "time: {start: 0}")]
-        return []
+    needs = (forward_flow, _divided_second, _events_before)
 
     def folder(self, source: Source) -> str:
         scene, _, number = source.name.rpartition("_")

@@ -24,7 +24,7 @@ from blinkgl.io.camchain import Calibrated, cam_to_cam_yaml
 from blinkgl.io.dsec import identity_rectify_map, write_rectify_map
 from blinkgl.io.flow_png import encode_png
 from blinkgl.layouts.files import copy, write_bytes, write_lines
-from blinkgl.layouts.layout import Layout, Missing, needs_flow
+from blinkgl.layouts.layout import Layout, Missing, forward_flow
 from blinkgl.layouts.source import Source
 
 DISPARITY_SCALE = 256.0
@@ -34,15 +34,34 @@ _INTERVAL_US = 100_000
 """E-RAFT's windows, written into its loader."""
 
 
+def _rectified(source: Source) -> Missing | None:
+    """DSEC's truth lies in the rectified picture; its loaders rectify the events alone."""
+    if source.camera is None or source.rectified:
+        return None
+    return Missing("labels in rectified pixels", "labels: {pixels: rectified}")
+
+
+def _over_100_ms(source: Source) -> Missing | None:
+    times = source.flow_times("forward")
+    if all(b - a == _INTERVAL_US for a, b in times):
+        return None
+    rate = 1e6 / (times[0][1] - times[0][0])
+    return Missing(f"flow over 100 ms (labels come at {rate:g} Hz)", "time: {label_rate: 10}")
+
+
+def _three_labels(source: Source) -> Missing | None:
+    if not 0 < len(source.flow_times("forward")) < 3:
+        return None
+    return Missing("a third label", "time: {duration: 0.3, label_rate: 10}")
+
+
 class Dsec(Layout):
     """Training sequences with flow, and of a stereo rig with disparity."""
 
     name = "dsec"
     about = "DSEC's provider and event slicer, bflow, E-RAFT's training loaders, eflow"
     size = (480, 640)
-
-    def missing(self, source: Source) -> list[Missing]:
-        return needs_flow(source) + _needs_rectified(source)
+    needs = (forward_flow, _rectified)
 
     def write(self, source: Source, folder: Path) -> list[str]:
         said: list[str] = []
@@ -69,19 +88,7 @@ class ERaft(Layout):
     name = "eraft"
     about = "E-RAFT's DSEC loader (test sequences, standard and warm start)"
     size = (480, 640)
-
-    def missing(self, source: Source) -> list[Missing]:
-        found = needs_flow(source)
-        if found:
-            return found
-        found = _needs_rectified(source)
-        times = source.flow_times("forward")
-        if any(b - a != _INTERVAL_US for a, b in times):
-            rate = 1e6 / (times[0][1] - times[0][0])
-            found.append(Missing(f"flow over 100 ms (labels come at {rate:g} Hz)", "time: {label_rate: 10}"))
-        if len(times) < 3:
-            found.append(Missing("a third label", "time: {duration: 0.3, label_rate: 10}"))
-        return found
+    needs = (forward_flow, _rectified, _over_100_ms, _three_labels)
 
     def folder(self, source: Source) -> str:
         return f"test/{source.name}"
@@ -96,12 +103,6 @@ class ERaft(Layout):
         )  # of label 0 its loader makes no sample
         write_flow(source, "forward", folder / "flow")
         return []
-
-
-def _needs_rectified(source: Source) -> list[Missing]:
-    """DSEC's truth lies in the rectified picture; its loaders rectify the events alone."""
-    there = source.camera is None or source.rectified
-    return [] if there else [Missing("labels in rectified pixels", "labels: {pixels: rectified}")]
 
 
 def image_times(source: Source) -> list[int]:
@@ -143,22 +144,22 @@ def encode_disparity(disparity: np.ndarray) -> bytes:
 
 
 def _write_disparity(left: Source, right: Source, folder: Path) -> list[str]:
-    pair = _pair(left, right)
-    if pair is None:
+    baseline, camera = _baseline(left, right), left.camera
+    if baseline is None or camera is None:
         return [f"{left.name}: no disparity: its cameras are not parallel, side by side and alike"]
     times = left.flow_times("forward")
     labelled = left.count("disparity") >= len(times)
     if not labelled and left.count("depth") < len(times):
         return [f"{left.name}: no disparity without 'labels: {{disparity: true}}'"]
     for k in range(len(times)):
-        disparity = left.value("disparity", k) if labelled else pair[0] * pair[1] / left.value("depth", k)
+        disparity = left.value("disparity", k) if labelled else camera.disparity(left.value("depth", k), baseline)
         write_bytes(folder / f"event/{2 * k:06d}.png", encode_disparity(disparity))
     write_lines(folder / "timestamps.txt", [a for a, _ in times])
     return []
 
 
-def _pair(left: Source, right: Source) -> tuple[float, float] | None:
-    """Focal length, px, and baseline, world units; None where a disparity is no f b / Z."""
+def _baseline(left: Source, right: Source) -> float | None:
+    """World units; None where a disparity is no f b / Z."""
     eyes = left.camera, right.camera
     if eyes[0] is None or eyes[1] is None or not np.allclose(eyes[0].K, eyes[1].K, rtol=0, atol=1e-9):
         return None
@@ -167,7 +168,7 @@ def _pair(left: Source, right: Source) -> tuple[float, float] | None:
     turned = np.abs(T_left_right[:, :3, :3] - np.eye(3)).max()
     aside = np.abs(t - [t[0, 0], 0, 0]).max()
     parallel = t[0, 0] > 0 and max(turned, aside) < _PARALLEL * max(1.0, t[0, 0])
-    return (float(eyes[0].fx), float(t[0, 0])) if parallel else None
+    return float(t[0, 0]) if parallel else None
 
 
 def cam_to_cam(source: Source, camera: CameraModel) -> str:
@@ -178,8 +179,8 @@ def cam_to_cam(source: Source, camera: CameraModel) -> str:
         return cam_to_cam_yaml([Calibrated(camera)])
     T_right_left = np.linalg.inv(right.poses["T_world_cam"][0]) @ source.poses["T_world_cam"][0]
     tables = None
-    if (pair := _pair(source, right)) is not None:
-        focal, baseline = pair
-        Q = [[1.0, 0.0, 0.0, -camera.cx], [0.0, 1.0, 0.0, -camera.cy], [0.0, 0.0, 0.0, focal]]
+    if (baseline := _baseline(source, right)) is not None:
+        focal, _, cx, cy = camera.intrinsics
+        Q = [[1.0, 0.0, 0.0, -cx], [0.0, 1.0, 0.0, -cy], [0.0, 0.0, 0.0, focal]]
         tables = {"cams_03": [[float(v) for v in row] for row in (*Q, [0.0, 0.0, 1 / baseline, 0.0])]}
     return cam_to_cam_yaml([Calibrated(camera), Calibrated(right.camera, T_right_left)], (0, 3), tables)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,19 +16,24 @@ class Missing(NamedTuple):
     yaml: str
 
 
+Need = Callable[[Source], "Missing | None"]
+"""What loaders cannot do without, asked of a sequence: None where it is there, or where another need speaks of it."""
+
+
 class Layout:
     """One layout; a row of the table is an instance.
 
     name : as ``--layout`` has it.   about : what opens it, for tables.   size : (height, width) that its loaders have
-    written into their code, None: any; other sizes are exported and said."""
+    written into their code, None: any; other sizes are exported and said.   needs : what its loaders ask for."""
 
     name: str
     about: str
     size: tuple[int, int] | None = None
+    needs: tuple[Need, ...] = ()
 
     def missing(self, source: Source) -> list[Missing]:
         """What ``source`` lacks and its loaders cannot do without."""
-        raise NotImplementedError
+        return [missing for need in self.needs if (missing := need(source)) is not None]
 
     def folder(self, source: Source) -> str:
         """Where its files go, below the export."""
@@ -39,6 +45,11 @@ class Layout:
         raise NotImplementedError
 
 
-def needs_flow(source: Source) -> list[Missing]:
+def forward_flow(source: Source) -> Missing | None:
     """What nearly every layout asks for."""
-    return [] if source.flow_times("forward") else [Missing("forward flow", "labels: {flow: [forward]}")]
+    return None if source.flow_times("forward") else Missing("forward flow", "labels: {flow: [forward]}")
+
+
+def images(source: Source) -> Missing | None:
+    """Of the camera that makes the events."""
+    return None if source.image_times else Missing("images", "labels: {images: true}")

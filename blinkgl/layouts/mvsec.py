@@ -20,7 +20,7 @@ import numpy as np
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.imu import H5 as IMU, read_imu
 from blinkgl.layouts.files import append, growing
-from blinkgl.layouts.layout import Layout, Missing, needs_flow
+from blinkgl.layouts.layout import Layout, forward_flow, images
 from blinkgl.layouts.source import Source
 
 _ALMOST_NOTHING = np.float32(1e-6)
@@ -32,12 +32,7 @@ class Mvsec(Layout):
     name = "mvsec"
     about = "EV-FlowNet's and later loaders of MVSEC (hdf5 and *_gt_flow_dist.npz), eflow"
     size = (260, 346)
-
-    def missing(self, source: Source) -> list[Missing]:
-        found = needs_flow(source)
-        if not source.image_times:
-            found.append(Missing("images", "labels: {images: true}"))
-        return found
+    needs = (forward_flow, images)
 
     def folder(self, source: Source) -> str:
         return source.split
@@ -55,15 +50,15 @@ class Mvsec(Layout):
 
 def _data(source: Source, file: h5py.File, group: str) -> None:
     rows = growing(file, f"{group}/events", np.float64, (4,))
-    images = np.array(source.image_times, np.int64)
-    first = np.zeros(len(images), np.int64)  # number of the first event that is not before the image
+    taken = np.array(source.image_times, np.int64)
+    first = np.zeros(len(taken), np.int64)  # number of the first event that is not before the image
     for events in source.events():
         append(rows, np.stack([events.x, events.y, events.t * 1e-6, events.p * 2.0 - 1], axis=1))
-        first += np.searchsorted(events.t, images, side="left")
+        first += np.searchsorted(events.t, taken, side="left")
     pictures = growing(file, f"{group}/image_raw", np.uint8, (source.height, source.width), rows=1)
-    for k in range(len(images)):
+    for k in range(len(taken)):
         append(pictures, source.grey(k)[None])
-    _keep(file, f"{group}/image_raw_ts", images * 1e-6)
+    _keep(file, f"{group}/image_raw_ts", taken * 1e-6)
     _keep(file, f"{group}/image_raw_event_inds", np.minimum(first, len(rows) - 1))
     if source.has(IMU):
         imu = read_imu(source.folder)

@@ -14,8 +14,20 @@ import numpy as np
 
 from blinkgl.io.tracks import TRACKS, read_tracks
 from blinkgl.layouts.files import write_bytes
-from blinkgl.layouts.layout import Layout, Missing
+from blinkgl.layouts.layout import Layout, Missing, images
 from blinkgl.layouts.source import Source
+
+
+def _tracks(source: Source) -> Missing | None:
+    return None if source.has(TRACKS) else Missing("point tracks", "tracks: {points: 256}")
+
+
+def _at_images(source: Source) -> Missing | None:
+    if not source.has(TRACKS) or not source.image_times:
+        return None
+    if len(_common(source, read_tracks(source.folder)["t_us"])[0]) > 1:
+        return None
+    return Missing("tracks at the images' times", "tracks: {points: 256}, without a rate")
 
 
 class TapVid(Layout):
@@ -23,26 +35,19 @@ class TapVid(Layout):
 
     name = "tapvid"
     about = "TAP-Vid's DAVIS reader (TAPIR, CoTracker, BootsTAP: a pickle of NumPy arrays)"
-
-    def missing(self, source: Source) -> list[Missing]:
-        found = [] if source.has(TRACKS) else [Missing("point tracks", "tracks: {points: 256}")]
-        if not source.image_times:
-            found.append(Missing("images", "labels: {images: true}"))
-        if not found and len(_common(source, read_tracks(source.folder)["t_us"])[0]) < 2:
-            found.append(Missing("tracks at the images' times", "tracks: {points: 256}, without a rate"))
-        return found
+    needs = (_tracks, images, _at_images)
 
     def folder(self, source: Source) -> str:
         return source.split
 
     def write(self, source: Source, folder: Path) -> list[str]:
         tracks = read_tracks(source.folder)
-        at, images = _common(source, tracks["t_us"])
+        at, shown = _common(source, tracks["t_us"])
         hidden = tracks["occluded"][:, at]
         ever = ~hidden.all(axis=1)  # what no frame shows cannot be asked for
         share = (tracks["target_points"][:, at] + 0.5) / [source.width, source.height]
         table = {
-            "video": np.stack([source.image(k) for k in images]),
+            "video": np.stack([source.image(k) for k in shown]),
             "points": share[ever].astype(np.float32),
             "occluded": hidden[ever],
         }
@@ -53,5 +58,5 @@ class TapVid(Layout):
 
 def _common(source: Source, t_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of the tracks' times at which there is an image, and of those images."""
-    _, at, images = np.intersect1d(t_us, source.image_times, return_indices=True)
-    return at, images
+    _, at, shown = np.intersect1d(t_us, source.image_times, return_indices=True)
+    return at, shown

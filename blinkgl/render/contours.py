@@ -1,7 +1,7 @@
 """Where one surface ends in front of another: the edges of meshes that a picture shows as steps, as lines in it.
 
-    lines = Lines(scene)
-    quads = lines.of(moment, items, width, height)      # what passes/edges.py draws
+    lines = Lines()
+    quads = lines.of(moment, items, width, height)      # what passes/edged.py draws
 
 An edge of a mesh is seen when the surface turns away from the camera there (a silhouette), when it ends there (a
 border), or when two of its faces meet at an angle (a crease). Which ones that are is decided in float64, in the mesh's

@@ -3,6 +3,8 @@ look at the buffers of other times."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -44,6 +46,8 @@ class Labels:
             for towards, end_ns in ends.items()
             if (names := LabelRequest(*(name for name in request if LABELS[name].towards == towards)).there)
         }
+        each = request.each
+        leading = {ns: self.frame(t_ns, each, t_ns + ns, None) for ns in request.intervals_ns} if each else {}
         drawn: dict[str, np.ndarray] = {}
         if names := request.buffers:
             frame = self._drawn(names, t_ns, ends)
@@ -55,30 +59,14 @@ class Labels:
                 values[name] = (draw.colour(t_ns) if self._view is None else draw.flat_colour(at)).read()
         started = working_clock()
         for name in request:
-            self._finished(name, drawn, ends, there, values)
+            self._finished(name, _Seen(t_ns, drawn, ends, there, leading, request.categories), values)
         draw.stats.render_s += working_clock() - started
         return LabelFrame(t_ns, {name: values[name] for name in request})
 
-    def _finished(
-        self,
-        name: str,
-        drawn: dict[str, np.ndarray],
-        ends: dict[str, int],
-        there: dict[str, dict[str, np.ndarray]],
-        values: dict[str, Any],
-    ) -> Any:
+    def _finished(self, name: str, seen: _Seen, values: dict[str, Any]) -> Any:
         if name not in values:
             label = LABELS[name]
-            value = label.finish(
-                _Drawn(
-                    label,
-                    self.scene,
-                    ends.get(label.towards),
-                    drawn,
-                    there.get(label.towards, {}),
-                    lambda other: self._finished(other, drawn, ends, there, values),
-                )
-            )
+            value = label.finish(_Drawn(label, self.scene, seen, lambda other: self._finished(other, seen, values)))
             camera = self.scene.camera
             if (wrong := label.wrong(value, camera.height, camera.width)) is not None:
                 raise TypeError(f"label '{name}': `finish` gives {wrong}")
@@ -115,20 +103,29 @@ class Labels:
         return self._kept[key]
 
 
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """All that was drawn of one time. drawn : buffers.   ends : where labels lead, ns, by ``towards``.
+    there : buffers at those times.   leading : frames of labels that lead over intervals, by those."""
+
+    t_ns: int
+    drawn: dict[str, np.ndarray]
+    ends: dict[str, int]
+    there: dict[str, dict[str, np.ndarray]]
+    leading: dict[int, LabelFrame]
+    categories: tuple[tuple[str, int], ...]
+
+
 class _Drawn:
     """:class:`blinkgl.labels.label.Drawn`: what one label may look at."""
 
-    def __init__(
-        self,
-        label: Label,
-        scene: Scene,
-        end_ns: int | None,
-        drawn: dict[str, np.ndarray],
-        there: dict[str, np.ndarray],
-        value_of,
-    ):
-        self.scene, self.end_ns = scene, end_ns
-        self._label, self._drawn, self._there, self._value_of = label, drawn, there, value_of
+    def __init__(self, label: Label, scene: Scene, seen: _Seen, value_of: Callable[[str], Any]):
+        towards = label.towards or ""
+        self.scene, self.t_ns, self.end_ns = scene, seen.t_ns, seen.ends.get(towards)
+        self.categories = seen.categories
+        self.leading = seen.leading if label.each else {}
+        self._label, self._drawn, self._there = label, seen.drawn, seen.there.get(towards, {})
+        self._value_of = value_of
 
     def raw(self, name: str) -> np.ndarray:
         return self._allowed(self._drawn, name, (self._label.name, *self._label.needs), "needs")

@@ -34,6 +34,7 @@ from blinkgl.render.passes import (
     Geometry,
     Luminance,
     Pass,
+    ShadowMap,
     Shot,
     Velocity,
     filtered,
@@ -59,8 +60,9 @@ class Renderer:
     without triangles that are lines in float32.   width, height : of the image, px.   stats : RenderStats.
     whole : frames are always drawn whole; otherwise a camera that stands still has only what
     moves drawn again, to the same pixels.
-    beside : of the same scene seen by another sensor: meshes, textures, poses and shadow maps are then its own, but
-    where levels of detail are asked for, which hang on the camera. It has to be released last.
+    beside : of the same scene seen by another sensor: meshes, textures, poses and (where they hold all whose shadows
+    both see) shadow maps are then its own, but where levels of detail are asked for, which hang on the camera. It has
+    to be released last.
     painter : class that issues the draw calls; a subclass may look on."""
 
     def __init__(
@@ -97,7 +99,10 @@ class Renderer:
         # Worth it when something stands still besides the camera; a scene of movers alone is drawn whole.
         some_stand = any(o.is_static for o in scene.objects)
         lamps_stand = all(lamp.path.is_static for lamp in scene.light.lamps)
-        self._shadows = shadow_maps(scene, self.items) if scene.light.shadows != "off" else ()
+        # Those of the rig's first camera, not equal ones: the path of a sun is no value, so that maps are told by it.
+        self._shadows: tuple[ShadowMap, ...] = ()
+        if scene.light.shadows != "off":
+            self._shadows = shadow_maps(scene, self.items) if beside is None else beside._shadows  # noqa: SLF001
         # What is in the shadow of something that moves changes, too, where it is itself at rest.
         shadows_stand = not (self._shadows and any(item.casts and item.moves for item in self.items))
         self.whole = whole or not (scene.camera_path.is_static and some_stand and lamps_stand and shadows_stand)
@@ -194,7 +199,7 @@ class Renderer:
     def _drawn(self, pass_: Pass, moment: Moment, ends: Mapping[str, Moment], done: dict[Pass, Frame]) -> Frame:
         frame = done.get(pass_)
         if frame is None:
-            if pass_.common and (last := self._last.get(pass_)) is not None and last.t_ns == moment.t_ns:
+            if pass_.common and (last := self._last.get(pass_)) is not None and pass_.serves(last.moment, moment):
                 done[pass_] = last
                 return last
             inputs = {one.sampler: self._drawn(one.of, moment, ends, done) for one in pass_.inputs}

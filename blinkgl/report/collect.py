@@ -215,7 +215,7 @@ def _example(folder: Path, line: dict[str, Any], flows: list[Path], pairs, k: in
         event_colour(counts),
         flow_colour(flow, top or None, valid),
         caption,
-        [*_of_the_camera(folder, line, start), *_others(folder, int(flows[k].stem))],
+        [*_of_the_camera(folder, line, start), *_others(folder, int(flows[k].stem), image)],
     )
 
 
@@ -234,8 +234,9 @@ def _of_the_camera(folder: Path, line: dict[str, Any], t_us: int) -> list[tuple[
     return pictures
 
 
-def _others(folder: Path, index: int) -> list[tuple[str, np.ndarray]]:
-    """Pictures of the labels besides those that every example shows."""
+def _others(folder: Path, index: int, image: np.ndarray | None) -> list[tuple[str, np.ndarray]]:
+    """Pictures of the labels besides those that every example shows. image : of the same time, what is no picture is
+    drawn over that."""
     from blinkgl.io.pictures import picture
 
     pictures = []
@@ -244,6 +245,8 @@ def _others(folder: Path, index: int) -> list[tuple[str, np.ndarray]]:
         if name in ("images", _FLOW.name) or form.read is None or not (folder / form.file(index)).is_file():
             continue
         value = form.read(folder / form.file(index))
+        if image is not None and (over := label.drawn_on(image, value)) is not None:
+            pictures.append((label.heading, over))
         pictures += [
             (view.title, picture(view.kind, view.of(value))[0])
             for view in label.views

@@ -9,7 +9,14 @@ import numpy as np
 
 from blinkgl.config.camera import CameraConfig, camera_radius
 from blinkgl.config.rig import RigSensorConfig, baseline_of
-from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig, SceneConfig
+from blinkgl.config.scene import (
+    ExplicitSceneConfig,
+    FileSceneConfig,
+    LightConfig,
+    RandomSceneConfig,
+    SceneConfig,
+    TrajectoryConfig,
+)
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.scene.rig import Rig, Sensor
@@ -68,7 +75,7 @@ def sequence_scene(config: SequenceConfig, index: int, base: Path | str = ".") -
     time, seed = config.time, config.seed
     scene = build_scene(
         _with_room(config) if config.sensors else config.scene,
-        _cameras(config)[0] if config.sensors else config.camera,
+        seen_by(config),
         time.t0_ns,
         time.t1_ns,
         split=config.output.split,
@@ -76,14 +83,19 @@ def sequence_scene(config: SequenceConfig, index: int, base: Path | str = ".") -
         sequence=index,
         base=base,
     )
+    return equipped(scene, config)
+
+
+def equipped(scene: Scene, config: SequenceConfig) -> Scene:
+    """The scene with the sensors that the configuration describes, each recording what is asked of it."""
     if config.sensors is None:
         return recording(scene, config)
     return replace(scene, rig=Rig(scene.rig.path, tuple(_on_rig(one, config.sensors) for one in config.sensors)))
 
 
-def _cameras(config: SequenceConfig) -> list[CameraConfig]:
-    """Of the rig's cameras; where it has none, that of the top, by which random worlds are laid out."""
-    return [one.camera for one in config.sensors or () if one.sees] or [config.camera]
+def seen_by(config: SequenceConfig) -> CameraConfig:
+    """The camera that a scene is made for: a rig's first one; where it has none, that of the top."""
+    return next((one.camera for one in config.sensors or () if one.sees), config.camera)
 
 
 def _on_rig(one: RigSensorConfig, all_: tuple[RigSensorConfig, ...]) -> Sensor:
@@ -130,18 +142,32 @@ def check_assets(config: SceneConfig, base: Path | str = ".", split: str = "trai
         moving = [("scene.camera", config.camera), *((f"scene.objects.{k}", o) for k, o in enumerate(config.objects))]
         for where, motion in moving:
             if motion.trajectory is not None:
-                _exists(motion.trajectory.file, base, f"{where}.trajectory.file", "a trajectory")
+                _check_trajectory(motion.trajectory, base, f"{where}.trajectory")
         for name, mesh in config.meshes.items():
             _exists(mesh.file, base, f"scene.meshes.{name}.file", "a mesh file")
             if mesh.primitive is not None:
                 check_primitive(mesh.primitive, mesh.parameters, name)
         for name, material in config.materials.items():
-            _exists(material.texture, base, f"scene.materials.{name}.texture", "an image file")
+            for key, used in material.files.items():
+                _exists(used, base, f"scene.materials.{name}.{key}", "an image file")
+        _exists(panorama_of(config.light), base, "scene.light.environment.map", "a panorama")
     else:
         assert isinstance(config, FileSceneConfig)
+        _exists(panorama_of(config.light), base, "scene.light.environment.map", "a panorama")
         _exists(config.path, base, "scene.path", "a gltf or glb file")
         if config.pose is not None and config.pose.trajectory is not None:
-            _exists(config.pose.trajectory.file, base, "scene.pose.trajectory.file", "a trajectory")
+            _check_trajectory(config.pose.trajectory, base, "scene.pose.trajectory")
+
+
+def _check_trajectory(config: TrajectoryConfig, base: Path, where: str) -> None:
+    _exists(config.file, base, f"{where}.file", "a trajectory")
+    if isinstance(config.T_body_sensor, str):
+        _exists(config.T_body_sensor, base, f"{where}.T_body_sensor", "EuRoC's sensor.yaml")
+
+
+def panorama_of(light: LightConfig) -> str | None:
+    """File that lights a scene; None: none."""
+    return None if light.environment is None else light.environment.map
 
 
 def _exists(path: str | None, base: Path, where: str, what: str) -> None:

@@ -103,15 +103,16 @@ class _Writer:
 
     def _lens(self) -> dict[str, Any]:
         camera = self.scene.camera
+        fx, fy, cx, cy = camera.intrinsics
         perspective = {
-            "yfov": 2 * math.atan(camera.height / 2 / camera.fy),
-            "aspectRatio": camera.width * camera.fy / (camera.height * camera.fx),
+            "yfov": 2 * math.atan(camera.height / 2 / fy),
+            "aspectRatio": camera.width * fy / (camera.height * fx),
             "znear": camera.near,
         }
         if not isinstance(camera, PinHole):
             self.said.append("the lens's distortion")
         middle = ((camera.width - 1) / 2, (camera.height - 1) / 2)
-        if max(abs(camera.cx - middle[0]), abs(camera.cy - middle[1])) > 1e-6:
+        if max(abs(cx - middle[0]), abs(cy - middle[1])) > 1e-6:
             self.said.append("a principal point beside the middle of the picture")
         return {"type": "perspective", "name": "camera", "perspective": perspective}
 

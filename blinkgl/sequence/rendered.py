@@ -40,13 +40,19 @@ SURFACES = LabelRequest("ids", "depth", "velocity")
 
 
 def drawn(
-    renderer: Renderer, times: Iterable[int], rates: bool = False, surfaces: bool = False
+    renderer: Renderer, times: Iterable[int], rates: bool = False, surfaces: bool = False, textures: bool = False
 ) -> Iterator[EventFrame]:
     """The frames of the event pass at ``times``, ns; a :class:`Timeline` is told every one.
-    rates : with d(luminance)/dt.   surfaces : with what every pixel shows."""
+    rates : with d(luminance)/dt.   surfaces : with what every pixel shows.   textures : as they lie on the card, where
+    the timeline does not look at them; without rates then."""
     observe, frame = times.observe if isinstance(times, Timeline) else None, None
+    textures = textures and not rates and not (isinstance(times, Timeline) and times.looks_at_frames)
     for t_ns in times:
         before, frame = frame, renderer.luminance(t_ns, rate=rates)
+        if textures:
+            shown = surfaces_at(renderer, t_ns) if surfaces else None
+            yield EventFrame(t_ns, frame.texture(), None, frame.rows_changed_since(before), shown)
+            continue
         luminance, rate = frame.view(), frame.view("rate") if rates else None
         if observe is not None:
             observe(t_ns, luminance, rate)
@@ -105,6 +111,9 @@ class RenderedSequence(Simulation):
                 self.libraries = {scene.dynamics.engine: scene.dynamics.version}
             self.sensor = recording(scene, config).sensors[0]
             self.name = self.sensor.folder
+            if labels and self.sensor.labels is not None:
+                for name in asked_for(self.sensor.labels):
+                    LABELS[name].check(scene, self.sensor.labels)
             self.triangles, self._before = renderer.triangles, (renderer.stats.render_s, renderer.stats.readback_s)
             camera = None
             if events:
@@ -143,7 +152,13 @@ class RenderedSequence(Simulation):
     def _event_pass(self) -> Iterator[tuple[int, Events]]:
         try:
             yield from emulate(
-                drawn(self.renderer, self.timeline, self.camera.emulator.needs_rate, self.camera.tells),
+                drawn(
+                    self.renderer,
+                    self.timeline,
+                    self.camera.emulator.needs_rate,
+                    self.camera.tells,
+                    self.camera.takes_textures(self.renderer.gl),
+                ),
                 self.camera,
                 self.clock,
             )
@@ -171,7 +186,7 @@ class RenderedSequence(Simulation):
         request, interval = asked_for(self.sensor.labels), self.config.time.interval_ns
         last = k == self.config.time.label_count
         if last:
-            request = LabelRequest(*(name for name in request if LABELS[name].at_last))
+            request = request.only(name for name in request if LABELS[name].at_last)
         return self._truth_over(k, t_ns, interval, request, last)
 
     def truth(self, t_ns: int, span_ns: int) -> GroundTruth:
@@ -179,6 +194,7 @@ class RenderedSequence(Simulation):
         return self._truth_over(-1, t_ns, span_ns, asked_for(self.sensor.labels), False)
 
     def _truth_over(self, k: int, t_ns: int, span_ns: int, request: LabelRequest, last: bool) -> GroundTruth:
+        request = request.within(self.scene.t0_ns - t_ns, self.scene.t1_ns - t_ns)
         frame = self.renderer.labels(t_ns, request, t_ns + span_ns, t_ns - span_ns, self._rectified)
         camera, objects = poses_at(self.scene, [t_ns])
         leads_to = (None, None) if last else (t_ns + span_ns, t_ns - span_ns)
@@ -242,6 +258,12 @@ class RenderedSequence(Simulation):
         rng = generator(self.config.seed, self.index, Role.TRACKS, self.number)
         return track_points(scene, config, times, rng)
 
+    def _facts_of_labels(self) -> dict[str, Any]:
+        labels, facts = self.sensor.labels, {}
+        for name in () if labels is None else asked_for(labels):
+            facts.update(LABELS[name].facts(self.renderer.scene, labels))
+        return facts
+
     def facts(self) -> dict[str, Any]:
         gl, scene, timeline = self.renderer.gl, self.renderer.scene, self.config.timeline
         return {
@@ -249,6 +271,7 @@ class RenderedSequence(Simulation):
             "timeline": {"kind": timeline.kind, "reconstruction": timeline.reconstruction, **self.achieved},
             "triangles": self.triangles,
             "objects": [_described(o) for o in scene.objects],
+            **self._facts_of_labels(),
             "scene_log": list(scene.log),
             "not_drawn": list(scene.omissions),
             **({} if scene.dynamics is None else {"dynamics": _facts_of(scene.dynamics)}),

@@ -21,6 +21,7 @@ from blinkgl.gl import GLContext, create_context
 from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, generator
 from blinkgl.scene.build import sequence_scene
+from blinkgl.scene.types import Scene
 from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.inertial import Inertial, measured
 from blinkgl.sequence.items import Item
@@ -35,10 +36,11 @@ def simulate_rig(
     *,
     base: Path = Path("."),
     pictures_hz: float | None = None,
+    scene: Scene | None = None,
 ) -> RigSequence:
     """Sequence ``index`` of a run whose configuration has ``sensors``; arguments as of
     :func:`~blinkgl.sequence.simulate.simulate_sequence`. Raises BlinkGLError."""
-    return RigSequence(config, index, gl, base=base, pictures_hz=pictures_hz)
+    return RigSequence(config, index, gl, base=base, pictures_hz=pictures_hz, scene=scene)
 
 
 class RigSequence:
@@ -56,10 +58,11 @@ class RigSequence:
         *,
         base: Path,
         pictures_hz: float | None,
+        scene: Scene | None = None,
     ):
         self.config, self.index, self.clock, self.pictures_hz = config, index, StageClock(), pictures_hz
         with self.clock("scene"):
-            self.scene = sequence_scene(config, index, base)
+            self.scene = scene or sequence_scene(config, index, base)
         self.t0_ns, self.t1_ns = self.scene.t0_ns, self.scene.t1_ns
         self.members: list[RenderedSequence] = []
         with ExitStack() as stack:

@@ -78,7 +78,7 @@ def simulate_sequence(
             "several sensors are simulated together, not as one camera",
             where="sensors",
             value=[one.name for one in config.sensors],
-            accepted="simulate_rig, or a configuration of a single camera",
+            accepted="record_rig or simulate_rig, or a configuration of a single camera",
         )
     # They import this module, for what they share.
     from blinkgl.sequence.recorded import RecordedSequence

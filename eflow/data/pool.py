@@ -10,14 +10,12 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from blinkgl.errors import AssetError, EventDataError
-from blinkgl.io.atomic import output_errors, remove_stale, temporary_beside
-from blinkgl.io.sequence_dir import refuse_existing
+from blinkgl.io.atomic import atomic_folder, output_errors
 from blinkgl.online.samples import read_sample
 from eflow.data.window import RawSample, raw_sample
 
@@ -84,31 +82,19 @@ def render_pool(
 
     about : further entries of windows.json.   Raises OutputError (the folder exists, no space), ConfigError (a recipe
     that gives no samples)."""
-    final = Path(out)
-    refuse_existing(final)
-    with output_errors(final):
-        final.parent.mkdir(parents=True, exist_ok=True)
-        remove_stale(final.parent)
-        temporary = temporary_beside(final)
-        temporary.mkdir()
     done = 0
-    try:
+    with atomic_folder(out) as folder:
         try:
             for n in range(count):
-                with output_errors(final):
-                    source.move(n, temporary / f"{n:07d}.npz")
+                with output_errors(folder):
+                    source.move(n, folder / f"{n:07d}.npz")
                 done = n + 1
                 progress(done)
         except KeyboardInterrupt:
             if done == 0:
                 raise
-            (temporary / f"{done:07d}.npz").unlink(missing_ok=True)
+            (folder / f"{done:07d}.npz").unlink(missing_ok=True)
         tree = {**(about or {}), "version": _VERSION, "samples": done, "backward": source.has_backward}
-        with output_errors(final):
-            (temporary / ABOUT).write_text(json.dumps(tree, indent=1) + "\n", encoding="utf-8")
-            refuse_existing(final)
-            os.rename(temporary, final)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
+        with output_errors(folder):
+            (folder / ABOUT).write_text(json.dumps(tree, indent=1) + "\n", encoding="utf-8")
     return done

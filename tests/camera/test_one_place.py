@@ -6,9 +6,6 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 READS_OTHERS = {
     "blinkgl/scene/worlds/from_file.py",  # pyrender's cameras have such names
-    "blinkgl/io/rig_dir.py",  # files that state them as numbers
-    "blinkgl/layouts/dsec.py",
-    "blinkgl/scene/exporting.py",
 }
 
 

@@ -153,7 +153,10 @@ def test_every_error_of_every_key_is_plain(monkeypatch):
     [
         (
             "labels: {flow: both}",
-            "labels.flow: not a list (got 'both'); expected a list of 'forward' or 'backward', such as [forward]",
+            (
+                "labels.flow: not a list (got 'both'); expected a list of 'forward' or 'backward', or a number, "
+                "such as [forward]"
+            ),
         ),
         ("labels: {depth: maybe}", "labels.depth: not true or false (got 'maybe'); expected true or false"),
         ("scene: {region: 3}", "scene.region: not a table of keys (got 3); expected a table of keys"),

@@ -271,7 +271,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
     },
     "flow": {
         "forward": NOTHING,
-        "both": {"labels": {"flow": ["forward", "backward"]}},
+        "all ways": {"labels": {"flow": ["forward", "backward", 0.004, -0.01]}},
         "backward": {"labels": {"flow": ["backward"]}},
         "none": {"labels": {"flow": []}},
     },
@@ -284,6 +284,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
                 for name, info in LabelsConfig.model_fields.items()
                 if info.annotation is bool and name not in OF_PAIRS
             }
+            | {"semantics": {"cuboid*": 7, "*": 1}}
         },
         "fewest": {"labels": {"occlusion": False}},
     },

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from blinkgl.config.labels import LabelsConfig
-from blinkgl.labels import LABELS, Flow, LabelFrame, LabelRequest, asked_for, grading, label_of
+from blinkgl.labels import LABELS, Flow, Flows, LabelFrame, LabelRequest, Occlusions, asked_for, grading, label_of
+from blinkgl.labels.boxes import Boxes, empty
 from blinkgl.labels.files import Form
 
 H, W = 4, 5
@@ -17,6 +18,13 @@ H, W = 4, 5
 def whole(name: str):
     """A value that is right, of (H, W) px."""
     label = LABELS[name]
+    if name == "boxes":
+        arrays = {key: np.ones((1, *array.shape[1:]), array.dtype) for key, array in empty().items()}
+        return Boxes(**arrays, resolution=np.array([W, H]))
+    if name == "flow_intervals":
+        return Flows(0, np.array([1, 2]), np.ones((2, H, W, 2), np.float32), np.ones((2, H, W), bool))
+    if name == "occlusion_intervals":
+        return Occlusions(0, np.array([1, 2]), np.ones((2, H, W), bool))
     if name.startswith("flow"):
         return Flow(np.ones((H, W, 2), np.float32), np.ones((H, W), bool))
     channels = 3 if label.channels is None else label.channels
@@ -24,6 +32,12 @@ def whole(name: str):
 
 
 # --- configuration ----------------------------------------------------------------------------------------------------
+
+
+def parts(value) -> list[np.ndarray]:
+    """The arrays of a value."""
+    several = (Boxes, Flow, Flows, Occlusions)
+    return [v for v in vars(value).values() if isinstance(v, np.ndarray)] if isinstance(value, several) else [value]
 
 
 def test_what_is_asked_for_when_nothing_is_said():
@@ -37,9 +51,9 @@ def test_each_is_asked_for_by_its_own_name_in_python():
         tree: dict = {"images": False, "flow": [], "occlusion": False}
         label.ask(tree)
         if name.startswith("occlusion"):
-            tree["flow"] = [label.towards]
+            tree["flow"] = [label.towards or 0.5]
         got = set(asked_for(LabelsConfig(**tree)))
-        assert got - {f"flow_{label.towards}"} <= {name} and name in got
+        assert got - {f"flow_{label.towards or 'intervals'}"} <= {name} and name in got
     said = {name: label.said for name, label in LABELS.items()}
     assert said["flow_forward"] == "flow" and said["flow_backward"] == "flow_backward" and said["depth"] == "depth"
     assert said["occlusion_forward"] == said["occlusion_backward"] == "occlusion"
@@ -80,11 +94,16 @@ FILES = {
     "flow_backward": [name.format("backward") for name in FLOW],
     "occlusion_forward": ["occlusion/forward/000007.png"],
     "occlusion_backward": ["occlusion/backward/000007.png"],
+    "flow_intervals": ["flow/intervals/000007.h5"],
+    "occlusion_intervals": ["occlusion/intervals/000007.h5"],
+    "semantics": ["semantics/000007.png"],
+    "boxes": ["boxes/000007.npz", "boxes_kitti/000007.txt"],
     "depth": ["depth/000007.npy"],
     "disparity": ["disparity/000007.npy"],
     "ids": ["ids/000007.png"],
     "normals": ["normals/000007.npy"],
     "velocity": ["velocity/000007.npy"],
+    "scene_flow": ["scene_flow/000007.npy"],
 }
 """The layout that docs/ and DSEC's loaders know."""
 
@@ -95,17 +114,23 @@ def test_where_labels_lie():
         "images": "images/timestamps.txt",
         "flow_forward": "flow/forward_timestamps.txt",
         "flow_backward": "flow/backward_timestamps.txt",
+        "flow_intervals": "flow/intervals_timestamps.txt",
+        "scene_flow": "scene_flow/timestamps.txt",
     }
     assert {name: label.shard for name, label in LABELS.items() if label.shard} == {
         "images": "image.png",
         "flow_forward": "flow.png",
         "flow_backward": "back.png",
         "occlusion_forward": "occlusion.png",
+        "flow_intervals": "flow_intervals.h5",
         "depth": "depth.npy",
         "disparity": "disparity.npy",
         "ids": "ids.png",
         "normals": "normals.npy",
         "velocity": "velocity.npy",
+        "scene_flow": "scene_flow.npy",
+        "semantics": "semantics.png",
+        "boxes": "boxes.npz",
     }
 
 
@@ -141,6 +166,8 @@ def test_a_value_of_another_shape_or_kind_is_refused(name):
     assert label.wrong(value, H, W) is None
     for height, width in ((W, H), (H + 1, W), (H, W - 1)):
         assert f"not {width}x{height} px" in label.wrong(value, height, width)
+    if name.endswith("_intervals") or name == "boxes":
+        return
     if name.startswith("flow"):
         assert label.wrong(Flow(value.flow[..., :1], value.valid), H, W) and label.wrong(
             Flow(value.flow, value.flow), H, W
@@ -160,7 +187,7 @@ def test_a_value_of_another_shape_or_kind_is_refused(name):
 def test_what_is_kept_is_a_copy(name):
     value = whole(name)
     own = LABELS[name].own(value)
-    for a, b in ((own.flow, value.flow), (own.valid, value.valid)) if name.startswith("flow") else ((own, value),):
+    for a, b in zip(parts(own), parts(value), strict=True):
         assert np.array_equal(a, b) and a.dtype == b.dtype and not np.shares_memory(a, b)
 
 
@@ -270,6 +297,8 @@ def test_how_strictly_each_is_judged():
         "id": (0.0, "max", "mismatch"),
         "normals": (1e-3, "max", "of a unit vector"),
         "velocity": (1e-2, "max", "px per label interval"),
+        "scene_flow": (1e-4, "max", "world units"),
+        "semantics": (0.0, "max", "mismatch"),
         "flow_forward": (1e-2, "max", "px"),
         "valid_forward": (0.0, "max", "mismatch"),
         "flow_backward": (1e-2, "max", "px"),
@@ -278,7 +307,7 @@ def test_how_strictly_each_is_judged():
         "occluded_backward": (1e-3, "mean", "fraction of pixels"),
     }
     loose = {v.name for label in LABELS.values() for v in label.views if not v.same_triangle}
-    assert loose == {"id", "occluded_forward", "occluded_backward"}
+    assert loose == {"id", "semantics", "occluded_forward", "occluded_backward"}
 
 
 def test_a_label_that_shows_itself_in_its_own_way_needs_no_reference():
@@ -292,8 +321,11 @@ def test_two_renderers_need_not_agree_but_in_what_is_measured():
     """Colours, numbers of objects, normals and velocities may differ in every pixel; depth, disparity and flow may
     not."""
     zero, one = np.zeros((H, W), np.float32), np.ones((H, W), np.float32)
-    free = {name for name, label in LABELS.items() if not name.startswith("flow") and label.agrees(zero, one)}
-    assert free == set(LABELS) - {"depth", "disparity", "flow_forward", "flow_backward"}
+    of_arrays = [name for name in LABELS if not name.startswith("flow") and name != "boxes"]
+    free = {name for name in of_arrays if LABELS[name].agrees(zero, one)}
+    assert free == set(LABELS) - {
+        *("depth", "disparity", "scene_flow", "boxes", "flow_forward", "flow_backward", "flow_intervals")
+    }
     assert LABELS["depth"].agrees(one, one) and not LABELS["depth"].agrees(one, one[:, :3])
 
 

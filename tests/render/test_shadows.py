@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import ExitStack
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.render import reference
 from blinkgl.render.passes import shadow_maps
+from blinkgl.render.passes.shadow import ShadowMap
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.lights import lamp_pose
 from blinkgl.scene.motion.paths import StaticPath
@@ -20,6 +22,7 @@ from blinkgl.tools.shadow_faults import faults, frame as random_frame
 from render_scenes import LEVEL, SECOND, cube, curve, drift, quad, rig, scene, sphere, still, thing
 
 PLAIN = RenderConfig(image_antialiasing="none")
+SEEN = ShadowMap.seen
 DOWN = LEVEL * Rotation.from_rotvec([-0.45, 0, 0])
 SLANT = np.array([-0.5, -0.3, 1.0]) / np.sqrt(1.34)
 
@@ -121,6 +124,51 @@ def test_soft_shadows_are_a_mean_over_the_sun(gl):
     assert half.sum() > 100
     assert np.abs(seen - true)[half].mean() < 0.12 < np.abs(hard - true)[half].mean()
     assert np.abs(seen - true).mean() < 0.01
+
+
+@pytest.mark.parametrize("crowd", [False, True])
+def test_each_camera_of_a_rig_has_the_shadows_that_it_sees(gl, crowd):
+    """Two that look at different things share the map where it holds what both see, and get what they get alone."""
+    movers = [thing(f"ball {x}", 3, sphere(0.3), drift((x - 0.1, 4, 0.3), (x, 4, 0.3))) for x in (-4.0, 0.0, 4.0)]
+    stays = [] if crowd else [thing("wall", 4, cube(2.0), still((0, 30, 0)))]
+    one = sunlit(*movers, *stays)
+    apart = [one.with_path(still((x, 0, 1.0), DOWN)) for x in (-4.0, 0.0, 4.0)]
+    alone = [drawn(gl, world, SECOND // 2) for world in apart]
+    bare = drawn(gl, replace(apart[2], light=replace(one.light, shadows="off")), SECOND // 2)
+    assert (alone[2] != bare).sum() > 20
+    with ExitStack() as stack:
+        renderers: list[Renderer] = []
+        for world in apart:
+            beside = renderers[0] if renderers else None
+            renderers.append(stack.enter_context(Renderer(gl, world, PLAIN, beside=beside)))
+        for k in (0, 1, 2, 1, 0):
+            np.testing.assert_array_equal(renderers[k].luminance(SECOND // 2).read(), alone[k], err_msg=str(k))
+
+
+def test_the_cameras_of_a_rig_share_a_map_that_holds_what_both_see(gl, monkeypatch):
+    """Drawn once a time, whichever looks first; again where another sees more."""
+    painted = []
+    monkeypatch.setattr(ShadowMap, "seen", lambda self, moment: painted.append(moment) or SEEN(self, moment))
+    near, far = (sunlit(thing("ball", 2, sphere(0.3), drift((x - 0.1, 4, 0.3), (x, 4, 0.3)))) for x in (0.0, 4.0))
+    for world, drawings in ((near, 2), (far, 4)):
+        painted.clear()
+        eyes = [world.with_path(still((x, 0, 1.0), DOWN)) for x in (0.0, 0.1 if world is near else 4.0)]
+        with Renderer(gl, eyes[0], PLAIN) as left, Renderer(gl, eyes[1], PLAIN, beside=left) as right:
+            for t in (0, SECOND // 2):
+                for eye in (left, right, left, right):
+                    eye.luminance(t).read()
+        assert len(painted) == drawings, painted
+
+
+def test_the_same_time_from_elsewhere_has_its_own_shadows(gl):
+    """A moment moved to another place may see shadows that the scene's camera does not."""
+    world = sunlit(*(thing(f"ball {x}", 3, sphere(0.3), drift((x - 0.1, 4, 0.3), (x, 4, 0.3))) for x in (-4.0, 4.0)))
+    here, there = (world.with_path(still((x, 0, 1.0), DOWN)) for x in (-4.0, 4.0))
+    with Renderer(gl, there, PLAIN) as alone, Renderer(gl, here, PLAIN) as renderer:
+        renderer.colour(0).read()
+        moment = renderer.moment(0)
+        moved = moment.from_place(moment.view, there.camera_path.pose(0))
+        np.testing.assert_array_equal(renderer.colour(moved).read(), alone.colour(0).read())
 
 
 def test_a_map_is_drawn_again_only_where_something_moved(gl):

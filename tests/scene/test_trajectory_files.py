@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import yaml
 from scipy.spatial.transform import Rotation
 
 from blinkgl import (
@@ -164,3 +165,79 @@ def test_what_a_sequence_cannot_have(flight, tmp_path):
     )
     with pytest.raises(ConfigError, match="give a trajectory, a fixed pose or keyframes"):
         load_run(flight / "c.yaml")
+
+
+SENSOR = """# General sensor definitions.
+sensor_type: camera
+comment: VI-Sensor cam0
+
+# Sensor extrinsics wrt. the body-frame.
+T_BS:
+  cols: 4
+  rows: 4
+  data: [0.0148655429818, -0.999880929698, 0.00414029679422, -0.0216401454975,
+         0.999557249008, 0.0149672133247, 0.025715529948, -0.064676986768,
+        -0.0257744366974, 0.00375618835797, 0.999660727178, 0.00981073058949,
+         0.0, 0.0, 0.0, 1.0]
+
+# Camera specific definitions.
+rate_hz: 20
+resolution: [188, 120]
+camera_model: pinhole
+intrinsics: [114.66, 114.32, 91.8, 62.1] #fu, fv, cu, cv
+distortion_model: radial-tangential
+distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
+"""
+
+
+def test_a_camera_beside_the_body_that_the_file_is_of(flight):
+    """EuRoC's truth is of its inertial unit; `T_BS` of the camera's sensor.yaml leads from there to the camera."""
+    (flight / "sensor.yaml").write_text(SENSOR)
+    numbers = yaml.safe_load(SENSOR)["T_BS"]["data"]
+    T_BS = np.array(numbers).reshape(4, 4)
+    camera = Camera(
+        calibration=flight / "sensor.yaml", pose=Trajectory(flight / "euroc.csv", T_body_sensor=flight / "sensor.yaml")
+    )
+    assert camera.tree["lens"] == "radtan" and camera.tree["fx"] == 114.66 and camera.tree["width"] == 188
+    beside = Scene(camera, (Primitive("cuboid"),), duration=0.2, label_rate=20)
+    said = scene(Trajectory(flight / "euroc.csv", T_body_sensor=T_BS))
+    for made in (beside, said):
+        config = made.template().sequence(0)
+        path = made.build(config).camera_path
+        t = np.linspace(0.05, 0.2, 7)
+        expected = circle(t) @ T_BS
+        assert np.abs(path.poses(np.round(t * 1e9).astype(np.int64)) - expected).max() < 2e-6
+    # In a run's file, relative to it; an object may ride on the body, too.
+    tree = said.template().tree
+    tree["scene"]["camera"] = {"trajectory": {"file": "euroc.csv", "T_body_sensor": "sensor.yaml"}}
+    tree["scene"]["objects"][0]["trajectory"] = {"file": "tum.txt", "T_body_sensor": T_BS.tolist()}
+    (flight / "run.yaml").write_text(yaml.safe_dump(tree))
+    built = sequence_scene(load_run(flight / "run.yaml").sequence(0), 0, flight)
+    assert np.abs(built.camera_path.pose(100_000_000) - built.objects[0].path.pose(100_000_000)).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("T_BS", "T_SB"), "T_BS: not a rigid transform"),
+        (("0.0148655429818", "1.0148655429818"), "T_BS: not a rigid transform"),
+        (("0.0148655429818", ".nan"), "T_BS: not a rigid transform"),
+        (("0.0, 0.0, 0.0, 1.0]", "0.0, 0.0]"), "T_BS: not a rigid transform"),
+        (None, "T_body_sensor: no such file"),
+    ],
+)
+def test_a_body_of_which_the_file_says_nothing(flight, change, said):
+    if change:
+        (flight / "sensor.yaml").write_text(SENSOR.replace(*change))
+    made = scene(Trajectory(flight / "euroc.csv", T_body_sensor=flight / "sensor.yaml"))
+    config = made.template().sequence(0)
+    with pytest.raises(ConfigError, match=said):
+        check_assets(config.scene)
+        made.build(config)
+
+
+def test_a_place_on_the_body_that_is_none():
+    with pytest.raises(ConfigError, match="Trajectory.T_body_sensor: the matrix mirrors"):
+        Trajectory("a.txt", T_body_sensor=np.diag([1.0, 1, -1, 1]))
+    with pytest.raises(ConfigError, match="Trajectory.T_body_sensor: not such an array"):
+        Trajectory("a.txt", T_body_sensor=np.eye(3))

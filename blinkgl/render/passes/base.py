@@ -69,8 +69,8 @@ class Pass:
     still : whether a camera that stands still has only what moves drawn again.
     lit : whether its program asks light.glsl for the light, and fog.glsl for what of it arrives.
     one_channel : whether one channel of it will do, where the surface is of one colour.
-    common : it is the same whoever looks, at one time of one scene, so that it is drawn once for all sensors of a rig
-    and all passes that read it.
+    common : it hangs on the time and the scene more than on who looks, so that what was drawn for one sensor of a rig
+    is used for the others where it :meth:`serves`.
     pointwise : each pixel comes of the inputs' pixel at the same place (or where :meth:`changed` says), so that it does
     not change where they do not."""
 
@@ -113,6 +113,10 @@ class Pass:
         """The moment as this pass looks at it: the camera's, unless it draws for another one
         (``moment.from_place``)."""
         return moment
+
+    def serves(self, drawn: Moment, moment: Moment) -> bool:
+        """Of a pass that is ``common``: whether what it last drew, as it saw it then, will do for a moment."""
+        return drawn.t_ns == moment.t_ns
 
     def begin(self, painter: Painter, shot: Shot) -> None:
         """Before :meth:`paint`: clears what it does not write everywhere."""

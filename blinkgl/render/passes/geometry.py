@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from itertools import combinations
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -21,6 +20,8 @@ if TYPE_CHECKING:
 MADE.append(includes)
 LENS_UNIT = 7
 """Texture unit of what a lens's pixels look at."""
+MOST_BUFFERS = 8
+"""Outputs that every OpenGL 4 has (GL_MAX_DRAW_BUFFERS)."""
 _OF_THE_PASS = {
     "", "mvp", "inverse_depths", "image_size", "clip_rate", "clip_forward", "clip_backward", "coverage", "cutoff",
     "lens_claims", "lens_plane", "lens_focal", "lens_limit", "lens_k",
@@ -51,12 +52,14 @@ class Geometry(ScenePass):
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
         programs, values = painter.programs(self), self._values(shot)
+        of_shapes = {name for label in self.names for name in LABELS[label].of_shapes}
         checked = set()
         for item in self.items(shot.moment) if items is None else items:
             uniforms = programs[item.kind]
             if item.kind not in checked:
                 checked.add(item.kind)
-                self._check(uniforms, values, item)
+                given = {k: v for k, v in values.items() if item.deformer is not None or k not in of_shapes}
+                self._check(uniforms, given, item)
             painter.place(uniforms, item, shot.moment)
             if item.deformer is not None:
                 painter.deform(uniforms, item, shot)
@@ -65,6 +68,8 @@ class Geometry(ScenePass):
             if self.lens and painter.lens is not None:
                 painter.lens.set(uniforms, shot, LENS_UNIT)
             for name, (_, rows) in values.items():
+                if item.deformer is None and name in of_shapes:
+                    continue
                 uniforms[name].write(rows[item.object_index])
             painter.draw(uniforms, item)
 
@@ -110,6 +115,9 @@ class Geometry(ScenePass):
 
     @classmethod
     def every_kind(cls) -> Iterator[Pass]:
+        """Each label alone, which lacks what it leaves to another, and all at once, where two get in each other's way:
+        of subsets there are twice as many with every label more."""
         drawn = [name for name, label in LABELS.items() if label.buffer]
-        yield from (cls(names) for count in range(1, len(drawn) + 1) for names in combinations(drawn, count))
-        yield from (cls(tuple(drawn[:8]), lens) for lens in ("RADTAN", "EQUIDISTANT"))
+        yield from (cls((name,)) for name in drawn)
+        yield cls(tuple(drawn[:MOST_BUFFERS]))
+        yield from (cls(tuple(drawn[:MOST_BUFFERS]), lens) for lens in ("RADTAN", "EQUIDISTANT"))

@@ -59,6 +59,12 @@ class ShadowMap(ScenePass):
         seen.looker = moment
         return seen
 
+    def serves(self, drawn: Moment, moment: Moment) -> bool:
+        """Another may see shadows of what was left out."""
+        if drawn.looker is None or drawn.t_ns != moment.t_ns:
+            return False
+        return drawn.looker is moment or self.umbra(moment).throws <= self.umbra(drawn.looker).throws
+
     def items(self, moment: Moment) -> list[DrawItem]:
         assert moment.looker is not None
         throws, all_ = self.umbra(moment.looker).throws, not self.stands_still(False)

@@ -1,0 +1,151 @@
+"""Rigs in Python: the pieces of ``sensors:``, checked by the same models.
+
+    rig = Rig(
+        RigSensor("left", camera=Camera(640, 480, fov=70), pair="right"),
+        RigSensor("right", camera=Camera(640, 480, fov=70), pair="left", position=(0.1, 0, 0)),
+        RigSensor("imu", imu="adis16448", position=(0.05, 0.02, 0)),
+    )
+
+The camera of the :class:`~blinkgl.front.scenes.Scene` moves the rig: its pose is the rig's, and what sensors do not say
+of their own cameras they have of it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from numpy.typing import ArrayLike
+
+from blinkgl.config.base import Config
+from blinkgl.config.camera import CameraConfig
+from blinkgl.config.readout import ReadoutConfig
+from blinkgl.config.rig import PlaceConfig, RigSensorConfig, spelled_out
+from blinkgl.errors import ConfigError
+from blinkgl.front import arguments as check
+from blinkgl.front.scenes import Camera, Piece, Vector
+from blinkgl.front.sections import (
+    EmulatorSettings,
+    ImageSettings,
+    ImuSettings,
+    TrackSettings,
+    events_tree,
+    images_tree,
+    imu_tree,
+    labels_tree,
+    tracks_tree,
+)
+
+
+class RigSensor(Piece):
+    """One device on a rig: an event camera, a frame camera, an inertial unit, or several of them behind one lens.
+
+    name : of its folder, and by which it is found in a recording.
+    position : (3,) m on the rig's axes, x right, y down, z forward.   euler : (3,) degrees about the rig's x, y, z
+    axes; or quaternion : (4,) w, x, y, z; or matrix : (4, 4) T_rig_sensor, from the sensor's axes to the rig's, in the
+    place of all of them.
+    pair : name of the other eye of a rectified stereo pair.
+    camera : :class:`Camera` without a pose, or a table of ``camera:`` that is laid over the scene's; None: the scene's.
+    events : whether it makes events; None: where it has neither images nor imu.
+    emulator, sensor, labels, images, imu, tracks : as of :func:`record`; None: emulator, sensor and labels are the
+    run's, the others are not there.   readout : a table of ``readout:``.
+    Raises ConfigError."""
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        position: Vector = (0.0, 0.0, 0.0),
+        euler: Vector | None = None,
+        quaternion: Vector | None = None,
+        matrix: ArrayLike | None = None,
+        pair: str | None = None,
+        camera: Camera | Mapping[str, Any] | None = None,
+        events: bool | None = None,
+        emulator: EmulatorSettings | None = None,
+        sensor: str | os.PathLike | None = None,
+        readout: Mapping[str, Any] | Config | None = None,
+        labels: Sequence[str | float] | None = None,
+        images: ImageSettings | None = None,
+        imu: ImuSettings | None = None,
+        tracks: TrackSettings | None = None,
+    ):
+        if matrix is not None:
+            matrix = check.array(matrix, "RigSensor.matrix", (4, 4), "an array (4, 4) of numbers, T_rig_sensor")
+        place = check.given(position=position, euler=euler, quaternion=quaternion, matrix=matrix)
+        tree = check.given(name=name, pair=pair, sensor=sensor)
+        tree["place"] = self._checked(PlaceConfig, place)
+        if camera is not None:
+            tree["camera"] = _camera_tree(camera)
+        if events is not None:
+            check.one_of(events, "RigSensor.events", bool, "True, False or None")
+        if emulator is not None:
+            if events is False:
+                raise ConfigError("of a sensor without events", where="RigSensor.emulator", value=emulator)
+            tree["events"] = events_tree(emulator)
+        elif events is not None:
+            tree["events"] = {} if events else None
+        if readout is not None:
+            given = readout.model_dump(exclude_unset=True) if isinstance(readout, Config) else readout
+            check.one_of(given, "RigSensor.readout", Mapping, "a table of readout:")
+            tree["readout"] = self._checked(ReadoutConfig, check.given(**given))
+        if labels is not None:
+            tree["labels"] = labels_tree(labels)
+        if images is not None:
+            tree["images"] = images_tree(images)
+        if imu is not None:
+            tree["imu"] = imu_tree(imu)
+        if tracks is not None:
+            tree["tracks"] = tracks_tree(tracks)
+        said = {key: value for key, value in tree.items() if key not in ("events", "sensor", "camera")}
+        self._checked(RigSensorConfig, said)  # those three are whole when the run's are laid under them
+        self.tree = tree
+
+
+def _camera_tree(camera: Camera | Mapping[str, Any]) -> dict[str, Any]:
+    """All keys of a Camera, so that none of the run's camera shows through; those of a table."""
+    if isinstance(camera, Mapping):
+        return check.given(**camera)
+    check.one_of(camera, "RigSensor.camera", Camera, "a Camera, or a table such as {'fov': 80}")
+    if camera.motion != Camera(1, 1).motion:
+        raise ConfigError(
+            "a sensor moves with its rig and has no pose of its own",
+            where="RigSensor.camera",
+            value=camera,
+            accepted="position, euler, quaternion or matrix of the RigSensor",
+        )
+    return {**CameraConfig().model_dump(mode="json"), **camera.tree}
+
+
+class Rig(Piece):
+    """Sensors that move together: ``record_rig(scene, Rig(RigSensor("left"), RigSensor("imu", imu="adis16448")))``.
+
+    sensors : :class:`RigSensor`, each of its own name.   preset : "stereo", "davis", "dsec" or "mvsec": its sensors
+    first, those of ``sensors`` laid over the ones of the same names (docs/rigs.md).
+    Raises ConfigError; what hangs on the scene's camera is found when the rig is used."""
+
+    def __init__(self, *sensors: RigSensor, preset: str | None = None):
+        for k, one in enumerate(sensors):
+            check.one_of(one, f"Rig.sensors[{k}]", RigSensor, "a RigSensor")
+        self.sensors = sensors
+        # both keys: a rig takes the place of that which a configuration has
+        self.tree = {"rig": check.plain(preset), "sensors": [one.tree for one in sensors] or None}
+        try:
+            spelled_out(self.tree, ())
+        except ConfigError as error:
+            where = "Rig.preset" if error.where == "rig" else f"Rig.{error.where}"
+            raise ConfigError(error.problem, where=where, value=error.value, accepted=error.accepted) from None
+
+    def __repr__(self) -> str:
+        return f"<Rig of {', '.join([*([self.tree['rig']] if self.tree['rig'] else []), *self.names])}>"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of ``sensors``; a preset has its own besides."""
+        return tuple(one.tree["name"] for one in self.sensors)
+
+
+def rig_of(given: Rig | str) -> Rig:
+    """A rig, or that of a preset's name. Raises ConfigError."""
+    return Rig(preset=given) if isinstance(given, str) else check.one_of(given, "rig", Rig, "a Rig, or a preset's name")

@@ -1,0 +1,112 @@
+"""Sections of a configuration from the arguments of a person's call: a name, a table, or the model itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from blinkgl.config.base import Config, validate_field
+from blinkgl.config.sequence import SequenceConfig
+from blinkgl.errors import ConfigError
+from blinkgl.front import arguments as check
+from blinkgl.labels import LABELS
+
+EmulatorSettings = str | Mapping[str, Any] | Config
+ImageSettings = str | Mapping[str, Any] | Config
+ImuSettings = str | Mapping[str, Any] | Config
+TrackSettings = str | Mapping[str, Any] | Config
+
+
+def events_tree(emulator: EmulatorSettings) -> dict[str, Any]:
+    """``events:`` of a name, a table with ``emulator``, or a configuration. Raises ConfigError."""
+    from blinkgl.recordings.simulation import emulator_config
+
+    if not isinstance(emulator, (str, Mapping, Config)):
+        raise ConfigError(
+            "not an emulator",
+            where="emulator",
+            value=emulator,
+            accepted="a name, or a table such as {'emulator': 'v2e', 'cutoff_hz': 200}",
+        )
+    tree = (
+        emulator.model_dump()
+        if isinstance(emulator, Config)
+        else {"emulator": emulator}
+        if isinstance(emulator, str)
+        else check.plain(emulator)
+    )
+    emulator_config(tree)
+    return tree
+
+
+def images_tree(images: ImageSettings) -> dict[str, Any]:
+    """``images:`` of a preset's name, a table, or a configuration. Raises ConfigError."""
+    return section_tree(
+        "images",
+        images,
+        "preset",
+        "a frame camera",
+        "a preset's name, or a table such as {'exposure_us': 10000, 'photon_noise': True}",
+    )
+
+
+def imu_tree(imu: ImuSettings) -> dict[str, Any]:
+    """``imu:`` of a preset's name, a table, or a configuration. Raises ConfigError."""
+    return section_tree("imu", imu, "preset", "an inertial unit", "a preset's name, or a table such as {'rate': 400}")
+
+
+def tracks_tree(tracks: TrackSettings) -> dict[str, Any]:
+    """``tracks:`` of a way to choose points, a table, or a configuration. Raises ConfigError."""
+    return section_tree(
+        "tracks", tracks, "choose", "point tracks", "grid, random, surface, or a table such as {'points': 100}"
+    )
+
+
+def section_tree(key: str, given: Any, named: str, what: str, accepted: str) -> dict[str, Any]:
+    """A section of a configuration of a table, a configuration, or a text, which is its key ``named``.
+    Raises ConfigError."""
+    if not isinstance(given, (str, Mapping, Config)):
+        raise ConfigError(f"not {what}", where=key, value=given, accepted=accepted)
+    tree = (
+        given.model_dump(exclude_unset=True)
+        if isinstance(given, Config)
+        else {named: given}
+        if isinstance(given, str)
+        else check.plain(given)
+    )
+    validate_field(SequenceConfig, key, tree)
+    return tree
+
+
+OF_EVENTS = ("events",)
+"""Labels that are of events and not of a time."""
+
+
+def label_names(labels: Sequence[str | float]) -> set[str | float]:
+    """Names, and intervals of flow, s. Raises ConfigError: no such label (:mod:`blinkgl.labels`)."""
+    known = [*dict.fromkeys(label.said for label in LABELS.values()), *OF_EVENTS]
+    wanted = check.one_of(labels, "labels", (list, tuple, set, frozenset), "a list of names of labels")
+    for name in wanted:
+        if name not in known and not is_interval(name):
+            raise ConfigError("unknown label", where="labels", value=name, accepted=", ".join(known))
+    return set(wanted)
+
+
+def is_interval(label: Any) -> bool:
+    """Whether a label is the interval of a flow, s; which ones there may be says ``labels.flow``."""
+    return isinstance(label, (int, float)) and not isinstance(label, bool)
+
+
+def labels_tree(labels: Sequence[str | float]) -> dict[str, Any]:
+    """``labels:`` that asks for these and no others. Raises ConfigError as :func:`label_names`."""
+    wanted = label_names(labels)
+    everything: dict[str, Any] = {}
+    asked: dict[str, Any] = {}
+    for label in LABELS.values():
+        label.ask(everything)
+        if label.said in wanted:
+            label.ask(asked)
+    if intervals := [float(one) for one in wanted if is_interval(one)]:
+        asked["flow"] = [*asked.get("flow", ()), *sorted(intervals)]
+    tree = {key: asked.get(key, [] if isinstance(value, list) else False) for key, value in everything.items()}
+    return {**tree, **{name: name in wanted for name in OF_EVENTS}}

@@ -1,0 +1,125 @@
+"""Rigs in Python: what they record is what files hold; wrong ones say which argument."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import blinkgl
+from blinkgl import Camera, Mesh, Rig, RigSensor, Timeline, record_rig, simulate_rig
+from blinkgl.errors import ConfigError
+from blinkgl.io.frame_camera import read_exposures
+from blinkgl.io.imu import read_imu
+from blinkgl.io.rig_dir import read_rig
+from tests.test_front import box_scene
+
+TURNED = np.array([[0.0, 0, 1, 0.02], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
+RIG = Rig(
+    RigSensor("left", pair="right", labels=["flow", "depth", "disparity", "images"], tracks={"points": 20}),
+    RigSensor("right", pair="left", position=(0.2, 0, 0), emulator="v2e"),
+    RigSensor(
+        "fish", camera=Camera(40, 30, focal=28, lens="equidistant", distortion=(-0.02, 0.005, 0, 0)), euler=(0, 10, 0)
+    ),
+    RigSensor("rgb", camera={"fov": 90}, images={"rate": 20, "exposure_us": 2000}, imu={"rate": 100}),
+    RigSensor("imu", imu="adis16448", matrix=TURNED),
+)
+TIMELINE = Timeline("uniform", fps=60)
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    return record_rig(box_scene(), RIG, timeline=TIMELINE, labels=["flow"])
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    out = tmp_path_factory.mktemp("rig") / "out"
+    assert len(blinkgl.generate(box_scene(), out, rig=RIG, timeline=TIMELINE, labels=["flow"]).made) == 1
+    return out / "train/sequence_000000"
+
+
+def test_arrays_are_what_the_files_hold(recorded, written):
+    assert list(recorded.cameras) == ["left", "right", "fish", "rgb"] and set(recorded.imu) == {"rgb", "imu"}
+    for name in ("left", "right", "fish"):
+        events, mine = blinkgl.read_events(written / name / "events.h5"), recorded[name].events
+        assert len(mine) > 100 and all(np.array_equal(getattr(events, k), getattr(mine, k)) for k in "xytp"), name
+        flow, valid = blinkgl.read_flow(written / name / "flow/forward/000000.png")
+        assert np.abs(flow - recorded[name].flow[0])[valid].max() <= 0.5 / 128
+    assert len(recorded["rgb"].events) == 0 and not (written / "rgb/events.h5").exists()
+    assert len(recorded["rgb"].camera) == len(read_exposures(written / "rgb")) > 0
+    np.testing.assert_array_equal(np.load(written / "left/disparity/000000.npy"), recorded["left"].labels[0].disparity)
+    for folder, name in ((written / "rgb", "rgb"), (written / "imu", "imu")):
+        np.testing.assert_array_equal(read_imu(folder)["acceleration"], recorded.imu[name].acceleration)
+    places = read_rig(written)
+    for name, T in recorded.T_rig_sensor.items():
+        np.testing.assert_array_equal(places[name]["T_rig_sensor"], T)
+
+
+def test_places_lenses_and_labels_are_each_sensors_own(recorded):
+    np.testing.assert_array_equal(recorded.T_rig_sensor["imu"], TURNED)
+    sizes = {name: (one.config.camera.width, one.config.camera.lens) for name, one in recorded.cameras.items()}
+    assert sizes == {**dict.fromkeys(("left", "right", "rgb"), (32, "pinhole")), "fish": (40, "equidistant")}
+    assert recorded["rgb"].config.camera.fov == 90 and recorded["left"].config.camera.fov is None
+    assert recorded["right"].config.events.emulator == "v2e" and recorded["left"].config.events.emulator == "esim"
+    assert recorded["right"].labels[0].depth is None and recorded["left"].tracks.target_points.shape[0] <= 20
+    left = recorded["left"].labels[0]
+    seen = left.disparity > 0
+    np.testing.assert_allclose(left.disparity[seen], 16 / np.tan(np.radians(30)) * 0.2 / left.depth[seen], rtol=1e-5)
+
+
+def test_the_rig_goes_where_the_scenes_camera_does(recorded):
+    alone = blinkgl.record(box_scene(), timeline=TIMELINE, labels=["flow", "depth"])
+    for k in "xytp":
+        np.testing.assert_array_equal(getattr(alone.events, k), getattr(recorded["left"].events, k))
+    np.testing.assert_array_equal(recorded.t_us[1:], recorded["left"].image_t_us)
+    assert np.allclose(recorded.T_world_rig[0, :3, 3], (-2, -0.3, 0.8)) and recorded.T_world_rig.shape == (4, 4, 4)
+
+
+def test_scenes_of_arrays_and_runs_of_files(tmp_path):
+    triangle = Mesh(vertices=[(0, -1, -1), (0, 1, -1), (0, 0, 1)], faces=[(0, 2, 1)])
+    seen = [
+        (member.name, item.t_ns)
+        for member, item in simulate_rig(box_scene() + triangle, "stereo", timeline=TIMELINE, labels=["flow"])
+    ]
+    assert {name for name, _ in seen} == {"left", "right"} and [t for _, t in seen] == sorted(t for _, t in seen)
+    import yaml
+
+    run = tmp_path / "rig.yaml"
+    run.write_text(yaml.safe_dump(box_scene().template().tree | {"rig": "stereo", "timeline": TIMELINE.tree}))
+    both, one = record_rig(blinkgl.load(run)), record_rig(blinkgl.load(run), Rig(RigSensor("alone")))
+    assert list(both.cameras) == ["left", "right"] and list(one.cameras) == ["alone"]
+    assert all(np.array_equal(getattr(both["left"].events, k), getattr(one["alone"].events, k)) for k in "xytp")
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: RigSensor("a/b"), "RigSensor.name: not a name for folders"),
+        (lambda: RigSensor("a", euler=(0, 0, 1), quaternion=(1, 0, 0, 0)), "RigSensor: only one of euler"),
+        (lambda: RigSensor("a", matrix=np.diag([1.0, 1, -1, 1])), "RigSensor.matrix: the matrix mirrors"),
+        (lambda: RigSensor("a", matrix=np.full((4, 4), np.nan)), "RigSensor.matrix"),
+        (lambda: RigSensor("a", matrix=np.eye(3)), "RigSensor.matrix: not such an array"),
+        (lambda: RigSensor("a", position=(0, np.nan, 0)), "RigSensor.position"),
+        (lambda: RigSensor("a", camera=Camera(pose=(1, 0, 0))), "RigSensor.camera: a sensor moves with its rig"),
+        (lambda: RigSensor("a", camera=5), "RigSensor.camera: not a Camera"),
+        (lambda: RigSensor("a", events=False, emulator="v2e"), "RigSensor.emulator: of a sensor without events"),
+        (lambda: RigSensor("a", imu={"rate": 0}), "imu.rate"),
+        (lambda: RigSensor("a", readout={"rows": 1}), "RigSensor.rows: unknown key"),
+        (Rig, "Rig.sensors: a rig without a sensor"),
+        (lambda: Rig("left"), "Rig.sensors\\[0\\]: not a RigSensor"),
+        (lambda: Rig(RigSensor("a"), RigSensor("A")), "Rig.sensors.1.name: two sensors have one name"),
+        (lambda: Rig(preset="kitti"), "Rig.preset: unknown rig"),
+        (lambda: record_rig(box_scene()), "rig: the source is of a single camera"),
+        (lambda: record_rig(box_scene(), 7), "rig: not a Rig, or a preset's name"),
+        (lambda: record_rig(box_scene(), Rig(RigSensor("a", pair="b"))), "sensors.0.pair: no such camera on the rig"),
+        (lambda: blinkgl.generate(box_scene(), "x", rig="stereo", imu="ideal"), "imu: a rig's sensors have it"),
+    ],
+)
+def test_wrong_rigs_say_which_argument(call, said):
+    with pytest.raises(ConfigError, match=said):
+        call()
+
+
+def test_a_camera_that_is_not_there(recorded):
+    with pytest.raises(ConfigError, match="no such camera on the rig.*left, right, fish, rgb"):
+        recorded["imu"]

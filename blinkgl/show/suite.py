@@ -32,7 +32,7 @@ def run(
     cost: str,
     others: dict[str, bool],
 ) -> int:
-    """Measures the scenes and writes the files. others : options of one scene, and whether they were given. Returns 1
+    """Measures the scenes and writes the files. others : options of one scene, and whether they were given. Returns 3
     where a scene is missing, so that a script knows. Raises BlinkGLError."""
     check_cost(cost)
     if given := [name for name, said in others.items() if said]:
@@ -59,7 +59,7 @@ def run(
             file.write_bytes(fronts(result, Path(out)))
         names.append(path.name)
     say(console, f"written to {out}: " + ", ".join(names))
-    return 0 if result["complete"] else 1
+    return 0 if result["complete"] else 3
 
 
 def show(result: dict, console: Console) -> None:

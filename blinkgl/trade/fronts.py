@@ -32,8 +32,9 @@ def fronts(result: dict, folder: Path) -> bytes:
         f"Nothing lies below and left of the line; presets of `quality:` are marked by their first letter.{missing}",
         fontsize=14,
     )
-    figure.supxlabel(COSTS[result["cost"]] + " (log scale)", fontsize=12)
-    figure.supylabel("error of the events (voxel grids, relative, log scale)", fontsize=12)
+    figure.supylabel(
+        "error of the events (difference of voxel grids, relative); both scales are logarithmic", fontsize=12
+    )
     _legend(figure, scenes)
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=80, metadata={"Software": None})
@@ -67,7 +68,7 @@ def _panel(ax, name: str, scene: dict, result: dict, folder: Path) -> None:
             )
     best = sorted((r for r in scene["settings"] if r["on_front"]), key=lambda r: r[cost])
     ax.step([r[cost] for r in best], [100 * r["voxel"] for r in best], where="post", color="0.25", lw=1.3, zorder=2)
-    ax.set(xscale="log", yscale="log")
+    ax.set(xscale="log", yscale="log", xlabel=COSTS[cost])
     for axis, text in ((ax.xaxis, lambda v, _: f"{v:g}"), (ax.yaxis, lambda v, _: f"{v:g} %")):
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axis.set_major_formatter(FuncFormatter(text))

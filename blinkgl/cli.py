@@ -2,8 +2,9 @@
 
 Exit status: 0 done; 1 `shader diff`, `shader check` or `qualify` found something wrong; 2 the user's input or machine
 (``error: …`` on stderr, one line); 3 done but for sequences (`trade --suite`: scenes) that were set aside; 130
-interrupted. A traceback means a bug in BlinkGL, or ``--debug``. What a command does and prints is ``blinkgl.show.COMMAND.run``, which returns the
-status; it is imported inside the function, so that ``--help`` answers at once.
+interrupted. A traceback means a bug in BlinkGL, or ``--debug``. What a command does and prints is
+``blinkgl.show.COMMAND.run``, which returns the status; it is imported inside the function, so that ``--help`` answers
+at once.
 """
 
 from __future__ import annotations

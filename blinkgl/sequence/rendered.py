@@ -31,7 +31,7 @@ from blinkgl.scene.rig import Sensor
 from blinkgl.scene.types import Dynamics, Scene, SceneObject
 from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.inertial import Inertial, measured
-from blinkgl.sequence.items import GroundTruth, Picture
+from blinkgl.sequence.items import GroundTruth, Item, Picture
 from blinkgl.sequence.simulate import Simulation
 from blinkgl.timeline import Timeline, make_timeline
 
@@ -162,6 +162,11 @@ class RenderedSequence(Simulation):
         except EventDataError as error:
             raise self._explained(error) from error
 
+    def _in_order(self) -> Iterator[Item]:
+        yield from super()._in_order()
+        self._resume()
+        self.renderer.gl.check()  # before anybody calls the sequence whole
+
     def _explained(self, error: EventDataError) -> EventDataError:
         """The error with the time and, where a pixel is at fault, what is seen there."""
         if error.pixel is None or error.t_ns is None:
@@ -188,6 +193,7 @@ class RenderedSequence(Simulation):
 
     def truth(self, t_ns: int, span_ns: int) -> GroundTruth:
         self._resume()
+        self.renderer.gl.check()
         return self._truth_over(-1, t_ns, span_ns, asked_for(self.sensor.labels), False)
 
     def _truth_over(self, k: int, t_ns: int, span_ns: int, request: LabelRequest, last: bool) -> GroundTruth:

@@ -50,7 +50,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True)
-class Clip:
+class Trial:
     """A scene of the suite. what : the first sentence of its file: what is hard about it."""
 
     name: str
@@ -63,13 +63,13 @@ class Clip:
         return first.removeprefix("#").strip() if first.startswith("#") else ""
 
 
-def clips(folder: str | Path | None = None, only: Sequence[str] = ()) -> tuple[Clip, ...]:
+def clips(folder: str | Path | None = None, only: Sequence[str] = ()) -> tuple[Trial, ...]:
     """The scenes of a folder (None: the shipped ones), by name; those whose name contains one of ``only``. Raises
     ConfigError where there is none."""
     place = Path(str(resources.files("blinkgl.configs"))) / "trade" if folder is None else Path(folder)
     if not place.is_dir():
         raise ConfigError("the suite is a folder of scenes", where=str(folder), accepted="a folder with .yaml files")
-    every = tuple(Clip(path.stem, path) for path in sorted(place.glob("*.yaml")))
+    every = tuple(Trial(path.stem, path) for path in sorted(place.glob("*.yaml")))
     if not every:
         raise ConfigError("no scenes there", where=str(folder), accepted="a folder with .yaml files")
     found = tuple(c for c in every if not only or any(text.lower() in c.name.lower() for text in only))
@@ -84,7 +84,7 @@ def clips(folder: str | Path | None = None, only: Sequence[str] = ()) -> tuple[C
 
 
 def run_suite(
-    scenes: Sequence[Clip],
+    scenes: Sequence[Trial],
     out: str | Path,
     *,
     options: Options = OPTIONS,
@@ -133,7 +133,7 @@ def run_suite(
 
 
 def _measured(
-    scene: Clip,
+    scene: Trial,
     options: Options,
     settings: tuple[Setting, ...],
     overrides: Sequence[str],
@@ -199,7 +199,7 @@ def _kept(path: Path, asked: dict[str, Any]) -> dict[str, dict]:
     return scenes
 
 
-def _whole(done: dict[str, dict], scenes: Sequence[Clip], asked: dict[str, Any], seconds: float) -> dict[str, Any]:
+def _whole(done: dict[str, dict], scenes: Sequence[Trial], asked: dict[str, Any], seconds: float) -> dict[str, Any]:
     measured = {c.name: done[c.name] for c in scenes if c.name in done}
     missing = [c.name for c in scenes if "settings" not in measured.get(c.name, {})]
     return {

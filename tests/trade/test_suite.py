@@ -23,7 +23,7 @@ from blinkgl.trade.measure import Density, Level, Options
 from blinkgl.trade.pareto import excess
 from blinkgl.trade.reference import FineTiles
 from blinkgl.trade.settings import Setting, suite_design
-from blinkgl.trade.suite import Clip, clips, preset_names, run_suite, standing
+from blinkgl.trade.suite import Trial, clips, preset_names, run_suite, standing
 
 SAMPLES = {"none": 1, "taps4": 2, "edges": 2.5, "ssaa2": 4, "ssaa4": 16}
 """What a frame costs, in frames without a filter, about (docs/trade.md)."""
@@ -96,7 +96,7 @@ def test_a_scene_that_cannot_be_measured_has_a_line_and_the_others_stay(measured
     assert json.loads((out / "suite.json").read_text())["missing"] == ["broken"]
     assert (out / "suite.csv").read_text().count("\nworld,") == len(result["scenes"]["world"]["settings"])
     with pytest.raises(ConfigError, match="nothing to trade"):
-        run_suite([Clip("broken", folder / "broken.yaml")], out / "alone", options=OPTIONS)
+        run_suite([Trial("broken", folder / "broken.yaml")], out / "alone", options=OPTIONS)
 
 
 def test_what_was_measured_is_kept(measured, folder, tmp_path):
@@ -115,7 +115,7 @@ def test_what_was_measured_is_kept(measured, folder, tmp_path):
 
 def test_time_that_is_too_short_leaves_scenes_out(folder, tmp_path):
     """The first scene is always measured, with what reference there is time for: none that says anything."""
-    two = [Clip("one", folder / "world.yaml"), Clip("two", folder / "world.yaml")]
+    two = [Trial("one", folder / "world.yaml"), Trial("two", folder / "world.yaml")]
     said: list[str] = []
     options = replace(OPTIONS, levels=Density((4, 8), (0.25,)))
     result = run_suite(two, tmp_path, options=options, settings=RIVALS[:1], minutes=1e-3, say=said.append)

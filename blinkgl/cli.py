@@ -272,7 +272,8 @@ def export(
     layout: Annotated[
         str | None,
         typer.Option(
-            help="webdataset (shards SPLIT-000000.tar …, the default), dsec, eraft, blinkflow, mvsec or tapvid."
+            help="webdataset (shards SPLIT-000000.tar …, the default), dsec, eraft, blinkflow, mvsec, tapvid or "
+            "multiflow."
         ),
     ] = None,
     shard_mb: Annotated[float | None, typer.Option("--shard-mb", min=1, help="Size of a shard (default: 512).")] = None,

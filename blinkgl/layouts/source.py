@@ -85,6 +85,12 @@ class Source:
         return self._pairs(stamps) if self.has(stamps) else []
 
     @functools.cached_property
+    def interval_times(self) -> list[int]:
+        """Of the labels that lead to several times (``flow_intervals``); empty: there are none."""
+        stamps = _stamps("flow_intervals")
+        return [int(line) for line in self._lines(stamps)] if self.has(stamps) else []
+
+    @functools.cached_property
     def image_times(self) -> list[int]:
         """Of the sRGB images; empty: there are none."""
         stamps = _stamps("images")

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from blinkgl.events.truth import Surfaces, SurfaceTruth
 from blinkgl.events.types import Events
 from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging import FrameCamera
-from blinkgl.labels import LABELS, LabelRequest, asked_for
+from blinkgl.labels import LABELS, Label, LabelRequest, asked_for
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.tracks import Tracks, track_points
@@ -31,7 +32,7 @@ from blinkgl.scene.rig import Sensor
 from blinkgl.scene.types import Dynamics, Scene, SceneObject
 from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.inertial import Inertial, measured
-from blinkgl.sequence.items import GroundTruth, Picture
+from blinkgl.sequence.items import GroundTruth, Item, Picture
 from blinkgl.sequence.simulate import Simulation
 from blinkgl.timeline import Timeline, make_timeline
 
@@ -165,6 +166,11 @@ class RenderedSequence(Simulation):
         except EventDataError as error:
             raise self._explained(error) from error
 
+    def _in_order(self) -> Iterator[Item]:
+        yield from super()._in_order()
+        self._resume()
+        self.renderer.gl.check()  # before anybody calls the sequence whole
+
     def _explained(self, error: EventDataError) -> EventDataError:
         """The error with the time and, where a pixel is at fault, what is seen there."""
         if error.pixel is None or error.t_ns is None:
@@ -191,6 +197,7 @@ class RenderedSequence(Simulation):
 
     def truth(self, t_ns: int, span_ns: int) -> GroundTruth:
         self._resume()
+        self.renderer.gl.check()
         return self._truth_over(-1, t_ns, span_ns, asked_for(self.sensor.labels), False)
 
     def _truth_over(self, k: int, t_ns: int, span_ns: int, request: LabelRequest, last: bool) -> GroundTruth:
@@ -201,9 +208,12 @@ class RenderedSequence(Simulation):
         return GroundTruth(k, t_ns, frame, *leads_to, camera[0], objects[:, 0])
 
     def _picture(self, t_ns: int) -> Picture:
-        return Picture(
-            t_ns, self.renderer.colour(t_ns, antialiasing="none").read(), self.renderer.velocity(t_ns).read()
-        )
+        over = {}
+        if self._over:
+            frame = self.renderer.labels(t_ns, self._over)
+            over = {name: frame.values[name] for name in self._over}
+        image = self.renderer.colour(t_ns, antialiasing="none").read()
+        return Picture(t_ns, image, self.renderer.velocity(t_ns).read(), over)
 
     @property
     def seconds(self) -> dict[str, float]:
@@ -235,6 +245,18 @@ class RenderedSequence(Simulation):
     def lens(self) -> CameraModel | None:
         return self.scene.camera if self.scene.camera.coefficients else None
 
+    @cached_property
+    def _over(self) -> LabelRequest:
+        """Labels that are drawn over pictures: those that are asked for and know how."""
+        if self.sensor.labels is None:
+            return LabelRequest()
+        asked = asked_for(self.sensor.labels)
+        return asked.only(name for name in asked if type(LABELS[name]).drawn_on is not Label.drawn_on)
+
+    @property
+    def rectifies(self) -> bool:
+        return self._rectified is not None
+
     @property
     def _rectified(self) -> PinHole | None:
         """The camera in whose pixels labels are; None: the sensor's own."""
@@ -242,12 +264,20 @@ class RenderedSequence(Simulation):
         return rectified(self.scene.camera) if asked and self.lens is not None else None
 
     def imu(self) -> Inertial | None:
+        return self._imu
+
+    def tracks(self) -> Tracks | None:
+        return self._tracks
+
+    @cached_property
+    def _imu(self) -> Inertial | None:
         if self.config.imu is None:
             return None
         rng = generator(self.config.seed, self.index, Role.IMU, self.number)
         return measured(self.scene.camera_path, self.config.imu, self.config.time.t0_ns, self.config.time.t1_ns, rng)
 
-    def tracks(self) -> Tracks | None:
+    @cached_property
+    def _tracks(self) -> Tracks | None:
         config, time = self.config.tracks, self.config.time
         if config is None:
             return None

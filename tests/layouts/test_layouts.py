@@ -25,6 +25,7 @@ from loaders import (
     dsec_flow,
     dsec_sequence,
     eraft_sequence,
+    multiflow_sample,
     rectify_map,
     tapvid,
 )
@@ -227,6 +228,34 @@ def test_flow_over_another_time_than_the_loaders_windows(data, tmp_path):
     ):
         with pytest.raises(AssetError, match=line.replace("{", "\\{")):
             export_layout(other, tmp_path / "there", layout)
+    assert not (tmp_path / "there").exists()
+
+
+def test_multiflow(tmp_path):
+    labels = {"flow": [0.01, 0.1, 0.25, 0.305, 0.5], "images": True}
+    recipe = {**{k: v for k, v in RECIPE.items() if k not in ("tracks", "imu")}, "labels": labels}
+    recipe["timeline"] = {"kind": "uniform", "fps": 30}
+    short = generate(tmp_path / "short", {**recipe, "labels": {**labels, "flow": [0.1, 0.2]}})
+    line = "a label with 0.4 s before it.*'time: {duration: 1, label_rate: 2}'"
+    with pytest.raises(AssetError, match="0.5 s after the label.*'labels: {flow: .0.1, 0.2"):
+        export_layout(short, tmp_path / "there", "multiflow")
+    data = generate(tmp_path / "data", {**recipe, "time": {"duration": 1, "label_rate": 2, "start": 3}})
+    folder = exported(data, tmp_path, "multiflow") / "train"
+    assert [f.name for f in folder.iterdir()] == ["sequence_000000_000000"], "the second label has 0.5 s after it"
+    events, images, flows = multiflow_sample(folder / "sequence_000000_000000", HEIGHT, WIDTH)
+    sequence = data / "train/sequence_000000"
+    true = read_events(sequence / "events.h5").window(3_100_000, 4_100_000)
+    same([*events[:2], events[2] + 3_100_000, events[3]], true)
+    for image, k in zip(images, (0, 1)):
+        np.testing.assert_array_equal(image, cv2.imread(str(sequence / f"images/{k:06d}.png")))
+    with h5py.File(sequence / "flow/intervals/000000.h5") as file:
+        own = dict(zip(file["interval_ns"][()].tolist(), file["flow"][()]))
+    assert sorted(flows) == [410_000, 500_000, 650_000, 900_000], "0.305 s is no multiple of 10 ms"
+    for t, flow in flows.items():
+        np.testing.assert_array_equal(flow, own[(t - 400_000) * 1000])
+    slow = generate(tmp_path / "slow", {**recipe, "time": {"duration": 0.8, "label_rate": 2.5, "start": 3}})
+    with pytest.raises(AssetError, match=line):
+        export_layout(slow, tmp_path / "there", "multiflow")
     assert not (tmp_path / "there").exists()
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.gl import ShaderLoader
-from blinkgl.gl.shader import STAGES, ShaderError, expand
+from blinkgl.gl.shader import ShaderError, expand, stages_of
 from blinkgl.io import pictures
 from blinkgl.tools.shader_debugger import picture
 from blinkgl.tools.shader_debugger.commands import _finite, _meaningful
@@ -237,7 +237,8 @@ class Inspector:
 
     def _sources(self, loader: _Loader) -> dict:
         try:
-            return {stage: expand(loader.asked[0], stage, loader.asked[1], loader.folder) for stage in STAGES}
+            name, defines = loader.asked
+            return {stage: expand(name, stage, defines, loader.folder) for stage in stages_of(defines)}
         except ShaderError:
             return {}
 

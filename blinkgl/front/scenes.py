@@ -720,7 +720,7 @@ class Scene(Piece):
     @property
     def on_disk(self) -> bool:
         """Whether a YAML file could say it: nothing is made of arrays."""
-        return not (self._memory.meshes or self._memory.textures)
+        return not (self._memory.meshes or self._memory.textures or self._memory.maps)
 
     def build(self, config: SequenceConfig) -> data.Scene:
         """What the renderer draws. Raises ConfigError and AssetError: files."""

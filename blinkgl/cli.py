@@ -237,6 +237,14 @@ def trade(
             "small camera and a short --clip)."
         ),
     ] = "raster",
+    reference_set: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="scene.a=b",
+            help="Judge by a scene that has more: an effect that the settings leave out, such as "
+            "scene.light.shadows=soft; may be repeated.",
+        ),
+    ] = None,
 ) -> int:
     """Measure what accuracy costs: settings timed and judged against a converged reference,
     as a table, a plot and a page."""
@@ -263,6 +271,7 @@ def trade(
                 "--sequence": sequence is not None,
                 "--clip": clip is not None,
                 "--reference": reference != "raster",
+                "--reference-set": bool(reference_set),
             },
         )
     return command.run(
@@ -280,6 +289,7 @@ def trade(
         minutes=minutes,
         cost=cost or "wall",
         reference=reference,
+        reference_set=reference_set,
         seed=seed,
     )
 

@@ -31,6 +31,7 @@ def run(
     minutes: float | None,
     cost: str,
     reference: str = "raster",
+    reference_set: list[str] | None = None,
     seed: int | None = None,
 ) -> int:
     """Measures, writes the files, and names the settings that nothing beats. Raises BlinkGLError."""
@@ -47,6 +48,7 @@ def run(
         "limit_us": round(limit_ms * 1000),
         "sequence": template.sequence(0).output.first_index if sequence is None else sequence,
     }
+    changes["reference_set"] = tuple(reference_set or ())
     if reference == "cycles":
         changes |= {"reference": reference, "levels": TRACED_LEVELS}
     if clip is not None:

@@ -69,6 +69,7 @@ class Options:
     levels : (samples per pixel side, px between frames) of the reference, rising until it has
     converged or ``reference_s`` is spent. A :class:`Density` instead: each scene's own.
     reference : "raster", or "cycles" (extra [cycles]): the same scene path-traced, samples² paths a pixel.
+    reference_set : overrides of the scene, "scene.a.b=c", that the reference alone has: effects that are left out.
     rounds, rounds_s : at most so many rounds, and no new one when so many seconds are gone."""
 
     clip_s: float = 0.0
@@ -80,6 +81,7 @@ class Options:
     limit_us: int = 10_000
     sequence: int = 0
     reference: str = "raster"
+    reference_set: tuple[str, ...] = ()
     labels: bool = True
     """Whether flow labels are judged, too."""
 
@@ -216,6 +218,15 @@ class Bench:
         self._scenes: dict[str, Scene] = {}
         self.base = self.config(())
         self.scene = self.scene_of(self.base)
+        for text in options.reference_set:
+            if not text.startswith("scene."):
+                raise ConfigError(
+                    "the reference differs in what it shows alone",
+                    where="--reference-set",
+                    value=text,
+                    accepted="a key of the scene, such as scene.light.shadows=soft",
+                )
+        self.reference_scene = self.scene_of(self.config(options.reference_set))
         camera = self.scene.camera
         self.height, self.width = camera.height, camera.width
         self.tiles = lattice(self.width, self.height, *options.tiles)
@@ -360,8 +371,8 @@ class Bench:
         if self.options.reference == "cycles":
             from blinkgl.trade.traced import TracedFrames
 
-            return TracedFrames(self.gl, self.scene, self.tiles, scale)
-        return FineTiles(self.gl, self.scene, self.tiles, scale)
+            return TracedFrames(self.gl, self.reference_scene, self.tiles, scale)
+        return FineTiles(self.gl, self.reference_scene, self.tiles, scale)
 
     def errors(self, reference: Events, events: Events, speeds: SpeedMaps) -> EventErrors:
         return event_errors(

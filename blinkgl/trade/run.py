@@ -123,6 +123,7 @@ def trade(
         "sequence": options.sequence,
         "quick": quick,
         "reference": options.reference,
+        "reference_set": list(options.reference_set),
         "only": only or [],
         "skip": skip or [],
         "cost": cost,
@@ -148,6 +149,8 @@ def convergence_line(result: dict, size: str = "full") -> str:
         else f"{last['scale']}x{last['scale']} samples a pixel"
     )
     what = f"{samples}, {last['max_px']:g} px between frames ({last['frames']} frames)"
+    if more := result.get("reference_set"):
+        what += f", with {', '.join(more)}"
     if not last["ratio"]:
         return f"the reference, {what}, was NOT checked: there was time for one level only"
     moved = ", ".join(f"{NAMES[k]} {100 * v:.2g} %" for k, v in last["ratio"].items())

@@ -17,6 +17,7 @@ from blinkgl.blender import process
 from blinkgl.cli import run
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.config.sequence import RenderConfig, load_run
+from blinkgl.errors import ConfigError
 from blinkgl.events.table import EMULATORS
 from blinkgl.render.rectangles import Rectangle
 from blinkgl.render.renderer import Renderer
@@ -108,6 +109,21 @@ def test_reference_converges_and_the_ladder_says_so(gl, config):
     )
     assert level.converged and not replace(level, smallest=dict.fromkeys(level.movement, 9.9)).converged
     assert not Level(1, 1.0, 1, 1.0, levels[0].events).converged, "a single level was never checked"
+
+
+def test_a_reference_with_more_than_the_settings(gl, config):
+    """Judged by a scene with shadows: the settings have none, the reference other events."""
+    template = load_run(config)
+    same, more = (
+        Bench(gl, template, replace(OPTIONS, levels=((2, 0.5),), reference_set=texts))
+        for texts in ((), ("scene.light.shadows=hard", "scene.light.sky=0.1"))
+    )
+    assert (more.scene.light.shadows, more.reference_scene.light.shadows) == ("off", "hard")
+    assert same.reference_scene is same.scene and more.tiles == same.tiles
+    (plain,), (shaded,) = (bench.judge([], bench.speeds()) for bench in (same, more))
+    assert same.errors(shaded.events, plain.events, same.speeds()).wrong > 0.02
+    with pytest.raises(ConfigError, match="--reference-set: the reference differs in what it shows alone"):
+        Bench(gl, template, replace(OPTIONS, reference_set=("camera.width=10",)))
 
 
 def test_no_more_time_no_finer_reference(gl, config):

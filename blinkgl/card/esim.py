@@ -36,6 +36,7 @@ from blinkgl.card.kernels import (
     refuse_without_compute,
 )
 from blinkgl.card.late import Slot, maps_persistently
+from blinkgl.card.memory import refuse_if_out_of_memory, refuse_too_large
 from blinkgl.card.proof import rounds_like_ieee
 from blinkgl.config.events import EsimConfig
 from blinkgl.errors import EventDataError, GLError
@@ -510,8 +511,14 @@ class _Room:
             **({"thresholds": 8 * padded} if spread else {}),
             **({"more": 16 * padded} if more else {}),
         }
-        _refuse_too_large(gl, sizes, f"{width}x{height}")
+        what = f"{width}x{height} pixels"
+        refuse_too_large(gl, sizes, what, (width, height))
         self._buffers = {name: gl.ctx.buffer(reserve=size) for name, size in sizes.items()}
+        try:
+            refuse_if_out_of_memory(gl, what)
+        except GLError:
+            self.release()
+            raise
         self._buffers["levels"].write(np.tile(np.array([_FAR, -_FAR], np.int32), padded).tobytes())
         self.clear_head()
         for name in ("now", "before"):
@@ -540,22 +547,10 @@ class _Room:
     def grow(self, count: int) -> None:
         """Room for so many events, and a quarter more."""
         capacity = count + count // 4
-        _refuse_too_large(self._gl, {"packed": 8 * capacity}, f"{count} events in one step")
+        refuse_too_large(self._gl, {"packed": 8 * capacity}, f"{count} events in one step")
         self._buffers["packed"].release()
         self._buffers["packed"], self.capacity = self._gl.ctx.buffer(reserve=8 * capacity), capacity
 
     def release(self) -> None:
         for buffer in self._buffers.values():
             buffer.release()
-
-
-def _refuse_too_large(gl: GLContext, sizes: dict[str, int], what: str) -> None:
-    limit = gl.ctx.info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"]
-    largest = max(sizes.values())
-    if largest > limit:
-        raise GLError(
-            f"{what} are too many for this card's buffers",
-            where="events.device",
-            value=f"{largest / 2**20:.0f} MiB in one",
-            accepted=f"at most {limit / 2**20:.0f} MiB, or events.device: cpu",
-        )

@@ -32,7 +32,7 @@ from blinkgl.scene.rig import Sensor
 from blinkgl.scene.types import Dynamics, Scene, SceneObject
 from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.inertial import Inertial, measured
-from blinkgl.sequence.items import GroundTruth, Picture
+from blinkgl.sequence.items import GroundTruth, Item, Picture
 from blinkgl.sequence.simulate import Simulation
 from blinkgl.timeline import Timeline, make_timeline
 
@@ -65,7 +65,7 @@ def _truth_of(sensor: Sensor, config: SequenceConfig) -> SurfaceTruth | None:
     """What says what made a sensor's events; None where its labels do not ask."""
     if sensor.labels is None or not sensor.labels.events:
         return None
-    return SurfaceTruth(reach=int(samples_of(config.render.antialiasing).stored > 1))
+    return SurfaceTruth(reach=int(samples_of(config.render.antialiasing).shared))
 
 
 def surfaces_at(renderer: Renderer, t_ns: int) -> Surfaces:
@@ -166,6 +166,11 @@ class RenderedSequence(Simulation):
         except EventDataError as error:
             raise self._explained(error) from error
 
+    def _in_order(self) -> Iterator[Item]:
+        yield from super()._in_order()
+        self._resume()
+        self.renderer.gl.check()  # before anybody calls the sequence whole
+
     def _explained(self, error: EventDataError) -> EventDataError:
         """The error with the time and, where a pixel is at fault, what is seen there."""
         if error.pixel is None or error.t_ns is None:
@@ -192,6 +197,7 @@ class RenderedSequence(Simulation):
 
     def truth(self, t_ns: int, span_ns: int) -> GroundTruth:
         self._resume()
+        self.renderer.gl.check()
         return self._truth_over(-1, t_ns, span_ns, asked_for(self.sensor.labels), False)
 
     def _truth_over(self, k: int, t_ns: int, span_ns: int, request: LabelRequest, last: bool) -> GroundTruth:

@@ -55,7 +55,7 @@ void main()
 #else
     const float light = 1.0;
 #endif
-    vec3 added = vec3(0.0);
+    vec3 added = vec3(0.0); // to what goes through the albedo
 #ifdef SURFACED
 #ifdef BUMPED
     vec4 along = tangent;
@@ -75,6 +75,9 @@ void main()
     ILLUMINANT light = shown_matt;
 #endif
 #endif
+#ifdef SHOW_LOOKUP
+    vec3 mirrored_light = added;
+#endif
 #ifdef EMISSIVE
 #ifdef EMISSION_MAP
     added += emission * map_at(emission_map, emission_map_place * vec3(uv, 1.0), 0.0).rgb;
@@ -83,12 +86,17 @@ void main()
 #endif
 #endif
 #ifdef SHOW_LOOKUP
+#ifndef LIT
+    const float shown_direct = 0.0, shown_arrives = 0.0, shown_around = 0.0;
+#endif
 #ifdef HUED
     vec3 weighed = radiance * vec3(0.2126, 0.7152, 0.0722); // Rec. 709
-    show_lookup(radiance, dot(weighed, light) / max(weighed.r + weighed.g + weighed.b, 1e-30), added);
+#define OF_LUMINANCE(light) (dot(weighed, light) / max(weighed.r + weighed.g + weighed.b, 1e-30))
 #else
-    show_lookup(radiance, light, added);
+#define OF_LUMINANCE(light) (light)
 #endif
+    show_lookup(radiance, vec3(light), OF_LUMINANCE(light), mirrored_light, added - mirrored_light, OF_LUMINANCE(shown_direct),
+                OF_LUMINANCE(shown_arrives), OF_LUMINANCE(shown_around));
 #endif
 #ifdef LIT
     radiance *= light;

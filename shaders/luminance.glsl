@@ -265,21 +265,24 @@ void main()
 #ifdef SURFACED
     ILLUMINANT light = shown_matt;
 #elif !defined(LIT)
-    const float light = 1.0;
+    const float light = 1.0, shown_direct = 0.0, shown_arrives = 0.0, shown_around = 0.0;
 #endif
 #ifdef HUED
-    float known = unlit.r + unlit.g + unlit.b, seen_light = dot(unlit, vec3(light)) / max(known, 1e-30);
+    float known = unlit.r + unlit.g + unlit.b;
+#define OF_LUMINANCE(light) (dot(unlit, vec3(light)) / max(known, 1e-30))
 #else
-    float known = unlit, seen_light = light;
+    float known = unlit;
+#define OF_LUMINANCE(light) (light)
 #endif
-    float added = 0.0;
+    float mirrored_light = 0.0, emitted = 0.0;
 #ifdef GLOSSY
-    added += seen - known * seen_light;
+    mirrored_light = seen - known * OF_LUMINANCE(light);
 #endif
 #ifdef EMISSIVE
-    added += own;
+    emitted = own;
 #endif
-    show_lookup(vec3(known), seen_light, vec3(added));
+    show_lookup(vec3(known), vec3(light), OF_LUMINANCE(light), vec3(mirrored_light), vec3(emitted),
+                OF_LUMINANCE(shown_direct), OF_LUMINANCE(shown_arrives), OF_LUMINANCE(shown_around));
 #endif
 #ifdef EMISSIVE
     seen += own;

@@ -108,7 +108,10 @@ def build(bpy, job: dict, arrays: dict):
     scene = bpy.context.scene
     images = {}
     # Without shadows nothing is in the way of the dome: its share is a formula, and needs no paths.
-    even_sky = 0.0 if job["settings"]["shadows"] else job["light"]["sky"]
+    open_ = not (job["settings"]["shadows"] and job["settings"]["occlusion"])
+    light = job["light"]
+    formula = open_ and "panorama" not in arrays and all(paint["gloss"] is None for paint in job["materials"])
+    even_sky = [light["sky"] * c if formula else 0.0 for c in light["sky_color"]]
     materials = [make_material(bpy, m, k, images, arrays, even_sky) for k, m in enumerate(job["materials"])]
     meshes: dict[tuple[int, int], object] = {}
     bodies = []
@@ -124,10 +127,11 @@ def build(bpy, job: dict, arrays: dict):
             thing = bpy.data.objects.new(body["name"], meshes[mesh, material])
             thing.parent = root
             solid = not body["picture_only"]
-            thing.visible_diffuse = thing.visible_shadow = solid and job["settings"]["shadows"]
+            thing.visible_shadow = solid and job["settings"]["shadows"]
+            thing.visible_diffuse = solid and not open_  # what a ray to the dome meets
             thing.visible_glossy = thing.visible_transmission = False
             scene.collection.objects.link(thing)
-    make_light(bpy, scene, job)
+    make_light(bpy, scene, job, arrays.get("panorama"), 0.0 if formula else light["sky"])
     camera = make_camera(bpy, scene, job)
     adjust(scene, job["settings"])
     scene.render.resolution_x, scene.render.resolution_y = job["size"]
@@ -145,16 +149,20 @@ def make_mesh(bpy, k: int, arrays: dict):
     mesh.attributes.new("custom_normal", "FLOAT_VECTOR", "POINT").data.foreach_set(
         "vector", arrays[f"normals{k}"].ravel()
     )
+    if f"colours{k}" in arrays:
+        rgba = np.ones((len(arrays[f"colours{k}"]), 4), np.float32)
+        rgba[:, :3] = arrays[f"colours{k}"]
+        mesh.color_attributes.new("tint", "FLOAT_COLOR", "POINT").data.foreach_set("color", rgba.ravel())
     mesh.update()
     return mesh
 
 
-def make_material(bpy, paint: dict, k: int, images: dict, arrays: dict, even_sky: float):
+def make_material(bpy, paint: dict, k: int, images: dict, arrays: dict, even_sky: list[float]):
     """Unlit: emission that only the camera sees. Lit: a diffuse BSDF, and albedo * even_sky * (0.5 + 0.5 n_z) as
-    emission. Culled: nothing where the camera sees a back face."""
+    emission, or a principled one. Culled: nothing where the camera sees a back face."""
     material = bpy.data.materials.new(f"material {k}")
     material.use_nodes = True
-    material.use_transparent_shadow = False  # what is culled is culled for the camera alone
+    material.use_transparent_shadow = paint["alpha"] is not None  # what is culled is culled for the camera alone
     material.cycles.emission_sampling = "NONE"
     tree = material.node_tree
     tree.nodes.clear()
@@ -162,39 +170,78 @@ def make_material(bpy, paint: dict, k: int, images: dict, arrays: dict, even_sky
     if paint["unlit"]:
         surface = add("ShaderNodeEmission")
         link(add("ShaderNodeLightPath").outputs["Is Camera Ray"], surface.inputs["Strength"])
+    elif paint["gloss"] is not None:
+        surface = add("ShaderNodeBsdfPrincipled")
+        surface.distribution = "MULTI_GGX"
+        for name, value in zip(("Metallic", "Roughness"), paint["gloss"]):
+            surface.inputs[name].default_value = value
     else:
         surface = add("ShaderNodeBsdfDiffuse")
         surface.inputs["Roughness"].default_value = 0.0
+    normal = None
+    if paint["bumps"] is not None:
+        normal = add("ShaderNodeNormalMap")
+        picture = picture_of(bpy, tree, paint["bumps"], images, arrays)
+        if paint["bump_scale"] != 1:
+            raise ValueError("normal maps are taken as they are")
+        link(picture.outputs["Color"], normal.inputs["Color"])
+        link(normal.outputs[0], surface.inputs["Normal"])
     glow = None
-    if even_sky > 0 and not paint["unlit"]:
+    if max(even_sky) > 0 and not paint["unlit"] and paint["gloss"] is None:
         glow = add("ShaderNodeEmission")
         axes, up = add("ShaderNodeSeparateXYZ"), add("ShaderNodeMath")
         up.operation = "MULTIPLY_ADD"
-        up.inputs[1].default_value = up.inputs[2].default_value = 0.5 * even_sky
-        link(add("ShaderNodeNewGeometry").outputs["Normal"], axes.inputs[0])
+        up.inputs[1].default_value = up.inputs[2].default_value = 0.5
+        link((normal or add("ShaderNodeNewGeometry")).outputs["Normal"], axes.inputs[0])
         link(axes.outputs["Z"], up.inputs[0])
         link(up.outputs[0], glow.inputs["Strength"])
-    coloured = [node.inputs["Color"] for node in (surface, glow) if node is not None]
-    for colour in coloured:
-        colour.default_value = [*paint["base_color"], 1.0]
+    factors = []
     if paint["texture"] is not None:
-        picture = add("ShaderNodeTexImage")
-        picture.image = images.get(paint["texture"]) or images.setdefault(
-            paint["texture"], make_image(bpy, paint["texture"], arrays)
-        )
-        picture.interpolation, picture.extension = "Linear", "REPEAT"
-        product = add("ShaderNodeVectorMath")
-        product.operation = "MULTIPLY"
-        product.inputs[1].default_value = paint["base_color"]
-        link(picture.outputs["Color"], product.inputs[0])
-        for colour in coloured:
-            link(product.outputs["Vector"], colour)
+        factors.append(picture_of(bpy, tree, paint["texture"], images, arrays).outputs["Color"])
+    if paint["tinted"]:
+        tint = add("ShaderNodeAttribute")
+        tint.attribute_name = "tint"
+        factors.append(tint.outputs["Color"])
+    principled = paint["gloss"] is not None and not paint["unlit"]
+    for node, more in ((surface, (1.0, 1.0, 1.0)), (glow, even_sky)):
+        if node is None:
+            continue
+        base = [a * b for a, b in zip(paint["base_color"], more)]
+        colour = node.inputs["Base Color" if principled and node is surface else "Color"]
+        colour.default_value = [*base, 1.0]
+        out = None
+        for factor in factors:
+            product = add("ShaderNodeVectorMath")
+            product.operation = "MULTIPLY"
+            link(factor, product.inputs[0])
+            if out is None:
+                product.inputs[1].default_value = base
+            else:
+                link(out, product.inputs[1])
+            out = product.outputs["Vector"]
+        if out is not None:
+            link(out, colour)
     shader = surface.outputs[0]
-    if glow is not None:
-        both = add("ShaderNodeAddShader")
-        link(shader, both.inputs[0])
-        link(glow.outputs[0], both.inputs[1])
-        shader = both.outputs[0]
+    own = None
+    if any(paint["emission"]) and not paint["unlit"]:
+        own = add("ShaderNodeEmission")
+        own.inputs["Color"].default_value = [*paint["emission"], 1.0]
+        link(add("ShaderNodeLightPath").outputs["Is Camera Ray"], own.inputs["Strength"])
+    for more in (glow, own):
+        if more is not None:
+            both = add("ShaderNodeAddShader")
+            link(shader, both.inputs[0])
+            link(more.outputs[0], both.inputs[1])
+            shader = both.outputs[0]
+    if paint["alpha"] is not None:
+        there, mix = add("ShaderNodeMath"), add("ShaderNodeMixShader")
+        there.operation = "GREATER_THAN"
+        there.inputs[1].default_value = paint["threshold"]
+        link(picture_of(bpy, tree, paint["alpha"], images, arrays).outputs["Color"], there.inputs[0])
+        link(there.outputs[0], mix.inputs[0])
+        link(add("ShaderNodeBsdfTransparent").outputs[0], mix.inputs[1])
+        link(shader, mix.inputs[2])
+        shader = mix.outputs[0]
     if paint["culled"]:
         seen = add("ShaderNodeMath")
         seen.operation = "MULTIPLY"
@@ -209,11 +256,19 @@ def make_material(bpy, paint: dict, k: int, images: dict, arrays: dict, even_sky
     return material
 
 
-def make_image(bpy, k: int, arrays: dict):
+def picture_of(bpy, tree, k: int, images: dict, arrays: dict):
+    """A node that looks texture k up, bilinear, repeated."""
+    picture = tree.nodes.new("ShaderNodeTexImage")
+    picture.image = images.get(k) or images.setdefault(k, make_image(bpy, f"texture{k}", arrays))
+    picture.interpolation, picture.extension = "Linear", "REPEAT"
+    return picture
+
+
+def make_image(bpy, name: str, arrays: dict):
     """Linear float texels, used as they are; Blender's row 0 is the bottom one."""
-    texels = arrays[f"texture{k}"][::-1]
+    texels = arrays[name][::-1]
     height, width, _ = texels.shape
-    image = bpy.data.images.new(f"texture {k}", width, height, alpha=False, float_buffer=True, is_data=True)
+    image = bpy.data.images.new(name, width, height, alpha=False, float_buffer=True, is_data=True)
     rgba = np.ones((height, width, 4), np.float32)
     rgba[..., :3] = texels
     image.pixels.foreach_set(rgba.ravel())
@@ -221,10 +276,12 @@ def make_image(bpy, k: int, arrays: dict):
     return image
 
 
-def make_light(bpy, scene, job: dict) -> None:
-    """Sun without extent, and a dome that is white above the horizon and black below: without anything in between it
-    gives an upward-facing share of 0.5 + 0.5 n_z, exactly BlinkGL's sky. The camera sees
-    the background instead of the dome."""
+def make_light(bpy, scene, job: dict, panorama: np.ndarray | None, sky: float) -> None:
+    """Sun without extent, and a dome that is of one colour above the horizon and black below: without anything in
+    between it gives an upward-facing share of 0.5 + 0.5 n_z, exactly BlinkGL's sky; or a panorama. The camera sees
+    the background instead of the dome.
+
+    sky : strength of the dome, 0 where it is in the materials (see make_material)."""
     light = job["light"]
     if light["sun"] > 0:
         lamp = bpy.data.lights.new("sun", "SUN")
@@ -236,7 +293,11 @@ def make_light(bpy, scene, job: dict) -> None:
         scene.collection.objects.link(sun)
     world = scene.world = bpy.data.worlds.new("world")
     world.use_nodes = True
-    world.cycles.sampling_method = "NONE"  # the surface's own cosine distribution finds a dome best
+    # The surface's own cosine distribution finds a dome best; a panorama is looked for where it is bright, by rays that
+    # what casts shadows would stop; what mirrors finds it in its mirror.
+    smooth = any(paint["gloss"] is not None and paint["gloss"][1] < 0.3 for paint in job["materials"])
+    by_brightness = panorama is not None and not job["settings"]["shadows"] and not smooth
+    world.cycles.sampling_method = "AUTOMATIC" if by_brightness else "NONE"
     tree = world.node_tree
     tree.nodes.clear()
     add, link = tree.nodes.new, tree.links.new
@@ -246,18 +307,25 @@ def make_light(bpy, scene, job: dict) -> None:
     above.operation = "GREATER_THAN"
     above.inputs[1].default_value = 0.0
     link(split.outputs["Z"], above.inputs[0])
-    strength = add("ShaderNodeMix")  # its first sockets are those of floats
-    link(add("ShaderNodeLightPath").outputs["Is Camera Ray"], strength.inputs[0])
     scale = add("ShaderNodeMath")
     scale.operation = "MULTIPLY"
-    scale.inputs[1].default_value = light["sky"] if job["settings"]["shadows"] else 0.0  # else see make_material
+    scale.inputs[1].default_value = sky
     link(above.outputs[0], scale.inputs[0])
-    link(scale.outputs[0], strength.inputs[2])
-    strength.inputs[3].default_value = job["background"]
-    shine = add("ShaderNodeBackground")
-    shine.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
-    link(strength.outputs[0], shine.inputs["Strength"])
-    link(shine.outputs[0], add("ShaderNodeOutputWorld").inputs["Surface"])
+    seen, dome, backdrop = (add(f"ShaderNode{kind}") for kind in ("MixShader", "Background", "Background"))
+    dome.inputs["Color"].default_value = [*light["sky_color"], 1.0]
+    link(scale.outputs[0], dome.inputs["Strength"])
+    if panorama is not None:
+        around = add("ShaderNodeTexEnvironment")
+        around.image, around.interpolation = make_image(bpy, "panorama", {"panorama": panorama}), "Linear"
+        link(around.outputs["Color"], dome.inputs["Color"])
+        dome.inputs["Strength"].default_value = 1.0
+        tree.links.remove(dome.inputs["Strength"].links[0])
+    backdrop.inputs["Strength"].default_value = job["background"]
+    backdrop.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
+    link(add("ShaderNodeLightPath").outputs["Is Camera Ray"], seen.inputs[0])
+    link(dome.outputs[0], seen.inputs[1])
+    link(backdrop.outputs[0], seen.inputs[2])
+    link(seen.outputs[0], add("ShaderNodeOutputWorld").inputs["Surface"])
 
 
 def make_lamp(bpy, scene, lamp: dict, shadows: bool):

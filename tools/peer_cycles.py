@@ -19,7 +19,12 @@ The same picture, as far as two renderers can make it:
 * The sun is a lamp without extent, the sky a dome that is white above the horizon and black below: unobstructed,
   exactly ``sun * max(0, n.s) + sky * (0.5 + 0.5 n_z)``. Obstructed it is not what BlinkGL draws: that is the
   measurement. ``shadows=False, bounces=0`` is BlinkGL's own light model (the sky is evaluated, so nothing is noisy);
-  ``bounces=0`` adds shadows of sun and dome; ``bounces > 0`` adds inter-reflection.
+  ``shadows=True, occlusion=False`` adds shadows of the lamps, which is BlinkGL's with ``light.shadows``; ``bounces=0``
+  adds those of the dome; ``bounces > 0`` adds inter-reflection. A panorama is the picture that BlinkGL found its
+  harmonics in, its suns lamps.
+* A gloss is Blender's principled surface with multiple scattering, which mirrors the world and the lamps alone; normal
+  maps, light of its own, holes and colours of vertices are nodes of their own. Fog is refused: there it would swallow
+  the light of the lamps, too.
 * Sky boxes are pictures: the camera sees them, light passes through them. Other unlit surfaces cast shadows but do not
   shine on anything, as in BlinkGL. Back faces of closed one-sided meshes are invisible to the camera alone.
 * What stays different: shading normals that point away from the side that is lit are treated more strictly by a path
@@ -43,9 +48,9 @@ from blinkgl.blender.process import Blender, how_it_ended, interpreter
 from blinkgl.camera import PinHole
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.render.colour import LUMA, linear_image
-from blinkgl.scene.lights import lamps_of
+from blinkgl.scene.lights import lamps_of, seen_around
 from blinkgl.scene.shapes.deformer import all_rigid
-from blinkgl.scene.types import WHITE, Material, Scene
+from blinkgl.scene.types import Material, Scene
 
 WORKER = Path(__file__).with_name("cycles_worker.py")
 # OpenCV's camera looks along +z with y down, Blender's along -z with y up.
@@ -55,12 +60,14 @@ CV_FROM_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])
 @dataclass(frozen=True)
 class CyclesSettings:
     """samples : paths per pixel.   seed : of all frames.   shadows : of sun and dome; False
-    needs bounces=0.   bounces : of diffuse light.
+    needs bounces=0.   occlusion : of the dome by what stands around, where there are shadows; False needs bounces=0.
+    bounces : of diffuse light.
     engine : "cycles" or "eevee" (bounces and seed do nothing there).   threads : 0 for all."""
 
     samples: int = 64
     seed: int = 0
     shadows: bool = True
+    occlusion: bool = True
     bounces: int = 4
     engine: str = "cycles"
     threads: int = 0
@@ -78,12 +85,12 @@ class CyclesSettings:
                 )
         if self.engine not in ("cycles", "eevee"):
             raise ConfigError("unknown engine", where="cycles.engine", value=self.engine, accepted="cycles or eevee")
-        if self.bounces and not self.shadows:
+        if self.bounces and not (self.shadows and self.occlusion):
             raise ConfigError(
                 "light that passes through everything cannot bounce",
                 where="cycles.bounces",
                 value=self.bounces,
-                accepted="0 with shadows=False",
+                accepted="0 with shadows=False" if not self.shadows else "0 with occlusion=False",
             )
 
 
@@ -160,12 +167,14 @@ def export(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings, fold
     """Writes job.json and job.npz, all that the worker reads. World axes are the scene's (z up in
     both), its origin the first camera's place.
 
-    job.json: size [W, H]; blender_camera, near; background; light {sun_direction, sun, sky, lamps [{kind,
+    job.json: size [W, H]; blender_camera, near; background; light {sun_direction, sun, sky, sky_color, lamps [{kind,
     strength, size, outer, blend}], which are the sun, too, unless the light is plain}; settings; frames;
-    materials [{texture index or null, base_color, unlit, culled}]; bodies [{name, picture_only, parts [[mesh,
+    materials [{texture index or null, base_color, unlit, culled, tinted, gloss [metallic, roughness] or null, bumps
+    index or null, bump_scale, emission, alpha index or null, threshold}]; bodies [{name, picture_only, parts [[mesh,
     material], …]}]. job.npz, k counting what job.json refers to: vertices{k} (V, 3), normals{k} (V, 3), uvs{k} (V, 2)
-    float32 with uv_scale in them and v growing upwards, faces{k} (F, 3) int32; texture{k} (h, w, 3) float32 linear, row
-    0 at the top; poses (bodies, N, 4, 4) and camera_poses (N, 4, 4), lamp_poses (lamps, N, 4, 4) float64, the
+    float32 with uv_scale in them and v growing upwards, colours{k} (V, 3) where vertices have them, faces{k} (F, 3)
+    int32; texture{k} (h, w, 3) float32, linear or numbers, row 0 at the top; panorama (h, w, 3) float32, where one
+    lights the scene; poses (bodies, N, 4, 4) and camera_poses (N, 4, 4), lamp_poses (lamps, N, 4, 4) float64, the
     camera's in Blender's camera axes. Blender's spot lights fade otherwise between the inner and the outer angle.
     """
     all_rigid(scene, "the path tracer")
@@ -184,9 +193,11 @@ def export(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings, fold
                 arrays[f"normals{k}"] = mesh.normals.astype(np.float32)
                 arrays[f"faces{k}"] = mesh.faces.astype(np.int32)
                 arrays[f"uvs{k}"] = _blender_uvs(mesh.uvs, paint.uv_scale)
-            m, new = materials.number((id(paint), culled))
+                if mesh.colours is not None:
+                    arrays[f"colours{k}"] = mesh.colours.astype(np.float32)
+            m, new = materials.number((id(paint), culled, mesh.colours is not None))
             if new:
-                paints.append(_paint(paint, culled, textures, arrays))
+                paints.append(_paint(paint, culled, mesh.colours is not None, textures, arrays))
             parts.append([k, m])
         bodies.append({"name": thing.name, "picture_only": thing.category == "sky", "parts": parts})
 
@@ -200,8 +211,10 @@ def export(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings, fold
     arrays["poses"] = np.array([poses(thing.path) for thing in scene.objects]).reshape(-1, len(times_ns), 4, 4)
     arrays["camera_poses"] = poses(scene.camera_path) @ CV_FROM_BLENDER
     light = scene.light
-    if light.sky and light.sky_color != WHITE:
-        raise BlinkGLError("the path tracer's sky is white", where="scene.light.sky_color", value=light.sky_color)
+    if scene.fog is not None:
+        raise BlinkGLError("the path tracer knows no fog", where="scene.fog", accepted="a scene without fog")
+    if light.surroundings is not None:
+        arrays["panorama"] = seen_around(light)
     lamps = () if light.plain else lamps_of(light)
     arrays["lamp_poses"] = np.array([poses(lamp.path) for lamp in lamps]).reshape(-1, len(times_ns), 4, 4)
     job = {
@@ -215,6 +228,7 @@ def export(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings, fold
             "sun_direction": [float(s) for s in light.sun_direction],
             "sun": float(light.sun) if light.plain else 0.0,
             "sky": float(light.sky),
+            "sky_color": [float(c) for c in light.sky_color],
             "lamps": [
                 {
                     "kind": lamp.kind,
@@ -260,18 +274,33 @@ class _Numbered(dict):
         return self.setdefault(key, len(self)), new
 
 
-def _paint(material: Material, culled: bool, textures: _Numbered, arrays: dict) -> dict:
-    index = None
-    if material.texture is not None:
-        index, new = textures.number(id(material.texture))
+def _paint(material: Material, culled: bool, tinted: bool, textures: _Numbered, arrays: dict) -> dict:
+    def stored(key, image: Callable[[], np.ndarray]) -> int:
+        index, new = textures.number(key)
         if new:
-            arrays[f"texture{index}"] = linear_image(material.texture.image)
+            arrays[f"texture{index}"] = image()
+        return index
+
+    texture, bumps, gloss, mask = material.texture, material.bumps, material.gloss, material.mask
+    if material.emission_map is not None or (gloss is not None and gloss.map is not None):
+        raise BlinkGLError("the path tracer knows no maps of gloss and emission", where="material")
     return {
-        "texture": index,
+        "texture": None if texture is None else stored(id(texture), lambda: linear_image(texture.image)),
         "base_color": [float(c) for c in material.base_color],
         "unlit": material.unlit,
         "culled": culled,
+        "tinted": tinted,
+        "gloss": None if gloss is None else [gloss.metallic, gloss.roughness],
+        "bumps": None if bumps is None else stored(id(bumps), lambda: _numbers(bumps.texture.image)),
+        "bump_scale": material.bump_scale,
+        "emission": [float(c) for c in material.emission],
+        "alpha": None if mask is None else stored(id(mask), lambda: _numbers(np.dstack([mask.alpha] * 3))),
+        "threshold": None if mask is None else mask.threshold,
     }
+
+
+def _numbers(image: np.ndarray) -> np.ndarray:
+    return image.astype(np.float32) / np.float32(255)
 
 
 def _blender_uvs(uvs: np.ndarray, uv_scale: tuple[float, float]) -> np.ndarray:

@@ -1,10 +1,13 @@
 """ESIM on the card (``shaders/compute/events_*.glsl``): the events of :class:`~blinkgl.events.esim.Esim`, bit for bit.
 
-A step is ten dispatches. *Mark*: the logarithm of every pixel against its two levels, a bit each. *List*: the pixels
-that fire, in raster order, their places found by prefix sums. *Fire*: how many events each has, its next levels, and a
-record. *Emit*: the events, from the records alone, at places found by prefix sums again. No place comes of an unordered
-atomic, so the order is that of the kernels on the processor before they sort, and the state has moved when events are
-written: a buffer that is too small is made again and *emit* repeated, nothing is lost.
+A frame that was drawn by the same context is handed on as the texture it lies in (*take*, a copy on the card that also
+looks for values that cannot be used); arrays are copied to the card. A step is ten dispatches more. *Mark*: the
+logarithm of every pixel against its two levels, a bit each. *List*: the pixels that fire, in raster order, their places
+found by prefix sums. *Fire*: how many events each has, its next levels, and a record. *Emit*: the events, from the
+records alone, at places found by prefix sums again. No place comes of an unordered atomic, so the order is that of the
+kernels on the processor before they sort, and the state has moved when events are written: a buffer that is too small
+is made again and *emit* repeated, nothing is lost. Events are sorted on the card (``events_sort.glsl``) or by the
+processor, and come at once or, so that nobody waits, one frame late (:mod:`blinkgl.card.late`).
 
 Logarithms and levels are whole numbers of 2^-25, times are divided exactly in 64 bits made of pairs of 32, the draws
 of jitter are doubles made of whole numbers (:file:`shaders/include/soft_double.glsl`). What is left are sums and
@@ -14,32 +17,39 @@ and where it does not, they are whole numbers, too.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import moderngl
 import numpy as np
 
 from blinkgl.card.arith import words
 from blinkgl.card.kernels import (
+    CUT,
+    EVENTS,
     HEAD_BYTES,
     PIXELS_AT,
     PIXELS_PER_GROUP,
+    UNUSABLE,
     WORD,
     Kernels,
+    SortRoom,
     refuse_without_compute,
 )
+from blinkgl.card.late import Slot, maps_persistently
+from blinkgl.card.memory import refuse_if_out_of_memory, refuse_too_large
 from blinkgl.card.proof import rounds_like_ieee
 from blinkgl.config.events import EsimConfig
 from blinkgl.errors import EventDataError, GLError
 from blinkgl.events.arith import Q_ONE, log_q25
-from blinkgl.events.emulator import BLOCK
+from blinkgl.events.emulator import BLOCK, INTENSITY_LIMIT_BITS
 from blinkgl.events.esim import Esim
+from blinkgl.events.packing import unpacked
 from blinkgl.events.types import Events
 
 if TYPE_CHECKING:
-    import moderngl
-
     from blinkgl.gl import GLContext
 
+_FREE_UNIT = 15  # of textures; no pass has so many
 _FAR = 2**30  # a level that no logarithm reaches: of the pixels that fill up the last block
 _LARGEST_STEP = 22.0
 """Thresholds beyond that, ln units, do not fit into 32 bits with a logarithm; normal numbers stay below 8.6."""
@@ -48,13 +58,19 @@ _LARGEST_STEP = 22.0
 class CardEsim(Esim):
     """See the module and :class:`~blinkgl.events.emulator.Emulator`; straight lines between frames alone.
 
+    ``step`` takes, besides arrays, a texture of ``gl``, (W, H) R32F, row 0 the picture's top row, and is done with it
+    when it returns.
     gl : where it runs; made current at every step.   soft_float : logarithms in whole numbers; None: where the card's
     own rounding is not that of IEEE 754.
     owns_gl : release the context with it.
+    late : ``step`` returns the events of the interval before its own, whose way back nobody had to wait for; ``flush``
+    the last ones (as of any emulator that ``lags``). sorts : events are sorted on the card. None for either: where the
+    context is not the processor's, which gains by neither. Events and their order are the same.
     State on the card: 16 bytes per pixel, spread thresholds 8 more, jitter or a refractory period 16.
     Raises EventDataError for a configuration that it does not do, GLError: no compute shaders, or not enough memory."""
 
     device = "gl"
+    takes_textures = True
 
     def __init__(
         self,
@@ -67,6 +83,8 @@ class CardEsim(Esim):
         gl: GLContext,
         owns_gl: bool = False,
         soft_float: bool | None = None,
+        late: bool | None = None,
+        sorts: bool | None = None,
     ):
         config = config or EsimConfig()
         if problem := self.unfit(config, reconstruction):
@@ -90,6 +108,12 @@ class CardEsim(Esim):
             self._room.put("thresholds", np.stack([self._on, self._off], axis=1))
         self._before_is_log, self._stays = False, False
         self._made = 0, 0  # events of the last step, and the microsecond before it
+        self._late = (not gl.is_software if late is None else late) and maps_persistently(gl)
+        self._sorts = not gl.is_software if sorts is None else sorts
+        self._sorting: SortRoom | None = None
+        self._slots: list[Slot | None] = [None, None]
+        self._flight: _Flight | None = None
+        self._kept: list[Events] = []  # that were on their way when the next ones were told to stay
 
     @classmethod
     def unfit(cls, config: EsimConfig, reconstruction: str = "linear") -> EventDataError | None:
@@ -130,12 +154,17 @@ class CardEsim(Esim):
         if not self.gl.released:
             with self.gl.borrowed():
                 self._room.release()
+                for thing in (self._sorting, *self._slots):
+                    if thing is not None:
+                        thing.release()
+                self._sorting, self._slots = None, [None, None]
             if self._owns_gl:
                 self.gl.release()
 
     # -- steps ----------------------------------------------------------------------------------------------
-    def advance(self, luminance: np.ndarray, t_ns: int) -> int:
-        """As ``step``, but the events stay on the card, for :mod:`blinkgl.card.sinks`; how many there are."""
+    def advance(self, luminance: np.ndarray | moderngl.Texture, t_ns: int) -> int:
+        """As ``step``, but the events stay on the card, for :mod:`blinkgl.card.sinks`; how many there are. (Those of a
+        step before it that are on their way come with the next ``step`` or ``flush``.)"""
         self._stays = True
         try:
             self.step(luminance, t_ns)
@@ -144,10 +173,41 @@ class CardEsim(Esim):
         return self._made[0]
 
     @property
+    def lags(self) -> bool:
+        return self._late
+
+    @property
+    def done_ns(self) -> int | None:
+        return self.t_ns if self._flight is None else self._flight.start_ns
+
+    def flush(self) -> Events:
+        self.gl.resume()
+        return self._landed()
+
+    @property
     def on_card(self) -> tuple[moderngl.Buffer, int, int]:
         """Packed events of the last step as they were emitted, not sorted by time; how many; the microsecond that their
         times count from."""
         return self._room["packed"], *self._made
+
+    def _checked_frame(self, luminance: Any) -> Any:
+        if not isinstance(luminance, moderngl.Texture):
+            return super()._checked_frame(luminance)
+        shape, kind = (luminance.height, luminance.width), (luminance.components, luminance.dtype)
+        if luminance.ctx is not self.gl.ctx or kind != (1, "f4"):
+            raise EventDataError(
+                "not a frame of this card",
+                where=f"frame {self.frames}",
+                value=f"{kind[0]} x {kind[1]}" + ("" if luminance.ctx is self.gl.ctx else " of another context"),
+                accepted="a texture of one 32-bit float a pixel, of the emulator's own context",
+            )
+        if shape == (self.height, self.width) and self.t_ns is not None:
+            return luminance
+        return super()._checked_frame(np.frombuffer(luminance.read(), np.float32).reshape(shape))
+
+    def _check_intensity(self, frame: Any) -> None:
+        if not isinstance(frame, moderngl.Texture):  # those are looked at on the card
+            super()._check_intensity(frame)
 
     def _start(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
         events = super()._start(frame, t_ns, rate)
@@ -162,31 +222,151 @@ class CardEsim(Esim):
     def _intensity(self, frame: np.ndarray) -> np.ndarray:
         return self._decode[frame] if frame.dtype == np.uint8 else frame
 
-    def _advance(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
+    def _advance(self, frame: np.ndarray | moderngl.Texture, t_ns: int, rate: np.ndarray | None) -> Events:
         self.gl.resume()
-        room, before_us = self._room, self.t_ns // 1000
+        room, interval = self._room, (self.t_ns, t_ns)
+        before = self._landed()
         room.turn()
-        room.put("now", self._intensity(frame))
-        self._fire(t_ns)
-        self._before_is_log = False
+        if isinstance(frame, moderngl.Texture):
+            self._take(frame)
+        else:
+            room.put("now", self._intensity(frame))
+        was_log, self._before_is_log = self._before_is_log, False
+        self._fire(interval, was_log)
+        flight = _Flight(*interval, was_log, room["packed"])
+        if self._late and not self._stays:
+            self._send(flight)
+            return before
         head = np.frombuffer(room["listed"].read(HEAD_BYTES), np.uint32)
-        count, cut = int(head[7]), int(head[8])
-        self.saturated += cut
-        self._made = count, before_us
-        if count > room.capacity:
-            room.grow(count)
-            self._emit(t_ns)
-        if not count or self._stays:
+        self._refuse_unusable(head, flight)
+        count = self._counted(head, flight)
+        if self._stays:
+            self._kept += [before] if len(before) else []
             return Events.empty()
-        return self._sorted(count, before_us, t_ns // 1000 - before_us)
+        flight = flight._replace(packed=self._where_they_are(*interval))
+        return Events.concatenate([before, self._read(flight, count)]) if len(before) else self._read(flight, count)
 
-    def _fire(self, t_ns: int) -> None:
-        """Marks, lists, fires, and emits as far as there is room."""
-        room, kernels, values = self._room, self._kernels, self._values(t_ns)
+    # -- from the card to the processor ---------------------------------------------------------------------
+    def _refuse_unusable(self, head: np.ndarray, flight: _Flight) -> None:
+        """Raises EventDataError where the frame at the flight's end had a value that cannot be used. Nothing has fired
+        and no level has moved; everything is as it was before that frame."""
+        if not head[UNUSABLE]:
+            return
+        room, seen = self._room, self._room.get("now", np.float32)
+        room.turn()
+        room.clear_head()
+        self._before_is_log = flight.was_log
+        if self.t_ns == flight.end_ns:  # it was taken for good then
+            self.t_ns, self.frames = flight.start_ns, self.frames - 1
+        try:
+            self._refuse_intensity(seen)
+        except EventDataError as error:
+            error.t_ns = flight.end_ns
+            raise
+
+    def _counted(self, head: np.ndarray, flight: _Flight) -> int:
+        """How many events there are; where they did not find room they are emitted again, into more."""
+        count = int(head[EVENTS])
+        self.saturated += int(head[CUT])
+        self._made = count, flight.start_ns // 1000
+        if count > self._room.capacity:
+            self._room.grow(count)
+            self._emit((flight.start_ns, flight.end_ns), flight.was_log)
+        return count
+
+    def _where_they_are(self, start_ns: int, end_ns: int) -> moderngl.Buffer:
+        """The events of an interval, sorted where that is done on the card."""
+        room = self._room
+        if not self._sorts:
+            return room["packed"]
+        if self._sorting is None or self._sorting.capacity != room.capacity:
+            if self._sorting is not None:
+                self._sorting.release()
+            self._sorting = SortRoom(self.gl, room.capacity)
+        bits = (end_ns // 1000 - start_ns // 1000).bit_length()
+        return self._kernels.sort(room["listed"], room["packed"], self._sorting, bits)
+
+    def _send(self, flight: _Flight) -> None:
+        """Sends the events off: as many as the last step had, and a quarter more. (How many there are nobody knows yet;
+        more of them are fetched when they are missed.)"""
+        flight = flight._replace(packed=self._where_they_are(flight.start_ns, flight.end_ns))
+        expected = min(self._room.capacity, max(BLOCK, self._made[0] * 5 // 4))
+        size, turn = HEAD_BYTES + 8 * expected, self.frames % 2
+        slot = self._slots[turn]
+        if slot is None or slot.size < size:
+            if slot is not None:
+                slot.release()
+            slot = self._slots[turn] = Slot(self.gl, size + size // 4)
+        slot.copy(self._room["listed"], HEAD_BYTES)
+        slot.copy(flight.packed, 8 * expected, HEAD_BYTES)
+        slot.seal()
+        self._flight = flight._replace(slot=slot, expected=expected)
+
+    def _landed(self) -> Events:
+        """The events that were on their way."""
+        kept, self._kept = self._kept, []
+        flight, self._flight = self._flight, None
+        if flight is None:
+            return Events.concatenate(kept) if kept else Events.empty()
+        assert flight.slot is not None
+        memory = flight.slot.wait()
+        head = memory[:HEAD_BYTES].view(np.uint32)
+        self._refuse_unusable(head, flight)
+        capacity = self._room.capacity
+        count = self._counted(head, flight)
+        if count > capacity:
+            packed = self._where_they_are(flight.start_ns, flight.end_ns)
+            events = self._read(flight._replace(packed=packed), count)
+        elif count > flight.expected:
+            events = self._read(flight, count)
+        else:
+            events = self._unpacked(memory[HEAD_BYTES : HEAD_BYTES + 8 * count].view(np.int64), flight)
+        return Events.concatenate([*kept, events]) if kept else events
+
+    def _read(self, flight: _Flight, count: int) -> Events:
+        if not count:
+            return Events.empty()
+        rows = self._buffer.rows(1, count)[0, :count]
+        flight.packed.read_into(rows, 8 * count)
+        return self._unpacked(rows, flight)
+
+    def _unpacked(self, packed: np.ndarray, flight: _Flight) -> Events:
+        """(N,) int64 as they came, sorted here where the card has not done it."""
+        base_us = flight.start_ns // 1000
+        if not len(packed):
+            return Events.empty()
+        if self._sorts:
+            return unpacked(packed, base_us, self.causes)
+        rows = self._buffer.rows(1, len(packed))
+        if not np.shares_memory(rows, packed):
+            rows[0, : len(packed)] = packed
+        span_us = flight.end_ns // 1000 - base_us
+        return self._buffer.to_events(np.array([len(packed)]), base_us, span_us, 1, self.causes)
+
+    # -- kernels --------------------------------------------------------------------------------------------
+    def _take(self, frame: moderngl.Texture) -> None:
+        """Copies a frame on the card, and tells the head whether a value in it cannot be used."""
+        frame.use(_FREE_UNIT)
+        values = {
+            "frame": _FREE_UNIT,
+            "width": self.width,
+            "pixels": self.height * self.width,
+            "limit": int(INTENSITY_LIMIT_BITS),
+        }
+        buffers = {0: self._room["now"], 1: self._room["listed"]}
+        self._kernels.run(
+            "compute/events_take.glsl", {}, buffers, values, items=values["pixels"], local=PIXELS_PER_GROUP
+        )
+
+    def _fire(self, interval: tuple[int, int], was_log: bool) -> None:
+        """Marks, lists, fires, and emits as far as there is room.
+
+        interval : its times, ns.   was_log : what was before are logarithms, not intensities."""
+        room, kernels, values = self._room, self._kernels, self._values(interval, was_log)
         kernels.run(
             "compute/events_mark.glsl",
             {},
-            {0: room["now"], 1: room["levels"], 2: room["marks"]},
+            {0: room["now"], 1: room["levels"], 2: room["marks"], 3: room["listed"]},
             values,
             items=room.words,
         )
@@ -204,22 +384,28 @@ class CardEsim(Esim):
             6: room["levels"],
             **({7: room["more"]} if self._has_more else {}),
         }
-        self._run_fire({}, buffers, t_ns, values)
-        kernels.prefix_of_counts(room["listed"], room["counts"], room["sums"], room["places"])
-        self._emit(t_ns)
+        self._run_fire({}, buffers, interval, values)
+        self._emit(interval, was_log)
 
-    def _emit(self, t_ns: int) -> None:
-        buffers = {4: self._room["places"], 5: self._room["packed"]}
-        self._run_fire({"EMIT": 1}, buffers, t_ns, self._values(t_ns))
+    def _emit(self, interval: tuple[int, int], was_log: bool) -> None:
+        """The events, from the records, with what the head says of them."""
+        room = self._room
+        self._kernels.prefix_of_counts(room["listed"], room["counts"], room["sums"], room["places"], room.capacity)
+        buffers = {4: room["places"], 5: room["packed"]}
+        self._run_fire({"EMIT": 1}, buffers, interval, self._values(interval, was_log))
 
     def _run_fire(
-        self, defines: dict[str, int], buffers: dict[int, moderngl.Buffer], t_ns: int, values: dict[str, Any]
+        self,
+        defines: dict[str, int],
+        buffers: dict[int, moderngl.Buffer],
+        interval: tuple[int, int],
+        values: dict[str, Any],
     ) -> None:
         room = self._room
         common = {0: room["listed"], 1: room["records"], 2: room["counts"]}
         if self._on.size:
             common[3] = room["thresholds"]
-        long = {"LONG": 1} if t_ns - self.t_ns >= 2**31 else {}
+        long = {"LONG": 1} if interval[1] - interval[0] >= 2**31 else {}
         self._kernels.run(
             "compute/events_fire.glsl",
             {**self._defines, **long, **defines},
@@ -228,29 +414,25 @@ class CardEsim(Esim):
             indirect=(room["listed"], PIXELS_AT),
         )
 
-    def _values(self, t_ns: int) -> dict[str, Any]:
+    def _values(self, interval: tuple[int, int], was_log: bool) -> dict[str, Any]:
+        start_ns, end_ns = interval
         jitter = np.float64(self.config.threshold_jitter * Q_ONE)
         return {
             "words": self._room.words,
             "eps": float(np.float32(self.config.log_eps)),
             "share": max(BLOCK, self.config.max_events_per_step // self._blocks),
-            "before_is_log": self._before_is_log,
+            "before_is_log": was_log,
             "width": self.width,
             "steps": (self._on_all, self._off_all),
-            "start_ns": self.t_ns % 1000,
-            "dt_ns": words(t_ns - self.t_ns),
-            "base_ns": words(self.t_ns - self.t_ns % 1000),
+            "start_ns": start_ns % 1000,
+            "dt_ns": words(end_ns - start_ns),
+            "base_ns": words(start_ns - start_ns % 1000),
             "refractory_ns": words(self._refractory_ns),
             "floors": (self._floor_on, self._floor_off),
             "jitter": words(int(jitter.view(np.uint64))),
             "seed": words(int(self.seed)),
             "capacity": self._room.capacity,
         }
-
-    def _sorted(self, count: int, base_us: int, span_us: int) -> Events:
-        rows = self._buffer.rows(1, count)
-        self._room["packed"].read_into(rows[0, :count], 8 * count)
-        return self._buffer.to_events(np.array([count]), base_us, span_us, 1, self.causes)
 
     # -- state ----------------------------------------------------------------------------------------------
     def _put_state(self) -> None:
@@ -264,7 +446,12 @@ class CardEsim(Esim):
             self._room.put("more", more)
 
     def state_dict(self) -> dict[str, np.ndarray]:
-        """As of :class:`Esim`, with which it may be exchanged."""
+        """As of :class:`Esim`, with which it may be exchanged. Raises EventDataError while events are on their way,
+        which are no state, and would be lost."""
+        if self._flight is not None or self._kept:
+            raise EventDataError(
+                "events are on their way from the card", where="state_dict", accepted="flush() before it"
+            )
         if self.t_ns is not None:
             self.gl.resume()
             levels = self._room.get("levels", np.int32).reshape(-1, 2)
@@ -283,10 +470,23 @@ class CardEsim(Esim):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         super().load_state_dict(state)
+        self._flight, self._kept = None, []
         self.gl.resume()
         self._room.put("now", self._log)
         self._before_is_log = True
         self._put_state()
+
+
+class _Flight(NamedTuple):
+    """Events of one interval, ns, that are made.   was_log : see :meth:`CardEsim._fire`.   packed : where they are.
+    slot, expected : where they will be, and how many of them."""
+
+    start_ns: int
+    end_ns: int
+    was_log: bool
+    packed: moderngl.Buffer
+    slot: Slot | None = None
+    expected: int = 0
 
 
 class _Room:
@@ -311,9 +511,16 @@ class _Room:
             **({"thresholds": 8 * padded} if spread else {}),
             **({"more": 16 * padded} if more else {}),
         }
-        _refuse_too_large(gl, sizes, f"{width}x{height}")
+        what = f"{width}x{height} pixels"
+        refuse_too_large(gl, sizes, what, (width, height))
         self._buffers = {name: gl.ctx.buffer(reserve=size) for name, size in sizes.items()}
+        try:
+            refuse_if_out_of_memory(gl, what)
+        except GLError:
+            self.release()
+            raise
         self._buffers["levels"].write(np.tile(np.array([_FAR, -_FAR], np.int32), padded).tobytes())
+        self.clear_head()
         for name in ("now", "before"):
             self._buffers[name].write(np.ones(padded, np.float32).tobytes())
 
@@ -324,6 +531,9 @@ class _Room:
         """What is now becomes what was before; `now` is to be written."""
         both = self._buffers
         both["now"], both["before"] = both["before"], both["now"]
+
+    def clear_head(self) -> None:
+        self._buffers["listed"].write(bytes(HEAD_BYTES))
 
     def put(self, name: str, array: np.ndarray) -> None:
         self._buffers[name].write(np.ascontiguousarray(array))
@@ -337,22 +547,10 @@ class _Room:
     def grow(self, count: int) -> None:
         """Room for so many events, and a quarter more."""
         capacity = count + count // 4
-        _refuse_too_large(self._gl, {"packed": 8 * capacity}, f"{count} events in one step")
+        refuse_too_large(self._gl, {"packed": 8 * capacity}, f"{count} events in one step")
         self._buffers["packed"].release()
         self._buffers["packed"], self.capacity = self._gl.ctx.buffer(reserve=8 * capacity), capacity
 
     def release(self) -> None:
         for buffer in self._buffers.values():
             buffer.release()
-
-
-def _refuse_too_large(gl: GLContext, sizes: dict[str, int], what: str) -> None:
-    limit = gl.ctx.info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"]
-    largest = max(sizes.values())
-    if largest > limit:
-        raise GLError(
-            f"{what} are too many for this card's buffers",
-            where="events.device",
-            value=f"{largest / 2**20:.0f} MiB in one",
-            accepted=f"at most {limit / 2**20:.0f} MiB, or events.device: cpu",
-        )

@@ -17,8 +17,13 @@ if TYPE_CHECKING:
 MADE.append(includes)
 WORD, BLOCK_WORDS, LOCAL, PIXELS_PER_GROUP = 32, 32, 64, 256
 """As in shaders/include/events.glsl: pixels of a word of marks, words of a block, invocations of a group."""
-HEAD_BYTES, PIXELS_AT, CHUNKS_AT = 48, 0, 12
-"""Size of the head of a list, and where in it the two triples for indirect dispatches stand."""
+PART, DIGIT_BITS = 64, 4
+DIGITS = 2**DIGIT_BITS
+"""As in shaders/compute/events_sort.glsl: events that an invocation sorts, and bits of a digit."""
+HEAD_BYTES, PIXELS_AT, CHUNKS_AT, PARTS_AT, DIGITS_AT = 80, 0, 12, 48, 60
+"""Size of the head of a list, and where in it the triples for indirect dispatches stand."""
+EVENTS, CUT, UNUSABLE = 7, 8, 10
+"""Words of the head: events, those that were cut, whether the frame has a value that cannot be used."""
 
 
 class Kernels:
@@ -67,13 +72,62 @@ class Kernels:
         self.run("compute/prefix.glsl", {"BITS": 1, "OFFSETS": 1}, {**buffers, 3: offsets}, values, items=chunks)
 
     def prefix_of_counts(
-        self, head: moderngl.Buffer, counts: moderngl.Buffer, sums: moderngl.Buffer, offsets: moderngl.Buffer
+        self,
+        head: moderngl.Buffer,
+        counts: moderngl.Buffer,
+        sums: moderngl.Buffer,
+        offsets: moderngl.Buffer,
+        capacity: int,
     ) -> None:
-        """``offsets``: the sum of ``counts`` before each; the head says how many there are, and is told the total."""
-        buffers, chunks = {0: head, 1: counts, 2: sums}, (head, CHUNKS_AT)
-        self.run("compute/prefix.glsl", {"SUMS": 1}, buffers, {}, indirect=chunks)
-        self.run("compute/prefix.glsl", {"SCAN": 1, "LANES": self._lanes}, buffers, {}, items=1)
-        self.run("compute/prefix.glsl", {"OFFSETS": 1}, {**buffers, 3: offsets}, {}, indirect=chunks)
+        """``offsets``: the sum of ``counts`` before each; the head says how many there are, and is told the total.
+        capacity : events that there is room for."""
+        self._prefix_of_numbers({}, head, counts, sums, offsets, CHUNKS_AT, {"capacity": capacity})
+
+    def _prefix_of_numbers(
+        self,
+        defines: Mapping[str, Any],
+        head: moderngl.Buffer,
+        numbers: moderngl.Buffer,
+        sums: moderngl.Buffer,
+        offsets: moderngl.Buffer,
+        at: int,
+        values: Mapping[str, Any],
+    ) -> None:
+        buffers = {0: head, 1: numbers, 2: sums}
+        self.run("compute/prefix.glsl", {**defines, "SUMS": 1}, buffers, {}, indirect=(head, at))
+        self.run("compute/prefix.glsl", {**defines, "SCAN": 1, "LANES": self._lanes}, buffers, values, items=1)
+        self.run("compute/prefix.glsl", {**defines, "OFFSETS": 1}, {**buffers, 3: offsets}, {}, indirect=(head, at))
+
+    def sort(self, head: moderngl.Buffer, events: moderngl.Buffer, room: SortRoom, bits: int) -> moderngl.Buffer:
+        """The packed events that the head counts, by time, equal times in the order in which they are: in ``events`` or
+        in the room's other buffer, which is returned. bits : of the largest time.   room : for as many."""
+        capacity = events.size // 8
+        given, taken = events, room.other
+        for low in range(0, bits, DIGIT_BITS):
+            values = {"shift": low + 1, "capacity": capacity}
+            parts = (head, PARTS_AT)
+            buffers = {0: head, 1: given, 2: room.digits}
+            self.run("compute/events_sort.glsl", {"DIGITS": 1}, buffers, values, indirect=parts)
+            self._prefix_of_numbers({"PARTS": 1}, head, room.digits, room.sums, room.places, DIGITS_AT, {})
+            buffers = {0: head, 1: given, 2: room.places, 3: taken}
+            self.run("compute/events_sort.glsl", {"SCATTER": 1}, buffers, values, indirect=parts)
+            given, taken = taken, given
+        return given
+
+
+class SortRoom:
+    """What sorting ``capacity`` events on the card takes beside them: 11 bytes each."""
+
+    def __init__(self, gl: GLContext, capacity: int):
+        self.capacity = capacity
+        numbers = 4 * DIGITS * 2 * -(-capacity // (2 * PART))
+        self.other = gl.ctx.buffer(reserve=8 * capacity)
+        self.digits, self.places = (gl.ctx.buffer(reserve=numbers) for _ in range(2))
+        self.sums = gl.ctx.buffer(reserve=numbers // 32 + 4)
+
+    def release(self) -> None:
+        for buffer in (self.other, self.digits, self.places, self.sums):
+            buffer.release()
 
 
 def refuse_without_compute(gl: GLContext) -> None:

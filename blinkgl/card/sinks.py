@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from blinkgl.card.kernels import PIXELS_PER_GROUP, Kernels
+from blinkgl.card.memory import refuse_if_out_of_memory, refuse_too_large
 from blinkgl.errors import EventDataError
 
 if TYPE_CHECKING:
@@ -38,7 +39,10 @@ class _Sink:
         self._card, self.shape = card, (planes, card.height, card.width)
         card.gl.resume()
         self._kernels = Kernels(card.gl)
-        self._buffer = card.gl.ctx.buffer(reserve=4 * planes * card.height * card.width)
+        size, what = 4 * planes * card.height * card.width, f"{planes} planes of {card.width}x{card.height}"
+        refuse_too_large(card.gl, {"sink": size}, what, (card.width, card.height))
+        self._buffer = card.gl.ctx.buffer(reserve=size)
+        refuse_if_out_of_memory(card.gl, what)
         self._window_us = (0, 1)
 
     def begin(self, t0_us: int, t1_us: int) -> None:

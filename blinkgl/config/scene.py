@@ -15,17 +15,16 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from blinkgl.config.base import Config, Refused, one_of, rule
 from blinkgl.config.deform import AnimationConfig, DeformConfig, RandomDeformConfig
+from blinkgl.config.materials import TEXTURE_KINDS, MaterialConfig, Radiance, TextureKind
 from blinkgl.config.physics import BodyConfig, PhysicsConfig, RandomPhysicsConfig
 from blinkgl.config.places import Matrix, check_rigid
 from blinkgl.config.trajectory import CameraMotion, ObjectMotion
 
 PRIMITIVE_KINDS = ("cuboid", "cylinder", "sphere", "icosphere", "cone", "torus", "capsule", "prism", "pyramid")
-TEXTURE_KINDS = ("value", "perlin", "fbm", "stripes", "checks", "glyphs", "dots", "gradient", "bricks")
 
 PrimitiveKind = Literal["cuboid", "cylinder", "sphere", "icosphere", "cone", "torus", "capsule", "prism", "pyramid"]
 LIVING_KINDS = ("figure", "flag", "fish")
 LivingKind = Literal["figure", "flag", "fish"]
-TextureKind = Literal["value", "perlin", "fbm", "stripes", "checks", "glyphs", "dots", "gradient", "bricks"]
 
 
 def _ordered(value: tuple[float, float]) -> tuple[float, float]:
@@ -92,7 +91,6 @@ def _greater_than_zero(value: Any) -> Any:
 
 
 Positive = Annotated[float, Field(gt=0, le=1e9)]
-Radiance = Annotated[float, Field(ge=0, le=1e9)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 PositiveRange = Annotated[tuple[Positive, Positive], BeforeValidator(_as_pair), AfterValidator(_ordered)]
 Paths = Annotated[tuple[str, ...], BeforeValidator(_as_list)]
@@ -101,7 +99,6 @@ Vector3 = tuple[float, float, float]
 # the end.
 Coordinate = Annotated[float, Field(ge=-1e9, le=1e9)]
 Position = tuple[Coordinate, Coordinate, Coordinate]
-Repeats = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
 class ObjectsConfig(Config):
@@ -502,6 +499,14 @@ class TrajectoryConfig(Config):
         description="each pose becomes the mean of those within so many s before and after, weighed by a triangle; 0: "
         "the spline passes them all",
     )
+    speed_limit: float = Field(
+        100.0,
+        gt=0,
+        le=1e9,
+        description="world units/s from one pose to the next: what is faster is taken for a jump, or for poses in mm, "
+        "and refused",
+    )
+    turn_limit: float = Field(7200.0, gt=0, le=1e9, description="degrees/s from one pose to the next, likewise")
     T_body_sensor: str | Matrix | None = Field(
         None,
         description="where this camera or object is on the body whose poses the file has, from its axes to the body's: "
@@ -619,35 +624,6 @@ class MeshConfig(Config):
     def _up_of_a_file(file, up):
         if not file and up != "auto":
             raise Refused("up belongs to a file, not to a primitive", where="up", value=up)
-
-
-class MaterialConfig(Config):
-    """A colour, times at most one texture."""
-
-    texture: str | None = Field(None, description="image file, sRGB, or .hdr, linear")
-    procedural: Literal[TextureKind, "pips"] | None = Field(
-        None, description="kind of procedural texture; pips: the faces of a die"
-    )
-    seed: int = Field(0, ge=0, description="which procedural texture of that kind")
-    photograph: str | None = Field(
-        None, description="name of a photograph bundled with scikit-image, such as astronaut"
-    )
-    max_size: int = Field(2048, ge=1, le=16384, description="longer texture sides are reduced to this, px")
-    color: tuple[Radiance, Radiance, Radiance] = Field((1.0, 1.0, 1.0), description="linear factor")
-    uv_scale: tuple[Repeats, Repeats] = Field((1.0, 1.0), description="texture repeats per unit of texture coordinate")
-    unlit: bool = Field(False, description="radiance = albedo, whatever the light")
-    double_sided: bool = Field(False, description="draw back faces, with the normal turned round")
-    metallic: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="how much of it is metal")
-    roughness: Annotated[float, Field(ge=0, le=1)] = Field(
-        1.0, description="0: a mirror; 1, of what is no metal: matt, without any reflection"
-    )
-    emission: tuple[Radiance, Radiance, Radiance] = Field((0.0, 0.0, 0.0), description="radiance of its own, linear")
-
-    @rule("texture", "procedural", "photograph")
-    def _one(*sources):
-        given = [k for k, v in zip(("texture", "procedural", "photograph"), sources) if v is not None]
-        if len(given) > 1:
-            raise Refused("only one of texture, procedural, photograph may be given, not " + " and ".join(given))
 
 
 class ObjectConfig(KeyedMotionConfig):

@@ -23,7 +23,7 @@ from blinkgl.config.recipe import Group, all_groups
 from blinkgl.config.scene import LIVING_KINDS, ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig
 from blinkgl.config.sequence import OutputConfig, RunTemplate, SequenceConfig
 from blinkgl.errors import AssetError, ConfigError, OutputError
-from blinkgl.scene.build import check_assets
+from blinkgl.scene.build import check_assets, panorama_of
 from blinkgl.scene.importing.mesh_files import dependencies
 from blinkgl.scene.motion.dynamics import engine_version
 from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash
@@ -268,11 +268,15 @@ def _hash_scene_files(scene, base: Path, hashes: dict[str, str]) -> None:
             ):
                 hashes[f"{name}/{found.name}"] = content_hash(found.read_bytes())
     elif isinstance(scene, ExplicitSceneConfig):
-        for used in [*(m.file for m in scene.meshes.values()), *(m.texture for m in scene.materials.values())]:
+        for used in (mesh.file for mesh in scene.meshes.values()):
             if used is not None:
                 file(resolve(used, base), used)
+        for used in {used: None for m in scene.materials.values() for used in m.files.values()}:
+            file(resolve(used, base), used)
     elif isinstance(scene, FileSceneConfig):
         file(resolve(scene.path, base), scene.path)
+    if not isinstance(scene, RandomSceneConfig) and (panorama := panorama_of(scene.light)) is not None:
+        file(resolve(panorama, base), panorama)
 
 
 def digest(hashes: dict[str, str]) -> str:

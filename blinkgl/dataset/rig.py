@@ -35,7 +35,9 @@ def generate_rig(
         RigWriter(report.path, config.sensors or (), config_yaml=text, t_offset_us=rig.t0_ns // 1000) as writer,
     ):
         span_ns = rig.t1_ns - rig.t0_ns
-        with PreviewRecorder(config.preview, rig.members, writer) as preview, ExitStack() as stack:
+        units = list(rig.inertial_units())
+        unit = units[0][2] if units else None
+        with PreviewRecorder(config.preview, rig.members, writer, unit) as preview, ExitStack() as stack:
             writers = {
                 member.name: stack.enter_context(writer_of(member, writer.folder(member.name), text))
                 for member in rig.members
@@ -52,8 +54,8 @@ def generate_rig(
         with rig.clock("write"):
             for name in writers:
                 writer.adopt(name)
-            for name, unit, inertial in rig.inertial_units():
-                writer.imu(unit, vars(inertial), f"{name}/")
+            for name, unit_config, inertial in units:
+                writer.imu(unit_config, vars(inertial), f"{name}/")
             writer.info.update(_manifest_info(rig))
         report.count(rig)
         flushing = StageClock()

@@ -24,7 +24,7 @@ import time
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib import resources
 from pathlib import Path
 from types import MappingProxyType
@@ -115,13 +115,21 @@ class Maker:
                 raise ConfigError(
                     "the groups ask for different OpenGL", where="gl", accepted="one gl section at the top level"
                 )
-            self.gl = create_context(rendered[0].backend, rendered[0].device if self.device is None else self.device)
+            device = rendered[0].device if self.device is None else self.device
+            self._context = partial(create_context, rendered[0].backend, device)
+            self.gl = self._context()
         return {
             "kind": "hello",
             "pid": os.getpid(),
             "environment": environment(self.gl, self.plan.libraries()),
             "assets": digest(assets),
         }
+
+    def renew(self) -> None:
+        """A new context in place of one that was lost. Raises GLError: the card gives none."""
+        if self.gl is not None and self.gl.lost:
+            self.gl.release()
+            self.gl = self._context()
 
     def make(self, number: int, attempt: int, tell: Callable[[Message], None]) -> Message:
         """The ``number``-th task of the plan. Returns "done" or "failed"; only
@@ -148,6 +156,7 @@ class Maker:
                 )
 
         try:
+            self.renew()
             config = self.plan.config(task)
             report = generate_sequence(
                 config, task.index, self.job.out, self.gl, base=Path(self.job.base), progress=progress

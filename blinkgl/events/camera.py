@@ -25,6 +25,8 @@ from blinkgl.events.truth import Surfaces, SurfaceTruth
 from blinkgl.events.types import Events
 
 if TYPE_CHECKING:
+    import moderngl
+
     from blinkgl.gl import GLContext
 
 _NOTHING = nullcontext()
@@ -34,12 +36,13 @@ class EventFrame(NamedTuple):
     """What an emulator is given of one moment; valid until the next one is asked for, so
     that a source may reuse its arrays.
 
-    luminance : (H, W) float32, linear, or uint8 codes.   rate : (H, W) float32, d(luminance)/dt per second, or None.
+    luminance : (H, W) float32, linear, or uint8 codes; a texture of the card's, where the camera
+    :attr:`~EventCamera.takes_textures`.   rate : (H, W) float32, d(luminance)/dt per second, or None.
     rows : (y0, y1): outside these rows the frame is the one before; None: it may differ anywhere.
     As of ``Emulator.step``. surfaces : what the pixels show, of a camera that says what made its events."""
 
     t_ns: int
-    luminance: np.ndarray
+    luminance: np.ndarray | moderngl.Texture
     rate: np.ndarray | None = None
     rows: tuple[int, int] | None = None
     surfaces: Surfaces | None = None
@@ -87,6 +90,12 @@ class EventCamera:
         """Whether events say what made them, so that frames have to come with their ``surfaces``."""
         return self._truth is not None
 
+    def takes_textures(self, gl: GLContext) -> bool:
+        """Whether frames that ``gl`` draws may stay on its card: the emulator takes them, and nothing else of the
+        camera looks at them."""
+        mine = self.emulator.takes_textures and getattr(self.emulator, "gl", None) is gl
+        return mine and self._latency is None and self._truth is None
+
     @property
     def frames(self) -> int:
         """Taken so far."""
@@ -123,7 +132,7 @@ class EventCamera:
         try:
             events = self.emulator.step(frame.luminance, frame.t_ns, frame.rows, frame.rate)
         except EventDataError as error:
-            error.t_ns = frame.t_ns
+            error.t_ns = frame.t_ns if error.t_ns is None else error.t_ns
             raise
         if self._truth is not None and frame.surfaces is not None:
             memory_s = self.emulator.memory_s(self.emulator.decoded(frame.luminance))

@@ -68,6 +68,8 @@ class Emulator(ABC):
     """Its configuration: name, keys, the paths between frames that it can follow, and what a sensor sets."""
     device: ClassVar[str] = "cpu"
     """Where events are made: "cpu" or "gl"."""
+    takes_textures: ClassVar[bool] = False
+    """Whether ``step`` takes a frame that lies on the card, too."""
     _still_pixels_sleep = False
     """Whether a pixel whose luminance does not change has no events and no changing state."""
     _state: tuple[str, ...] = ()
@@ -255,6 +257,10 @@ class Emulator(ABC):
         first, stop = self._changed
         if frame.dtype == np.uint8 or first >= stop or frame[first:stop].view(np.uint32).max() <= INTENSITY_LIMIT_BITS:
             return
+        self._refuse_intensity(frame)
+
+    def _refuse_intensity(self, frame: np.ndarray) -> None:
+        """Raises EventDataError that names the first pixel that cannot be used, if there is one."""
         bad = np.flatnonzero(~((frame >= 0) & (frame <= LOG_MAX_INPUT)))  # -0.0 is not bad
         if bad.size:
             y, x = divmod(int(bad[0]), self.width)

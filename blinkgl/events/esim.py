@@ -333,6 +333,11 @@ class Esim(Emulator):
     Config = EsimConfig
     _still_pixels_sleep = True
 
+    @property
+    def _looks_around(self) -> bool:
+        """Whether slopes are of the neighbouring frames, so that the last ones are kept."""
+        return self.reconstruction == "pchip"
+
     @classmethod
     def response(cls, config: EsimConfig) -> Response:
         return Response(smallest_threshold(config), 1.0, config.log_eps)
@@ -355,7 +360,7 @@ class Esim(Emulator):
             "_lower",
             "_fired",
             "_last_ns",
-            *(("_ring", "_ring_ns", "_ring_rows", "_passed") if self.lags else ("_log",)),
+            *(("_ring", "_ring_ns", "_ring_rows", "_passed") if self._looks_around else ("_log",)),
             *(("_slope",) if self.needs_rate else ()),
         )
         self.config = config = config or EsimConfig()
@@ -380,7 +385,7 @@ class Esim(Emulator):
         self._refractory_ns = round(config.refractory_us * 1000)
         self._last_ns = np.full(pixels if self._refractory_ns else 0, NEVER_NS, np.int64)
         self._upper, self._lower = (np.zeros(pixels, np.int32) for _ in range(2))
-        if self.lags:
+        if self._looks_around:
             # The last four frames, frame k in row k mod 4: their logs, times, and the pixels [first, stop) in which
             # each differs from the one before it.
             self._ring, self._ring_ns, self._ring_rows = (
@@ -398,12 +403,12 @@ class Esim(Emulator):
         self._table = log_q25(self._decode + np.float32(self.config.log_eps))
 
     def _start(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
-        log, eps = self._ring[0] if self.lags else self._log, np.float32(self.config.log_eps)
+        log, eps = self._ring[0] if self._looks_around else self._log, np.float32(self.config.log_eps)
         if frame.dtype == np.uint8:
             lookup_block(frame, self._table, log)
         else:
             log_block(frame, eps, log)
-        if self.lags:
+        if self._looks_around:
             self._ring_ns[0], self._ring_rows[0], self._passed[0] = t_ns, (0, log.size), 0
         if self.needs_rate:
             slope_block(rate, self._decode[frame] if frame.dtype == np.uint8 else frame, eps, self._slope)
@@ -419,7 +424,7 @@ class Esim(Emulator):
 
     def _advance(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
         source = (NO_FRAME, frame, self._table) if frame.dtype == np.uint8 else (frame, NO_CODES, self._table)
-        if self.lags:
+        if self._looks_around:
             return self._advance_late(source, t_ns)
         levels, interval = self._levels(self._log), self._interval(self.t_ns, t_ns)
         base_us = self.t_ns // 1000
@@ -484,10 +489,10 @@ class Esim(Emulator):
 
     @property
     def done_ns(self) -> int | None:
-        return int(self._ring_ns[self._passed[0] % 4]) if self.lags and self.t_ns is not None else self.t_ns
+        return int(self._ring_ns[self._passed[0] % 4]) if self._looks_around and self.t_ns is not None else self.t_ns
 
     def flush(self) -> Events:
-        if not self.lags or self.t_ns is None or self._passed[0] >= self.frames - 1:
+        if not self._looks_around or self.t_ns is None or self._passed[0] >= self.frames - 1:
             return Events.empty()
         return self._pass_interval(self.frames - 1, None)
 

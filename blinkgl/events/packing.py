@@ -176,11 +176,22 @@ class PackedBuffer:
             run(_scatter_parts, parts, (source, starts, counts, first_row, shift, mask, histogram, target), threads)
             # Contiguous from now on.
             source, starts, counts, first_row = (target, edges[:-1], np.diff(edges), np.arange(parts + 1))
-        x, y = np.empty(total, np.uint16), np.empty(total, np.uint16)
-        t, p = np.empty(total, np.int64), np.empty(total, np.uint8)
-        cause = np.empty(total if causes else 0, np.uint8)
-        run(_unpack_parts, parts, (source, edges, base_us, x, y, t, p, cause), threads)
-        return Events(x, y, t, p, cause if causes else None)
+        return unpacked(source[:total], base_us, causes, edges, threads)
+
+
+def unpacked(
+    packed: np.ndarray, base_us: int, causes: bool = False, edges: np.ndarray | None = None, threads: int = 1
+) -> Events:
+    """The events of (N,) int64 words that are in their order.
+
+    edges : (parts + 1,) int64, what each thread takes; None: one takes all.   causes : whether the words hold them."""
+    total = len(packed)
+    edges = np.array([0, total]) if edges is None else edges
+    x, y = np.empty(total, np.uint16), np.empty(total, np.uint16)
+    t, p = np.empty(total, np.int64), np.empty(total, np.uint8)
+    cause = np.empty(total if causes else 0, np.uint8)
+    run(_unpack_parts, len(edges) - 1, (packed, edges, base_us, x, y, t, p, cause), threads)
+    return Events(x, y, t, p, cause if causes else None)
 
 
 def _even_split(counts: np.ndarray, parts: int) -> np.ndarray:

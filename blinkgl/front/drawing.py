@@ -15,7 +15,7 @@ from blinkgl.front import arguments as check
 from blinkgl.front.runs import MAX_INDEX, Source, configured, scene_of
 from blinkgl.front.sections import OF_EVENTS, label_names, labels_tree
 from blinkgl.gl import create_context
-from blinkgl.labels import LabelFrame, asked_for
+from blinkgl.labels import LABELS, LabelFrame, asked_for
 from blinkgl.render.renderer import Renderer as SceneRenderer
 from blinkgl.srgb import to_srgb8
 
@@ -75,7 +75,10 @@ class Renderer:
         to, back_to : s, where flow and flow_backward lead; default: one label interval on and back."""
         if of_events := [name for name in OF_EVENTS if name in label_names(labels)]:
             raise ConfigError("is of events and not of a time", where="labels", value=of_events[0], accepted="record()")
-        request = asked_for(validate(LabelsConfig, labels_tree(labels), where="labels"))
+        asked = validate(LabelsConfig, labels_tree(labels), where="labels")
+        request = asked_for(asked)
+        for name in request:
+            LABELS[name].check(self._renderer.scene, asked)
         t_ns, interval = _ns(t, "t"), self.config.time.interval_ns
         return self._renderer.labels(
             t_ns,

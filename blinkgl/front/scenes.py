@@ -23,12 +23,12 @@ from numpy.typing import ArrayLike
 from blinkgl.config.base import Config, validate
 from blinkgl.config.camera import CameraConfig, calibrated
 from blinkgl.config.deform import AnimationConfig
+from blinkgl.config.materials import MaterialConfig
 from blinkgl.config.physics import BodyConfig, PhysicsConfig
 from blinkgl.config.scene import (
     ExplicitSceneConfig,
     KeyedMotionConfig,
     LightConfig,
-    MaterialConfig,
     MeshConfig,
     ObjectConfig,
     PoseConfig,
@@ -120,8 +120,9 @@ class Trajectory(Piece):
 
     file : path.   form : "tum", "euroc"; "auto": EuRoC's where lines have commas.   start : s on the file's clock that
     are 0 s on the scene's; None: its first pose is where the sequence begins.   smooth : s, each pose becomes the mean
-    of those within it.   T_body_sensor : where the camera or body that follows it is on the body whose poses these are:
-    (4, 4), or the path of EuRoC's sensor.yaml, whose T_BS that is; None: it is that body.
+    of those within it.   speed_limit : units/s, turn_limit : degrees/s, beyond which poses are refused.
+    T_body_sensor : where the camera or body that follows it is on the body whose poses these are: (4, 4), or the path
+    of EuRoC's sensor.yaml, whose T_BS that is; None: it is that body.
     Raises ConfigError; a file that does not cover the sequence is found when the scene is built."""
 
     def __init__(
@@ -131,9 +132,12 @@ class Trajectory(Piece):
         form: Literal["auto", "tum", "euroc"] = "auto",
         start: float | None = None,
         smooth: float = 0.0,
+        speed_limit: float = 100.0,
+        turn_limit: float = 7200.0,
         T_body_sensor: ArrayLike | str | os.PathLike | None = None,
     ):
         tree = check.given(file=os.fspath(check.path(file, "file").absolute()), form=form, start=start, smooth=smooth)
+        tree |= check.given(speed_limit=speed_limit, turn_limit=turn_limit)
         if isinstance(T_body_sensor, (str, os.PathLike)):
             tree["T_body_sensor"] = os.fspath(check.path(T_body_sensor, "T_body_sensor").absolute())
         elif T_body_sensor is not None:
@@ -255,7 +259,11 @@ class Material(Piece):
     photograph : one that scikit-image brings, such as "astronaut".   uv_scale : (2,) repeats.
     max_size : px, longer sides of a file are reduced.
     unlit : radiance = albedo, whatever the light.   double_sided : draw back faces.
-    metallic, roughness : 0 to 1; 0 and 1 are matt.   emission : (3,) linear radiance of its own.
+    metallic, roughness : 0 to 1; 0 and 1 are matt; times ``metallic_roughness_map``, its blue and its green.
+    emission : (3,) linear radiance of its own; times ``emission_map``, sRGB.
+    normal_map : x to the right in the picture, y up, z outwards, 0 to 255 for -1 to 1; ``normal_scale`` times its x, y.
+    mask : what is there: holes where it is below ``cutoff`` (0 to 1).
+    Maps are files, or arrays (h, w, 3) uint8, of the mask (h, w) uint8.
     Raises ConfigError; a missing file is found when the scene is built."""
 
     def __init__(
@@ -273,7 +281,21 @@ class Material(Piece):
         metallic: float = 0.0,
         roughness: float = 1.0,
         emission: Vector = (0.0, 0.0, 0.0),
+        metallic_roughness_map: str | os.PathLike | np.ndarray | None = None,
+        normal_map: str | os.PathLike | np.ndarray | None = None,
+        normal_scale: float = 1.0,
+        emission_map: str | os.PathLike | np.ndarray | None = None,
+        mask: str | os.PathLike | np.ndarray | None = None,
+        cutoff: float = 0.5,
     ):
+        given = {
+            "metallic_roughness_map": metallic_roughness_map,
+            "normal_map": normal_map,
+            "emission_map": emission_map,
+            "mask": mask,
+        }
+        self.maps = {key: _map(map_, key) for key, map_ in given.items() if map_ is not None and not _is_file(map_)}
+        files = {key: map_ if _is_file(map_) or map_ is None else f"<{key}>" for key, map_ in given.items()}
         self.image: data.Texture | None = None
         if image is not None and not isinstance(image, (str, os.PathLike)):
             self.image, image = _texture(image), None
@@ -292,8 +314,28 @@ class Material(Piece):
             metallic=metallic,
             roughness=roughness,
             emission=emission,
+            normal_scale=normal_scale,
+            cutoff=cutoff,
+            **files,
         )
         self.tree = self._checked(MaterialConfig, tree, texture="image")
+
+
+def _is_file(given: Any) -> bool:
+    return isinstance(given, (str, os.PathLike))
+
+
+def _map(given: Any, key: str) -> np.ndarray:
+    """(h, w, 3) uint8, of a mask (h, w)."""
+    shape = (None, None) if key == "mask" else (None, None, 3)
+    accepted = f"a file, or an array ({'h, w' if key == 'mask' else 'h, w, 3'}), uint8"
+    where = f"Material.{key}"
+    numbers = check.array(given, where, shape, accepted)
+    if not numbers.size or max(numbers.shape) > 16384:
+        raise ConfigError("size out of range", where=where, value=numbers.shape, accepted="1 to 16384 rows and columns")
+    if numbers.dtype != np.uint8:
+        raise ConfigError("pixels cannot be used", where=where, value=str(numbers.dtype), accepted=accepted)
+    return np.array(numbers, order="C")
 
 
 def _texture(image: Any) -> data.Texture:
@@ -627,6 +669,8 @@ class Scene(Piece):
             if body.material is not None:
                 item["material"] = f"material{k}"
                 materials[f"material{k}"] = body.material.tree
+                if body.material.maps:
+                    self._memory.maps[f"material{k}"] = body.material.maps
                 if body.material.image is not None:
                     self._memory.textures[f"material{k}"] = body.material.image
             named.append(item)
@@ -676,7 +720,7 @@ class Scene(Piece):
     @property
     def on_disk(self) -> bool:
         """Whether a YAML file could say it: nothing is made of arrays."""
-        return not (self._memory.meshes or self._memory.textures)
+        return not (self._memory.meshes or self._memory.textures or self._memory.maps)
 
     def build(self, config: SequenceConfig) -> data.Scene:
         """What the renderer draws. Raises ConfigError and AssetError: files."""

@@ -79,6 +79,9 @@ class GLContext:
         _thread.current = weakref.ref(self)
         self.shaders = ShaderLoader(self.ctx)
         self.idle = self.ctx.framebuffer(self.ctx.renderbuffer((1, 1)))  # bound when a target in use is released
+        self.lost = False
+        """Whether :meth:`check` has found that it draws no more."""
+        self._checks = 0
         self._set_clip_control()
 
     def _set_clip_control(self) -> None:
@@ -134,6 +137,24 @@ class GLContext:
                 "this context is in use by another thread", where=self.renderer, accepted="a context per thread"
             )
         _thread.current = weakref.ref(self)
+
+    def check(self) -> None:
+        """Draws one pixel and reads it back. A driver that resets its card throws contexts away, and what is read from
+        such a one is nothing that was drawn; most say nothing of it. Raises GLError, after which the work has to be
+        done again, in another context."""
+        self.resume()
+        self._checks = self._checks % 250 + 1
+        red, green = self._checks, 255 - self._checks
+        asked = bytes([red, green, 85, 170])
+        self.idle.clear(red / 255, green / 255, 85 / 255, 170 / 255)
+        answer = self.idle.read(components=4)
+        if answer != asked:
+            self.lost = True
+            raise GLError(
+                "the card has lost its context: what it drew last is gone",
+                where=self.renderer,
+                accepted="another try, in a new context",
+            )
 
     def resume(self) -> None:
         """:meth:`make_current` where another context has been made so in this thread since. For

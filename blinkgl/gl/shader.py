@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 STAGES = ("vertex", "fragment")
 """Of a program that draws."""
+GEOMETRY = "geometry"
+"""The stage between them, of variants that define ``GEOMETRY_STAGE``."""
 COMPUTE = "compute"
 DEFAULT_VERSION = "#version 430 core"
 
@@ -45,7 +47,12 @@ _MESSAGES = (
     re.compile(r"\d+\((?P<line>\d+)\) : (?P<kind>error|warning) (?P<text>.*)"),
     re.compile(r"(?P<kind>ERROR|WARNING): \d+:(?P<line>\d+): (?P<text>.*)"),
 )
-_STAGE_HEADER = re.compile(r"(vertex|fragment|compute)_shader$")
+_STAGE_HEADER = re.compile(r"(vertex|geometry|fragment|compute)_shader$")
+
+
+def stages_of(defines: Mapping[str, Any] | None) -> tuple[str, ...]:
+    """Of a variant of a program that draws, in the order in which they run."""
+    return (STAGES[0], GEOMETRY, STAGES[1]) if (defines or {}).get("GEOMETRY_STAGE") else STAGES
 
 
 @dataclass(frozen=True)
@@ -88,13 +95,13 @@ def expand(
     """Source of one stage with includes and defines written out.
 
     name    : file in ``folder`` (default: the shipped shaders), or an absolute path; includes are always the folder's.
-            stage: "vertex", "fragment" or "compute".
+            stage: "vertex", "geometry", "fragment" or "compute".
     defines : NAME -> number, True (1), text as it stands, or False/None (left undefined).
 
     Raises ShaderError for a missing file, an include cycle, or a define that is no GLSL identifier.
     """
-    if stage not in (*STAGES, COMPUTE):
-        raise ValueError(f"stage must be one of {(*STAGES, COMPUTE)}, not {stage!r}")
+    if stage not in (*STAGES, GEOMETRY, COMPUTE):
+        raise ValueError(f"stage must be one of {(*STAGES, GEOMETRY, COMPUTE)}, not {stage!r}")
     folder = shader_folder() if folder is None else folder
     body = _Expansion(folder)
     body.file(name, Path(name) if Path(name).is_absolute() else folder / name, chain=())
@@ -269,9 +276,13 @@ class ShaderLoader:
         return tuple(self._programs)
 
     def _compile(self, name: str, defines: Mapping[str, Any] | None) -> moderngl.Program:
-        sources = {stage: expand(name, stage, defines, self.folder) for stage in STAGES}
+        sources = {stage: expand(name, stage, defines, self.folder) for stage in stages_of(defines)}
         try:
-            program = self.ctx.program(vertex_shader=sources["vertex"].text, fragment_shader=sources["fragment"].text)
+            program = self.ctx.program(
+                vertex_shader=sources["vertex"].text,
+                geometry_shader=sources[GEOMETRY].text if GEOMETRY in sources else None,
+                fragment_shader=sources["fragment"].text,
+            )
         except moderngl.Error as error:
             raise translate(str(error), sources) from None
         self._made[name, normalised(defines)] = {

@@ -7,6 +7,7 @@ Start: label.py, which says what a row holds, and depth.py, the plainest of them
 imported here: a YAML is read by it.
 """
 
+from blinkgl.labels.boxes import ObjectBoxes
 from blinkgl.labels.depth import Depth
 from blinkgl.labels.disparity import Disparity
 from blinkgl.labels.files import Form
@@ -19,6 +20,7 @@ from blinkgl.labels.label import Label
 from blinkgl.labels.normals import Normals
 from blinkgl.labels.occlusion import OcclusionAt
 from blinkgl.labels.scene_flow import SceneFlow
+from blinkgl.labels.semantics import Semantics
 from blinkgl.labels.table import LABELS, asked_for, label_of, register, unregister
 from blinkgl.labels.velocity import Velocity
 
@@ -34,6 +36,8 @@ for _row in (
     OcclusionAt("forward"),
     OcclusionAt("backward"),
     SceneFlow(),
+    Semantics(),
+    ObjectBoxes(),
     FlowIntervals(),
     OcclusionIntervals(),
 ):

@@ -31,6 +31,9 @@ class Disparity(Label):
     shard = "disparity.npy"
     judged_in, tolerance, error = "relative", 1e-5, staticmethod(grading.relative)
 
+    def can_be_of(self, scene: Scene) -> bool:
+        return scene.sensors[0].baseline is not None
+
     def finish(self, drawn: Drawn) -> np.ndarray:
         return _of(drawn.scene, drawn.raw("depth")).astype(np.float32)
 

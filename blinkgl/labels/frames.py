@@ -16,12 +16,13 @@ class LabelRequest:
     ``LabelRequest("depth", "flow_forward")``; what is not asked for is not computed.
 
     intervals_ns : how far those lead that lead to several times, "flow_intervals".
+    categories : pattern of names and number of the category, for those that tell objects apart by them.
     Iterating gives the names in the order of the table. Raises KeyError: no such label."""
 
-    def __init__(self, *names: str, intervals_ns: Iterable[int] = ()):
+    def __init__(self, *names: str, intervals_ns: Iterable[int] = (), categories: tuple[tuple[str, int], ...] = ()):
         asked = {label_of(name).name for name in names}
         self.names = tuple(name for name in LABELS if name in asked)
-        self.intervals_ns = tuple(intervals_ns)
+        self.intervals_ns, self.categories = tuple(intervals_ns), categories
 
     @property
     def buffers(self) -> tuple[str, ...]:
@@ -42,14 +43,15 @@ class LabelRequest:
 
     def only(self, names: Iterable[str]) -> LabelRequest:
         """Of these names alone."""
-        return LabelRequest(*names, intervals_ns=self.intervals_ns)
+        return LabelRequest(*names, intervals_ns=self.intervals_ns, categories=self.categories)
 
     def without(self, *names: str) -> LabelRequest:
         return self.only(name for name in self.names if name not in names)
 
     def within(self, before_ns: int, after_ns: int) -> LabelRequest:
         """With those intervals alone that end in [before_ns, after_ns], as :func:`ending_within` has it."""
-        return LabelRequest(*self.names, intervals_ns=ending_within(self.intervals_ns, before_ns, after_ns))
+        there = ending_within(self.intervals_ns, before_ns, after_ns)
+        return LabelRequest(*self.names, intervals_ns=there, categories=self.categories)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.names)
@@ -60,11 +62,15 @@ class LabelRequest:
     def __bool__(self) -> bool:
         return bool(self.names)
 
+    @property
+    def _said(self) -> tuple:
+        return self.names, self.intervals_ns, self.categories
+
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, LabelRequest) and self.names == other.names and self.intervals_ns == other.intervals_ns
+        return isinstance(other, LabelRequest) and self._said == other._said
 
     def __hash__(self) -> int:
-        return hash((self.names, self.intervals_ns))
+        return hash(self._said)
 
     def __repr__(self) -> str:
         said = [repr(name) for name in self.names]

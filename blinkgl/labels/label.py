@@ -89,6 +89,7 @@ class Drawn(Protocol):
     """What :meth:`Label.finish` is given: the buffers of one time as the shader wrote them.
 
     scene : as it is drawn.   end_ns : the time that this label leads to; None: it is of one time.
+    categories : pattern of names and number of the category, in order.
     t_ns : the time.   leading : of a label that says ``each``, interval in ns -> frame of those labels, leading so far.
     raw(name) : (H, W[, C]) buffer of a label, its own or one of ``needs``.   value(name) : what that label made of its.
     there(name) : buffer of a label among its ``there``, at the time that this label leads to."""
@@ -96,6 +97,7 @@ class Drawn(Protocol):
     scene: Scene
     t_ns: int
     end_ns: int | None
+    categories: tuple[tuple[str, int], ...]
     leading: Mapping[int, LabelFrame]
 
     def raw(self, name: str) -> np.ndarray: ...
@@ -196,9 +198,24 @@ class Label:
         """Of a label that says ``each``: how far each leads from the label's time, ns, increasing."""
         return ()
 
+    def categories(self, labels: LabelsConfig) -> tuple[tuple[str, int], ...]:
+        """Of a label that tells kinds of objects apart: pattern of names and number, in order."""
+        return ()
+
+    def check(self, scene: Scene, labels: LabelsConfig) -> None:
+        """Raises ConfigError for what ``labels:`` asks for and a scene cannot give."""
+
+    def facts(self, scene: Scene, labels: LabelsConfig) -> dict[str, Any]:
+        """What the manifest says of it besides, by key: plain values."""
+        return {}
+
     def ask(self, tree: dict[str, Any]) -> None:
         """Asks for it in a tree of ``labels:``."""
         tree[self.name] = True
+
+    def can_be_of(self, scene: Scene) -> bool:
+        """Whether it says anything of a scene: where it does not the shader debugger leaves it out."""
+        return True
 
     # ---- the shader and the CPU ----------------------------------------------------------------------------------
 
@@ -256,6 +273,10 @@ class Label:
     def agrees(self, one: Any, other: Any) -> bool:
         """Whether two machines may have drawn these for one moment. True: a renderer may change every pixel."""
         return True
+
+    def drawn_on(self, picture: np.ndarray, value: Any) -> np.ndarray | None:
+        """(H, W, 3) uint8: the value drawn over a picture, of a label that is no picture itself; else None."""
+        return None
 
     # ---- the reference -------------------------------------------------------------------------------------------
 

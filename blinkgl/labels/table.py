@@ -65,7 +65,8 @@ def asked_for(labels: LabelsConfig) -> LabelRequest:
 
     asked = [name for name, label in LABELS.items() if label.asked(labels)]
     intervals = {ns for name in asked for ns in LABELS[name].intervals(labels)}
-    return LabelRequest(*asked, intervals_ns=sorted(intervals))
+    categories = next((found for name in asked if (found := LABELS[name].categories(labels))), ())
+    return LabelRequest(*asked, intervals_ns=sorted(intervals), categories=categories)
 
 
 def _checked(label: Any) -> dict[str, Key]:

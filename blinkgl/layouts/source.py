@@ -18,6 +18,7 @@ from blinkgl.events.types import Events
 from blinkgl.io.camchain import read_camchain
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.images import NpzReader, numpy_errors, read_image
+from blinkgl.io.imu import H5 as IMU
 from blinkgl.io.index import made_folders
 from blinkgl.io.lens_files import CAM_TO_CAM
 from blinkgl.io.records import read_text
@@ -31,15 +32,19 @@ class Source:
     """One sequence. Times are µs on its own clock; the events of :meth:`events` are on it, too.
 
     folder : its directory.   manifest : what stands in there.   name : the directory's, or that of the rig it is on.
-    beside : the directory of the right eye, where this is the left one of a stereo pair."""
+    beside : the directory of the right eye, where this is the left one of a stereo pair.   unit : that of the inertial
+    unit, its own or another of its rig; None: there is none."""
 
     folder: Path
     manifest: dict[str, Any]
     name: str
     beside: Path | None = None
+    unit: Path | None = None
 
     @classmethod
-    def open(cls, folder: Path, name: str | None = None, beside: Path | None = None) -> Source:
+    def open(
+        cls, folder: Path, name: str | None = None, beside: Path | None = None, unit: Path | None = None
+    ) -> Source:
         """Raises AssetError: no sequence, or files are missing or cut."""
         if problems := verify_sequence(folder, checksums=False):
             raise AssetError(
@@ -47,7 +52,8 @@ class Source:
                 where=str(folder),
                 accepted="a data set that 'blinkgl verify' passes",
             )
-        return cls(folder, read_manifest(folder), name or folder.name, beside)
+        manifest = read_manifest(folder)
+        return cls(folder, manifest, name or folder.name, beside, folder if IMU in manifest["files"] else unit)
 
     @property
     def split(self) -> str:
@@ -83,6 +89,12 @@ class Source:
         """(from, to) of every flow label; empty: there is none."""
         stamps = _stamps(f"flow_{towards}")
         return self._pairs(stamps) if self.has(stamps) else []
+
+    @functools.cached_property
+    def interval_times(self) -> list[int]:
+        """Of the labels that lead to several times (``flow_intervals``); empty: there are none."""
+        stamps = _stamps("flow_intervals")
+        return [int(line) for line in self._lines(stamps)] if self.has(stamps) else []
 
     @functools.cached_property
     def image_times(self) -> list[int]:
@@ -184,8 +196,9 @@ def _of_rig(folder: Path) -> Source:
     cameras = [name for name, one in tables.items() if "events" in one["records"]]
     if not cameras:
         raise AssetError("a rig without an event camera", where=str(folder))
+    unit = next((folder / name for name, one in tables.items() if "imu" in one["records"]), None)
     one, other = cameras[0], tables[cameras[0]].get("pair")
     if other not in cameras:
-        return Source.open(folder / one, folder.name)
+        return Source.open(folder / one, folder.name, unit=unit)
     left, right = (one, other) if tables[one]["baseline"] > 0 else (other, one)
-    return Source.open(folder / left, folder.name, folder / right)
+    return Source.open(folder / left, folder.name, folder / right, unit)

@@ -52,6 +52,7 @@ class SlotMaker(Maker):
             index = number + (tried - 1) * _APART
             group = self._group(number, tried)
             try:
+                self.renew()
                 config = group.template.sequence(index)
                 name = sequence_name(config.output, index).split("/")[1]
                 with simulate_sequence(config, index, self.gl, base=Path(job.base), labels=False) as sequence:

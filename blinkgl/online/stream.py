@@ -245,9 +245,11 @@ class SampleStream:
 
     def _make(self, slot: int) -> None:
         executor = cast(Executor, self._executor)
-        executor.submit(slot, _ATTEMPTS)
-        for message in executor.poll(0.0):
-            self._counted(message, _ATTEMPTS)
+        for attempt in range(1, _ATTEMPTS + 1):
+            executor.submit(slot, attempt)
+            (message,) = executor.poll(0.0)
+            if not self._counted(message, attempt):
+                return
 
     def _counted(self, message: Message, attempt: int) -> bool:
         """Takes note of a slot's end; whether it has to be tried again."""

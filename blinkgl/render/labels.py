@@ -59,7 +59,7 @@ class Labels:
                 values[name] = (draw.colour(t_ns) if self._view is None else draw.flat_colour(at)).read()
         started = working_clock()
         for name in request:
-            self._finished(name, _Seen(t_ns, drawn, ends, there, leading), values)
+            self._finished(name, _Seen(t_ns, drawn, ends, there, leading, request.categories), values)
         draw.stats.render_s += working_clock() - started
         return LabelFrame(t_ns, {name: values[name] for name in request})
 
@@ -113,6 +113,7 @@ class _Seen:
     ends: dict[str, int]
     there: dict[str, dict[str, np.ndarray]]
     leading: dict[int, LabelFrame]
+    categories: tuple[tuple[str, int], ...]
 
 
 class _Drawn:
@@ -121,6 +122,7 @@ class _Drawn:
     def __init__(self, label: Label, scene: Scene, seen: _Seen, value_of: Callable[[str], Any]):
         towards = label.towards or ""
         self.scene, self.t_ns, self.end_ns = scene, seen.t_ns, seen.ends.get(towards)
+        self.categories = seen.categories
         self.leading = seen.leading if label.each else {}
         self._label, self._drawn, self._there = label, seen.drawn, seen.there.get(towards, {})
         self._value_of = value_of

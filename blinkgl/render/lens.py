@@ -54,10 +54,10 @@ def places_of(camera: CameraModel, flat: PinHole, width: int, height: int) -> Pl
 
 @lru_cache(maxsize=8)
 def claims_of(camera: CameraModel, flat: PinHole) -> np.ndarray:
-    """(h, w, 2) float32 of the flat picture: px from each pixel's centre to the ray of the pixel that claims it; 0
+    """(h, w, 2) float32 of the flat picture: px from each pixel's centre to the ray of the pixel that claims it; 9
     where none does."""
     places = places_of(camera, flat, camera.width, camera.height).places
-    claims = np.zeros((flat.height, flat.width, 2), np.float32)
+    claims = np.full((flat.height, flat.width, 2), 9, np.float32)
     nearest = np.floor(places).astype(np.intp)
     claims[nearest[..., 1], nearest[..., 0]] = places - (nearest + np.float32(0.5))
     return claims

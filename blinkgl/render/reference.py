@@ -224,9 +224,9 @@ def _holes_of(part: Part) -> Holes | None:
     return Holes(uvs, mask.alpha.astype(np.float32) / np.float32(255), mask.threshold, part.material.wrap)
 
 
-def _nearest(scene, t_ns, rays, far=None, skip=None, exhaustive=False, eye=None, near=None):
+def _nearest(scene, t_ns, rays, far=None, skip=None, exhaustive=False, eye=None, near=None, any_will_do=False):
     """(hit (N, 3) int32, bary (N, 3), depth (N,)) as described at :func:`raycast.nearest_tree`. eye, near : of other
-    rays than the camera's: (4, 4) pose where they come from, Z at which they begin."""
+    rays than the camera's: (4, 4) pose where they come from, Z at which they begin.   any_will_do : as there."""
     forest = _forest(scene, int(t_ns))
     camera_pose = scene.camera_path.pose(t_ns) if eye is None else eye
     # relative to the camera by differences of positions, so that a common offset from the origin cancels first
@@ -249,6 +249,7 @@ def _nearest(scene, t_ns, rays, far=None, skip=None, exhaustive=False, eye=None,
         hit,
         bary,
         depth,
+        any_will_do,
     )
     return hit, bary, depth
 
@@ -376,7 +377,8 @@ def is_hidden(scene: Scene, t_ns: int, xy: np.ndarray, depth: np.ndarray, slack:
     """(N,) bool: something is in front of points that are at (N, 2) ``xy`` px and (N,) ``depth`` at t_ns.
 
     slack : what is nearer by less than this part of the depth counts as the point's own surface."""
-    hit, _, _ = _nearest(scene, t_ns, _rays(scene.camera, xy)[:, :2], far=depth * (1.0 - slack))
+    far = depth * (1.0 - slack)
+    hit, _, _ = _nearest(scene, t_ns, _rays(scene.camera, xy)[:, :2], far=far, any_will_do=True)
     return hit[:, 0] >= 0
 
 
@@ -450,8 +452,10 @@ def seen_through_fog(scene: Scene, hits: Hits, colour: np.ndarray) -> np.ndarray
 class Radiated:
     """What N points of one part send to the camera, (N, 3) each: albedo * matt + mirrored + emission.
 
-    matt : radiance that a white surface of this kind scatters.   mirrored : of the lamps and of all around."""
+    light : what it receives.   matt : radiance that a white surface of this kind scatters of it.   mirrored : of the
+    lamps and of all around."""
 
+    light: Received
     matt: np.ndarray
     mirrored: np.ndarray
     emission: np.ndarray
@@ -479,7 +483,7 @@ def radiated(
     own = np.column_stack([hits.part[rows], hits.triangle[rows]])
     light = received(scene, hits.t_ns, points, normal, own)
     if material.gloss is None:
-        return Radiated(light.total, np.zeros_like(albedo), emission)
+        return Radiated(light, light.total, np.zeros_like(albedo), emission)
     metallic, roughness = np.full(len(at), material.gloss.metallic), np.full(len(at), material.gloss.roughness)
     if material.gloss.map is not None:
         given = sample_map(material.gloss.map, at)
@@ -487,7 +491,7 @@ def radiated(
     eye = scene.camera_path.pose(hits.t_ns)[:3, 3] - points
     eye /= np.linalg.norm(eye, axis=1, keepdims=True)
     matt, mirrored = shone(scene, hits.t_ns, light, points, normal, eye, albedo, metallic, roughness)
-    return Radiated(matt * light.total, mirrored, emission)
+    return Radiated(light, matt * light.total, mirrored, emission)
 
 
 def bumped(
@@ -532,14 +536,16 @@ def shone(
     part = gloss.energy_at(nv, roughness)
     lost = (1.0 / part.sum(axis=1) - 1.0)[:, None]
     mix = metallic[:, None]
-    clear, metal = 1.0 + gloss.DIELECTRIC * lost, 1.0 + albedo * lost
+    clear = 1.0 + gloss.several(np.full((1, 1), gloss.DIELECTRIC), roughness) * lost
+    metal = 1.0 + gloss.several(albedo, roughness) * lost
     even_clear = clear * (gloss.DIELECTRIC * part[:, :1] + part[:, 1:])
     even_metal = metal * (albedo * part[:, :1] + part[:, 1:])
     away = 2.0 * (normal * eye).sum(axis=1, keepdims=True) * normal - eye
     if id(scene.light) not in _surroundings:
         _surroundings.clear()
         _surroundings[id(scene.light)] = scene.light, surroundings_of(scene.light)
-    around = gloss.mirrored(_surroundings[id(scene.light)][1], away, roughness)
+    there = gloss.looked_at(normal, away, nv, roughness)
+    around = gloss.mirrored(_surroundings[id(scene.light)][1], *there)
     out = around * (even_clear * (1 - mix) + even_metal * mix)
     for k, lamp in enumerate(lamps_of(scene.light)):
         towards, _ = beam(lamp, lamp.path.pose(t_ns), points)
@@ -563,9 +569,11 @@ _surroundings: dict[int, tuple] = {}
 class Received:
     """The light that N points of a scene receive, as the radiance of a white Lambert surface there, (N, 3) each.
 
-    direct : (lamps, N, 3) of each of :func:`blinkgl.scene.lights.lamps_of`.   around : from all around."""
+    direct : (lamps, N, 3) of each of :func:`blinkgl.scene.lights.lamps_of`, in the others' shadows.   open : the same
+    without shadows.   around : from all around."""
 
     direct: np.ndarray
+    open: np.ndarray
     around: np.ndarray
 
     @property
@@ -581,15 +589,15 @@ def received(
 
     own : (N, 2) part and triangle that each point is on, which do not hide it from a lamp; None: no shadows."""
     lamps = lamps_of(scene.light)
-    direct = np.zeros((len(lamps), *points.shape))
+    direct, open_ = np.zeros((2, len(lamps), *points.shape))
     casting = shadowing(scene.light)
     for k, lamp in enumerate(lamps):
         towards, strength = beam(lamp, lamp.path.pose(t_ns), points)
         facing = np.maximum(0.0, (towards * normal).sum(axis=1))
+        direct[k] = open_[k] = facing[:, None] * strength
         if own is not None and k in casting:
-            facing = facing * seen_share(scene, t_ns, lamp, points, own)
-        direct[k] = facing[:, None] * strength
-    return Received(direct, ambient(quadric_of(scene.light), normal))
+            direct[k] *= seen_share(scene, t_ns, lamp, points, own)[:, None]
+    return Received(direct, open_, ambient(quadric_of(scene.light), normal))
 
 
 SOFT_SAMPLES = 64
@@ -629,6 +637,42 @@ def seen_share(scene: Scene, t_ns: int, lamp: Lamp, points: np.ndarray, own: np.
 
 
 _shadowers: WeakKeyDictionary = WeakKeyDictionary()
+
+
+def seen_by_lamp(
+    scene: Scene, t_ns: int, eye: np.ndarray, rays: np.ndarray, near: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """What a shadow map should hold: (N,) depth along the axis of a lamp that looks from the (4, 4) pose ``eye`` along
+    (N, 3) rays of length 1 there, inf where nothing casts, and (N,) number of the part among all that cast, -1.
+
+    Of closed meshes it is the nearest side that faces away from the lamp."""
+    casters, _ = _casters(scene)
+    if not casters.objects:
+        return np.full(len(rays), np.inf), np.full(len(rays), -1, np.int32)
+    if casters not in _inside_out:
+        _inside_out[casters] = replace(casters, objects=tuple(_turned_out(thing) for thing in casters.objects))
+    turned = _inside_out[casters]
+    hit, _, depth = _nearest(turned, t_ns, np.ascontiguousarray(rays[:, :2]), eye=eye, near=near)
+    return depth, hit[:, 0]
+
+
+_inside_out: WeakKeyDictionary = WeakKeyDictionary()
+
+
+def _turned_out(thing: SceneObject) -> SceneObject:
+    """With the faces of what is drawn from one side alone turned round."""
+    parts = (
+        replace(part, mesh=replace(part.mesh, faces=np.ascontiguousarray(part.mesh.faces[:, ::-1])))
+        if part.culled
+        else part
+        for part in thing.parts
+    )
+    return replace(thing, parts=tuple(parts))
+
+
+def casts(scene: Scene) -> bool:
+    """Whether anything in it casts shadows."""
+    return bool(_casters(scene)[0].objects)
 
 
 def _casters(scene: Scene) -> tuple[Scene, np.ndarray]:

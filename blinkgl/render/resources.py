@@ -20,7 +20,7 @@ from blinkgl.scene.geometry.tangents import tangents
 from blinkgl.scene.lights import is_coloured, surroundings_of
 from blinkgl.scene.shapes.deformer import Deformer
 from blinkgl.scene.shapes.table import define_of, includes
-from blinkgl.scene.surfaces.gloss import energy
+from blinkgl.scene.surfaces.gloss import energy, mean_energy
 from blinkgl.scene.types import IDENTITY, REPEAT, Map, Material, Mesh, Part, Scene, Texture, Wrap
 
 MADE.append(includes)
@@ -358,10 +358,12 @@ class SceneResources:
         return float(LUMA @ np.asarray(material.emission, np.float64))
 
     def energy_texture(self) -> moderngl.Texture:
-        """RG32F of :func:`~blinkgl.scene.surfaces.gloss.energy`."""
+        """RGB32F of :func:`~blinkgl.scene.surfaces.gloss.energy`, and its mean."""
         if ("energy",) not in self._textures:
+            once = energy()
+            mean = np.broadcast_to(mean_energy()[:, None, None], (*once.shape[:2], 1))
             table = self._textures["energy",] = self._upload(
-                energy().astype(np.float32), "energy", wrap=("clamp", "clamp"), levels=False
+                np.concatenate([once, mean], axis=2).astype(np.float32), "energy", wrap=("clamp", "clamp"), levels=False
             )
             table.filter = (moderngl.LINEAR, moderngl.LINEAR)
         return self._textures["energy",]

@@ -19,14 +19,18 @@ from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flow_png import read_flow_png
 from blinkgl.io.frame_camera import EXPOSURES, picture_file, read_codes, read_exposures
 from blinkgl.io.images import read_image
+from blinkgl.io.imu import H5 as IMU_H5, read_imu
 from blinkgl.io.index import entry, sequence_folders
 from blinkgl.io.records import shown
 from blinkgl.io.sequence_dir import read_manifest, verify_sequence
+from blinkgl.io.tracks import TRACKS, read_tracks
 from blinkgl.labels import LABELS
 
 SAMPLED_SEQUENCES, LABELS_EACH, PIXEL_STEP = 150, 3, 8
 MAX_CONFIGS = 5000
 _FLOW = LABELS["flow_forward"]
+_CURVES = 480, 120
+"""Width and height of the inertial unit's picture, px."""
 
 
 @dataclass(eq=False)
@@ -215,7 +219,11 @@ def _example(folder: Path, line: dict[str, Any], flows: list[Path], pairs, k: in
         event_colour(counts),
         flow_colour(flow, top or None, valid),
         caption,
-        [*_of_the_camera(folder, line, start), *_others(folder, int(flows[k].stem))],
+        [
+            *_of_the_camera(folder, line, start),
+            *_others(folder, int(flows[k].stem), image),
+            *_over_time(folder, line, start, image),
+        ],
     )
 
 
@@ -234,8 +242,29 @@ def _of_the_camera(folder: Path, line: dict[str, Any], t_us: int) -> list[tuple[
     return pictures
 
 
-def _others(folder: Path, index: int) -> list[tuple[str, np.ndarray]]:
-    """Pictures of the labels besides those that every example shows."""
+def _over_time(folder: Path, line: dict[str, Any], t_us: int, image: np.ndarray | None) -> list[tuple[str, np.ndarray]]:
+    """Point tracks over the image of a time, with tails, and the curves of an inertial unit."""
+    from blinkgl.io.overlays import Curves, TrackLines, with_tracks
+
+    pictures = []
+    if (folder / TRACKS).is_file():
+        tracks, size = read_tracks(folder), np.array([line["width"], line["height"]])
+        lines = TrackLines(tracks["t_us"], tracks["target_points"], tracks["occluded"], tracks["instance"], size)
+        under = np.full((line["height"], line["width"], 3), 24, np.uint8) if image is None else image
+        title = f"point tracks, {len(tracks['instance'])}"
+        pictures.append((title, with_tracks(under, lines, t_us)))
+    if (folder / IMU_H5).is_file():
+        unit, manifest = read_imu(folder), read_manifest(folder)
+        begin = manifest["t_offset_us"]
+        span = begin, begin + manifest["duration_us"]
+        curves = Curves(unit["t_ns"] // 1000, unit["rate"], unit["acceleration"], span, *_CURVES)
+        pictures.append(("inertial unit: rates and accelerations, x red, y green, z blue", curves.at(span[1])))
+    return pictures
+
+
+def _others(folder: Path, index: int, image: np.ndarray | None) -> list[tuple[str, np.ndarray]]:
+    """Pictures of the labels besides those that every example shows. image : of the same time, what is no picture is
+    drawn over that."""
     from blinkgl.io.pictures import picture
 
     pictures = []
@@ -244,6 +273,8 @@ def _others(folder: Path, index: int) -> list[tuple[str, np.ndarray]]:
         if name in ("images", _FLOW.name) or form.read is None or not (folder / form.file(index)).is_file():
             continue
         value = form.read(folder / form.file(index))
+        if image is not None and (over := label.drawn_on(image, value)) is not None:
+            pictures.append((label.heading, over))
         pictures += [
             (view.title, picture(view.kind, view.of(value))[0])
             for view in label.views

@@ -9,7 +9,14 @@ import numpy as np
 
 from blinkgl.config.camera import CameraConfig, camera_radius
 from blinkgl.config.rig import RigSensorConfig, baseline_of
-from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig, SceneConfig, TrajectoryConfig
+from blinkgl.config.scene import (
+    ExplicitSceneConfig,
+    FileSceneConfig,
+    LightConfig,
+    RandomSceneConfig,
+    SceneConfig,
+    TrajectoryConfig,
+)
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.scene.rig import Rig, Sensor
@@ -141,9 +148,12 @@ def check_assets(config: SceneConfig, base: Path | str = ".", split: str = "trai
             if mesh.primitive is not None:
                 check_primitive(mesh.primitive, mesh.parameters, name)
         for name, material in config.materials.items():
-            _exists(material.texture, base, f"scene.materials.{name}.texture", "an image file")
+            for key, used in material.files.items():
+                _exists(used, base, f"scene.materials.{name}.{key}", "an image file")
+        _exists(panorama_of(config.light), base, "scene.light.environment.map", "a panorama")
     else:
         assert isinstance(config, FileSceneConfig)
+        _exists(panorama_of(config.light), base, "scene.light.environment.map", "a panorama")
         _exists(config.path, base, "scene.path", "a gltf or glb file")
         if config.pose is not None and config.pose.trajectory is not None:
             _check_trajectory(config.pose.trajectory, base, "scene.pose.trajectory")
@@ -153,6 +163,11 @@ def _check_trajectory(config: TrajectoryConfig, base: Path, where: str) -> None:
     _exists(config.file, base, f"{where}.file", "a trajectory")
     if isinstance(config.T_body_sensor, str):
         _exists(config.T_body_sensor, base, f"{where}.T_body_sensor", "EuRoC's sensor.yaml")
+
+
+def panorama_of(light: LightConfig) -> str | None:
+    """File that lights a scene; None: none."""
+    return None if light.environment is None else light.environment.map
 
 
 def _exists(path: str | None, base: Path, where: str, what: str) -> None:

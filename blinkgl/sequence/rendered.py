@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from blinkgl.events.truth import Surfaces, SurfaceTruth
 from blinkgl.events.types import Events
 from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging import FrameCamera
-from blinkgl.labels import LABELS, LabelRequest, asked_for
+from blinkgl.labels import LABELS, Label, LabelRequest, asked_for
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.tracks import Tracks, track_points
@@ -31,7 +32,7 @@ from blinkgl.scene.rig import Sensor
 from blinkgl.scene.types import Dynamics, Scene, SceneObject
 from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.inertial import Inertial, measured
-from blinkgl.sequence.items import GroundTruth, Picture
+from blinkgl.sequence.items import GroundTruth, Item, Picture
 from blinkgl.sequence.simulate import Simulation
 from blinkgl.timeline import Timeline, make_timeline
 
@@ -40,13 +41,19 @@ SURFACES = LabelRequest("ids", "depth", "velocity")
 
 
 def drawn(
-    renderer: Renderer, times: Iterable[int], rates: bool = False, surfaces: bool = False
+    renderer: Renderer, times: Iterable[int], rates: bool = False, surfaces: bool = False, textures: bool = False
 ) -> Iterator[EventFrame]:
     """The frames of the event pass at ``times``, ns; a :class:`Timeline` is told every one.
-    rates : with d(luminance)/dt.   surfaces : with what every pixel shows."""
+    rates : with d(luminance)/dt.   surfaces : with what every pixel shows.   textures : as they lie on the card, where
+    the timeline does not look at them; without rates then."""
     observe, frame = times.observe if isinstance(times, Timeline) else None, None
+    textures = textures and not rates and not (isinstance(times, Timeline) and times.looks_at_frames)
     for t_ns in times:
         before, frame = frame, renderer.luminance(t_ns, rate=rates)
+        if textures:
+            shown = surfaces_at(renderer, t_ns) if surfaces else None
+            yield EventFrame(t_ns, frame.texture(), None, frame.rows_changed_since(before), shown)
+            continue
         luminance, rate = frame.view(), frame.view("rate") if rates else None
         if observe is not None:
             observe(t_ns, luminance, rate)
@@ -58,7 +65,7 @@ def _truth_of(sensor: Sensor, config: SequenceConfig) -> SurfaceTruth | None:
     """What says what made a sensor's events; None where its labels do not ask."""
     if sensor.labels is None or not sensor.labels.events:
         return None
-    return SurfaceTruth(reach=int(samples_of(config.render.antialiasing).stored > 1))
+    return SurfaceTruth(reach=int(samples_of(config.render.antialiasing).shared))
 
 
 def surfaces_at(renderer: Renderer, t_ns: int) -> Surfaces:
@@ -105,6 +112,9 @@ class RenderedSequence(Simulation):
                 self.libraries = {scene.dynamics.engine: scene.dynamics.version}
             self.sensor = recording(scene, config).sensors[0]
             self.name = self.sensor.folder
+            if labels and self.sensor.labels is not None:
+                for name in asked_for(self.sensor.labels):
+                    LABELS[name].check(scene, self.sensor.labels)
             self.triangles, self._before = renderer.triangles, (renderer.stats.render_s, renderer.stats.readback_s)
             camera = None
             if events:
@@ -143,12 +153,23 @@ class RenderedSequence(Simulation):
     def _event_pass(self) -> Iterator[tuple[int, Events]]:
         try:
             yield from emulate(
-                drawn(self.renderer, self.timeline, self.camera.emulator.needs_rate, self.camera.tells),
+                drawn(
+                    self.renderer,
+                    self.timeline,
+                    self.camera.emulator.needs_rate,
+                    self.camera.tells,
+                    self.camera.takes_textures(self.renderer.gl),
+                ),
                 self.camera,
                 self.clock,
             )
         except EventDataError as error:
             raise self._explained(error) from error
+
+    def _in_order(self) -> Iterator[Item]:
+        yield from super()._in_order()
+        self._resume()
+        self.renderer.gl.check()  # before anybody calls the sequence whole
 
     def _explained(self, error: EventDataError) -> EventDataError:
         """The error with the time and, where a pixel is at fault, what is seen there."""
@@ -176,6 +197,7 @@ class RenderedSequence(Simulation):
 
     def truth(self, t_ns: int, span_ns: int) -> GroundTruth:
         self._resume()
+        self.renderer.gl.check()
         return self._truth_over(-1, t_ns, span_ns, asked_for(self.sensor.labels), False)
 
     def _truth_over(self, k: int, t_ns: int, span_ns: int, request: LabelRequest, last: bool) -> GroundTruth:
@@ -186,9 +208,12 @@ class RenderedSequence(Simulation):
         return GroundTruth(k, t_ns, frame, *leads_to, camera[0], objects[:, 0])
 
     def _picture(self, t_ns: int) -> Picture:
-        return Picture(
-            t_ns, self.renderer.colour(t_ns, antialiasing="none").read(), self.renderer.velocity(t_ns).read()
-        )
+        over = {}
+        if self._over:
+            frame = self.renderer.labels(t_ns, self._over)
+            over = {name: frame.values[name] for name in self._over}
+        image = self.renderer.colour(t_ns, antialiasing="none").read()
+        return Picture(t_ns, image, self.renderer.velocity(t_ns).read(), over)
 
     @property
     def seconds(self) -> dict[str, float]:
@@ -220,6 +245,18 @@ class RenderedSequence(Simulation):
     def lens(self) -> CameraModel | None:
         return self.scene.camera if self.scene.camera.coefficients else None
 
+    @cached_property
+    def _over(self) -> LabelRequest:
+        """Labels that are drawn over pictures: those that are asked for and know how."""
+        if self.sensor.labels is None:
+            return LabelRequest()
+        asked = asked_for(self.sensor.labels)
+        return asked.only(name for name in asked if type(LABELS[name]).drawn_on is not Label.drawn_on)
+
+    @property
+    def rectifies(self) -> bool:
+        return self._rectified is not None
+
     @property
     def _rectified(self) -> PinHole | None:
         """The camera in whose pixels labels are; None: the sensor's own."""
@@ -227,12 +264,20 @@ class RenderedSequence(Simulation):
         return rectified(self.scene.camera) if asked and self.lens is not None else None
 
     def imu(self) -> Inertial | None:
+        return self._imu
+
+    def tracks(self) -> Tracks | None:
+        return self._tracks
+
+    @cached_property
+    def _imu(self) -> Inertial | None:
         if self.config.imu is None:
             return None
         rng = generator(self.config.seed, self.index, Role.IMU, self.number)
         return measured(self.scene.camera_path, self.config.imu, self.config.time.t0_ns, self.config.time.t1_ns, rng)
 
-    def tracks(self) -> Tracks | None:
+    @cached_property
+    def _tracks(self) -> Tracks | None:
         config, time = self.config.tracks, self.config.time
         if config is None:
             return None
@@ -243,6 +288,12 @@ class RenderedSequence(Simulation):
         rng = generator(self.config.seed, self.index, Role.TRACKS, self.number)
         return track_points(scene, config, times, rng)
 
+    def _facts_of_labels(self) -> dict[str, Any]:
+        labels, facts = self.sensor.labels, {}
+        for name in () if labels is None else asked_for(labels):
+            facts.update(LABELS[name].facts(self.renderer.scene, labels))
+        return facts
+
     def facts(self) -> dict[str, Any]:
         gl, scene, timeline = self.renderer.gl, self.renderer.scene, self.config.timeline
         return {
@@ -250,6 +301,7 @@ class RenderedSequence(Simulation):
             "timeline": {"kind": timeline.kind, "reconstruction": timeline.reconstruction, **self.achieved},
             "triangles": self.triangles,
             "objects": [_described(o) for o in scene.objects],
+            **self._facts_of_labels(),
             "scene_log": list(scene.log),
             "not_drawn": list(scene.omissions),
             **({} if scene.dynamics is None else {"dynamics": _facts_of(scene.dynamics)}),

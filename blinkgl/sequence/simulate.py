@@ -283,6 +283,11 @@ class Simulation(ABC):
         """The camera, where it distorts."""
         return None
 
+    @property
+    def rectifies(self) -> bool:
+        """Whether its labels and tracks are in other pixels than its pictures: those of the rectified camera."""
+        return False
+
     def imu(self) -> Inertial | None:
         """What the inertial unit of ``imu:`` measures; None: there is none. Raises ConfigError where the camera's
         velocity jumps."""

@@ -40,6 +40,9 @@ class Timeline:
     """Iterates over frame times, int64 ns, from t0 to t1, both included, strictly increasing;
     each is decided when asked for. ``stops_ns``: times of impacts, that adaptive kinds do not step over."""
 
+    looks_at_frames = False
+    """Whether :meth:`observe` looks at what it is given: frames may stay on the card where not."""
+
     def __init__(
         self,
         config: TimelineConfig,
@@ -110,6 +113,8 @@ class Brightness(Timeline):
 
 class Budget(Timeline):
     """The step whose estimated error is what was asked for: :mod:`blinkgl.timeline.budget`."""
+
+    looks_at_frames = True
 
     def __init__(self, config: TimelineConfig, *others: Any):
         super().__init__(config, *others)

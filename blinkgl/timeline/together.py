@@ -18,6 +18,7 @@ class Shared(Timeline):
     def __init__(self, own: Timeline, times: Iterator[int]):
         self.own, self._times = own, times
         super().__init__(own.config, own.t0_ns, own.t1_ns, own.pictures, own.response, own.stops_ns)
+        self.looks_at_frames = own.looks_at_frames
 
     def __iter__(self) -> Iterator[int]:
         return self._times

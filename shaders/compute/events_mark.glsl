@@ -1,14 +1,13 @@
 // Which pixels have reached a level: a bit each, 32 pixels an invocation. What is read here, 12 bytes a pixel, is all that
 // a pixel without events costs.
+#include "events.glsl"
 #include "log_q25.glsl"
 layout(local_size_x = 64) in;
 
 layout(std430, binding = 0) readonly restrict buffer Intensity { vec4 intensity[]; };
 layout(std430, binding = 1) readonly restrict buffer Levels { ivec4 levels[]; }; // upper and lower of two pixels
 layout(std430, binding = 2) writeonly restrict buffer Marks { uint marks[]; };
-#ifdef CHECKED
-layout(std430, binding = 3) writeonly restrict buffer Largest { uint largest[]; };
-#endif
+layout(std430, binding = 3) readonly restrict buffer Heads { Head head; };
 uniform uint words;
 uniform float eps;
 
@@ -21,7 +20,6 @@ void main()
     const ivec4 SIDES = ivec4(1, -1, 1, -1);
     const uvec4 FIRST = uvec4(1u, 1u, 2u, 2u), SECOND = uvec4(4u, 4u, 8u, 8u);
     uint bits = 0u;
-    uvec4 most = uvec4(0u);
     for (uint k = 0u; k < 8u; ++k) {
         vec4 four = intensity[8u * word + k];
         ivec4 now = log_of(four, eps);
@@ -30,10 +28,6 @@ void main()
         ivec4 second = (now.zzww - levels[16u * word + 2u * k + 1u]) * SIDES;
         uvec4 fired = (FIRST & uvec4(~(first >> 31))) | (SECOND & uvec4(~(second >> 31)));
         bits |= (fired.x | fired.y | fired.z | fired.w) << (4u * k);
-        most = max(most, floatBitsToUint(four));
     }
-    marks[word] = bits;
-#ifdef CHECKED
-    largest[word] = max(max(most.x, most.y), max(most.z, most.w));
-#endif
+    marks[word] = head.unusable == 0u ? bits : 0u;
 }

@@ -3,7 +3,7 @@
 // SCAN    : one work group makes of those where each chunk begins, and their total;
 // OFFSETS : where each item begins.
 // Of BITS: items are words whose bits are counted, and the number of items is a uniform; else the items are numbers, as
-// many as the head says.
+// many as the head says, of pixels that fire or, with PARTS, of the digits of a sort.
 #include "events.glsl"
 #ifdef SCAN
 layout(local_size_x = LANES) in;
@@ -22,7 +22,12 @@ uniform uint chunks_given;
 #define CHUNKS chunks_given
 #define NUMBER(ITEM) uvec4(bitCount(ITEM))
 #else
+#ifdef PARTS
+#define CHUNKS head.digit_chunks
+#else
+uniform uint capacity; // events that there is room for
 #define CHUNKS head.chunks
+#endif
 #define NUMBER(ITEM) ITEM
 #endif
 
@@ -93,8 +98,13 @@ void main()
         head.groups_y = head.groups_z = head.chunks_y = head.chunks_z = 1u;
         head.events = 0u;
         head.cut = 0u;
-#else
+#elif !defined(PARTS)
         head.events = total;
+        head.parts = 2u * ((min(total, capacity) + 2u * PART - 1u) / (2u * PART));
+        head.groups_of_parts = (head.parts + 63u) / 64u;
+        head.digit_chunks = head.parts / 2u;
+        head.groups_of_digits = (head.digit_chunks + CHUNKS_PER_GROUP - 1u) / CHUNKS_PER_GROUP;
+        head.parts_y = head.parts_z = head.digits_y = head.digits_z = 1u;
 #endif
     }
 }

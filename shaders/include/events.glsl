@@ -7,6 +7,11 @@ struct Head {
     uint events;
     uint cut; // events that a block of 1024 pixels had too many
     uint chunks; // of 32 pixels that fire
-    uint spare_a, spare_b;
+    uint unusable; // a frame with values that cannot be used: nothing fires
+    uint parts; // of 64 events that are sorted; an even number
+    uint groups_of_parts, parts_y, parts_z;
+    uint groups_of_digits, digits_y, digits_z;
+    uint digit_chunks; // of 32 numbers, how often a digit is in a part
+    uint spare;
 };
-const uint WORD = 32u, PER_GROUP = 256u, CHUNKS_PER_GROUP = 64u;
+const uint WORD = 32u, PER_GROUP = 256u, CHUNKS_PER_GROUP = 64u, PART = 64u;

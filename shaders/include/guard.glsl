@@ -6,21 +6,25 @@
 // larger. So everything is compared as unsigned integers: compilers may turn !(a < b) into a >= b, which NaN does not
 // survive.
 
+#ifndef LENS_CLAIMS // behind a lens rays meet facets where they are (along_ray.glsl)
 // Smallest 1/Z of the part in this frame, as bits; by how much the largest's bits exceed them.
 uniform uvec2 inverse_depths;
 
 // Corners are snapped to 1/256 px: where depth changes by more than a quarter over so little, it is not known at all.
 const float STEEPEST = 64.0; // of its own value per pixel
+#endif
 
 // A fragment at no depth that the part has is not of the part. To be called last: derivatives are undefined after a
 // discard.
 void drop_artefact()
 {
+#ifndef LENS_CLAIMS
     float W = gl_FragCoord.w; // 1/Z: the projection's w is the depth along the optical axis
     // Below the smallest, the unsigned difference wraps round and is large, too: one comparison for both ends and for
     // NaN.
     if (floatBitsToUint(W) - inverse_depths.x > inverse_depths.y || fwidth(W) > STEEPEST * W)
         discard;
+#endif
 #ifdef MASKED
     if (is_hole())
         discard;

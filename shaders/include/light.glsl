@@ -3,10 +3,18 @@
 // (blinkgl/scene/types.py: Light):
 //   E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 * n_up)
 // n, s and up in the object's own frame, so that normals need no matrix.
+#ifdef SHOW_LOOKUP
+#define SHOW(term, light) shown_##term += light; // the shader debugger's, see lookup.glsl
+#else
+#define SHOW(term, light)
+#endif
 #ifdef LIGHTS
 #include "lights.glsl"
 #else
 #define ILLUMINANT float
+#ifdef SHOW_LOOKUP
+float shown_direct = 0.0, shown_arrives = 0.0, shown_around = 0.0;
+#endif
 uniform vec3 sun_direction;  // s, object frame, unit
 uniform vec3 up_direction;   // world z, object frame, unit
 uniform vec2 light_strength; // (sun, sky)
@@ -15,8 +23,12 @@ float irradiance(vec3 normal)
 {
     // normalize(), except that the normal of a degenerate triangle, zero, stays zero instead of becoming NaN.
     vec3 n = normal * inversesqrt(max(dot(normal, normal), 1e-30));
-    return light_strength.x * max(0.0, dot(n, sun_direction))
-         + light_strength.y * (0.5 + 0.5 * dot(n, up_direction));
+    float direct = light_strength.x * max(0.0, dot(n, sun_direction));
+    float around = light_strength.y * (0.5 + 0.5 * dot(n, up_direction));
+    SHOW(direct, direct)
+    SHOW(arrives, direct)
+    SHOW(around, around)
+    return direct + around;
 }
 
 #ifdef RATE

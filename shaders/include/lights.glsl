@@ -12,6 +12,9 @@
 #else
 #define ILLUMINANT float
 #endif
+#ifdef SHOW_LOOKUP
+ILLUMINANT shown_direct = ILLUMINANT(0.0), shown_arrives = ILLUMINANT(0.0), shown_around = ILLUMINANT(0.0);
+#endif
 
 #if defined(SURFACED) && defined(RATE)
 #define MOVED
@@ -143,12 +146,14 @@ ILLUMINANT irradiance(vec3 normal)
 #else
     sum += ambient(n); // no sky is below 0
 #endif
+    SHOW(around, sum)
 #endif
 #ifdef SUNS
     for (int i = 0; i < SUNS; ++i)
     {
         Beam beam = sun_beam(i);
         float facing = max(0.0, dot(n, beam.towards));
+        SHOW(direct, facing * beam.strength)
 #ifdef SHADOW_SUNS
         if (i < SHADOW_SUNS)
         {
@@ -159,6 +164,7 @@ ILLUMINANT irradiance(vec3 normal)
             facing *= shadow_share[i];
         }
 #endif
+        SHOW(arrives, facing * beam.strength)
         sum += facing * beam.strength;
     }
 #endif
@@ -167,6 +173,7 @@ ILLUMINANT irradiance(vec3 normal)
     {
         Beam beam = lamp_beam(i, here());
         float facing = max(0.0, dot(n, beam.towards));
+        SHOW(direct, facing * beam.strength)
 #ifdef SHADOW_SPOTS
         int k = i - (LAMPS - SPOTS);
         if (k >= 0 && k < SHADOW_SPOTS)
@@ -180,6 +187,7 @@ ILLUMINANT irradiance(vec3 normal)
             facing *= shadow_share[map];
         }
 #endif
+        SHOW(arrives, facing * beam.strength)
         sum += facing * beam.strength;
     }
 #endif

@@ -43,7 +43,7 @@ uniform vec2 gloss;    // metallic, roughness
 uniform sampler2D gloss_map;
 uniform mat3x2 gloss_map_place;
 #endif
-uniform sampler2D energy;       // what is reflected of even light, over (cosine, roughness): F0 r + g
+uniform sampler2D energy;       // what is reflected of even light, over (cosine, roughness): F0 r + g; b: the mean of r + g
 uniform sampler3D surroundings; // radiance seen in a mirror, by longitude, latitude and roughness
 #ifdef MOVED
 uniform vec3 eye_rate;
@@ -68,6 +68,9 @@ ILLUMINANT mirrored(vec3 d, float roughness)
 #endif
 }
 
+// Of what hits more than once, what comes out: F is the mean of Schlick's term, even that of the energy.
+#define SEVERAL(F0, F, even) { F = F0 + (1.0 - F0) * (1.0 / 21.0); F = F * even / (1.0 - F * (1.0 - even)); }
+
 ILLUMINANT shone(ILLUMINANT base, vec3 normal, vec3 at, vec2 coordinates)
 {
     vec3 n = normal * inversesqrt(max(dot(normal, normal), 1e-30)), v = normalize(EYE - at);
@@ -79,13 +82,21 @@ ILLUMINANT shone(ILLUMINANT base, vec3 normal, vec3 at, vec2 coordinates)
 #endif
     roughness = max(roughness, SMOOTHEST);
     float facing_eye = clamp(dot(n, v), 1e-3, 1.0), square = roughness * roughness * roughness * roughness;
-    vec2 cells = vec2(textureSize(energy, 0)), part = map_at(energy, (vec2(facing_eye, roughness) * (cells - 1.0) + 0.5) / cells, 0.0).rg;
-    float lost = 1.0 / (part.r + part.g) - 1.0;
-    float clear = 1.0 + DIELECTRIC * lost, even_clear = clear * (DIELECTRIC * part.r + part.g);
-    ILLUMINANT metal = 1.0 + base * lost, even_metal = metal * (base * part.r + part.g);
+    vec2 cells = vec2(textureSize(energy, 0));
+    vec3 part = map_at(energy, (vec2(facing_eye, roughness) * (cells - 1.0) + 0.5) / cells, 0.0).rgb;
+    float lost = 1.0 / (part.r + part.g) - 1.0, clear;
+    ILLUMINANT metal;
+    SEVERAL(DIELECTRIC, clear, part.b)
+    SEVERAL(base, metal, part.b)
+    clear = 1.0 + clear * lost;
+    metal = 1.0 + metal * lost;
+    float even_clear = clear * (DIELECTRIC * part.r + part.g);
+    ILLUMINANT even_metal = metal * (base * part.r + part.g);
     shown_matt = (1.0 - metallic) * (1.0 - even_clear) * irradiance(normal);
     ILLUMINANT sum = base * shown_matt;
-    sum += mirrored(normalize(TO_WORLD * reflect(-v, n)), roughness) * mix(ILLUMINANT(even_clear), even_metal, metallic);
+    // a rough surface's lobe leans towards the normal: gloss.py, looked_at()
+    vec3 ahead = mix(n, reflect(-v, n), (1.0 - roughness * roughness) * (1.0 + 0.6 * roughness * (facing_eye - 0.5)));
+    sum += mirrored(normalize(TO_WORLD * ahead), min(roughness * (0.875 + 0.25 * facing_eye), 1.0)) * mix(ILLUMINANT(even_clear), even_metal, metallic);
 #if defined(SUNS) || defined(LAMPS)
     float seen = sqrt(facing_eye * facing_eye * (1.0 - square) + square);
 #define LOBE(beam, share) \

@@ -127,7 +127,12 @@ void main()
 }
 #endif
 
+#ifdef LENS_CLAIMS
+#include "along_ray.glsl"
+#endif
+
 #ifdef FRAGMENT_SHADER
+#ifndef LENS_CLAIMS // behind a lens they are values of along_ray.glsl
 #ifdef NEEDS_UV
 in vec2 uv;
 #endif
@@ -142,16 +147,6 @@ in vec3 tint;
 #endif
 #ifdef NEEDS_TANGENT
 in vec4 tangent;
-#endif
-#ifdef MASKED
-uniform sampler2D coverage; // opacity over the coordinates of the base colour
-uniform float cutoff;
-
-// Of the finest level whatever the distance: a hole is a shape, which every pass, the shadow maps and the float64 ray caster see alike.
-bool is_hole()
-{
-    return textureLod(coverage, uv, 0.0).r < cutoff;
-}
 #endif
 #ifdef DEFORM
 #ifdef NEEDS_RATE
@@ -172,5 +167,16 @@ in vec3 local_rate;
 #ifdef NEEDS_TANGENT_RATE
 in vec3 tangent_rate;
 #endif
+#endif
+#endif
+#ifdef MASKED
+uniform sampler2D coverage; // opacity over the coordinates of the base colour
+uniform float cutoff;
+
+// Of the finest level whatever the distance: a hole is a shape, which every pass, the shadow maps and the float64 ray caster see alike.
+bool is_hole()
+{
+    return textureLod(coverage, uv, 0.0).r < cutoff;
+}
 #endif
 #endif

@@ -155,7 +155,7 @@ def test_what_it_does_not_do_is_said_in_one_line(gl, monkeypatch):
     with pytest.raises(EventDataError, match=r"^events\.threshold_jitter: .*at most 1\.4"):
         CardEsim(8, 8, EsimConfig(threshold_jitter=3.0), gl=gl)
     CardEsim(8, 8, EsimConfig(threshold_jitter=1.3), gl=gl).release()
-    with pytest.raises(GLError, match=r"^events\.device: 30000x30000 are too many .*MiB.*events\.device: cpu"):
+    with pytest.raises(GLError, match=r"^events\.device: 30000x30000 pixels are too many .*MiB.*events\.device: cpu"):
         card_esim._Room(gl, 30000, 30000, False, False)
 
     class Old:

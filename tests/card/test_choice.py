@@ -56,7 +56,7 @@ def test_auto_takes_a_graphics_card_that_can_do_it(gl, monkeypatch):
 def test_auto_goes_back_to_the_processor_where_the_picture_is_too_large(gl, monkeypatch):
     assert choice.same_events(gl)
     card = Hardware(gl)
-    monkeypatch.setattr("blinkgl.card.esim._refuse_too_large", lambda *_: (_ for _ in ()).throw(GLError("too large")))
+    monkeypatch.setattr("blinkgl.card.esim.refuse_too_large", lambda *_: (_ for _ in ()).throw(GLError("too large")))
     assert made(card) is Esim
     with pytest.raises(GLError, match="too large"):
         made(gl, device="gl")
@@ -92,22 +92,57 @@ def config_of(folder, **changes):
     return load_run(path).sequence(0)
 
 
-def test_files_are_the_same_and_the_manifest_says_which(gl, tmp_path):
+def test_files_are_the_same_and_the_manifest_says_which(gl, tmp_path, monkeypatch):
     from blinkgl.dataset.generate import generate_sequence
     from blinkgl.dataset.verify import verify_dataset
     from blinkgl.io.sequence_dir import read_manifest
+    from blinkgl.render.canvas import Frame
 
-    sums, said = {}, {}
-    for device in ("cpu", "gl", "auto"):
-        config = config_of(tmp_path, events={"device": device})
+    viewed, view = [], Frame.view
+    monkeypatch.setattr(Frame, "view", lambda frame, name="": viewed.append(frame) or view(frame, name))
+    sums, said, read_back = {}, {}, {}
+    for device in ("cpu", "gl", "auto", "card"):
+        if device == "card":  # sorted there, read back one frame late
+            monkeypatch.setattr(gl, "is_software", False)
+        config = config_of(tmp_path, events={"device": "auto" if device == "card" else device})
+        viewed.clear()
         path = generate_sequence(config, 0, tmp_path / device, gl).path
+        read_back[device] = len(viewed)
         said[device] = read_manifest(path)["events_device"]
         files = (p for p in path.rglob("*") if p.is_file() and p.name not in ("manifest.json", "config.yaml"))
         sums[device] = {p.relative_to(path).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
-    assert said == {"cpu": "cpu", "gl": "gl", "auto": "cpu"}
-    assert sums["cpu"] == sums["gl"] == sums["auto"] and "events.h5" in sums["cpu"]
+    monkeypatch.undo()
+    assert said == {"cpu": "cpu", "gl": "gl", "auto": "cpu", "card": "gl"}
+    assert read_back["gl"] == read_back["card"] == 0 < read_back["cpu"], "event frames stay on the card"
+    assert sums["cpu"] == sums["gl"] == sums["auto"] == sums["card"] and "events.h5" in sums["cpu"]
     result = verify_dataset(tmp_path / "gl", deep=1)
     assert result.clean and len(result.deep) == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "stay"),
+    [
+        ({"timeline": {"kind": "budget", "max_time_error_px": 0.2}}, False),  # a timeline that looks at the frames
+        ({"readout": {"latency": {"dark_us": 500}}}, False),  # as slow as pixels are bright
+        ({"labels": {"events": True}}, False),
+        ({"render": {"antialiasing": "ssaa2"}, "timeline": {"kind": "uniform", "fps": 100}}, True),
+    ],
+)
+def test_who_looks_at_frames_gets_arrays(gl, tmp_path, changes, stay):
+    from blinkgl.events import Events
+    from blinkgl.sequence import simulate_sequence
+
+    found = []
+    for device in ("cpu", "gl"):
+        with simulate_sequence(config_of(tmp_path, **{**changes, "events": {"device": device}}), 0, gl) as sequence:
+            if device == "gl":
+                camera, seen = sequence.camera, []
+                step = camera.step
+                camera.step = lambda frame, step=step, seen=seen: seen.append(frame.luminance) or step(frame)
+            found.append(Events.concatenate([chunk.events for chunk in sequence.chunks()]))
+    assert_same(*found)
+    assert len(found[0]) > 100 and len(seen) > 3
+    assert all(hasattr(frame, "glo") == stay for frame in seen)
 
 
 def test_what_the_card_does_not_do_names_the_key(gl, tmp_path):

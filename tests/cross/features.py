@@ -284,6 +284,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
                 for name, info in LabelsConfig.model_fields.items()
                 if info.annotation is bool and name not in OF_PAIRS
             }
+            | {"semantics": {"cuboid*": 7, "*": 1}}
         },
         "fewest": {"labels": {"occlusion": False}},
     },

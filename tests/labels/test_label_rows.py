@@ -9,6 +9,7 @@ import pytest
 
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.labels import LABELS, Flow, Flows, LabelFrame, LabelRequest, Occlusions, asked_for, grading, label_of
+from blinkgl.labels.boxes import Boxes, empty
 from blinkgl.labels.files import Form
 
 H, W = 4, 5
@@ -17,6 +18,9 @@ H, W = 4, 5
 def whole(name: str):
     """A value that is right, of (H, W) px."""
     label = LABELS[name]
+    if name == "boxes":
+        arrays = {key: np.ones((1, *array.shape[1:]), array.dtype) for key, array in empty().items()}
+        return Boxes(**arrays, resolution=np.array([W, H]))
     if name == "flow_intervals":
         return Flows(0, np.array([1, 2]), np.ones((2, H, W, 2), np.float32), np.ones((2, H, W), bool))
     if name == "occlusion_intervals":
@@ -32,7 +36,7 @@ def whole(name: str):
 
 def parts(value) -> list[np.ndarray]:
     """The arrays of a value."""
-    several = (Flow, Flows, Occlusions)
+    several = (Boxes, Flow, Flows, Occlusions)
     return [v for v in vars(value).values() if isinstance(v, np.ndarray)] if isinstance(value, several) else [value]
 
 
@@ -92,6 +96,8 @@ FILES = {
     "occlusion_backward": ["occlusion/backward/000007.png"],
     "flow_intervals": ["flow/intervals/000007.h5"],
     "occlusion_intervals": ["occlusion/intervals/000007.h5"],
+    "semantics": ["semantics/000007.png"],
+    "boxes": ["boxes/000007.npz", "boxes_kitti/000007.txt"],
     "depth": ["depth/000007.npy"],
     "disparity": ["disparity/000007.npy"],
     "ids": ["ids/000007.png"],
@@ -123,6 +129,8 @@ def test_where_labels_lie():
         "normals": "normals.npy",
         "velocity": "velocity.npy",
         "scene_flow": "scene_flow.npy",
+        "semantics": "semantics.png",
+        "boxes": "boxes.npz",
     }
 
 
@@ -158,7 +166,7 @@ def test_a_value_of_another_shape_or_kind_is_refused(name):
     assert label.wrong(value, H, W) is None
     for height, width in ((W, H), (H + 1, W), (H, W - 1)):
         assert f"not {width}x{height} px" in label.wrong(value, height, width)
-    if name.endswith("_intervals"):
+    if name.endswith("_intervals") or name == "boxes":
         return
     if name.startswith("flow"):
         assert label.wrong(Flow(value.flow[..., :1], value.valid), H, W) and label.wrong(
@@ -290,6 +298,7 @@ def test_how_strictly_each_is_judged():
         "normals": (1e-3, "max", "of a unit vector"),
         "velocity": (1e-2, "max", "px per label interval"),
         "scene_flow": (1e-4, "max", "world units"),
+        "semantics": (0.0, "max", "mismatch"),
         "flow_forward": (1e-2, "max", "px"),
         "valid_forward": (0.0, "max", "mismatch"),
         "flow_backward": (1e-2, "max", "px"),
@@ -298,7 +307,7 @@ def test_how_strictly_each_is_judged():
         "occluded_backward": (1e-3, "mean", "fraction of pixels"),
     }
     loose = {v.name for label in LABELS.values() for v in label.views if not v.same_triangle}
-    assert loose == {"id", "occluded_forward", "occluded_backward"}
+    assert loose == {"id", "semantics", "occluded_forward", "occluded_backward"}
 
 
 def test_a_label_that_shows_itself_in_its_own_way_needs_no_reference():
@@ -312,9 +321,10 @@ def test_two_renderers_need_not_agree_but_in_what_is_measured():
     """Colours, numbers of objects, normals and velocities may differ in every pixel; depth, disparity and flow may
     not."""
     zero, one = np.zeros((H, W), np.float32), np.ones((H, W), np.float32)
-    free = {name for name, label in LABELS.items() if not name.startswith("flow") and label.agrees(zero, one)}
+    of_arrays = [name for name in LABELS if not name.startswith("flow") and name != "boxes"]
+    free = {name for name in of_arrays if LABELS[name].agrees(zero, one)}
     assert free == set(LABELS) - {
-        *("depth", "disparity", "scene_flow", "flow_forward", "flow_backward", "flow_intervals")
+        *("depth", "disparity", "scene_flow", "boxes", "flow_forward", "flow_backward", "flow_intervals")
     }
     assert LABELS["depth"].agrees(one, one) and not LABELS["depth"].agrees(one, one[:, :3])
 

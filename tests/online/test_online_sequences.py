@@ -1,5 +1,6 @@
 """OnlineSequences: the same samples whoever renders and whoever takes them; two kinds; batches for torch."""
 
+import itertools
 import os
 import signal
 from itertools import islice, pairwise
@@ -10,7 +11,7 @@ import pytest
 import yaml
 from tiny_recipe import TINY
 
-from blinkgl import ConfigError, EventDataError, OnlineSequences, StreamSample, WindowSample, load
+from blinkgl import AssetError, ConfigError, EventDataError, GLError, OnlineSequences, StreamSample, WindowSample, load
 from blinkgl.online.stream import MIX
 
 RECIPE = {**TINY, "output": {"sequences": 3}}
@@ -162,3 +163,47 @@ def test_a_recipe_that_gives_nothing_is_one_line(tmp_path):
     with OnlineSequences(tmp_path / "still.yaml", kind="streams", steps=200, window_ms=1, workers=0) as sequences:
         with pytest.raises(ConfigError, match="holds no 200 windows of 1 ms"):
             next(iter(sequences))
+
+
+def test_a_context_that_is_lost_costs_no_sample(recipe, monkeypatch):
+    """Found when a sequence is drawn, and when its flow is: the slot is made again, with another context."""
+    from blinkgl.gl import GLContext
+
+    how = {"workers": 0, "per_sequence": 2}
+    with OnlineSequences(recipe, **how) as sequences:
+        wanted = [told(sample) for sample in islice(sequences, 3)]
+    calls, check = [], GLContext.check
+
+    def lose(self):
+        calls.append(self)
+        if len(calls) in (1, 3):
+            self.lost = True
+            raise GLError("the card has lost its context")
+        check(self)
+
+    monkeypatch.setattr(GLContext, "check", lose)
+    with OnlineSequences(recipe, **how) as sequences:
+        assert [told(sample) for sample in islice(sequences, 3)] == wanted
+    assert len(set(map(id, calls[:4]))) == 3
+
+
+def test_sequences_that_fail_are_counted_and_bounded(recipe, monkeypatch):
+    """Three of four: others take their place until there were too many; then one line with the numbers and the
+    last."""
+    from blinkgl.online import maker, stream
+
+    simulate, count = maker.simulate_sequence, itertools.count()
+
+    def fails(*args, **how):
+        if next(count) % 4:
+            raise AssetError("no such mesh", where="pool/a.glb")
+        return simulate(*args, **how)
+
+    monkeypatch.setattr(maker, "simulate_sequence", fails)
+    monkeypatch.setattr(stream, "_FREE_FAILURES", 4)
+    with OnlineSequences(recipe, workers=0, per_sequence=2) as sequences, pytest.raises(ConfigError) as caught:
+        list(islice(sequences, 60))
+    stats = sequences.stats
+    assert 4 + stats.sequences / 2 < stats.failures < stats.sequences < 60 and stats.samples > 0
+    assert str(caught.value).startswith(f"recipe: {stats.failures} of {stats.sequences} sequences failed, the last: ")
+    assert str(caught.value).endswith("pool/a.glb: no such mesh")

@@ -1,7 +1,7 @@
 """Pictures and labels through lenses that distort, against the float64 caster that looks through the same model."""
 
 import math
-from dataclasses import replace
+from dataclasses import is_dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -55,56 +55,63 @@ def scene_with(lens, **keys):
     return scene.build(scene.template().sequence(0))
 
 
-def insides(true, scene, t_ns=T):
-    """Pixels away from silhouettes, and those of them whose ray meets the facet that the flat picture's nearest pixel
-    shows."""
-    inner = ~reference.silhouette_band(true.instance, true.depth, 2)
+def next_facets(true, scene, t_ns=T):
+    """Pixels whose ray meets another facet, or body, than the flat picture's nearest pixel shows."""
     flat = seen_through(scene.camera)
     nearest = np.floor(places_of(scene.camera, flat, scene.camera.width, scene.camera.height).places)
     drawn = reference.cast(scene.with_camera(flat), t_ns, nearest.reshape(-1, 2))
     same = (drawn.part == true.part.ravel()) & (drawn.triangle == true.triangle.ravel())
-    return inner, inner & true.hit & same.reshape(inner.shape)
+    return true.hit & ~same.reshape(true.hit.shape)
 
 
 @pytest.fixture(scope="module", params=LENSES)
 def seen(request, gl):
-    """(labels, what they should be, insides, scene)"""
+    """(labels, what they should be, next_facets, scene)"""
     with Renderer(gl, scene_with(LENSES[request.param]), RenderConfig()) as renderer:
         frame = renderer.labels(T, EVERYTHING, T + SPAN, T - SPAN)
         true = reference.render(renderer.scene, T, forward_ns=T + SPAN, backward_ns=T - SPAN)
-        return frame, true, insides(true, renderer.scene), renderer.scene
+        return frame, true, next_facets(true, renderer.scene), renderer.scene
 
 
 def within(error, bound):
-    """Corners are snapped to 1/256 px when they are drawn, so a fragment in 500 may be of another facet than the
-    reference has at its centre."""
-    assert (error > bound).mean() < 2e-3, np.sort(error)[-10:]
+    assert error.max() <= bound, np.sort(error)[-10:]
 
 
 def test_labels_are_those_of_the_rays(seen):
-    frame, true, (inner, hit), scene = seen
-    assert inner.mean() > 0.7 and hit.sum() > 0.8 * (true.hit & inner).sum() > 500
-    np.testing.assert_array_equal(frame.ids[inner], true.instance[inner])
+    """Of every pixel: up to silhouettes, and where the flat picture shows the facet beside the ray's."""
+    frame, true, aside, scene = seen
+    hit = true.hit
+    assert hit.sum() > 1000 and aside.sum() > 50
+    np.testing.assert_array_equal(frame.ids, true.instance)
     within(np.abs(frame.depth[hit] / true.depth[hit] - 1), 5e-6)
     turned = true.normal @ scene.camera_path.pose(T)[:3, :3]
     within(np.abs(frame.normals - turned)[hit].max(axis=-1), 2e-5)
     within(np.abs(frame.velocity - true.velocity)[hit].max(axis=-1), 2e-3)
     for ours, theirs in ((frame.forward, true.forward), (frame.backward, true.backward)):
-        np.testing.assert_array_equal(ours.valid[inner], theirs.valid[inner])
-        assert np.abs(theirs.flow[hit & ours.valid]).max() > 1
-        error = np.abs(ours.flow - theirs.flow).max(axis=-1)
-        within(error[hit & ours.valid], 1e-4)  # asked: 1e-3 px
-        assert error[inner & true.hit & ours.valid].max() < 0.03  # beside the edges of a coarse ball's facets
-        assert (ours.occluded != theirs.occluded)[inner].sum() <= 2
+        np.testing.assert_array_equal(ours.valid, theirs.valid)
+        assert np.abs(theirs.flow[ours.valid]).max() > 1
+        within(np.abs(ours.flow - theirs.flow)[ours.valid].max(axis=-1), 2e-5)  # asked: 1e-3 px
+        assert (ours.occluded != theirs.occluded).sum() <= 2
 
 
-def test_beside_silhouettes_a_label_is_of_a_ray_near_by(seen):
-    frame, true, (inner, _), scene = seen
-    y, x = np.nonzero(~inner & (frame.ids != true.instance))
-    assert len(x) < 0.03 * inner.size
-    around = [reference.cast(scene, T, np.stack([x + dx, y + dy], 1)).instance
-              for dx in np.linspace(-0.5, 0.5, 9) for dy in np.linspace(-0.5, 0.5, 9)]  # fmt: skip
-    assert (np.stack(around) == frame.ids[y, x]).any(axis=0).all()
+def test_through_the_near_plane_past_the_horizon_and_thinner_than_a_pixel(gl):
+    """A floor that the camera stands on, needles, and a mesh whose facets are smaller than pixels."""
+    camera = blinkgl.Camera(104, 80, pose=blinkgl.look_at((0, 0, 0.1), (3, 0.4, 0.25)), **LENSES["fisheye"])
+    scene = blinkgl.Scene(camera)
+    scene += blinkgl.Primitive("grid", width=40, depth=40)
+    scene += blinkgl.Mesh(vertices=[(1, -0.5, 0.1), (1, 0.6, 0.3), (1, 0.6, 0.318)], faces=[(0, 1, 2), (0, 2, 1)])
+    spin = blinkgl.Keyframes({0: blinkgl.Pose((3, 0.5, 0.8)), 1: blinkgl.Pose((3, 0.2, 1.0), euler=(0, 40, 70))})
+    scene += blinkgl.Primitive("sphere", radius=0.5, rings=48, segments=96, pose=spin)
+    with Renderer(gl, scene.build(scene.template().sequence(0)), RenderConfig()) as renderer:
+        frame = renderer.labels(T, LabelRequest("ids", "depth", "flow_forward"), T + SPAN)
+        true = reference.render(renderer.scene, T, forward_ns=T + SPAN)
+    assert min((true.instance == k).sum() for k in (1, 2, 3)) > 10
+    wrong = frame.ids != true.instance
+    assert wrong.sum() <= 2, "a needle is a pixel wide at most"
+    hit = true.hit & ~wrong
+    within(np.abs(frame.depth[hit] / true.depth[hit] - 1), 1e-4)  # at the horizon a ray meets the floor far away
+    valid = hit & frame.forward.valid & true.forward.valid
+    within(np.abs(frame.forward.flow - true.forward.flow)[valid].max(axis=-1), 1e-3)
 
 
 def test_flow_is_zero_where_nothing_moves(gl):
@@ -119,7 +126,8 @@ def test_shapes_that_change(gl):
     with Renderer(gl, scene_with(LENSES["radtan"], shapes=("wave",)), RenderConfig()) as renderer:
         frame = renderer.labels(T, LabelRequest("flow_forward", "ids", "velocity"), T + SPAN)
         true = reference.render(renderer.scene, T, forward_ns=T + SPAN)
-        hit = insides(true, renderer.scene)[1] & frame.forward.valid
+        hit = true.hit
+    np.testing.assert_array_equal(frame.forward.valid, true.forward.valid)
     np.testing.assert_array_equal(frame.ids[hit], true.instance[hit])
     within(np.abs(frame.forward.flow - true.forward.flow)[hit].max(axis=-1), 1e-4)
     within(np.abs(frame.velocity - true.velocity)[hit].max(axis=-1), 2e-3)
@@ -136,9 +144,9 @@ def test_rectified_labels_are_a_pin_hole_camera_s(gl):
         )
         for name in EVERYTHING:
             one, other = ours.values[name], theirs.values[name]
-            pairs = ((one.flow, other.flow), (one.valid, other.valid)) if name.startswith("flow") else ((one, other),)
-            for a, b in pairs:
-                np.testing.assert_array_equal(a, b)
+            arrays = (vars(one), vars(other)) if is_dataclass(one) else ({"": one}, {"": other})
+            for field in arrays[0]:
+                np.testing.assert_array_equal(arrays[0][field], arrays[1][field], f"{name} {field}")
         own = lens.labels(T, EVERYTHING, T + SPAN, T - SPAN)  # and the sensor's own are still what they were
         assert (own.ids != ours.ids).any()
 
@@ -248,7 +256,7 @@ def test_another_part_of_the_same_lens(gl):
             renderer.look_through(part)
             depth = renderer.labels(T, LabelRequest("depth")).depth
             true = reference.render(scene.with_camera(part), T)
-            hit = insides(true, renderer.scene)[1]
+            hit = true.hit
             within(np.abs(depth[hit] / true.depth[hit] - 1), 5e-6)
 
 

@@ -175,9 +175,10 @@ def test_lamps_and_surroundings_are_one(metallic, roughness):
     lobe = gloss.lobe(nl, eye[0, 2], half[:, 2], np.full(len(nl), roughness)) / np.pi
     part = gloss.energy_at(eye[:, 2], np.array([roughness]))[0]
     lost = 1 / part.sum() - 1
-    clear = 1 + gloss.DIELECTRIC * lost
+    rough = np.array([roughness])
+    clear = 1 + gloss.several(np.array([[gloss.DIELECTRIC]]), rough)[0, 0] * lost
     for c in range(3):
-        metal = (1 + albedo[0, c] * lost) * (albedo[0, c] + (1 - albedo[0, c]) * edge)
+        metal = (1 + gloss.several(albedo, rough)[0, c] * lost) * (albedo[0, c] + (1 - albedo[0, c]) * edge)
         plain = clear * (gloss.DIELECTRIC + (1 - gloss.DIELECTRIC) * edge)
         total[c] = (lobe * nl * ((1 - metallic) * plain + metallic * metal)).sum() * solid
     even = tuple(tuple(tuple(float(i == j == 3) for j in range(4)) for i in range(4)) for _ in range(3))

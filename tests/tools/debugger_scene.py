@@ -123,11 +123,11 @@ LOOKUP_MISTAKES = {
         [
             (
                 "include/light.glsl",
-                "vec3 n = normal * inversesqrt(max(dot(normal, normal), 1e-30));\n    return",
-                "vec3 n = normal;\n    return",
+                "vec3 n = normal * inversesqrt(max(dot(normal, normal), 1e-30));\n    float direct",
+                "vec3 n = normal;\n    float direct",
             )
         ],
-        "luminance_light",
+        "luminance_direct",
         "the interpolated normal is not normalised",
         {"ball"},
     ),
@@ -139,7 +139,7 @@ LOOKUP_MISTAKES = {
     ),
     "two-sided normal reversed": (
         [("include/needs.glsl", "gl_FrontFacing ? (way) : -(way)", "gl_FrontFacing ? -(way) : (way)")],
-        "luminance_light",
+        "luminance_direct",
         "the normal points the other way",
         {"floor"},
     ),

@@ -13,13 +13,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from blinkgl.config.sequence import RenderConfig, load_run
-from blinkgl.gl.shader import STAGES, ShaderError, ShaderLoader, expand, normalised, shader_folder
+from blinkgl.gl.shader import ShaderError, ShaderLoader, expand, normalised, shader_folder, stages_of
 from blinkgl.labels import LABELS, LabelRequest
 from blinkgl.render.painter import Painter
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.tools.shader_debugger import check, diagnostics, preprocess, timing, variants
-from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment
+from blinkgl.tools.shader_debugger.moments import GpuMoment, buffers_of
 from blinkgl.tools.shader_debugger.session import DebugRenderer, moment, open_folder, open_subject
 from debugger_scene import copy_shaders, edit
 
@@ -94,7 +94,7 @@ def sources(folder=None) -> dict[str, str]:
     out = {}
     for name in PRODUCTION:
         for defines in variants.variants(name):
-            for stage in STAGES:
+            for stage in stages_of(defines):
                 out[f"{name} {stage} {normalised(defines)}"] = hashlib.sha256(
                     expand(name, stage, defines, folder).text.encode()
                 ).hexdigest()
@@ -120,7 +120,7 @@ def test_production_programs_are_the_same_without_the_debugger(tmp_path, gl, con
     try:
         with DebugRenderer(gl, subject.scene, RenderConfig(image_antialiasing="none")) as renderer:
             made = GpuMoment(renderer, moment(subject), 1e-3)
-            for name in PASSES:
+            for name in buffers_of(subject.scene):
                 made[name]
         gl.shaders.clear()
     finally:
@@ -274,16 +274,15 @@ def test_show_is_what_the_compiler_gets(shader):
 def test_active_lines_compile_to_the_same_interface(gl, name):
     """The driver's preprocessor is the oracle: what is dropped must not matter to it."""
     for defines in [*(variants.variants(name) + variants.lookups(name))[::7], *variants.lookups(name)[-1:]]:
-        text = {stage: expand(name, stage, defines).text for stage in STAGES}
+        text = {stage: expand(name, stage, defines).text for stage in stages_of(defines)}
         kept = {}
-        for stage in STAGES:
+        for stage in text:
             version = text[stage].split("\n")[0]
             kept[stage] = (
                 "\n".join([version, *(line for _, line in preprocess.active_lines(text[stage], defines=True))]) + "\n"
             )
             assert "#if" not in kept[stage]
-        full = gl.ctx.program(vertex_shader=text["vertex"], fragment_shader=text["fragment"])
-        bare = gl.ctx.program(vertex_shader=kept["vertex"], fragment_shader=kept["fragment"])
+        full, bare = (gl.ctx.program(**{f"{stage}_shader": s for stage, s in one.items()}) for one in (text, kept))
         assert sorted(full) == sorted(bare)
         full.release(), bare.release()
 

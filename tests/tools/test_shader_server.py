@@ -20,7 +20,7 @@ from PIL import Image
 
 import webdriver
 from blinkgl.tools.shader_debugger import server as server_module
-from blinkgl.tools.shader_debugger.moments import PASSES
+from blinkgl.tools.shader_debugger.moments import buffers_of
 from blinkgl.tools.shader_debugger.server import LOCAL, MOST_OPEN, MOST_WAITING, THREADS, DebugServer, host_allowed
 from blinkgl.tools.shader_debugger.session import moment, open_subject
 from debugger_scene import HEIGHT, WIDTH, copy_shaders, edit
@@ -33,6 +33,11 @@ def served(config, tmp_path_factory):
     subject = open_subject(config)
     with DebugServer(subject, moment(subject), str(folder)) as server:
         yield server, folder
+
+
+def buffers(config: str) -> dict:
+    """What the page has of this configuration."""
+    return buffers_of(open_subject(config).scene)
 
 
 def ask(server, path: str, method: str = "GET", host: str | None = None):
@@ -60,7 +65,7 @@ def as_json(server, path: str):
 # ------------------------------------------------------------------------------------------------- routes
 
 
-def test_page_and_state(served):
+def test_page_and_state(served, config):
     server, _ = served
     for path, kind in (("/", "text/html"), ("/app.js", "text/javascript"), ("/style.css", "text/css")):
         status, headers, body = ask(server, path)
@@ -70,14 +75,14 @@ def test_page_and_state(served):
         assert "//cdn" not in text and "https://" not in text and "http://" not in text  # works offline
     state = as_json(server, "/state")
     assert (state["width"], state["height"], state["generation"], state["errors"]) == (WIDTH, HEIGHT, 1, [])
-    assert [p["name"] for p in state["passes"]] == list(PASSES)
+    assert [p["name"] for p in state["passes"]] == [*buffers(config)]
     status, _, body = ask(server, "/", "HEAD")
     assert status == 200 and body == b""
 
 
-def test_every_buffer_as_a_picture_from_both_sides(served):
+def test_every_buffer_as_a_picture_from_both_sides(served, config):
     server, _ = served
-    for name in PASSES:
+    for name in buffers(config):
         for source in ("gpu", "reference"):
             status, headers, body = ask(server, f"/image?pass={name}&source={source}&t=0.1")
             assert status == 200, body
@@ -442,7 +447,7 @@ def test_the_page_in_chromium(served, shader, config, tmp_path):
         page.wait("return document.body.dataset.ready === 'yes'")
         assert page.run("return document.title") == "BlinkGL shader debugger"
         assert page.run("return document.querySelector('#pane-a img').naturalWidth") == WIDTH
-        assert page.run("return document.querySelectorAll('#a option').length") == 2 * len(PASSES)
+        assert page.run("return document.querySelectorAll('#a option').length") == 2 * len(buffers(config))
 
         picture = (
             "const c = document.createElement('canvas'), i = document.querySelector(arguments[0]); c.width = "
@@ -471,7 +476,7 @@ def test_the_page_in_chromium(served, shader, config, tmp_path):
         assert (x, y) == (40, 45)
         status, out, _ = shader("probe", config, "--shaders", folder, "--time", 0.3, "--pixel", f"{x},{y}")
         assert status == 0
-        for name, info in PASSES.items():
+        for name, info in buffers(config).items():
             if name in ("triangle", "local"):  # told below
                 continue
             line = next(row[3:] for row in out.splitlines() if row[3:].startswith(f"{info.title} "))
@@ -482,7 +487,7 @@ def test_the_page_in_chromium(served, shader, config, tmp_path):
 
         page.run("document.querySelector('#compare').click()")
         page.wait("return document.querySelector('#verdict').className === 'good'", timeout=60)
-        assert "all 25 buffers agree" in page.text("#verdict") and page.text("#objects") == ""
+        assert "all 26 buffers agree" in page.text("#verdict") and page.text("#objects") == ""
         good = (folder / "luminance.glsl").read_text()
         edit(
             folder / "luminance.glsl",

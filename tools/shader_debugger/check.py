@@ -13,7 +13,7 @@ import moderngl
 
 from blinkgl.errors import ConfigError
 from blinkgl.gl import ShaderLoader, create_context
-from blinkgl.gl.shader import STAGES, ShaderError, ShaderSource, expand
+from blinkgl.gl.shader import GEOMETRY, STAGES, ShaderError, ShaderSource, expand, stages_of
 from blinkgl.tools.shader_debugger.diagnostics import Diagnostic, diagnose
 from blinkgl.tools.shader_debugger.preprocess import active_lines
 from blinkgl.tools.shader_debugger.session import EditedFolder, files_of, open_folder
@@ -86,7 +86,7 @@ def check_program(ctx: moderngl.Context, folder, name: str, result: Result) -> N
     for defines in wanted:
         sources: dict[str, ShaderSource] = {}
         try:
-            for stage in STAGES:
+            for stage in stages_of(defines):
                 sources[stage] = expand(name, stage, defines, folder)
             program = loader.program(name, defines)
         except ShaderError as error:
@@ -116,6 +116,8 @@ def unused(sources: dict[str, ShaderSource], members: set[str]) -> list[Diagnost
     text = {stage: active_lines(source.text) for stage, source in sources.items()}
     words = {stage: re.findall(r"\w+", "\n".join(line for _, line in lines)) for stage, lines in text.items()}
     inputs = {name for kind, name, *_ in _declarations(text["fragment"]) if kind == "in"}
+    if GEOMETRY in sources:  # which declares what it hands on by macros
+        inputs |= set(re.findall(r"\w+", sources[GEOMETRY].text))
     for stage, lines in text.items():
         for kind, name, number, column in _declarations(lines):
             mentioned = words[stage].count(name) > 1
@@ -239,12 +241,14 @@ def _defines(defines: dict) -> str:
 
 def show_source(program: str, defines: list[str], stage: str, active: bool, numbers: bool, shaders: str | None) -> str:
     """What ``blinkgl shader show`` prints. Raises ConfigError, ShaderError."""
-    if stage not in (*STAGES, "both"):
-        raise ConfigError("unknown stage", where="--stage", value=stage, accepted="vertex, fragment or both")
-    folder = open_folder(shaders)
     table = {name: value or "1" for name, _, value in (text.partition("=") for text in defines)}
+    if stage not in (*STAGES, GEOMETRY, "both"):
+        raise ConfigError(
+            "unknown stage", where="--stage", value=stage, accepted="vertex, geometry, fragment, or both for all"
+        )
+    folder = open_folder(shaders)
     out = []
-    for one in STAGES if stage == "both" else (stage,):
+    for one in stages_of(table) if stage == "both" else (stage,):
         source = expand(program, one, table, folder)
         if stage == "both":
             out.append(f"// ---- {one} stage of {program}\n")

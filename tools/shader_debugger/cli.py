@@ -140,7 +140,7 @@ def show(
     define: Annotated[
         list[str] | None, typer.Option("--define", "-D", metavar="NAME[=VALUE]", help="May be repeated.")
     ] = None,
-    stage: Annotated[str, typer.Option(help="vertex, fragment or both.")] = "both",
+    stage: Annotated[str, typer.Option(help="vertex, geometry, fragment, or both for all.")] = "both",
     active: Annotated[bool, typer.Option("--active", help="Only the lines that #if and #ifdef leave alive.")] = False,
     numbers: Annotated[bool, typer.Option("--numbers", help="File and line before each line.")] = False,
     shaders: Shaders = None,

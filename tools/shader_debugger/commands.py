@@ -11,9 +11,11 @@ from blinkgl.errors import OutputError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.tools.shader_debugger.compare import Comparison, Report, parse_tolerances
 from blinkgl.tools.shader_debugger.moments import (
+    MAPS,
     PASSES,
     GpuMoment,
     ReferenceMoment,
+    buffers_of,
     check_pass,
     lookup_of,
     open_reference,
@@ -33,7 +35,8 @@ def write_passes(
     from blinkgl.io import pictures
     from blinkgl.tools.shader_debugger import picture
 
-    names = [check_pass(name) for name in names] if names else list(PASSES)
+    there = buffers_of(subject.scene)
+    names = [check_pass(name, there) for name in names] if names else list(there)
     paths, tiles = [], []
     caption = (
         f"{Path(subject.path).name}, sequence {subject.index}, seed {subject.config.seed}, t = {when.t_ns * 1e-9:.6g} s"
@@ -59,6 +62,8 @@ def write_passes(
 
 def _meaningful(moment, info) -> np.ndarray | None:
     """Where a buffer's values mean something: where something is hit, or where the flow is valid."""
+    if info.name in MAPS:
+        return moment[info.name] > 0
     if info.name.startswith("flow_"):
         return moment[info.name.replace("flow", "valid")]
     everywhere = info.name in ("luminance", "log_luminance", "dL_dt")  # the background has them, too
@@ -84,7 +89,7 @@ def run_probe(subject: Subject, when: When, pixel: str, shaders: str | None = No
     """What ``blinkgl shader probe`` prints."""
     x, y = check_pixel(subject.scene, pixel)
     with open_renderer(subject, shaders) as renderer:
-        found = probe(GpuMoment(renderer, when, subject.log_eps), open_reference(subject, when), x, y)
+        found = probe(GpuMoment(renderer, when, subject.log_eps), open_reference(subject, when, renderer.maps), x, y)
     return json.dumps(_finite(found)) if as_json else as_text(found)
 
 
@@ -102,9 +107,12 @@ def run_diff(
     from blinkgl.tools.shader_debugger.compare import QUANTITIES
 
     if names:
-        names = [check_pass(name, QUANTITIES) for name in names]
+        there = buffers_of(subject.scene)
+        names = [check_pass(name, [known for known in QUANTITIES if known in there]) for name in names]
     with open_renderer(subject, shaders) as renderer:
-        comparison = Comparison(GpuMoment(renderer, when, subject.log_eps), open_reference(subject, when))
+        comparison = Comparison(
+            GpuMoment(renderer, when, subject.log_eps), open_reference(subject, when, renderer.maps)
+        )
         names = names or comparison.names()
         limits = parse_tolerances(tolerances, names)
         reports = [comparison.report(name, limits.get(name)) for name in names]

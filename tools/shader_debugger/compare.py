@@ -29,13 +29,17 @@ from blinkgl.errors import ConfigError
 from blinkgl.labels.grading import length
 from blinkgl.labels.label import Label, View
 from blinkgl.render import reference
+from blinkgl.scene.lights import is_coloured
 from blinkgl.scene.types import Material
+from blinkgl.tools.shader_debugger.lamps import near_an_edge
 from blinkgl.tools.shader_debugger.mipmaps import mipmapped_albedo
 from blinkgl.tools.shader_debugger.moments import (
+    MAPS,
     PASSES,
     GpuMoment,
     OfLabels,
     ReferenceMoment,
+    buffers_of,
     check_pass,
     lookup_of,
     luma_of,
@@ -93,6 +97,11 @@ def _pixels_of_texture(g, r, gpu, ref):
     return length((shift - np.rint(shift)) * ref["texture_size"]) / np.exp2(ref["level"])
 
 
+def _of_the_lamps(g, r, gpu, ref):
+    """What a wrong shadow does to the light: where a lamp hardly shines nobody sees its shadow."""
+    return np.abs(g.astype(np.float64) - r) * np.minimum(ref["direct"], 1.0)
+
+
 def _misplaced(g, r, gpu, ref):
     return length(displaced(gpu, ref))
 
@@ -101,6 +110,8 @@ _TWIN = "against a CPU twin of mip-mapped sampling at the GPU's own uv and level
 _SHADING = "against the GPU's own albedo times its own light, and what it adds"
 _MAPPED = "not graded where a map says how a surface shines, which the reference has without mip maps"
 _LEVEL = "drivers may approximate the level (OpenGL 4.6, 8.14.1)"
+_EDGES = "not graded near the edge of a shadow, nor where light grazes: there a map is off by its texels"
+_MAP = "off its silhouettes; with what throws its shadow out of the picture, too"
 _MIPS = "against a CPU twin of mip-mapped sampling; drivers may make mip maps differently, hence the loose tolerance"
 
 
@@ -111,9 +122,13 @@ def _shading(name: str, unit: str) -> tuple[Quantity, ...]:
         Quantity(f"{name}_level", "levels", 0.6, _absolute, note=_LEVEL, fit=1.0),
         # sRGB textures of 8 bits: llvmpipe rounds each of their mip levels to 8 bits again, 0.025 after ten
         Quantity(f"{name}_albedo", "linear", 0.05 if name == "colour" else 0.03, _absolute, note=_TWIN, fit=1.0),
-        Quantity(f"{name}_light", "1", 1e-4, _absolute, note=_MAPPED),
+        Quantity(f"{name}_direct", "1", 1e-4, _relative, note=_MAPPED),
+        Quantity(f"{name}_shadow", "light", 1e-3, _of_the_lamps, note=_EDGES),
+        Quantity(f"{name}_around", "1", 1e-4, _relative, note=_MAPPED),
+        Quantity(f"{name}_light", "1", 1e-4, _relative, note=_MAPPED),
         # a highlight is steep: float32's normal is 1e-7 off, and a mirror's lobe 0.0025 wide
-        Quantity(f"{name}_added", "linear", 2e-3, _relative, note=_MAPPED),
+        Quantity(f"{name}_mirrored", "linear", 2e-3, _relative, note=_MAPPED),
+        Quantity(f"{name}_emission", "linear", 1e-4, _relative, note=_MAPPED),
         Quantity(name, unit, 1e-4, _absolute, note=_SHADING),
     )
 
@@ -129,6 +144,7 @@ _BEFORE = (
     ),
 )
 _SHADED = (
+    *(Quantity(name, "depth", 1e-3, _absolute, same_triangle=False, note=_MAP) for name in MAPS),
     *_shading("luminance", "linear"),
     *_shading("colour", "linear radiance"),
     Quantity("dL_dt", "luminance over the step", 0.05, _per_step, note=_MIPS),
@@ -144,6 +160,12 @@ def _of_label(label: Label, view: View) -> Quantity:
 
 QUANTITIES = OfLabels(_of_label, _BEFORE, _SHADED)
 """In the order in which a pass makes them: the first that is wrong is where to look."""
+LIT = ("direct", "shadow", "around", "light", "mirrored", "emission")
+MAP_JUMP = 0.005
+"""A second difference of a shadow map above this part of its depth is an edge."""
+COLOURED = 10.0
+"""In coloured light a term is weighed by the colours of the albedo, which mip maps of 8 bits know no better: so much
+wider are tolerances."""
 NEEDS_ISOTROPIC = ("luminance_level", "luminance_albedo", "colour_level", "colour_albedo", "dL_dt")
 
 
@@ -252,6 +274,8 @@ class Comparison:
         self.gpu, self.ref = gpu, ref
         frame = ref.frame
         self.band = reference.silhouette_band(frame.instance, frame.depth)
+        self._coloured = is_coloured(ref.scene.light)
+        self._shadow_edges: dict[int, np.ndarray] = {}
         self.same_triangle = (gpu["part"] == ref["part"]) & ((gpu["triangle"] == ref["triangle"]) | ~frame.hit)
         things = [thing for thing, _ in reference.scene_parts(ref.scene)]
         names = [thing.name or f"object {thing.instance_id}" for thing in ref.scene.objects]
@@ -267,10 +291,30 @@ class Comparison:
         there, or, for the local position, the one that was drawn."""
         return self._object_of_part[(self.gpu if name == "local" else self.ref)["part"]]
 
+    def tolerance(self, name: str) -> float:
+        """Of a buffer of this scene, where nobody says another."""
+        wider = COLOURED if lookup_of(name)[1] in ("direct", "around", "light") and self._coloured else 1.0
+        return wider * QUANTITIES[name].tolerance
+
+    def shadow_edges(self, t_ns: int) -> np.ndarray:
+        """(H, W) bool: where shadows are not graded."""
+        if t_ns not in self._shadow_edges:
+            frame, maps = self.ref.at(t_ns), self.ref.maps
+            self._shadow_edges[t_ns] = (
+                near_an_edge(self.ref.scene, frame, maps) if maps else np.zeros(frame.hit.shape, bool)
+            )
+        return self._shadow_edges[t_ns]
+
+    def map_band(self, name: str) -> np.ndarray:
+        """(texels, texels) bool: silhouettes of a shadow map."""
+        depth = self.ref[name]
+        with np.errstate(divide="ignore"):
+            return reference.silhouette_band(depth > 0, 1.0 / depth, jump=MAP_JUMP)
+
     def names(self) -> list[str]:
         """Every buffer that can be graded here."""
-        isotropic = self.gpu.renderer.config.anisotropy <= 1
-        return [name for name in QUANTITIES if isotropic or name not in NEEDS_ISOTROPIC]
+        isotropic, there = self.gpu.renderer.config.anisotropy <= 1, buffers_of(self.ref.scene)
+        return [name for name in QUANTITIES if name in there and (isotropic or name not in NEEDS_ISOTROPIC)]
 
     def pair(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """(GPU, what it is graded against); equal shapes."""
@@ -279,8 +323,12 @@ class Comparison:
         if what == "albedo":
             return gpu[name], self.twin(of)
         if name in ("luminance", "colour"):
-            shaded = gpu[f"{name}_albedo"].astype(np.float64) * gpu[f"{name}_light"][..., None]
-            shaded = shaded + gpu[f"{name}_added"]
+            light = gpu["colour_light_rgb"] if name == "colour" else gpu["luminance_light"][..., None]
+            shaded = gpu[f"{name}_albedo"].astype(np.float64) * light
+            shaded = shaded + gpu[f"{name}_mirrored"] + gpu[f"{name}_emission"]
+            shaded = reference.seen_through_fog(ref.scene, ref.frame.hits(), shaded.reshape(-1, 3)).reshape(
+                shaded.shape
+            )
             shaded = shaded if name == "colour" else shaded[..., 0]
             hit = ref.frame.hit if name == "luminance" else ref.frame.hit[..., None]
             return gpu[name], np.where(hit, shaded, ref[name])
@@ -329,10 +377,14 @@ class Comparison:
     def report(self, name: str, tolerance: float | None = None) -> Report:
         quantity = QUANTITIES[name]
         errors = self.errors(name)
-        graded = ~self.band
+        of_map = name in MAPS
+        band = self.map_band(name) if of_map else self.band
+        graded = ~band
         if quantity.same_triangle:
             graded &= self.same_triangle
-        if lookup_of(name)[1] in ("light", "added"):
+        if lookup_of(name)[1] in ("shadow", "light", "mirrored"):
+            graded &= ~self.shadow_edges(self.gpu.when.t_ns)
+        if lookup_of(name)[1] in LIT:
             for p, (_, part) in enumerate(reference.scene_parts(self.ref.scene)):
                 if is_mapped(part.material):
                     graded &= self.ref.frame.part != p
@@ -341,29 +393,29 @@ class Comparison:
                 other, drawn = self.ref.at(t_ns), self.gpu.renderer.inspect(t_ns)
                 graded &= ~reference.silhouette_band(other.instance, other.depth) & (other.part == self.ref["part"])
                 graded &= (drawn["TRIANGLE"] == other.triangle + 1) & (drawn["LOCAL"][..., 3] == other.part + 1)
+                graded &= ~self.shadow_edges(t_ns)
         if name == "local":
             graded &= self.gpu["part"] >= 0
         inside = errors[graded]
         value = (float(inside.mean()) if quantity.statistic == "mean" else float(inside.max())) if inside.size else 0.0
-        report = Report(
-            quantity, quantity.tolerance if tolerance is None else tolerance, errors, graded, self.band, value
-        )
+        report = Report(quantity, self.tolerance(name) if tolerance is None else tolerance, errors, graded, band, value)
         report.objects = self._per_object(report)
-        if not report.passed:
+        if not report.passed and not of_map:
             report.suspicions = pose_suspicions(self, report) if name == "local" else suspicions(self, report)
         return report
 
     def _per_object(self, report: Report) -> list[dict]:
         name = report.quantity.name
         g, r = self.pair(name)
-        owner, out = self.owner(name), []
+        owner = np.full(report.errors.shape, len(self.objects) - 1) if name in MAPS else self.owner(name)
+        out = []
         for k in np.unique(owner[report.graded]):
             rows = np.flatnonzero((report.graded & (owner == k)).ravel())
             errors = report.errors.ravel()[rows]
             y, x = np.unravel_index(rows[errors.argmax()], owner.shape)
             out.append(
                 {
-                    "object": self.objects[k],
+                    "object": name if name in MAPS else self.objects[k],
                     "pixels": len(rows),
                     "over_tolerance": int((errors > report.limit).sum()),
                     "median": _at(errors, 0.5),
@@ -373,7 +425,7 @@ class Comparison:
                     "error": float(errors.max()),
                     "gpu": g[y, x].tolist(),
                     "reference": r[y, x].tolist(),
-                    "triangle": int(self.ref["triangle"][y, x]) - 1,
+                    "triangle": -1 if name in MAPS else int(self.ref["triangle"][y, x]) - 1,
                 }
             )
         return sorted(out, key=lambda one: -one["max"])[:WORST]

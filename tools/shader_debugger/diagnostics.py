@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
-from blinkgl.gl.shader import STAGES, ShaderError, ShaderSource, made_includes
+from blinkgl.gl.shader import ShaderError, ShaderSource, made_includes
 
 # Mesa "0:12(5): error: …", NVIDIA "0(12) : error C1503: …", AMD, Intel, Apple "ERROR: 0:12: …".
 _MESSAGES = (
@@ -75,7 +75,7 @@ def diagnose(error: ShaderError, sources: Mapping[str, ShaderSource], folder) ->
         text = " ".join(
             line.strip() for line in error.log.splitlines() if line.strip(" =") and not _STAGE.match(line.strip())
         )
-        for stage in (s for s in reversed(STAGES) if s in sources):
+        for stage in reversed(sources):
             for name in _QUOTED.findall(text):
                 if place := _declaration(sources[stage], name):
                     return [Diagnostic(*place, "error", text, stage, excerpt(folder, *place))]

@@ -12,13 +12,20 @@ import numpy as np
 
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.gl import ShaderLoader
-from blinkgl.gl.shader import STAGES, ShaderError, expand
+from blinkgl.gl.shader import ShaderError, expand, stages_of
 from blinkgl.io import pictures
 from blinkgl.tools.shader_debugger import picture
 from blinkgl.tools.shader_debugger.commands import _finite, _meaningful
 from blinkgl.tools.shader_debugger.compare import Comparison
 from blinkgl.tools.shader_debugger.diagnostics import Diagnostic, diagnose
-from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment, ReferenceMoment, open_reference
+from blinkgl.tools.shader_debugger.moments import (
+    PASSES,
+    GpuMoment,
+    ReferenceMoment,
+    buffers_of,
+    check_pass,
+    open_reference,
+)
 from blinkgl.tools.shader_debugger.probe import _numbers, _surface_text, probe
 from blinkgl.tools.shader_debugger.questions import SOURCES
 from blinkgl.tools.shader_debugger.session import (
@@ -79,7 +86,7 @@ class Inspector:
 
     def _draw_all(self, when: When) -> GpuMoment:
         made = GpuMoment(self.renderer, when, self.subject.log_eps)
-        for name in PASSES:
+        for name in buffers_of(self.subject.scene):
             made[name]
         return made
 
@@ -92,7 +99,7 @@ class Inspector:
         return _kept(self._gpu, key, lambda: GpuMoment(self.renderer, when, self.subject.log_eps))
 
     def reference(self, when: When) -> ReferenceMoment:
-        return _kept(self._reference, when.t_ns, lambda: open_reference(self.subject, when))
+        return _kept(self._reference, when.t_ns, lambda: open_reference(self.subject, when, self.renderer.maps))
 
     def _comparison(self, when: When) -> Comparison:
         gpu, ref = self.gpu(when), self.reference(when)
@@ -121,7 +128,7 @@ class Inspector:
             "folder": str(getattr(self.folder, "path", self.folder)),
             "passes": [
                 {"name": p.name, "title": p.title, "unit": p.unit, "kind": p.kind, "source": p.source}
-                for p in PASSES.values()
+                for p in buffers_of(scene).values()
             ],
         }
 
@@ -130,7 +137,7 @@ class Inspector:
 
     def image(self, q: dict[str, Any]) -> tuple[bytes, dict]:
         """PNG and legend of one buffer. q : as :func:`questions.read_query` gives it, here and below."""
-        when, name = self._when(q["t"]), q["pass"]
+        when, name = self._when(q["t"]), check_pass(q["pass"], buffers_of(self.subject.scene), "pass")
         source = self.gpu(when) if q["source"] == "gpu" else self.reference(when)
         info = PASSES[name]
         rgb, legend = pictures.picture(
@@ -147,6 +154,8 @@ class Inspector:
     def difference(self, q: dict[str, Any]) -> tuple[bytes, dict]:
         """PNG and legend of |A - B|, on a logarithmic scale unless q's low is 0."""
         when = self._when(q["t"])
+        for key in "ab":
+            check_pass(q[key][0], buffers_of(self.subject.scene), key)
         a, b = (
             np.asarray((self.gpu(when) if source == "gpu" else self.reference(when))[name], np.float64)
             for name, source in (q["a"], q["b"])
@@ -228,7 +237,8 @@ class Inspector:
 
     def _sources(self, loader: _Loader) -> dict:
         try:
-            return {stage: expand(loader.asked[0], stage, loader.asked[1], loader.folder) for stage in STAGES}
+            name, defines = loader.asked
+            return {stage: expand(name, stage, defines, loader.folder) for stage in stages_of(defines)}
         except ShaderError:
             return {}
 

@@ -14,7 +14,10 @@ from blinkgl.labels import LABELS, LabelRequest
 from blinkgl.labels.label import Label, View
 from blinkgl.render import reference
 from blinkgl.render.colour import LUMA
+from blinkgl.render.passes.shadow import ShadowMap
+from blinkgl.scene.lights import MAX_SHADOWS, shadowing
 from blinkgl.scene.types import Scene
+from blinkgl.tools.shader_debugger.lamps import map_of
 from blinkgl.tools.shader_debugger.mipmaps import mipmapped_albedo
 from blinkgl.tools.shader_debugger.session import LOOKUPS as LOOKUP_PASSES, DebugRenderer, Subject, When
 
@@ -34,8 +37,12 @@ class Pass:
     source: str
 
 
-LOOKUPS = ("uv", "level", "albedo", "light", "added")
-"""What a textured pass shows of its way to the result, in the order in which it happens."""
+LOOKUPS = ("uv", "level", "albedo", "direct", "shadow", "around", "light", "mirrored", "emission")
+"""What a pass that is lit shows of its way to the result, in the order in which it happens: albedo · light + mirrored +
+emission, where the light of what is matt is direct · shadow + around."""
+TERMS = LOOKUPS[3:6]
+MAPS = tuple(f"shadow_map_{k}" for k in range(MAX_SHADOWS))
+"""Buffers that are a lamp's picture, not the camera's."""
 
 
 def _lookups(name: str, program: str) -> tuple[Pass, ...]:
@@ -44,8 +51,12 @@ def _lookups(name: str, program: str) -> tuple[Pass, ...]:
         Pass(f"{name}_uv", f"uv of {name}", "texture repeats", "uv", source),
         Pass(f"{name}_level", f"level of {name}", "log2(texels per px)", "scalar", source),
         Pass(f"{name}_albedo", f"albedo of {name}", "linear", "light", source),
+        Pass(f"{name}_direct", f"lamps of {name}", "irradiance factor, without shadows", "scalar", source),
+        Pass(f"{name}_shadow", f"shadow factor of {name}", "share of the lamps' light", "scalar", source),
+        Pass(f"{name}_around", f"environment of {name}", "irradiance factor", "scalar", source),
         Pass(f"{name}_light", f"light of {name}", "irradiance factor", "scalar", source),
-        Pass(f"{name}_added", f"mirrored and own light of {name}", "linear", "light", source),
+        Pass(f"{name}_mirrored", f"mirrored light of {name}", "linear", "light", source),
+        Pass(f"{name}_emission", f"emission of {name}", "linear", "light", source),
     )
 
 
@@ -54,6 +65,7 @@ _BEFORE = (
     Pass("local", "local position", "object axes", "scalar", "debug.glsl OUT_LOCAL"),
 )
 _SHADED = (
+    *(Pass(name, name.replace("_", " "), "depth, 0: nothing casts", "scalar", "shadow.glsl") for name in MAPS),
     *_lookups("luminance", LOOKUP_PASSES["luminance"].program),
     Pass("luminance", "luminance", "linear", "scalar", "luminance.glsl"),
     *_lookups("colour", LOOKUP_PASSES["colour"].program),
@@ -105,6 +117,24 @@ def _of_label(label: Label, view: View) -> Pass:
 PASSES = OfLabels(_of_label, _BEFORE, _SHADED)
 
 
+def buffers_of(scene: Scene) -> dict[str, Pass]:
+    """Those of :data:`PASSES` that a scene has: of one without shadows no shadow maps, and so on."""
+    maps = len(shadowing(scene.light)) if reference.casts(scene) else 0
+    materials = [part.material for _, part in reference.scene_parts(scene) if not part.material.unlit]
+    there = {
+        "shadow": maps > 0,
+        "mirrored": any(material.gloss is not None for material in materials),
+        "emission": any(any(material.emission) for material in materials),
+    }
+    return {
+        name: info
+        for name, info in PASSES.items()
+        if there.get(lookup_of(name)[1], True)
+        and name not in MAPS[maps:]
+        and ((found := view_of(name)) is None or found[0].can_be_of(scene))
+    }
+
+
 def view_of(name: str) -> tuple[Label, View] | None:
     """The label that has this buffer, and its view; None: it is no label's."""
     return next(((label, view) for label in LABELS.values() for view in label.views if view.name == name), None)
@@ -141,7 +171,7 @@ class _Lazy:
 class GpuMoment(_Lazy):
     """What the GPU wrote. Besides :data:`PASSES`: part (H, W) int32, -1: nothing hit; window (H, W, 4) gl_FragCoord;
     next_depth_forward|backward (H, W), the depth at t' that the flow program returns; luminance_count, colour_count (H,
-    W), the number of texture look-ups at the pixel.
+    W), the number of texture look-ups at the pixel; colour_light_rgb (H, W, 3), its light in colour.
 
     Conventions: depth inf, flow 0 and id 0 where nothing is hit; velocity 0 there.
     """
@@ -161,12 +191,14 @@ class GpuMoment(_Lazy):
         if name == "dL_dt":
             change = draw.luminance(when.after_ns).read() - draw.luminance(when.before_ns).read()
             return {name: change / np.float32(when.step_s)}
+        if name in MAPS:
+            return {name: draw.shadow_map(MAPS.index(name), when.t_ns)}
         if name in ("triangle", "part", "local", "window"):
             return self._inspect()
-        if name.endswith("_count") or lookup_of(name)[0]:
-            of = name.rpartition("_")[0]
+        if name.endswith(("_count", "_light_rgb")) or lookup_of(name)[0]:
+            of = name.partition("_")[0]
             shown = draw.lookups(of, when.t_ns)
-            return {f"{of}_{key}": shown[key] for key in (*LOOKUPS, "count")}
+            return {f"{of}_{key}": shown[key] for key in (*LOOKUPS, "light_rgb", "count")}
         if name.startswith("next_depth_"):
             way = name.removeprefix("next_depth_")
             raw = draw.raw(when.t_ns, f"flow_{way}", forward_ns=when.forward_ns, backward_ns=when.backward_ns)
@@ -199,12 +231,17 @@ class ReferenceMoment(_Lazy):
     that level by the CPU twin in :mod:`mipmaps`, because the reference itself has no mip maps; its own values, at full
     resolution, are albedo_level0, colour_level0 and luminance_level0.   texture_size : (H, W,
     2) texels, 1 where there is no texture.
-    light : of the luminance of what the surface is made of: coloured light takes of each colour as much as it has.
-    uv, level, albedo, light : what both passes should look up; luminance_albedo is the luminance of albedo.
+    light, and its terms : of the luminance of what the surface is made of: coloured light takes of each colour as much
+    as it has.
+    uv, level, albedo, light … : what both passes should look up; luminance_albedo is the luminance of albedo.
+    shadow_map_0 … : as ``maps``, those of the renderer, lie.
     """
 
-    def __init__(self, scene: Scene, when: When, log_eps: float, mip_bias: float = 0.0):
+    def __init__(
+        self, scene: Scene, when: When, log_eps: float, mip_bias: float = 0.0, maps: tuple[ShadowMap, ...] = ()
+    ):
         super().__init__()
+        self.maps = maps
         self.scene, self.when, self.log_eps, self.mip_bias = scene, when, log_eps, mip_bias
         self._frame: reference.ReferenceFrame | None = None
         self._others: dict[int, reference.ReferenceFrame] = {}
@@ -235,6 +272,8 @@ class ReferenceMoment(_Lazy):
                 raise TypeError(f"label '{label.name}': `reference` fails: {error}") from error
         if name.endswith("_level0"):
             return {name: getattr(frame, name.removesuffix("_level0"))}
+        if name in MAPS:
+            return {name: map_of(self.scene, self.when.t_ns, self.maps[MAPS.index(name)])[0]}
         if name == "triangle":
             return {name: frame.triangle + 1}
         if name == "part":
@@ -248,7 +287,7 @@ class ReferenceMoment(_Lazy):
             return {name: (after - before) / self.when.step_s}
         of, what = lookup_of(name)
         if of:
-            grey = name in ("luminance_albedo", "luminance_added")
+            grey = of == "luminance" and what in ("albedo", "mirrored", "emission")
             return {name: luma_of(self[what]) if grey else self[what]}
         if name in (*LOOKUPS, "colour", "luminance", "texture_size"):
             return self._surface(self.when.t_ns)
@@ -266,7 +305,8 @@ class ReferenceMoment(_Lazy):
             np.zeros((*shape, 3)),
             np.ones((*shape, 2)),
         )
-        lit, added = albedo.copy(), albedo.copy()
+        lit, mirrored, emission = (albedo.copy() for _ in range(3))
+        direct, around, shadow = (light.copy() for _ in range(3))
         xy = reference.pixel_grid(scene.camera).reshape(*shape, 2)
         for p, (thing, part) in enumerate(reference.scene_parts(scene)):
             on = frame.part == p
@@ -291,30 +331,45 @@ class ReferenceMoment(_Lazy):
             if part.mesh.colours is not None:
                 corners = part.mesh.colours[part.mesh.faces[frame.triangle[on]]].astype(np.float64)
                 albedo[on] *= np.einsum("nc,nck->nk", frame.bary[on], corners)
-            lit[on], light[on] = albedo[on], 1.0
+            lit[on], light[on], shadow[on] = albedo[on], 1.0, 1.0
             if not part.material.unlit:
                 hits, rows = frame.hits(), np.flatnonzero(on.ravel())
                 sent = reference.radiated(scene, hits, rows, albedo[on], frame.normal[on], frame.uv[on])
                 lit[on] *= sent.matt
-                grey = albedo[on] @ LUMA
-                light[on] = np.where(grey > 0, lit[on] @ LUMA / np.where(grey > 0, grey, 1.0), sent.matt @ LUMA)
-                added[on] = sent.added
-        colour = np.where(frame.hit[..., None], lit + added, frame.colour)
+                weights = albedo[on] * LUMA
+                weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-30)
+
+                def seen(light, weights=weights):
+                    return (light * weights).sum(axis=1)
+
+                light[on], around[on], direct[on] = (
+                    seen(one) for one in (sent.matt, sent.light.around, sent.light.open.sum(axis=0))
+                )
+                arrives = seen(sent.light.direct.sum(axis=0))
+                shadow[on] = np.where(direct[on] > 0, arrives / np.maximum(direct[on], 1e-30), 1.0)
+                mirrored[on], emission[on] = sent.mirrored, sent.emission
+        radiance = lit + mirrored + emission
+        in_fog = reference.seen_through_fog(scene, frame.hits(), radiance.reshape(-1, 3)).reshape(radiance.shape)
+        colour = np.where(frame.hit[..., None], in_fog, frame.colour)
         return {
             "uv": uv,
             "light": light,
             "level": level,
             "albedo": albedo,
-            "added": added,
+            "direct": direct,
+            "shadow": shadow,
+            "around": around,
+            "mirrored": mirrored,
+            "emission": emission,
             "colour": colour,
             "luminance": colour @ LUMA,
             "texture_size": size,
         }
 
 
-def open_reference(subject: Subject, when: When) -> ReferenceMoment:
-    """What the GPU should write for this subject."""
-    return ReferenceMoment(subject.scene, when, subject.log_eps, subject.config.render.mip_bias)
+def open_reference(subject: Subject, when: When, maps: tuple[ShadowMap, ...] = ()) -> ReferenceMoment:
+    """What the GPU should write for this subject. maps : of the renderer that draws it."""
+    return ReferenceMoment(subject.scene, when, subject.log_eps, subject.config.render.mip_bias, maps)
 
 
 def luma_of(albedo: np.ndarray) -> np.ndarray:

@@ -9,7 +9,8 @@ from blinkgl.render import reference
 from blinkgl.render.probe import probe as reference_probe
 from blinkgl.render.renderer import Renderer
 from blinkgl.tools.shader_debugger.compare import QUANTITIES, Comparison
-from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment, ReferenceMoment
+from blinkgl.tools.shader_debugger.lamps import place_in
+from blinkgl.tools.shader_debugger.moments import MAPS, PASSES, GpuMoment, ReferenceMoment, buffers_of, lookup_of
 
 
 def ulps(gpu: np.ndarray, ref: np.ndarray) -> float:
@@ -32,8 +33,8 @@ def probe(gpu: GpuMoment, ref: ReferenceMoment, x: int, y: int, comparison: Comp
     buffers  : rows of name, unit, gpu, reference, error, error_unit, ulps, ok (None: not graded here), note.
     surface  : what the reference hit: object, category, instance, part, triangle, front, bary, corners …, and what the
     GPU drew. positions: rows of name, gpu, reference (4 or 3 numbers each): local, camera, world, clip, window at t and
-    t'. why      : per direction, the reference's reason and the GPU's own for invalid or
-                 occluded ("": seen at both times).
+    t', and of each shadow map where in it (texels), how deep, and what it holds there.
+    why : per direction, the reference's reason and the GPU's own for invalid or occluded ("": seen at both times).
     """
     comparison = comparison or Comparison(gpu, ref)
     scene, when = ref.scene, gpu.when
@@ -47,7 +48,9 @@ def probe(gpu: GpuMoment, ref: ReferenceMoment, x: int, y: int, comparison: Comp
         "times_s": {"forward": when.forward_ns * 1e-9, "backward": when.backward_ns * 1e-9},
         "band": bool(comparison.band[y, x]),
         "buffers": [
-            _row(name, gpu, ref, comparison, x, y) for name in PASSES if name not in ("triangle", "local")
+            _row(name, gpu, ref, comparison, x, y)
+            for name in buffers_of(scene)
+            if name not in ("triangle", "local", *MAPS)
         ],  # told below
         "surface": {
             "gpu": _surface(
@@ -92,9 +95,10 @@ def _row(name, gpu, ref, comparison, x, y) -> dict:
     if name in comparison.names() and name in QUANTITIES:
         quantity = QUANTITIES[name]
         error = float(comparison.errors(name)[y, x])
-        row["ok"] = (
-            None if comparison.band[y, x] else error <= (quantity.tolerance if quantity.statistic == "max" else 0.5)
+        skipped = comparison.band[y, x] or (
+            lookup_of(name)[1] in ("shadow", "light", "mirrored") and comparison.shadow_edges(gpu.when.t_ns)[y, x]
         )
+        row["ok"] = None if skipped else error <= (comparison.tolerance(name) if quantity.statistic == "max" else 0.5)
         if name in ("luminance", "colour"):
             row["note"] = (
                 "of the GPU's own albedo and light: "
@@ -145,7 +149,7 @@ def _positions(gpu, ref, x, y, seen) -> list[dict]:
     scene, when = ref.scene, gpu.when
     P = scene.camera.clip_from_cam()
     size = np.array([scene.camera.width, scene.camera.height], float)
-    rows = []
+    rows: list[dict] = []
 
     def add(name, g, r):
         rows.append({"name": name, "gpu": _plain(g), "reference": _plain(r)})
@@ -185,6 +189,15 @@ def _positions(gpu, ref, x, y, seen) -> list[dict]:
             [x, y] + gpu[f"flow_{way}"][y, x].astype(np.float64) if gpu[f"valid_{way}"][y, x] else None,
             later.xy_to,
         )
+    for k, one in enumerate(ref.maps):
+        here = {}
+        for side, moment, at in (("gpu", gpu, world(when.t_ns)), ("reference", ref, point.world)):
+            there = None if at is None else place_in(one, when.t_ns, at)
+            if there is not None:
+                x_map, y_map = (int(np.clip(v, 0, one.texels - 1)) for v in there[:2])
+                there = np.array([*there, moment[MAPS[k]][y_map, x_map]])
+            here[side] = there
+        add(f"{MAPS[k]}: x, y, depth; map", here["gpu"], here["reference"])
     return rows
 
 

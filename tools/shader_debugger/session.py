@@ -18,8 +18,10 @@ from blinkgl.config.sequence import NS_PER_S, SequenceConfig, load_run
 from blinkgl.errors import ConfigError, GLError
 from blinkgl.gl import GLContext, ShaderLoader, create_context
 from blinkgl.gl.shader import ShaderError, expand, shader_folder
+from blinkgl.render.canvas import DEPTH_BUFFER
 from blinkgl.render.painter import Painter
 from blinkgl.render.passes import Colour, Geometry, Luminance, Output, ScenePass
+from blinkgl.render.passes.shadow import ShadowMap
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import check_assets, sequence_scene
 from blinkgl.scene.geometry.lod import at_level_of_detail
@@ -253,7 +255,7 @@ class Inspection(ScenePass):
         uniforms["part_number"].value = item.part + 1
 
 
-SHOWN = (Output("lookup", "RGBA32F"), Output("albedo", "RGBA32F"), Output("added", "RGBA32F"))
+SHOWN = tuple(Output(name, "RGBA32F") for name in ("lookup", "albedo", "mirrored", "emission", "terms", "light"))
 """What the variant SHOW_LOOKUP writes beside a pass's own output."""
 
 
@@ -281,6 +283,17 @@ class ColourLookup(Colour):
         return super().defines(kind) | {"SHOW_LOOKUP": 1}
 
 
+@dataclass(frozen=True)
+class WholeShadowMap(ShadowMap):
+    """With all that casts, also what throws its shadow out of the picture."""
+
+    def stands_still(self, whole: bool) -> bool:
+        return False
+
+    def items(self, moment):
+        return [item for item in moment.visible if item.casts]
+
+
 LOOKUPS = {"luminance": LuminanceLookup(), "colour": ColourLookup()}
 """Passes that show what they look up. One sample at the pixel's centre, whatever the anti-aliasing."""
 
@@ -304,9 +317,9 @@ class DebugRenderer(Renderer):
 
     def lookups(self, name: str, t_ns: int) -> dict[str, np.ndarray]:
         """What the pass "luminance" or "colour" looks up and multiplies, float32, as its own source says it (variant
-        SHOW_LOOKUP): result (H, W[, 3]) as the pass writes it; uv (H, W, 2); level, light, count (H, W), the number of
-        look-ups; albedo, added (H, W, 3). One sample at the pixel's centre whatever the anti-aliasing; 0 where nothing
-        is hit.
+        SHOW_LOOKUP): result (H, W[, 3]) as the pass writes it; uv (H, W, 2); level, count (H, W), the number of
+        look-ups; light, and its terms direct, shadow, around (H, W); albedo, mirrored, emission, light_rgb (H, W, 3).
+        One sample at the pixel's centre whatever the anti-aliasing; 0 where nothing is hit.
 
         Raises ShaderError when the source shows nothing (a copy that is older than the debugger)."""
         program = LOOKUPS[name].program
@@ -318,11 +331,11 @@ class DebugRenderer(Renderer):
             raise ShaderError(
                 "does not show what it looks up",
                 where=program,
-                accepted='#include "lookup.glsl" and show_lookup(albedo, light) under #ifdef SHOW_LOOKUP, as in the '
+                accepted='#include "lookup.glsl" and show_lookup(albedo, light, …) under #ifdef SHOW_LOOKUP, as in the '
                 "shipped file",
             )
         frame = self.draw(replace(LOOKUPS[name], shadows=self._shadows), t_ns)
-        lookup, albedo = frame.read("lookup"), frame.read("albedo")
+        lookup, albedo, terms = frame.read("lookup"), frame.read("albedo"), frame.read("terms")
         return {
             "result": frame.read(name),
             "uv": lookup[..., :2],
@@ -330,8 +343,25 @@ class DebugRenderer(Renderer):
             "light": lookup[..., 3],
             "albedo": albedo[..., :3],
             "count": albedo[..., 3],
-            "added": frame.read("added")[..., :3],
+            "direct": terms[..., 0],
+            "shadow": terms[..., 1],
+            "around": terms[..., 2],
+            "mirrored": frame.read("mirrored")[..., :3],
+            "emission": frame.read("emission")[..., :3],
+            "light_rgb": frame.read("light")[..., :3],
         }
+
+    @property
+    def maps(self) -> tuple[ShadowMap, ...]:
+        """Of the lamps that cast shadows, in the shaders' order."""
+        return self._shadows
+
+    def shadow_map(self, k: int, t_ns: int) -> np.ndarray:
+        """(texels, texels) float32, the depths of map k with all that casts in it, 0 where nothing does."""
+        frame = self.draw(WholeShadowMap(**vars(self.maps[k])), t_ns)
+        depths = np.empty((self.maps[k].texels,) * 2, np.float32)
+        frame.texture(DEPTH_BUFFER).read_into(depths)
+        return depths
 
     def raw(
         self, t_ns: int, *names: str, forward_ns: int | None = None, backward_ns: int | None = None

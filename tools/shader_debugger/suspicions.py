@@ -7,6 +7,7 @@ where nothing fits all, for single objects."""
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -82,7 +83,15 @@ def _candidates(comparison, report, r, g, on) -> Candidates:
     """(text, what the GPU would have written) pairs; r, g : (N[, C]) at the pixels ``on``."""
     name = report.quantity.name
     _, what = lookup_of(name)
-    specific = {"uv": _uv, "level": _level, "albedo": _albedo, "light": _light}.get(what) or {
+    specific = {
+        "uv": _uv,
+        "level": _level,
+        "albedo": _albedo,
+        "light": _light,
+        "direct": _light,
+        "around": _light,
+        "shadow": _shadow,
+    }.get(what) or {
         "depth": _depth,
         "normals": _normals,
         "luminance": _shaded,
@@ -317,9 +326,17 @@ def _albedo(comparison, name, r, g, on) -> Candidates:
             )
 
 
+def _shadow(comparison, name, r, g, on) -> Candidates:
+    yield "no shadow falls", np.ones_like(r)
+    yield "light and shadow are exchanged", 1 - r
+
+
 def _light(comparison, name, r, g, on) -> Candidates:
-    ref = comparison.ref
+    """Of the light as a whole, and of its terms, of which one alone is asked for: the light without the other."""
+    ref, what = comparison.ref, lookup_of(name)[1]
     light, normal, scene = ref.scene.light, ref.frame.normal[on], ref.scene
+    light = replace(light, **{"direct": {"sky": 0.0}, "around": {"sun": 0.0}}.get(what, {}))
+    scene = replace(scene, light=light)
     facing, up = normal @ np.asarray(light.sun_direction), normal[:, 2]
     if not light.plain:  # what follows are mistakes in the formula of the plain sun and sky
         yield "unlit: the light is always 1", np.ones_like(r)

@@ -24,7 +24,7 @@ MOST_BUFFERS = 8
 """Outputs that every OpenGL 4 has (GL_MAX_DRAW_BUFFERS)."""
 _OF_THE_PASS = {
     "", "mvp", "inverse_depths", "image_size", "clip_rate", "clip_forward", "clip_backward", "coverage", "cutoff",
-    "lens_claims", "lens_plane", "lens_focal", "lens_limit", "lens_k",
+    "lens_claims", "target_size", "lens_plane", "lens_focal", "lens_limit", "lens_k",
 }  # fmt: skip
 
 
@@ -47,7 +47,7 @@ class Geometry(ScenePass):
         return tuple(Output(name, LABELS[name].buffer) for name in self.names)
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
-        through = {"LENS": 1, "LENS_CLAIMS": 1, self.lens: 1} if self.lens else {}
+        through = {"LENS": 1, "LENS_CLAIMS": 1, "GEOMETRY_STAGE": 1, self.lens: 1} if self.lens else {}
         return {define_of(name): i for i, name in enumerate(self.names)} | through
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
@@ -65,6 +65,8 @@ class Geometry(ScenePass):
                 painter.deform(uniforms, item, shot)
             if "image_size" in uniforms:
                 uniforms["image_size"].value = shot.size
+            if "target_size" in uniforms:
+                uniforms["target_size"].value = shot.size
             if self.lens and painter.lens is not None:
                 painter.lens.set(uniforms, shot, LENS_UNIT)
             for name, (_, rows) in values.items():

@@ -3,9 +3,10 @@
 A lobe is GGX with the height-correlated Smith term and Schlick's Fresnel term (Walter et al. 2007, "Microfacet Models
 for Refraction through Rough Surfaces"; Heitz 2014, "Understanding the Masking-Shadowing Function"; glTF 2.0, appendix
 B). Once through it sends back ``F0 r + g`` of even light (Karis 2013, "Real Shading in Unreal Engine 4"), which is too
-little where it is rough: light that hits twice is lost. A factor ``1 + F0 (1 / (r + g) - 1)`` gives it back
-(Fdez-Agüera 2019, "A Multiple-Scattering Microfacet Model for Real-Time Image-based Lighting"), so that a white metal
-under even light is white. What is no metal reflects 4 %, and scatters below that what is not reflected.
+little where it is rough: light that hits twice is lost. A factor ``1 + F_ms (1 / (r + g) - 1)`` gives it back, F_ms
+being what of it comes out that was reflected F_0 at a time, twice and more often (:func:`several`), so that a white
+metal under even light is white and gold is the more golden the rougher. What is no metal reflects 4 %, and scatters
+below that what is not reflected.
 """
 
 from __future__ import annotations
@@ -65,6 +66,33 @@ def energy() -> np.ndarray:
         edge = np.clip(1 - vh, 0, 1) ** 5
         out[k, :, 0], out[k, :, 1] = (weight * (1 - edge)).mean(axis=1), (weight * edge).mean(axis=1)
     return out
+
+
+@lru_cache(maxsize=1)
+def mean_energy() -> np.ndarray:
+    """(roughness 32,) of :func:`energy` with reflectance 1, the mean over all directions, weighed by their cosine."""
+    E, mu = energy().sum(axis=2), np.arange(_ANGLES) / (_ANGLES - 1)
+    return np.trapezoid(2 * mu * E, mu, axis=1)
+
+
+def several(F0: np.ndarray, roughness: np.ndarray) -> np.ndarray:
+    """F_ms of (N, C) reflectances at (N,) roughnesses (Turquin 2019, "Practical Multiple Scattering Compensation for
+    Microfacet Models"): with F the mean of Schlick's term and E that of the energy, F E / (1 - F (1 - E))."""
+    F = F0 + (1.0 - F0) / 21.0
+    at = np.clip(roughness, 0, 1) * (_ROUGHNESSES - 1)
+    E = np.interp(at, np.arange(_ROUGHNESSES), mean_energy())[:, None]
+    return F * E / (1.0 - F * (1.0 - E))
+
+
+def looked_at(
+    normal: np.ndarray, away: np.ndarray, cosine: np.ndarray, roughness: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 3) unit directions and (N,) roughnesses at which surroundings are looked up of surfaces that mirror towards
+    ``away``: the lobe of a rough one leans towards the normal, and is narrower where the eye, at (N,) cosines, looks
+    along the surface, than :func:`blurred` has it. Fitted against a path tracer (docs/results.md)."""
+    share = ((1.0 - roughness**2) * (1.0 + 0.6 * roughness * (cosine - 0.5)))[:, None]
+    way = share * away + (1.0 - share) * normal
+    return way / np.linalg.norm(way, axis=1, keepdims=True), roughness * (0.875 + 0.25 * cosine)
 
 
 def energy_at(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:

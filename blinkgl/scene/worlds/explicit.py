@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import CameraModel
 from blinkgl.config.deform import AnimationConfig, animation_of
+from blinkgl.config.materials import MaterialConfig
 from blinkgl.config.places import rigid_matrix
 from blinkgl.config.scene import (
     LIVING_KINDS,
     ExplicitSceneConfig,
     KeyedMotionConfig,
-    MaterialConfig,
     MeshConfig,
     PoseConfig,
     TrajectoryConfig,
@@ -28,6 +29,7 @@ from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.geometry.deforming import deforming
 from blinkgl.scene.geometry.meshes import transform_mesh
 from blinkgl.scene.geometry.primitives import BUILDERS
+from blinkgl.scene.geometry.tangents import split_mirrored
 from blinkgl.scene.importing.mesh_files import Asset, load_asset
 from blinkgl.scene.lights import make_light
 from blinkgl.scene.motion.collision import resolve_collisions
@@ -39,9 +41,9 @@ from blinkgl.scene.reading import contents
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.shapes.deformer import gait
 from blinkgl.scene.surfaces.coats import COATS, coat
-from blinkgl.scene.surfaces.images import content_hash, decode_image, photographs
+from blinkgl.scene.surfaces.images import content_hash, decode_alpha, decode_image, decode_numbers, photographs
 from blinkgl.scene.surfaces.textures import procedural_texture
-from blinkgl.scene.types import Gloss, Material, Mesh, Part, PosePath, Scene, SceneObject, Texture
+from blinkgl.scene.types import Gloss, Map, Mask, Material, Mesh, Part, PosePath, Scene, SceneObject, Texture
 from blinkgl.scene.worlds.pool import resolve
 from blinkgl.scene.worlds.sky import with_environment
 
@@ -57,6 +59,8 @@ class InMemory:
 
     meshes: dict[str, Mesh] = field(default_factory=dict)
     textures: dict[str, Texture] = field(default_factory=dict)
+    maps: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
+    """By material and key: (h, w, 3) uint8 as the file of the key would be, (h, w) of the mask."""
 
 
 def explicit_scene(
@@ -69,7 +73,7 @@ def explicit_scene(
     log: list[str] = []
     omissions: dict[str, None] = {}
     materials = {
-        name: _material(m, base, f"scene.materials.{name}", memory.textures.get(name))
+        name: _material(m, base, f"scene.materials.{name}", memory.textures.get(name), memory.maps.get(name, {}))
         for name, m in config.materials.items()
     }
     assets: dict[tuple[str, bool, AnimationConfig | None], Asset] = {}
@@ -96,7 +100,10 @@ def explicit_scene(
         for part in assets[key].parts:
             material = part.material if own else materials[item.material]
             material = replace(material, unlit=material.unlit or config.light.unlit)
-            parts.append(Part(transform_mesh(part.mesh, matrix), material))
+            mesh = transform_mesh(part.mesh, matrix)
+            if not own and material.bumps is not None and mesh.deformer is None:
+                mesh, _ = split_mirrored(mesh)  # of what deforms already the seams stay: its joints count its vertices
+            parts.append(Part(mesh, material))
         if item.deform is not None:
             if animation is not None:
                 raise ConfigError(
@@ -182,8 +189,30 @@ def trajectory_path(config: TrajectoryConfig, t0_ns: int, t1_ns: int, where: str
     last = int(np.searchsorted(t_ns, t1_ns + aside)) + _BEYOND
     t_ns, poses = t_ns[first:last], poses[first:last]
     positions, rotations = smoothed(t_ns, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]), aside)
+    _check_speeds(config, t_ns, positions, rotations, where)
     path = KeyframePath(t_ns, positions, rotations, "spline", where)
     return path if config.T_body_sensor is None else OffsetPath(path, _on_body(config.T_body_sensor, where, base))
+
+
+def _check_speeds(
+    config: TrajectoryConfig, t_ns: np.ndarray, positions: np.ndarray, rotations: Rotation, where: str
+) -> None:
+    """Raises ConfigError: the poses are farther apart than anything flies, or turns, between them."""
+    seconds = np.diff(t_ns) * 1e-9
+    speed = np.linalg.norm(np.diff(positions, axis=0), axis=1) / seconds
+    turn = np.degrees((rotations[1:] * rotations[:-1].inv()).magnitude()) / seconds
+    for rate, limit, key, unit, guess in (
+        (speed, config.speed_limit, "speed_limit", "units/s", "positions in mm, or a jump?"),
+        (turn, config.turn_limit, "turn_limit", "degrees/s", "quaternions in another order, or a jump?"),
+    ):
+        k = int(np.argmax(rate))
+        if rate[k] > limit:
+            raise ConfigError(
+                f"the trajectory goes too fast: {guess}",
+                where=f"{where}.{key}",
+                value=f"{rate[k]:.4g} {unit} at {t_ns[k] * 1e-9:.6g} s",
+                accepted=f"at most {limit:g} {unit}, or another {key}",
+            )
 
 
 def _on_body(given: Any, where: str, base: Path) -> np.ndarray:
@@ -287,7 +316,13 @@ def _asset(
     )
 
 
-def _material(config: MaterialConfig, base: Path, where: str, texture: Texture | None = None) -> Material:
+def _material(
+    config: MaterialConfig,
+    base: Path,
+    where: str,
+    texture: Texture | None = None,
+    maps: Mapping[str, np.ndarray] = MappingProxyType({}),
+) -> Material:
     if config.texture is not None:
         texture = _texture(resolve(config.texture, base), config.max_size, f"{where}.texture", config.texture)
     elif config.procedural is not None:
@@ -302,14 +337,60 @@ def _material(config: MaterialConfig, base: Path, where: str, texture: Texture |
                 accepted="one of: " + ", ".join(bundled) if bundled else "run 'pip install scikit-image'",
             )
         texture = _texture(bundled[config.photograph], config.max_size, f"{where}.photograph", config.photograph)
-    shines = config.metallic > 0 or config.roughness < 1
-    gloss = Gloss(config.metallic, config.roughness) if shines else None
+    rough = _map(config, "metallic_roughness_map", base, where, maps)
+    shines = config.metallic > 0 or config.roughness < 1 or rough is not None
     plain = texture, config.color, config.uv_scale, config.unlit, config.double_sided
-    return Material(*plain, gloss=gloss, emission=config.emission)
+    return Material(
+        *plain,
+        gloss=Gloss(config.metallic, config.roughness, rough) if shines else None,
+        bumps=_map(config, "normal_map", base, where, maps),
+        bump_scale=config.normal_scale,
+        emission=config.emission,
+        emission_map=_map(config, "emission_map", base, where, maps),
+        mask=_mask(config, base, where, maps),
+    )
+
+
+def _map(config: MaterialConfig, key: str, base: Path, where: str, maps: Mapping[str, np.ndarray]) -> Map | None:
+    """Of the image file that a key names, or in memory; None: neither."""
+    if key in maps:
+        return Map(Texture(maps[key], key))
+    given = getattr(config, key)
+    if given is None:
+        return None
+    data = _image(resolve(given, base), f"{where}.{key}", given)
+    decode = decode_image if key == "emission_map" else decode_numbers
+    pixels = decode(data, config.max_size, f"{where}.{key}: {given}")
+    return Map(Texture(pixels, Path(given).name, content_hash(data)))
+
+
+def _mask(config: MaterialConfig, base: Path, where: str, maps: Mapping[str, np.ndarray]) -> Mask | None:
+    """None where nothing of it is below the cutoff. Raises ConfigError where all is."""
+    alpha = maps.get("mask")
+    if alpha is None and config.mask is None:
+        return None
+    if alpha is None:
+        data = _image(resolve(config.mask, base), f"{where}.mask", config.mask)
+        said = f"{where}.mask: {config.mask}"
+        alpha = decode_alpha(data, config.max_size, said)
+        if alpha is None:
+            alpha = decode_numbers(data, config.max_size, said).mean(axis=2).round().astype(np.uint8)
+    if alpha.max() < 255 * config.cutoff:
+        raise ConfigError(
+            "nothing of the surface is left",
+            where=f"{where}.cutoff",
+            value=config.cutoff,
+            accepted=f"a mask that reaches it; its largest value is {alpha.max() / 255:.3g}",
+        )
+    return Mask(alpha, cutoff=config.cutoff) if alpha.min() < 255 * config.cutoff else None
+
+
+def _image(path: Path, where: str, given: str) -> bytes:
+    if not path.is_file():
+        raise ConfigError("no such file", where=where, value=given, accepted="an image file")
+    return contents(path, "image")
 
 
 def _texture(path: Path, max_size: int, where: str, given: str) -> Texture:
-    if not path.is_file():
-        raise ConfigError("no such file", where=where, value=given, accepted="an image file")
-    data = contents(path, "image")
+    data = _image(path, where, given)
     return Texture(decode_image(data, max_size, str(path)), path.name, content_hash(data))

@@ -1,0 +1,86 @@
+"""What a surface of an explicit scene is made of (docs/materials.md)."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from blinkgl.config.base import Config, Refused, rule
+
+TEXTURE_KINDS = ("value", "perlin", "fbm", "stripes", "checks", "glyphs", "dots", "gradient", "bricks")
+TextureKind = Literal["value", "perlin", "fbm", "stripes", "checks", "glyphs", "dots", "gradient", "bricks"]
+Radiance = Annotated[float, Field(ge=0, le=1e9)]
+Repeats = Annotated[float, Field(ge=-1e6, le=1e6)]
+
+
+class MaterialConfig(Config):
+    """A colour, times at most one texture; what more a surface is."""
+
+    texture: str | None = Field(None, description="image file, sRGB, or .hdr, linear")
+    procedural: Literal[TextureKind, "pips"] | None = Field(
+        None, description="kind of procedural texture; pips: the faces of a die"
+    )
+    seed: int = Field(0, ge=0, description="which procedural texture of that kind")
+    photograph: str | None = Field(
+        None, description="name of a photograph bundled with scikit-image, such as astronaut"
+    )
+    max_size: int = Field(2048, ge=1, le=16384, description="longer texture sides are reduced to this, px")
+    color: tuple[Radiance, Radiance, Radiance] = Field((1.0, 1.0, 1.0), description="linear factor")
+    uv_scale: tuple[Repeats, Repeats] = Field((1.0, 1.0), description="texture repeats per unit of texture coordinate")
+    unlit: bool = Field(False, description="radiance = albedo, whatever the light")
+    double_sided: bool = Field(False, description="draw back faces, with the normal turned round")
+    metallic: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="how much of it is metal")
+    roughness: Annotated[float, Field(ge=0, le=1)] = Field(
+        1.0, description="0: a mirror; 1, of what is no metal: matt, without any reflection"
+    )
+    metallic_roughness_map: str | None = Field(
+        None,
+        description="image file of numbers, as in glTF: its blue channel times metallic, its green one times roughness",
+    )
+    normal_map: str | None = Field(
+        None, description="image file of normals: x to the right in the picture, y up, z outwards, as in glTF"
+    )
+    normal_scale: Annotated[float, Field(ge=-100, le=100)] = Field(
+        1.0, description="factor on the x and y of the normal map; y alone the other way: swap it in the picture"
+    )
+    emission: tuple[Radiance, Radiance, Radiance] = Field((0.0, 0.0, 0.0), description="radiance of its own, linear")
+    emission_map: str | None = Field(None, description="image file, sRGB, times emission")
+    mask: str | None = Field(
+        None,
+        description="image file of what is there: holes where its opacity, or its grey if it has none, is below cutoff",
+    )
+    cutoff: Annotated[float, Field(gt=0, le=1)] = Field(0.5, description="of the mask, 1 being white or opaque")
+
+    @rule("texture", "procedural", "photograph")
+    def _one(*sources):
+        given = [k for k, v in zip(("texture", "procedural", "photograph"), sources) if v is not None]
+        if len(given) > 1:
+            raise Refused("only one of texture, procedural, photograph may be given, not " + " and ".join(given))
+
+    @property
+    def files(self) -> dict[str, str]:
+        """What it reads, by key."""
+        keys = ("texture", "metallic_roughness_map", "normal_map", "emission_map", "mask")
+        return {key: file for key in keys if (file := getattr(self, key)) is not None}
+
+    @rule("emission_map", "emission")
+    def _a_map_of_nothing(emission_map, emission):
+        if emission_map is not None and not any(emission):
+            raise Refused(
+                "a map of light that is none: it is multiplied by emission",
+                where="emission",
+                value=list(emission),
+                accepted="a radiance above 0, such as [1, 1, 1]",
+            )
+
+    @rule("unlit", "normal_map", "metallic_roughness_map", "emission_map")
+    def _maps_of_what_is_lit(unlit, *maps):
+        given = [k for k, v in zip(("normal_map", "metallic_roughness_map", "emission_map"), maps) if v is not None]
+        if unlit and given:
+            raise Refused(
+                "an unlit surface shows its colour whatever its maps say",
+                where=given[0],
+                value=maps[0] or maps[1] or maps[2],
+                accepted="unlit: false, or no such map",
+            )

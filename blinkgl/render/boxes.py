@@ -1,0 +1,185 @@
+"""Boxes of objects (:class:`blinkgl.labels.boxes.Boxes`) from their vertices in float64 and a picture of ids.
+
+What of an object is before the near plane is cut there, and its corners are projected: of a pin-hole camera the box of
+those is that of the whole, since a triangle's picture is a triangle. Through a lens its edges bend, by less than the
+triangles are fine.
+"""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+
+from blinkgl.camera import CameraModel
+from blinkgl.labels.boxes import Boxes, empty
+from blinkgl.labels.semantics import Categories, category_of, class_of
+from blinkgl.render.matrices import cam_from_obj
+from blinkgl.render.reference import vertices_at
+from blinkgl.scene.types import Scene, SceneObject
+
+
+def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -> Boxes:
+    """Of the objects that are before the camera at t_ns. ids : (H, W) uint32 instances that are seen."""
+    camera, T_world_cam = scene.camera, scene.camera_path.pose(t_ns)
+    shown = extents(ids, 1 + max((thing.instance_id for thing in scene.objects), default=0))
+    whole = np.array([-0.5, -0.5, camera.width - 0.5, camera.height - 0.5])
+    rows = []
+    for thing in scene.objects:
+        T_world_obj = thing.path.pose(t_ns)
+        T_cam_obj = cam_from_obj(T_world_cam, T_world_obj)
+        x0, y0, x1, y1, seen = (int(n) for n in shown[thing.instance_id])
+        if not seen and not thing.deforms and _aside(camera, thing, T_cam_obj):
+            continue
+        vertices, faces = _solid(thing, t_ns)
+        if not len(faces):
+            continue
+        px, drawn = _projected(camera, vertices @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3], faces)
+        if not len(drawn):
+            continue
+        corners = px[np.unique(drawn)]
+        amodal = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
+        if not seen and ((amodal[2:] < whole[:2]) | (amodal[:2] > whole[2:])).any():
+            continue
+        mask = np.zeros(ids.shape, np.bool_)
+        cover(px, drawn, mask)
+        pixels = max(int(np.count_nonzero(mask)), seen)
+        if not pixels:  # between the centres of pixels
+            continue
+        low, high = vertices.min(axis=0), vertices.max(axis=0)
+        middle = np.eye(4)
+        middle[:3, 3] = 0.5 * (low + high)
+        inside = np.clip(amodal.reshape(2, 2), whole[:2], whole[2:])
+        area = np.prod(amodal[2:] - amodal[:2])
+        rows.append(
+            {
+                "instance": thing.instance_id,
+                "category": category_of(thing, categories),
+                "kind": class_of(thing),
+                "visible_box": np.array([x0 - 0.5, y0 - 0.5, x1 + 0.5, y1 + 0.5]) if seen else np.zeros(4),
+                "visible_pixels": seen,
+                "amodal_box": amodal,
+                "cut_box": inside.ravel(),
+                "amodal_pixels": pixels,
+                "size": high - low,
+                "T_cam_box": T_cam_obj @ middle,
+                "T_world_box": T_world_obj @ middle,
+                "occluded": 1.0 - seen / pixels,
+                "truncated": 1.0 - float(np.prod(inside[1] - inside[0]) / area) if area > 0 else 0.0,
+            }
+        )
+    made = empty()
+    if rows:
+        made = {
+            name: np.array([row[name] for row in rows], None if none.dtype.kind == "U" else none.dtype)
+            for name, none in made.items()
+        }
+    return Boxes(**made, resolution=np.array([camera.width, camera.height], np.int64))
+
+
+def _aside(camera: CameraModel, thing: SceneObject, T_cam_obj: np.ndarray) -> bool:
+    """Whether the ball round an object's origin is out of the picture."""
+    return bool((camera.frustum_planes() @ T_cam_obj[:3, 3] < -thing.radius).any())
+
+
+def _solid(thing: SceneObject, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
+    """(V, 3) float64 vertices of all parts at t_ns, object axes, and (F, 3) faces."""
+    vertices, faces, begin = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
+    for part in thing.parts:
+        vertices.append(vertices_at(part.mesh, t_ns))
+        faces.append(part.mesh.faces.astype(np.int64) + begin)
+        begin += len(vertices[-1])
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+def _projected(camera: CameraModel, points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(M, 2) px and (F', 3) of the triangles of (V, 3) points, camera axes, cut at the near plane, without those that
+    the camera has no place for."""
+    points, faces = before(points, faces, camera.near)
+    px = np.full((len(points), 2), np.nan)
+    used = np.unique(faces)
+    px[used] = camera.project(points[used])
+    return px, faces[np.isfinite(px[faces]).all(axis=(1, 2))]
+
+
+def before(points: np.ndarray, faces: np.ndarray, near: float) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles of (V, 3) points cut at Z = near: points with those of the cuts behind them, and faces of what is
+    farther."""
+    there = points[:, 2] >= near
+    count = there[faces].sum(axis=1)
+    kept, extra = [faces[count == 3]], [points]
+    begin = len(points)
+    for inside in (1, 2):
+        some = faces[count == inside]
+        if not len(some):
+            continue
+        # Turned so that the corner that stands alone comes first.
+        alone = np.argmax(there[some] == (inside == 1), axis=1)
+        a, b, c = (some[np.arange(len(some)), (alone + k) % 3] for k in range(3))
+        cuts = []
+        for other in (b, c):
+            share = (near - points[a, 2]) / (points[other, 2] - points[a, 2])
+            cut = points[a] + share[:, None] * (points[other] - points[a])
+            cut[:, 2] = near
+            extra.append(cut)
+            cuts.append(begin + np.arange(len(some)))
+            begin += len(some)
+        ab, ac = cuts
+        kept += [np.stack([a, ab, ac], 1)] if inside == 1 else [np.stack([ab, b, c], 1), np.stack([ab, c, ac], 1)]
+    return np.concatenate(extra), np.concatenate(kept)
+
+
+_EDGE = 1e-9
+"""px: so near to an edge a pixel's centre is in the triangles on both sides of it."""
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def cover(px: np.ndarray, faces: np.ndarray, mask: np.ndarray) -> None:
+    """Sets ``mask`` (H, W) where a pixel's centre is in one of the triangles (F, 3) of (V, 2) float64 px, their edges
+    included."""
+    height, width = mask.shape
+    for f in range(len(faces)):
+        ax, ay = px[faces[f, 0]]
+        bx, by = px[faces[f, 1]]
+        cx, cy = px[faces[f, 2]]
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        if area == 0.0:
+            continue
+        if area < 0.0:
+            bx, by, cx, cy = cx, cy, bx, by
+        first = int(max(np.ceil(min(ay, by, cy) - _EDGE), 0.0))
+        last = int(min(np.floor(max(ay, by, cy) + _EDGE), height - 1.0))
+        if not max(ax, bx, cx) >= -_EDGE or not min(ax, bx, cx) <= width - 1.0 + _EDGE:
+            continue
+        for y in range(first, last + 1):
+            # What of the row is on the inner side of each edge: a x + b >= 0.
+            left, right = 0.0, width - 1.0
+            for px0, py0, px1, py1 in ((ax, ay, bx, by), (bx, by, cx, cy), (cx, cy, ax, ay)):
+                slope = py0 - py1
+                rest = (px1 - px0) * (y - py0) + (py1 - py0) * px0
+                if slope > 0.0:
+                    left = max(left, -rest / slope)
+                elif slope < 0.0:
+                    right = min(right, -rest / slope)
+                elif rest < 0.0:
+                    right = -1.0
+            if not left <= right + 2.0 * _EDGE:
+                continue
+            for x in range(int(np.ceil(left - _EDGE)), int(np.floor(right + _EDGE)) + 1):
+                mask[y, x] = True
+
+
+@nb.njit(cache=True, nogil=True)
+def extents(ids: np.ndarray, count: int) -> np.ndarray:
+    """(count, 5) int64: of every id below ``count`` the first and last column and row of its pixels, as x0, y0, x1, y1,
+    and how many there are."""
+    out = np.zeros((count, 5), np.int64)
+    out[:, 0], out[:, 1] = ids.shape[1], ids.shape[0]
+    for y in range(ids.shape[0]):
+        for x in range(ids.shape[1]):
+            k = ids[y, x]
+            out[k, 0] = min(out[k, 0], x)
+            out[k, 1] = min(out[k, 1], y)
+            out[k, 2] = max(out[k, 2], x)
+            out[k, 3] = y
+            out[k, 4] += 1
+    return out

@@ -1,0 +1,138 @@
+"""Boxes, categories, tracks and an inertial unit in whole data sets: written, verified, shown by report and preview."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+
+from blinkgl import ConfigError, Renderer, load
+from blinkgl.cli import run
+from blinkgl.config.reader import to_yaml
+from blinkgl.config.sequence import load_run
+from blinkgl.dataset.shards import sample
+from blinkgl.dataset.verify import verify_dataset
+from blinkgl.io.boxes import read_boxes
+from blinkgl.io.images import read_ids
+from blinkgl.io.overlays import Curves, TrackLines, with_tracks
+from blinkgl.labels import LABELS
+from blinkgl.report.collect import collect
+
+RUN = {
+    "seed": 5,
+    "camera": {"width": 64, "height": 48, "fov": 60},
+    "time": {"duration": 0.05, "label_rate": 40},
+    "timeline": {"kind": "uniform", "fps": 80},
+    "scene": {
+        "objects": {"count": 3, "distance": [2, 4]},
+        "pool": {"primitives": ["cuboid", "flag"], "variants": 4, "urdfs": False},
+        "textures": {"procedural": ["checks"], "variants": 4, "photographs": False, "max_size": 32},
+    },
+    "labels": {"boxes": True, "semantics": {"ground": 2, "*": 1}, "scene_flow": True, "ids": True},
+    "tracks": {"points": 20, "choose": "surface", "rate": 200},
+    "imu": {"rate": 200},
+    "preview": {"rate": 40},
+}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("shown")
+    (folder / "run.yaml").write_text(to_yaml(RUN), encoding="utf-8")
+    assert run(["generate", str(folder / "run.yaml"), "--out", str(folder / "out")]) == 0
+    return folder
+
+
+def folder_of(made: Path) -> Path:
+    return next((made / "out").rglob("manifest.json")).parent
+
+
+def test_written_and_verified(made, tmp_path):
+    assert verify_dataset(made / "out", deep=1).problems == {}
+    folder = folder_of(made)
+    boxes, ids = read_boxes(folder / "boxes/000001.npz"), read_ids(folder / "ids/000001.png")
+    assert boxes.visible_pixels.sum() == np.count_nonzero(ids) and set(boxes.category.tolist()) == {1, 2}
+    semantics = read_ids(folder / "semantics/000001.png")
+    ground = int(boxes.instance[boxes.kind == "ground"][0])
+    assert (semantics[ids == ground] == 2).all() and (semantics[(ids > 0) & (ids != ground)] == 1).all()
+    poses = np.load(folder / "poses.npz")  # of the start and every label
+    row = int(np.flatnonzero(poses["object_ids"] == boxes.instance[-1])[0])
+    np.testing.assert_allclose(boxes.T_world_box[-1, :3, :3], poses["T_world_obj"][row, 2, :3, :3], atol=1e-12)
+    told = json.loads((folder / "manifest.json").read_text())["categories"]
+    assert told["patterns"] == {"ground": 2, "*": 1} and told["objects"]["ground"] == 2
+    stamps = [line.split(",") for line in (folder / "scene_flow/timestamps.txt").read_text().splitlines()[1:]]
+    assert [[int(a), int(b)] for a, b in stamps] == [[25_000, 50_000], [50_000, 75_000]]
+    endings = {name.partition(".")[2] for name, _ in sample(folder, 0)}
+    assert {"boxes.npz", "boxes.txt", "semantics.png", "scene_flow.npy"} <= endings
+
+    other = tmp_path / "s"
+    shutil.copytree(folder, other)
+    from blinkgl.dataset.verify import _check_labels
+    from blinkgl.io.sequence_dir import read_manifest
+
+    form = LABELS["boxes"].forms[0]
+    value = form.read(other / "boxes/000000.npz")
+    value.size[0] = np.nan
+    (other / "boxes/000000.npz").write_bytes(form.encode(value))
+    assert _check_labels(other, read_manifest(other)) == ["boxes/000000.npz: a number that is not finite"]
+
+
+def test_report_and_preview_show_them(made):
+    folder, others = folder_of(made), dict(collect(made / "out").examples[0].others)
+    frame = collect(made / "out").examples[0].image
+    assert {"boxes", "semantics", "scene flow", "point tracks, 20"} <= set(others)
+    assert (others["boxes"] != frame).any() and (others["point tracks, 20"] != frame).any()
+    [unit] = [picture for name, picture in others.items() if name.startswith("inertial unit")]
+    assert unit.shape == (120, 480, 3)
+    video = iio.imread(folder / "preview.mp4")
+    assert video.shape[1] == 96 + 30 + 64  # frame, caption, curves
+    strip = video[-1][-64:].astype(int)
+    assert (strip.max(axis=2) - strip.min(axis=2) > 60).any()  # coloured
+
+
+def test_tracks_have_tails():
+    """A dot where the point is now, its tail behind it, nothing of what is hidden, at any scale."""
+    t_us = np.arange(5) * 10_000
+    px = np.zeros((2, 5, 2))
+    px[0] = np.stack([np.arange(5) * 8.0 + 4, np.full(5, 10.0)], 1)
+    px[1] = px[0] + [0, 20]
+    lines = TrackLines(t_us, px, np.array([[False] * 5, [True] * 5]), np.array([3, 4]), np.array([48, 40]))
+    for scale in (1, 2):
+        out = with_tracks(np.zeros((40 * scale, 48 * scale, 3), np.uint8), lines, 25_000)
+        y, x = np.nonzero(out.max(axis=2) > 60)
+        assert abs(x.max() / scale - 25) < 2 and x.min() / scale < 6 and np.abs((y + 0.5) / scale - 10.5).max() < 2
+        assert out[10 * scale + scale // 2, 24 * scale + scale // 2].max() > 150
+    assert not with_tracks(np.zeros((40, 48, 3), np.uint8), lines, 50_000).any()
+
+
+def test_curves_are_dim_from_now_on():
+    t_us = np.arange(100) * 1000
+    wave = np.stack([0 * t_us, 0 * t_us, np.sin(t_us / 9e3)], 1)
+    strip = Curves(t_us, wave, 3 * wave, (0, 99_000), 200, 60)
+    end, middle = strip.at(99_000), strip.at(50_000)
+    assert end.shape == (60, 200, 3) and np.array_equal(middle[:, :50], end[:, :50])
+    assert middle[:, 60:99].max() < 0.6 * end[:, 60:99].max()
+    rows = np.argmax(end[:, 30:90, 2].astype(int) - end[:, 30:90, 0], axis=0)
+    assert np.abs(rows - 29.5 * (1 - 0.9 * np.sin(np.arange(30, 90) / 9))).max() < 2
+
+
+def test_a_table_that_fits_nothing_is_refused(made, tmp_path, capsys):
+    tree = {**RUN, "labels": {"semantics": {"car*": 1, "bus": 2}}}
+    (tmp_path / "a.yaml").write_text(to_yaml(tree), encoding="utf-8")
+    assert run(["generate", str(tmp_path / "a.yaml"), "--out", str(tmp_path / "out")]) != 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert (
+        "labels.semantics: no object has a name that one of the patterns fits (got ['car*', 'bus']); expected" in said
+    )
+    assert "cuboid" in said and "Traceback" not in said and not list((tmp_path / "out").rglob("manifest.json"))
+    with Renderer(load(tmp_path / "a.yaml")) as renderer:
+        assert renderer.frame(0.05, labels=["semantics"]).semantics.max() > 1  # by kinds of shape
+    for table in ({"": 1}, {"a": 70_000}, {"a": "b"}, [1]):
+        tree["labels"] = {"semantics": table}
+        (tmp_path / "a.yaml").write_text(to_yaml(tree), encoding="utf-8")
+        with pytest.raises(ConfigError, match="labels.semantics"):
+            load_run(tmp_path / "a.yaml")

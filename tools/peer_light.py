@@ -1,0 +1,216 @@
+"""Light and materials beside a path tracer: the same scene in Blender's Cycles (extra [cycles], see ``peer_cycles.py``)
+at path depth 1, each effect by itself.
+
+    python -m blinkgl.tools.peer_light [--samples 256] [--only WORD …] [--panoramas FOLDER] [--pictures FOLDER]
+
+Diffuse scenes: floor, ball, box, open sheet. Metal: five balls of five roughnesses, graded by themselves. Of each the
+relative difference of colours, (theirs - ours) / (theirs + 0.01), over pixels off silhouettes and, of hard shadows,
+farther than two texels from their edges: median of what is there, and 95 % quantile.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from blinkgl.camera import PinHole
+from blinkgl.config.sequence import RenderConfig
+from blinkgl.gl import create_context
+from blinkgl.render import reference
+from blinkgl.scene.geometry.primitives import cuboid, grid, sphere
+from blinkgl.scene.lights import lamp_pose
+from blinkgl.scene.motion.paths import StaticPath
+from blinkgl.scene.motion.trajectories import look_rotation
+from blinkgl.scene.rig import Rig
+from blinkgl.scene.types import Gloss, Lamp, Light, Map, Mask, Material, Mesh, Part, Scene, SceneObject, Texture
+from blinkgl.scene.worlds.sky import panorama_light
+from blinkgl.srgb import to_srgb8
+from blinkgl.tools.peer_cycles import CyclesSettings, colours
+from blinkgl.tools.shader_debugger.lamps import near_an_edge
+from blinkgl.tools.shader_debugger.session import DebugRenderer
+
+ROUGHNESSES = (0.1, 0.25, 0.45, 0.7, 1.0)
+WHITE = (1.0, 1.0, 1.0)
+WARM, BLUE = (1.0, 0.8, 0.6), (0.65, 0.8, 1.0)
+SUN = (-0.48, -0.6, 0.64)
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One effect. graded : ids of the objects that are looked at.   settings : of Cycles, samples are the tool's."""
+
+    name: str
+    scene: Scene
+    graded: tuple[int, ...]
+    shadows: bool = False
+
+
+def _body(number: int, mesh: Mesh, place, material: Material, turn=(0.0, 0.0, 0.0), category="object") -> SceneObject:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
+    T[:3, 3] = place
+    return SceneObject(f"{number}", number, (Part(mesh, material),), StaticPath(T), category)
+
+
+def _seen(objects, light: Light, size: tuple[int, int]) -> Scene:
+    eye = np.array([0.3, -5.2, 2.6])
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = look_rotation(np.array([0.1, 0.3, 0.45]) - eye), eye
+    camera = PinHole.centred(*size, 1.5 * size[0], near=0.1)
+    return Scene(tuple(objects), Rig.alone(camera, StaticPath(T)), 0, 1_000_000, light, 0.3)
+
+
+def matt(light: Light, size=(128, 96), **paint) -> Scene:
+    """Floor, ball, box and an open sheet; ``paint``: more of the materials of the last three."""
+    return _seen(
+        [
+            _body(1, grid(width=14, depth=14), (0, 0, 0), Material(base_color=(0.62, 0.6, 0.57)), category="ground"),
+            _body(
+                2,
+                sphere(radius=0.5, segments=96, rings=48),
+                (-0.7, 0, 0.8),
+                Material(base_color=(0.8, 0.35, 0.3), **paint),
+            ),
+            _body(3, cuboid(), (0.5, 0.6, 0.55), Material(base_color=(0.5, 0.75, 0.6), **paint), (0, 0, 30)),
+            _body(
+                4,
+                grid(width=0.9, depth=0.7),
+                (0.5, -0.9, 0.9),
+                Material(base_color=(0.7, 0.7, 0.3), double_sided=True, **paint),
+                (50, 0, 15),
+            ),
+        ],
+        light,
+        size,
+    )
+
+
+def metal(light: Light, smooth: bool, size=(160, 64)) -> Scene:
+    """Balls of metal, of the smooth ones of :data:`ROUGHNESSES` or of the others."""
+    ball = sphere(radius=0.42, segments=128, rings=64)
+    balls = [
+        _body(
+            k + 1,
+            ball,
+            (0.95 * (k - 2) + 0.1, 0.3, 0.45),
+            Material(base_color=(1.0, 0.77, 0.34), gloss=Gloss(1.0, roughness)),
+        )
+        for k, roughness in enumerate(ROUGHNESSES)
+        if (roughness < 0.3) is smooth
+    ]
+    scene = _seen(balls, light, size)
+    return scene.with_camera(replace(scene.camera, fx=0.9 * size[0], fy=0.9 * size[0]))
+
+
+def dimples(size: int = 64) -> Map:
+    """A normal map, without anything that a texel could not hold."""
+    y, x = np.mgrid[0:size, 0:size] / size * 2 * np.pi
+    slope = np.stack([np.cos(2 * x) * np.sin(2 * y), np.sin(2 * x) * np.cos(2 * y), np.full_like(x, 2.0)], axis=-1)
+    normals = 0.5 + 0.5 * slope / np.linalg.norm(slope, axis=-1, keepdims=True)
+    return Map(Texture(np.clip(255 * normals, 0, 255).round().astype(np.uint8)))
+
+
+def lattice(size: int = 64) -> Mask:
+    y, x = np.mgrid[0:size, 0:size] / size * 2 * np.pi
+    return Mask(np.clip(255 * (0.6 + 0.5 * np.sin(2 * x) * np.sin(2 * y)), 0, 255).round().astype(np.uint8))
+
+
+def tinted(scene: Scene) -> Scene:
+    """With colours of vertices on all but the floor."""
+
+    def one(thing: SceneObject) -> SceneObject:
+        (part,) = thing.parts
+        v = part.mesh.vertices
+        colours = 0.6 + 0.4 * np.sin(3.0 * v + [0.0, 2.0, 4.0])
+        mesh = replace(part.mesh, colours=colours.astype(np.float32))
+        return thing if thing.category == "ground" else replace(thing, parts=(Part(mesh, part.material),))
+
+    return replace(scene, objects=tuple(one(thing) for thing in scene.objects))
+
+
+def cases(panoramas: Path | None) -> Iterator[Case]:
+    """Each effect by itself, beside a plain sun and sky."""
+    every = (1, 2, 3, 4)
+    plain = Light(SUN, 0.7, 0.5)
+    point = Lamp("point", (3.0, 2.4, 1.8), StaticPath(lamp_pose((-0.4, -1.6, 2.0))))
+    outer = math.radians(25)
+    spot = Lamp(  # an edge without a width, Blender's is another curve
+        "spot",
+        (9.0, 9.0, 8.0),
+        StaticPath(lamp_pose((1.4, -0.8, 3.2), (-0.3, 0.25, -1.0))),
+        inner=outer * (1 - 1e-6),
+        outer=outer,
+    )
+    yield Case("sun and sky", matt(plain), every)
+    yield Case("coloured sun and sky", matt(replace(plain, sun_color=WARM, sky_color=BLUE)), every)
+    yield Case("point light", matt(Light(SUN, 0.0, 0.0, lamps=(point,))), every)
+    yield Case("spot light", matt(Light(SUN, 0.0, 0.0, lamps=(spot,))), every)
+    yield Case("hard shadows", matt(replace(plain, shadows="hard", shadow_size=2048)), every, True)
+    yield Case("hard shadows of a spot light", matt(Light(SUN, 0.0, 0.1, lamps=(spot,), shadows="hard")), every, True)
+    wide = replace(plain, shadows="soft", sun_size=math.radians(8))
+    yield Case("soft shadows, sun of 8 degrees", matt(wide), every, True)
+    yield Case("normal map", matt(plain, bumps=dimples()), (2, 3, 4))
+    yield Case("light of its own", matt(plain, emission=(0.3, 0.2, 0.5)), (2, 3, 4))
+    yield Case("holes", matt(plain, mask=lattice()), every)
+    yield Case("colours of vertices", tinted(matt(plain)), (2, 3, 4))
+    for smooth in (True, False):
+        yield Case("metal, sun and sky", metal(plain, smooth), (1, 2, 3, 4, 5))
+    for file in sorted(panoramas.glob("*.hdr")) if panoramas is not None else ():
+        light = panorama_light(file, 0.0, 1.0, Light(), file.name)
+        yield Case(f"panorama {file.stem}", matt(light), every)
+        for smooth in (True, False):
+            yield Case(f"metal, panorama {file.stem}", metal(light, smooth), (1, 2, 3, 4, 5))
+
+
+def compared(gl, case: Case, samples: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, reference.ReferenceFrame]:
+    """((H, W, 3) ours, theirs, (H, W) bool what is graded, the reference's frame)."""
+    settings = CyclesSettings(samples, shadows=case.shadows, occlusion=False, bounces=0)
+    (theirs,) = colours(case.scene, [0], settings)
+    with DebugRenderer(gl, case.scene, RenderConfig(image_antialiasing="ssaa4")) as renderer:
+        ours = renderer.colour(0).read()
+        maps = renderer.maps
+    true = reference.render(case.scene, 0)
+    graded = np.isin(true.instance, case.graded) & ~reference.silhouette_band(true.instance, true.depth)
+    if case.scene.light.shadows == "hard":
+        graded &= ~near_an_edge(case.scene, true, maps)
+    return ours, theirs, graded, true
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--samples", type=int, default=256)
+    parser.add_argument("--only", nargs="*", default=[""], help="cases that have one of these words in their names")
+    parser.add_argument("--panoramas", type=Path, help="folder of .hdr files")
+    parser.add_argument("--pictures", type=Path, help="folder for ours and theirs, side by side")
+    options = parser.parse_args()
+    if options.pictures is not None:
+        options.pictures.mkdir(parents=True, exist_ok=True)
+    print(f"{'effect':34} {'pixels':>7} {'median':>8} {'95 %':>8}")
+    with create_context() as gl:
+        for case in cases(options.panoramas):
+            if not any(word in case.name for word in options.only):
+                continue
+            ours, theirs, graded, true = compared(gl, case, options.samples)
+            error = np.abs(theirs - ours).mean(axis=2) / (theirs.mean(axis=2) + 0.01)
+            rows = [(case.name, graded)]
+            if case.name.startswith("metal"):
+                rows = [(f"{case.name}, {r:g}", graded & (true.instance == k + 1)) for k, r in enumerate(ROUGHNESSES)]
+                rows = [(name, on) for name, on in rows if on.any()]
+            for name, on in rows:
+                median, most = (100 * np.quantile(error[on], q) for q in (0.5, 0.95))
+                print(f"{name:34} {on.sum():7} {median:7.2f}% {most:7.2f}%", flush=True)
+            if options.pictures is not None:
+                both = np.concatenate([ours, theirs], axis=1)[..., ::-1]
+                file = options.pictures / f"{case.name.replace(', ', '-').replace(' ', '-')}.png"
+                cv2.imwrite(str(file), cv2.resize(to_srgb8(both), None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST))
+
+
+if __name__ == "__main__":
+    main()

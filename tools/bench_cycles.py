@@ -10,7 +10,9 @@
 
    filtering   our frames against path-traced ones under our own light model (no shadows,
                no bounces): mip maps, anti-aliasing
-   shadows     without them against with them, both path-traced
+   shadows     without them against with them, both path-traced: of the lamps alone, of the sky, of both; and ours,
+               light.shadows: hard, on path-traced frames without any (times the ratio of our own frames with and
+               without), so that filtering is not in it (--only shadows: these alone)
    bounces     direct light against four diffuse bounces, both path-traced
    all         our frames against everything
    noise       everything again with another seed: what cannot be told from no difference at all
@@ -53,6 +55,7 @@ from blinkgl.tools.peer_cycles import Cost, CyclesSettings, frames
 from blinkgl.trade.metrics import SpeedMaps, event_errors
 
 ANTIALIASINGS = ("none", "ssaa2", "ssaa4")
+SHADED = "our light, our shadows"
 
 
 def smaller(scene: Scene, width: int) -> Scene:
@@ -70,6 +73,17 @@ def rasterised(gl, scene: Scene, times: list[int], antialiasing: str, cost: Cost
             cost.wall_s.append(time.perf_counter() - wall)
             cost.cpu_s.append(time.process_time() - cpu)
             yield frame
+
+
+def shares(gl, scene: Scene, times: list[int], size: int, cost: Cost) -> Iterator[np.ndarray]:
+    """(H, W) of the light that our hard shadows leave at each time, ssaa4. size : of their maps, texels."""
+    light = scene.light
+    shaded, plain = (
+        rasterised(gl, replace(scene, light=replace(light, shadows=word, shadow_size=size)), times, "ssaa4", cost)
+        for word in ("hard", "off")
+    )
+    for dark, bright in zip(shaded, plain):
+        yield np.where(bright > 0, dark / np.where(bright > 0, bright, 1.0), 1.0)
 
 
 def clip(gl, scene: Scene, options, console: Console) -> dict:
@@ -96,22 +110,30 @@ def clip(gl, scene: Scene, options, console: Console) -> dict:
     everything = CyclesSettings(samples=options.samples, bounces=4)
     traced = {
         "our light": replace(everything, shadows=False, bounces=0),
+        "lamps' shadows": replace(everything, occlusion=False, bounces=0),
         "shadows": replace(everything, bounces=0),
         "everything": everything,
         "everything, another seed": replace(everything, seed=1),
     }
     costs, streams, first = {}, {}, {}
-    for name in (*ANTIALIASINGS, *traced):
+    if options.only == "shadows":
+        traced = {name: one for name, one in traced.items() if "everything" not in name}
+    names = [*traced, SHADED] if options.only == "shadows" else [*ANTIALIASINGS, *traced, SHADED]
+    open_: list[np.ndarray] = []  # path-traced frames without shadows
+    for name in names:
         cost = costs[name] = Cost()
-        source = (
-            rasterised(gl, scene, times, name, cost)
-            if name in ANTIALIASINGS
-            else frames(scene, times, traced[name], cost)
-        )
+        if name in traced:
+            source = frames(scene, times, traced[name], cost)
+        elif name == SHADED:
+            source = (frame * share for frame, share in zip(open_, shares(gl, scene, times, options.shadow_size, cost)))
+        else:
+            source = rasterised(gl, scene, times, name, cost)
 
         def event_frames(name=name, source=source):
             for t, frame in zip(times, source):
                 first.setdefault(name, frame.copy())
+                if name == "our light":
+                    open_.append(frame.copy())
                 yield EventFrame(t, frame)
 
         camera = EventCamera(config, None, height, width, seed=1)
@@ -120,8 +142,11 @@ def clip(gl, scene: Scene, options, console: Console) -> dict:
             f"{name}: {len(streams[name]):,} events, {np.median(cost.wall_s):.3f} s per frame", highlight=False
         )
     rows = [("filtering", a, "our light") for a in ANTIALIASINGS]
-    rows += [("shadows", "our light", "shadows"), ("bounces", "shadows", "everything")]
+    rows += [("lamps' shadows", "our light", "lamps' shadows"), ("lamps' shadows", SHADED, "lamps' shadows")]
+    rows += [("sky's shadows", "lamps' shadows", "shadows"), ("shadows", "our light", "shadows")]
+    rows += [("shadows", SHADED, "shadows"), ("bounces", "shadows", "everything")]
     rows += [("all", a, "everything") for a in ANTIALIASINGS] + [("noise", "everything, another seed", "everything")]
+    rows = [row for row in rows if {*row[1:]} <= set(names)]
     limit = round(options.partners * step / 1000)
     t0, t1 = times[0] // 1000, times[-1] // 1000 + 1
     errors = []
@@ -225,7 +250,8 @@ def main() -> None:
     parser.add_argument(
         "--partners", type=float, default=4.0, help="events are partners up to this many median frame steps apart"
     )
-    parser.add_argument("--only", choices=["clip", "speed"])
+    parser.add_argument("--only", choices=["clip", "speed", "shadows"])
+    parser.add_argument("--shadow-size", type=int, default=2048, help="of our shadow maps, texels")
     parser.add_argument("--no-eevee", action="store_true")
     parser.add_argument("--json", metavar="FILE")
     parser.add_argument("--pictures", metavar="FOLDER", help="first frame of each renderer as PNG")
@@ -245,7 +271,7 @@ def main() -> None:
         if options.only != "speed":
             result["clip"] = clip(gl, smaller(scene, options.width), options, console)
             _show_clip(console, result["clip"])
-        if options.only != "clip":
+        if options.only not in ("clip", "shadows"):
             result["speed"] = speed(gl, scene, getattr(config.timeline, "max_px", 1.0), options)
             _show_speed(console, result["speed"])
         result["load_after"] = os.getloadavg()

@@ -1,5 +1,6 @@
-"""The pictures of docs/light.md and docs/materials.md: one scene, each kind of light added to what was there before; a
-row of balls, each with one thing more than a matt colour.
+"""The pictures of docs/light.md and docs/materials.md: one scene, each effect of light and surfaces added to what was
+there before, a path tracer's (extra [cycles], see ``peer_cycles.py``) below it; a row of balls, each with one thing
+more than a matt colour.
 
 python -m blinkgl.tools.light_effects [--out docs/images/light.jpg] [--materials docs/images/materials.jpg]
 """
@@ -13,17 +14,19 @@ import cv2
 import numpy as np
 
 import blinkgl.scene.types as data
-from blinkgl import Camera, Light, Material, Pose, Primitive, Scene, look_at, render_frame
+from blinkgl import Camera, Light, Material, Pose, Primitive, Scene, look_at
 from blinkgl.camera import PinHole
 from blinkgl.config.sequence import RenderConfig
-from blinkgl.gl import create_context
+from blinkgl.gl import GLContext, create_context
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.geometry.primitives import grid, sphere
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.rig import Rig
+from blinkgl.tools.peer_cycles import CyclesSettings, colours
 
-SIZE = 300, 260  # px of a panel, width and height
+SIZE = 300, 225  # px of a panel, width and height
 WHITE = 1.25  # radiance that is white in the picture: lamps shine on top of the sun
+COLUMNS = 3
 LAMPS = [
     {"kind": "point", "position": (-0.9, -1.4, 1.5), "strength": 0.9, "color": (1.0, 0.62, 0.36)},
     {
@@ -31,42 +34,88 @@ LAMPS = [
         "position": (1.0, 0.6, 3.4),
         "look_at": (0.9, -0.1, 0),
         "angle": 46,
-        "edge": 0.3,
+        "edge": 0.1,
         "strength": 6.0,
-        "size": 0.5,
+        "size": 0.3,
     },
 ]
 LOW_SUN = {"sun": 0.5, "sky": 0.45, "elevation": 32, "azimuth": 200}
 COLOURED = {**LOW_SUN, "sun_color": (1.0, 0.82, 0.6), "sky_color": (0.65, 0.8, 1.0)}
-PANELS: dict[str, dict[str, Any]] = {
-    "nothing said": {},
-    "coloured sun and sky": COLOURED,
-    "point and spot light": {**COLOURED, "lights": LAMPS},
-    "hard shadows": {**COLOURED, "lights": LAMPS, "shadows": "hard"},
-    "soft shadows": {**COLOURED, "lights": LAMPS, "shadows": "soft", "sun_size": 8},
-}
+LIT = {**COLOURED, "lights": LAMPS}
+PANELS: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
+    # Each has what those before it have: caption, light, effects of the surfaces
+    ("nothing said", {}, ()),
+    ("coloured sun and sky", COLOURED, ()),
+    ("point and spot light", LIT, ()),
+    ("hard shadows", {**LIT, "shadows": "hard"}, ()),
+    ("soft shadows", {**LIT, "shadows": "soft", "sun_size": 6}, ()),
+    ("metal and roughness", {**LIT, "shadows": "soft", "sun_size": 6}, ("gloss",)),
+    ("a normal map", {**LIT, "shadows": "soft", "sun_size": 6}, ("gloss", "bumps")),
+    ("light of its own", {**LIT, "shadows": "soft", "sun_size": 6}, ("gloss", "bumps", "glow")),
+    ("holes", {**LIT, "shadows": "soft", "sun_size": 6}, ("gloss", "bumps", "glow", "holes")),
+]
 
 
-def scene(light: Light) -> Scene:
-    """A person, a box, two balls, one of which floats, on a plane."""
+def scene(light: Light, effects: tuple[str, ...]) -> Scene:
+    """A box, balls, a ring and a standing sheet on a plane."""
+    bumps, opacity, _ = _waves()
+    gold = {"metallic": 1.0, "roughness": 0.3} if "gloss" in effects else {}
+    wet = {"roughness": 0.35} if "gloss" in effects else {}
+    dents = {"normal_map": bumps} if "bumps" in effects else {}
+    glow = {"emission": (0.25, 0.12, 0.4)} if "glow" in effects else {}
+    holes = {"mask": opacity, "cutoff": 0.45} if "holes" in effects else {}
+    lying = Pose((0.1, -1.25, 0.13), euler=(0, 0, 20))
     things = (
         Primitive("grid", category="ground", scale=14, material=Material(color=(0.62, 0.6, 0.57))),
-        Primitive("figure", pose=Pose((-0.55, 0.0, 0.0), euler=(0, 0, -80)), variant=3, coat=5, clip="wave"),
-        Primitive("cuboid", pose=(0.35, 1.5, 0.5), material=Material(procedural="bricks", color=(0.5, 0.85, 0.6))),
-        Primitive("sphere", pose=(0.95, -0.15, 0.75), scale=0.5),
-        Primitive("sphere", pose=(-1.6, 1.7, 0.6), scale=1.0, material=Material(color=(0.8, 0.35, 0.3))),
+        Primitive(
+            "cuboid",
+            pose=Pose((0.45, 1.3, 0.55), euler=(0, 0, 25)),
+            scale=1.1,
+            material=Material(procedural="bricks", color=(0.5, 0.85, 0.6), **dents),
+        ),
+        Primitive("sphere", pose=(1.15, -0.2, 0.75), scale=0.8, material=Material(color=(1.0, 0.77, 0.34), **gold)),
+        Primitive("sphere", pose=(-1.6, 1.4, 0.6), scale=1.2, material=Material(color=(0.8, 0.35, 0.3), **wet)),
+        Primitive("torus", pose=lying, scale=0.9, material=Material(color=(0.35, 0.3, 0.5), **glow)),
+        Primitive(
+            "grid",
+            pose=Pose((-0.75, -0.15, 0.75), euler=(80, 0, -15)),
+            scale=1.1,
+            material=Material(color=(0.45, 0.6, 0.85), double_sided=True, **holes),
+        ),
     )
-    camera = Camera(*SIZE, fov=36, pose=look_at((0.3, -5.2, 2.6), (0.1, 0.3, 0.45)))
+    camera = Camera(*SIZE, fov=42, pose=look_at((0.3, -5.2, 2.6), (0.0, 0.2, 0.4)))
     return Scene(camera, things, light=light, background=0.32)
 
 
-def panel(light: dict[str, Any], caption: str) -> np.ndarray:
-    """(h, w, 3) uint8 BGR."""
-    seen = np.clip(render_frame(scene(Light(**light)), 0.2).images / WHITE, 0, 1)
-    picture = np.ascontiguousarray((255 * seen ** (1 / 2.2)).round().astype(np.uint8)[..., ::-1])
-    bar = np.full((26, SIZE[0], 3), 255, np.uint8)
-    cv2.putText(bar, caption, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (40, 40, 40), 1, cv2.LINE_AA)
+def shown(radiance: np.ndarray) -> np.ndarray:
+    """(h, w, 3) uint8 BGR of linear radiance."""
+    seen = np.clip(radiance / WHITE, 0, 1)
+    return np.ascontiguousarray((255 * seen ** (1 / 2.2)).round().astype(np.uint8)[..., ::-1])
+
+
+def labelled(picture: np.ndarray, caption: str) -> np.ndarray:
+    """With a line above it."""
+    bar = np.full((24, picture.shape[1], 3), 255, np.uint8)
+    cv2.putText(bar, caption, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (40, 40, 40), 1, cv2.LINE_AA)
     return np.concatenate([bar, picture])
+
+
+def panels(gl: GLContext, samples: int) -> np.ndarray:
+    """Each effect added to those before: ours above, Cycles below; and Cycles with all that it knows as the last."""
+    pairs = []
+    for number, (caption, light, effects) in enumerate(PANELS):
+        described = scene(Light(**light), effects)
+        made = described.build(described.template().sequence(0))
+        with Renderer(gl, made, RenderConfig(image_antialiasing="ssaa4")) as renderer:
+            ours = renderer.colour(0).read()
+        settings = CyclesSettings(
+            max(samples, 1), shadows=light.get("shadows", "off") != "off", occlusion=False, bounces=0
+        )
+        (theirs,) = colours(made, [0], settings) if samples else (np.ones_like(ours),)
+        text = caption if number == 0 else f"+ {caption}"
+        pairs.append(np.concatenate([labelled(shown(ours), text), labelled(shown(theirs), "Cycles, path depth 1")]))
+    rows = [np.concatenate(pairs[k : k + COLUMNS], axis=1) for k in range(0, len(pairs), COLUMNS)]
+    return np.concatenate(rows)
 
 
 def _waves(size: int = 128) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -97,7 +146,7 @@ def balls() -> dict[str, data.Material]:
     }
 
 
-def row_of_balls() -> np.ndarray:
+def row_of_balls(gl: GLContext) -> np.ndarray:
     """(h, w, 3) uint8 BGR."""
     made, width, height = balls(), 1500, 240
     ball, floor = sphere(segments=64, rings=32), grid(width=40.0, depth=14.0)
@@ -112,7 +161,7 @@ def row_of_balls() -> np.ndarray:
     eye[:3, 3] = 0, -16.0, 3.2
     camera = PinHole.centred(width, height, 2000.0, near=0.1)
     scene = data.Scene(tuple(things), Rig.alone(camera, StaticPath(eye)), 0, 1_000_000, sun, 0.5)
-    with create_context() as gl, Renderer(gl, scene, RenderConfig(image_antialiasing="ssaa4")) as renderer:
+    with Renderer(gl, scene, RenderConfig(image_antialiasing="ssaa4")) as renderer:
         seen = np.clip(renderer.colour(0).read(), 0, 1)
     picture = np.ascontiguousarray((255 * seen ** (1 / 2.2)).round().astype(np.uint8)[..., ::-1])
     bar = np.full((26, width, 3), 255, np.uint8)
@@ -129,12 +178,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", default="docs/images/light.jpg")
     parser.add_argument("--materials", default="docs/images/materials.jpg")
+    parser.add_argument("--samples", type=int, default=128, help="of Cycles, paths a pixel; 0: white in its place")
     options = parser.parse_args()
-    if not cv2.imwrite(options.materials, row_of_balls(), [cv2.IMWRITE_JPEG_QUALITY, 90]):
-        parser.error(f"cannot write {options.materials}")
-    panels = [panel(light, caption) for caption, light in PANELS.items()]
-    if not cv2.imwrite(options.out, np.concatenate(panels, axis=1), [cv2.IMWRITE_JPEG_QUALITY, 90]):
-        parser.error(f"cannot write {options.out}")
+    with create_context() as gl:
+        pages = {options.materials: row_of_balls(gl), options.out: panels(gl, options.samples)}
+    for path, picture in pages.items():
+        if not cv2.imwrite(path, picture, [cv2.IMWRITE_JPEG_QUALITY, 88]):
+            parser.error(f"cannot write {path}")
 
 
 if __name__ == "__main__":

@@ -6,10 +6,11 @@ from blinkgl.errors import ConfigError
 from blinkgl.layouts.blinkflow import BlinkFlow
 from blinkgl.layouts.dsec import Dsec, ERaft
 from blinkgl.layouts.layout import Layout
+from blinkgl.layouts.multiflow import MultiFlow
 from blinkgl.layouts.mvsec import Mvsec
 from blinkgl.layouts.tapvid import TapVid
 
-LAYOUTS: dict[str, Layout] = {row.name: row for row in (Dsec(), ERaft(), BlinkFlow(), Mvsec(), TapVid())}
+LAYOUTS: dict[str, Layout] = {row.name: row for row in (Dsec(), ERaft(), BlinkFlow(), Mvsec(), TapVid(), MultiFlow())}
 
 
 def layout_of(name: str) -> Layout:

@@ -95,7 +95,7 @@ ILLUMINANT shone(ILLUMINANT base, vec3 normal, vec3 at, vec2 coordinates)
     shown_matt = (1.0 - metallic) * (1.0 - even_clear) * irradiance(normal);
     ILLUMINANT sum = base * shown_matt;
     // a rough surface's lobe leans towards the normal: gloss.py, looked_at()
-    vec3 ahead = mix(n, reflect(-v, n), (1.0 - roughness * roughness) * (0.8 + 0.4 * facing_eye));
+    vec3 ahead = mix(n, reflect(-v, n), (1.0 - roughness * roughness) * (1.0 + 0.6 * roughness * (facing_eye - 0.5)));
     sum += mirrored(normalize(TO_WORLD * ahead), min(roughness * (0.875 + 0.25 * facing_eye), 1.0)) * mix(ILLUMINANT(even_clear), even_metal, metallic);
 #if defined(SUNS) || defined(LAMPS)
     float seen = sqrt(facing_eye * facing_eye * (1.0 - square) + square);

@@ -129,3 +129,22 @@ def tapvid(path):
         assert video["points"].shape == (n, times, 2) and video["points"].dtype == np.float32
         assert video["occluded"].dtype == bool and not video["occluded"].all(axis=1).any()
     return table
+
+
+def multiflow_sample(folder, height, width):
+    """MultiFlow's sample: the reference at 0.4 s of its own clock, the target at 0.9 s, images at both, flow from the
+    one to every time that a file is named by, events a tenth of a second beyond. (x, y, t, p), images, {µs: flow}."""
+    with h5py.File(folder / "events/events.h5") as file:
+        x, y, t, p = (file[name][:] for name in "xytp")
+    assert (np.diff(t) >= 0).all() and t[0] >= 0 and t[-1] < 1_000_000 and set(np.unique(p)) <= {0, 1}
+    assert (t.astype("i4") == t).all() and (x.astype("i2") == x).all()
+    images = [cv2.imread(str(folder / f"images/{time:07d}.png")) for time in (400_000, 900_000)]
+    assert all(image.shape == (height, width, 3) for image in images)
+    flows = {}
+    for path in sorted((folder / "flow").iterdir()):
+        assert path.suffix == ".h5" and len(path.stem) == 7 and int(path.stem) % 10_000 == 0
+        with h5py.File(path) as file:
+            flows[int(path.stem)] = file["flow"][()]
+        assert flows[int(path.stem)].shape == (height, width, 2) and flows[int(path.stem)].dtype == np.float32
+    assert max(flows) == 900_000 and min(flows) > 400_000
+    return (x, y, t, p), images, flows

@@ -90,7 +90,7 @@ def looked_at(
     """(N, 3) unit directions and (N,) roughnesses at which surroundings are looked up of surfaces that mirror towards
     ``away``: the lobe of a rough one leans towards the normal, and is narrower where the eye, at (N,) cosines, looks
     along the surface, than :func:`blurred` has it. Fitted against a path tracer (docs/results.md)."""
-    share = ((1.0 - roughness**2) * (0.8 + 0.4 * cosine))[:, None]
+    share = ((1.0 - roughness**2) * (1.0 + 0.6 * roughness * (cosine - 0.5)))[:, None]
     way = share * away + (1.0 - share) * normal
     return way / np.linalg.norm(way, axis=1, keepdims=True), roughness * (0.875 + 0.25 * cosine)
 

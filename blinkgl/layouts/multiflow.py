@@ -1,0 +1,131 @@
+"""MultiFlow's samples (Gehrig, Muglikar, Scaramuzza: Dense Continuous-Time Optical Flow from Event Cameras, T-PAMI
+2024), as bflow's loader reads them.
+
+    train|val/<sequence>_<label>/
+      events/events.h5           x, y u2, p u1, t i8 µs on the sample's clock, 0 to 1 s; gzip
+      flow/%07d.h5               flow (H, W, 2) f4 px from 0400000 to that µs: multiples of 10 ms, the last one 0900000
+      images/0400000.png         and 0900000.png
+
+A sample is a second around one label: its clock is 400 ms when the label is. There is no mask; where nothing is seen
+the flow is 0.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from blinkgl.camera import PinHole
+from blinkgl.io.atomic import output_errors
+from blinkgl.io.intervals import intervals_in
+from blinkgl.layouts.files import append, copy, growing
+from blinkgl.layouts.layout import Layout, Missing, images
+from blinkgl.layouts.source import Source
+
+LABEL_US, TARGET_US, END_US, STEP_US = 400_000, 900_000, 1_000_000, 10_000
+_FLOW = "labels: {flow: [0.1, 0.2, 0.3, 0.4, 0.5]}"
+
+
+def _flow_over_half_a_second(source: Source) -> Missing | None:
+    if any(_leads(source, k) for k in range(len(source.interval_times))):
+        return None
+    return Missing("flow to several times, the last one 0.5 s after the label", _FLOW)
+
+
+def _samples(source: Source) -> Missing | None:
+    if _flow_over_half_a_second(source) or not source.image_times or labels_of(source):
+        return None
+    said = "a label with 0.4 s before it, 0.6 s after it, and images at it and 0.5 s later"
+    return Missing(said, "time: {duration: 1, label_rate: 2}")
+
+
+def _sensor_pixels(source: Source) -> Missing | None:
+    """Its events are not rectified."""
+    if source.camera is None or isinstance(source.camera, PinHole) or not source.rectified:
+        return None
+    return Missing("labels in the sensor's pixels", "labels: {pixels: sensor}")
+
+
+class MultiFlow(Layout):
+    """Flow to many times, of samples of a second."""
+
+    name = "multiflow"
+    about = "bflow's MultiFlow loader (flow at many times after one; folders train and val)"
+    size = (384, 512)
+    needs = (_flow_over_half_a_second, images, _samples, _sensor_pixels)
+
+    def folder(self, source: Source) -> str:
+        return "train" if source.split == "train" else "val"
+
+    def write(self, source: Source, folder: Path) -> list[str]:
+        unseen = []
+        for k in labels_of(source):
+            t = source.interval_times[k]
+            sample = folder / f"{source.name}_{k:06d}"
+            _write_events(source, t, sample / "events/events.h5")
+            for clock_us in (LABEL_US, TARGET_US):
+                at = source.image_times.index(t + clock_us - LABEL_US)
+                copy(source.file("images", at), sample / f"images/{clock_us:07d}.png")
+            flows = source.flows(k)
+            for clock_us, one, valid in zip(_clock_us(flows.interval_ns), flows.flow, flows.valid):
+                if clock_us is not None:
+                    _write_flow(one, sample / f"flow/{clock_us:07d}.h5")
+                    unseen.append(1 - valid.mean())
+        share = float(np.mean(unseen))
+        return [f"{source.name}: {share:.1%} of its flow is 0 where nothing is seen: there is no mask"] if share else []
+
+
+def labels_of(source: Source) -> list[int]:
+    """Numbers of the labels that samples are made of."""
+    there = set(source.image_times)
+    return [
+        k
+        for k, t in enumerate(source.interval_times)
+        if t - LABEL_US >= source.start_us
+        and t - LABEL_US + END_US <= source.end_us
+        and {t, t + TARGET_US - LABEL_US} <= there
+        and _leads(source, k)
+    ]
+
+
+def _leads(source: Source, k: int) -> bool:
+    """Whether label ``k`` leads to the end of a sample."""
+    return TARGET_US in _clock_us(intervals_in(source.file("flow_intervals", k)))
+
+
+def _clock_us(interval_ns: np.ndarray) -> list[int | None]:
+    """When they end on a sample's clock; None: not in a sample, or at no multiple of its step."""
+    ends = [(int(ns) / 1000, round(int(ns) / 1000 / STEP_US) * STEP_US) for ns in interval_ns]
+    fits = [abs(us - step) <= 1 and 0 < step <= TARGET_US - LABEL_US for us, step in ends]
+    return [LABEL_US + step if fit else None for (_, step), fit in zip(ends, fits)]
+
+
+def _write_flow(flow: np.ndarray, path: Path) -> None:
+    with output_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with h5py.File(path, "w") as file:
+            file.create_dataset(
+                "flow",
+                data=flow.astype(np.float32),
+                compression="gzip",
+                compression_opts=1,
+                shuffle=True,
+                track_times=False,
+            )
+
+
+def _write_events(source: Source, label_us: int, path: Path) -> None:
+    start = label_us - LABEL_US
+    with output_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with h5py.File(path, "w") as file:
+            columns = {
+                name: growing(file, name, dtype)
+                for name, dtype in (("x", np.uint16), ("y", np.uint16), ("p", np.uint8), ("t", np.int64))
+            }
+            for events in source.events():
+                part = events.window(start, start + END_US)
+                for name, column in columns.items():
+                    append(column, part.t - start if name == "t" else getattr(part, name))

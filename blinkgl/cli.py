@@ -460,7 +460,10 @@ def calibrate(
             help="No frames: an even scene under light that goes as 1 + CONTRAST sin, HZ times a second. Thresholds.",
         ),
     ] = None,
-    emulator: Annotated[str, typer.Option("--emulator", "-e", help="esim, v2e or voltmeter.")] = "esim",
+    emulator: Annotated[
+        str,
+        typer.Option("--emulator", "-e", help="esim, v2e or voltmeter; with --still also pixels: noise beside any."),
+    ] = "esim",
     sensor: Annotated[str | None, typer.Option("--sensor", help="A sensor whose values the fit begins with.")] = None,
     overrides: Annotated[
         list[str] | None,

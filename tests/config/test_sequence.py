@@ -243,7 +243,7 @@ def test_field_of_view_is_horizontal_and_the_principal_point_the_centre():
         ("events: {emulator: easim}", "events.emulator: unknown choice (got 'easim')"),
         (
             "labels: {flow: [sideways]}",
-            "labels.flow.0: unknown choice (got 'sideways'); expected 'forward' or 'backward'",
+            "labels.flow.0: no direction, and no interval (got 'sideways'); expected forward, backward",
         ),
         (
             "output: {name: ../escape}",

@@ -1,9 +1,10 @@
 """The ``blinkgl`` command: thin functions over the library, one line per error.
 
 Exit status: 0 done; 1 `shader diff`, `shader check` or `qualify` found something wrong; 2 the user's input or machine
-(``error: …`` on stderr, one line); 3 done but for sequences that were set aside; 130 interrupted. A traceback means a
-bug in BlinkGL, or ``--debug``. What a command does and prints is ``blinkgl.show.COMMAND.run``, which returns the
-status; it is imported inside the function, so that ``--help`` answers at once.
+(``error: …`` on stderr, one line); 3 done but for sequences (`trade --suite`: scenes) that were set aside; 130
+interrupted. A traceback means a bug in BlinkGL, or ``--debug``. What a command does and prints is
+``blinkgl.show.COMMAND.run``, which returns the status; it is imported inside the function, so that ``--help`` answers
+at once.
 """
 
 from __future__ import annotations
@@ -177,10 +178,25 @@ def qualify(
 
 @app.command()
 def trade(
-    config: Annotated[str, typer.Argument(help="YAML file; see configs/ for examples.")],
+    config: Annotated[
+        str | None, typer.Argument(help="YAML file; see configs/ for examples. With --suite: a folder of your scenes.")
+    ] = None,
     out: Annotated[
-        str, typer.Option("--out", "-o", help="Folder for trade.json, trade.csv, pareto.png and trade.html.")
+        str,
+        typer.Option(
+            "--out", "-o", help="Folder for trade.json, trade.csv, pareto.png and trade.html (--suite: suite.*)."
+        ),
     ] = "trade",
+    suite: Annotated[
+        bool, typer.Option("--suite", help="The shipped scenes, each hard in another way, in place of one.")
+    ] = False,
+    scene: Annotated[
+        list[str] | None,
+        typer.Option("--scene", metavar="TEXT", help="--suite: only scenes whose name contains this; may be repeated."),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="--suite: keep the scenes that --out holds already.")
+    ] = False,
     quick: Annotated[
         bool, typer.Option("--quick", help="Fewer settings, fewer pixels, a shorter clip: minutes.")
     ] = False,
@@ -210,7 +226,10 @@ def trade(
         float | None,
         typer.Option(min=0.1, help="Give up on further rounds and finer references after about this long."),
     ] = None,
-    cost: Annotated[str, typer.Option(help="What the front is drawn over: wall, or cpu on a busy machine.")] = "wall",
+    cost: Annotated[
+        str | None,
+        typer.Option(help="What the front is drawn over: wall (default), or cpu on a busy machine (--suite: cpu)."),
+    ] = None,
     reference: Annotated[
         str,
         typer.Option(
@@ -231,9 +250,34 @@ def trade(
     as a table, a plot and a page."""
     from blinkgl.show import trade as command
 
+    if suite:
+        from blinkgl.show import suite as suite_command
+
+        return suite_command.run(
+            config,
+            out,
+            overrides=overrides or [],
+            only=only or [],
+            skip=skip or [],
+            scenes=scene or [],
+            resume=resume,
+            limit_ms=limit_ms,
+            rounds=rounds,
+            minutes=minutes,
+            cost=cost or "cpu",
+            others={
+                "--quick": quick,
+                "--seed": seed is not None,
+                "--sequence": sequence is not None,
+                "--clip": clip is not None,
+                "--reference": reference != "raster",
+                "--reference-set": bool(reference_set),
+            },
+        )
     return command.run(
         config,
         out,
+        suite_options=[name for name, given in (("--scene", scene), ("--resume", resume)) if given],
         overrides=overrides or [],
         quick=quick,
         only=only or [],
@@ -243,7 +287,7 @@ def trade(
         limit_ms=limit_ms,
         rounds=rounds,
         minutes=minutes,
-        cost=cost,
+        cost=cost or "wall",
         reference=reference,
         reference_set=reference_set,
         seed=seed,
@@ -416,7 +460,10 @@ def calibrate(
             help="No frames: an even scene under light that goes as 1 + CONTRAST sin, HZ times a second. Thresholds.",
         ),
     ] = None,
-    emulator: Annotated[str, typer.Option("--emulator", "-e", help="esim, v2e or voltmeter.")] = "esim",
+    emulator: Annotated[
+        str,
+        typer.Option("--emulator", "-e", help="esim, v2e or voltmeter; with --still also pixels: noise beside any."),
+    ] = "esim",
     sensor: Annotated[str | None, typer.Option("--sensor", help="A sensor whose values the fit begins with.")] = None,
     overrides: Annotated[
         list[str] | None,

@@ -25,10 +25,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from scipy import stats
 
-from blinkgl.config.reader import read_table
+from blinkgl.config.reader import read_table, to_yaml
 from blinkgl.errors import ConfigError
 from blinkgl.machine.bench import machine_line
 from blinkgl.tools.compare_networks import Steps, log
@@ -237,7 +236,7 @@ def run(a: argparse.Namespace) -> None:
     for seed in a.seeds:
         for name in a.arms:
             arm = ARMS[name]
-            text = yaml.safe_dump(recipe_of(arm, base), sort_keys=False)
+            text = to_yaml(recipe_of(arm, base))
             key = text + " ".join(arm.windows)
             if key not in pools:  # arms that change the training alone share the windows
                 folder = a.out / name

@@ -21,7 +21,7 @@ Made from the commands by `python -m blinkgl.tools.command_docs`; do not edit. `
 
 `--debug`, before or after a command, shows the traceback of an error. Exit status: 0 done; 1 `shader diff`,
 `shader check` or `qualify` found something wrong; 2 your input or the machine (`error: …`, one line); 3 done but for
-sequences that were set aside; 130 interrupted.
+sequences (`trade --suite`: scenes) that were set aside; 130 interrupted.
 """
 REMARKS = re.compile(r"\s*\[([^\]]*)\]$")
 """What ``--help`` says last of an option, ``[default: 4; 1<=x<=1000]``."""

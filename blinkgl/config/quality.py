@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 from functools import lru_cache
 from importlib import resources
 from typing import Any, Literal
@@ -12,11 +13,25 @@ from blinkgl.config.reader import parse_yaml
 
 Quality = Literal["fast", "balanced", "accurate", "reference"]
 QUALITIES = ("fast", "balanced", "accurate", "reference")
+DEFAULT: Quality = "balanced"
+"""Of a configuration that says nothing; ``quality: null`` leaves every key at its own default."""
+
+
+def with_default(tree: Any) -> Any:
+    """A configuration's plain data with ``quality`` said."""
+    return {"quality": DEFAULT, **tree} if isinstance(tree, dict) else tree
 
 
 def load_quality(name: str) -> dict[str, Any]:
     """``timeline:`` and ``render:`` of a preset, plain data; the figures it was chosen by are comments in its file."""
     return copy.deepcopy(_shipped(name))
+
+
+@lru_cache
+def measured() -> dict[str, Any]:
+    """The run of the suite that the presets were chosen by (``configs/quality/measured.json``): ``settings``, name ->
+    timeline and render; ``scenes``, name -> its rows; not to be changed."""
+    return json.loads((resources.files("blinkgl.configs") / "quality" / "measured.json").read_text(encoding="utf-8"))
 
 
 @lru_cache

@@ -14,7 +14,9 @@ class PixelsConfig(Config):
     """Pixels that are dead, hot, or fire in the dark, whatever the emulator: drawn once, from the sequence's seed.
 
     Noise events are a Poisson process of each pixel's own rate, beside the emulator's events and without a word to its
-    comparators. Rates are log-normal over the pixels, hot ones about a median of their own."""
+    comparators. Rates are log-normal over the pixels, hot ones about a median of their own. Some are answered: noise
+    that passed one threshold comes back through the other, so that an event of the opposite polarity follows, later by
+    a log-normal time. Both are in the rates."""
 
     dead_fraction: float = Field(0.0, ge=0, le=1, description="Share of pixels that never fire.")
     hot_fraction: float = Field(0.0, ge=0, le=1, description="Share of pixels that are hot.")
@@ -22,7 +24,18 @@ class PixelsConfig(Config):
     hot_spread_decades: float = Field(0.0, ge=0, le=3, description="Spread of the hot pixels' rates, decades.")
     rate_hz: float = Field(0.0, ge=0, le=1e4, description="Median rate of the other pixels, events per second.")
     spread_decades: float = Field(0.0, ge=0, le=3, description="Spread of the other pixels' rates, decades.")
-    on_share: float = Field(0.5, ge=0, le=1, description="Share of ON events among all of these.")
+    on_share: float = Field(0.5, ge=0, le=1, description="Share of ON events among those that answer no other.")
+    answered: float = Field(
+        0.0, ge=0, le=1, description="Share of noise events that one of the opposite polarity follows."
+    )
+    answer_ms: float = Field(30.0, ge=0.001, le=1e3, description="Median time from an event to its answer, ms.")
+    answer_spread_decades: float = Field(0.5, ge=0, le=1, description="Spread of that time, decades.")
+    refractory_us: float = Field(
+        0.0,
+        ge=0,
+        le=1e6,
+        description="Dead time of a pixel's noise after an event of it, microseconds; rates are without.",
+    )
 
 
 class LatencyConfig(Config):

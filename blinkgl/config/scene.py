@@ -499,6 +499,14 @@ class TrajectoryConfig(Config):
         description="each pose becomes the mean of those within so many s before and after, weighed by a triangle; 0: "
         "the spline passes them all",
     )
+    speed_limit: float = Field(
+        100.0,
+        gt=0,
+        le=1e9,
+        description="world units/s from one pose to the next: what is faster is taken for a jump, or for poses in mm, "
+        "and refused",
+    )
+    turn_limit: float = Field(7200.0, gt=0, le=1e9, description="degrees/s from one pose to the next, likewise")
     T_body_sensor: str | Matrix | None = Field(
         None,
         description="where this camera or object is on the body whose poses the file has, from its axes to the body's: "

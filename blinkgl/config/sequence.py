@@ -28,7 +28,7 @@ from blinkgl.config.images import ImagesConfig, check_images, readout_us
 from blinkgl.config.imu import ImuConfig, check_imu
 from blinkgl.config.labels import LabelsConfig, fill_causes
 from blinkgl.config.lod import LodConfig
-from blinkgl.config.quality import Quality, fill_quality
+from blinkgl.config.quality import DEFAULT, Quality, fill_quality, with_default
 from blinkgl.config.reader import parse_yaml, read_table
 from blinkgl.config.readout import ReadoutConfig, drain_us
 from blinkgl.config.recipes import with_recipes
@@ -192,9 +192,10 @@ class SequenceConfig(Config):
     camera: CameraConfig = Field(CameraConfig(), description="resolution, intrinsics and lens")
     time: TimeConfig = Field(TimeConfig(), description="duration and label rate")
     quality: Quality | None = Field(
-        None,
+        DEFAULT,
         description="fast, balanced, accurate or reference: gives timeline and render the values of a measured "
-        "point of speed against accuracy (docs/trade.md); what is said beside it wins",
+        "point of speed against accuracy (docs/trade.md); what is said beside it wins. null: every key has the default "
+        "that stands in its own table",
     )
     timeline: TimelineConfig = Field(DisplacementTimeline(), description="when event frames are drawn")
     scene: SceneConfig = Field(RandomSceneConfig(), description="what is in front of the camera and how it moves")
@@ -463,7 +464,7 @@ class RunTemplate:
                 )
         first = None
         with remembering():
-            for tree in corners(SequenceConfig, self.tree, FILLS):
+            for tree in corners(SequenceConfig, with_default(self.tree), FILLS):
                 config = _validated(tree)
                 first = config if first is None else first
         assert first is not None
@@ -471,13 +472,14 @@ class RunTemplate:
 
     def corners_of(self, *keys: str) -> Iterator[SequenceConfig]:
         """Configurations with every combination that can be drawn of the choices and ends at or below ``keys``."""
-        for tree in corners_of(keys, SequenceConfig, self.tree, FILLS):
+        for tree in corners_of(keys, SequenceConfig, with_default(self.tree), FILLS):
             yield _validated(tree)
 
 
 def _validated(tree: dict[str, Any]) -> SequenceConfig:
     """SequenceConfig of plain data, with the values of a named quality and sensor filled in
     where the tree says nothing."""
+    tree = with_default(tree)
     if is_rig(tree):
         return _validated_rig(tree)
     for fill in FILLS:

@@ -22,6 +22,7 @@ from blinkgl.config.images import ImagesConfig
 from blinkgl.config.imu import imu_count
 from blinkgl.config.sequence import RunTemplate, SequenceConfig
 from blinkgl.config.tracks import TracksConfig, track_times
+from blinkgl.dataset.choices import quality_in_words
 from blinkgl.dataset.effects import Effect, effects_of
 from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging import FrameCamera
@@ -83,7 +84,7 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
         result = Explanation(machine=gl.renderer)
         for name, own, seen, events in _cameras(config, scene):
             with Renderer(gl, seen, config.render) as renderer:
-                one = Explanation(scene=_describe(renderer.scene, renderer))
+                one = Explanation(scene=_describe(renderer.scene, renderer, config))
                 if events:
                     _passes(own, index, seen, renderer, gl, one)
                 elif own.images is not None:
@@ -210,7 +211,7 @@ def _living(scene: Scene) -> dict[str, str]:
     return rows
 
 
-def _describe(scene: Scene, renderer: Renderer) -> dict[str, str]:
+def _describe(scene: Scene, renderer: Renderer, config: SequenceConfig) -> dict[str, str]:
     moving = sum(not o.is_static for o in scene.objects)
     parts = [p for o in scene.objects for p in o.parts]
     textures = {id(p.material.texture): p.material.texture for p in parts if p.material.texture is not None}
@@ -231,6 +232,7 @@ def _describe(scene: Scene, renderer: Renderer) -> dict[str, str]:
         if lit
         else "none: every surface is unlit",
         **_fog(scene),
+        "quality": quality_in_words(config),
         "notes": "; ".join(scene.log) or "–",
         **({"not drawn": "; ".join(scene.omissions)} if scene.omissions else {}),
     }

@@ -18,8 +18,19 @@ from blinkgl.events.packing import JIT
 from blinkgl.events.philox import Stream, normal2, pixel_counters, uniform2
 from blinkgl.events.types import OPTIONAL, Cause, Events
 
-_BATCH, _MOST_HZ = 1024, 1e6
+_BATCH, _MOST_HZ, _LONGEST_BEFORE_S = 1024, 1e6, 5.0
 _DEFECT, _OWN, _LATE = np.uint64(Stream.DEFECT), np.uint64(Stream.OWN_NOISE), np.uint64(Stream.LATENCY)
+
+
+@numba.njit(**JIT)
+def _awake(pixel, t_us, dead_us, last):
+    """(n,) bool: events that come at least ``dead_us`` after the last one of their pixel that did; ``last`` follows."""
+    out = np.empty(t_us.size, np.bool_)
+    for i in range(t_us.size):
+        out[i] = t_us[i] - last[pixel[i]] >= dead_us
+        if out[i]:
+            last[pixel[i]] = t_us[i]
+    return out
 
 
 class PixelNoise:
@@ -39,7 +50,13 @@ class PixelNoise:
         decades = np.where(self.hot, config.hot_spread_decades, config.spread_decades)
         rates = np.minimum(median * exp_f64(np.log(10.0) * decades * spread), _MOST_HZ)
         self.rates = np.where(self.dead, 0.0, rates)
-        self._sums = np.cumsum(self.rates)
+        self._sums = np.cumsum(self.rates / (1.0 + config.answered))
+        self._decades = np.log(10.0) * config.answer_spread_decades
+        # Answers that are on their way when the recording begins are those of noise before it.
+        before_s = min(1e-3 * config.answer_ms * np.exp(3.0 * self._decades), _LONGEST_BEFORE_S)
+        self._before_ns = round(1e9 * before_s) if config.answered else 0
+        self._from_us = 0
+        self._last = np.full(height * width, -(2**62), np.int64) if config.refractory_us else None
         self._batch = 0  # next to be drawn
         self._t_ns: int | None = None  # where the last batch ended
         self._drawn = Events.empty()  # and not given yet
@@ -52,13 +69,17 @@ class PixelNoise:
         if not (self._sums.size and self._sums[-1] > 0):
             return events
         if self._t_ns is None:
-            self._t_ns = 1000 * until_us
+            self._t_ns, self._from_us = 1000 * until_us - self._before_ns, until_us
             return events
         while self._t_ns // 1000 <= until_us:
-            self._drawn = Events.concatenate([self._drawn, self._more()])
+            drawn = Events.concatenate([self._drawn, self._more()])
+            self._drawn = drawn.part(np.argsort(drawn.t, kind="stable")) if self._before_ns else drawn
         count = int(np.searchsorted(self._drawn.t, until_us, side="right"))
         own, self._drawn = self._drawn.part(slice(count)), self._drawn.part(slice(count, None))
-        if not count:
+        if self._last is not None:
+            pixel = own.y.astype(np.int64) * self._width + own.x
+            own = own.part(_awake(pixel, own.t, self.config.refractory_us, self._last))
+        if not len(own):
             return events
         if not len(events):
             return own
@@ -66,32 +87,45 @@ class PixelNoise:
         return both.part(np.argsort(both.t, kind="stable"))
 
     def _more(self) -> Events:
-        """The next batch of a Poisson process of the sensor as a whole; pixels in proportion to their rates."""
+        """The next batch of a Poisson process of the sensor as a whole, with their answers behind them; pixels in
+        proportion to their rates."""
         index = np.uint64(self._batch * _BATCH) + np.arange(_BATCH, dtype=np.uint64)
         self._batch += 1
         wait, pick = uniform2(self._seed, index, _OWN, np.uint64(0))
-        polarity, _ = uniform2(self._seed, index, _OWN, np.uint64(1))
+        polarity, answers = uniform2(self._seed, index, _OWN, np.uint64(1))
         total = self._sums[-1]
         gaps = np.minimum(-log_f64(wait) * (1e9 / total), 2.0**55).astype(np.int64)
         t_ns = self._t_ns + np.cumsum(gaps)
         self._t_ns = int(t_ns[-1])
         pixel = np.minimum(np.searchsorted(self._sums, pick * total, side="right"), len(self._sums) - 1)
         cause = np.where(self.hot[pixel], np.uint8(Cause.HOT), np.uint8(Cause.SHOT)) if self._causes else None
-        return Events(
+        own = Events(
             (pixel % self._width).astype(np.uint16),
             (pixel // self._width).astype(np.uint16),
             t_ns // 1000,
             (polarity < self.config.on_share).astype(np.uint8),
             cause,
         )
+        if not self._before_ns:
+            return own
+        late, _ = normal2(self._seed, index, _OWN, np.uint64(2))
+        wait_ns = 1e6 * self.config.answer_ms * exp_f64(self._decades * late)
+        chosen = answers < self.config.answered
+        answer = own.part(chosen)
+        at_us = (t_ns[chosen] + np.minimum(wait_ns[chosen], 2.0**55).astype(np.int64)) // 1000
+        both = Events.concatenate([own, replace(answer, t=at_us, p=1 - answer.p)])
+        return both.part(both.t > self._from_us)
 
     def state_dict(self) -> dict[str, np.ndarray]:
-        clock = [self._t_ns is not None, self._t_ns or 0, self._batch]
-        return {"clock": np.array(clock, np.int64), **_columns("drawn", self._drawn)}
+        clock = [self._t_ns is not None, self._t_ns or 0, self._batch, self._from_us]
+        last = {} if self._last is None else {"last": self._last.copy()}
+        return {"clock": np.array(clock, np.int64), **last, **_columns("drawn", self._drawn)}
 
     def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
-        self._drawn = _events("drawn", state, {"clock"})
-        started, t_ns, self._batch = (int(v) for v in state["clock"])
+        self._drawn = _events("drawn", state, {"clock"} if self._last is None else {"clock", "last"})
+        if self._last is not None:
+            self._last[...] = state["last"]
+        started, t_ns, self._batch, self._from_us = (int(v) for v in state["clock"])
         self._t_ns = t_ns if started else None
 
 

@@ -120,8 +120,9 @@ class Trajectory(Piece):
 
     file : path.   form : "tum", "euroc"; "auto": EuRoC's where lines have commas.   start : s on the file's clock that
     are 0 s on the scene's; None: its first pose is where the sequence begins.   smooth : s, each pose becomes the mean
-    of those within it.   T_body_sensor : where the camera or body that follows it is on the body whose poses these are:
-    (4, 4), or the path of EuRoC's sensor.yaml, whose T_BS that is; None: it is that body.
+    of those within it.   speed_limit : units/s, turn_limit : degrees/s, beyond which poses are refused.
+    T_body_sensor : where the camera or body that follows it is on the body whose poses these are: (4, 4), or the path
+    of EuRoC's sensor.yaml, whose T_BS that is; None: it is that body.
     Raises ConfigError; a file that does not cover the sequence is found when the scene is built."""
 
     def __init__(
@@ -131,9 +132,12 @@ class Trajectory(Piece):
         form: Literal["auto", "tum", "euroc"] = "auto",
         start: float | None = None,
         smooth: float = 0.0,
+        speed_limit: float = 100.0,
+        turn_limit: float = 7200.0,
         T_body_sensor: ArrayLike | str | os.PathLike | None = None,
     ):
         tree = check.given(file=os.fspath(check.path(file, "file").absolute()), form=form, start=start, smooth=smooth)
+        tree |= check.given(speed_limit=speed_limit, turn_limit=turn_limit)
         if isinstance(T_body_sensor, (str, os.PathLike)):
             tree["T_body_sensor"] = os.fspath(check.path(T_body_sensor, "T_body_sensor").absolute())
         elif T_body_sensor is not None:

@@ -156,7 +156,7 @@ def record(
     emulator : "esim", "v2e", "voltmeter", or a table with its values, ``{"emulator": "v2e", "cutoff_hz": 200}``.
     sensor : camera whose size, emulator values and read-out are taken, such as "davis346".
     timeline : :class:`Timeline`.
-    quality : "fast", "balanced", "accurate" or "reference".
+    quality : "fast", "balanced" (the default), "accurate" or "reference".
     labels : names of labels, such as images, flow, flow_backward, occlusion, depth
     (docs/configuration.md has all), and numbers: intervals of ``flow_intervals``, s; "events": what made each
     event, ``events.truth``; default: the source's.

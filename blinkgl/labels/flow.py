@@ -106,9 +106,9 @@ class FlowTo(Label):
         return {f"difference_{self.towards}": (shot.ends[self.towards].mvp - shot.moment.mvp)[:, [0, 1, 3]]}
 
     def finish(self, drawn: Drawn) -> Flow:
-        raw = drawn.raw(self.name)
-        valid = (raw[..., 3] > 0) & (raw[..., 2] > 0)
-        return Flow(np.where(valid[..., None], raw[..., :2], np.float32(0)), valid)
+        from blinkgl.render.occlusion import flow_and_reach
+
+        return Flow(*flow_and_reach(drawn.raw(self.name)))
 
     def wrong(self, value: Flow, height: int, width: int) -> str | None:
         shapes = np.shape(value.flow), np.shape(value.valid)

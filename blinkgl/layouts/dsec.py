@@ -7,6 +7,7 @@
       images/left/ev_inf/%06d.png                  what the event camera's own lens sees, at the flow's times
       disparity/event/%06d.png, timestamps.txt     of a stereo rig with depth
       calibration/cam_to_cam.yaml
+      imu/imu.csv, imu.h5, imu.yaml …              of an inertial unit, as the sequence has it (EuRoC's, Kalibr's)
 
 A file's number is its line in ``images/timestamps.txt``, so flow k is file 2k, as in the published sequences: loaders
 count on the step of two.
@@ -76,6 +77,9 @@ class Dsec(Layout):
         if source.right is not None:
             write_events(source.right, folder / "events/right")
             said += _write_disparity(source, source.right, folder / "disparity")
+        if source.unit is not None:
+            for file in sorted((source.unit / "imu").iterdir()):
+                copy(file, folder / "imu" / file.name)
         if source.camera is not None:
             write_bytes(folder / "calibration/cam_to_cam.yaml", cam_to_cam(source, source.camera).encode())
         return said

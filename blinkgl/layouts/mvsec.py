@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 
 from blinkgl.io.atomic import output_errors
-from blinkgl.io.imu import H5 as IMU, read_imu
+from blinkgl.io.imu import read_imu
 from blinkgl.layouts.files import append, growing
 from blinkgl.layouts.layout import Layout, forward_flow, images
 from blinkgl.layouts.source import Source
@@ -60,8 +60,8 @@ def _data(source: Source, file: h5py.File, group: str) -> None:
         append(pictures, source.grey(k)[None])
     _keep(file, f"{group}/image_raw_ts", taken * 1e-6)
     _keep(file, f"{group}/image_raw_event_inds", np.minimum(first, len(rows) - 1))
-    if source.has(IMU):
-        imu = read_imu(source.folder)
+    if source.unit is not None:
+        imu = read_imu(source.unit)
         _keep(file, f"{group}/imu", np.hstack([imu["acceleration"], imu["rate"]]))
         _keep(file, f"{group}/imu_ts", imu["t_ns"] * 1e-9)
 

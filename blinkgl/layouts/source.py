@@ -18,12 +18,14 @@ from blinkgl.events.types import Events
 from blinkgl.io.camchain import read_camchain
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.images import NpzReader, numpy_errors, read_image
+from blinkgl.io.imu import H5 as IMU
 from blinkgl.io.index import made_folders
 from blinkgl.io.lens_files import CAM_TO_CAM
 from blinkgl.io.records import read_text
 from blinkgl.io.rig_dir import read_rig
 from blinkgl.io.sequence_dir import is_rig_folder, read_manifest, verify_sequence
 from blinkgl.labels import LABELS, Form
+from blinkgl.labels.intervals import Flows
 
 
 @dataclass(frozen=True)
@@ -31,15 +33,19 @@ class Source:
     """One sequence. Times are µs on its own clock; the events of :meth:`events` are on it, too.
 
     folder : its directory.   manifest : what stands in there.   name : the directory's, or that of the rig it is on.
-    beside : the directory of the right eye, where this is the left one of a stereo pair."""
+    beside : the directory of the right eye, where this is the left one of a stereo pair.   unit : that of the inertial
+    unit, its own or another of its rig; None: there is none."""
 
     folder: Path
     manifest: dict[str, Any]
     name: str
     beside: Path | None = None
+    unit: Path | None = None
 
     @classmethod
-    def open(cls, folder: Path, name: str | None = None, beside: Path | None = None) -> Source:
+    def open(
+        cls, folder: Path, name: str | None = None, beside: Path | None = None, unit: Path | None = None
+    ) -> Source:
         """Raises AssetError: no sequence, or files are missing or cut."""
         if problems := verify_sequence(folder, checksums=False):
             raise AssetError(
@@ -47,7 +53,8 @@ class Source:
                 where=str(folder),
                 accepted="a data set that 'blinkgl verify' passes",
             )
-        return cls(folder, read_manifest(folder), name or folder.name, beside)
+        manifest = read_manifest(folder)
+        return cls(folder, manifest, name or folder.name, beside, folder if IMU in manifest["files"] else unit)
 
     @property
     def split(self) -> str:
@@ -122,6 +129,10 @@ class Source:
         """The ``k``-th value of a label that is one array, (H, W[, C]); depth is inf where nothing is. AssetError."""
         return _read(LABELS[label].forms[0], self.file(label, k))
 
+    def flows(self, k: int) -> Flows:
+        """Flow from label ``k`` to several times. AssetError."""
+        return _read(LABELS["flow_intervals"].forms[0], self.file("flow_intervals", k))
+
     def events(self, chunk: int = 1 << 20) -> Iterator[Events]:
         """All events, in order, in pieces."""
         with DsecEventReader(self.folder / "events.h5") as reader:
@@ -190,8 +201,9 @@ def _of_rig(folder: Path) -> Source:
     cameras = [name for name, one in tables.items() if "events" in one["records"]]
     if not cameras:
         raise AssetError("a rig without an event camera", where=str(folder))
+    unit = next((folder / name for name, one in tables.items() if "imu" in one["records"]), None)
     one, other = cameras[0], tables[cameras[0]].get("pair")
     if other not in cameras:
-        return Source.open(folder / one, folder.name)
+        return Source.open(folder / one, folder.name, unit=unit)
     left, right = (one, other) if tables[one]["baseline"] > 0 else (other, one)
-    return Source.open(folder / left, folder.name, folder / right)
+    return Source.open(folder / left, folder.name, folder / right, unit)

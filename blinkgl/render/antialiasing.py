@@ -31,6 +31,11 @@ class Samples(NamedTuple):
         """Samples kept in memory per pixel of the image."""
         return self.grid**2 * max(1, self.multi)
 
+    @property
+    def shared(self) -> bool:
+        """Whether a pixel at a silhouette shows both surfaces by their shares, and not only that of its centre."""
+        return self.stored > 1 or self.edges
+
 
 ANTIALIASING = {
     "none": Samples(),

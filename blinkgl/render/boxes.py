@@ -128,7 +128,11 @@ def before(points: np.ndarray, faces: np.ndarray, near: float) -> tuple[np.ndarr
     return np.concatenate(extra), np.concatenate(kept)
 
 
-@nb.njit(cache=True, nogil=True)
+_EDGE = 1e-9
+"""px: so near to an edge a pixel's centre is in the triangles on both sides of it."""
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def cover(px: np.ndarray, faces: np.ndarray, mask: np.ndarray) -> None:
     """Sets ``mask`` (H, W) where a pixel's centre is in one of the triangles (F, 3) of (V, 2) float64 px, their edges
     included."""
@@ -142,20 +146,26 @@ def cover(px: np.ndarray, faces: np.ndarray, mask: np.ndarray) -> None:
             continue
         if area < 0.0:
             bx, by, cx, cy = cx, cy, bx, by
-        top = max(np.ceil(min(ay, by, cy)), 0.0)
-        bottom = min(np.floor(max(ay, by, cy)), height - 1.0)
-        left = max(np.ceil(min(ax, bx, cx)), 0.0)
-        right = min(np.floor(max(ax, bx, cx)), width - 1.0)
-        if not (top <= bottom and left <= right):
+        first = int(max(np.ceil(min(ay, by, cy) - _EDGE), 0.0))
+        last = int(min(np.floor(max(ay, by, cy) + _EDGE), height - 1.0))
+        if not max(ax, bx, cx) >= -_EDGE or not min(ax, bx, cx) <= width - 1.0 + _EDGE:
             continue
-        for y in range(int(top), int(bottom) + 1):
-            for x in range(int(left), int(right) + 1):
-                if (
-                    (bx - ax) * (y - ay) - (by - ay) * (x - ax) >= 0.0
-                    and (cx - bx) * (y - by) - (cy - by) * (x - bx) >= 0.0
-                    and (ax - cx) * (y - cy) - (ay - cy) * (x - cx) >= 0.0
-                ):
-                    mask[y, x] = True
+        for y in range(first, last + 1):
+            # What of the row is on the inner side of each edge: a x + b >= 0.
+            left, right = 0.0, width - 1.0
+            for px0, py0, px1, py1 in ((ax, ay, bx, by), (bx, by, cx, cy), (cx, cy, ax, ay)):
+                slope = py0 - py1
+                rest = (px1 - px0) * (y - py0) + (py1 - py0) * px0
+                if slope > 0.0:
+                    left = max(left, -rest / slope)
+                elif slope < 0.0:
+                    right = min(right, -rest / slope)
+                elif rest < 0.0:
+                    right = -1.0
+            if not left <= right + 2.0 * _EDGE:
+                continue
+            for x in range(int(np.ceil(left - _EDGE)), int(np.floor(right + _EDGE)) + 1):
+                mask[y, x] = True
 
 
 @nb.njit(cache=True, nogil=True)

@@ -25,7 +25,7 @@ _SAME = 3e-4
 SLACK = 1e-4
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def judged_by_samples(
     flow: np.ndarray,
     z_there: np.ndarray,
@@ -47,6 +47,12 @@ def judged_by_samples(
     """
     height, width = valid.shape
     verdict = np.zeros((height, width), np.uint8)
+    # 1/Z once a pixel instead of once a sample: a point has four of these, and divisions are what this loop waits for.
+    nearness = np.empty((height, width))
+    for y in range(height):
+        for x in range(width):
+            nearness[y, x] = 1.0 / np.float64(depth_there[y, x]) if depth_there[y, x] > 0 else 0.0
+    last_x, last_y = max(width - 2, 0), max(height - 2, 0)
     for y in range(height):
         for x in range(width):
             if not valid[y, x]:
@@ -59,23 +65,28 @@ def judged_by_samples(
             inverse = 1.0 / np.float64(z_there[y, x])
             # At the border the four pixels are the outermost ones and the weights extrapolate: a surface that is seen
             # at a slant would otherwise seem to lie nearer than its own point there.
-            x0 = min(max(int(np.floor(xt)), 0), max(width - 2, 0))
-            y0 = min(max(int(np.floor(yt)), 0), max(height - 2, 0))
-            ax, ay = xt - x0, yt - y0
-            own, others_in_front, mean = 0, 0, 0.0
+            x0 = min(max(int(np.floor(xt)), 0), last_x)
+            y0 = min(max(int(np.floor(yt)), 0), last_y)
+            x1, y1 = min(x0 + 1, width - 1), min(y0 + 1, height - 1)
+            ax, ay, own = xt - x0, yt - y0, ids[y, x]
+            if (
+                ids_there[y0, x0] == own
+                and ids_there[y0, x1] == own
+                and ids_there[y1, x0] == own
+                and ids_there[y1, x1] == own
+            ):
+                above = (1.0 - ax) * nearness[y0, x0] + ax * nearness[y0, x1]
+                below = (1.0 - ax) * nearness[y1, x0] + ax * nearness[y1, x1]
+                if (1.0 - ay) * above + ay * below > inverse * (1.0 + _SAME):
+                    verdict[y, x] = UNDECIDED
+                continue
+            limit = inverse * (1.0 + _IN_FRONT)
+            verdict[y, x] = HIDDEN
             for dy in range(2):
                 for dx in range(2):
-                    xn, yn = min(x0 + dx, width - 1), min(y0 + dy, height - 1)
-                    z = np.float64(depth_there[yn, xn])
-                    if ids_there[yn, xn] == ids[y, x]:
-                        own += 1
-                        mean += (ax if dx else 1.0 - ax) * (ay if dy else 1.0 - ay) / z
-                    elif z > 0 and 1.0 / z > inverse * (1.0 + _IN_FRONT):
-                        others_in_front += 1
-            if others_in_front == 4:
-                verdict[y, x] = HIDDEN
-            elif own < 4 or mean > inverse * (1.0 + _SAME):
-                verdict[y, x] = UNDECIDED
+                    yn, xn = y1 if dy else y0, x1 if dx else x0
+                    if ids_there[yn, xn] == own or not nearness[yn, xn] > limit:
+                        verdict[y, x] = UNDECIDED
     return verdict
 
 
@@ -95,8 +106,44 @@ def occlusion_mask(
     """
     camera = scene.camera
     verdict = judged_by_samples(flow, z_there, valid, ids, depth_there, ids_there, camera.near)
-    y, x = np.nonzero(verdict == UNDECIDED)
-    if len(x):
-        place = np.stack([x, y], axis=1) + flow[y, x].astype(np.float64)
-        verdict[y, x] = reference.is_hidden(scene, t_ns, place, z_there[y, x].astype(np.float64), SLACK)
+    where, place, depth = undecided(verdict, flow, z_there)
+    if len(where):
+        verdict.reshape(-1)[where] = reference.is_hidden(scene, t_ns, place, depth, SLACK)
     return verdict == HIDDEN
+
+
+@nb.njit(cache=True, nogil=True)
+def undecided(verdict: np.ndarray, flow: np.ndarray, z_there: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of the points of which ``verdict`` is UNDECIDED, row by row: (N,) number of the pixel, (N, 2) float64 px where
+    they are then, (N,) float64 how far away."""
+    width = verdict.shape[1]
+    flat = verdict.reshape(-1)
+    count = 0
+    for k in range(len(flat)):
+        count += flat[k] == UNDECIDED
+    where, place, depth = np.empty(count, np.int64), np.empty((count, 2)), np.empty(count)
+    n = 0
+    for k in range(len(flat)):
+        if flat[k] == UNDECIDED:
+            y, x = k // width, k % width
+            where[n] = k
+            place[n, 0] = x + np.float64(flow[y, x, 0])
+            place[n, 1] = y + np.float64(flow[y, x, 1])
+            depth[n] = z_there[y, x]
+            n += 1
+    return where, place, depth
+
+
+@nb.njit(cache=True, nogil=True)
+def flow_and_reach(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W, 2) float32 px, 0 where not valid, and (H, W) bool of the shader's (H, W, 4): u, v, Z at the other time,
+    which is to be above 0, and whether something is hit."""
+    height, width = raw.shape[:2]
+    flow, valid = np.empty((height, width, 2), np.float32), np.empty((height, width), np.bool_)
+    for y in range(height):
+        for x in range(width):
+            there = raw[y, x, 3] > 0.0 and raw[y, x, 2] > 0.0
+            valid[y, x] = there
+            flow[y, x, 0] = raw[y, x, 0] if there else 0.0
+            flow[y, x, 1] = raw[y, x, 1] if there else 0.0
+    return flow, valid

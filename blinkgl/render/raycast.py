@@ -21,6 +21,7 @@ LEAF_TRIANGLES = 4
 _STACK = 64  # the tree is balanced: 64 levels are more than any mesh in memory needs
 # Relative slack of the box tests, far above the rounding of the triangle test (a few 1e-16) and far below anything
 # that would make the tree visit noticeably more boxes. With it, the tree finds what the exhaustive loop finds.
+_BALL_SLACK = 1e-9
 _BOX_SLACK = 1e-14
 _DEPTH_SLACK = 1e-9
 
@@ -248,6 +249,29 @@ def _local_ray(axes, rx, ry, d):
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
+def _balls(forest, origins, axes):
+    """Balls round the parts, a little too large, camera axes: (P, 3) middles, (P,) radii, and (P,) the square of the
+    length of the tangents from the camera's centre, a little too short; <= 0: it is inside. Most rays pass most parts
+    by, and a ball says so before a ray is turned into a part's axes."""
+    count = forest.root.shape[0]
+    centre, radius, outside = np.empty((count, 3)), np.empty(count), np.empty(count)
+    for p in range(count):
+        node, half, square, scale = forest.root[p], 0.0, 0.0, forest.extent[p]
+        away = np.empty(3)
+        for k in range(3):
+            scale = max(scale, abs(origins[p, k]))
+            side = 0.5 * (forest.upper[node, k] - forest.lower[node, k]) if forest.size[p] else 0.0
+            half += side * side
+            away[k] = (forest.lower[node, k] + side if forest.size[p] else 0.0) - origins[p, k]
+        for k in range(3):
+            centre[p, k] = axes[p, 0, k] * away[0] + axes[p, 1, k] * away[1] + axes[p, 2, k] * away[2]
+            square += centre[p, k] * centre[p, k]
+        radius[p] = np.sqrt(half) * (1.0 + _BALL_SLACK) + _BALL_SLACK * scale
+        outside[p] = (square - radius[p] * radius[p]) * (1.0 - _BALL_SLACK)
+    return centre, radius, outside
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def nearest_tree(
     forest: Forest,
     origins: np.ndarray,
@@ -259,24 +283,33 @@ def nearest_tree(
     hit: np.ndarray,
     bary: np.ndarray,
     depth: np.ndarray,
+    any_will_do: bool = False,
 ) -> None:
     """Nearest hit of each ray through the hierarchy.
 
     origins : (P, 3) camera centre and axes : (P, 3, 3) camera axes (columns) in each part's frame.
     rays : (N, 2) (rx, ry).   near : depth below which nothing is hit.   far : (N,) depth from which nothing is hit.
     skip : (N, 2) int32 (part, face) each ray passes through, or (-1, -1).
+    any_will_do : the first hit that is found instead of the nearest: for who asks whether there is one.
     Output: hit (N, 3) int32 (part, face, 1 when seen from the front) or -1; bary (N, 3); depth (N,), inf when nothing
     is hit.
     """
     triangles, face, lower, upper, child, count, root, _, size, cull, extent, mask, uvs, masks, cutoffs, texels = forest
     o, d, inverse, o_lo, o_hi = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     stack, entry = np.empty(_STACK, np.int64), np.empty(_STACK)
+    centre, radius, outside = _balls(forest, origins, axes)
     for i in range(rays.shape[0]):
         best = far[i]
+        length = rays[i, 0] * rays[i, 0] + rays[i, 1] * rays[i, 1] + 1.0
         depth[i] = np.inf
         hit[i] = -1
         for p in range(root.shape[0]):
-            if size[p] == 0:
+            if any_will_do and hit[i, 0] >= 0:
+                break
+            if size[p] == 0 or centre[p, 2] - radius[p] > best:
+                continue
+            along = centre[p, 0] * rays[i, 0] + centre[p, 1] * rays[i, 1] + centre[p, 2]
+            if outside[p] > 0.0 and (along < 0.0 or along * along < outside[p] * length):
                 continue
             scale = extent[p]
             for k in range(3):
@@ -289,7 +322,7 @@ def nearest_tree(
                 o_lo[k], o_hi[k] = o[k] + _BOX_SLACK * scale, o[k] - _BOX_SLACK * scale
             stack[0], entry[0] = root[p], 0.0
             n = 1
-            while n > 0:
+            while n > 0 and not (any_will_do and hit[i, 0] >= 0):
                 n -= 1
                 if entry[n] > best:
                     continue
@@ -344,6 +377,7 @@ def nearest_exhaustive(
     hit: np.ndarray,
     bary: np.ndarray,
     depth: np.ndarray,
+    any_will_do: bool = False,
 ) -> None:
     """The slow twin of :func:`nearest_tree`: every triangle against every ray; the same arguments and answer."""
     triangles, face, _, _, _, _, root, first, size, cull, _, mask, uvs, masks, cutoffs, texels = forest

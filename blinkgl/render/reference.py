@@ -224,9 +224,9 @@ def _holes_of(part: Part) -> Holes | None:
     return Holes(uvs, mask.alpha.astype(np.float32) / np.float32(255), mask.threshold, part.material.wrap)
 
 
-def _nearest(scene, t_ns, rays, far=None, skip=None, exhaustive=False, eye=None, near=None):
+def _nearest(scene, t_ns, rays, far=None, skip=None, exhaustive=False, eye=None, near=None, any_will_do=False):
     """(hit (N, 3) int32, bary (N, 3), depth (N,)) as described at :func:`raycast.nearest_tree`. eye, near : of other
-    rays than the camera's: (4, 4) pose where they come from, Z at which they begin."""
+    rays than the camera's: (4, 4) pose where they come from, Z at which they begin.   any_will_do : as there."""
     forest = _forest(scene, int(t_ns))
     camera_pose = scene.camera_path.pose(t_ns) if eye is None else eye
     # relative to the camera by differences of positions, so that a common offset from the origin cancels first
@@ -249,6 +249,7 @@ def _nearest(scene, t_ns, rays, far=None, skip=None, exhaustive=False, eye=None,
         hit,
         bary,
         depth,
+        any_will_do,
     )
     return hit, bary, depth
 
@@ -376,7 +377,8 @@ def is_hidden(scene: Scene, t_ns: int, xy: np.ndarray, depth: np.ndarray, slack:
     """(N,) bool: something is in front of points that are at (N, 2) ``xy`` px and (N,) ``depth`` at t_ns.
 
     slack : what is nearer by less than this part of the depth counts as the point's own surface."""
-    hit, _, _ = _nearest(scene, t_ns, _rays(scene.camera, xy)[:, :2], far=depth * (1.0 - slack))
+    far = depth * (1.0 - slack)
+    hit, _, _ = _nearest(scene, t_ns, _rays(scene.camera, xy)[:, :2], far=far, any_will_do=True)
     return hit[:, 0] >= 0
 
 

@@ -65,7 +65,7 @@ def _truth_of(sensor: Sensor, config: SequenceConfig) -> SurfaceTruth | None:
     """What says what made a sensor's events; None where its labels do not ask."""
     if sensor.labels is None or not sensor.labels.events:
         return None
-    return SurfaceTruth(reach=int(samples_of(config.render.antialiasing).stored > 1))
+    return SurfaceTruth(reach=int(samples_of(config.render.antialiasing).shared))
 
 
 def surfaces_at(renderer: Renderer, t_ns: int) -> Surfaces:

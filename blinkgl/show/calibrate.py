@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
 from rich.progress import BarColumn, Progress, TimeElapsedColumn
 from rich.table import Table
 
@@ -14,9 +15,14 @@ from blinkgl.errors import ConfigError, OutputError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.recordings.calibration import calibrate
 from blinkgl.recordings.clip import Flicker
+from blinkgl.recordings.pixel_noise import fit_pixels
+from blinkgl.report import pixel_noise
 from blinkgl.report.calibration import page, parameters, rows
 from blinkgl.show.simulate import emulator_options
 from blinkgl.show.terminal import plain_column, plain_console, say
+
+PIXELS = "pixels"
+"""In the place of an emulator's name: the noise of single pixels, which stands beside any emulator."""
 
 
 def run(
@@ -41,17 +47,12 @@ def run(
     for path in (target, beside):
         if path.exists() and not overwrite:  # before the work, not after it
             raise OutputError("output file exists", where=str(path), accepted="a new name, or --overwrite")
+    if emulator == PIXELS:
+        return _pixels(recording, frames, target, flicker, sensor, overrides, overwrite, quiet, options)
     base = emulator_options(emulator, None, overrides, sensor)["emulator"]
     fixed = [item.partition("=")[0].strip() for item in overrides]
     console = plain_console(quiet=quiet)
-    bar = Progress(
-        plain_column("{task.description}"),
-        BarColumn(),
-        TimeElapsedColumn(),
-        console=console,
-        transient=True,
-        disable=quiet or not console.is_terminal,
-    )
+    bar = _bar(console, quiet)
     with bar:
         task = bar.add_task("reading", total=1.0)
         progress = lambda what, done: bar.update(task, description=what, completed=done)
@@ -65,10 +66,7 @@ def run(
             **options,
         )
     text = to_short_yaml(result.sensor())
-    with atomic_file(beside, overwrite=overwrite) as html, atomic_file(target, overwrite=overwrite) as file:
-        with output_errors(target):
-            html.write_text(page(result, text), encoding="utf-8")
-            file.write_text(text, encoding="utf-8")
+    _write(target, text, page(result, text), overwrite)
     judged = Table(title=f"{result.config.emulator} beside {Path(recording).name}", title_justify="left")
     for head in ("", "recorded", "before", "fitted", "recorded, other half", "before", "fitted"):
         judged.add_column(head)
@@ -85,6 +83,68 @@ def run(
         say(console, note)
     say(console, f"written: {target}, {beside}")
     return 0
+
+
+def _pixels(
+    recording: str,
+    frames: str | None,
+    target: Path,
+    flicker: str | None,
+    sensor: str | None,
+    overrides: Sequence[str],
+    overwrite: bool,
+    quiet: bool,
+    options: dict[str, Any],
+) -> int:
+    """The noise of single pixels in the place of an emulator."""
+    if not options["still"] or frames is not None or flicker is not None:
+        raise ConfigError(
+            "the noise of single pixels shows where nothing moves", where="--emulator", value=PIXELS, accepted="--still"
+        )
+    for option, value in (("--sensor", sensor), ("--set", overrides)):
+        if value:
+            raise ConfigError("says something of an emulator", where=option, accepted=f"none with --emulator {PIXELS}")
+    console = plain_console(quiet=quiet)
+    with _bar(console, quiet) as bar:
+        task = bar.add_task("reading", total=1.0)
+        progress = lambda what, done: bar.update(task, description=what, completed=done)
+        result = fit_pixels(recording, seed=options["seed"], progress=progress)
+    text = to_short_yaml(result.sensor())
+    _write(target, text, pixel_noise.page(result, text), overwrite)
+    judged = Table(title=f"noise of single pixels beside {Path(recording).name}, other half", title_justify="left")
+    for head in ("", "recorded", "fitted"):
+        judged.add_column(head)
+    for row in pixel_noise.rows(result):
+        judged.add_row(*row)
+    console.print(judged, highlight=False)
+    found = Table(title="parameters", title_justify="left")
+    for head in ("key", "fitted", ""):
+        found.add_column(head)
+    for row in pixel_noise.parameters(result):
+        found.add_row(*row)
+    console.print(found, highlight=False)
+    say(console, f"written: {target}, {target.with_suffix('.html')}")
+    return 0
+
+
+def _bar(console: Console, quiet: bool) -> Progress:
+    return Progress(
+        plain_column("{task.description}"),
+        BarColumn(),
+        TimeElapsedColumn(),
+        console=console,
+        transient=True,
+        disable=quiet or not console.is_terminal,
+    )
+
+
+def _write(target: Path, sensor: str, page_: str, overwrite: bool) -> None:
+    """The sensor file and the page beside it; both or neither."""
+    beside = target.with_suffix(".html")
+    with atomic_file(beside, overwrite=overwrite) as html, atomic_file(target, overwrite=overwrite) as file:
+        with output_errors(target):
+            html.write_text(page_, encoding="utf-8")
+            file.write_text(sensor, encoding="utf-8")
 
 
 def _flicker(text: str) -> Flicker:

@@ -16,9 +16,10 @@ from blinkgl.trade.run import convergence_line, trade, write
 
 
 def run(
-    config: str,
+    config: str | None,
     out: str,
     *,
+    suite_options: list[str],
     overrides: list[str],
     quick: bool,
     only: list[str],
@@ -34,8 +35,11 @@ def run(
     seed: int | None = None,
 ) -> int:
     """Measures, writes the files, and names the settings that nothing beats. Raises BlinkGLError."""
-    if cost not in ("wall", "cpu"):
-        raise ConfigError("unknown cost", where="--cost", value=cost, accepted="wall or cpu")
+    if config is None:
+        raise ConfigError("which scene?", where="trade", accepted="a YAML file, or --suite for the shipped scenes")
+    if suite_options:
+        raise ConfigError("is of the suite", where=", ".join(suite_options), accepted="together with --suite")
+    check_cost(cost)
     if reference not in ("raster", "cycles"):
         raise ConfigError("unknown reference", where="--reference", value=reference, accepted="raster or cycles")
     template = load_run(config, overrides, seed=seed)
@@ -67,6 +71,12 @@ def run(
     paths = write(result, out)
     say(console, f"written to {out}: " + ", ".join(p.name for p in paths))
     return 0
+
+
+def check_cost(cost: str) -> None:
+    """Raises ConfigError where it is neither wall nor cpu."""
+    if cost not in ("wall", "cpu"):
+        raise ConfigError("unknown cost", where="--cost", value=cost, accepted="wall or cpu")
 
 
 def show(result: dict, console: Console) -> None:

@@ -11,6 +11,7 @@ import json
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
@@ -35,18 +36,45 @@ ENOUGH = 0.1
 
 
 @dataclass(frozen=True)
+class Density:
+    """How dense a reference has to be is the scene's affair: first frames come closer, at few samples a pixel, until
+    that moves the events by less than ``share`` of what is allowed (:data:`ENOUGH`); then samples are doubled at that
+    step. What the last halving of the step moved is added to what the last doubling of the samples did.
+
+    scales : samples per pixel side, rising.   steps : px between frames, falling."""
+
+    scales: tuple[int, ...] = (16, 32, 64, 128)
+    steps: tuple[float, ...] = (0.25, 0.125, 0.0625, 0.03125)
+    share: float = 0.4
+
+    def next(self, levels: list[Level]) -> tuple[int, float] | None:
+        """Samples and step of the level after these; None: there is none."""
+        if not levels:
+            return self.scales[0], self.steps[0]
+        last = levels[-1]
+        k = self.steps.index(last.max_px)
+        if last.scale == self.scales[0] and not self._still(last) and k + 1 < len(self.steps):
+            return last.scale, self.steps[k + 1]
+        finer = [s for s in self.scales if s > last.scale]
+        return (finer[0], last.max_px) if finer else None
+
+    def _still(self, level: Level) -> bool:
+        return bool(level.ratio) and max(level.ratio.values()) <= self.share * ENOUGH
+
+
+@dataclass(frozen=True)
 class Options:
     """clip_s : simulated seconds; 0: one label interval.   tiles : columns, rows, width,
     height of the judged rectangles.
     levels : (samples per pixel side, px between frames) of the reference, rising until it has
-    converged or ``reference_s`` is spent.
+    converged or ``reference_s`` is spent. A :class:`Density` instead: each scene's own.
     reference : "raster", or "cycles" (extra [cycles]): the same scene path-traced, samples² paths a pixel.
     reference_set : overrides of the scene, "scene.a.b=c", that the reference alone has: effects that are left out.
     rounds, rounds_s : at most so many rounds, and no new one when so many seconds are gone."""
 
     clip_s: float = 0.0
     tiles: tuple[int, int, int, int] = (4, 3, 20, 15)
-    levels: tuple[tuple[int, float], ...] = ((8, 0.12), (16, 0.08), (32, 0.056), (64, 0.04), (128, 0.028))
+    levels: tuple[tuple[int, float], ...] | Density = ((8, 0.12), (16, 0.08), (32, 0.056), (64, 0.04), (128, 0.028))
     reference_s: float = 1200.0
     rounds: int = 3
     rounds_s: float = 1200.0
@@ -54,6 +82,8 @@ class Options:
     sequence: int = 0
     reference: str = "raster"
     reference_set: tuple[str, ...] = ()
+    labels: bool = True
+    """Whether flow labels are judged, too."""
 
 
 TRACED_LEVELS = ((8, 0.5), (16, 0.25), (32, 0.125))
@@ -80,6 +110,13 @@ class Measured:
     flow: dict[str, float] = field(default_factory=dict)
     events: Events | None = field(default=None, repr=False)
     errors: EventErrors | None = None
+    moved: dict[str, float] = field(default_factory=dict)
+    """What the reference moved last, in parts of this setting's own errors."""
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the reference stands still by a tenth of what it says of this setting."""
+        return bool(self.moved) and max(self.moved.values()) <= ENOUGH
 
     @property
     def cost(self) -> float:
@@ -103,6 +140,8 @@ class Measured:
             "triangles": self.triangles,
             **self.errors.to_dict(),
             **self.flow,
+            "moved": self.moved,
+            "trusted": self.trusted,
         }
 
 
@@ -117,7 +156,10 @@ class Level:
     seconds: float
     events: Events = field(repr=False)
     movement: dict[str, float] | None = None
+    """Includes what the level's step moved where only its samples were changed."""
     smallest: dict[str, float] | None = None
+    whole: bool = True
+    """Whether samples and step have both been changed: half a movement shows nothing."""
     frame_wall_s: float | None = None
     frame_cpu_s: float | None = None
 
@@ -131,7 +173,7 @@ class Level:
 
     @property
     def converged(self) -> bool:
-        return bool(self.ratio) and max(self.ratio.values()) <= ENOUGH
+        return self.whole and bool(self.ratio) and max(self.ratio.values()) <= ENOUGH
 
     def to_dict(self) -> dict:
         return {
@@ -227,7 +269,7 @@ class Bench:
                 with Renderer(self.gl, self.scene_of(config), config.render) as renderer:
                     for i in members:
                         self._run(results[i], configs[i], renderer, first=number == 0)
-                    if number == 0:
+                    if number == 0 and self.options.labels:
                         flow = flow_errors(self.scene, renderer, self.t0_ns, self.t0_ns + self.base.time.interval_ns)
                         for i in members:
                             results[i].flow = flow
@@ -256,11 +298,14 @@ class Bench:
                 chunks.append(masked(chunk.events, self.mask))
                 wall += time.perf_counter() - paused[0]
                 cpu += time.process_time() - paused[1]
-        result.wall_s.append((time.perf_counter() - wall) / self.duration_s)
-        result.cpu_s.append((time.process_time() - cpu) / self.duration_s)
+        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+        # n steps take n + 1 frames: of a short clip that one would count for much, of a sequence it does not.
+        steps = max(run.frames - 1, 1)
+        result.wall_s.append(wall * steps / run.frames / self.duration_s)
+        result.cpu_s.append(cpu * steps / run.frames / self.duration_s)
         if first:
             result.events = Events.concatenate(chunks)
-            result.frames_per_s = run.frames / self.duration_s
+            result.frames_per_s = steps / self.duration_s
             result.triangles = (renderer.stats.triangles - drawn) / run.frames
 
     # ---- judging -------------------------------------------------------------------------------------------------
@@ -277,7 +322,8 @@ class Bench:
         """Raises the reference until it has converged (or time is up) and fills in the results' errors."""
         levels: list[Level] = []
         begun = time.perf_counter()
-        for scale, max_px in self.options.levels:
+        while (asked := self._next(levels)) is not None:
+            scale, max_px = asked
             if levels and not self._affordable(levels, scale, max_px, time.perf_counter() - begun):
                 self.say(f"reference: {scale}x{scale} at {max_px:g} px would take too long; stopped")
                 break
@@ -293,15 +339,33 @@ class Bench:
             for result in results:
                 result.errors = self.errors(events, result.events, speeds)
             if levels and results:
-                moved = self.errors(events, levels[-1].events, speeds).to_dict()
-                level.movement = {k: moved[k] for k in JUDGED}
+                last, moved = levels[-1], self.errors(events, levels[-1].events, speeds).to_dict()
+                carried = self._carried(levels) if max_px == last.max_px else dict.fromkeys(JUDGED, 0.0)
+                level.whole = not isinstance(self.options.levels, Density) or scale != last.scale
+                level.movement = {k: moved[k] + carried[k] for k in JUDGED}
                 level.smallest = {k: float(np.nanmin([r.errors.to_dict()[k] for r in results])) for k in JUDGED}
             levels.append(level)
             said = f"; moved by {max(level.ratio.values()):.2g} of the smallest error" if level.ratio else ""
             self.say(f"reference {scale}x{scale} samples, {max_px:g} px, {frames} frames, {level.seconds:.0f} s{said}")
             if level.converged:
                 break
+        if levels[-1].whole and (moved := levels[-1].movement):
+            for result in results:
+                own = result.errors.to_dict()
+                result.moved = {k: moved[k] / own[k] if own[k] else float("inf") for k in JUDGED}
         return levels
+
+    def _next(self, levels: list[Level]) -> tuple[int, float] | None:
+        plan = self.options.levels
+        if isinstance(plan, Density):
+            return plan.next(levels)
+        return plan[len(levels)] if len(levels) < len(plan) else None
+
+    @staticmethod
+    def _carried(levels: list[Level]) -> dict[str, float]:
+        """What the step moved the last time that it alone was changed."""
+        halved = [b.movement for a, b in pairwise(levels) if a.scale == b.scale and b.movement]
+        return halved[-1] if halved else dict.fromkeys(JUDGED, 0.0)
 
     def _source(self, scale: int):
         if self.options.reference == "cycles":

@@ -14,3 +14,11 @@ def pareto_front(rows: Sequence[dict], cost: str, error: str) -> list[dict]:
         if not result or row[error] < result[-1][error]:
             result.append(row)
     return result
+
+
+def excess(row: dict, rows: Sequence[dict], cost: str, error: str) -> float:
+    """By how much the best of ``rows`` beats ``row`` in cost and in error, whichever it beats less in: 0.1 where one is
+    a tenth better in both. At most 0: nothing beats it."""
+    ratio = lambda mine, other: mine / other if other else (1.0 if not mine else math.inf)
+    others = [r for r in rows if r is not row and math.isfinite(r[error])]
+    return max((min(ratio(row[cost], r[cost]), ratio(row[error], r[error])) for r in others), default=1.0) - 1

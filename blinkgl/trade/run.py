@@ -69,10 +69,12 @@ def trade(
     cost: str = "wall_s",
     settings: tuple[Setting, ...] | None = None,
     say: Callable[[str], None] = lambda _: None,
+    look: Callable[[Bench], None] = lambda _: None,
 ) -> dict[str, Any]:
     """The whole measurement as plain data (what trade.json holds).
 
-    cost : "wall_s" or "cpu_s", what the front is drawn over. settings : instead of the designed set.
+    cost : "wall_s" or "cpu_s", what the front is drawn over. settings : instead of the designed set. look : called
+    with every bench before it measures.
     Raises BlinkGLError: what generating the sequence would raise, or no setting of that name."""
     started = time.perf_counter()
     options = options or (QUICK if quick else Options())
@@ -90,6 +92,7 @@ def trade(
             if not mine:
                 continue
             bench = Bench(gl, template, options, size, say)
+            look(bench)
             say(
                 f"{bench.width}x{bench.height}, {bench.duration_s:g} s of sequence {options.sequence}, {len(mine)} "
                 "settings"
@@ -178,7 +181,7 @@ def write(result: dict, out: str | Path) -> list[Path]:
     out = Path(out)
     paths = [out / name for name in ("trade.json", "trade.csv", "pareto.png", "trade.html")]
     with atomic_file(paths[0]) as path, output_errors(paths[0]):
-        path.write_text(json.dumps(_plain(result), indent=1) + "\n", encoding="utf-8")
+        path.write_text(json.dumps(plain(result), indent=1) + "\n", encoding="utf-8")
     with atomic_file(paths[1]) as path, output_errors(paths[1]), path.open("w", newline="", encoding="utf-8") as file:
         rows = csv.DictWriter(file, COLUMNS, extrasaction="ignore")
         rows.writeheader()
@@ -191,12 +194,12 @@ def write(result: dict, out: str | Path) -> list[Path]:
     return paths
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """For JSON, which has no NaN."""
     if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
+        return {k: plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
+        return [plain(v) for v in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

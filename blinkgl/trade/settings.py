@@ -21,7 +21,7 @@ SAMPLINGS = {
     **{f"uniform {fps}/s": (f"timeline={{kind: uniform, fps: {fps}}}",) for fps in (50, 100, 200, 400, 800, 1600)},
     **{
         f"displacement {px:g} px": (f"timeline={{kind: displacement, max_px: {px}, min_step_us: 20}}",)
-        for px in (4, 2, 1, 0.5, 0.25, 0.125)
+        for px in (4, 2, 1.5, 1, 0.5, 0.25, 0.125)
     },
     **{
         f"brightness {c:g} C": (f"timeline={{kind: brightness, max_fraction_of_threshold: {c}, min_step_us: 20}}",)
@@ -137,4 +137,23 @@ def design(quick: bool, random_scene: bool = True) -> tuple[Setting, ...]:
         points += [
             Setting(s, "pchip", a, size="half size") for s, a in zip(displacement(2, 1, 1), ("none", "none", "ssaa2"))
         ]
+    return tuple(dict.fromkeys(points))
+
+
+def suite_design() -> tuple[Setting, ...]:
+    """The settings that every scene of the suite is drawn with: all that a preset may be, what presets have to beat,
+    and rows for two questions. Where do more frames help (displacement with and without filtering)? Do steps by
+    contrast x speed (brightness) or by the measured error (budget) need fewer?"""
+    displacement = lambda *px: [f"displacement {p:g} px" for p in px]
+    sharp = "mip bias -1"
+    points = [Setting(s, antialiasing=a) for s in displacement(2, 1, 0.5, 0.25) for a in ("none", "edges")]
+    points += [Setting(s, antialiasing=a, other=sharp) for s in displacement(2, 1) for a in ("none", "taps4")]
+    points += [Setting(s, antialiasing="edges", other=o) for s in displacement(2, 1) for o in ("mip bias -0.5", sharp)]
+    points += [Setting(s, antialiasing="edges", other=sharp) for s in displacement(4, 1.5, 0.5)]
+    points += [Setting(s, antialiasing="ssaa2", other=sharp) for s in displacement(2, 1, 0.5)]
+    points += [Setting(s, "pchip", "edges", sharp) for s in displacement(4, 2, 1, 0.5)]
+    points += [Setting(s, "pchip", "ssaa4", sharp) for s in displacement(2, 1)]
+    points += [Setting(displacement(0.5)[0], antialiasing="ssaa4", other=sharp)]
+    points += [Setting(f"brightness {c} C", antialiasing="edges", other=sharp) for c in (4, 2, 1)]
+    points += [Setting(f"budget {px} px", antialiasing="edges", other=sharp) for px in (0.1, 0.05)]
     return tuple(dict.fromkeys(points))

@@ -5,15 +5,20 @@ from __future__ import annotations
 import pytest
 import yaml
 
-from blinkgl.config.quality import QUALITIES, fill_quality, load_quality
-from blinkgl.config.sequence import load_run
+from blinkgl.config.quality import DEFAULT, QUALITIES, fill_quality, load_quality
+from blinkgl.config.sequence import RenderConfig, RunTemplate, load_run
+from blinkgl.config.timeline import DisplacementTimeline
 from blinkgl.dataset.report import config_yaml
 from blinkgl.errors import ConfigError
 
 
-def sequence(tmp_path, tree: dict, *overrides: str):
+def load_run_of(tmp_path, tree: dict, *overrides: str) -> RunTemplate:
     (tmp_path / "c.yaml").write_text(yaml.safe_dump(tree))
-    return load_run(tmp_path / "c.yaml", overrides).sequence(0)
+    return load_run(tmp_path / "c.yaml", overrides)
+
+
+def sequence(tmp_path, tree: dict, *overrides: str):
+    return load_run_of(tmp_path, tree, *overrides).sequence(0)
 
 
 @pytest.mark.parametrize("name", QUALITIES)
@@ -45,11 +50,25 @@ def test_emulators_that_follow_straight_lines(tmp_path):
     )
 
 
-def test_no_quality_changes_nothing(tmp_path):
-    tree = {"timeline": {"kind": "uniform", "fps": 50}}
+def test_what_says_no_quality_has_the_default_one(tmp_path):
+    assert sequence(tmp_path, {}) == sequence(tmp_path, {"quality": DEFAULT})
+    config, preset = sequence(tmp_path, {"timeline": {"max_px": 0.3}}), load_quality(DEFAULT)
+    assert config.timeline.max_px == 0.3 and config.timeline.min_step_us == preset["timeline"]["min_step_us"]
+    assert config.render.antialiasing == preset["render"]["antialiasing"] != RenderConfig().antialiasing
+
+
+def test_null_leaves_every_key_its_own_default(tmp_path):
     assert fill_quality(None, "uniform", None, None) == {} == fill_quality("best", None, None, None)
-    assert sequence(tmp_path, tree).timeline.fps == 50
-    assert sequence(tmp_path, {"quality": None}) == sequence(tmp_path, {})
+    config = sequence(tmp_path, {"quality": None})
+    assert (config.timeline, config.render) == (DisplacementTimeline(), RenderConfig())
+    (tmp_path / "again.yaml").write_text(config_yaml(config, 0))
+    assert load_run(tmp_path / "again.yaml").sequence(0) == config, "and stays so in what is written"
+
+
+def test_null_is_a_choice_among_others(tmp_path):
+    tree = {"quality": {"choice": [None, "fast"]}, "render": {"mip_bias": 0}}
+    drawn = {load_run_of(tmp_path, tree).sequence(k).render.antialiasing for k in range(8)}
+    assert drawn == {RenderConfig().antialiasing, load_quality("fast")["render"]["antialiasing"]}
 
 
 def test_a_preset_is_resolved_in_what_is_written(tmp_path):

@@ -7,6 +7,7 @@ import pytest
 
 from blinkgl.camera import PinHole
 from blinkgl.config.camera import CameraConfig
+from blinkgl.config.quality import DEFAULT
 from blinkgl.config.recipe import all_groups
 from blinkgl.config.sequence import SequenceConfig, TimeConfig, load_run
 from blinkgl.errors import ConfigError
@@ -19,7 +20,8 @@ def write(tmp_path, text):
 
 
 def test_an_empty_file_is_a_valid_run(tmp_path):
-    assert load_run(write(tmp_path, "")).sequence(0) == SequenceConfig()
+    assert load_run(write(tmp_path, "quality: null")).sequence(0) == SequenceConfig(quality=None)
+    assert load_run(write(tmp_path, "")).sequence(0).quality == SequenceConfig().quality == DEFAULT
 
 
 def test_shipped_configurations_are_valid():
@@ -241,7 +243,7 @@ def test_field_of_view_is_horizontal_and_the_principal_point_the_centre():
         ("events: {emulator: easim}", "events.emulator: unknown choice (got 'easim')"),
         (
             "labels: {flow: [sideways]}",
-            "labels.flow.0: unknown choice (got 'sideways'); expected 'forward' or 'backward'",
+            "labels.flow.0: no direction, and no interval (got 'sideways'); expected forward, backward",
         ),
         (
             "output: {name: ../escape}",

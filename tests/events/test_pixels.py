@@ -74,6 +74,51 @@ def test_noise_does_not_depend_on_the_steps_and_resumes():
     assert ((whole.cause == Cause.HOT) == hot).all()
 
 
+ANSWERED = PixelsConfig(
+    rate_hz=3.0, spread_decades=0.4, on_share=0.7, answered=0.6, answer_ms=20, answer_spread_decades=0.4
+)
+
+
+def test_an_answer_is_of_the_other_polarity_and_later_by_the_stated_law():
+    """Rates so low that what follows within seconds is the answer."""
+    config = ANSWERED.model_copy(update={"rate_hz": 0.02, "spread_decades": 0.0})
+    _, events = noise_of(config, [0, 30_000_000])
+    pixel = events.y.astype(int) * W + events.x
+    order = np.lexsort((events.t, pixel))
+    pixel, t, p = pixel[order], events.t[order], events.p[order]
+    gap = np.where(np.diff(pixel) == 0, np.diff(t) / 1000, np.inf)
+    follows = gap < 20 * 10**1.6
+    assert (p[1:][follows] != p[:-1][follows]).mean() > 0.97
+    first = ~np.concatenate([[False], follows])
+    n = first.sum()
+    assert abs(follows.sum() / n - 0.6) < 4 * np.sqrt(0.24 / n) + 0.02
+    assert abs(p[first].mean() - 0.7) < 4 * np.sqrt(0.21 / n)
+    law = stats.lognorm(s=0.4 * np.log(10), scale=20.0)
+    assert stats.kstest(gap[follows], law.cdf).statistic < 1.6 / np.sqrt(follows.sum()) + 0.02
+    assert abs(len(events) / (H * W * 30) - 0.02) < 0.02 * 0.05
+
+
+@pytest.mark.parametrize("step_us", [500, 200_000])
+def test_answers_are_in_the_rates_from_the_first_moment(step_us):
+    stage, events = noise_of(ANSWERED, np.arange(0, 2_000_001, step_us))
+    expected = stage.rates.sum() * 0.1
+    early, late = (((a < events.t) & (events.t <= a + 100_000)).sum() for a in (0, 1_900_000))
+    for count in (early, late):
+        assert abs(count - expected) < 5 * np.sqrt(2 * expected)
+    assert events.t[0] > 0 and (np.diff(events.t) >= 0).all()
+
+
+def test_answers_do_not_depend_on_the_steps_and_resume():
+    _, whole = noise_of(ANSWERED, [0, 1_000_000], causes=True)
+    stage, parts = PixelNoise(ANSWERED, H, W, 5, True), []
+    for t in (0, 1, 20_000, 20_001, 600_000, 1_000_000):
+        parts.append(stage.step(Events.empty(), t))
+        again = PixelNoise(ANSWERED, H, W, 5, True)
+        again.load_state_dict(stage.state_dict())
+        stage = again
+    assert_same(Events.concatenate(parts), whole)
+
+
 def test_dead_pixels_are_silent_and_others_untouched():
     stage = PixelNoise(PixelsConfig(dead_fraction=0.3), H, W, 2)
     rng = np.random.default_rng(1)

@@ -317,7 +317,11 @@ def stereo(tmp_path_factory):
         "camera": {"keyframes": [pose(0, 0), pose(1, 0.5)]},
     }
     return (
-        generate(tmp_path_factory.mktemp("rig"), {**STEREO, "scene": scene, "rig": "stereo"}) / "train/sequence_000000"
+        generate(
+            tmp_path_factory.mktemp("rig"),
+            {**STEREO, "scene": scene, "rig": "stereo", "sensors": [{"name": "unit", "imu": {"rate": 200}}]},
+        )
+        / "train/sequence_000000"
     )
 
 
@@ -343,6 +347,9 @@ def test_a_stereo_rig_has_a_right_eye_disparity_and_a_calibration(stereo, tmp_pa
     assert point[2] / point[3] == pytest.approx(depth, abs=0.6 * quantum)
     with h5py.File(exported(stereo, tmp_path, "mvsec") / "train/sequence_000000_data.hdf5") as file:
         assert len(file["davis/right/events"]) == len(eyes["right"])
+        imu = read_imu(stereo / "unit")
+        np.testing.assert_array_equal(file["davis/left/imu"][:, :3], imu["acceleration"])
+    assert (folder / "imu/imu.csv").read_bytes() == (stereo / "unit/imu/imu.csv").read_bytes()
 
 
 LENS = {
@@ -365,3 +372,23 @@ def test_a_lens_that_distorts_has_its_rectify_map_and_truth_that_is_rectified(tm
     calibration = yaml.safe_load((folder / "calibration/cam_to_cam.yaml").read_text())
     assert calibration["intrinsics"]["cam0"]["distortion_coeffs"] == pytest.approx([-0.2, 0.05, 0, 0])
     assert list(dsec_sequence(folder, HEIGHT, WIDTH))
+
+
+def test_tonic_opens_events_and_makes_frames_of_them(data, sequence, tmp_path):
+    """tonic's DSEC reads `events_left/events.h5` of a recording's folder, as layout `eraft` has it. Made without its
+    constructor, which downloads a plugin for images and knows the published recordings' names alone."""
+    tonic = pytest.importorskip("tonic", reason="not an extra of ours: pip install tonic")
+    loader = pytest.importorskip("torch.utils.data").DataLoader
+    read = tonic.datasets.DSEC.__new__(tonic.datasets.DSEC)
+    read.location_on_system = str(exported(data, tmp_path, "eraft") / "test")
+    read.recording_selection, read.data_selection, read.target_selection = ["sequence_000000"], ["events_left"], []
+    read.transform = read.target_transform = read.transforms = None
+    (found,), _ = read[0]
+    mine, theirs = read_events(sequence / "events.h5"), found["events_left"]
+    same([theirs[name].astype("i8") for name in "xytp"], mine)
+    frames = tonic.transforms.ToFrame((WIDTH, HEIGHT, 2), time_window=100_000)
+    counts = frames(theirs)
+    assert counts.shape[1:] == (2, HEIGHT, WIDTH) and 0.7 * len(mine) < counts.sum() <= len(mine)
+    cut = tonic.SlicedDataset([(theirs, 0)], tonic.slicers.SliceByTime(100_000), transform=frames)
+    batches = list(loader(cut, batch_size=2, collate_fn=tonic.collation.PadTensors()))
+    assert sum(int(x.sum()) for x, _ in batches) == counts.sum()

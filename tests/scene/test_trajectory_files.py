@@ -241,3 +241,31 @@ def test_a_place_on_the_body_that_is_none():
         Trajectory("a.txt", T_body_sensor=np.diag([1.0, 1, -1, 1]))
     with pytest.raises(ConfigError, match="Trajectory.T_body_sensor: not such an array"):
         Trajectory("a.txt", T_body_sensor=np.eye(3))
+
+
+def test_what_goes_faster_than_anything_flies_is_refused(tmp_path):
+    t_ns, T = EPOCH + np.arange(151) * 10_000_000, circle(np.arange(151) * 0.01)
+    flip = np.diag([-1.0, 1, -1, 1])
+    for name, changed in (("mm", T.copy()), ("jump", T.copy()), ("turned", T.copy()), ("later", T.copy())):
+        if name == "mm":
+            changed[:, :3, 3] *= 1000
+        elif name == "jump":
+            changed[20:, 2, 3] += 1.5
+        elif name == "turned":
+            changed[20:] = changed[20:] @ flip
+        else:
+            changed[100:, 2, 3] += 1.5  # which the sequence does not see
+        write_trajectory(tmp_path / name, t_ns, changed)
+    for name, key, value in (
+        ("mm", "speed_limit", "2000 units/s"),
+        ("jump", "speed_limit", "150 units/s at 0.19 s"),
+        ("turned", "turn_limit", "degrees/s at 0.19 s"),
+    ):
+        made = scene(Trajectory(tmp_path / name))
+        with pytest.raises(ConfigError, match=f"trajectory.{key}: the trajectory goes too fast.*{value}"):
+            made.build(made.template().sequence(0))
+    for name, more in (("later", {}), ("mm", {"speed_limit": 1e4})):
+        tree = scene(Trajectory(tmp_path / name)).template().tree
+        tree["scene"]["camera"]["trajectory"].update(more)
+        (tmp_path / "run.yaml").write_text(yaml.safe_dump(tree))
+        assert sequence_scene(load_run(tmp_path / "run.yaml").sequence(0), 0, tmp_path).camera_path.t1_ns

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -15,13 +16,14 @@ from rich.console import Console
 from blinkgl.blender import process
 from blinkgl.cli import run
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
-from blinkgl.config.sequence import load_run
+from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.errors import ConfigError
 from blinkgl.events.table import EMULATORS
 from blinkgl.render.rectangles import Rectangle
 from blinkgl.render.renderer import Renderer
 from blinkgl.show.trade import show
 from blinkgl.tools import peer_cycles
+from blinkgl.trade import run as run_module
 from blinkgl.trade.measure import Bench, Level, Options
 from blinkgl.trade.pareto import pareto_front
 from blinkgl.trade.reference import FineTiles, lattice, mask_of
@@ -78,7 +80,10 @@ def test_fine_tiles_are_the_image_itself_and_then_its_mean(gl, config):
     t = bench.t0_ns
     for scale, antialiasing in ((1, "none"), (2, "ssaa2"), (4, "ssaa4")):
         render = bench.config([f"render.antialiasing={antialiasing}"]).render
-        with Renderer(gl, bench.scene, render) as whole, FineTiles(gl, bench.scene, bench.tiles, scale) as tiles:
+        with (
+            Renderer(gl, bench.scene, render) as whole,
+            FineTiles(gl, bench.scene, bench.tiles, scale, RenderConfig()) as tiles,
+        ):
             image = whole.luminance(t).read()
             (mine,) = tiles([t])
             inside = np.abs(mine - image)[bench.mask]
@@ -270,6 +275,9 @@ def test_a_path_tracer_in_the_references_place(gl, config, monkeypatch, tmp_path
         with FineTiles(gl, scene, (Rectangle(0, 0, scene.camera.width, scene.camera.height),), 2) as source:
             yield from source(times)
 
+    monkeypatch.setattr(
+        run_module, "create_context", lambda *_: nullcontext(gl)
+    )  # else theirs is current, not this one
     monkeypatch.setattr(peer_cycles, "frames", frames)
     monkeypatch.setattr(process, "available", lambda: "")
     options = replace(OPTIONS, tiles=(1, 1, 64, 48), reference="cycles")

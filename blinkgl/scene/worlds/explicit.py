@@ -189,8 +189,30 @@ def trajectory_path(config: TrajectoryConfig, t0_ns: int, t1_ns: int, where: str
     last = int(np.searchsorted(t_ns, t1_ns + aside)) + _BEYOND
     t_ns, poses = t_ns[first:last], poses[first:last]
     positions, rotations = smoothed(t_ns, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]), aside)
+    _check_speeds(config, t_ns, positions, rotations, where)
     path = KeyframePath(t_ns, positions, rotations, "spline", where)
     return path if config.T_body_sensor is None else OffsetPath(path, _on_body(config.T_body_sensor, where, base))
+
+
+def _check_speeds(
+    config: TrajectoryConfig, t_ns: np.ndarray, positions: np.ndarray, rotations: Rotation, where: str
+) -> None:
+    """Raises ConfigError: the poses are farther apart than anything flies, or turns, between them."""
+    seconds = np.diff(t_ns) * 1e-9
+    speed = np.linalg.norm(np.diff(positions, axis=0), axis=1) / seconds
+    turn = np.degrees((rotations[1:] * rotations[:-1].inv()).magnitude()) / seconds
+    for rate, limit, key, unit, guess in (
+        (speed, config.speed_limit, "speed_limit", "units/s", "positions in mm, or a jump?"),
+        (turn, config.turn_limit, "turn_limit", "degrees/s", "quaternions in another order, or a jump?"),
+    ):
+        k = int(np.argmax(rate))
+        if rate[k] > limit:
+            raise ConfigError(
+                f"the trajectory goes too fast: {guess}",
+                where=f"{where}.{key}",
+                value=f"{rate[k]:.4g} {unit} at {t_ns[k] * 1e-9:.6g} s",
+                accepted=f"at most {limit:g} {unit}, or another {key}",
+            )
 
 
 def _on_body(given: Any, where: str, base: Path) -> np.ndarray:

@@ -1,0 +1,386 @@
+"""The noise of single pixels (``readout.pixels``) that a camera's still scene shows: how many pixels are noisy or hot,
+how much, and how often an event of noise is answered by one of the opposite polarity.
+
+Fitted by maximum likelihood to how many events each pixel made in the first half of the recording (the Poisson process
+of :class:`~blinkgl.events.pixels.PixelNoise`, its rates a mixture of two log-normal laws, counts of answered events
+compound), and to the time between the two events of pixels that made two. Judged by the half that was not fitted.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import expit, ndtr
+from scipy.stats import binom, ks_2samp, poisson
+
+from blinkgl.config.readout import PixelsConfig
+from blinkgl.errors import EventDataError
+from blinkgl.events.pixels import PixelNoise
+from blinkgl.events.types import Events
+from blinkgl.recordings.clip import read_recording
+
+LEAST_EVENTS = 500
+"""Of a half: fewer say nothing of a spread over pixels."""
+WORTH = 6.0
+"""By which the logarithm of the likelihood has to grow for hot pixels, or answers, to be told."""
+_EXACT, _PER_DECADE = 64, 12
+"""Counts up to the first are told apart; larger ones in bins, so many a decade."""
+_GRID = np.linspace(np.log(1e-7), np.log(1e6), 480)
+"""Logarithms of expected counts over which laws of rates are summed."""
+_SHARES = 20
+_TEN = float(np.log(10.0))
+
+
+@dataclass(frozen=True, eq=False)
+class PixelFit:
+    """Result of :func:`fit_pixels`.
+
+    config : as fitted.   uncertainty : standard deviations of what was fitted, by key.   untold : why the rest was not.
+    recorded, simulated : events of the half that was not fitted.
+    counts_distance, intervals_distance : Kolmogorov and Smirnov's, of the number of events of the pixels that fired,
+    and of the intervals between a pixel's events.   counts, intervals : these, recorded and simulated; µs.
+    seconds : of both halves."""
+
+    recording: str
+    size: tuple[int, int]
+    config: PixelsConfig
+    uncertainty: dict[str, float]
+    untold: dict[str, str]
+    recorded: int
+    simulated: int
+    counts: tuple[np.ndarray, np.ndarray]
+    intervals: tuple[np.ndarray, np.ndarray]
+    seconds: tuple[float, float]
+
+    @property
+    def fired(self) -> tuple[int, int]:
+        """Pixels, recorded and simulated."""
+        return len(self.counts[0]), len(self.counts[1])
+
+    @property
+    def counts_distance(self) -> float:
+        return _distance(*self.counts)
+
+    @property
+    def intervals_distance(self) -> float:
+        return _distance(*self.intervals)
+
+    @property
+    def rate_ratio(self) -> float:
+        return self.simulated / max(self.recorded, 1)
+
+    def sensor(self) -> dict[str, Any]:
+        """The table of a sensor file (:class:`~blinkgl.config.sensor.SensorConfig`)."""
+        file = os.path.basename(self.recording)
+        told = {k: float(f"{v:.4g}") for k, v in self.config.model_dump(exclude_defaults=True).items()}
+        return {
+            "name": os.path.splitext(file)[0],
+            "width": self.size[1],
+            "height": self.size[0],
+            "readout": {"pixels": told},
+            "sources": {
+                "readout.pixels": f"blinkgl calibrate --still --emulator pixels, fitted to the first "
+                f"{self.seconds[0]:.3g} s of {file}; in the other {self.seconds[1]:.3g} s {self.rate_ratio:.2f} of its "
+                f"events, events of a pixel KS {self.counts_distance:.3f}, intervals KS {self.intervals_distance:.3f}",
+                **{f"readout.pixels.{key}": why for key, why in self.untold.items()},
+            },
+            "uncertainty": {f"readout.pixels.{key}": float(f"{v:.2g}") for key, v in self.uncertainty.items()},
+        }
+
+
+def fit_pixels(
+    recording: str | os.PathLike, *, seed: int = 0, progress: Callable[[str, float], None] | None = None
+) -> PixelFit:
+    """:func:`fit_pixels_of` of a file.   Raises EventDataError (too few events), AssetError (unreadable)."""
+    if progress:
+        progress("reading", 0.0)
+    events, size = read_recording(recording, least=2 * LEAST_EVENTS)
+    return fit_pixels_of(events, size, name=os.fspath(recording), seed=seed, progress=progress)
+
+
+def fit_pixels_of(
+    events: Events,
+    size: tuple[int, int],
+    *,
+    used: np.ndarray | None = None,
+    name: str = "events",
+    seed: int = 0,
+    progress: Callable[[str, float], None] | None = None,
+) -> PixelFit:
+    """``readout.pixels`` for what a still scene in constant light shows. size : (height, width) of the sensor.
+    used : (height, width) bool, the pixels that are looked at; None: all."""
+    say = progress or (lambda *_: None)
+    height, width = size
+    looked = np.ones(height * width, bool) if used is None else np.asarray(used, bool).reshape(-1)
+    events = events.part(looked[events.y.astype(np.int64) * width + events.x])
+    if len(events) < 2 * LEAST_EVENTS:
+        raise _too_few(name, len(events) // 2)
+    t0, t1 = int(events.t[0]), int(events.t[-1]) + 1
+    middle = (t0 + t1) // 2
+    halves = [events.window(t0, middle), events.window(middle, t1)]
+    if min(map(len, halves)) < LEAST_EVENTS:
+        raise _too_few(name, min(map(len, halves)))
+    seconds = ((middle - t0) / 1e6, (t1 - middle) / 1e6)
+    pixel = halves[0].y.astype(np.int64) * width + halves[0].x
+    counts = np.bincount(pixel, minlength=height * width)
+    untold: dict[str, str] = {}
+    say("counts of pixels", 0.1)
+    dead = _dead_time(halves[0], pixel, counts, seconds[0])
+    law = _Counts(counts[looked], seconds[0], dead)
+    plain = law.fit(False, False)
+    say("counts of pixels", 0.3)
+    hot = law.fit(True, False)
+    say("counts of pixels", 0.5)
+    answered = law.fit(True, True, hot.at)
+    say("counts of pixels", 0.8)
+    if answered.likelihood - hot.likelihood < WORTH:
+        answered = hot
+    if hot.likelihood - plain.likelihood < WORTH:
+        alone = law.fit(False, True, plain.at)
+        answered = alone if alone.likelihood - plain.likelihood >= WORTH else plain
+    values, uncertainty = answered.values, answered.uncertainty
+    if not answered.hot:
+        untold["hot_fraction"] = "one law of rates says as much as two"
+    if dead:
+        values["refractory_us"] = 1e6 * dead
+    else:
+        untold["refractory_us"] = "no pixel fires so often that it would show"
+    first_on = float((halves[0].p > 0).mean())
+    if answered.answers:
+        share = values.pop("share")
+        spread = uncertainty.pop("share")
+        delay, wide, first_on = _delays(halves[0], pixel, counts, seconds[0])
+        seen = _seen(delay, wide, seconds[0])
+        # Answers that come after the end are lost, those of what came before the beginning stand alone.
+        q = min(share / max(seen + share * (seen - 1.0), 1e-3), 1.0)
+        values |= {"answered": q, "answer_ms": 1e3 * delay, "answer_spread_decades": wide}
+        uncertainty["answered"] = spread * q / share
+    else:
+        untold["answered"] = "events of a pixel are as many as if none answered another"
+    values["on_share"] = float(np.clip(first_on, 0.0, 1.0))
+    config = PixelsConfig(**{key: _within(key, value) for key, value in values.items()})
+    say("judging", 0.9)
+    noise = PixelNoise(config, height, width, seed + 1)
+    noise.step(Events.empty(), 0)
+    made = noise.step(Events.empty(), t1 - middle)
+    made = made.part(looked[made.y.astype(np.int64) * width + made.x])
+    ours, theirs = (
+        np.bincount(e.y.astype(np.int64) * width + e.x, minlength=height * width) for e in (made, halves[1])
+    )
+    return PixelFit(
+        name,
+        size,
+        config,
+        {key: value for key, value in uncertainty.items() if value > 0},
+        untold,
+        len(halves[1]),
+        len(made),
+        (theirs[theirs > 0], ours[ours > 0]),
+        (_gaps(halves[1], width), _gaps(made, width)),
+        seconds,
+    )
+
+
+def _distance(a: np.ndarray, b: np.ndarray) -> float:
+    return float(ks_2samp(a, b).statistic) if len(a) and len(b) else float("nan")
+
+
+def _too_few(name: str, count: int) -> EventDataError:
+    return EventDataError(
+        "too few events to tell the noise of single pixels",
+        where=name,
+        value=count,
+        accepted=f"{LEAST_EVENTS:,} or more in each half of its time",
+    )
+
+
+def _within(key: str, value: float) -> float:
+    """A value inside the key's own limits."""
+    ends = {"ge": -np.inf, "le": np.inf}
+    for rule in PixelsConfig.model_fields[key].metadata:
+        ends |= {side: getattr(rule, side) for side in ends if getattr(rule, side, None) is not None}
+    return float(np.clip(value, ends["ge"], ends["le"]))
+
+
+def _gaps(events: Events, width: int) -> np.ndarray:
+    """Times between a pixel's events, µs."""
+    pixel = events.y.astype(np.int64) * width + events.x
+    order = np.lexsort((events.t, pixel))
+    return np.diff(events.t[order])[np.diff(pixel[order]) == 0]
+
+
+def _delays(events: Events, pixel: np.ndarray, counts: np.ndarray, seconds: float) -> tuple[float, float, float]:
+    """(median s, spread in decades) of a log-normal law of the time to an answer: by maximum likelihood from pixels
+    with two events of opposite polarity, of which a share are two by chance. And the share of them that begin ON."""
+    pairs = counts[pixel] == 2
+    order = np.lexsort((events.t[pairs], pixel[pairs]))
+    t, p = events.t[pairs][order].reshape(-1, 2), events.p[pairs][order].reshape(-1, 2)
+    opposite = p[:, 0] != p[:, 1]
+    gap = np.maximum((t[:, 1] - t[:, 0]) * 1e-6, 1e-6)[opposite]
+    if len(gap) < 20:
+        return 0.03, 0.5, float((events.p > 0).mean())
+    grid = np.linspace(np.log(1e-6), np.log(seconds), 400)
+
+    def loss(at: np.ndarray) -> float:
+        median, spread, chance = at[0], np.exp(at[1]), expit(at[2])
+        pdf = lambda x: np.exp(-0.5 * ((x - median) / spread) ** 2) / spread
+        whole = np.trapezoid(pdf(grid) * (1 - np.exp(grid) / seconds), grid)
+        room = np.maximum(1 - gap / seconds, 1e-9)
+        density = (1 - chance) * pdf(np.log(gap)) * room / max(whole, 1e-12) / gap + chance * 2 * room / seconds
+        return -float(np.log(np.maximum(density, 1e-300)).sum())
+
+    start = np.array([np.log(np.median(gap)), 0.0, -1.5])
+    found = minimize(loss, start, method="Nelder-Mead", options={"maxiter": 600}).x
+    return float(np.exp(found[0])), float(np.exp(found[1]) / _TEN), float((p[opposite, 0] > 0).mean())
+
+
+def _dead_time(events: Events, pixel: np.ndarray, counts: np.ndarray, seconds: float) -> float:
+    """Seconds that a pixel sleeps after an event: a low percentile of the intervals of those that fire most, if no
+    shorter ones are due there; 0 where nobody fires often enough to tell."""
+    busy = counts >= max(100, 0.3 * counts.max())
+    inside = busy[pixel]
+    order = np.lexsort((events.t[inside], pixel[inside]))
+    gap = np.diff(events.t[inside][order])[np.diff(pixel[inside][order]) == 0] * 1e-6
+    if len(gap) < 200:
+        return 0.0
+    low = float(np.percentile(gap, 2))
+    # By chance alone two of a hundred exponential intervals are below a fiftieth of their mean.
+    return low if low > 5 * 0.02 * gap.mean() else 0.0
+
+
+def _seen(delay: float, decades: float, seconds: float) -> float:
+    """Share of answers that fall into a recording of that length in which what they answer does."""
+    if decades <= 0:
+        return max(1 - delay / seconds, 0.0)
+    x = np.linspace(-6, 6, 600)
+    weight = np.exp(-0.5 * x**2)
+    late = delay * np.exp(_TEN * decades * x)
+    return float((weight * np.maximum(1 - late / seconds, 0)).sum() / weight.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    hot: bool
+    answers: bool
+    likelihood: float
+    values: dict[str, float]
+    uncertainty: dict[str, float]
+    at: np.ndarray
+
+
+class _Counts:
+    """The likelihood of how many events each pixel made. counts : (pixels,).   seconds : in which.
+    dead : s that a pixel sleeps after an event."""
+
+    def __init__(self, counts: np.ndarray, seconds: float, dead: float = 0.0):
+        self._seconds, self._dead = seconds, dead
+        top = max(int(counts.max()), _EXACT) + 1
+        decades = int(np.ceil(_PER_DECADE * np.log10(top / _EXACT))) + 1
+        edges = _EXACT * 10 ** (np.arange(decades + 1) / _PER_DECADE)
+        self._edges = np.concatenate([np.arange(_EXACT + 1), edges[1:]]) + 0.5
+        """upper ends of the bins; the last one is open"""
+        where = np.searchsorted(self._edges, counts)
+        self._observed = np.bincount(where, minlength=len(self._edges) + 1)
+        self._mean = float(counts.mean())
+        self._busiest = float(np.sort(counts)[-max(len(counts) // 1000, 1)])
+        self._kept: dict[int, np.ndarray] = {}
+
+    def _of_rates(self, q: float) -> np.ndarray:
+        """(expected counts, bins) probabilities; ``q``: share of events that are answered. In between a few shares they
+        are nearly straight."""
+        place = q * _SHARES
+        below = min(int(place), _SHARES - 1)
+        return (below + 1 - place) * self._at_share(below) + (place - below) * self._at_share(below + 1)
+
+    def _at_share(self, number: int) -> np.ndarray:
+        if number in self._kept:
+            return self._kept[number]
+        q = number / _SHARES
+        mean = np.exp(_GRID) / (1 + np.exp(_GRID) * self._dead / self._seconds)
+        k = np.arange(_EXACT + 1)
+        few = poisson.pmf(k[None, :], mean[:, None] / (1 + q))
+        if q > 0:
+            few = few @ binom.pmf(k[None, :] - k[:, None], k[:, None], q)
+        asleep = mean * self._dead / self._seconds
+        deviation = np.sqrt(mean * (1 + 3 * q) / (1 + q)) * np.maximum(1 - asleep, 1e-2)
+        above = ndtr((self._edges[None, _EXACT:] - mean[:, None]) / deviation[:, None])
+        many = np.diff(above, axis=1, append=1.0)
+        found = np.concatenate([few, many], axis=1)
+        self._kept[number] = found / np.maximum(found.sum(axis=1, keepdims=True), 1e-12)
+        return self._kept[number]
+
+    def _law(self, median: float, decades: float) -> np.ndarray:
+        """Weights of the grid, of a log-normal law of rates (1/s)."""
+        weight = np.exp(-0.5 * ((_GRID - np.log(median * self._seconds)) / (_TEN * decades)) ** 2)
+        return weight / max(weight.sum(), 1e-300)
+
+    def fit(self, hot: bool, answers: bool, before: np.ndarray | None = None) -> _Found:
+        """hot : two laws of rates.   answers : some events are answered.   before : where the same without answers
+        ended."""
+
+        def read(at: np.ndarray) -> dict[str, float]:
+            values = {"rate_hz": np.exp(at[0]), "spread_decades": 3 * expit(at[1])}
+            if hot:
+                values |= {
+                    "hot_fraction": expit(at[2]),
+                    "hot_rate_hz": np.exp(at[3]),
+                    "hot_spread_decades": 3 * expit(at[4]),
+                }
+            if answers:
+                values["share"] = expit(at[-1])
+            return {key: float(value) for key, value in values.items()}
+
+        def loss(at: np.ndarray) -> float:
+            if np.abs(at).max() > 40:
+                return 1e300
+            v = read(at)
+            weights = self._law(v["rate_hz"], max(v["spread_decades"], 0.02))
+            if hot:
+                own = self._law(v["hot_rate_hz"], max(v["hot_spread_decades"], 0.02))
+                weights = (1 - v["hot_fraction"]) * weights + v["hot_fraction"] * own
+            chances = weights @ self._of_rates(v.get("share", 0.0))
+            return -float((self._observed * np.log(np.maximum(chances, 1e-300))).sum())
+
+        ends: list[tuple[float, np.ndarray]] = []
+        tail = np.log(max(self._busiest, 3.0) / self._seconds)
+        starts = [] if before is None else [before]
+        for below, spread in ((1.0, -1.5), (5.0, -0.5)) if before is None else ():
+            rate = np.log(max(self._mean, 1e-6) / self._seconds) - below
+            starts.append(np.array([rate, spread, *((-6.0, tail, -2.0) if hot else ())]))
+        for start in starts:
+            start = np.append(start, 0.0) if answers else start
+            for _ in range(2):  # the simplex begins anew where it ended
+                options = {"maxiter": 400 * len(start), "xatol": 1e-3, "fatol": 1e-2}
+                start = minimize(loss, start, method="Nelder-Mead", options=options).x
+            ends.append((loss(start), start))
+        least, best = min(ends, key=lambda end: end[0])
+        values, step = read(best), {}
+        deviations = np.sqrt(np.clip(np.diag(np.linalg.pinv(_curvature(loss, best))), 0.0, None))
+        for d in np.diag(deviations):
+            apart = read(best + d), read(best - d)
+            step |= {key: abs(apart[0][key] - apart[1][key]) / 2 for key in values if apart[0][key] != apart[1][key]}
+        if hot and values["hot_rate_hz"] < values["rate_hz"]:
+            for table in (values, step):
+                for key in ("rate_hz", "spread_decades"):
+                    table[key], table[f"hot_{key}"] = table.get(f"hot_{key}", 0.0), table.get(key, 0.0)
+            values["hot_fraction"] = 1 - values["hot_fraction"]
+        for key in ("spread_decades", "hot_spread_decades"):
+            values |= {key: 0.0} if values.get(key, 1.0) < 0.005 else {}
+        return _Found(hot, answers, -least, values, step, best)
+
+
+def _curvature(loss: Callable[[np.ndarray], float], at: np.ndarray, step: float = 0.02) -> np.ndarray:
+    """(n, n) second differences."""
+    n = len(at)
+    found, unit = np.zeros((n, n)), step * np.eye(n)
+    for i in range(n):
+        for j in range(i + 1):
+            a, b = unit[i], unit[j]
+            found[i, j] = loss(at + a + b) - loss(at + a - b) - loss(at - a + b) + loss(at - a - b)
+            found[j, i] = found[i, j]
+    return found / (4 * step**2)

@@ -1,0 +1,289 @@
+"""``blinkgl trade --suite``: the same settings on scenes that differ in what is hard.
+
+One scene says little: what is bought by filtering textures is not bought by filtering silhouettes. Each scene of
+``configs/trade/`` is measured as :func:`blinkgl.trade.run.trade` measures one, with a reference of its own density, and
+the file is written after each, so that whatever ends the run leaves what was measured, marked as a part.
+
+A row, one setting in one scene, counts only where the reference stands still by a tenth of what it says of that row.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from blinkgl.config.quality import QUALITIES, load_quality
+from blinkgl.config.sequence import RunTemplate, SequenceConfig, apply_overrides, load_run
+from blinkgl.errors import BlinkGLError, ConfigError
+from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.render.renderer import Renderer
+from blinkgl.srgb import to_srgb8
+from blinkgl.trade.measure import Bench, Density, Options
+from blinkgl.trade.pareto import excess, pareto_front
+from blinkgl.trade.run import chosen, convergence_line, plain, trade
+from blinkgl.trade.settings import Setting, suite_design
+
+OPTIONS = Options(tiles=(3, 2, 14, 11), levels=Density(), reference_s=480.0, rounds=3, rounds_s=240.0, labels=False)
+FILE = "suite.json"
+COLUMNS = (
+    "scene",
+    "name",
+    "cpu_s",
+    "wall_s",
+    "frames_per_s",
+    "voxel",
+    "missed",
+    "extra",
+    "count",
+    "time_median_us",
+    "time_p95_us",
+    "trusted",
+    "on_front",
+)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A scene of the suite. what : the first sentence of its file: what is hard about it."""
+
+    name: str
+    path: Path
+
+    @property
+    def what(self) -> str:
+        with self.path.open(encoding="utf-8", errors="replace") as file:
+            first = file.readline(1000)
+        return first.removeprefix("#").strip() if first.startswith("#") else ""
+
+
+def clips(folder: str | Path | None = None, only: Sequence[str] = ()) -> tuple[Trial, ...]:
+    """The scenes of a folder (None: the shipped ones), by name; those whose name contains one of ``only``. Raises
+    ConfigError where there is none."""
+    place = Path(str(resources.files("blinkgl.configs"))) / "trade" if folder is None else Path(folder)
+    if not place.is_dir():
+        raise ConfigError("the suite is a folder of scenes", where=str(folder), accepted="a folder with .yaml files")
+    every = tuple(Trial(path.stem, path) for path in sorted(place.glob("*.yaml")))
+    if not every:
+        raise ConfigError("no scenes there", where=str(folder), accepted="a folder with .yaml files")
+    found = tuple(c for c in every if not only or any(text.lower() in c.name.lower() for text in only))
+    if not found:
+        raise ConfigError(
+            "no scene is called that",
+            where="--scene",
+            value=", ".join(only),
+            accepted="part of one of " + ", ".join(c.name for c in every),
+        )
+    return found
+
+
+def run_suite(
+    scenes: Sequence[Trial],
+    out: str | Path,
+    *,
+    options: Options = OPTIONS,
+    settings: tuple[Setting, ...] | None = None,
+    only: Sequence[str] = (),
+    skip: Sequence[str] = (),
+    overrides: Sequence[str] = (),
+    minutes: float | None = None,
+    cost: str = "cpu_s",
+    resume: bool = False,
+    say: Callable[[str], None] = lambda _: None,
+) -> dict[str, Any]:
+    """Measures every scene and writes suite.json, suite.csv and a picture of each scene to the folder ``out``, after
+    each scene anew; returns what the first holds.
+
+    minutes : for all of it, shared out evenly over what is left to do; scenes for which none is left are named as
+    missing. resume : scenes of a file that is there, measured with the same settings, are kept.
+    A scene that cannot be measured has a line that says why. Raises BlinkGLError when none can."""
+    out = Path(out)
+    settings = chosen(settings or suite_design(), list(only), list(skip))
+    asked = {"settings": [s.name for s in settings], "overrides": list(overrides), "cost": cost}
+    done: dict[str, dict] = _kept(out / FILE, asked) if resume else {}
+    began, failed = time.perf_counter(), []
+    for k, scene in enumerate(scenes):
+        if scene.name in done and "settings" in done[scene.name]:
+            continue
+        mine = options
+        if minutes is not None:
+            left = (60 * minutes - (time.perf_counter() - began)) / (len(scenes) - k)
+            if left <= 0:
+                say(f"{scene.name}: not measured, the time is up")
+                continue
+            mine = replace(options, rounds_s=0.4 * left, reference_s=0.6 * left)
+        say(f"{scene.name}: {scene.what}")
+        try:
+            done[scene.name] = _measured(scene, mine, settings, overrides, cost, out, say)
+        except BlinkGLError as error:
+            failed.append(error)
+            done[scene.name] = {"what": scene.what, "error": str(error)}
+            say(f"{scene.name}: not measured: {error}")
+        result = _whole(done, scenes, asked, time.perf_counter() - began)
+        write(result, out)
+    if failed and not any("settings" in scene for scene in done.values()):
+        raise failed[0]
+    return _whole(done, scenes, asked, time.perf_counter() - began)
+
+
+def _measured(
+    scene: Trial,
+    options: Options,
+    settings: tuple[Setting, ...],
+    overrides: Sequence[str],
+    cost: str,
+    out: Path,
+    say: Callable[[str], None],
+) -> dict[str, Any]:
+    def look(bench: Bench) -> None:
+        with Renderer(bench.gl, bench.scene, bench.base.render) as renderer:
+            _picture(renderer.colour((bench.t0_ns + bench.t1_ns) // 2).read(), out / f"{scene.name}.png")
+
+    # What generates the scene usually is no business of the measurement: labels, previews, read-outs are left out.
+    template = load_run(scene.path, list(overrides))
+    result = trade(template, options=options, cost=cost, settings=settings, say=say, look=look)
+    size = result["sizes"]["full"]
+    rows = result["settings"]
+    best = {r["name"] for r in pareto_front([r for r in rows if r["trusted"]], cost, "voxel")}
+    for row in rows:
+        row["on_front"] = row["name"] in best
+        for key in ("sampling", "reconstruction", "antialiasing", "other", "size", "overrides", "width", "height"):
+            row.pop(key, None)
+    return {
+        "what": scene.what,
+        "converged": size["converged"],
+        "trusted": sum(r["trusted"] for r in rows),
+        "reference": convergence_line(result),
+        "machine": result["machine"],
+        "seconds": result["seconds"],
+        **{k: size[k] for k in ("width", "height", "judged_pixels", "clip_s", "levels")},
+        "settings": rows,
+        "front": [r["name"] for r in sorted(rows, key=lambda r: r[cost]) if r["on_front"]],
+    }
+
+
+def _picture(colour: Any, path: Path) -> None:
+    import cv2
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    done, data = cv2.imencode(".png", to_srgb8(colour)[..., ::-1])
+    assert done
+    with atomic_file(path) as file, output_errors(path):
+        file.write_bytes(data.tobytes())
+
+
+def _kept(path: Path, asked: dict[str, Any]) -> dict[str, dict]:
+    """Scenes of a file of the same question; none where there is no such file. Raises ConfigError where it is of
+    another question, or no such file at all."""
+    if not path.exists():
+        return {}
+    try:
+        old = json.loads(path.read_text(encoding="utf-8"))
+        same = old["asked"] == asked
+        scenes = {str(name): dict(scene) for name, scene in old["scenes"].items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        raise ConfigError("not a file of blinkgl trade --suite", where=str(path)) from None
+    if not same:
+        raise ConfigError(
+            "was measured with other settings",
+            where=str(path),
+            value="other settings",
+            accepted="the same --only, --skip, --set and --cost, or another --out",
+        )
+    return scenes
+
+
+def _whole(done: dict[str, dict], scenes: Sequence[Trial], asked: dict[str, Any], seconds: float) -> dict[str, Any]:
+    measured = {c.name: done[c.name] for c in scenes if c.name in done}
+    missing = [c.name for c in scenes if "settings" not in measured.get(c.name, {})]
+    return {
+        "complete": not missing,
+        "missing": missing,
+        "asked": asked,
+        "cost": asked["cost"],
+        "error": "voxel",
+        "seconds": seconds,
+        "presets": preset_names(asked["settings"]),
+        "scenes": measured,
+        "standing": standing(measured, asked["cost"]),
+    }
+
+
+def preset_names(names: Iterable[str]) -> dict[str, str]:
+    """Quality -> name of the setting that it is, of those among ``names``."""
+    wanted = {_meaning(_as_overrides(quality)): quality for quality in QUALITIES}
+    known = {s.name: s for s in suite_design()}
+    found = {
+        wanted[key]: name for name in names if name in known and (key := _meaning(known[name].overrides)) in wanted
+    }
+    return {quality: found[quality] for quality in QUALITIES if quality in found}
+
+
+def _as_overrides(quality: str) -> tuple[str, ...]:
+    preset = load_quality(quality)
+    return tuple(f"{table}={json.dumps(preset[table])}" for table in ("timeline", "render"))
+
+
+def _meaning(overrides: Iterable[str]) -> str:
+    """Timeline and render that overrides mean, every value filled in."""
+    tree = apply_overrides({"quality": None}, list(overrides))
+    config: SequenceConfig = RunTemplate(tree, Path()).sequence(0)
+    return json.dumps([config.timeline.model_dump(), config.render.model_dump()], sort_keys=True)
+
+
+def standing(scenes: dict[str, dict], cost: str) -> list[dict[str, Any]]:
+    """Per setting, over the scenes where its row counts: how often nothing beats it, and the worst.
+
+    excess : 0.1 says that another setting is better by 10 % in cost and error both. The largest error is of all
+    scenes, the name of that scene beside it."""
+    names = dict.fromkeys(row["name"] for scene in scenes.values() for row in scene.get("settings", ()))
+    result = []
+    for name in names:
+        counted = []
+        for title, scene in scenes.items():
+            rows = [r for r in scene.get("settings", ()) if r["trusted"]]
+            counted += [(title, r, excess(r, rows, cost, "voxel")) for r in rows if r["name"] == name]
+        if not counted:
+            result.append({"name": name, "scenes": 0})
+            continue
+        worst = max(counted, key=lambda c: c[1]["voxel"])
+        result.append(
+            {
+                "name": name,
+                "scenes": len(counted),
+                "undominated": sum(e <= 0 for *_, e in counted),
+                "excess": max(e for *_, e in counted),
+                "voxel": _mean(r["voxel"] for _, r, _ in counted),
+                "cost": _mean(r[cost] for _, r, _ in counted),
+                "worst_voxel": worst[1]["voxel"],
+                "worst_scene": worst[0],
+            }
+        )
+    return result
+
+
+def _mean(values: Iterable[float]) -> float:
+    """Geometric: scenes differ by factors."""
+    logs = [math.log(max(v, 1e-12)) for v in values]
+    return math.exp(sum(logs) / len(logs))
+
+
+def write(result: dict[str, Any], out: Path) -> None:
+    """suite.json and suite.csv. Raises OutputError."""
+    with atomic_file(out / FILE) as path, output_errors(out / FILE):
+        path.write_text(json.dumps(plain(result), indent=1) + "\n", encoding="utf-8")
+    with (
+        atomic_file(out / "suite.csv") as path,
+        output_errors(out / "suite.csv"),
+        path.open("w", newline="", encoding="utf-8") as file,
+    ):
+        rows = csv.DictWriter(file, COLUMNS, extrasaction="ignore")
+        rows.writeheader()
+        for name, scene in result["scenes"].items():
+            rows.writerows({"scene": name, **row} for row in scene.get("settings", ()))

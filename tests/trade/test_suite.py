@@ -1,0 +1,202 @@
+"""The suite: a small one is measured here, presets are judged by it, and what can go wrong in one does."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from rich.console import Console
+
+from blinkgl.cli import run
+from blinkgl.config.quality import QUALITIES
+from blinkgl.config.sequence import RenderConfig, load_run
+from blinkgl.errors import ConfigError
+from blinkgl.render.rectangles import Rectangle
+from blinkgl.scene.build import sequence_scene
+from blinkgl.show.suite import show
+from blinkgl.trade.fronts import fronts
+from blinkgl.trade.measure import Density, Level, Options
+from blinkgl.trade.pareto import excess
+from blinkgl.trade.reference import FineTiles
+from blinkgl.trade.settings import Setting, suite_design
+from blinkgl.trade.suite import Trial, clips, preset_names, run_suite, standing
+
+SAMPLES = {"none": 1, "taps4": 2, "edges": 2.5, "ssaa2": 4, "ssaa4": 16}
+"""What a frame costs, in frames without a filter, about (docs/trade.md)."""
+WORLD = {
+    "seed": 5,
+    "camera": {"width": 80, "height": 60, "fov": 60},
+    "time": {"duration": 0.1, "label_rate": 50},
+    "scene": {
+        "kind": "random",
+        "objects": {"count": 4, "distance": [2, 5]},
+        "camera_motion": {"speed": [0.5, 1.0], "rotation_rate": [40, 60]},
+        "pool": {"primitives": ["cuboid", "torus"], "variants": 2, "urdfs": False},
+        "textures": {"procedural": ["checks", "bricks"], "variants": 2, "photographs": False, "max_size": 128},
+    },
+}
+RIVALS = tuple(
+    Setting(f"displacement {px:g} px", "linear", a, o)
+    for px, a, o in (
+        (2, "none", "mip bias -1"),
+        (0.5, "none", ""),
+        (1, "ssaa2", "mip bias -1"),
+        (2, "taps4", "mip bias -1"),
+    )
+)
+OPTIONS = Options(tiles=(1, 1, 80, 60), levels=Density((4, 8), (0.25, 0.125)), rounds=1, labels=False)
+
+
+def presets() -> tuple[Setting, ...]:
+    names = preset_names(s.name for s in suite_design())
+    assert list(names) == list(QUALITIES), "every preset is a setting of the suite"
+    return tuple(s for s in suite_design() if s.name in names.values())
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("scenes")
+    (path / "world.yaml").write_text("# A world: of a few objects.\n" + yaml.safe_dump(WORLD))
+    (path / "broken.yaml").write_text("frames: {folders: nowhere}\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def measured(folder, tmp_path_factory) -> tuple[dict, Path]:
+    out = tmp_path_factory.mktemp("suite")
+    settings = tuple(dict.fromkeys([*presets(), *RIVALS]))
+    return run_suite(clips(folder), out, options=OPTIONS, settings=settings), out
+
+
+def test_no_rival_beats_a_preset_measured_again(measured):
+    """Cost is what a busy machine cannot change: samples drawn. A rival has to be better by 15 % in both to count: the
+    scene is small, and its reference coarse."""
+    rows = measured[0]["scenes"]["world"]["settings"]
+    rows = [
+        {**r, "cost": r["frames_per_s"] * next(n for a, n in SAMPLES.items() if f", {a}" in r["name"])} for r in rows
+    ]
+    names = {s.name for s in presets()}
+    for row in rows:
+        if row["name"] in names:
+            assert excess(row, rows, "cost", "voxel") < 0.15, row["name"]
+    errors = {r["name"]: r["voxel"] for r in rows}
+    by_quality = [errors[name] for name in preset_names(errors).values()]
+    assert by_quality == sorted(by_quality, reverse=True), "each preset is better than the one before"
+    assert by_quality[0] < errors["displacement 2 px, linear, none, mip bias -1"]
+
+
+def test_a_scene_that_cannot_be_measured_has_a_line_and_the_others_stay(measured, folder):
+    result, out = measured
+    assert result["missing"] == ["broken"] and not result["complete"]
+    assert "nothing to trade" in result["scenes"]["broken"]["error"]
+    assert json.loads((out / "suite.json").read_text())["missing"] == ["broken"]
+    assert (out / "suite.csv").read_text().count("\nworld,") == len(result["scenes"]["world"]["settings"])
+    with pytest.raises(ConfigError, match="nothing to trade"):
+        run_suite([Trial("broken", folder / "broken.yaml")], out / "alone", options=OPTIONS)
+
+
+def test_what_was_measured_is_kept(measured, folder, tmp_path):
+    result, out = measured
+    said: list[str] = []
+    asked = {"settings": tuple(dict.fromkeys([*presets(), *RIVALS])), "options": OPTIONS, "say": said.append}
+    again = run_suite(clips(folder, ["world"]), out, resume=True, **asked)
+    assert again["complete"] and not said
+    assert again["scenes"]["world"]["front"] == result["scenes"]["world"]["front"]
+    with pytest.raises(ConfigError, match="measured with other settings"):
+        run_suite(clips(folder), out, resume=True, options=OPTIONS, settings=RIVALS)
+    (tmp_path / "suite.json").write_text("[1]")
+    with pytest.raises(ConfigError, match="not a file of blinkgl trade --suite"):
+        run_suite(clips(folder), tmp_path, resume=True, **asked)
+
+
+def test_time_that_is_too_short_leaves_scenes_out(folder, tmp_path):
+    """The first scene is always measured, with what reference there is time for: none that says anything."""
+    two = [Trial("one", folder / "world.yaml"), Trial("two", folder / "world.yaml")]
+    said: list[str] = []
+    options = replace(OPTIONS, levels=Density((4, 8), (0.25,)))
+    result = run_suite(two, tmp_path, options=options, settings=RIVALS[:1], minutes=1e-3, say=said.append)
+    assert result["missing"] == ["two"] and "two: not measured, the time is up" in said
+    (row,) = result["scenes"]["one"]["settings"]
+    assert not row["trusted"] and result["standing"] == [{"name": row["name"], "scenes": 0}]
+
+
+def test_table_and_picture(measured, capsys):
+    result, out = measured
+    show(result, Console())
+    text = capsys.readouterr().out
+    assert "PARTIAL: without broken" in text and "broken: not measured" in text and "world" in text
+    assert fronts(result, out)[:4] == b"\x89PNG" and (out / "world.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_standing_by_hand():
+    row = lambda name, cost, error, trusted=True: {"name": name, "cpu_s": cost, "voxel": error, "trusted": trusted}
+    scenes = {
+        "a": {"settings": [row("x", 1, 0.4), row("y", 2, 0.2), row("z", 3, 0.22)]},
+        "b": {"settings": [row("x", 1, 0.9), row("y", 2, 0.1, trusted=False), row("z", 3, 0.3)]},
+    }
+    x, y, z = standing(scenes, "cpu_s")
+    assert (x["scenes"], x["undominated"], x["worst_voxel"], x["worst_scene"]) == (2, 2, 0.9, "b")
+    assert (y["scenes"], y["undominated"]) == (1, 1), "a row that does not count beats nobody and is not counted"
+    assert (z["undominated"], round(z["excess"], 6)) == (1, 0.1), "y is better by 1.5 in cost and by 1.1 in error"
+    assert x["voxel"] == pytest.approx(0.6) and x["cost"] == 1
+    assert excess(row("p", 1, 0.5), [], "cpu_s", "voxel") == 0
+
+
+def test_density_halves_steps_first_and_then_doubles_samples():
+    plan, levels = Density((8, 16, 32), (0.4, 0.2, 0.1)), []
+    for moved, asked in ((None, (8, 0.4)), (0.3, (8, 0.2)), (0.03, (8, 0.1)), (0.2, (16, 0.1)), (0.2, (32, 0.1))):
+        assert plan.next(levels) == asked
+        level = Level(*asked, frames=1, seconds=1, events=None, whole=len(levels) > 2)
+        if moved is not None:
+            measures = ("time_median_us", "time_p95_us", "wrong", "voxel")
+            level.movement, level.smallest = dict.fromkeys(measures, moved), dict.fromkeys(measures, 1.0)
+        levels.append(level)
+    assert plan.next(levels) is None
+    assert not levels[2].converged, "half a movement shows nothing"
+
+
+def test_shipped_scenes_are_short_small_and_say_what_is_hard():
+    shipped = clips()
+    assert len(shipped) >= 8
+    for clip in shipped:
+        config = load_run(clip.path).sequence(0)
+        assert config.time.interval_ns <= 100_000_000 and config.camera.width <= 320, clip.name
+        assert clip.what and clip.what[0].isupper() and clip.name == config.output.name
+
+
+def test_samples_of_a_reference_end_where_plain_ones_do(gl, folder):
+    """The reference draws its samples as `edges`, which is judged, too: so it is held to samples that are points."""
+    config = load_run(folder / "world.yaml").sequence(0)
+    scene = sequence_scene(config, 0, folder)
+    t_ns, tiles = (scene.t0_ns + scene.t1_ns) // 2, (Rectangle(10, 8, 34, 26),)
+
+    def drawn(scale: int, *samples: RenderConfig) -> np.ndarray:
+        with FineTiles(gl, scene, tiles, scale, *samples) as source:
+            return np.log(next(iter(source([t_ns])))[8:26, 10:34] + 1e-3)
+
+    plain = drawn(96, RenderConfig(mip_bias=-1.0))
+    away = lambda frame: float(np.sqrt(np.mean((frame - plain) ** 2)))
+    coarse, fine = away(drawn(8)), away(drawn(32))
+    assert fine < 0.004 and fine < coarse / 4
+    assert away(drawn(32, RenderConfig())) > 2 * fine, "or the plain samples that there were before would do"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--suite", "--scene", "moon"], "--scene: no scene is called that"),
+        (["--suite", "nowhere"], "nowhere: the suite is a folder of scenes"),
+        (["--suite", "--quick"], "--quick: is for one scene"),
+        (["--suite", "--only", "raytracing"], "no setting is called that"),
+        ([], "which scene?"),
+        (["c.yaml", "--resume"], "--resume: is of the suite"),
+    ],
+)
+def test_bad_input(arguments, message, tmp_path, capsys):
+    assert run(["trade", *arguments, "-o", str(tmp_path / "x")]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1 and not (tmp_path / "x").exists()

@@ -68,7 +68,7 @@ class MultiFlow(Layout):
             for clock_us in (LABEL_US, TARGET_US):
                 at = source.image_times.index(t + clock_us - LABEL_US)
                 copy(source.file("images", at), sample / f"images/{clock_us:07d}.png")
-            flows = source.value("flow_intervals", k)
+            flows = source.flows(k)
             for clock_us, one, valid in zip(_clock_us(flows.interval_ns), flows.flow, flows.valid):
                 if clock_us is not None:
                     _write_flow(one, sample / f"flow/{clock_us:07d}.h5")

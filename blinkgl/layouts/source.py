@@ -25,6 +25,7 @@ from blinkgl.io.records import read_text
 from blinkgl.io.rig_dir import read_rig
 from blinkgl.io.sequence_dir import is_rig_folder, read_manifest, verify_sequence
 from blinkgl.labels import LABELS, Form
+from blinkgl.labels.intervals import Flows
 
 
 @dataclass(frozen=True)
@@ -127,6 +128,10 @@ class Source:
     def value(self, label: str, k: int) -> np.ndarray:
         """The ``k``-th value of a label that is one array, (H, W[, C]); depth is inf where nothing is. AssetError."""
         return _read(LABELS[label].forms[0], self.file(label, k))
+
+    def flows(self, k: int) -> Flows:
+        """Flow from label ``k`` to several times. AssetError."""
+        return _read(LABELS["flow_intervals"].forms[0], self.file("flow_intervals", k))
 
     def events(self, chunk: int = 1 << 20) -> Iterator[Events]:
         """All events, in order, in pieces."""

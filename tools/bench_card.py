@@ -2,10 +2,12 @@
 
     python -m blinkgl.tools.bench_card [--quick] [--traffic]
 
-Processor time of both, in turns, frame by frame, on `bench_events`' clips and on a still picture; the events of both
-are compared. On OpenGL that the processor draws, this is the price of the detour; on a graphics card look at the wall
-time. ``--traffic``: no measurement, but a table computed from the sizes of the buffers: bytes per pixel and frame and
-per pixel that fires, and what a card of a given memory bandwidth makes of them at most.
+Processor time of numba's kernel, the card's, the card's given frames that lie there already, and that one with the sort
+and the read-back one frame late that graphics cards have: in turns, frame by frame, on `bench_events`' clips and on a
+still picture; the events of all are compared. On OpenGL that the processor draws, this is the price of the detour; for
+a graphics card there is ``gpu_suite``. ``--traffic``: no measurement, but a table computed from the sizes of the
+buffers: bytes per pixel and frame and per pixel that fires, and what a card of a given memory bandwidth makes of them
+at most.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import numpy as np
 
 from blinkgl.card import CardEsim
 from blinkgl.config.events import EsimConfig
-from blinkgl.events import Esim
+from blinkgl.events import Esim, Events
 from blinkgl.gl import GLContext, create_context
 from blinkgl.machine import bench
 from blinkgl.tools.bench_events import HEIGHT, WIDTH, clip
@@ -44,6 +46,8 @@ FIRE = {
 }
 """Bytes per pixel that fires; of the default kernel."""
 EVENT = {"packed event": 8}
+SORT = {"events, read twice and written": 24, "digits: counted, added up, placed": 5}
+"""Bytes per event and four bits of time, where events are sorted on the card."""
 
 
 def main() -> None:
@@ -59,45 +63,57 @@ def main() -> None:
 
 
 def measure(gl: GLContext, frames: int) -> None:
-    """Prints processor and wall ms a frame, in turns, median over ``frames``."""
+    """Prints processor ms a frame, in turns, median over ``frames``."""
     numba.set_num_threads(1)
     print(bench.machine_line(f"{gl.renderer}"))
-    print("| clip | kernel | events per pixel and frame | numba, ms | card, ms | ratio | card, wall ms |")
-    print("|---|---|---|---|---|---|---|")
+    print(
+        "| clip | kernel | events per pixel and frame | numba, ms | card, ms | ratio | textures, ms | sorts, late, ms |"
+    )
+    print("|---|---|---|---|---|---|---|---|")
     for name in ("still", "mid", "dense"):
         pictures = np.zeros((frames + 4, HEIGHT, WIDTH), np.uint8) if name == "still" else clip(name, frames + 4)[0]
         pictures = (pictures / 255.0).astype(np.float32)
         for variant, config in VARIANTS.items():
-            both = Esim(HEIGHT, WIDTH, config, 1), CardEsim(HEIGHT, WIDTH, config, 1, gl=gl)
-            spent: tuple[list[float], ...] = ([], [], [])
-            count = 0
+            ways = (
+                Esim(HEIGHT, WIDTH, config, 1),
+                CardEsim(HEIGHT, WIDTH, config, 1, gl=gl, late=False, sorts=False),
+                CardEsim(HEIGHT, WIDTH, config, 1, gl=gl, late=False, sorts=False),
+                CardEsim(HEIGHT, WIDTH, config, 1, gl=gl, late=True, sorts=True),
+            )
+            spent: tuple[list[float], ...] = ([], [], [], [])
+            made: tuple[list[Events], ...] = ([], [], [], [])
+            texture = gl.ctx.texture((WIDTH, HEIGHT), 1, dtype="f4")
             for k, picture in enumerate(pictures):
-                made = []
-                for j, emulator in enumerate(both):
-                    started, wall = time.process_time(), time.perf_counter()
-                    made.append(emulator.step(picture, k * 1_000_000))
+                texture.write(picture)
+                for j, emulator in enumerate(ways):
+                    started = time.process_time()
+                    made[j].append(emulator.step(picture if j < 2 else texture, k * 1_000_000))
                     gl.ctx.finish()
                     if k >= 4:
                         spent[j].append(time.process_time() - started)
-                        spent[2].append(time.perf_counter() - wall)
-                same = all(np.array_equal(getattr(made[0], c), getattr(made[1], c)) for c in made[0].columns)
-                if not same:
-                    raise SystemExit(f"{name}, {variant}: other events in frame {k}")
-                count += len(made[0]) if k >= 4 else 0
-            both[1].release()
-            mine, card = (1e3 * float(np.median(s)) for s in spent[:2])
-            per_pixel = count / frames / pictures[0].size
-            print(
-                f"| {name} | {variant} | {per_pixel:.3f} | {mine:.2f} | {card:.2f} | {card / mine:.2f} | "
-                f"{1e3 * float(np.median(spent[2][1::2])):.2f} |"
-            )
+            made[3].append(ways[3].flush())
+            events = [Events.concatenate(parts) for parts in made]
+            for one in events[1:]:
+                if not all(np.array_equal(getattr(events[0], c), getattr(one, c)) for c in one.columns):
+                    raise SystemExit(f"{name}, {variant}: other events")
+            for emulator in ways:
+                emulator.release()
+            texture.release()
+            mine, card, textures, late = (1e3 * float(np.median(s)) for s in spent)
+            per_pixel = sum(map(len, made[0][4:])) / frames / pictures[0].size
+            figures = f"{per_pixel:.3f} | {mine:.2f} | {card:.2f} | {card / mine:.2f} | {textures:.2f} | {late:.2f}"
+            print(f"| {name} | {variant} | {figures} |", flush=True)
 
 
 def traffic() -> None:
     """Prints the computed table."""
     quiet, copy, fire, event = (sum(table.values()) for table in (MARK, UPLOAD, FIRE, EVENT))
     print(f"\nper pixel and frame {quiet:.1f} B, {copy} B more where frames are copied; ", end="")
-    print(f"per pixel that fires {fire} B; per event {event} B, and {event} B over the bus")
+    print(
+        f"per pixel that fires {fire} B; per event {event} B, {sum(SORT.values())} B for each four bits of time that ",
+        end="",
+    )
+    print(f"are sorted, and {event} B over the bus")
     print("| 640x480 | " + " | ".join(f"{card}, {rate:.0f} GB/s" for card, rate in CARDS.items()) + " |")
     print("|---|" + "---|" * len(CARDS))
     pixels = HEIGHT * WIDTH

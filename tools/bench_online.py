@@ -63,7 +63,7 @@ def leaks(recipe: str, workers: int, samples: int) -> list[dict[str, float]]:
         for n, _ in zip(range(1, samples + 1), sequences, strict=False):
             if n % (samples // 10) == 0:
                 mine, theirs = resident(os.getpid()), [resident(pid) for pid in descendants(os.getpid())]
-                spool = [f.stat().st_size for f in sequences.stream.spool.iterdir()]
+                spool = [size for f in sequences.stream.spool.iterdir() if (size := size_of(f)) is not None]
                 rows.append(
                     {
                         "samples": n,
@@ -74,7 +74,16 @@ def leaks(recipe: str, workers: int, samples: int) -> list[dict[str, float]]:
                         "replaced": sequences.stats.replaced,
                     }
                 )
+                print(rows[-1], flush=True)  # it takes long, and may be ended
     return rows
+
+
+def size_of(file: Path) -> int | None:
+    """Bytes of a file of the spool; None: the stream has just thrown it away."""
+    try:
+        return file.stat().st_size
+    except FileNotFoundError:
+        return None
 
 
 def resident(pid: int) -> float:

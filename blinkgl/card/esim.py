@@ -1,13 +1,14 @@
 """ESIM on the card (``shaders/compute/events_*.glsl``): the events of :class:`~blinkgl.events.esim.Esim`, bit for bit.
 
-A frame that was drawn by the same context is handed on as the texture it lies in (*take*, a copy on the card that also
-looks for values that cannot be used); arrays are copied to the card. A step is ten dispatches more. *Mark*: the
-logarithm of every pixel against its two levels, a bit each. *List*: the pixels that fire, in raster order, their places
-found by prefix sums. *Fire*: how many events each has, its next levels, and a record. *Emit*: the events, from the
-records alone, at places found by prefix sums again. No place comes of an unordered atomic, so the order is that of the
-kernels on the processor before they sort, and the state has moved when events are written: a buffer that is too small
-is made again and *emit* repeated, nothing is lost. Events are sorted on the card (``events_sort.glsl``) or by the
-processor, and come at once or, so that nobody waits, one frame late (:mod:`blinkgl.card.late`).
+A frame that was drawn by the same context is handed on as the texture it lies in and copied from there; arrays are
+copied to the card. A step is ten dispatches. *Mark*: the logarithm of every pixel against its two levels, a bit each;
+of a texture also whether it has a value that cannot be used, in which case nothing fires. *List*: the pixels that fire,
+in raster order, their places found by prefix sums. *Fire*: how many events each has, its next levels, and a record.
+*Emit*: the events, from the records alone, at places found by prefix sums again. No place comes of an unordered atomic,
+so the order is that of the kernels on the processor before they sort, and the state has moved when events are written:
+a buffer that is too small is made again and *emit* repeated, nothing is lost. Events are sorted on the card
+(``events_sort.glsl``) or by the processor, and come at once or, so that nobody waits, one frame late
+(:mod:`blinkgl.card.late`).
 
 Logarithms and levels are whole numbers of 2^-25, times are divided exactly in 64 bits made of pairs of 32, the draws
 of jitter are doubles made of whole numbers (:file:`shaders/include/soft_double.glsl`). What is left are sums and
@@ -49,7 +50,6 @@ from blinkgl.events.types import Events
 if TYPE_CHECKING:
     from blinkgl.gl import GLContext
 
-_FREE_UNIT = 15  # of textures; no pass has so many
 _FAR = 2**30  # a level that no logarithm reaches: of the pixels that fill up the last block
 _LARGEST_STEP = 22.0
 """Thresholds beyond that, ln units, do not fit into 32 bits with a logarithm; normal numbers stay below 8.6."""
@@ -227,12 +227,13 @@ class CardEsim(Esim):
         room, interval = self._room, (self.t_ns, t_ns)
         before = self._landed()
         room.turn()
-        if isinstance(frame, moderngl.Texture):
-            self._take(frame)
+        drawn_here = isinstance(frame, moderngl.Texture)
+        if drawn_here:
+            frame.read_into(room["now"])  # from one place on the card to another
         else:
             room.put("now", self._intensity(frame))
         was_log, self._before_is_log = self._before_is_log, False
-        self._fire(interval, was_log)
+        self._fire(interval, was_log, {"CHECKED": 1} if drawn_here else {})
         flight = _Flight(*interval, was_log, room["packed"])
         if self._late and not self._stays:
             self._send(flight)
@@ -344,28 +345,15 @@ class CardEsim(Esim):
         return self._buffer.to_events(np.array([len(packed)]), base_us, span_us, 1, self.causes)
 
     # -- kernels --------------------------------------------------------------------------------------------
-    def _take(self, frame: moderngl.Texture) -> None:
-        """Copies a frame on the card, and tells the head whether a value in it cannot be used."""
-        frame.use(_FREE_UNIT)
-        values = {
-            "frame": _FREE_UNIT,
-            "width": self.width,
-            "pixels": self.height * self.width,
-            "limit": int(INTENSITY_LIMIT_BITS),
-        }
-        buffers = {0: self._room["now"], 1: self._room["listed"]}
-        self._kernels.run(
-            "compute/events_take.glsl", {}, buffers, values, items=values["pixels"], local=PIXELS_PER_GROUP
-        )
-
-    def _fire(self, interval: tuple[int, int], was_log: bool) -> None:
+    def _fire(self, interval: tuple[int, int], was_log: bool, checked: dict[str, int]) -> None:
         """Marks, lists, fires, and emits as far as there is room.
 
-        interval : its times, ns.   was_log : what was before are logarithms, not intensities."""
+        interval : its times, ns.   was_log : what was before are logarithms, not intensities.
+        checked : macro that looks for values that cannot be used: then nothing fires, and the head says so."""
         room, kernels, values = self._room, self._kernels, self._values(interval, was_log)
         kernels.run(
             "compute/events_mark.glsl",
-            {},
+            checked,
             {0: room["now"], 1: room["levels"], 2: room["marks"], 3: room["listed"]},
             values,
             items=room.words,
@@ -419,6 +407,7 @@ class CardEsim(Esim):
         jitter = np.float64(self.config.threshold_jitter * Q_ONE)
         return {
             "words": self._room.words,
+            "limit": int(INTENSITY_LIMIT_BITS),
             "eps": float(np.float32(self.config.log_eps)),
             "share": max(BLOCK, self.config.max_events_per_step // self._blocks),
             "before_is_log": was_log,

@@ -32,6 +32,7 @@ class Kernels:
     def __init__(self, gl: GLContext, soft_float: bool = False):
         self.gl = gl
         self._soft = {"SOFT_FLOAT": 1} if soft_float else {}
+        self._uniforms: dict[moderngl.ComputeShader, dict[str, moderngl.Uniform]] = {}
         self._lanes = 64 if gl.is_software else 1024  # of the one group that adds up sums
 
     def run(
@@ -50,10 +51,14 @@ class Kernels:
         kernel = self.gl.kernel(name, {**defines, **self._soft})
         for binding, buffer in buffers.items():
             buffer.bind_to_storage_buffer(binding)
-        for key, value in values.items():
-            member = kernel.get(key, None)
-            if isinstance(member, moderngl.Uniform):
-                member.value = value
+        uniforms = self._uniforms.get(kernel)
+        if uniforms is None:
+            members = {key: kernel[key] for key in kernel}
+            uniforms = {key: one for key, one in members.items() if isinstance(one, moderngl.Uniform)}
+            self._uniforms[kernel] = uniforms
+        for key, uniform in uniforms.items():
+            if key in values:
+                uniform.value = values[key]
         if indirect is not None:
             kernel.run_indirect(*indirect)
         else:

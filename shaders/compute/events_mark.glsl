@@ -7,7 +7,10 @@ layout(local_size_x = 64) in;
 layout(std430, binding = 0) readonly restrict buffer Intensity { vec4 intensity[]; };
 layout(std430, binding = 1) readonly restrict buffer Levels { ivec4 levels[]; }; // upper and lower of two pixels
 layout(std430, binding = 2) writeonly restrict buffer Marks { uint marks[]; };
-layout(std430, binding = 3) readonly restrict buffer Heads { Head head; };
+#ifdef CHECKED
+layout(std430, binding = 3) restrict buffer Heads { Head head; };
+uniform uint limit; // bits of the largest value; those of negative numbers, infinities and NaN are larger
+#endif
 uniform uint words;
 uniform float eps;
 
@@ -20,6 +23,9 @@ void main()
     const ivec4 SIDES = ivec4(1, -1, 1, -1);
     const uvec4 FIRST = uvec4(1u, 1u, 2u, 2u), SECOND = uvec4(4u, 4u, 8u, 8u);
     uint bits = 0u;
+#ifdef CHECKED
+    uvec4 most = uvec4(0u);
+#endif
     for (uint k = 0u; k < 8u; ++k) {
         vec4 four = intensity[8u * word + k];
         ivec4 now = log_of(four, eps);
@@ -28,6 +34,15 @@ void main()
         ivec4 second = (now.zzww - levels[16u * word + 2u * k + 1u]) * SIDES;
         uvec4 fired = (FIRST & uvec4(~(first >> 31))) | (SECOND & uvec4(~(second >> 31)));
         bits |= (fired.x | fired.y | fired.z | fired.w) << (4u * k);
+#ifdef CHECKED
+        uvec4 seen = floatBitsToUint(four);
+        most = max(most, seen * uvec4(notEqual(seen, uvec4(0x80000000u)))); // minus zero is zero
+#endif
     }
-    marks[word] = head.unusable == 0u ? bits : 0u;
+    marks[word] = bits;
+#ifdef CHECKED
+    if (max(max(most.x, most.y), max(most.z, most.w)) > limit) {
+        atomicOr(head.unusable, 1u);
+    }
+#endif
 }

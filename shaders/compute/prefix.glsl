@@ -83,6 +83,9 @@ void main()
     }
     barrier();
     uint begin = partial[lane] - sum, total = partial[LANES - 1];
+#ifdef BITS
+    total = head.unusable == 0u ? total : 0u;
+#endif
     for (uint k = first; k < stop; ++k) {
         uint here = sums[k];
         sums[k] = begin;

@@ -1,6 +1,6 @@
 """A still camera with one moving object: redrawing only what moves against redrawing everything, drawing to events.
 
-    python -m blinkgl.tools.bench_still [--coverage 0.05] [--rounds 200] [--json FILE]
+    python -m blinkgl.tools.bench_still [--coverage 0.05] [--rounds 200] [--quality balanced] [--json FILE]
 
 bench_generate's probe scene (10 balls, ground and sky; "tri/16": 7,000 triangles, "full": 110,000), 640x480, camera and
 nine balls at rest, the tenth at a distance at which its rectangle covers about ``--coverage`` of the image, moving by
@@ -21,6 +21,8 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from blinkgl.config.events import EsimConfig
+from blinkgl.config.quality import QUALITIES, load_quality
+from blinkgl.config.sequence import RenderConfig
 from blinkgl.events import Events
 from blinkgl.events.camera import EventCamera, EventFrame
 from blinkgl.gl import create_context
@@ -63,8 +65,8 @@ def one_mover(kind: str, coverage: float) -> Scene:
 class Way:
     """One way of drawing, from the scene to events; seconds of each stage and frame."""
 
-    def __init__(self, gl, scene: Scene, still: bool):
-        self.renderer = Renderer(gl, scene, PLAIN, whole=not still)
+    def __init__(self, gl, scene: Scene, still: bool, render: RenderConfig = PLAIN):
+        self.renderer = Renderer(gl, scene, render, whole=not still)
         self.camera = EventCamera(EsimConfig(), None, HEIGHT, WIDTH, seed=1)
         self.frame = None
         self.events: list[Events] = []
@@ -90,9 +92,9 @@ class Way:
 STAGES = ("draw", "read-back", "kernel", "all", "cpu")
 
 
-def measure(gl, kind: str, coverage: float, rounds: int, warm_up: int = 10) -> dict:
+def measure(gl, kind: str, coverage: float, rounds: int, warm_up: int = 10, render: RenderConfig = PLAIN) -> dict:
     scene = one_mover(kind, coverage)
-    ways = {"full redraw": Way(gl, scene, False), "what moves": Way(gl, scene, True)}
+    ways = {"full redraw": Way(gl, scene, False, render), "what moves": Way(gl, scene, True, render)}
     for start in range(0, rounds + warm_up, TURN):
         for way in ways.values():
             for k in range(start, start + TURN):
@@ -124,12 +126,18 @@ def main() -> None:
         help="of the image, by the ball alone; what is redrawn is a little more",
     )
     parser.add_argument("--rounds", type=int, default=200)
+    parser.add_argument("--quality", choices=QUALITIES, help="draw as this preset does, in the place of no filter")
     parser.add_argument("--json")
     arguments = parser.parse_args()
+    render = PLAIN
+    if arguments.quality is not None:
+        render = PLAIN.model_copy(update=load_quality(arguments.quality)["render"])
     with create_context() as gl:
         report = {
             "machine": bench.machine_line(gl.renderer),
-            "results": [measure(gl, kind, arguments.coverage, arguments.rounds) for kind in ("tri/16", "full")],
+            "results": [
+                measure(gl, kind, arguments.coverage, arguments.rounds, render=render) for kind in ("tri/16", "full")
+            ],
         }
     table = Table(title=report["machine"], title_justify="left")
     for column in ("scene", "way", *(f"{s} ms" for s in (*STAGES, "mean"))):

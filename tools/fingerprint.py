@@ -49,6 +49,7 @@ BASE = {
 STILL = "scene.camera_motion={speed: 0, rotation_rate: 0}"
 CASES: dict[str, list[str]] = {
     "default": [],
+    "no_quality": ["quality=null"],
     "uniform": ["timeline={kind: uniform, fps: 400}", "labels.float_flow=[npy, flo, h5]"],
     "peak": ["timeline={kind: displacement, max_px: 1, percentile: 90, max_px_peak: 3}"],
     "brightness": ["timeline={kind: brightness, max_fraction_of_threshold: 2}", "render.antialiasing=taps4"],

@@ -30,7 +30,7 @@ from blinkgl.trade.pareto import excess, pareto_front
 from blinkgl.trade.run import chosen, convergence_line, plain, trade
 from blinkgl.trade.settings import Setting, suite_design
 
-OPTIONS = Options(tiles=(3, 2, 14, 11), levels=Density(), reference_s=240.0, rounds=3, rounds_s=240.0, labels=False)
+OPTIONS = Options(tiles=(3, 2, 14, 11), levels=Density(), reference_s=480.0, rounds=3, rounds_s=240.0, labels=False)
 FILE = "suite.json"
 COLUMNS = (
     "scene",

@@ -230,6 +230,7 @@ def test_the_preview_is_fed_and_ended(monkeypatch, rate, recorded, fails):
     sequence = SimpleNamespace(
         name="", clock=StageClock(), pictures_hz=rate, height=3, width=4, t0_ns=2_500_000, t1_ns=10**9,
         config=SimpleNamespace(time=SimpleNamespace(interval_ns=50_000_000), frames=object() if recorded else None),
+        rectifies=True, imu=lambda: None,  # neither tracks nor an inertial unit
     )  # fmt: skip
     velocity = np.full((3, 4, 2), 40, np.float32)
     try:
@@ -244,11 +245,19 @@ def test_the_preview_is_fed_and_ended(monkeypatch, rate, recorded, fails):
     if rate is None:
         assert calls == [] and "preview" not in sequence.clock.seconds
         return
-    about = {"t0_us": 2500, "flow": not recorded, "rate_hz": 50.0, "fps": 12.5, "label": "frame"}
+    about = {
+        "t0_us": 2500,
+        "flow": not recorded,
+        "rate_hz": 50.0,
+        "fps": 12.5,
+        "label": "frame",
+        "tracks": None,
+        "curves": None,
+    }
     assert calls[0] == ("made", "preview.mp4", (3, 4, about), 12.5)
     names = [name for name, *_ in calls[1:]]
     assert names == ["add_events", *([] if recorded else ["set_flow"]), "frame", "abort" if fails else "close"]
-    assert calls[-2][1:] == (0, 7999, "image") and sequence.clock.seconds["preview"] >= 0
+    assert calls[-2][1:] == (0, 7999, "image", []) and sequence.clock.seconds["preview"] >= 0
     if not recorded:
         assert (calls[2][1] == 2).all(), "px in a label interval"
 
@@ -288,7 +297,7 @@ def test_what_each_pass_holds_and_how_often_it_is_drawn(tmp_path, changes, frame
     """Bytes a pixel: depth 4, luminance 4, its rate 4, colour 16, velocity 8, of labels what their buffers say."""
     path = tmp_path / "run.yaml"
     tree = {**EXPLAINED, **changes}
-    tree["render"] = {"image_antialiasing": "none", **changes.get("render", {})}
+    tree["render"] = {"image_antialiasing": "none", "antialiasing": "none", **changes.get("render", {})}
     path.write_text(yaml.safe_dump(tree))
     told = explain(load_run(path))
     pixels = 64 * 48

@@ -6,9 +6,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import blinkgl
-from blinkgl.camera import PinHole
+from blinkgl.camera import CAMERA_MODELS, PinHole
 from blinkgl.camera.drawing import seen_through
 from blinkgl.camera.rectified import rectified
 from blinkgl.config.sequence import RenderConfig
@@ -19,6 +20,7 @@ from blinkgl.render import reference
 from blinkgl.render.lens import places_of
 from blinkgl.render.renderer import Renderer
 from blinkgl.timeline import make_timeline
+from tests.render.test_materials import drift, hidden_ball
 
 LENSES = {
     "radtan": {
@@ -112,6 +114,19 @@ def test_through_the_near_plane_past_the_horizon_and_thinner_than_a_pixel(gl):
     within(np.abs(frame.depth[hit] / true.depth[hit] - 1), 1e-4)  # at the horizon a ray meets the floor far away
     valid = hit & frame.forward.valid & true.forward.valid
     within(np.abs(frame.forward.flow - true.forward.flow)[valid].max(axis=-1), 1e-3)
+
+
+@pytest.mark.parametrize("kind, numbers", [("radtan", (-0.2, 0.05, 1e-3, 0, 0)), ("equidistant", (-0.02, 0.005, 0, 0))])
+def test_through_holes(gl, kind, numbers):
+    made = hidden_ball(drift((0, 2, 0), (0.4, 2, 0.1), Rotation.from_euler("x", 90, degrees=True)))
+    old, model = made.camera, CAMERA_MODELS[kind]
+    camera = model(old.width, old.height, *old.intrinsics, old.near, **dict(zip(model.coefficients, numbers)))
+    with Renderer(gl, made.with_camera(camera), RenderConfig()) as renderer:
+        frame = renderer.labels(T, LabelRequest("ids", "flow_forward"), T + SPAN)
+        true = reference.render(renderer.scene, T, forward_ns=T + SPAN)
+    assert set(np.unique(frame.ids)) == {0, 1, 2, 3} and (frame.ids != true.instance).sum() <= 2
+    valid = (frame.ids == true.instance) & true.forward.valid
+    within(np.abs(frame.forward.flow - true.forward.flow)[valid].max(axis=-1), 1e-4)
 
 
 def test_flow_is_zero_where_nothing_moves(gl):

@@ -517,7 +517,7 @@ def test_overdraw_and_the_half_resolution_twin(gl):
         (("check", "--backend", "vulkan"), ["gl.backend", "vulkan"]),
         (("check", "--device", "97", "--backend", "egl"), ["gl"]),
         (("show", "nothing.glsl"), ["nothing.glsl", "label.glsl"]),
-        (("show", "label.glsl", "--stage", "geometry"), ["--stage", "geometry"]),
+        (("show", "label.glsl", "--stage", "tessellation"), ["--stage", "tessellation"]),
         (("show", "label.glsl", "--define", "2X"), ["2X"]),
         (("probe", "/nowhere.yaml", "--pixel", "1,1"), ["/nowhere.yaml", "no such file"]),
         (("serve", "CONFIG", "--port", "70000"), ["--port"]),

@@ -4,75 +4,26 @@ emission; and a mistake in any of them is named by the first term that is wrong.
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from blinkgl.gl import ShaderLoader
 from blinkgl.render.passes import ScenePass
-from blinkgl.tools.shader_debugger import compare, moments, session
+from blinkgl.tools.mutate import Mutant
+from blinkgl.tools.shader_debugger import moments, session
 from blinkgl.tools.shader_debugger.session import moment, open_renderer, open_subject
+from blinkgl.tools.shader_mutants import Judge, judged
 from debugger_scene import edit
 
-YAML = """
-seed: 3
-camera: {width: 72, height: 54, fov: 60}
-time: {duration: 0.3, label_rate: 10}
-timeline: {kind: uniform, fps: 50}
-preview: {enabled: false}
-scene:
-  kind: explicit
-  light:
-    sun_elevation: 50
-    sun_azimuth: 200
-    sun: 0.7
-    sky: 0.4
-    sky_color: [0.6, 0.8, 1.0]
-    shadows: hard
-    shadow_size: 256
-    lights:
-    - kind: spot
-      position: [0.8, 3.4, 3.0]
-      look_at: [0.2, 3.8, 0]
-      angle: 60
-      edge: 0.3
-      strength: 4
-      color: [1, 0.8, 0.6]
-    - {kind: point, position: [-1.5, 2.5, 1.5], strength: 0.8}
-  fog: {density: 0.02, radiance: 0.4}
-  meshes:
-    floor: {primitive: grid, parameters: {width: 12, depth: 12, subdivisions: 6}}
-    ball: {primitive: icosphere, parameters: {radius: 0.5, subdivisions: 4}}
-    box: {primitive: cuboid, parameters: {extents: [0.6, 0.6, 0.6]}}
-    sheet: {primitive: grid, parameters: {width: 0.5, depth: 0.5, subdivisions: 3}}
-  materials:
-    stone: {procedural: bricks, color: [0.8, 0.7, 0.6], uv_scale: [5, 5]}
-    gold: {color: [1.0, 0.77, 0.34], metallic: 0.7, roughness: 0.5}
-    red: {color: [0.9, 0.3, 0.2]}
-    paper: {color: [0.9, 0.9, 0.9], double_sided: true}
-    glow: {color: [0.3, 0.3, 0.3], emission: [0.5, 0.4, 0.1]}
-  objects:
-  - {mesh: floor, material: stone, category: ground, name: floor, position: [0, 5, 0]}
-  - {mesh: ball, material: gold, name: ball, position: [-0.6, 4, 0.7]}
-  - {mesh: sheet, material: paper, name: sheet, position: [-1.1, 3.7, 1.35], euler: [50, 0, 0]}
-  - mesh: box
-    material: red
-    name: box
-    keyframes: [{time: 0, position: [0.9, 3.8, 0.7]}, {time: 0.4, position: [0.5, 3.6, 0.7], euler: [0, 20, 60]}]
-  - {mesh: box, material: glow, name: lamp, position: [0.2, 5, 0.4], euler: [0, 0, 30], scale: 0.8}
-  camera:
-    keyframes:
-    - {time: 0, position: [0, 0, 1.6], look_at: [0, 4, 0.6]}
-    - {time: 0.4, position: [0.1, 0.1, 1.65], look_at: [0.1, 4, 0.6]}
-"""
+LIT = str(Path(__file__).with_name("lit.yaml"))
 TERMS = ("direct", "shadow", "around", "mirrored", "emission")
 
 
 @pytest.fixture(scope="module")
-def lit(tmp_path_factory) -> str:
-    path = tmp_path_factory.mktemp("lit") / "lit.yaml"
-    path.write_text(YAML)
-    return str(path)
+def lit() -> str:
+    return LIT
 
 
 @pytest.fixture(scope="module")
@@ -80,14 +31,18 @@ def looked_at(lit):
     subject = open_subject(lit)
     when = moment(subject)
     with open_renderer(subject) as renderer:
-        gpu = moments.GpuMoment(renderer, when, subject.log_eps)
-        comparison = compare.Comparison(gpu, moments.open_reference(subject, when, renderer.maps))
-        reports = {name: comparison.report(name) for name in comparison.names()}
-        yield gpu, comparison, reports
+        one = Judge(renderer, subject, when)
+        reports = {name: one.comparison.report(name) for name in one.comparison.names()}
+        yield one.right, one.comparison, reports, one
+
+
+@pytest.fixture(scope="module")
+def judge(looked_at):
+    return looked_at[3]
 
 
 def test_every_term_agrees_with_the_reference(looked_at):
-    gpu, comparison, reports = looked_at
+    gpu, comparison, reports, _ = looked_at
     for name, report in reports.items():
         assert report.passed, (name, report.value, report.objects[:1])
     for of in ("luminance", "colour"):
@@ -103,7 +58,7 @@ def test_every_term_agrees_with_the_reference(looked_at):
 
 
 def test_terms_make_the_light_and_the_picture(looked_at):
-    gpu, comparison, _ = looked_at
+    gpu, comparison, *_ = looked_at
     red = comparison.owner("luminance") == comparison.objects.index("box")
     for of in ("luminance", "colour"):
         whole = gpu[f"{of}_direct"] * gpu[f"{of}_shadow"] + gpu[f"{of}_around"]
@@ -165,27 +120,13 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_named_by_its_term(looked_at, shaders, mistake):
+def test_a_mistake_is_named_by_its_term(judge, shaders, mistake):
     """The first of the terms, in the order of ``diff``; the surface is where it was."""
-    right_gpu, right, _ = looked_at
     file, good, bad, term = MISTAKES[mistake]
     edit(shaders / file, good, bad)
-    right_gpu.renderer.gl.make_current()
-    renderer, ours = right_gpu.renderer, right_gpu.renderer.gl.shaders
-    gpu = moments.GpuMoment(renderer, right_gpu.when, right_gpu.log_eps)
-    gpu._made.update({name: right_gpu[name] for name in ("part", "triangle", "local")})
-    of = term.partition("_")[0]
-    try:
-        renderer.use_shaders(ShaderLoader(renderer.gl.ctx, session.open_folder(str(shaders))))
-        comparison = compare.Comparison(gpu, right.ref)
-        comparison._shadow_edges = right._shadow_edges
-        wrong = [
-            name
-            for name in compare.QUANTITIES
-            if moments.lookup_of(name)[0] == of and not comparison.report(name).passed
-        ]
-    finally:
-        renderer.use_shaders(ours)
+    gpu = judge.right
+    gpu.renderer.gl.make_current()
+    wrong = judge.wrong(ShaderLoader(gpu.renderer.gl.ctx, session.open_folder(str(shaders))))
     assert wrong and wrong[0] == term, wrong
 
 
@@ -196,11 +137,10 @@ def test_diff_says_so(shader, lit, shaders):
 
 
 def test_no_shadow_at_all_is_called_so(looked_at):
-    gpu, right, _ = looked_at
+    gpu, right, *_ = looked_at
     none = moments.GpuMoment(gpu.renderer, gpu.when, gpu.log_eps)
     none._made |= gpu._made | {"luminance_shadow": np.ones_like(gpu["luminance_shadow"])}
-    comparison = compare.Comparison(none, right.ref)
-    assert comparison.report("luminance_shadow").suspicions[0].startswith("no shadow falls (")
+    assert right.of(none).report("luminance_shadow").suspicions[0].startswith("no shadow falls (")
 
 
 def test_a_map_that_is_drawn_from_the_front_is_found_in_itself(shader, lit, monkeypatch):
@@ -208,3 +148,22 @@ def test_a_map_that_is_drawn_from_the_front_is_found_in_itself(shader, lit, monk
     monkeypatch.setattr(session.WholeShadowMap, "paint", ScenePass.paint)
     status, out, _ = shader("diff", lit, "--json", "--pass", "shadow_map_0")
     assert status == 1 and json.loads(out)["first"]["buffer"] == "shadow_map_0"
+
+
+@pytest.mark.slow
+def test_mutants_of_every_file_die(judge, shaders):
+    """One of each, by a term of its own; and what changes nothing lives."""
+    judge.right.renderer.gl.make_current()
+    for name, line, column, before, after, term in (
+        ("lights", "sum += facing * beam.strength", 15, "*", "/", "luminance_light"),
+        ("shadows", "c.z = max(c.z", 7, "max", "min", "luminance_shadow"),
+        ("surface", "edge = edge * edge * edge", 19, "*", "/", "luminance_mirrored"),
+        ("shadows", "float SPARE = 0.25", 14, "0.25", "0.2501", ""),
+    ):
+        path = f"shaders/include/{name}.glsl"
+        rows = (shaders / "include" / f"{name}.glsl").read_text().splitlines()
+        row = next(k for k, text in enumerate(rows) if line in text)
+        assert (f"include/{name}.glsl", row + 1) in judge.compiled
+        start = rows[row].index(line) + column
+        mutant = Mutant(path, row + 1, rows[row].index(before, start - 2) + 1, before, after, "")
+        assert judged(judge, shaders, mutant) == term, mutant.name

@@ -21,6 +21,7 @@ anisotropic filtering (``render.anisotropy`` > 1) level and albedo are left out.
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -285,6 +286,12 @@ class Comparison:
         ] + [NOTHING]
         index = {id(thing): i for i, thing in enumerate(ref.scene.objects)}
         self._object_of_part = np.array([index[id(thing)] for thing in things] + [len(names)], np.intp)
+
+    def of(self, gpu: GpuMoment) -> Comparison:
+        """The same of another picture of the same moment, whose surfaces lie where they were."""
+        other = copy(self)
+        other.gpu = gpu
+        return other
 
     def owner(self, name: str) -> np.ndarray:
         """(H, W) number of the object that a pixel's error in buffer ``name`` is put down to: the one that should be

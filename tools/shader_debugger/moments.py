@@ -164,6 +164,10 @@ class _Lazy:
             self._made.update(self._make(name))
         return self._made[name]
 
+    def keep(self, other: _Lazy, names: Iterable[str]) -> None:
+        """Takes these buffers from another moment in place of making them."""
+        self._made |= {name: other[name] for name in names}
+
     def _make(self, name: str) -> dict[str, np.ndarray]:
         raise NotImplementedError
 

@@ -286,7 +286,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
             }
             | {"semantics": {"cuboid*": 7, "*": 1}}
         },
-        "fewest": {"labels": {"occlusion": False}},
+        "fewest": {"labels": {"occlusion": False, "semantics": True}},
     },
     "over time": {
         "nothing": NOTHING,

@@ -172,6 +172,7 @@ class Canvas:
 
     def read(self, name: str, out: np.ndarray | None) -> np.ndarray:
         i, component = self._place(name)
+        self.painter.gl.resume()
         self.painter.finish()
         started = working_clock()
         if component is None and not self.outputs[i].components:
@@ -185,6 +186,7 @@ class Canvas:
 
     def view(self, name: str, frame: Frame) -> np.ndarray:
         i, _ = self._place(name)
+        self.painter.gl.resume()
         number, pictures = self._held.get(i, (0, {}))
         if number != self.number:
             stale = frame.changed if number == self.number - 1 and number > 0 else None

@@ -75,6 +75,7 @@ class Renderer:
         beside: Renderer | None = None,
         painter: type[Painter] = Painter,
     ):
+        gl.resume()
         if beside is not None and not config.lod.enabled:
             scene = replace(beside.scene, rig=scene.rig)
         else:
@@ -170,6 +171,7 @@ class Renderer:
 
         ends_ns : other times that it looks at, by name: {"forward": t1_ns}. A pass that draws the scene draws the flat
         picture of a lens that distorts; :meth:`seen` is what the lens makes of it."""
+        self.gl.resume()
         started = working_clock()
         ends = {name: self._moment(t) for name, t in (ends_ns or {}).items()}
         frame = self._drawn(pass_, self._moment(at), ends, {})

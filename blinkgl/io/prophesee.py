@@ -126,12 +126,12 @@ class PropheseeReader:
             with open_hdf5(self.path) as file, hdf5_errors(self.path):
                 table = self._table(file)
                 if _filters(table) == [ecf.FILTER]:
-                    columns = self._unpacked(table, start, size)
+                    x, y, t, p = self._unpacked(table, start, size)
                 else:
                     rows = table[start : start + size]
-                    columns = rows["x"], rows["y"], rows["t"], rows["p"]
-            yield events_of(*columns, str(self.path), start)
-            start += len(columns[0])
+                    x, y, t, p = (rows[name] for name in "xytp")
+            yield events_of(x, y, t, p, str(self.path), start)
+            start += len(t)
 
     def _unpacked(self, table: h5py.Dataset, start: int, size: int) -> tuple[np.ndarray, ...]:
         """Columns x, y, t, p of the chunks from ``start``, a chunk's begin, on: as many as hold ``size`` events."""
@@ -141,7 +141,7 @@ class PropheseeReader:
             skipped, data = table.id.read_direct_chunk((at,))
             if skipped:  # the filter is an optional one: a program that lacks it stores rows as they are
                 rows = np.frombuffer(data, table.dtype, min(step, len(data) // table.dtype.itemsize))
-                piece = rows["x"], rows["y"], rows["t"], rows["p"]
+                piece = tuple(rows[name] for name in "xytp")
             else:
                 piece = ecf.decode(data, step, where)
             if len(piece[0]) < (rest := min(step, self.count - at)):

@@ -4,7 +4,7 @@
 |---|---|---|---|
 | dsec (also BlinkFlow's h5) | .h5 .hdf5 | x | x |
 | mvsec | .hdf5 .h5 | x | |
-| prophesee (not packed with ECF) | .hdf5 .h5 | x | x (by name) |
+| prophesee (ECF) | .hdf5 .h5 | x | x (by name) |
 | mcap (extra [exchange]) | .mcap | x | x |
 | evt3, evt2 | .raw | x | x (.raw is EVT3; EVT2 by name) |
 | aedat4 (extra [formats]) | .aedat4 | x | x |

@@ -7,8 +7,9 @@ from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
+from blinkgl.config.base import Refused
 from blinkgl.errors import ConfigError
 from blinkgl.labels import files, grading
 from blinkgl.labels.files import Form
@@ -29,8 +30,25 @@ BY_NAME: Categories = (*((kind, k) for k, kind in enumerate(_KINDS, 1)), ("*", 2
 """``semantics: true``: sky 1, ground 2, wall 3, shapes from 4 on, 255 for other names. Data sets hold these numbers:
 new kinds come at the end."""
 
+
+def _a_table(value: Any) -> Any:
+    """One message for what is neither of the two, instead of one for each."""
+    if isinstance(value, bool):
+        return value
+    if not isinstance(value, dict):
+        raise Refused(
+            "no table of patterns", value=value, accepted="a table such as {'chair*': 7, '*': 0}, or true or false"
+        )
+    for pattern, number in value.items():
+        if not isinstance(pattern, str) or not 1 <= len(pattern) <= 200:
+            raise Refused("not a pattern of names", value=pattern, accepted="text of 1 to 200 characters")
+        if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number <= 65535:
+            raise Refused(f"no number of a category for '{pattern}'", value=number, accepted="0 to 65535")
+    return value
+
+
 SEMANTICS_KEY = Key(
-    bool | dict[Annotated[str, Field(min_length=1, max_length=200)], Annotated[int, Field(ge=0, le=65535)]],
+    Annotated[bool | dict[str, int], BeforeValidator(_a_table)],
     Field(
         False,
         description='category of what is seen, 16-bit PNG: a table of patterns, `{"wall-*": 1, "chair*": 7, "*": 0}`, '

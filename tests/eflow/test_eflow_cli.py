@@ -340,6 +340,7 @@ def test_submit_blinkflow(network, tmp_path, full, capsys):
     assert submit.decode(data).shape == ((480, 640, 2) if full else (19200, 2))
 
 
+@pytest.mark.slow
 def test_bench_reports_every_row(tmp_path, capsys):
     assert (
         run(

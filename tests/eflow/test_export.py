@@ -37,6 +37,7 @@ def agrees(model, path, sizes, batch=1):
         assert np.abs(flow - wanted).max() <= 1e-4 * max(1, np.abs(wanted).max())
 
 
+@pytest.mark.slow
 def test_ev_flownet_of_any_size_and_batch(tmp_path, capsys):
     model = network(name="ev_flownet", width=8, input="voxel", bins=5, consensus=True)
     ckpt.write_tensors(tmp_path / "n.safetensors", model.state_dict(), ckpt.metadata_of(model))

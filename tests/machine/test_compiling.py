@@ -59,6 +59,7 @@ def test_it_has_a_line_of_its_own(tmp_path, capsys):
         assert ("compiling kernels, once per machine: 14 s\n" in out) == (compiled > 0) and "6.70 s" in out
 
 
+@pytest.mark.slow
 def test_a_cold_and_a_warm_simulate(tmp_path):
     """The first says what it compiled; the second finds it on disk."""
     np.save(tmp_path / "f.npy", np.random.default_rng(0).integers(0, 255, (3, 8, 8), np.uint8))

@@ -126,7 +126,10 @@ def run_of(timeline, renderer):
     return simulate_sequence(SequenceConfig(timeline=timeline, events=ESIM), labels=False, renderer=renderer)
 
 
-@pytest.mark.parametrize("reconstruction", ["linear", "pchip", "hermite"])
+@pytest.mark.parametrize(
+    "reconstruction",
+    ["linear", pytest.param("pchip", marks=pytest.mark.slow), pytest.param("hermite", marks=pytest.mark.slow)],
+)
 def test_budget_keeps_to_its_target_and_its_estimate_to_the_truth(gl, world, reconstruction):
     """Against a much denser run: the promised percentile is within a factor 2 of the estimate
     and of the target, the median within 3."""

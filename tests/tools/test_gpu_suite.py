@@ -92,6 +92,7 @@ def test_density_of_the_clips():
         assert np.mean(counts) / (48 * 64) == pytest.approx(density, rel=0.1)
 
 
+@pytest.mark.slow
 def test_rows_of_card_and_processor(gl, tmp_path):
     """What is compared, beside something that differs."""
     found = gpu_pieces.Events.compared(gl, gpu_pieces.EsimConfig(), 24, 16, 0.3)

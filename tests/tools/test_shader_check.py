@@ -418,8 +418,8 @@ def test_time_counts_what_is_drawn(shader, config):
         assert 0.3 < p["overdraw"] < 2.5
     assert passes["colour"]["fragments"] == pytest.approx(4 * passes["luminance"]["fragments"], rel=0.05)
     assert {v["variant"] for v in passes["luminance"]["variants"]} == {
-        "luminance.glsl TEXTURED LIT",
-        "luminance.glsl TEXTURED LIT TWO_SIDED",
+        "luminance.glsl TAPS4 STRETCHED TEXTURED LIT",
+        "luminance.glsl TAPS4 STRETCHED TEXTURED LIT TWO_SIDED",
         "luminance.glsl LIT",
         "luminance.glsl TWO_SIDED",
     }

@@ -487,7 +487,7 @@ def test_the_page_in_chromium(served, shader, config, tmp_path):
 
         page.run("document.querySelector('#compare').click()")
         page.wait("return document.querySelector('#verdict').className === 'good'", timeout=60)
-        assert "all 26 buffers agree" in page.text("#verdict") and page.text("#objects") == ""
+        assert "all 28 buffers agree" in page.text("#verdict") and page.text("#objects") == ""
         good = (folder / "luminance.glsl").read_text()
         edit(
             folder / "luminance.glsl",

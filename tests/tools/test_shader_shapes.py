@@ -141,7 +141,13 @@ def test_shapes_that_change_are_what_the_reference_makes_of_them(shader, living)
     assert status == 0 and not [line for line in out.splitlines() if line.startswith("!!")]
 
 
-@pytest.mark.parametrize("mutant", MUTANTS)
+ALWAYS = ("terms of the motion", "waves", "morphs left out")
+"""The others take their turn with `make slow`."""
+
+
+@pytest.mark.parametrize(
+    "mutant", [pytest.param(name, marks=[pytest.mark.slow] * (name not in ALWAYS)) for name in MUTANTS]
+)
 def test_a_mistake_in_a_term_is_found(shader, living, shaders, mutant):
     edits, buffers, who = MUTANTS[mutant]
     for file, right, wrong in edits:

@@ -229,7 +229,8 @@ def _measure_pass(name, call, scale, full: TimedRenderer, half: TimedRenderer, r
     # noise may put the split outside [0, whole]
     fragment = min(whole, max(0.0, (whole - small) * ratio / (ratio - 1))) if ratio > 1 else 0.0
     pixels = int(full.width * scale) * int(full.height * scale)
-    fragments = first.fragments - (full.width * full.height if scale > 1 else 0)  # less those of the box filter
+    # Less those of what is drawn over it: the box filter, or the lines of silhouettes, which no item draws.
+    fragments = min(first.fragments, sum(one.fragments for one in runs["each"][0].variants.values()))
     variants = []
     for variant, one in runs["each"][0].variants.items():
         ms = float(np.median([run.variants[variant].gpu_ms for run in runs["each"]]))

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numba
 import numpy as np
+import pytest
 from rich.console import Console
 
 from blinkgl.dataset.report import SequenceReport

@@ -110,7 +110,8 @@ def test_the_events_are_those_that_come_without_it():
 
 @pytest.mark.slow
 def test_moved_back_by_its_velocity_an_edge_is_sharp():
-    """The variance of the image of events, over that of the same events where they lie: five random worlds."""
+    """The variance of the image of events, over that of the same events where they lie, off by the same parts of a
+    pixel (places between pixels blur an image by themselves): five random worlds."""
     ratios = []
     for seed in range(5):
         tree = {
@@ -131,10 +132,10 @@ def test_moved_back_by_its_velocity_an_edge_is_sharp():
         window = events.window(10_000, 70_000)
         back = 1e-6 * (window.t - 40_000)[:, None] * window.truth["velocity"]
         place = np.column_stack([window.x, window.y]).astype(float)
-        variance = [_image(one, 60, 80).var() for one in (place - back, place)]
+        variance = [_image(one, 60, 80).var() for one in (place - back, place - (back - np.round(back)))]
         ratios.append(variance[0] / variance[1])
         assert (np.linalg.norm(window.truth["velocity"], axis=1) * 0.06).max() > 3, "nothing moves: it says nothing"
-    assert min(ratios) > 1 and np.median(ratios) > 1.3, f"variance ratios {np.round(ratios, 2)}"
+    assert min(ratios) > 1.1 and np.median(ratios) > 1.4, f"variance ratios {np.round(ratios, 2)}"
 
 
 def _image(place: np.ndarray, height: int, width: int) -> np.ndarray:

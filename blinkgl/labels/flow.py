@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-from fractions import Fraction
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -29,8 +28,10 @@ def _where_to(value: Any) -> str | float:
     """An entry of ``labels.flow``: a direction, or seconds, which may be written as a fraction. Raises Refused."""
     if isinstance(value, str) and value in ("forward", "backward"):
         return value
+    # No Fraction: that of "1e999999999" is a number of as many digits, and takes hours.
+    top, slash, bottom = value.partition("/") if isinstance(value, str) else (value, "", "1")
     try:
-        seconds = math.nan if isinstance(value, bool) else float(Fraction(value) if isinstance(value, str) else value)
+        seconds = math.nan if isinstance(value, bool) else float(top) / float(bottom if slash else 1)
     except (ValueError, TypeError, ZeroDivisionError, OverflowError):
         seconds = math.nan
     if not 1e-6 <= abs(seconds) <= 4300:

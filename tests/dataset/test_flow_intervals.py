@@ -159,6 +159,8 @@ def test_torch_reads_those_that_lead_over_all(made):
     [
         ([0.0], "labels.flow.0: no direction, and no interval (got 0.0); expected forward, backward, or an interval"),
         (["forward", "1/0"], "labels.flow.1: no direction, and no interval (got '1/0')"),
+        (["1/"], "labels.flow.0: no direction, and no interval (got '1/')"),
+        (["1e999999999"], "labels.flow.0: no direction, and no interval (got '1e999999999')"),
         (["fowards"], "labels.flow.0: no direction, and no interval (got 'fowards')"),
         ([True], "labels.flow.0: no direction, and no interval (got True)"),
         ([float("nan")], "labels.flow.0: no direction, and no interval (got nan)"),

@@ -35,6 +35,8 @@ MAX_EVENTS = 65535
 """of one chunk: the longest run that can be written."""
 _HEADER = 12
 _FORMS = 3
+_ROWS, _SIGNS = (5, 2), (7, 1)
+"""Of runs: bits of the count, and bytes of count and value together."""
 
 
 def encode(x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray) -> bytes:
@@ -49,11 +51,11 @@ def encode(x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray) -> bytes:
     head += b"\xf0" * 4 if int(t[0]) % (1 << 32) < 1 << 18 else b""
     head += times[: _encode_times(t.view(np.uint64), times)].tobytes()
     wide = _four_in_three(y << 12 | x << 1 | p, 8, "<u4")
-    words, signs = np.empty(2 * len(t), np.uint16), np.empty(3 * len(t), np.uint8)
-    rows = words[: _encode_rows(y, words)].astype("<u2").tobytes()
+    words, runs = np.empty(len(t), np.uint16), np.empty(4 * len(t), np.uint8)
+    rows = runs[: _encode_runs(y, *_ROWS, runs)].tobytes()
     narrow = rows + _four_in_three(x << 1 | p, 4, "<u2")
     masks = words[: _encode_columns(x, words)].astype("<u2").tobytes()
-    masked = rows + masks + signs[: _encode_signs(p, signs)].tobytes()
+    masked = rows + masks + runs[: _encode_runs(p, *_SIGNS, runs)].tobytes()
     form, body = min(enumerate((masked, narrow, wide)), key=lambda one: len(one[1]))
     return np.array(len(t) << 2 | form, "<u4").tobytes() + head + body
 
@@ -81,13 +83,13 @@ def decode(data: bytes, most: int, where: str) -> tuple[np.ndarray, np.ndarray, 
         v, at = _three_to_four(raw, at, 8, "<u4", count)
         x[:], y[:], p[:] = v >> 1 & 0x7FF, v >> 12 & 0x7FF, v & 1
     else:
-        at = _decode_rows(raw, at, y)
+        at = _decode_runs(raw, at, *_ROWS, y)
         if form == 1:
             v, at = _three_to_four(raw, at, 4, "<u2", count)
             x[:], p[:] = v >> 1, v & 1
         else:
             at = _decode_columns(raw, at, x)
-            at = _decode_signs(raw, at, p)
+            at = _decode_runs(raw, at, *_SIGNS, p)
     if at != len(raw):
         raise AssetError(
             "damaged: an ECF chunk that is truncated, or whose runs do not add up to its events"
@@ -138,25 +140,30 @@ def _encode_times(t, out):
         out[n] = np.int64(later) << 4 | min(count, 15)
         n += 1
         if count >= 15:
-            out[n], out[n + 1] = count & 0xFF, count >> 8
-            n += 2
+            n = _put(out, n, count, 2)
         i = end
     return n
 
 
 @numba.njit(cache=True, nogil=True)
-def _encode_rows(y, out):
-    n, i = 0, 0
-    while i < len(y):
+def _put(out, n, number, size):
+    for k in range(size):
+        out[n + k] = number >> 8 * k & 0xFF
+    return n + size
+
+
+@numba.njit(cache=True, nogil=True)
+def _encode_runs(values, bits, size, out):
+    """``value << bits | count`` in ``size`` bytes; a count that has no room is all ones there, and follows as u2."""
+    most, n, i = (1 << bits) - 1, 0, 0
+    while i < len(values):
         end = i + 1
-        while end < len(y) and y[end] == y[i]:
+        while end < len(values) and values[end] == values[i]:
             end += 1
         count = end - i
-        out[n] = y[i] << 5 | min(count, 31)
-        n += 1
-        if count >= 31:
-            out[n] = count
-            n += 1
+        n = _put(out, n, values[i] << bits | min(count, most), size)
+        if count >= most:
+            n = _put(out, n, count, 2)
         i = end
     return n
 
@@ -178,23 +185,6 @@ def _encode_columns(x, out):
 
 
 @numba.njit(cache=True, nogil=True)
-def _encode_signs(p, out):
-    n, i = 0, 0
-    while i < len(p):
-        end = i + 1
-        while end < len(p) and p[end] == p[i]:
-            end += 1
-        count = end - i
-        out[n] = p[i] << 7 | min(count, 127)
-        n += 1
-        if count >= 127:
-            out[n], out[n + 1] = count & 0xFF, count >> 8
-            n += 2
-        i = end
-    return n
-
-
-@numba.njit(cache=True, nogil=True)
 def _decode_times(raw, at, start, t):
     """Fills t; returns the byte after the times, -1 where they do not fit."""
     i, now, step, shift = 0, start, np.uint64(0), np.uint64(0)
@@ -210,11 +200,9 @@ def _decode_times(raw, at, start, t):
             shift += np.uint64(4)
             continue
         if count == 15:
-            if at + 2 > len(raw):
-                return -1
-            count = np.int64(raw[at]) | np.int64(raw[at + 1]) << 8
+            count = _number(raw, at, 2)
             at += 2
-        if count > len(t) - i:
+        if count < 0 or count > len(t) - i:
             return -1
         now += step + np.uint64(later)
         step, shift = np.uint64(0), np.uint64(0)
@@ -225,23 +213,33 @@ def _decode_times(raw, at, start, t):
 
 
 @numba.njit(cache=True, nogil=True)
-def _decode_rows(raw, at, y):
-    i = 0
-    while i < len(y):
-        if at < 0 or at + 2 > len(raw):
+def _number(raw, at, size):
+    """Of ``size`` bytes; -1 where there are not so many."""
+    if at < 0 or at + size > len(raw):
+        return -1
+    number = 0
+    for k in range(size):
+        number |= np.int64(raw[at + k]) << 8 * k
+    return number
+
+
+@numba.njit(cache=True, nogil=True)
+def _decode_runs(raw, at, bits, size, values):
+    """Fills ``values`` as of :func:`_encode_runs`; the byte after them, -1 where they do not fit."""
+    most, i = (1 << bits) - 1, 0
+    while i < len(values):
+        head = _number(raw, at, size)
+        if head < 0:
             return -1
-        word = np.int64(raw[at]) | np.int64(raw[at + 1]) << 8
-        count = word & 31
-        at += 2
-        if count == 31:
-            if at + 2 > len(raw):
-                return -1
-            count = np.int64(raw[at]) | np.int64(raw[at + 1]) << 8
+        at += size
+        count = head & most
+        if count == most:
+            count = _number(raw, at, 2)
             at += 2
-        if count > len(y) - i:
+        if count < 0 or count > len(values) - i:
             return -1
         for _ in range(count):
-            y[i] = word >> 5
+            values[i] = head >> bits
             i += 1
     return at
 
@@ -250,9 +248,9 @@ def _decode_rows(raw, at, y):
 def _decode_columns(raw, at, x):
     i = 0
     while i < len(x):
-        if at < 0 or at + 2 > len(raw):
+        word = _number(raw, at, 2)
+        if word < 0:
             return -1
-        word = np.int64(raw[at]) | np.int64(raw[at + 1]) << 8
         at += 2
         x[i] = word >> 5
         i += 1
@@ -261,25 +259,4 @@ def _decode_columns(raw, at, x):
             if i < len(x) and word >> (5 - k) & 1:
                 x[i] = (word >> 5) + k
                 i += 1
-    return at
-
-
-@numba.njit(cache=True, nogil=True)
-def _decode_signs(raw, at, p):
-    i = 0
-    while i < len(p):
-        if at < 0 or at >= len(raw):
-            return -1
-        sign, count = raw[at] >> 7, np.int64(raw[at] & 127)
-        at += 1
-        if count == 127:
-            if at + 2 > len(raw):
-                return -1
-            count = np.int64(raw[at]) | np.int64(raw[at + 1]) << 8
-            at += 2
-        if count > len(p) - i:
-            return -1
-        for _ in range(count):
-            p[i] = sign
-            i += 1
     return at

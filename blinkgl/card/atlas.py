@@ -29,6 +29,7 @@ from blinkgl.card.stages import Stages, is_long
 from blinkgl.errors import EventDataError
 from blinkgl.events.emulator import BLOCK, INTENSITY_LIMIT_BITS, NEVER_NS
 from blinkgl.events.esim import Esim
+from blinkgl.events.table import emulator_of
 from blinkgl.events.types import Events
 
 if TYPE_CHECKING:
@@ -119,7 +120,7 @@ class Atlas:
         """The emulator of a tile that is free, until it is released.   size : (height, width) that is wanted.
 
         Raises EventDataError: none is free, or the configuration asks for what the atlas was not made for."""
-        if not isinstance(config, Esim.Config):
+        if emulator_of(config) is not Esim:
             raise EventDataError(
                 "this emulator has no kernel for the card", where="events.emulator", value=config.emulator
             )

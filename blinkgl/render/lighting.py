@@ -32,7 +32,8 @@ EXAMPLES: tuple[dict[str, Any], ...] = (
     },
 )  # fmt: skip
 """Variants for which a program of a pass that is lit has to compile, besides the plain light's; HUED comes on top."""
-# By uniform, whether it has a value per channel: one of HUED's three, or the one that stands for them; how many, of arrays.
+# By uniform, whether it has a value per channel: one of HUED's three, or the one that stands for them;
+# of arrays how many.
 _FIXED = {"sun_strength": True, "lamp_strength": True, "lamp_fading": False, "spot_cone": False}
 _PLACED = {
     **dict.fromkeys(("sun_towards", "lamp_place", "spot_axis"), 0),

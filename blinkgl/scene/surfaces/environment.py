@@ -139,7 +139,7 @@ def quartic(image: np.ndarray, directions: np.ndarray, solid: np.ndarray) -> tup
     total = second @ one
     mixed = np.einsum("ci,j->cij", second, one)
     band = 35 * M - 15 * (mixed + mixed.swapaxes(1, 2)) + 3 * total[:, None, None] * np.outer(one, one)
-    # The mean of P4(n.d) P4(n.e) over n is P4(d.e) / 9: of two lights what the form of one makes of the other's moments.
+    # The mean of P4(n.d) P4(n.e) over n is P4(d.e) / 9: of two lights what one's form makes of the other's moments.
     energy = np.einsum("cij,cij->c", band, M) / 8 / 9
     scale = _FOURTH * 9 / (4 * np.pi)
     return scale * band / 8, abs(scale) * np.sqrt(np.maximum(energy, 0.0))

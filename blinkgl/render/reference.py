@@ -544,8 +544,7 @@ def shone(
     if id(scene.light) not in _surroundings:
         _surroundings.clear()
         _surroundings[id(scene.light)] = scene.light, surroundings_of(scene.light)
-    there = gloss.looked_at(normal, away, nv, roughness)
-    around = gloss.mirrored(_surroundings[id(scene.light)][1], *there)
+    around = gloss.around(_surroundings[id(scene.light)][1], normal, away, nv, roughness)
     out = around * (even_clear * (1 - mix) + even_metal * mix)
     for k, lamp in enumerate(lamps_of(scene.light)):
         towards, _ = beam(lamp, lamp.path.pose(t_ns), points)

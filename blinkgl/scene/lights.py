@@ -132,14 +132,15 @@ def seen_around(light: Light) -> np.ndarray:
 def surroundings_of(light: Light) -> np.ndarray:
     """(levels, h, w, 3) float32: :func:`seen_around` as surfaces of several roughnesses mirror it
     (:func:`~blinkgl.scene.surfaces.gloss.blurred`)."""
-    if light.around is None and light.surroundings is None:
+    if light.around is None and light.surroundings is None:  # one column will do
         return _half_a_sky() * (np.float32(light.sky) * np.asarray(light.sky_color, np.float32))
     return blurred(seen_around(light))
 
 
 @lru_cache(maxsize=1)
 def _half_a_sky() -> np.ndarray:
-    return blurred(seen_around(Light(sun=0.0, sky=1.0)))
+    """(levels, h, 1, 3): the same all round."""
+    return blurred(seen_around(Light(sun=0.0, sky=1.0)))[:, :, :1]
 
 
 def beam(lamp: Lamp, pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

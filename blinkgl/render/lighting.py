@@ -138,8 +138,7 @@ class Lighting:
         placed = {"sun_towards": own[:, : self._suns], "lamp_place": away @ R, "spot_axis": own[:, spots]}
         placed |= _forms(_seen_turned(self._quadric, turn))
         if self._quartic is not None:
-            pairs = _kron(R, R)
-            placed["around_fourth"] = _fourth(_seen_turned(self._quartic, pairs))
+            placed["around_fourth"] = _fourth(_seen_turned(self._quartic, _kron(R, R)))
         if rates:
             dR, dt = moment.rates.T_world_obj[:, :3, :3], moment.rates.T_world_obj[:, :3, 3]
             changes = np.array([lamp.path.derivative(moment.t_ns) for lamp in self.lamps]).reshape(-1, 4, 4)
@@ -155,7 +154,7 @@ class Lighting:
             placed |= {f"{name}_rate": values for name, values in changed.items()}
             if self._quartic is not None:
                 pairs_rate = _kron(dR, R) + _kron(R, dR)
-                placed["around_fourth_rate"] = _fourth(_seen_turned(self._quartic, pairs, pairs_rate))
+                placed["around_fourth_rate"] = _fourth(_seen_turned(self._quartic, _kron(R, R), pairs_rate))
         placed = {name: np.ascontiguousarray(values, np.float32) for name, values in placed.items()}
         self._last = moment, rates, placed
         return placed

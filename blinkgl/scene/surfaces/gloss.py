@@ -162,7 +162,8 @@ def around(
     """(N, 3) radiance of :func:`blurred` surroundings that surfaces of (N,) roughnesses mirror, of what comes of even
     light the mean. cosine : (N,) of the eye at the normal."""
     cells = _bilinear(looks(), cosine * (_ANGLES - 1), roughness * (_ROUGHNESSES - 1))
-    return sum(weight * mirrored(levels, way, rough) for way, rough, weight in both(normal, away, cells))
+    first, second = (weight * mirrored(levels, way, rough) for way, rough, weight in both(normal, away, cells))
+    return first + second
 
 
 def energy_at(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:

@@ -15,12 +15,14 @@ from argparse import Namespace
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
+from functools import lru_cache
 from importlib import resources
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from blinkgl.card import CardEsim, Voxels
+from blinkgl.card.reductions import OfTextures
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, RunTemplate, load_run
 from blinkgl.dataset.generate import generate_run
@@ -30,6 +32,7 @@ from blinkgl.gl import GLContext, create_context, egl_devices
 from blinkgl.labels import LABELS, LabelRequest
 from blinkgl.machine import doctor
 from blinkgl.render.renderer import Renderer
+from blinkgl.timeline.reductions import OfArrays
 from blinkgl.tools import bench_accuracy
 from blinkgl.tools.bench_generate import probe_scene
 
@@ -247,12 +250,15 @@ class Passes(Piece):
     @staticmethod
     def others() -> dict[str, Callable[[Renderer, int], Any]]:
         drawn = LabelRequest(*(name for name in ("flow_forward", "depth", "ids") if name in LABELS))
+        ranks = lru_cache(1)(lambda renderer: OfTextures(renderer.gl))
         return {
             "luminance and rate": lambda r, t: r.luminance(t, rate=True),
             "colour": lambda r, t: r.colour(t, "none"),
             "brightness, every 8th": lambda r, t: r.brightness(t, 8),
             "velocity": lambda r, t: r.velocity(t),
             "velocity, every 8th": lambda r, t: r.velocity_of_movers(t, 8),
+            "velocity, every 8th, its percentile there": lambda r, t: ranks(r).speeds(r.velocity_of_movers(t, 8), 95.0),
+            "velocity, every 8th, NumPy's percentile": lambda r, t: OfArrays().speeds(r.velocity_of_movers(t, 8), 95.0),
             "labels: flow, depth, ids": lambda r, t: r.labels(t, drawn, t + SECOND // 100),
         }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ from blinkgl.sequence.inertial import Inertial, measured
 from blinkgl.sequence.items import GroundTruth, Item, Picture
 from blinkgl.sequence.simulate import Simulation
 from blinkgl.timeline import Timeline, make_timeline
+from blinkgl.timeline.reductions import OfArrays, Reductions
 
 SURFACES = LabelRequest("ids", "depth", "velocity")
 """Labels that say what made an event."""
@@ -66,6 +67,18 @@ def _truth_of(sensor: Sensor, config: SequenceConfig) -> SurfaceTruth | None:
     if sensor.labels is None or not sensor.labels.events:
         return None
     return SurfaceTruth(reach=int(samples_of(config.render.antialiasing).shared))
+
+
+def _reductions(gl: GLContext, device: str, stack: ExitStack) -> Reductions:
+    """Who reduces the timeline's small pictures, where ``events.device`` says. What it holds goes with the stack."""
+    if device == "cpu" or (device == "auto" and gl.is_software):
+        return OfArrays()
+    from blinkgl.card.reductions import reductions_on  # nobody loads it who does not ask for a card
+
+    made = reductions_on(gl, device)
+    if not isinstance(made, OfArrays):
+        stack.callback(made.release)
+    return made
 
 
 def surfaces_at(renderer: Renderer, t_ns: int) -> Surfaces:
@@ -129,9 +142,9 @@ class RenderedSequence(Simulation):
                     renderer.gl,
                 )
                 response, dynamics = emulator_of(emulator).response(emulator), scene.dynamics
-                self.timeline = make_timeline(
-                    config.timeline, *span_ns, renderer, response, dynamics.impacts_ns if dynamics is not None else ()
-                )
+                stops = dynamics.impacts_ns if dynamics is not None else ()
+                reductions = partial(_reductions, renderer.gl, getattr(emulator, "device", "auto"), stack)
+                self.timeline = make_timeline(config.timeline, *span_ns, renderer, response, stops, reductions)
             if labels and config.images is not None:
                 seed = kernel_seed(config.seed, index, Role.IMAGES, number)
                 self.frame_camera = FrameCamera(renderer, config.images, seed, span_ns)

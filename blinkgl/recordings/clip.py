@@ -25,11 +25,14 @@ from blinkgl.recordings.simulation import Decoder
 from blinkgl.timeline.interpolate import Displacement, motion
 
 TILE_PX = 32
-MOST_PIXEL_STEPS = 24_000_000
+MOST_PIXEL_STEPS = 6_000_000
 """Pixels times frames that a clip holds at most, float32: what a fit of a minute or two has time for."""
 STILL = 0.04
 """Largest change of ln(I + 10) between two frames, blurred by a pixel, of a pixel that saw nothing."""
 MOST_SATURATED = 0.3
+LEAP, LARGEST_THRESHOLD = 0.1, 2.0
+"""Median change of ln(I + 10) from one frame to the next from which on events have to say so, too, and the contrast
+that they stand for at most."""
 MOST_SHIFT_US = 100_000
 LEAST_CORRELATION = 0.25
 """Of polarity sums with the frames' change: below, events and frames are not of one scene or not on one clock."""
@@ -161,7 +164,18 @@ def clip_of_frames(
             value=[tuple(round(t / 1e6, 6) for t in (a[0], a[-1])) for a in (events.t, clock)],
             accepted="two or more, on one clock (seconds of events and of frames shown)",
         )
-    first, last = int(inside[0]), int(inside[-1]) + 1
+    same = _one_exposure(inside, change, clock, ~full, events)
+    if len(same) < len(inside):
+        facts["other_exposure"] = len(inside) - len(same)
+        if len(same) < 2:
+            raise EventDataError(
+                "the frames' exposure changes from one to the next, and the events do not: what the light did is not "
+                "in them",
+                where=where,
+                value=f"{len(inside) - len(same)} of {len(inside)} intervals",
+                accepted="three or more frames in a row of one exposure and gain",
+            )
+    first, last = int(same[0]), int(same[-1]) + 1
     grey, logs, clock = grey[first : last + 1], logs[first : last + 1], clock[first : last + 1]
     edges = clock.copy()
     edges[0], edges[-1] = max(clock[0], events.t[0]), min(clock[-1], events.t[-1] + 1)
@@ -292,6 +306,23 @@ def _flicker_of(events: Events, hz: float) -> tuple[float, float, float]:
     best = float(tried[int(np.argmax(found))])
     turned = np.exp(-2j * np.pi * best * t) @ p
     return best, float(events.t[0] - np.angle(turned) / (2 * np.pi * best) * 1e6), float(np.abs(turned) / len(p))
+
+
+def _one_exposure(
+    inside: np.ndarray, change: np.ndarray, clock_us: np.ndarray, used: np.ndarray, events: Events
+) -> np.ndarray:
+    """The longest stretch of the intervals ``inside`` in which the picture as a whole does not become brighter or
+    darker without events: there the frames' exposure or gain was changed, which an emulator would take for light."""
+    pixels = max(int(used.sum()), 1)
+    stretch, best = [], []
+    for k in inside.tolist():
+        middle = float(np.median(change[k][used])) if used.any() else 0.0
+        part = events.window(int(clock_us[k]), int(clock_us[k + 1]))
+        polarity = float(2 * np.count_nonzero(part.p) - len(part)) / pixels
+        leaps = abs(middle) > LEAP and np.sign(middle) * polarity * LARGEST_THRESHOLD < abs(middle) / 2
+        stretch = [] if leaps else [*stretch, k]
+        best = stretch if len(stretch) > len(best) else best
+    return np.array(best, np.int64)
 
 
 _NO_TIMES = (np.empty(0, np.int64),) * 2

@@ -144,7 +144,8 @@ class Target:
 
     values : (N,).   chance : (N,), what each may be off by, of the recording and of a simulation.
     floor : (N,), by which a model is off besides.   weight : (N,), of the block a number belongs to.
-    jackknife : (G, N), differences without each group.   block : (N,) of names."""
+    jackknife : (G, N), differences without each group.   block : (N,) of names.
+    together : rates of ON and OFF events of pixels that moved in one number."""
 
     sums: Sums
     probes: np.ndarray
@@ -154,6 +155,7 @@ class Target:
     weight: np.ndarray
     jackknife: np.ndarray
     block: np.ndarray
+    together: bool = False
 
     @property
     def error(self) -> np.ndarray:
@@ -161,7 +163,10 @@ class Target:
 
     def residual(self, simulated: Sums) -> np.ndarray:
         """(N,), in errors, times the weights."""
-        return self.weight * (numbers(simulated, self.probes)[0] - self.values) / self.error
+        return self.weight * (self._numbers(simulated) - self.values) / self.error
+
+    def _numbers(self, of: Sums, without: int | None = None) -> np.ndarray:
+        return numbers(of, self.probes, without, self.together)[0]
 
     def beside(self, simulated: Sums, *, floor: str) -> Target:
         """With the errors that a simulation near the recording shows. Chance: the jackknife of the differences, in
@@ -169,9 +174,7 @@ class Target:
 
         floor : "expected": ``FLOOR``.   "lowest": a tenth of it, as for a model that is the camera.   "seen": what the
         simulation is off by beyond chance, block by block, between the two."""
-        value = lambda without: (
-            numbers(simulated, self.probes, without)[0] - numbers(self.sums, self.probes, without)[0]
-        )
+        value = lambda without: self._numbers(simulated, without) - self._numbers(self.sums, without)
         jackknife = np.stack([value(group) for group in range(GROUPS)])
         chance = np.sqrt((GROUPS - 1) / GROUPS * ((jackknife - jackknife.mean(axis=0)) ** 2).sum(axis=0))
         most = np.array([FLOOR[b] for b in self.block])
@@ -194,16 +197,15 @@ LOWEST = 0.1
 """Of a floor, where the model turns out to be nearer."""
 
 
-def target(recorded: Sums) -> Target:
-    """Of the recording's sums; with floors for errors until a simulation is beside it."""
+def target(recorded: Sums, together: bool = False) -> Target:
+    """Of the recording's sums; with floors for errors until a simulation is beside it. together: see Target."""
     probes = _probes(recorded.isi.sum(axis=(0, 1)))
-    values, block = numbers(recorded, probes)
+    values, block = numbers(recorded, probes, together=together)
     floor = np.array([FLOOR[b] for b in block])
     sizes = {b: np.count_nonzero(block == b) for b in FLOOR}
     weight = np.array([WEIGHTS[b] / np.sqrt(sizes[b]) for b in block])
-    return Target(
-        recorded, probes, values, np.zeros(len(values)), floor, weight, np.zeros((GROUPS, len(values))), block
-    )
+    chance, jackknife = np.zeros(len(values)), np.zeros((GROUPS, len(values)))
+    return Target(recorded, probes, values, chance, floor, weight, jackknife, block, together)
 
 
 def _probes(isi: np.ndarray) -> np.ndarray:
@@ -215,8 +217,10 @@ def _probes(isi: np.ndarray) -> np.ndarray:
     return np.unique(np.concatenate([found, [max(found[0] - 2, 0)]]))
 
 
-def numbers(s: Sums, probes: np.ndarray, without: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) numbers of a stream, and the name of the block of each."""
+def numbers(
+    s: Sums, probes: np.ndarray, without: int | None = None, together: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) numbers of a stream, and the name of the block of each. together: see Target."""
     rates, lights, isi, counts, still, still_counts, products, pixels = s.without(without)
     values, block = [], []
 
@@ -224,6 +228,8 @@ def numbers(s: Sums, probes: np.ndarray, without: int | None = None) -> tuple[np
         values.append(np.ravel(more))
         block.extend([name] * np.size(more))
 
+    if together:
+        rates, lights = (part.sum(axis=-1, keepdims=True) for part in (rates, lights))
     if pixels[0] >= LEAST_STILL:
         seconds = s.seconds[:, None] * pixels[0]
         add("rate", np.log((rates + 1) / seconds))

@@ -380,6 +380,12 @@ def _of_frames(clip: Clip, exposures: bool, interpolate: str, given: float | Non
             else "taken to go in a straight line: what moved further than a pixel is wrong there."
         ),
     ]
+    if "bursts" in facts:
+        notes.append(
+            f"{100 * facts['in_bursts']:.0f} % of the events come in {facts['bursts']:.0f} bursts of one polarity, all "
+            "over the sensor, at the frames' interval: the camera's frames set them off, not light. Intervals that "
+            "begin or end there are not compared."
+        )
     if "other_exposure" in facts:
         notes.append(
             f"{facts['other_exposure']} intervals between frames were left out: there, or beyond, the picture as a "

@@ -20,12 +20,13 @@ from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.types import Events
 from blinkgl.io.formats import open_events
 from blinkgl.io.frames import RECORDING, open_frames
+from blinkgl.recordings.bursts import frame_bursts, inside_any
 from blinkgl.recordings.comparison import BLUR_PX, LOG_OFFSET
 from blinkgl.recordings.simulation import Decoder
 from blinkgl.timeline.interpolate import Displacement, motion
 
 TILE_PX = 32
-MOST_PIXEL_STEPS = 6_000_000
+MOST_PIXEL_STEPS = 3_000_000
 """Pixels times frames that a clip holds at most, float32: what a fit of a minute or two has time for."""
 STILL = 0.04
 """Largest change of ln(I + 10) between two frames, blurred by a pixel, of a pixel that saw nothing."""
@@ -53,6 +54,7 @@ class Clip:
     used : (h, w) bool, pixels that count.   still : (h, w) bool, those of them that saw no change.
     light : (h, w) uint8, eighth of the brightness, 0 the darkest.   change : (K, h, w) float32, of ln(I + 10).
     sensor : (height, width) of the camera.   share : of its pixels that are in the clip.
+    bursts : (N, 2) int64 µs, of events that the camera's frames set off: what lies there counts, but not when.
     facts : what was found out on the way, by name."""
 
     frames: list[tuple[int, np.ndarray]]
@@ -65,6 +67,7 @@ class Clip:
     change: np.ndarray
     sensor: tuple[int, int]
     share: float = 1.0
+    bursts: np.ndarray = field(default_factory=lambda: np.empty((0, 2), np.int64))
     facts: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -140,6 +143,9 @@ def clip_of_frames(
     logs = [cv2.GaussianBlur(np.log(g.astype(np.float64) * 255 + LOG_OFFSET), (0, 0), BLUR_PX) for g in grey]
     clock = np.array(times, np.int64) // 1000
     facts: dict[str, float] = {"saturated": saturated}
+    bursts = frame_bursts(events, float(np.median(np.diff(clock)))) if len(clock) > 1 else np.empty((0, 2), np.int64)
+    if len(bursts):
+        facts |= {"bursts": len(bursts), "in_bursts": float(inside_any(events.t, bursts).mean())}
     change = np.diff(np.stack(logs), axis=0).astype(np.float32)
     found, correlation = clock_offset(events, change, clock, size)
     if delay_us is None:
@@ -197,7 +203,7 @@ def clip_of_frames(
     light = np.searchsorted(np.quantile(mean, np.arange(1, 8) / 8), mean).astype(np.uint8)
     events = events.window(int(edges[0]), int(edges[-1]))
     whole = _cut(path, events, ~full, still, light, change, size, most, seed)
-    return replace(whole, clock_us=clock, edges_us=edges, facts=facts)
+    return replace(whole, clock_us=clock, edges_us=edges, facts=facts, bursts=bursts)
 
 
 def clip_of_still(events: Events, size: tuple[int, int], *, luminance: float = DARK_BACKGROUND, parts: int = 8) -> Clip:

@@ -14,6 +14,7 @@ import numba
 import numpy as np
 
 from blinkgl.events.types import Events
+from blinkgl.recordings.bursts import inside_any
 from blinkgl.recordings.clip import TILE_PX, Clip
 from blinkgl.recordings.comparison import BLUR_PX
 
@@ -36,7 +37,7 @@ class Sums:
     """Of the intervals [first, stop) of a clip; the first axis is the group.
 
     rates : (G, K, 2) events by interval and polarity (OFF, ON), of pixels that saw a change.   lights : (G, 8, 2), by
-    brightness.   isi : (G, 2, bins), by whether the second event is of the other polarity.   counts : (G, C) pixels and
+    brightness.   isi : (G, 2, bins), by whether the second event is of the other polarity, of those that no burst set off.   counts : (G, C) pixels and
     intervals by number of events.   still, still_counts : (G, 2), (G, C) of pixels that saw none, over all intervals.
     products : (G, 3) sums of a*b, a*a, b*b of polarity sums with the recording's.   pixels : (G, 2) that moved, and
     did not.   polarity : (K, H*W) float32, polarity sums,
@@ -72,7 +73,8 @@ def sums(events: Events, clip: Clip, first: int, stop: int, against: np.ndarray 
     isi = np.zeros((GROUPS, 2, ISI_BINS), np.int64)
     part = events.window(int(clip.edges_us[first]), int(clip.edges_us[stop]))
     where = part.y.astype(np.int64) * width + part.x
-    _collect(where, part.t, part.p, clip.edges_us[first : stop + 1], group, total, isi)
+    by_light = ~inside_any(part.t, clip.bursts)
+    _collect(where, part.t, part.p, by_light, clip.edges_us[first : stop + 1], group, total, isi)
     used, still = clip.used.ravel(), clip.still.ravel()
     moving = used & ~still
     on_group = np.where(moving, group, GROUPS)
@@ -120,8 +122,9 @@ def _histogram(counts: np.ndarray, group: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True, nogil=True)
-def _collect(where, t, p, edges, group, total, isi):
-    """Counts by interval, pixel and polarity, and the histogram of the intervals between a pixel's events."""
+def _collect(where, t, p, by_light, edges, group, total, isi):
+    """Counts by interval, pixel and polarity, and the histogram of the intervals between a pixel's events, of those
+    both of whose times are ``by_light``."""
     pixels = total.shape[1]
     last = np.full(pixels, -1, np.int64)
     before = np.zeros(pixels, np.uint8)
@@ -131,6 +134,9 @@ def _collect(where, t, p, edges, group, total, isi):
             k += 1
         j = where[i]
         total[k, j, p[i]] += 1
+        if not by_light[i]:
+            last[j] = -1
+            continue
         now = t[i] - edges[0]
         if last[j] >= 0:
             b = min(int(ISI_PER_DECADE * np.log10(max(now - last[j], 1)) + 1e-9), ISI_BINS - 1)
@@ -187,7 +193,7 @@ class Target:
         return replace(self, chance=chance, floor=floors, jackknife=jackknife)
 
 
-WEIGHTS = {"rate": 3.0, "light": 3.0, "interval": 3.0, "turn": 1.0, "count": 2.0, "still": 2.0, "still count": 2.0,
+WEIGHTS = {"rate": 3.0, "light": 3.0, "interval": 5.0, "turn": 1.0, "count": 2.0, "still": 2.0, "still count": 2.0,
            "polarity": 2.0}  # fmt: skip
 """How much the blocks count, each as a whole: what rates and intervals are is what a simulation is used for."""
 FLOOR = {"rate": 0.02, "light": 0.05, "interval": 0.01, "turn": 0.02, "count": 0.01, "still": 0.05, "still count": 0.01,

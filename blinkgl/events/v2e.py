@@ -410,8 +410,8 @@ class V2e(Emulator):
     """See the module and :class:`~blinkgl.events.emulator.Emulator`. Luminance 1.0 is ``config.full_scale`` DN.
 
     State: 12 bytes per pixel; 4 more each with the low-pass, leak, photoreceptor noise, and intensity where the first
-    or shot noise asks for it, 8 each with the second low-pass and the dead time, 12 with causes. Constants: 16 bytes per pixel, 8 more with shot
-    noise."""
+    or shot noise asks for it, 8 each with the second low-pass and the dead time, 12 with causes. Constants: 16
+    bytes per pixel, 8 more with shot noise."""
 
     Config = V2eConfig
     _state = (

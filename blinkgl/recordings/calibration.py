@@ -487,7 +487,8 @@ class _Search:
                 self.untold[key] = f"told only to be {side} than its default ({within})"
                 best = self._descend(keys, others)
             if not keys:
-                self.cost, self._at, self._keys = *best, []
+                self.cost, self._at = best
+                self._keys = []
                 return
 
     def config(self, keys: list[str] | None = None, at: np.ndarray | None = None) -> EmulatorConfig:

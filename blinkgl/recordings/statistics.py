@@ -37,7 +37,8 @@ class Sums:
     """Of the intervals [first, stop) of a clip; the first axis is the group.
 
     rates : (G, K, 2) events by interval and polarity (OFF, ON), of pixels that saw a change.   lights : (G, 8, 2), by
-    brightness.   isi : (G, 2, bins), by whether the second event is of the other polarity, of those that no burst set off.   counts : (G, C) pixels and
+    brightness.   isi : (G, 2, bins), by whether the second event is of the other polarity, where
+    no burst set off either.   counts : (G, C) pixels and
     intervals by number of events.   still, still_counts : (G, 2), (G, C) of pixels that saw none, over all intervals.
     products : (G, 3) sums of a*b, a*a, b*b of polarity sums with the recording's.   pixels : (G, 2) that moved, and
     did not.   polarity : (K, H*W) float32, polarity sums,

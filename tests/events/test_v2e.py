@@ -143,7 +143,7 @@ def test_amplitude_and_phase_of_two_low_passes(ratio):
 
 
 def test_two_low_passes_at_any_frame_spacing():
-    """A bright step: where the levels are passed, against the response in closed form, from frames 0.1 to 4 ms apart."""
+    """A bright step: where the levels are passed, against the response in closed form; frames 0.1 to 4 ms apart."""
     bright, theta, fast, slow = 120.0, 0.15, 80.0, 20.0
     config = V2eConfig(**QUIET, cutoff_hz=slow * 275 / (bright + 20), second_cutoff_hz=fast, contrast_threshold=theta)
     a, b = 2 * np.pi * slow, 2 * np.pi * fast

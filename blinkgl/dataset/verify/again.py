@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,13 @@ _ENGINES = ("mujoco",)
 """Among the versions of a manifest: what computed the poses of falling bodies."""
 
 
-def made_again(root: Path, chosen: dict[str, Known], result: Verification, base: str | Path | None, progress) -> None:
+def made_again(
+    root: Path,
+    chosen: dict[str, Known],
+    result: Verification,
+    base: str | Path | None,
+    progress: Callable[[int, str], None] | None,
+) -> None:
     """``chosen`` generated again, in one OpenGL context. What differs goes to ``result``.   base : folder that relative
     paths start from; None: the run's.   progress : called with a count and a name, or None."""
     gl: GLContext | None = None

@@ -34,7 +34,7 @@ class Verification:
             self.problems.setdefault(name, []).extend(problems)
 
 
-@dataclass
+@dataclass(frozen=True)
 class Known:
     """A sequence without problems of its own."""
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -36,6 +36,9 @@ from blinkgl.sequence.items import GroundTruth, Item, Picture
 from blinkgl.sequence.simulate import Simulation
 from blinkgl.timeline import Timeline, make_timeline
 from blinkgl.timeline.reductions import OfArrays, Reductions
+
+if TYPE_CHECKING:
+    from blinkgl.card import Atlas
 
 SURFACES = LabelRequest("ids", "depth", "velocity")
 """Labels that say what made an event."""
@@ -92,7 +95,8 @@ class RenderedSequence(Simulation):
 
     scene : as it was built.   renderer : what draws it, at its level of detail.
     sensor : what is recorded, and through which camera. A scene that was made already is
-    recorded as the configuration says.   number : of the sensor on its rig, by which noise differs."""
+    recorded as the configuration says.   number : of the sensor on its rig, by which noise differs.
+    atlas : see :func:`~blinkgl.sequence.simulate.simulate_sequence`."""
 
     def __init__(
         self,
@@ -108,6 +112,7 @@ class RenderedSequence(Simulation):
         renderer: Renderer | None,
         window_ns: tuple[int, int] | None,
         number: int = 0,
+        atlas: Atlas | None = None,
     ):
         self.number = number
         clock = StageClock()
@@ -132,14 +137,17 @@ class RenderedSequence(Simulation):
             camera = None
             if events:
                 emulator, readout = self.sensor.emulator, self.sensor.readout
+                seed = kernel_seed(config.seed, index, Role.EVENTS, number)
+                path = config.timeline.reconstruction
                 camera = EventCamera(
                     emulator,
                     readout,
                     *size,
-                    kernel_seed(config.seed, index, Role.EVENTS, number),
-                    config.timeline.reconstruction,
+                    seed,
+                    path,
                     _truth_of(self.sensor, config),
                     renderer.gl,
+                    None if atlas is None else atlas.esim(emulator, seed, path, size),
                 )
                 response, dynamics = emulator_of(emulator).response(emulator), scene.dynamics
                 stops = dynamics.impacts_ns if dynamics is not None else ()

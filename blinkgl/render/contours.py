@@ -59,7 +59,8 @@ class Contour:
 
     def _sharp(self, mesh: Mesh) -> np.ndarray:
         """(E,) int8. Bent: its two faces have other normals at both of its ends; a surface that is bent there and lit
-        as if it were round shows no step. Torn: other texture coordinates, and not only by whole turns of the texture."""
+        as if it were round shows no step. Torn: other texture coordinates, and not only by whole turns of the
+        texture."""
         first, second = self.edges[:, 2], self.edges[:, 3]
         bent, torn = second >= 0, second >= 0
         for end in (0, 1):

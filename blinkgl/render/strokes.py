@@ -62,7 +62,7 @@ class Strokes:
         ctx.viewport = (0, 0, target.fbo.width, target.fbo.height)
         ctx.enable_only(moderngl.BLEND if add else moderngl.NOTHING)
         ctx.blend_func = moderngl.ONE, moderngl.ONE
-        ctx.blend_equation = moderngl.FUNC_ADD
+        ctx.blend_equation = moderngl.FUNC_ADD, moderngl.FUNC_ADD
         array.render(moderngl.TRIANGLES, vertices=6 * self._count)
         ctx.disable(moderngl.BLEND)
 

@@ -92,21 +92,26 @@ def expected_files() -> set[str]:
     return found
 
 
-def check_installation(bin_: Path, root: Path, elsewhere: Path) -> None:
-    """The installed command and resources, used from a folder that has nothing to do with the repository."""
-    python = bin_ / "python"
-    probe = json.loads(run(python, "-c", PROBE, cwd=elsewhere))
+def check_resources(bin_: Path, root: Path, elsewhere: Path) -> dict:
+    """The installed command and resources are there, in a folder that has nothing to do with the repository."""
+    probe = json.loads(run(bin_ / "python", "-c", PROBE, cwd=elsewhere))
     assert Path(probe["file"]).is_relative_to(root)
     for folder in ("shaders", "configs"):
         suffix = {"shaders": "*.glsl", "configs": "*.yaml"}[folder]
         assert probe[folder] == {path.name: path.read_text() for path in (REPOSITORY / folder).glob(suffix)}
     assert probe["shaders"]
     assert run(bin_ / "blinkgl", "--version", cwd=elsewhere) == f"blinkgl {probe['version']}\n"
+    return probe
+
+
+def check_installation(bin_: Path, root: Path, elsewhere: Path) -> None:
+    """They are there, and they work."""
+    probe = check_resources(bin_, root, elsewhere)
     assert json.loads(run(bin_ / "blinkgl", "doctor", "--json", cwd=elsewhere))["ok"]
     # a shader that includes another, compiled from where it was installed
     name = next(name for name, text in sorted(probe["shaders"].items()) if "#include" in text)
     run(
-        python,
+        bin_ / "python",
         "-c",
         "import blinkgl.render.resources\nfrom blinkgl.gl import expand\n"  # whose tables shaders include
         f"assert '#include' not in expand({name!r}, 'vertex').text",
@@ -184,7 +189,7 @@ def test_editable(source, tmp_path):
         source,
         cwd=tmp_path,
     )
-    check_installation(bin_, source, tmp_path)
+    check_resources(bin_, source, tmp_path)
     changed = source / "shaders" / "include" / "only_here.glsl"
     changed.write_text("// new\n")  # an editable install sees new files at once
     run(

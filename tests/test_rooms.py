@@ -88,7 +88,7 @@ def test_data_flows_one_way():
 FILLED_IN_LATER = set(
     """
     Collected Comparison Displacement Document DrawItem Example Explanation Level Measured Omissions Outcome Parameter
-    Pool RenderStats SequenceReport RecordingSide SimulationReport StreamStats Totals Verification _Body _Known
+    Pool RenderStats SequenceReport RecordingSide SimulationReport StreamStats Totals Verification _Body
 """.split()
 )
 """Records that are written to while they are made. All others are values: who holds one may count on it."""

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import yaml
 from pydantic import Field
+from sources import parsed
 
 import blinkgl
 from blinkgl.cli import run
@@ -263,11 +264,10 @@ def test_the_table_is_whole():
 def test_nothing_else_asks_which_kind_an_emulator_is():
     """No name of a kind is compared with or stands in a list or table; the models of the kinds
     are named where they are declared alone."""
-    root = Path(blinkgl.__file__).parent
     models = {emulator.Config.__name__ for emulator in EMULATORS.values()}
     found = {}
-    for path in root.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for path, nodes in parsed("blinkgl", words=(*EMULATORS, *models)):
+        for node in nodes:
             here = {
                 ast.Compare: lambda n: [n.left, *n.comparators],
                 ast.Dict: lambda n: n.keys,
@@ -283,7 +283,7 @@ def test_nothing_else_asks_which_kind_an_emulator_is():
             if isinstance(node, ast.Name) and node.id in models:
                 said.add(node.id)
             if said:
-                found.setdefault(path.relative_to(root).as_posix(), set()).update(said)
+                found.setdefault(path.removeprefix("blinkgl/"), set()).update(said)
     assert found.pop("config/sequence.py") == {"EsimConfig"}, "the default of `events:`"
     assert set(found) == {
         "config/events.py",
@@ -657,11 +657,10 @@ def test_reading_a_yaml_needs_neither_opengl_nor_a_compiler(tmp_path):
 def test_nothing_else_lists_labels():
     """No name of a label is a key of a table or stands among others in a list, outside its own row:
     who needs some takes them from the table."""
-    root = Path(blinkgl.__file__).parent
     names = {*LABELS, "normals", "occlusion"} - {"images", "depth", "velocity"}  # words of other things, too
     found = {}
-    for path in root.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for path, nodes in parsed("blinkgl", words=tuple(names)):
+        for node in nodes:
             here = {
                 ast.Dict: lambda n: n.keys,
                 ast.Tuple: lambda n: n.elts,
@@ -672,7 +671,7 @@ def test_nothing_else_lists_labels():
                 n.value for n in here if isinstance(n, ast.Constant) and isinstance(n.value, str) and n.value in names
             }
             if said:
-                found.setdefault(path.relative_to(root).as_posix(), set()).update(said)
+                found.setdefault(path.removeprefix("blinkgl/"), set()).update(said)
     elsewhere = {path: said for path, said in found.items() if not path.startswith("labels/")}
     assert elsewhere.pop("dataset/frames.py", elsewhere.pop("sequence/recorded.py", None)) == {
         "flow_forward",

@@ -7,7 +7,9 @@ names them. Each is fitted on its first half in time and judged on its second.
 
 --leave-one-out: each recording beside a sensor made of what was fitted to the others, a distribution over units: the
 rate of its middle and of units drawn from it, and how well the judge of `compare --judge` tells default, that sensor's
-middle and the recording's own fit from the recording.
+middle and the recording's own fit from the recording. What is added to the light before the logarithm is not fitted
+there: it is of the frames (their black level, exposure and gain) and not of the pixels, and thresholds that are fitted
+beside it trade with it, so that those of two recordings would not be of the same thing.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from blinkgl.config.draw import draw, middle
 from blinkgl.events.types import Events
 from blinkgl.io.frames import open_frames, read_any_image
 from blinkgl.recordings.calibration import Calibration, calibrate_events
-from blinkgl.recordings.clip import read_recording, timed_frames
+from blinkgl.recordings.clip import LOG_OFFSET, read_recording, timed_frames
 from blinkgl.recordings.judge import judge, judge_halves
 from blinkgl.recordings.simulation import emulator_config
 
@@ -48,7 +50,7 @@ def cuke_davis346(folder: Path) -> Recording:
 
 def evbench_davis240(folder: Path) -> Recording:
     """DAVIS240b that turns in an office. Rows from below and polarity the other way round in the file; frames without
-    times, 51.5 ms apart; two stuck pixels."""
+    times, as far apart as the bursts that they make in the events (50.96 ms); two stuck pixels."""
     from scipy.io import loadmat
 
     stored = loadmat(folder / "evbench_davis240" / "seq_0001_e.mat")
@@ -62,7 +64,7 @@ def evbench_davis240(folder: Path) -> Recording:
     )
     files = sorted((folder / "evbench_davis240" / "frames").glob("*.png"))
     frames = [
-        (np.ascontiguousarray(read_any_image(file)[:, :190]), 44_000_000 + 51_500_000 * k, file.name)
+        (np.ascontiguousarray(read_any_image(file)[:, :190]), 44_000_000 + 50_960_000 * k, file.name)
         for k, file in enumerate(files)
     ]
     return events, (180, 190), frames, False
@@ -98,13 +100,18 @@ def rows(folder: Path, only: str = "", starts: int = 3) -> Iterator[str]:
             yield f"<!-- {told}; not told: {', '.join(found.untold) or 'none'}; {found.notes[0]} -->"
 
 
+OFFSETS = {"esim": {"log_eps": LOG_OFFSET / 255}, "v2e": {"full_scale": 255.0}, "voltmeter": {"k2": LOG_OFFSET}}
+"""Of an emulator: the keys that are of the frames."""
+
+
 def units_of(configs: list[dict[str, Any]], keys: Iterable[str]) -> dict[str, Any]:
     """Keys of `events:` as a sensor file says them, of what was fitted to ``configs``: log-uniform where they differ.
 
     Of n values from a uniform law of width w the range is w (n - 1)/(n + 1) in the mean: so much wider than what was
     seen, on both sides, is the law that is taken."""
+    configs = [with_ratio(config) for config in configs]
     found: dict[str, Any] = {}
-    for key in keys:
+    for key in ("threshold_ratio" if key == "contrast_threshold_off" else key for key in keys):
         logs = np.log([c[key] for c in configs if c[key]])
         if not logs.size:
             continue
@@ -115,13 +122,22 @@ def units_of(configs: list[dict[str, Any]], keys: Iterable[str]) -> dict[str, An
     return found
 
 
+def with_ratio(config: dict[str, Any]) -> dict[str, Any]:
+    """The OFF threshold as its ratio to ON's: both are of one bias, and differ less between units than either does."""
+    if "contrast_threshold_off" not in config:
+        return config
+    off = config["contrast_threshold_off"] or config["contrast_threshold"]
+    return {**config, "contrast_threshold_off": None, "threshold_ratio": off / config["contrast_threshold"]}
+
+
 def left_out(folder: Path, emulator: str, starts: int = 3, units: int = 20) -> Iterator[str]:
     """Lines of a Markdown table, one for each recording."""
     found: dict[str, Calibration] = {}
     for name, read in RECORDINGS.items():
         events, size, frames, exposures = read(folder)
+        begin, fixed = {"emulator": emulator, **OFFSETS[emulator]}, OFFSETS[emulator]
         found[name] = calibrate_events(
-            events, size, frames, name=name, exposures=exposures, emulator=emulator, starts=starts
+            events, size, frames, name=name, exposures=exposures, emulator=begin, fixed=fixed, starts=starts
         )
     yield (
         "| recording | rate, middle | 90 % of units | judge: halves | default | others' sensor | own fit | "
@@ -131,7 +147,8 @@ def left_out(folder: Path, emulator: str, starts: int = 3, units: int = 20) -> I
     for name, own in found.items():
         clip, base = own.clip, own.before
         law = units_of([o.config.model_dump() for n, o in found.items() if n != name], base.fitted)
-        config = lambda keys, base=base: emulator_config({**base.model_dump(), **keys})
+        unset = with_ratio(base.model_dump())
+        config = lambda keys, unset=unset: emulator_config({**unset, **keys})
         recorded = len(clip.events)
         ratio = lambda keys: len(clip.simulate(config(keys), 1)) / recorded
         rates = np.sort([ratio(draw(law, unit, 0)) for unit in range(units)])
@@ -145,7 +162,7 @@ def left_out(folder: Path, emulator: str, starts: int = 3, units: int = 20) -> I
         yield (
             f"| {name} | {ratio(middle(law)):.3f} | {low:.2f}-{high:.2f} "
             f"| {judge_halves(clip.events, clip.size, span).auc:.3f} | {area({}):.3f} | {area(middle(law)):.3f} "
-            f"| {area(own.config.model_dump()):.3f} | {values} |"
+            f"| {area(with_ratio(own.config.model_dump())):.3f} | {values} |"
         )
         yield (
             f"<!-- {name}: own fit "

@@ -15,12 +15,14 @@ from argparse import Namespace
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
+from functools import lru_cache
 from importlib import resources
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from blinkgl.card import CardEsim, Voxels
+from blinkgl.card import Atlas, CardEsim, Voxels
+from blinkgl.card.reductions import OfTextures
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, RunTemplate, load_run
 from blinkgl.dataset.generate import generate_run
@@ -30,6 +32,7 @@ from blinkgl.gl import GLContext, create_context, egl_devices
 from blinkgl.labels import LABELS, LabelRequest
 from blinkgl.machine import doctor
 from blinkgl.render.renderer import Renderer
+from blinkgl.timeline.reductions import OfArrays
 from blinkgl.tools import bench_accuracy
 from blinkgl.tools.bench_generate import probe_scene
 
@@ -247,12 +250,15 @@ class Passes(Piece):
     @staticmethod
     def others() -> dict[str, Callable[[Renderer, int], Any]]:
         drawn = LabelRequest(*(name for name in ("flow_forward", "depth", "ids") if name in LABELS))
+        ranks = lru_cache(1)(lambda renderer: OfTextures(renderer.gl))
         return {
             "luminance and rate": lambda r, t: r.luminance(t, rate=True),
             "colour": lambda r, t: r.colour(t, "none"),
             "brightness, every 8th": lambda r, t: r.brightness(t, 8),
             "velocity": lambda r, t: r.velocity(t),
             "velocity, every 8th": lambda r, t: r.velocity_of_movers(t, 8),
+            "velocity, every 8th, its percentile there": lambda r, t: ranks(r).speeds(r.velocity_of_movers(t, 8), 95.0),
+            "velocity, every 8th, NumPy's percentile": lambda r, t: OfArrays().speeds(r.velocity_of_movers(t, 8), 95.0),
             "labels: flow, depth, ids": lambda r, t: r.labels(t, drawn, t + SECOND // 100),
         }
 
@@ -324,17 +330,23 @@ def pipeline(
 ) -> tuple[Callable[[], int], Callable[[], None]]:
     """(frame of ``count`` sequences drawn in turn and made events of, the end): the function returns the events.
 
-    how : "voxels", all stays on the card; "events", they are read back; "numba", frames are read back."""
-    parts = []
+    how : "voxels", all stays on the card; "events", they are read back; "batch", read back, the sequences being tiles
+    of one kernel; "numba", frames are read back."""
+    parts, atlas = [], Atlas(gl, height, width, count) if how == "batch" else None
     for k in range(count):
         renderer = Renderer(gl, probe_scene("tri/16", width, height), RenderConfig())
-        emulator: Any = Esim(height, width) if how == "numba" else CardEsim(height, width, gl=gl)
+        emulator: Any
+        if atlas is not None:
+            emulator = atlas.esim(EsimConfig())
+        else:
+            emulator = Esim(height, width) if how == "numba" else CardEsim(height, width, gl=gl)
         parts.append(
             (renderer, emulator, Voxels(emulator) if how == "voxels" else None, itertools.count(k * 1_000_000))
         )
         if how == "voxels":
             parts[-1][2].begin(0, 1_000_000_000)
     ends: list[Callable[[], None]] = [part.release for row in parts for part in reversed(row[:3]) if part is not None]
+    ends += [] if atlas is None else [atlas.release]
 
     def frame() -> int:
         events = 0
@@ -377,30 +389,31 @@ def paced(gl: GLContext, count: int, size: tuple[int, int], how: str, span_s: fl
     }
 
 
-def paced_here(size: tuple[int, int], span_s: float, backend: str, device: int) -> dict[str, float]:
+def paced_here(size: tuple[int, int], how: str, span_s: float, backend: str, device: int) -> dict[str, float]:
     """:func:`paced` of one sequence in a process with a context of its own."""
     with create_context(backend, device) as gl:
-        return paced(gl, 1, size, "voxels", span_s)
+        return paced(gl, 1, size, how, span_s)
 
 
 class Batches(Piece):
-    title = "several small sequences: in one context in turn, and in processes with a context each"
+    title = "several small sequences: as a batch or in turn in one context, and in processes with a context each"
 
     @classmethod
     def run(cls, rows: Rows, options: Namespace) -> None:
         small = dict(list(sizes(options).items())[: 1 if options.small else 2])
         counts = (1, 2) if options.small else (1, 2, 4, 8, 16)
         with context(options) as gl:
-            for (name, size), count in itertools.product(small.items(), counts):
-                if (key := f"{name}, {count} in one context") not in rows:
-                    rows.add(key, **paced(gl, count, size, "voxels", seconds(options)))
+            for (name, size), count, how in itertools.product(small.items(), counts, ("batch", "events", "voxels")):
+                in_turn = "as a batch" if how == "batch" else f"in turn, {how}"
+                if (key := f"{name}, {count} in one context {in_turn}") not in rows:
+                    rows.add(key, **paced(gl, count, size, how, seconds(options)))
         spawn = multiprocessing.get_context("spawn")
-        for (name, size), count in itertools.product(small.items(), counts):
-            key = f"{name}, {count} processes"
+        for (name, size), count, how in itertools.product(small.items(), counts, ("events", "voxels")):
+            key = f"{name}, {count} processes, {how}"
             if key in rows:
                 continue
             with spawn.Pool(count) as pool:
-                arguments = (size, 4 * seconds(options), options.backend, options.device)
+                arguments = (size, how, 4 * seconds(options), options.backend, options.device)
                 found = pool.starmap(paced_here, [arguments] * count, chunksize=1)
             mean = {k: float(np.mean([one[k] for one in found])) for k in found[0]}
             rows.add(key, **{k: v * (count if k.endswith("_per_s") else 1) for k, v in mean.items()})

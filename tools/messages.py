@@ -27,12 +27,12 @@ HEAD = """\
 """
 
 
-def error_classes(trees: dict[str, ast.Module]) -> set[str]:
-    """Names of BlinkGLError and everything that inherits from it, however far."""
+def error_classes(nodes: dict[str, list[ast.AST]]) -> set[str]:
+    """Names of BlinkGLError and everything that inherits from it, however far. ``nodes``: of every file's tree."""
     parents = {
         node.name: {base.id for base in node.bases if isinstance(base, ast.Name)}
-        for tree in trees.values()
-        for node in ast.walk(tree)
+        for tree in nodes.values()
+        for node in tree
         if isinstance(node, ast.ClassDef)
     }
     found = {"BlinkGLError"}
@@ -87,39 +87,44 @@ def _sentence(call: ast.Call, problem: ast.expr | None) -> str:
     return " ".join(line.split())
 
 
-def _functions(tree: ast.Module) -> Iterator[tuple[ast.FunctionDef, list[str]]]:
-    for node in ast.walk(tree):
+def _functions(nodes: list[ast.AST]) -> Iterator[tuple[ast.FunctionDef | ast.AsyncFunctionDef, list[str]]]:
+    for node in nodes:
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
             yield node, [a.arg for a in (*node.args.posonlyargs, *node.args.args)]
+
+
+def _passed_on(node: ast.AST, classes: set[str]) -> str | None:
+    """The name of what an error is given for its sentence, where it is a name alone."""
+    if isinstance(node, ast.Call) and _called(node) in classes and node.args and isinstance(node.args[0], ast.Name):
+        return node.args[0].id
+    return None
 
 
 @cache
 def sentences() -> dict[str, list[str]]:
     """Module -> its sentences, each once, in the order of the source."""
-    trees = {
-        p.relative_to(ROOT).as_posix(): ast.parse(p.read_text())
+    nodes = {
+        p.relative_to(ROOT).as_posix(): list(ast.walk(ast.parse(p.read_text())))
         for package in PACKAGES
         for p in sorted((ROOT / package).rglob("*.py"))
     }
-    classes = error_classes(trees)
+    classes = error_classes(nodes)
     # Helpers that are given their sentence: name -> which argument it is.
     helpers: dict[str, tuple[int, str]] = {}
-    for tree in trees.values():
+    for tree in nodes.values():
+        given = {name for node in tree if (name := _passed_on(node, classes))}
         for function, parameters in _functions(tree):
+            if given.isdisjoint(parameters):
+                continue
             for node in ast.walk(function):
-                if (
-                    isinstance(node, ast.Call)
-                    and _called(node) in classes
-                    and node.args
-                    and isinstance(node.args[0], ast.Name)
-                    and node.args[0].id in parameters
-                ):
+                name = _passed_on(node, classes)
+                if name in parameters:
                     skip = 1 if parameters[0] in ("self", "cls") else 0
-                    helpers[function.name] = (parameters.index(node.args[0].id) - skip, node.args[0].id)
+                    helpers[function.name] = (parameters.index(name) - skip, name)
     found: dict[str, list[str]] = {}
-    for path, tree in trees.items():
+    for path, tree in nodes.items():
         lines: list[tuple[int, str]] = []
-        for node in ast.walk(tree):
+        for node in tree:
             if isinstance(node, ast.Call):
                 name = _called(node)
                 if (

@@ -199,9 +199,30 @@ class Mutant:
 class _Finder(ast.NodeVisitor):
     def __init__(self, path: str, source: str):
         self.path, self.source, self.found, self.compiled = path, source, [], False
+        self.statement: ast.stmt | None = None
         self.starts = [0]
         for line in source.splitlines(keepends=True):
             self.starts.append(self.starts[-1] + len(line))
+
+    def visit(self, node):
+        """Of a statement, it is the part of the source that has to parse with an edit inside it."""
+        outer = self.statement
+        if isinstance(node, ast.stmt):
+            self.statement = node
+        super().visit(node)
+        self.statement = outer
+
+    def parses(self, start: int, end: int, after: str) -> bool:
+        """Whether the innermost statement round an edit still is one."""
+        node = self.statement
+        first = self.starts[min([node.lineno, *(d.lineno for d in getattr(node, "decorator_list", ()))]) - 1]
+        text = self.source[first:start] + after + self.source[end : self.span(node)[1]]
+        text = re.sub(r"\A(\s*)elif\b", r"\1if", text)  # a statement of its own in the tree
+        try:
+            ast.parse(f"if True:\n{text}" if text[0] in " \t" else text)
+        except SyntaxError:
+            return False
+        return True
 
     def offset(self, line: int, byte_column: int) -> int:
         text = self.source[self.starts[line - 1] : self.starts[line]]
@@ -215,19 +236,8 @@ class _Finder(ast.NodeVisitor):
         mutant = Mutant(
             self.path, line, start - self.starts[line - 1] + 1, self.source[start:end], after, operator, self.compiled
         )
-        first, last = self.statement
-        try:
-            ast.parse(self.source[first:start] + after + self.source[end:last])
-        except SyntaxError:
-            return
-        if mutant.before != mutant.after:
+        if mutant.before != mutant.after and self.parses(start, end, after):
             self.found.append(mutant)
-
-    def visit_Module(self, node) -> None:
-        for statement in node.body:
-            first = min([statement.lineno, *(d.lineno for d in getattr(statement, "decorator_list", ()))])
-            self.statement = self.starts[first - 1], self.span(statement)[1]  # the part of the source that has to parse
-            self.visit(statement)
 
     def between(self, left, right, symbol: str, operator: str) -> None:
         """The operator's symbol between two operands, brackets and comments left alone."""

@@ -5,7 +5,8 @@ Out:   an ``Emulator`` whose state lies on the card; tensors of events that stay
 Start: esim.py; the kernels are shaders/compute/events_*.glsl.
 """
 
+from blinkgl.card.atlas import Atlas
 from blinkgl.card.esim import CardEsim
 from blinkgl.card.sinks import Counts, Latest, Voxels
 
-__all__ = ["CardEsim", "Counts", "Latest", "Voxels"]
+__all__ = ["Atlas", "CardEsim", "Counts", "Latest", "Voxels"]

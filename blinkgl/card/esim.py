@@ -28,19 +28,17 @@ from blinkgl.card.kernels import (
     CUT,
     EVENTS,
     HEAD_BYTES,
-    PIXELS_AT,
-    PIXELS_PER_GROUP,
     UNUSABLE,
-    WORD,
     Kernels,
     SortRoom,
     refuse_without_compute,
 )
 from blinkgl.card.late import Slot, maps_persistently
-from blinkgl.card.memory import refuse_if_out_of_memory, refuse_too_large
 from blinkgl.card.proof import rounds_like_ieee
+from blinkgl.card.room import Room
+from blinkgl.card.stages import Stages, is_long
 from blinkgl.config.events import EsimConfig
-from blinkgl.errors import EventDataError, GLError
+from blinkgl.errors import EventDataError
 from blinkgl.events.arith import Q_ONE, log_q25
 from blinkgl.events.emulator import BLOCK, INTENSITY_LIMIT_BITS
 from blinkgl.events.esim import Esim
@@ -50,7 +48,6 @@ from blinkgl.events.types import Events
 if TYPE_CHECKING:
     from blinkgl.gl import GLContext
 
-_FAR = 2**30  # a level that no logarithm reaches: of the pixels that fill up the last block
 _LARGEST_STEP = 22.0
 """Thresholds beyond that, ln units, do not fit into 32 bits with a logarithm; normal numbers stay below 8.6."""
 
@@ -94,16 +91,21 @@ class CardEsim(Esim):
         self.gl, self._owns_gl = gl, owns_gl
         gl.resume()
         self._kernels = Kernels(gl, not rounds_like_ieee(gl) if soft_float is None else soft_float)
-        self._room = _Room(gl, self.height, self.width, self._on.size > 0, self._has_more)
-        self._defines = {
-            name: 1
-            for name, there in (
-                ("SPREAD", self._on.size),
-                ("JITTER", self._fired.size),
-                ("REFRACTORY", self._last_ns.size),
-            )
-            if there
-        }
+        self._room: Any = Room(
+            gl,
+            self.height * self.width,
+            f"{width}x{height} pixels",
+            (width, height),
+            spread=self._on.size > 0,
+            more=self._has_more,
+        )
+        self._stages = Stages(
+            self._kernels,
+            self._room,
+            spread=bool(self._on.size),
+            jitter=bool(self._fired.size),
+            refractory=bool(self._last_ns.size),
+        )
         if self._on.size:
             self._room.put("thresholds", np.stack([self._on, self._off], axis=1))
         self._before_is_log, self._stays = False, False
@@ -233,7 +235,7 @@ class CardEsim(Esim):
         else:
             room.put("now", self._intensity(frame))
         was_log, self._before_is_log = self._before_is_log, False
-        self._fire(interval, was_log, {"CHECKED": 1} if drawn_here else {})
+        self._stages.fire(self._values(interval, was_log), checked=drawn_here, long=is_long(interval))
         flight = _Flight(*interval, was_log, room["packed"])
         if self._late and not self._stays:
             self._send(flight)
@@ -272,7 +274,8 @@ class CardEsim(Esim):
         self._made = count, flight.start_ns // 1000
         if count > self._room.capacity:
             self._room.grow(count)
-            self._emit((flight.start_ns, flight.end_ns), flight.was_log)
+            interval = flight.start_ns, flight.end_ns
+            self._stages.emit(self._values(interval, flight.was_log), long=is_long(interval))
         return count
 
     def _where_they_are(self, start_ns: int, end_ns: int) -> moderngl.Buffer:
@@ -345,73 +348,22 @@ class CardEsim(Esim):
         return self._buffer.to_events(np.array([len(packed)]), base_us, span_us, 1, self.causes)
 
     # -- kernels --------------------------------------------------------------------------------------------
-    def _fire(self, interval: tuple[int, int], was_log: bool, checked: dict[str, int]) -> None:
-        """Marks, lists, fires, and emits as far as there is room.
-
-        interval : its times, ns.   was_log : what was before are logarithms, not intensities.
-        checked : macro that looks for values that cannot be used: then nothing fires, and the head says so."""
-        room, kernels, values = self._room, self._kernels, self._values(interval, was_log)
-        kernels.run(
-            "compute/events_mark.glsl",
-            checked,
-            {0: room["now"], 1: room["levels"], 2: room["marks"], 3: room["listed"]},
-            values,
-            items=room.words,
-        )
-        kernels.prefix_of_bits(room["listed"], room["marks"], room["sums"], room["places"], room.words)
-        kernels.run(
-            "compute/events_list.glsl",
-            {},
-            {0: room["marks"], 1: room["places"], 2: room["sums"], 3: room["listed"]},
-            values,
-            items=room.words,
-        )
-        buffers = {
-            4: room["now"],
-            5: room["before"],
-            6: room["levels"],
-            **({7: room["more"]} if self._has_more else {}),
-        }
-        self._run_fire({}, buffers, interval, values)
-        self._emit(interval, was_log)
-
-    def _emit(self, interval: tuple[int, int], was_log: bool) -> None:
-        """The events, from the records, with what the head says of them."""
-        room = self._room
-        self._kernels.prefix_of_counts(room["listed"], room["counts"], room["sums"], room["places"], room.capacity)
-        buffers = {4: room["places"], 5: room["packed"]}
-        self._run_fire({"EMIT": 1}, buffers, interval, self._values(interval, was_log))
-
-    def _run_fire(
-        self,
-        defines: dict[str, int],
-        buffers: dict[int, moderngl.Buffer],
-        interval: tuple[int, int],
-        values: dict[str, Any],
-    ) -> None:
-        room = self._room
-        common = {0: room["listed"], 1: room["records"], 2: room["counts"]}
-        if self._on.size:
-            common[3] = room["thresholds"]
-        long = {"LONG": 1} if interval[1] - interval[0] >= 2**31 else {}
-        self._kernels.run(
-            "compute/events_fire.glsl",
-            {**self._defines, **long, **defines},
-            {**common, **buffers},
-            values,
-            indirect=(room["listed"], PIXELS_AT),
-        )
-
     def _values(self, interval: tuple[int, int], was_log: bool) -> dict[str, Any]:
-        start_ns, end_ns = interval
-        jitter = np.float64(self.config.threshold_jitter * Q_ONE)
         return {
             "words": self._room.words,
             "limit": int(INTENSITY_LIMIT_BITS),
-            "eps": float(np.float32(self.config.log_eps)),
-            "share": max(BLOCK, self.config.max_events_per_step // self._blocks),
             "before_is_log": was_log,
             "width": self.width,
+            **self._own_values(interval),
+        }
+
+    def _own_values(self, interval: tuple[int, int]) -> dict[str, Any]:
+        """What sequences of one size do not share, as shaders/include/tiles.glsl names it."""
+        start_ns, end_ns = interval
+        jitter = np.float64(self.config.threshold_jitter * Q_ONE)
+        return {
+            "eps": float(np.float32(self.config.log_eps)),
+            "share": max(BLOCK, self.config.max_events_per_step // self._blocks),
             "steps": (self._on_all, self._off_all),
             "start_ns": start_ns % 1000,
             "dt_ns": words(end_ns - start_ns),
@@ -420,7 +372,6 @@ class CardEsim(Esim):
             "floors": (self._floor_on, self._floor_off),
             "jitter": words(int(jitter.view(np.uint64))),
             "seed": words(int(self.seed)),
-            "capacity": self._room.capacity,
         }
 
     # -- state ----------------------------------------------------------------------------------------------
@@ -467,8 +418,8 @@ class CardEsim(Esim):
 
 
 class _Flight(NamedTuple):
-    """Events of one interval, ns, that are made.   was_log : see :meth:`CardEsim._fire`.   packed : where they are.
-    slot, expected : where they will be, and how many of them."""
+    """Events of one interval, ns, that are made.   was_log : what was before are logarithms, not intensities.
+    packed : where they are.   slot, expected : where they will be, and how many of them."""
 
     start_ns: int
     end_ns: int
@@ -476,70 +427,3 @@ class _Flight(NamedTuple):
     packed: moderngl.Buffer
     slot: Slot | None = None
     expected: int = 0
-
-
-class _Room:
-    """The buffers of one emulator. words : of 32 pixels, whole blocks.   capacity : events that `packed` holds."""
-
-    def __init__(self, gl: GLContext, height: int, width: int, spread: bool, more: bool):
-        self._gl, self._pixels = gl, height * width
-        padded = -(-self._pixels // BLOCK) * BLOCK
-        self.words, self.capacity = padded // WORD, max(BLOCK, padded // 4)
-        record = 32 if more else 16
-        sizes = {
-            "now": 4 * padded,
-            "before": 4 * padded,
-            "levels": 8 * padded,
-            "marks": 4 * self.words,
-            "listed": HEAD_BYTES + 8 * padded,
-            "records": record * padded,
-            "counts": 4 * (padded + PIXELS_PER_GROUP),
-            "places": 4 * (padded + PIXELS_PER_GROUP),
-            "sums": 4 * (self.words + PIXELS_PER_GROUP),
-            "packed": 8 * self.capacity,
-            **({"thresholds": 8 * padded} if spread else {}),
-            **({"more": 16 * padded} if more else {}),
-        }
-        what = f"{width}x{height} pixels"
-        refuse_too_large(gl, sizes, what, (width, height))
-        self._buffers = {name: gl.ctx.buffer(reserve=size) for name, size in sizes.items()}
-        try:
-            refuse_if_out_of_memory(gl, what)
-        except GLError:
-            self.release()
-            raise
-        self._buffers["levels"].write(np.tile(np.array([_FAR, -_FAR], np.int32), padded).tobytes())
-        self.clear_head()
-        for name in ("now", "before"):
-            self._buffers[name].write(np.ones(padded, np.float32).tobytes())
-
-    def __getitem__(self, name: str) -> moderngl.Buffer:
-        return self._buffers[name]
-
-    def turn(self) -> None:
-        """What is now becomes what was before; `now` is to be written."""
-        both = self._buffers
-        both["now"], both["before"] = both["before"], both["now"]
-
-    def clear_head(self) -> None:
-        self._buffers["listed"].write(bytes(HEAD_BYTES))
-
-    def put(self, name: str, array: np.ndarray) -> None:
-        self._buffers[name].write(np.ascontiguousarray(array))
-
-    def get(self, name: str, dtype: type) -> np.ndarray:
-        """Of all pixels, flat."""
-        padded = self.words * WORD
-        size = self._buffers[name].size // padded * self._pixels
-        return np.frombuffer(self._buffers[name].read(size), dtype)
-
-    def grow(self, count: int) -> None:
-        """Room for so many events, and a quarter more."""
-        capacity = count + count // 4
-        refuse_too_large(self._gl, {"packed": 8 * capacity}, f"{count} events in one step")
-        self._buffers["packed"].release()
-        self._buffers["packed"], self.capacity = self._gl.ctx.buffer(reserve=8 * capacity), capacity
-
-    def release(self) -> None:
-        for buffer in self._buffers.values():
-            buffer.release()

@@ -97,12 +97,14 @@ class Config(BaseModel):
     """Frozen; unknown keys, NaN and infinity are refused. Numbers written as strings ("1e-4") are converted,
     because YAML 1.1 reads ``1e-4`` as a string.
 
-    presets : values that the key ``preset`` of a model gives to those of its other keys that are not given."""
+    presets : values that the key ``preset`` of a model gives to those of its other keys that are not given.
+    instead : keys that are given in the place of another, which then is null where it is not given itself."""
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True, ignored_types=(Rule,)
     )
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
+    instead: ClassVar[Mapping[str, str]] = {}
     rules: ClassVar[tuple[Rule, ...]] = ()
 
     @classmethod
@@ -133,8 +135,12 @@ class Config(BaseModel):
     def _fill_preset(cls, data: Any) -> Any:
         if cls.presets and isinstance(data, dict):
             name = data.get("preset", cls.model_fields["preset"].default)
-            data = {**(cls.presets.get(name, {}) if isinstance(name, str) else {}), **data}
+            data = {**(cls.presets.get(name, {}) if isinstance(name, str) else {}), **cls._left_out(data), **data}
         return cls.completed(data) if isinstance(data, dict) else data
+
+    @classmethod
+    def _left_out(cls, data: dict[str, Any]) -> dict[str, None]:
+        return {other: None for key, other in cls.instead.items() if data.get(key) is not None}
 
     @classmethod
     def completed(cls, data: dict[str, Any]) -> dict[str, Any]:

@@ -94,6 +94,8 @@ class EmulatorConfig(Family):
     """Paths between frames that the emulator can follow; "linear" is one of them."""
     fitted: ClassVar[Mapping[str, Fitted]] = MappingProxyType({})
     """Keys that `blinkgl calibrate` finds from a recording."""
+    one_threshold: ClassVar[bool] = False
+    """Nothing of it says how many events are ON and how many OFF: a calibration then asks for both together."""
 
     @classmethod
     @abstractmethod
@@ -287,6 +289,13 @@ class V2eConfig(_TwoThresholds, EmulatorConfig):
         description="Photoreceptor cut-off at full scale, Hz (v2e: 300), scaled by "
         "(I + 20)/275; 0: infinite bandwidth.",
     )
+    second_cutoff_hz: float = Field(
+        0.0,
+        ge=0,
+        le=1e7,
+        description="Corner of a second low-pass, Hz, the same at any light (a pixel's source follower, set by its "
+        "bias): the response falls by 40 dB a decade beyond both. Needs cutoff_hz > 0; 0: none.",
+    )
     leak_rate_hz: float = Field(0.01, ge=0, le=1e4, description="Leak events per second and pixel, ON (v2e: 0.01).")
     leak_jitter: float = Field(
         0.1,
@@ -327,6 +336,11 @@ class V2eConfig(_TwoThresholds, EmulatorConfig):
     max_events_per_step: int = _MAX_EVENTS
     causes: bool = _CAUSES
 
+    @rule("second_cutoff_hz", "cutoff_hz")
+    def _a_second_needs_a_first(second_cutoff_hz, cutoff_hz):
+        if second_cutoff_hz and cutoff_hz == 0:
+            raise Refused("a second low-pass needs a first: cutoff_hz > 0 and not infinite bandwidth")
+
     @rule("photoreceptor_noise", "cutoff_hz")
     def _noise_needs_bandwidth(noise, cutoff_hz):
         if noise and cutoff_hz == 0:
@@ -355,6 +369,7 @@ class VoltmeterConfig(EmulatorConfig):
     reconstructions = ("linear",)
     presets = VOLTMETER_PRESETS
     fitted = _VOLTMETER_FITTED
+    one_threshold = True
     emulator: Literal["voltmeter"] = "voltmeter"
     preset: Literal["DVS346", "DVS240"] = Field(
         "DVS346", description="Camera whose calibrated k1...k6 are the defaults."

@@ -77,11 +77,16 @@ class ImagesConfig(Config):
         },
     }
 
+    instead: ClassVar[dict[str, str]] = {"times": "rate"}
+
     preset: Literal["plain", "deblurring", "interpolation", "low_light", "rolling_shutter", "raw"] = Field(
         "plain", description="gives the other keys the values of a use (docs/images.md); what is said beside it wins"
     )
-    rate: float = Field(
-        30.0, gt=0, le=1e5, description="images per second, Hz, the first exposed from the sequence's start on"
+    rate: float | None = Field(
+        30.0,
+        gt=0,
+        le=1e5,
+        description="images per second, Hz, the first exposed from the sequence's start on; null beside `times`",
     )
     times: tuple[float, ...] | None = Field(
         None, min_length=1, max_length=MAX_IMAGES, description="when exposures begin instead, s on the sequence's clock"
@@ -152,11 +157,21 @@ class ImagesConfig(Config):
                 accepted=f"at most {most_db:g} (auto_exposure.max_gain_db)",
             )
 
+    @rule("rate", "times")
+    def _either(rate: float | None, times: tuple[float, ...] | None):
+        if (rate is None) == (times is None):
+            raise Refused(
+                "nothing says when images are taken" if times is None else "images are taken at a rate or at times",
+                where="rate",
+                value=rate,
+                accepted="a rate" if times is None else "null beside images.times",
+            )
+
     @rule("rate", "times", "exposure_us", "auto_exposure.longest_us")
-    def _one_at_a_time(rate: float, times: tuple[float, ...] | None, exposure: float, longest: float | None):
+    def _one_at_a_time(rate: float | None, times: tuple[float, ...] | None, exposure: float, longest: float | None):
         key = "exposure_us" if longest is None else "auto_exposure.longest_us"
         exposure = exposure if longest is None else longest
-        if times is None and exposure * rate > 1e6 * (1 + 1e-9):
+        if rate is not None and exposure * rate > 1e6 * (1 + 1e-9):
             raise Refused(
                 "an exposure lasts into the next image's",
                 where=key,
@@ -206,14 +221,14 @@ def readout_us(rows: int, row_us: float) -> float:
 def exposure_starts(images: ImagesConfig, t0_ns: int, t1_ns: int, rows: int) -> list[int]:
     """When exposures of the first row begin, ns: all whose last row's ends within [t0, t1] however long they become."""
     lasts_ns = round(NS_PER_US * (images.longest_us + readout_us(rows, images.row_us)))
-    if images.times is not None:
-        return [round(NS_PER_S * t) for t in images.times]
+    if images.rate is None:
+        return [round(NS_PER_S * t) for t in images.times or ()]
     count = int(((t1_ns - t0_ns - lasts_ns) * images.rate) / NS_PER_S + 1e-9) + 1
     return [t0_ns + round(k * NS_PER_S / images.rate) for k in range(count)]
 
 
 def check_images(
-    rate: float,
+    rate: float | None,
     times: tuple[float, ...] | None,
     lasts_us: float,
     rows_us: float,
@@ -222,7 +237,7 @@ def check_images(
 ) -> None:
     """Of a sequence from ``start`` on, s, that lasts so many: raises Refused, where ``images:`` stands."""
     whole_us = lasts_us + rows_us
-    if times is None:
+    if rate is not None:
         if rows_us * rate > 1e6 * (1 + 1e-9):
             raise Refused(
                 "the rows are not read before the next image begins",

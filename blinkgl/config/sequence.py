@@ -370,7 +370,7 @@ class SequenceConfig(Config):
     def _exposures_fit(
         rate: float | None,
         times: tuple[float, ...] | None,
-        exposure: float,
+        exposure: float | None,
         longest: float | None,
         row_us: float,
         height: int,
@@ -378,7 +378,7 @@ class SequenceConfig(Config):
         label_rate: float,
         start: float,
     ):
-        if rate is not None:
+        if exposure is not None:
             lasts = exposure if longest is None else longest
             count = int(duration * label_rate + 1e-9) + 1
             check_images(rate, times, lasts, readout_us(height, row_us), start, count / label_rate)

@@ -27,6 +27,7 @@ from blinkgl.events.types import Events
 if TYPE_CHECKING:
     import moderngl
 
+    from blinkgl.events.emulator import Emulator
     from blinkgl.gl import GLContext
 
 _NOTHING = nullcontext()
@@ -56,6 +57,7 @@ class EventCamera:
     reconstruction : the path between frames, see :class:`Emulator`.   emulator : the :class:`Emulator` itself.
     truth : says what made each event, of frames that come with their ``surfaces``; None: nobody asks.
     gl : context that draws the frames, on whose card the emulator may be; None: none.
+    made : the emulator, made already of that configuration, such as a tile of a batch.
     Raises EventDataError: size, or a path that the emulator cannot follow."""
 
     def __init__(
@@ -68,9 +70,10 @@ class EventCamera:
         reconstruction: str = "linear",
         truth: SurfaceTruth | None = None,
         gl: GLContext | None = None,
+        made: Emulator | None = None,
     ):
         self._truth = truth
-        self.emulator = make_emulator(config, height, width, seed, reconstruction, gl)
+        self.emulator = made or make_emulator(config, height, width, seed, reconstruction, gl)
         self._pixels, self._latency, self._readout, self._filters = None, None, None, ()
         self._luminance: np.ndarray | None = None
         if readout is not None:

@@ -210,9 +210,10 @@ class ReferenceV2e:
 
     def step(self, luminance: np.ndarray, t_ns: int) -> Events:
         intensity = (as_luminance(luminance) * np.float32(self.config.full_scale)).ravel()
-        x = v2e.lin_log(intensity)
+        x = before_second = v2e.lin_log(intensity)
         rows = []
         if self.t_ns is None:
+            self.second_lag = np.zeros(self.pixels, np.float32)
             self.t_ns = self.epoch = t_ns
             self.hum = np.zeros(0, np.float32)
             if self.hums:
@@ -236,6 +237,11 @@ class ReferenceV2e:
         else:
             kappa = 2 * np.pi * self.config.cutoff_hz * (t_ns - self.t_ns) * 1e-9 / 275.0
             lag = self.lag
+            if self.config.second_cutoff_hz:
+                k = np.float32(2 * np.pi * self.config.second_cutoff_hz * (t_ns - self.t_ns) * 1e-9)
+                keep, ramp = (np.float32(part) for part in v2e.decay(k))
+                self.second_lag = self.second_lag * keep - (x - self.before_second) * ramp
+                x = x + self.second_lag
             if self.config.cutoff_hz:
                 lag = v2e.relax(self.lag, self.x, x, self.intensity, intensity, np.float32(kappa))
             noise, hum = self.noise(intensity, t_ns), np.zeros(self.pixels, np.float32)
@@ -245,7 +251,7 @@ class ReferenceV2e:
                 rows += self.pixel(i, x, lag, intensity, kappa, t_ns, noise[i], hum[i])
             self.hum = hum
         self.frame = getattr(self, "frame", 0) + 1
-        self.x, self.intensity, self.lag, self.t_ns = x, intensity, lag, t_ns
+        self.x, self.before_second, self.intensity, self.lag, self.t_ns = x, before_second, intensity, lag, t_ns
         if t_ns - self.epoch >= self.rebase_ns:
             gone = self.leak * np.float32((t_ns - self.epoch) * 1e-9)
             self.upper, self.lower, self.epoch = self.upper - gone, self.lower - gone, t_ns

@@ -6,6 +6,9 @@ continuous time, so that nothing but the accuracy of the interpolation depends o
 * The photoreceptor follows the lin-log intensity x, linear in time between frames, through a first-order low-pass
   with k = 2 pi f_c dt (I + 20)/275 time constants per interval. With the lag D = y - x the exact solution over an
   interval is D' = D e^-k - dx (1 - e^-k)/k: stable for every k, second order in the frame spacing.
+* ``second_cutoff_hz`` puts a second low-pass, of a corner that does not move with the light, before the first, which
+  then follows its output, exact at the frames, on straight lines between them. (In the pixel the buffer comes after the
+  photoreceptor; which of two low-passes comes first makes a difference while the corner of one moves, and no other.)
 * The comparator sees z = y + leak (t - epoch) and fires where z, on its exact curve, meets the level (Newton's
   method), not on frame times.
 * After any event the reference is z at the end of the dead time: with no refractory period the level just passed,
@@ -40,6 +43,7 @@ from blinkgl.events.types import Events
 from blinkgl.events.v2e_model import (
     DARKEST,
     REBASE,
+    decay,
     draw_hot,
     draw_leaks,
     draw_start,
@@ -68,7 +72,7 @@ class Pixels(NamedTuple):
     """Per-pixel arrays, flat; size 0 when the feature is off. What the photoreceptor holds is of the frame before."""
 
     intensity: np.ndarray  # float32 DN; [] when neither low-pass nor shot noise asks for it
-    x: np.ndarray  # float32 lin-log
+    x: np.ndarray  # float32 lin-log, behind the second low-pass where there is one
     lag: np.ndarray  # float32 y - x; [] without low-pass
     noise: np.ndarray  # float32 photoreceptor noise, ln units; []
     noise_sizes: np.ndarray  # see noise.noise_table, for this frame spacing; []
@@ -83,6 +87,8 @@ class Pixels(NamedTuple):
     since_ns: np.ndarray  # int64: when the reference was taken; [] unless causes are asked for
     noise_then: np.ndarray  # float32: the photoreceptor noise in it; []
     hot: np.ndarray  # uint8: whether leak is that of a hot pixel; []
+    before_second: np.ndarray  # float32 lin-log before the second low-pass; [] without one
+    second_lag: np.ndarray  # float32 x - before_second; []
 
 
 class Interval(NamedTuple):
@@ -104,6 +110,8 @@ class Interval(NamedTuple):
     shot_unit_per_ns: float  # rate of a dark pixel with nominal threshold, one polarity
     inverse_threshold: float
     bound_per_pixel: int
+    second_keep: np.float32  # of the second low-pass, see v2e_model.decay
+    second_ramp: np.float32
 
 
 @numba.njit(**JIT)
@@ -126,6 +134,15 @@ def _relax_block_gently(lag, before, now, intensity_before, intensity_now, kappa
         lag_now = relax_gently(lag[i], before[i], now[i], intensity_before[i], intensity_now[i], kappa)
         out[i] = lag_now
         z[i] = now[i] + lag_now
+
+
+@numba.njit(**JIT)
+def _second_block(lag, before, x, keep, ramp, now, lag_now):
+    """``x`` through the second low-pass; what it was into ``now``."""
+    for i in range(x.size):
+        now[i] = x[i]
+        lag_now[i] = lag[i] * keep - (x[i] - before[i]) * ramp
+        x[i] = x[i] + lag_now[i]
 
 
 @numba.njit(**JIT)
@@ -278,6 +295,8 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
     flags, scratch, active = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64), np.empty(BLOCK + 8, np.int32)
     z, intensity, x = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     lag, noise, normals = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
+    seconds = BLOCK if p.second_lag.size else 0
+    before_second, second_lag = np.empty(seconds, np.float32), np.empty(seconds, np.float32)
     keys, constants = np.empty(BLOCK, np.int64), np.empty((BLOCK, 2), np.float32)
     floats, ints = np.empty(FLOATS, np.float64), np.empty(INTS, np.int64)
     draws = np.empty(_DRAWS, np.int64), np.empty(_DRAWS), np.empty(_DRAWS)
@@ -296,6 +315,11 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
         else:
             scale_block(frame[s:e], v.scale, intensity[:n])
             _lin_log_block(intensity[:n], x[:n])
+        if p.second_lag.size:
+            _second_block(
+                p.second_lag[s:e], p.before_second[s:e], x[:n], v.second_keep, v.second_ramp,
+                before_second[:n], second_lag[:n],
+            )  # fmt: skip
         if p.lag.size:
             if v.gentle:
                 _relax_block_gently(p.lag[s:e], p.x[s:e], x[:n], p.intensity[s:e], intensity[:n], kappa, lag[:n], z[:n])
@@ -356,6 +380,9 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
         copy_block(x[:n], p.x[s:e])
         if p.lag.size:
             copy_block(lag[:n], p.lag[s:e])
+        if p.second_lag.size:
+            copy_block(before_second[:n], p.before_second[s:e])
+            copy_block(second_lag[:n], p.second_lag[s:e])
         if p.noise.size:
             copy_block(noise[:n], p.noise[s:e])
         if p.clock_ns.size:
@@ -383,8 +410,8 @@ class V2e(Emulator):
     """See the module and :class:`~blinkgl.events.emulator.Emulator`. Luminance 1.0 is ``config.full_scale`` DN.
 
     State: 12 bytes per pixel; 4 more each with the low-pass, leak, photoreceptor noise, and intensity where the first
-    or shot noise asks for it, 8 with the dead time, 12 with causes. Constants: 16 bytes per pixel, 8 more with shot
-    noise."""
+    or shot noise asks for it, 8 each with the second low-pass and the dead time, 12 with causes. Constants: 16
+    bytes per pixel, 8 more with shot noise."""
 
     Config = V2eConfig
     _state = (
@@ -402,6 +429,8 @@ class V2e(Emulator):
         "_brightest",
         "_since_ns",
         "_noise_then",
+        "_before_second",
+        "_second_lag",
     )
 
     @classmethod
@@ -438,6 +467,7 @@ class V2e(Emulator):
         self._intensity = frame(config.cutoff_hz > 0 or config.shot_noise_rate_hz > 0)
         noisy = config.photoreceptor_noise and config.shot_noise_rate_hz > 0
         self._lag, self._noise = frame(config.cutoff_hz > 0), frame(noisy)
+        self._before_second, self._second_lag = (frame(config.second_cutoff_hz > 0) for _ in range(2))
         self._noise_sizes, self._sizes_dt_ns = np.empty(0, np.float32), -1
 
         self._leak = draw_leaks(height, width, config, self._on, self.seed)
@@ -474,11 +504,14 @@ class V2e(Emulator):
         if self.config.cutoff_hz == 0:
             return None
         corner = self.config.cutoff_hz * (luminance.astype(np.float64) * self.config.full_scale + 20.0) / 275.0
-        return _TAIL / (2 * np.pi * corner)
+        second = self.config.second_cutoff_hz
+        return _TAIL / (2 * np.pi * corner) + (_TAIL / (2 * np.pi * second) if second else 0.0)
 
     def _start(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
         intensity = self._table[frame] if frame.dtype == np.uint8 else frame * self._scale
         self._x[...] = lin_log(intensity)
+        if self._before_second.size:
+            self._before_second[...] = self._x
         if self._intensity.size:
             self._intensity[...] = intensity
         reference = self._x
@@ -532,9 +565,12 @@ class V2e(Emulator):
             self._since_ns,
             self._noise_then,
             self._hot,
+            self._before_second,
+            self._second_lag,
         )
         base_us, epoch = self.t_ns // 1000, int(self._epoch_ns[0])
         kappa = 2 * np.pi * config.cutoff_hz * dt_ns * 1e-9 / 275.0
+        second_keep, second_ramp = decay(_F(2 * np.pi * config.second_cutoff_hz * dt_ns * 1e-9))
         brightest = float(self._table.max() if frame.dtype == np.uint8 else frame.max() * self._scale)
         gentle = kappa * (max(brightest, self._brightest[0]) + 20.0) < 0.499
         interval = Interval(
@@ -554,6 +590,8 @@ class V2e(Emulator):
             self._shot_unit,
             self._inverse_threshold,
             dt_ns // self._refractory_ns + 2 if self._refractory_ns else 2**31,
+            _F(second_keep),
+            _F(second_ramp),
         )
         source = (NO_FRAME, frame) if frame.dtype == np.uint8 else (frame, NO_CODES)
         events = self._run(

@@ -51,6 +51,12 @@ _MOST_STEPS = 20
 _FEW_STEPS, _PLACES = 3, 6
 _DAMPINGS = (1e-3, 0.1, 3.0)
 _FARTHEST = 1.0
+_WORTH = 0.2
+"""How much worse than the best a place may be, with derivatives from elsewhere, to be worth a descent."""
+_EACH = 3
+"""Places for a start, from which a few steps are tried."""
+_LITTLE = 0.03
+"""Part of the cost below which a step with corrected derivatives asks for new ones."""
 
 
 @dataclass(frozen=True)
@@ -266,7 +272,10 @@ def calibrate_events(
     halves = ((0, half), (half, clip.intervals))
     found = _Search(clip, base, half, seed, lambda done: say("fitting", done))
     found.untold.update(untold)
-    found.run(found.responding(keys) if start is None else keys, starts, start)
+    if start is None:
+        keys = found.responding(keys)
+        start = found.roughly(keys, starts) if keys else np.empty(0)
+    found.run(keys, start)
     say("judging", 1.0)
     recorded = [sums(clip.events, clip, *part) for part in halves]
     streams = [clip.simulate(one, seed + 1) for one in (base, found.config())]
@@ -371,6 +380,17 @@ def _of_frames(clip: Clip, exposures: bool, interpolate: str, given: float | Non
             else "taken to go in a straight line: what moved further than a pixel is wrong there."
         ),
     ]
+    if "bursts" in facts:
+        notes.append(
+            f"{100 * facts['in_bursts']:.0f} % of the events come in {facts['bursts']:.0f} bursts of one polarity, all "
+            "over the sensor, at the frames' interval: the camera's frames set them off, not light. Intervals that "
+            "begin or end there are not compared."
+        )
+    if "other_exposure" in facts:
+        notes.append(
+            f"{facts['other_exposure']} intervals between frames were left out: there, or beyond, the picture as a "
+            "whole becomes brighter or darker without events, so the exposure or gain of the frames was changed."
+        )
     if facts["saturated"] > 0:
         notes.append(f"{100 * facts['saturated']:.1f} % of the pixels were saturated in a frame and are left out.")
     if clip.share < 1:
@@ -384,7 +404,8 @@ class _Search:
     def __init__(self, clip: Clip, base: EmulatorConfig, stop: int, seed: int, progress: Callable[[float], None]):
         self._clip, self._base, self._stop, self._seed, self._progress = clip, base, stop, seed, progress
         recorded = sums(clip.events, clip, 0, stop)
-        self.target: Target = target(recorded)
+        # What a model has no parameter for it would buy with those that are for something else.
+        self.target: Target = target(recorded, together=base.one_threshold)
         if not len(self.target.values):
             raise EventDataError("too few pixels to tell an emulator's parameters", value=int(clip.used.sum()))
         self.evaluations = 0
@@ -412,27 +433,33 @@ class _Search:
                 self._set[keys[i]] = self._default(keys[i])
         return found
 
-    def roughly(self, keys: list[str], starts: int, also: np.ndarray | None = None) -> np.ndarray:
-        """The logarithms of the parameters where the best of several descents ends. also : one more to start from."""
+    def roughly(self, keys: list[str], starts: int) -> np.ndarray:
+        """The logarithms of the parameters where the best of several descents ends: a few steps from more places, then
+        all from those that led lowest."""
         ends = self._ends(keys)
         tried = qmc.scale(qmc.Sobol(len(keys), seed=self._seed).random(TRIED), *ends.T)
-        first = [np.clip(self._defaults(keys), ends[:, 0], ends[:, 1])] + ([] if also is None else [also])
-        tried = np.vstack([*first, tried])
-        self._planned = len(tried) + starts * 10 * (len(keys) + 2)
+        tried = np.vstack([np.clip(self._defaults(keys), ends[:, 0], ends[:, 1]), tried])
+        self._planned = len(tried) + starts * 20 * (len(keys) + 2)
         ordered = tried[np.argsort(self._costs(keys, tried))]
         self.target = self.target.beside(self._sums(keys, ordered[0]), floor="expected")
-        return min((self._descend(keys, one) for one in _apart(ordered, starts)), key=lambda found: found[0])[1]
+        first = [self._descend(keys, one, steps=_FEW_STEPS) for one in _apart(ordered, _EACH * starts)]
+        first.sort(key=lambda found: found[0])
+        return min((self._descend(keys, at) for _, at in first[:starts]), key=lambda found: found[0])[1]
 
-    def run(self, keys: list[str], starts: int, also: np.ndarray | None = None) -> None:
+    def run(self, keys: list[str], start: np.ndarray) -> None:
+        """start : logarithms of the parameters, where :meth:`roughly` ended."""
         if not keys:
             self.cost = _loss(self._difference([], np.empty(0)))
             return
-        best = (0.0, self.roughly(keys, starts, also))
+        self.target = self.target.beside(self._sums(keys, start), floor="expected")
+        best = self._descend(keys, start)
         # As if the model were the camera, with nothing but chance between them; then with what it turns out to be off
         # by.
         for floor in ("lowest", "seen"):
             self.target = self.target.beside(self._sums(keys, best[1]), floor=floor)
-            best = self._scanned(keys, self._descend(keys, best[1]))
+            best = self._descend(keys, best[1])
+            if floor == "lowest":
+                best = self._scanned(keys, best)
         while True:
             self.cost, self._at, self._keys = best[0], best[1], keys
             self._residual = self._difference(keys, best[1])
@@ -448,7 +475,9 @@ class _Search:
             others = np.delete(best[1], worst)
             within = f"the data tell it within a factor of {min(np.exp(spread[worst]), 1e6):.2g} at best"
             self._set[key] = self._default(key)
-            again = self._descend(keys, others)
+            again = (_loss(self._difference(keys, others)), others)  # often the others need not follow
+            if again[0] > best[0] + TOLERANCE:
+                again = self._descend(keys, others)
             if again[0] <= best[0] + TOLERANCE:
                 self.untold[key] = f"not told by the recording, left at its default ({within})"
                 best = again
@@ -458,7 +487,8 @@ class _Search:
                 self.untold[key] = f"told only to be {side} than its default ({within})"
                 best = self._descend(keys, others)
             if not keys:
-                self.cost, self._at, self._keys = *best, []
+                self.cost, self._at = best
+                self._keys = []
                 return
 
     def config(self, keys: list[str] | None = None, at: np.ndarray | None = None) -> EmulatorConfig:
@@ -550,29 +580,39 @@ class _Search:
         self._keys, self._at, self._residual = keys, best[1], self._difference(keys, best[1])
         self._jacobian = self._derivatives(keys, best[1], self._residual)
         vague = [i for i, spread in enumerate(self._spread()) if spread > VAGUE]
-        start = best
+        start, slopes = best, self._jacobian
         for i in vague:
             others, held = [key for key in keys if key != keys[i]], self._set
             (low, high), tried = self._ends([keys[i]])[0], []
             for place in np.linspace(low, high, _PLACES + 2)[1:-1]:
                 self._set = {**held, keys[i]: float(np.exp(place))}
-                cost, at = self._descend(others, np.delete(start[1], i), steps=_FEW_STEPS)
+                # By the derivatives of where the scan began: near enough to see which places are worth a descent.
+                cost, at = self._descend(others, np.delete(start[1], i), np.delete(slopes, i, axis=1), _FEW_STEPS)
                 tried.append((cost, np.insert(at, i, place)))
             self._set = held
             tried.sort(key=lambda one: one[0])
             # A place may be better although the nearest that was tried is not: let go of it.
-            best = min([best, *(self._descend(keys, at) for _, at in tried[:2])], key=lambda one: one[0])
+            worth = [at for cost, at in tried[:2] if cost < best[0] + max(_WORTH * best[0], 2.0)]
+            best = min([best, *(self._descend(keys, at) for at in worth)], key=lambda one: one[0])
         return best
 
-    def _descend(self, keys: list[str], start: np.ndarray, steps: int = _MOST_STEPS) -> tuple[float, np.ndarray]:
+    def _descend(
+        self, keys: list[str], start: np.ndarray, slopes: np.ndarray | None = None, steps: int = _MOST_STEPS
+    ) -> tuple[float, np.ndarray]:
         """Levenberg and Marquardt's, on weights that follow the loss. Of each set of derivatives several dampings are
-        tried: a simulation jumps event by event, and the best of them is surer than the boldest."""
+        tried: a simulation jumps event by event, and the best of them is surer than the boldest. Derivatives are what
+        costs: after a step they are corrected by what it has shown (Broyden, Mathematics of Computation 19, 1965), and
+        taken anew where that leads no further.
+
+        slopes : derivatives to begin with, and to stop with where they lead no further; None: of the place."""
         ends = self._ends(keys)
         at = np.clip(start, ends[:, 0], ends[:, 1]) if keys else start
         residual = self._difference(keys, at)
-        cost = _loss(residual)
+        cost, j, borrowed = _loss(residual), slopes, slopes is not None
+        fresh = False
         for _ in range(steps if keys else 0):
-            j = self._derivatives(keys, at, residual)
+            if j is None:
+                j, fresh = self._derivatives(keys, at, residual), True
             weighted = j.T / np.sqrt(1 + residual**2)
             square, pull = weighted @ j, weighted @ residual
             scale = np.diag(square) + 1e-3
@@ -584,10 +624,18 @@ class _Search:
                 tried.append((_loss(found), there, found))
             best = min(tried, key=lambda one: one[0])
             gain = cost - best[0]
+            moved, changed = best[1] - at, best[2] - residual
             if gain > 0:
                 cost, at, residual = best
             if gain < max(0.003 * cost, 0.02):
-                break
+                if fresh or borrowed:
+                    break
+                j = None
+            elif gain < _LITTLE * cost and not (fresh or borrowed):
+                j = None
+            else:
+                j = j + np.outer(changed - j @ moved, moved) / (moved @ moved)
+                fresh = False
         return cost, at
 
 

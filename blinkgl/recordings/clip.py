@@ -20,16 +20,20 @@ from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.types import Events
 from blinkgl.io.formats import open_events
 from blinkgl.io.frames import RECORDING, open_frames
+from blinkgl.recordings.bursts import frame_bursts, inside_any
 from blinkgl.recordings.comparison import BLUR_PX, LOG_OFFSET
 from blinkgl.recordings.simulation import Decoder
 from blinkgl.timeline.interpolate import Displacement, motion
 
 TILE_PX = 32
-MOST_PIXEL_STEPS = 24_000_000
+MOST_PIXEL_STEPS = 3_000_000
 """Pixels times frames that a clip holds at most, float32: what a fit of a minute or two has time for."""
 STILL = 0.04
 """Largest change of ln(I + 10) between two frames, blurred by a pixel, of a pixel that saw nothing."""
 MOST_SATURATED = 0.3
+LEAP, LARGEST_THRESHOLD = 0.1, 2.0
+"""Median change of ln(I + 10) from one frame to the next from which on events have to say so, too, and the contrast
+that they stand for at most."""
 MOST_SHIFT_US = 100_000
 LEAST_CORRELATION = 0.25
 """Of polarity sums with the frames' change: below, events and frames are not of one scene or not on one clock."""
@@ -50,6 +54,7 @@ class Clip:
     used : (h, w) bool, pixels that count.   still : (h, w) bool, those of them that saw no change.
     light : (h, w) uint8, eighth of the brightness, 0 the darkest.   change : (K, h, w) float32, of ln(I + 10).
     sensor : (height, width) of the camera.   share : of its pixels that are in the clip.
+    bursts : (N, 2) int64 µs, of events that the camera's frames set off: what lies there counts, but not when.
     facts : what was found out on the way, by name."""
 
     frames: list[tuple[int, np.ndarray]]
@@ -62,6 +67,7 @@ class Clip:
     change: np.ndarray
     sensor: tuple[int, int]
     share: float = 1.0
+    bursts: np.ndarray = field(default_factory=lambda: np.empty((0, 2), np.int64))
     facts: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -137,6 +143,9 @@ def clip_of_frames(
     logs = [cv2.GaussianBlur(np.log(g.astype(np.float64) * 255 + LOG_OFFSET), (0, 0), BLUR_PX) for g in grey]
     clock = np.array(times, np.int64) // 1000
     facts: dict[str, float] = {"saturated": saturated}
+    bursts = frame_bursts(events, float(np.median(np.diff(clock)))) if len(clock) > 1 else np.empty((0, 2), np.int64)
+    if len(bursts):
+        facts |= {"bursts": len(bursts), "in_bursts": float(inside_any(events.t, bursts).mean())}
     change = np.diff(np.stack(logs), axis=0).astype(np.float32)
     found, correlation = clock_offset(events, change, clock, size)
     if delay_us is None:
@@ -161,7 +170,18 @@ def clip_of_frames(
             value=[tuple(round(t / 1e6, 6) for t in (a[0], a[-1])) for a in (events.t, clock)],
             accepted="two or more, on one clock (seconds of events and of frames shown)",
         )
-    first, last = int(inside[0]), int(inside[-1]) + 1
+    same = _one_exposure(inside, change, clock, ~full, events)
+    if len(same) < len(inside):
+        facts["other_exposure"] = len(inside) - len(same)
+        if len(same) < 2:
+            raise EventDataError(
+                "the frames' exposure changes from one to the next, and the events do not: what the light did is not "
+                "in them",
+                where=where,
+                value=f"{len(inside) - len(same)} of {len(inside)} intervals",
+                accepted="three or more frames in a row of one exposure and gain",
+            )
+    first, last = int(same[0]), int(same[-1]) + 1
     grey, logs, clock = grey[first : last + 1], logs[first : last + 1], clock[first : last + 1]
     edges = clock.copy()
     edges[0], edges[-1] = max(clock[0], events.t[0]), min(clock[-1], events.t[-1] + 1)
@@ -183,7 +203,7 @@ def clip_of_frames(
     light = np.searchsorted(np.quantile(mean, np.arange(1, 8) / 8), mean).astype(np.uint8)
     events = events.window(int(edges[0]), int(edges[-1]))
     whole = _cut(path, events, ~full, still, light, change, size, most, seed)
-    return replace(whole, clock_us=clock, edges_us=edges, facts=facts)
+    return replace(whole, clock_us=clock, edges_us=edges, facts=facts, bursts=bursts)
 
 
 def clip_of_still(events: Events, size: tuple[int, int], *, luminance: float = DARK_BACKGROUND, parts: int = 8) -> Clip:
@@ -292,6 +312,23 @@ def _flicker_of(events: Events, hz: float) -> tuple[float, float, float]:
     best = float(tried[int(np.argmax(found))])
     turned = np.exp(-2j * np.pi * best * t) @ p
     return best, float(events.t[0] - np.angle(turned) / (2 * np.pi * best) * 1e6), float(np.abs(turned) / len(p))
+
+
+def _one_exposure(
+    inside: np.ndarray, change: np.ndarray, clock_us: np.ndarray, used: np.ndarray, events: Events
+) -> np.ndarray:
+    """The longest stretch of the intervals ``inside`` in which the picture as a whole does not become brighter or
+    darker without events: there the frames' exposure or gain was changed, which an emulator would take for light."""
+    pixels = max(int(used.sum()), 1)
+    stretch, best = [], []
+    for k in inside.tolist():
+        middle = float(np.median(change[k][used])) if used.any() else 0.0
+        part = events.window(int(clock_us[k]), int(clock_us[k + 1]))
+        polarity = float(2 * np.count_nonzero(part.p) - len(part)) / pixels
+        leaps = abs(middle) > LEAP and np.sign(middle) * polarity * LARGEST_THRESHOLD < abs(middle) / 2
+        stretch = [] if leaps else [*stretch, k]
+        best = stretch if len(stretch) > len(best) else best
+    return np.array(best, np.int64)
 
 
 _NO_TIMES = (np.empty(0, np.int64),) * 2

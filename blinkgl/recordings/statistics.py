@@ -14,6 +14,7 @@ import numba
 import numpy as np
 
 from blinkgl.events.types import Events
+from blinkgl.recordings.bursts import inside_any
 from blinkgl.recordings.clip import TILE_PX, Clip
 from blinkgl.recordings.comparison import BLUR_PX
 
@@ -36,7 +37,8 @@ class Sums:
     """Of the intervals [first, stop) of a clip; the first axis is the group.
 
     rates : (G, K, 2) events by interval and polarity (OFF, ON), of pixels that saw a change.   lights : (G, 8, 2), by
-    brightness.   isi : (G, 2, bins), by whether the second event is of the other polarity.   counts : (G, C) pixels and
+    brightness.   isi : (G, 2, bins), by whether the second event is of the other polarity, where
+    no burst set off either.   counts : (G, C) pixels and
     intervals by number of events.   still, still_counts : (G, 2), (G, C) of pixels that saw none, over all intervals.
     products : (G, 3) sums of a*b, a*a, b*b of polarity sums with the recording's.   pixels : (G, 2) that moved, and
     did not.   polarity : (K, H*W) float32, polarity sums,
@@ -72,7 +74,8 @@ def sums(events: Events, clip: Clip, first: int, stop: int, against: np.ndarray 
     isi = np.zeros((GROUPS, 2, ISI_BINS), np.int64)
     part = events.window(int(clip.edges_us[first]), int(clip.edges_us[stop]))
     where = part.y.astype(np.int64) * width + part.x
-    _collect(where, part.t, part.p, clip.edges_us[first : stop + 1], group, total, isi)
+    by_light = ~inside_any(part.t, clip.bursts)
+    _collect(where, part.t, part.p, by_light, clip.edges_us[first : stop + 1], group, total, isi)
     used, still = clip.used.ravel(), clip.still.ravel()
     moving = used & ~still
     on_group = np.where(moving, group, GROUPS)
@@ -120,8 +123,9 @@ def _histogram(counts: np.ndarray, group: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True, nogil=True)
-def _collect(where, t, p, edges, group, total, isi):
-    """Counts by interval, pixel and polarity, and the histogram of the intervals between a pixel's events."""
+def _collect(where, t, p, by_light, edges, group, total, isi):
+    """Counts by interval, pixel and polarity, and the histogram of the intervals between a pixel's events, of those
+    both of whose times are ``by_light``."""
     pixels = total.shape[1]
     last = np.full(pixels, -1, np.int64)
     before = np.zeros(pixels, np.uint8)
@@ -131,6 +135,9 @@ def _collect(where, t, p, edges, group, total, isi):
             k += 1
         j = where[i]
         total[k, j, p[i]] += 1
+        if not by_light[i]:
+            last[j] = -1
+            continue
         now = t[i] - edges[0]
         if last[j] >= 0:
             b = min(int(ISI_PER_DECADE * np.log10(max(now - last[j], 1)) + 1e-9), ISI_BINS - 1)
@@ -144,7 +151,8 @@ class Target:
 
     values : (N,).   chance : (N,), what each may be off by, of the recording and of a simulation.
     floor : (N,), by which a model is off besides.   weight : (N,), of the block a number belongs to.
-    jackknife : (G, N), differences without each group.   block : (N,) of names."""
+    jackknife : (G, N), differences without each group.   block : (N,) of names.
+    together : rates of ON and OFF events of pixels that moved in one number."""
 
     sums: Sums
     probes: np.ndarray
@@ -154,6 +162,7 @@ class Target:
     weight: np.ndarray
     jackknife: np.ndarray
     block: np.ndarray
+    together: bool = False
 
     @property
     def error(self) -> np.ndarray:
@@ -161,7 +170,10 @@ class Target:
 
     def residual(self, simulated: Sums) -> np.ndarray:
         """(N,), in errors, times the weights."""
-        return self.weight * (numbers(simulated, self.probes)[0] - self.values) / self.error
+        return self.weight * (self._numbers(simulated) - self.values) / self.error
+
+    def _numbers(self, of: Sums, without: int | None = None) -> np.ndarray:
+        return numbers(of, self.probes, without, self.together)[0]
 
     def beside(self, simulated: Sums, *, floor: str) -> Target:
         """With the errors that a simulation near the recording shows. Chance: the jackknife of the differences, in
@@ -169,9 +181,7 @@ class Target:
 
         floor : "expected": ``FLOOR``.   "lowest": a tenth of it, as for a model that is the camera.   "seen": what the
         simulation is off by beyond chance, block by block, between the two."""
-        value = lambda without: (
-            numbers(simulated, self.probes, without)[0] - numbers(self.sums, self.probes, without)[0]
-        )
+        value = lambda without: self._numbers(simulated, without) - self._numbers(self.sums, without)
         jackknife = np.stack([value(group) for group in range(GROUPS)])
         chance = np.sqrt((GROUPS - 1) / GROUPS * ((jackknife - jackknife.mean(axis=0)) ** 2).sum(axis=0))
         most = np.array([FLOOR[b] for b in self.block])
@@ -184,7 +194,7 @@ class Target:
         return replace(self, chance=chance, floor=floors, jackknife=jackknife)
 
 
-WEIGHTS = {"rate": 3.0, "light": 3.0, "interval": 3.0, "turn": 1.0, "count": 2.0, "still": 2.0, "still count": 2.0,
+WEIGHTS = {"rate": 3.0, "light": 3.0, "interval": 5.0, "turn": 1.0, "count": 2.0, "still": 2.0, "still count": 2.0,
            "polarity": 2.0}  # fmt: skip
 """How much the blocks count, each as a whole: what rates and intervals are is what a simulation is used for."""
 FLOOR = {"rate": 0.02, "light": 0.05, "interval": 0.01, "turn": 0.02, "count": 0.01, "still": 0.05, "still count": 0.01,
@@ -194,16 +204,15 @@ LOWEST = 0.1
 """Of a floor, where the model turns out to be nearer."""
 
 
-def target(recorded: Sums) -> Target:
-    """Of the recording's sums; with floors for errors until a simulation is beside it."""
+def target(recorded: Sums, together: bool = False) -> Target:
+    """Of the recording's sums; with floors for errors until a simulation is beside it. together: see Target."""
     probes = _probes(recorded.isi.sum(axis=(0, 1)))
-    values, block = numbers(recorded, probes)
+    values, block = numbers(recorded, probes, together=together)
     floor = np.array([FLOOR[b] for b in block])
     sizes = {b: np.count_nonzero(block == b) for b in FLOOR}
     weight = np.array([WEIGHTS[b] / np.sqrt(sizes[b]) for b in block])
-    return Target(
-        recorded, probes, values, np.zeros(len(values)), floor, weight, np.zeros((GROUPS, len(values))), block
-    )
+    chance, jackknife = np.zeros(len(values)), np.zeros((GROUPS, len(values)))
+    return Target(recorded, probes, values, chance, floor, weight, jackknife, block, together)
 
 
 def _probes(isi: np.ndarray) -> np.ndarray:
@@ -215,8 +224,10 @@ def _probes(isi: np.ndarray) -> np.ndarray:
     return np.unique(np.concatenate([found, [max(found[0] - 2, 0)]]))
 
 
-def numbers(s: Sums, probes: np.ndarray, without: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) numbers of a stream, and the name of the block of each."""
+def numbers(
+    s: Sums, probes: np.ndarray, without: int | None = None, together: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) numbers of a stream, and the name of the block of each. together: see Target."""
     rates, lights, isi, counts, still, still_counts, products, pixels = s.without(without)
     values, block = [], []
 
@@ -224,6 +235,8 @@ def numbers(s: Sums, probes: np.ndarray, without: int | None = None) -> tuple[np
         values.append(np.ravel(more))
         block.extend([name] * np.size(more))
 
+    if together:
+        rates, lights = (part.sum(axis=-1, keepdims=True) for part in (rates, lights))
     if pixels[0] >= LEAST_STILL:
         seconds = s.seconds[:, None] * pixels[0]
         add("rate", np.log((rates + 1) / seconds))

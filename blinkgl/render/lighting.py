@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from blinkgl.render.colour import LUMA
-from blinkgl.scene.lights import is_coloured, lamps_of, quadric_of
+from blinkgl.scene.lights import is_coloured, lamps_of, quadric_of, quartic_of
 
 if TYPE_CHECKING:
     from blinkgl.render.moment import Moment
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 EXAMPLES: tuple[dict[str, Any], ...] = (
     {"LIGHTS": 1, "AMBIENT": 2},
+    {"LIGHTS": 1, "AMBIENT": 3},
     {"LIGHTS": 1, "SUNS": 2, "LAMPS": 2},
     {"LIGHTS": 1, "SUNS": 1, "AMBIENT": 1, "SHADOWS": 1, "SHADOW_SUNS": 1},
     {
@@ -31,11 +32,13 @@ EXAMPLES: tuple[dict[str, Any], ...] = (
     },
 )  # fmt: skip
 """Variants for which a program of a pass that is lit has to compile, besides the plain light's; HUED comes on top."""
-# By uniform, whether it has a value per channel: one of HUED's three, or the one that stands for them.
+# By uniform, whether it has a value per channel: one of HUED's three, or the one that stands for them;
+# of arrays how many.
 _FIXED = {"sun_strength": True, "lamp_strength": True, "lamp_fading": False, "spot_cone": False}
 _PLACED = {
-    **dict.fromkeys(("sun_towards", "lamp_place", "spot_axis"), False),
-    **dict.fromkeys(("around_even", "around_squares", "around_mixed"), True),
+    **dict.fromkeys(("sun_towards", "lamp_place", "spot_axis"), 0),
+    **dict.fromkeys(("around_even", "around_squares", "around_mixed"), 1),
+    "around_fourth": 5,
 }
 
 
@@ -48,7 +51,11 @@ class Lighting:
         self.casts = light.shadows != "off"
         self._suns = sum(lamp.kind == "sun" for lamp in self.lamps)
         self._spots = sum(lamp.kind == "spot" for lamp in self.lamps)
-        self._quadric = quadric_of(light)
+        self._quadric, self._quartic = quadric_of(light), quartic_of(light)
+        if self._quartic is not None:
+            # n is a unit vector: what is quadratic in it is quartic, too, and the shader has one form.
+            second, one = self._quadric[:, :3, :3].reshape(3, 9, 1), np.eye(3).reshape(1, 9)
+            self._quartic = self._quartic + 0.5 * (second @ one + (second @ one).swapaxes(1, 2))
         near = self.lamps[self._suns :]
         strength = np.array([lamp.strength for lamp in self.lamps], np.float64).reshape(-1, 3)
         self._fixed = {
@@ -70,7 +77,7 @@ class Lighting:
         if self.plain and not kind.whole and not getattr(pass_, "shadows", ()):
             return {}
         counts = {"SUNS": self._suns, "LAMPS": len(self.lamps) - self._suns, "SPOTS": self._spots}
-        ambient = 2 if self._quadric[:, :3, :3].any() else 1
+        ambient = 3 if self._quartic is not None else 2 if self._quadric[:, :3, :3].any() else 1
         return (
             {"LIGHTS": 1}
             | {name: count for name, count in counts.items() if count}
@@ -105,7 +112,7 @@ class Lighting:
             for one in (name, f"{name}_rate") if rates else (name,):
                 if (uniform := uniforms.get(one)) is not None:
                     values = placed[one][index]
-                    if per_channel and uniform.array_length == 1:
+                    if per_channel and uniform.array_length == per_channel:
                         values = (self.channel(channel) @ values).astype(np.float32)
                     uniform.write(values.tobytes())
 
@@ -129,23 +136,57 @@ class Lighting:
         own = axes @ R
         spots = slice(len(self.lamps) - self._spots, None)
         placed = {"sun_towards": own[:, : self._suns], "lamp_place": away @ R, "spot_axis": own[:, spots]}
-        placed |= _forms(turn[:, None].swapaxes(2, 3) @ self._quadric @ turn[:, None])
+        placed |= _forms(_seen_turned(self._quadric, turn))
+        if self._quartic is not None:
+            placed["around_fourth"] = _fourth(_seen_turned(self._quartic, _kron(R, R)))
         if rates:
             dR, dt = moment.rates.T_world_obj[:, :3, :3], moment.rates.T_world_obj[:, :3, 3]
             changes = np.array([lamp.path.derivative(moment.t_ns) for lamp in self.lamps]).reshape(-1, 4, 4)
             own_rate = axes @ dR + changes[:, :3, 2] @ R
             turn_rate = np.zeros_like(turn)
             turn_rate[:, :3, :3] = dR
-            half = turn[:, None].swapaxes(2, 3) @ self._quadric @ turn_rate[:, None]
             placed |= {
                 "sun_towards_rate": own_rate[:, : self._suns],
                 "lamp_place_rate": away @ dR + (changes[None, self._suns :, :3, 3] - dt[:, None]) @ R,
                 "spot_axis_rate": own_rate[:, spots],
             }
-            placed |= {f"{name}_rate": values for name, values in _forms(half + half.swapaxes(2, 3)).items()}
+            changed = _forms(_seen_turned(self._quadric, turn, turn_rate))
+            placed |= {f"{name}_rate": values for name, values in changed.items()}
+            if self._quartic is not None:
+                pairs_rate = _kron(dR, R) + _kron(R, dR)
+                placed["around_fourth_rate"] = _fourth(_seen_turned(self._quartic, _kron(R, R), pairs_rate))
         placed = {name: np.ascontiguousarray(values, np.float32) for name, values in placed.items()}
         self._last = moment, rates, placed
         return placed
+
+
+def _seen_turned(form: np.ndarray, turn: np.ndarray, rate: np.ndarray | None = None) -> np.ndarray:
+    """(N, 3, n, n): symmetric forms (3, n, n) of what (N, n, n) makes of another's arguments; or how they change, where
+    that changes by ``rate`` per second."""
+    if rate is None:
+        return turn[:, None].swapaxes(2, 3) @ form @ turn[:, None]
+    half = turn[:, None].swapaxes(2, 3) @ form @ rate[:, None]
+    return half + half.swapaxes(2, 3)
+
+
+def _kron(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(N, 9, 9) of (N, 3, 3) each: what turns the nine products of two coordinates."""
+    return np.einsum("nij,nkl->nikjl", a, b).reshape(-1, 9, 9)
+
+
+# Of lights.glsl: x^4 x²y² x³y xy³ x²yz, each with what follows when x, y, z become y, z, x.
+_MONOMIALS = tuple(
+    tuple(sorted((axis + k) % 3 for axis in one))
+    for one in ((0, 0, 0, 0), (0, 0, 1, 1), (0, 0, 0, 1), (0, 1, 1, 1), (0, 0, 1, 2))
+    for k in range(3)
+)
+_MONOMIAL_OF = np.zeros((81, len(_MONOMIALS)))  # of each of a quartic's numbers
+_MONOMIAL_OF[np.arange(81), [_MONOMIALS.index(tuple(sorted(one))) for one in np.ndindex(3, 3, 3, 3)]] = 1.0
+
+
+def _fourth(quartic: np.ndarray) -> np.ndarray:
+    """(..., 3, 9, 9) quartics as the shader has them, (..., 3, 15)."""
+    return quartic.reshape(*quartic.shape[:-2], 81) @ _MONOMIAL_OF
 
 
 def _forms(quadric: np.ndarray) -> dict[str, np.ndarray]:

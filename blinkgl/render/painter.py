@@ -29,7 +29,10 @@ if TYPE_CHECKING:
 FREE_UNIT = 8
 """Texture unit from which on a shape may put its own: a pass has a material's and those of its inputs."""
 MATERIAL_UNITS = {
-    name: 16 + k for k, name in enumerate(("coverage", "emission_map", "bumps", "gloss_map", "energy", "surroundings"))
+    name: 16 + k
+    for k, name in enumerate(
+        ("coverage", "emission_map", "bumps", "gloss_map", "energy", "looks", "surroundings", "surrounding_luminance")
+    )
 }
 """Texture units of what a material has beside a base colour."""
 Uniforms = dict[str, Any]
@@ -157,7 +160,10 @@ class Painter:
     def _shine(self, uniforms: Uniforms, item: DrawItem, moment: Moment) -> None:
         """Sets what is seen in what shines, and from where."""
         self._look_up(uniforms, "energy", self.resources.energy_texture())
-        self._look_up(uniforms, "surroundings", self.resources.surroundings_texture())
+        self._look_up(uniforms, "looks", self.resources.looks_texture())
+        coloured = "surroundings" in uniforms
+        name = "surroundings" if coloured else "surrounding_luminance"
+        self._look_up(uniforms, name, self.resources.surroundings_texture(coloured))
         pose = moment.T_world_obj[item.object_index]
         R, away = pose[:3, :3], moment.T_world_cam[:3, 3] - pose[:3, 3]
         uniforms["eye"].value = tuple(away @ R)

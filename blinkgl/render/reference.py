@@ -37,7 +37,7 @@ from scipy import ndimage
 from blinkgl.camera import CameraModel
 from blinkgl.render.raycast import Forest, Holes, build_tree, join_trees, nearest_exhaustive, nearest_tree
 from blinkgl.scene.geometry.tangents import tangents
-from blinkgl.scene.lights import ambient, beam, lamps_of, quadric_of, shadowing, surroundings_of
+from blinkgl.scene.lights import ambient, beam, lamps_of, quadric_of, quartic_of, shadowing, surroundings_of
 from blinkgl.scene.shapes.deformer import normals_at
 from blinkgl.scene.surfaces import gloss
 from blinkgl.scene.types import REPEAT, Lamp, Map, Material, Mesh, Part, Scene, SceneObject, Texture
@@ -544,8 +544,7 @@ def shone(
     if id(scene.light) not in _surroundings:
         _surroundings.clear()
         _surroundings[id(scene.light)] = scene.light, surroundings_of(scene.light)
-    there = gloss.looked_at(normal, away, nv, roughness)
-    around = gloss.mirrored(_surroundings[id(scene.light)][1], *there)
+    around = gloss.around(_surroundings[id(scene.light)][1], normal, away, nv, roughness)
     out = around * (even_clear * (1 - mix) + even_metal * mix)
     for k, lamp in enumerate(lamps_of(scene.light)):
         towards, _ = beam(lamp, lamp.path.pose(t_ns), points)
@@ -597,7 +596,7 @@ def received(
         direct[k] = open_[k] = facing[:, None] * strength
         if own is not None and k in casting:
             direct[k] *= seen_share(scene, t_ns, lamp, points, own)[:, None]
-    return Received(direct, open_, ambient(quadric_of(scene.light), normal))
+    return Received(direct, open_, ambient(quadric_of(scene.light), normal, quartic_of(scene.light)))
 
 
 SOFT_SAMPLES = 64

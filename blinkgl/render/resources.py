@@ -7,6 +7,7 @@ import ctypes
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import moderngl
@@ -20,7 +21,7 @@ from blinkgl.scene.geometry.tangents import tangents
 from blinkgl.scene.lights import is_coloured, surroundings_of
 from blinkgl.scene.shapes.deformer import Deformer
 from blinkgl.scene.shapes.table import define_of, includes
-from blinkgl.scene.surfaces.gloss import energy, mean_energy
+from blinkgl.scene.surfaces.gloss import energy, looks, mean_energy
 from blinkgl.scene.types import IDENTITY, REPEAT, Map, Material, Mesh, Part, Scene, Texture, Wrap
 
 MADE.append(includes)
@@ -358,26 +359,43 @@ class SceneResources:
         return float(LUMA @ np.asarray(material.emission, np.float64))
 
     def energy_texture(self) -> moderngl.Texture:
-        """RGB32F of :func:`~blinkgl.scene.surfaces.gloss.energy`, and its mean."""
-        if ("energy",) not in self._textures:
-            once = energy()
-            mean = np.broadcast_to(mean_energy()[:, None, None], (*once.shape[:2], 1))
-            table = self._textures["energy",] = self._upload(
-                np.concatenate([once, mean], axis=2).astype(np.float32), "energy", wrap=("clamp", "clamp"), levels=False
+        """RGBA32F of :func:`~blinkgl.scene.surfaces.gloss.energy`, its mean, and the weight of the first look."""
+        once = energy()
+        mean = np.broadcast_to(mean_energy()[:, None, None], (*once.shape[:2], 1))
+        return self._table("energy", np.concatenate([once, mean, looks()[..., 4:]], axis=2))
+
+    def looks_texture(self) -> moderngl.Texture:
+        """RGBA32F of :func:`~blinkgl.scene.surfaces.gloss.looks`: of both how far towards the mirror, and how rough."""
+        return self._table("looks", looks()[..., :4])
+
+    def _table(self, name: str, numbers: np.ndarray) -> moderngl.Texture:
+        if (name,) not in self._textures:
+            table = self._textures[name,] = self._upload(
+                numbers.astype(np.float32), name, wrap=("clamp", "clamp"), levels=False
             )
             table.filter = (moderngl.LINEAR, moderngl.LINEAR)
-        return self._textures["energy",]
+        return self._textures[name,]
 
-    def surroundings_texture(self) -> moderngl.Texture3D:
-        """RGB32F of :func:`~blinkgl.scene.surfaces.gloss.blurred`: longitude, latitude, roughness."""
-        if "surroundings" not in self._volumes:
-            levels = surroundings_of(self.scene.light)
-            depth, height, width, _ = levels.shape
-            volume = self.ctx.texture3d((width, height, depth), 3, levels.tobytes(), dtype="f4")
+    def surroundings_texture(self, coloured: bool) -> moderngl.Texture3D:
+        """RGBA32F, a: 1, of :func:`~blinkgl.scene.surfaces.gloss.blurred`: longitude, latitude, roughness; or R32F of
+        its luminance."""
+        name = "surroundings" if coloured else "luminance of surroundings"
+        if name not in self._volumes:
+            levels = self._surroundings
+            if coloured:
+                levels = np.concatenate([levels, np.ones_like(levels[..., :1])], axis=3)
+            else:
+                levels = (levels @ LUMA)[..., None].astype(np.float32)
+            depth, height, width, channels = levels.shape
+            volume = self.ctx.texture3d((width, height, depth), channels, levels.tobytes(), dtype="f4")
             volume.filter = (moderngl.LINEAR, moderngl.LINEAR)
             volume.repeat_x, volume.repeat_y, volume.repeat_z = True, False, False
-            self._volumes["surroundings"] = volume
-        return self._volumes["surroundings"]
+            self._volumes[name] = volume
+        return self._volumes[name]
+
+    @cached_property
+    def _surroundings(self) -> np.ndarray:
+        return surroundings_of(self.scene.light)
 
     def _stream(self, mesh: Mesh, name: str) -> moderngl.Buffer:
         """Of vertices' tangents or colours."""

@@ -93,15 +93,25 @@ def quadric_of(light: Light) -> np.ndarray:
 
 def is_coloured(light: Light) -> bool:
     """Whether any of it is not white, so that a surface's luminance is not its albedo's times a number."""
-    quadric = quadric_of(light)
-    return any(len(set(lamp.strength)) > 1 for lamp in lamps_of(light)) or bool((quadric != quadric[:1]).any())
+    forms = [form for form in (quadric_of(light), quartic_of(light)) if form is not None]
+    return any(len(set(lamp.strength)) > 1 for lamp in lamps_of(light)) or any((f != f[:1]).any() for f in forms)
 
 
-def ambient(quadric: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def quartic_of(light: Light) -> np.ndarray | None:
+    """(3, 9, 9) of what comes from all around, for :func:`ambient`; world axes. None: :func:`quadric_of` is all."""
+    return None if light.finer is None else np.asarray(light.finer, np.float64)
+
+
+def ambient(quadric: np.ndarray, normal: np.ndarray, quartic: np.ndarray | None = None) -> np.ndarray:
     """(..., 3) radiance of a white surface with (..., 3) unit normals, of light from all around: (n, 1) Q (n, 1) per
-    channel, not below 0. quadric : (3, 4, 4), symmetric, in the axes of the normals."""
+    channel, not below 0. quadric : (3, 4, 4), symmetric, in the axes of the normals.   quartic : (3, 9, 9), a form of
+    the nine products of two coordinates, that comes on top."""
     n = np.concatenate([normal, np.ones((*normal.shape[:-1], 1))], axis=-1)
-    return np.maximum(np.einsum("...i,cij,...j->...c", n, quadric, n), 0.0)
+    sums = np.einsum("...i,cij,...j->...c", n, quadric, n)
+    if quartic is not None:
+        pairs = np.einsum("...i,...j->...ij", normal, normal).reshape(*normal.shape[:-1], 9)
+        sums = sums + np.einsum("...i,cij,...j->...c", pairs, quartic, pairs)
+    return np.maximum(sums, 0.0)
 
 
 def seen_around(light: Light) -> np.ndarray:
@@ -114,7 +124,7 @@ def seen_around(light: Light) -> np.ndarray:
         picture += light.surroundings.pixels
     elif light.around is not None:
         directions, _ = pixel_directions(height, width)
-        picture += ambient(np.asarray(light.around, np.float64), directions)
+        picture += ambient(np.asarray(light.around, np.float64), directions, quartic_of(light))
     picture[: height // 2] += np.float32(light.sky) * np.asarray(light.sky_color, np.float32)
     return picture
 
@@ -122,14 +132,15 @@ def seen_around(light: Light) -> np.ndarray:
 def surroundings_of(light: Light) -> np.ndarray:
     """(levels, h, w, 3) float32: :func:`seen_around` as surfaces of several roughnesses mirror it
     (:func:`~blinkgl.scene.surfaces.gloss.blurred`)."""
-    if light.around is None and light.surroundings is None:
+    if light.around is None and light.surroundings is None:  # one column will do
         return _half_a_sky() * (np.float32(light.sky) * np.asarray(light.sky_color, np.float32))
     return blurred(seen_around(light))
 
 
 @lru_cache(maxsize=1)
 def _half_a_sky() -> np.ndarray:
-    return blurred(seen_around(Light(sun=0.0, sky=1.0)))
+    """(levels, h, 1, 3): the same all round."""
+    return blurred(seen_around(Light(sun=0.0, sky=1.0)))[:, :, :1]
 
 
 def beam(lamp: Lamp, pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -189,9 +200,12 @@ def lit_by(panorama: Environment, factor: float, light: Light) -> Light:
         Lamp("sun", _scaled(sun.strength, factor), StaticPath(lamp_pose(shines=-sun.towards)), size=sun.size)
         for sun in panorama.suns
     ]
-    around = tuple(tuple(tuple(float(factor * v) for v in row) for row in one) for one in panorama.quadric)
-    picture = Panorama(panorama.picture * np.float32(factor))
-    return replace(light, sun=0.0, sky=0.0, lamps=(*suns, *light.lamps), around=around, surroundings=picture)
+    around, finer = (
+        None if form is None else tuple(tuple(tuple(float(factor * v) for v in row) for row in one) for one in form)
+        for form in (panorama.quadric, panorama.quartic)
+    )
+    lamps, picture = (*suns, *light.lamps), Panorama(panorama.picture * np.float32(factor))
+    return replace(light, sun=0.0, sky=0.0, lamps=lamps, around=around, finer=finer, surroundings=picture)
 
 
 LUMENS_PER_WATT = 683.0

@@ -250,6 +250,7 @@ class Light:
     lamps : what shines beside them.
     around : quadric of what else comes from all around (:func:`blinkgl.scene.lights.ambient`), 3 x 4 x 4 numbers; None:
         nothing.
+    finer : quartic of the same, 3 x 9 x 9 numbers, where ``around`` alone is not near enough.
     surroundings : the same as a picture, its suns taken out, for what shines; lights that differ in nothing else are
         equal. None: the sky alone, ``sky`` above the horizon.
     shadows : of suns and spot lights; soft by their size.   shadow_size : px a side of the map of each.
@@ -265,6 +266,7 @@ class Light:
     sun_size: float = math.radians(LightConfig().sun_size)
     lamps: tuple[Lamp, ...] = ()
     around: tuple[tuple[tuple[float, ...], ...], ...] | None = None
+    finer: tuple[tuple[tuple[float, ...], ...], ...] | None = None
     surroundings: Panorama | None = field(default=None, compare=False, repr=False)
     shadows: Literal["off", "hard", "soft"] = "off"
     shadow_size: int = LightConfig().shadow_size

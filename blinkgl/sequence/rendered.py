@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -35,6 +35,10 @@ from blinkgl.sequence.inertial import Inertial, measured
 from blinkgl.sequence.items import GroundTruth, Item, Picture
 from blinkgl.sequence.simulate import Simulation
 from blinkgl.timeline import Timeline, make_timeline
+from blinkgl.timeline.reductions import OfArrays, Reductions
+
+if TYPE_CHECKING:
+    from blinkgl.card import Atlas
 
 SURFACES = LabelRequest("ids", "depth", "velocity")
 """Labels that say what made an event."""
@@ -68,6 +72,18 @@ def _truth_of(sensor: Sensor, config: SequenceConfig) -> SurfaceTruth | None:
     return SurfaceTruth(reach=int(samples_of(config.render.antialiasing).shared))
 
 
+def _reductions(gl: GLContext, device: str, stack: ExitStack) -> Reductions:
+    """Who reduces the timeline's small pictures, where ``events.device`` says. What it holds goes with the stack."""
+    if device == "cpu" or (device == "auto" and gl.is_software):
+        return OfArrays()
+    from blinkgl.card.reductions import reductions_on  # nobody loads it who does not ask for a card
+
+    made = reductions_on(gl, device)
+    if not isinstance(made, OfArrays):
+        stack.callback(made.release)
+    return made
+
+
 def surfaces_at(renderer: Renderer, t_ns: int) -> Surfaces:
     """What every pixel's centre shows at t_ns."""
     seen = renderer.labels(t_ns, SURFACES)
@@ -79,7 +95,8 @@ class RenderedSequence(Simulation):
 
     scene : as it was built.   renderer : what draws it, at its level of detail.
     sensor : what is recorded, and through which camera. A scene that was made already is
-    recorded as the configuration says.   number : of the sensor on its rig, by which noise differs."""
+    recorded as the configuration says.   number : of the sensor on its rig, by which noise differs.
+    atlas : see :func:`~blinkgl.sequence.simulate.simulate_sequence`."""
 
     def __init__(
         self,
@@ -95,6 +112,7 @@ class RenderedSequence(Simulation):
         renderer: Renderer | None,
         window_ns: tuple[int, int] | None,
         number: int = 0,
+        atlas: Atlas | None = None,
     ):
         self.number = number
         clock = StageClock()
@@ -119,19 +137,22 @@ class RenderedSequence(Simulation):
             camera = None
             if events:
                 emulator, readout = self.sensor.emulator, self.sensor.readout
+                seed = kernel_seed(config.seed, index, Role.EVENTS, number)
+                path = config.timeline.reconstruction
                 camera = EventCamera(
                     emulator,
                     readout,
                     *size,
-                    kernel_seed(config.seed, index, Role.EVENTS, number),
-                    config.timeline.reconstruction,
+                    seed,
+                    path,
                     _truth_of(self.sensor, config),
                     renderer.gl,
+                    None if atlas is None else atlas.esim(emulator, seed, path, size),
                 )
                 response, dynamics = emulator_of(emulator).response(emulator), scene.dynamics
-                self.timeline = make_timeline(
-                    config.timeline, *span_ns, renderer, response, dynamics.impacts_ns if dynamics is not None else ()
-                )
+                stops = dynamics.impacts_ns if dynamics is not None else ()
+                reductions = partial(_reductions, renderer.gl, getattr(emulator, "device", "auto"), stack)
+                self.timeline = make_timeline(config.timeline, *span_ns, renderer, response, stops, reductions)
             if labels and config.images is not None:
                 seed = kernel_seed(config.seed, index, Role.IMAGES, number)
                 self.frame_camera = FrameCamera(renderer, config.images, seed, span_ns)

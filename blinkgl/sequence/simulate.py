@@ -20,7 +20,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -39,6 +39,9 @@ from blinkgl.sequence.inertial import Inertial
 from blinkgl.sequence.items import CameraImage, EventChunk, GroundTruth, Item, Picture
 from blinkgl.timeline import Ticks, Timeline
 
+if TYPE_CHECKING:
+    from blinkgl.card import Atlas
+
 
 def simulate_sequence(
     config: SequenceConfig,
@@ -52,6 +55,7 @@ def simulate_sequence(
     scene: Scene | None = None,
     renderer: Renderer | None = None,
     window_ns: tuple[int, int] | None = None,
+    atlas: Atlas | None = None,
 ) -> Simulation:
     """Sequence ``index`` of a run, ready to be iterated over: :class:`EventChunk`, :class:`GroundTruth`,
     :class:`CameraImage` and :class:`Picture` in time order.
@@ -65,6 +69,8 @@ def simulate_sequence(
     released at the end; its scene is drawn.
     window_ns : first and last time, ns, instead of all of the sequence. (These three: of
     what is drawn, not of recorded frames.)
+    atlas : the batch that its events are made in, of the context ``gl``; see
+    :func:`~blinkgl.sequence.side_by_side.side_by_side`.
     Raises BlinkGLError for anything the user or the machine caused, here or while iterating."""
     if pictures_hz is not None and not events:
         raise ConfigError(
@@ -87,9 +93,9 @@ def simulate_sequence(
     wanted = dict(events=events, labels=labels, pictures_hz=pictures_hz)
     if config.frames is None:
         return RenderedSequence(
-            config, index, gl, base=base, scene=scene, renderer=renderer, window_ns=window_ns, **wanted
+            config, index, gl, base=base, scene=scene, renderer=renderer, window_ns=window_ns, atlas=atlas, **wanted
         )
-    if scene is not None or renderer is not None or window_ns is not None:
+    if scene is not None or renderer is not None or window_ns is not None or atlas is not None:
         raise ConfigError(
             "nothing is drawn of recorded frames", where="frames", accepted="neither scene, renderer nor window_ns"
         )

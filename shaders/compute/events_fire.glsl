@@ -36,18 +36,13 @@ layout(std430, binding = 7) restrict buffer State { uvec4 state[]; }; // levels 
 #endif
 #endif
 
-uniform float eps;
 uniform bool before_is_log;
 uniform uint width;
-uniform ivec2 steps; // ON and OFF threshold
-uniform uint start_ns; // of the interval, after a whole microsecond
-uniform uvec2 dt_ns;
-uniform uvec2 base_ns; // that microsecond
-uniform uvec2 refractory_ns;
-uniform ivec2 floors; // of thresholds with jitter
-uniform uvec2 jitter; // double
-uniform uvec2 seed;
 uniform uint capacity;
+#ifdef BATCH
+uniform uint cuts_at; // in Counts: where the tiles' cut events are counted
+#endif
+#include "tiles.glsl"
 
 ivec2 own_steps(uint pixel)
 {
@@ -127,6 +122,15 @@ void main()
     uint count = counts[k], at = offsets[k], whole = uint(record.y), word = uint(record.w);
     uint upper_word = uint(record.z) >> 31;
     int gap = record.x, step_ = record.z & 0x7FFFFFFF;
+#if defined(BATCH) || defined(MORE)
+    uint pixel = listed[k].x;
+#endif
+#ifdef MORE
+    ivec2 own = own_steps(pixel);
+#endif
+#ifdef BATCH
+    enter(pixel);
+#endif
 #if !defined(MORE) && !defined(LONG)
     // One step of the level takes always as long: whole nanoseconds and a rest of 1 / whole of one, so that two divisions
     // do for all events of a pixel.
@@ -145,8 +149,6 @@ void main()
 #else
 #ifdef MORE
     uvec4 more = uvec4(records[RECORD * k + 1u]);
-    uint pixel = listed[k].x;
-    ivec2 own = own_steps(pixel);
 #endif
     uint done = 0u;
     while (done < count) {
@@ -179,16 +181,26 @@ void main()
         return;
     }
     uvec2 this_one = listed[k];
-    uint pixel = this_one.x, limit = this_one.y;
+    uint pixel = this_one.x, limit = this_one.y, place = pixel;
+#ifdef BATCH
+    uint tile = enter(place);
+    bool swapped = here.swapped != 0u;
+    int level = log_of(swapped ? intBitsToFloat(before[pixel]) : now[pixel], eps);
+    int from = log_of(swapped ? now[pixel] : intBitsToFloat(before[pixel]), eps);
+#else
     int level = log_of(now[pixel], eps);
     int from = before_is_log ? before[pixel] : log_of(intBitsToFloat(before[pixel]), eps);
+#endif
     ivec2 next = own_steps(pixel), own = next;
     ivec2 reach = levels[pixel];
     bool up = level >= reach.x;
     // The path is `whole` units long, and ends `gap` beyond the level that is being passed.
     int whole = abs(level - from), gap = up ? level - reach.x : reach.y - level;
     int step_ = up ? own.x : own.y;
-    uint y = quotient_of(pixel, width), x = pixel - y * width;
+    uint y = quotient_of(place, width), x = place - y * width;
+#ifdef BATCH
+    y += tile * height; // so that events say whose they are
+#endif
     uint word = (y << 17) | (x << 1) | uint(up);
     records[RECORD * k] = ivec4(gap, whole, step_ | int((y >> 15) << 31), word);
     uint alive = 0u;
@@ -203,7 +215,7 @@ void main()
 #endif
 #ifdef JITTER
         more.x += 1u;
-        next = next_steps(pixel, more.x, own);
+        next = next_steps(place, more.x, own);
         step_ = up ? next.x : next.y;
 #endif
         gap -= step_;
@@ -218,6 +230,9 @@ void main()
     counts[k] = min(alive, limit);
     if (alive > limit) {
         atomicAdd(head.cut, alive - limit);
+#ifdef BATCH
+        atomicAdd(counts[cuts_at + tile], alive - limit);
+#endif
     }
 }
 #endif

@@ -7,7 +7,7 @@ layout(std430, binding = 1) readonly restrict buffer Offsets { uint offsets[]; }
 layout(std430, binding = 2) readonly restrict buffer Blocks { uint blocks[]; }; // 32 words: where they begin
 layout(std430, binding = 3) writeonly restrict buffer Listed { Head head; uvec2 listed[]; };
 uniform uint words;
-uniform uint share; // events that a block may have
+#include "tiles.glsl"
 
 void main()
 {
@@ -15,6 +15,10 @@ void main()
     if (word >= words) {
         return;
     }
+#ifdef BATCH
+    uint pixel = word * WORD;
+    enter(pixel);
+#endif
     uint bits = marks[word], at = offsets[word], block = word / WORD;
     uint limit = share / max(blocks[block + 1u] - blocks[block], 1u);
     while (bits != 0u) {

@@ -11,8 +11,11 @@ layout(std430, binding = 2) writeonly restrict buffer Marks { uint marks[]; };
 layout(std430, binding = 3) restrict buffer Heads { Head head; };
 uniform uint limit; // bits of the largest value; those of negative numbers, infinities and NaN are larger
 #endif
+#ifdef BATCH
+layout(std430, binding = 4) readonly restrict buffer Before { vec4 before[]; };
+#endif
 uniform uint words;
-uniform float eps;
+#include "tiles.glsl"
 
 void main()
 {
@@ -20,6 +23,15 @@ void main()
     if (word >= words) {
         return;
     }
+#ifdef BATCH
+    uint pixel = word * WORD;
+    enter(pixel);
+    if (here.fires == 0u) {
+        marks[word] = 0u;
+        return;
+    }
+    bool swapped = here.swapped != 0u;
+#endif
     const ivec4 SIDES = ivec4(1, -1, 1, -1);
     const uvec4 FIRST = uvec4(1u, 1u, 2u, 2u), SECOND = uvec4(4u, 4u, 8u, 8u);
     uint bits = 0u;
@@ -27,7 +39,11 @@ void main()
     uvec4 most = uvec4(0u);
 #endif
     for (uint k = 0u; k < 8u; ++k) {
+#ifdef BATCH
+        vec4 four = swapped ? before[8u * word + k] : intensity[8u * word + k];
+#else
         vec4 four = intensity[8u * word + k];
+#endif
         ivec4 now = log_of(four, eps);
         // Above the upper level or below the lower one: neither difference is negative then.
         ivec4 first = (now.xxyy - levels[16u * word + 2u * k]) * SIDES;

@@ -103,15 +103,20 @@ Beam lamp_beam(int i, vec3 at)
 #define BANDS 1
 #endif
 // Of a white surface with normal n: dot(even, (n, 1)), an even sky; and, of a panorama (AMBIENT 2), a quadratic form of n
-// besides: dot(squares, n n) + dot(mixed, n n.yzx).
+// besides: dot(squares, n n) + dot(mixed, n n.yzx); or, of one that is not smooth enough for that (AMBIENT 3), a quartic form,
+// which has the quadratic one in it: x^4 x²y² x³y xy³ x²yz, three of each.
 uniform vec4 around_even[BANDS];
-#if AMBIENT > 1
+#if AMBIENT == 2
 uniform vec3 around_squares[BANDS], around_mixed[BANDS];
+#elif AMBIENT > 2
+uniform vec3 around_fourth[5 * BANDS];
 #endif
 #ifdef RATE
 uniform vec4 around_even_rate[BANDS];
-#if AMBIENT > 1
+#if AMBIENT == 2
 uniform vec3 around_squares_rate[BANDS], around_mixed_rate[BANDS];
+#elif AMBIENT > 2
+uniform vec3 around_fourth_rate[5 * BANDS];
 #endif
 #endif
 
@@ -119,8 +124,13 @@ float around_band(int band, vec3 n)
 {
     vec4 even = NOW(around_even, band);
     float sum = dot(even.xyz, n) + even.w;
-#if AMBIENT > 1
+#if AMBIENT == 2
     sum += dot(NOW(around_squares, band), n * n) + dot(NOW(around_mixed, band), n * n.yzx);
+#elif AMBIENT > 2
+    vec3 square = n * n, mixed = n * n.yzx;
+    int k = 5 * band;
+    sum += dot(square, NOW(around_fourth, k) * square + NOW(around_fourth, k + 1) * square.yzx + NOW(around_fourth, k + 2) * mixed)
+         + dot(mixed, NOW(around_fourth, k + 3) * square.yzx + NOW(around_fourth, k + 4) * mixed.zxy);
 #endif
     return sum;
 }
@@ -200,9 +210,19 @@ ILLUMINANT irradiance(vec3 normal)
 float around_band_rate(int band, vec3 n, vec3 turn)
 {
     float rate = dot(around_even[band].xyz, turn) + dot(around_even_rate[band].xyz, n);
-#if AMBIENT > 1
+#if AMBIENT == 2
     rate += 2.0 * dot(around_squares[band], n * turn) + dot(around_squares_rate[band], n * n)
           + dot(around_mixed[band], turn * n.yzx + n * turn.yzx) + dot(around_mixed_rate[band], n * n.yzx);
+#elif AMBIENT > 2
+    vec3 square = n * n, mixed = n * n.yzx, square_rate = 2.0 * n * turn, mixed_rate = turn * n.yzx + n * turn.yzx;
+    int k = 5 * band;
+    rate += dot(around_fourth[k], 2.0 * square * square_rate) + dot(around_fourth_rate[k], square * square)
+          + dot(around_fourth[k + 1], square_rate * square.yzx + square * square_rate.yzx) + dot(around_fourth_rate[k + 1], square * square.yzx)
+          + dot(around_fourth[k + 2], square_rate * mixed + square * mixed_rate) + dot(around_fourth_rate[k + 2], square * mixed)
+          + dot(around_fourth[k + 3], square_rate.yzx * mixed + square.yzx * mixed_rate) + dot(around_fourth_rate[k + 3], square.yzx * mixed)
+          + dot(around_fourth[k + 4], mixed_rate * mixed.zxy + mixed * mixed_rate.zxy) + dot(around_fourth_rate[k + 4], mixed * mixed.zxy);
+#endif
+#if AMBIENT > 1
     rate *= step(0.0, around_band(band, n)); // none where it is cut off
 #endif
     return rate;

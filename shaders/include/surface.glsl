@@ -44,7 +44,14 @@ uniform sampler2D gloss_map;
 uniform mat3x2 gloss_map_place;
 #endif
 uniform sampler2D energy;       // what is reflected of even light, over (cosine, roughness): F0 r + g; b: the mean of r + g
-uniform sampler3D surroundings; // radiance seen in a mirror, by longitude, latitude and roughness
+uniform sampler2D looks;        // where it comes from, over the same: of two looks how far from the normal to the mirror's
+                                // direction, and roughness; energy's a: how much is the first one's (gloss.py, both())
+#ifdef HUED
+#define SURROUNDINGS surroundings
+#else
+#define SURROUNDINGS surrounding_luminance
+#endif
+uniform sampler3D SURROUNDINGS; // radiance seen in a mirror, by longitude, latitude and roughness
 #ifdef MOVED
 uniform vec3 eye_rate;
 uniform mat3 to_world_rate;
@@ -58,13 +65,13 @@ uniform mat3 to_world_rate;
 // Radiance from direction d, world axes, as a surface of this roughness mirrors it.
 ILLUMINANT mirrored(vec3 d, float roughness)
 {
-    vec3 size = vec3(textureSize(surroundings, 0));
+    float levels = float(textureSize(SURROUNDINGS, 0).z);
     vec2 at = vec2(0.5 - atan(d.y, d.x) * 0.15915494309, 0.5 - asin(clamp(d.z, -1.0, 1.0)) * 0.31830988618);
-    vec3 radiance = map_at(surroundings, vec3(at, (roughness * (size.z - 1.0) + 0.5) / size.z)).rgb;
+    vec4 radiance = map_at(SURROUNDINGS, vec3(at, (roughness * (levels - 1.0) + 0.5) / levels));
 #ifdef HUED
-    return radiance;
+    return radiance.rgb;
 #else
-    return dot(radiance, vec3(0.2126, 0.7152, 0.0722));
+    return radiance.r;
 #endif
 }
 
@@ -82,8 +89,8 @@ ILLUMINANT shone(ILLUMINANT base, vec3 normal, vec3 at, vec2 coordinates)
 #endif
     roughness = max(roughness, SMOOTHEST);
     float facing_eye = clamp(dot(n, v), 1e-3, 1.0), square = roughness * roughness * roughness * roughness;
-    vec2 cells = vec2(textureSize(energy, 0));
-    vec3 part = map_at(energy, (vec2(facing_eye, roughness) * (cells - 1.0) + 0.5) / cells, 0.0).rgb;
+    vec2 cells = vec2(textureSize(energy, 0)), cell = (vec2(facing_eye, roughness) * (cells - 1.0) + 0.5) / cells;
+    vec4 part = map_at(energy, cell, 0.0), look = map_at(looks, cell, 0.0);
     float lost = 1.0 / (part.r + part.g) - 1.0, clear;
     ILLUMINANT metal;
     SEVERAL(DIELECTRIC, clear, part.b)
@@ -94,9 +101,9 @@ ILLUMINANT shone(ILLUMINANT base, vec3 normal, vec3 at, vec2 coordinates)
     ILLUMINANT even_metal = metal * (base * part.r + part.g);
     shown_matt = (1.0 - metallic) * (1.0 - even_clear) * irradiance(normal);
     ILLUMINANT sum = base * shown_matt;
-    // a rough surface's lobe leans towards the normal: gloss.py, looked_at()
-    vec3 ahead = mix(n, reflect(-v, n), (1.0 - roughness * roughness) * (1.0 + 0.6 * roughness * (facing_eye - 0.5)));
-    sum += mirrored(normalize(TO_WORLD * ahead), min(roughness * (0.875 + 0.25 * facing_eye), 1.0)) * mix(ILLUMINANT(even_clear), even_metal, metallic);
+    vec3 up = TO_WORLD * n, away = TO_WORLD * reflect(-v, n);
+    ILLUMINANT first = mirrored(normalize(mix(up, away, look.r)), look.g), second = mirrored(normalize(mix(up, away, look.b)), look.a);
+    sum += mix(second, first, part.a) * mix(ILLUMINANT(even_clear), even_metal, metallic);
 #if defined(SUNS) || defined(LAMPS)
     float seen = sqrt(facing_eye * facing_eye * (1.0 - square) + square);
 #define LOBE(beam, share) \

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blinkgl.card import CardEsim, esim as card_esim
+from blinkgl.card import CardEsim
+from blinkgl.card.room import Room
 from blinkgl.config.events import EsimConfig
 from blinkgl.errors import EventDataError, GLError
 from blinkgl.events import Esim
@@ -156,7 +157,7 @@ def test_what_it_does_not_do_is_said_in_one_line(gl, monkeypatch):
         CardEsim(8, 8, EsimConfig(threshold_jitter=3.0), gl=gl)
     CardEsim(8, 8, EsimConfig(threshold_jitter=1.3), gl=gl).release()
     with pytest.raises(GLError, match=r"^events\.device: 30000x30000 pixels are too many .*MiB.*events\.device: cpu"):
-        card_esim._Room(gl, 30000, 30000, False, False)
+        Room(gl, 30000**2, "30000x30000 pixels", (30000, 30000), spread=False, more=False)
 
     class Old:
         version, renderer = "4.2", "an old card"

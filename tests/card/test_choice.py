@@ -56,7 +56,7 @@ def test_auto_takes_a_graphics_card_that_can_do_it(gl, monkeypatch):
 def test_auto_goes_back_to_the_processor_where_the_picture_is_too_large(gl, monkeypatch):
     assert choice.same_events(gl)
     card = Hardware(gl)
-    monkeypatch.setattr("blinkgl.card.esim.refuse_too_large", lambda *_: (_ for _ in ()).throw(GLError("too large")))
+    monkeypatch.setattr("blinkgl.card.room.refuse_too_large", lambda *_: (_ for _ in ()).throw(GLError("too large")))
     assert made(card) is Esim
     with pytest.raises(GLError, match="too large"):
         made(gl, device="gl")

@@ -11,7 +11,7 @@ from blinkgl.errors import GLError
 def test_more_than_is_free_is_refused_before_anything_is_made(gl, monkeypatch):
     monkeypatch.setattr(memory, "free_bytes", lambda gl: 2**20)
     made = []
-    monkeypatch.setattr("blinkgl.card.esim.refuse_if_out_of_memory", lambda *_: made.append(1))
+    monkeypatch.setattr("blinkgl.card.room.refuse_if_out_of_memory", lambda *_: made.append(1))
     with pytest.raises(GLError) as caught:
         CardEsim(480, 640, gl=gl)
     said = str(caught.value)

@@ -39,6 +39,15 @@ def read(tmp_path, **changes):
         ({"times": [0.2, 0.1]}, "images.times: times of exposures are out of order"),
         ({"times": [0.2, 0.201]}, "images.times: times of exposures are out of order, or nearer"),
         ({"times": []}, "images.times: too few entries"),
+        (
+            {"times": [0.2, 0.3], "rate": 20},
+            "images.rate: images are taken at a rate or at times (got 20.0); expected null beside images.times",
+        ),
+        (
+            {"times": [0.2, 0.3], "rate": 24, "preset": "deblurring"},
+            "images.rate: images are taken at a rate or at times (got 24.0)",
+        ),
+        ({"rate": None}, "images.rate: nothing says when images are taken (got None); expected a rate"),
         ({"times": [0.2, 0.21], "row_us": 100}, "images.times: the rows are not read before the next image begins"),
         ({"bits": 7}, "images.bits: too small (got 7); expected a whole number from 8 to 16"),
         ({"bits": 17}, "images.bits: too large"),
@@ -69,6 +78,16 @@ def test_what_cannot_be_is_one_line(tmp_path, images, said):
     with pytest.raises(ConfigError) as error:
         read(tmp_path, images=images)
     assert str(error.value).startswith(said) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("preset", ["plain", "interpolation"])
+def test_times_take_the_place_of_a_rate(tmp_path, preset):
+    """Also of a preset's; and what is written down is read again."""
+    config = read(tmp_path, images={"preset": preset, "times": [0.1, 0.4]}).sequence(0)
+    assert config.images.rate is None and config.images.times == (0.1, 0.4)
+    again = tmp_path / "again.yaml"
+    again.write_text(config_yaml(config, 0))
+    assert load_run(again).sequence(0).images == config.images
 
 
 def test_recorded_frames_have_no_frame_camera(tmp_path):

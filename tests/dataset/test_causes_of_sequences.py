@@ -7,7 +7,7 @@ import json
 import h5py
 
 from blinkgl.cli import run
-from blinkgl.dataset.verify import check_events
+from blinkgl.dataset.verify.contents import check_events
 
 CONFIG = """
 camera: {width: 48, height: 36}

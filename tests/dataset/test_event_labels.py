@@ -71,14 +71,15 @@ def test_a_row_per_event_of_what_the_scene_has(made):
     ],
 )
 def test_verify_sees_what_cannot_be(made, tmp_path, change, said):
-    from blinkgl.dataset.verify import _check_truth, _guarded
+    from blinkgl.dataset.verify.contents import _check_truth
+    from blinkgl.dataset.verify.found import guarded
 
     folder = tmp_path / "s"
     shutil.copytree(sequence_of(made), folder)
     with h5py.File(folder / "event_labels.h5", "r+") as file:
         change(file)
     manifest = json.loads((folder / "manifest.json").read_text())
-    (line,) = _guarded(lambda: _check_truth(folder, manifest))
+    (line,) = guarded(lambda: _check_truth(folder, manifest))
     assert "event_labels.h5" in line and said in line and "\n" not in line
     assert not verify_dataset(folder).clean
 

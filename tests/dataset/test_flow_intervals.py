@@ -81,8 +81,9 @@ def test_labels_and_images_have_rates_of_their_own(made):
 
 
 def test_verify_sees_what_is_altered(made, tmp_path):
-    from blinkgl.dataset.verify import _check_labels, _check_times, _guarded
-    from blinkgl.dataset.verify_labels import problems_of_asked
+    from blinkgl.dataset.verify.contents import _check_labels, _check_times
+    from blinkgl.dataset.verify.found import guarded
+    from blinkgl.dataset.verify.labels import problems_of_asked
     from blinkgl.io.sequence_dir import read_manifest
 
     assert verify_dataset(made / "out", deep=1).problems == {}
@@ -91,7 +92,7 @@ def test_verify_sees_what_is_altered(made, tmp_path):
     config, manifest = load_run(folder / "config.yaml").sequence(0), read_manifest(folder)
     row, file = LABELS["flow_intervals"], folder / "flow/intervals/000000.h5"
     value = row.forms[0].read(file)
-    look = lambda: _guarded(lambda: _check_labels(folder, manifest)) + problems_of_asked(folder, manifest, config)
+    look = lambda: guarded(lambda: _check_labels(folder, manifest)) + problems_of_asked(folder, manifest, config)
     assert look() == []
 
     def says(**changes) -> str:
@@ -102,8 +103,8 @@ def test_verify_sees_what_is_altered(made, tmp_path):
     assert "config.yaml asks for" in says(interval_ns=value.interval_ns + 5)
     assert "a flow that is no finite number" in says(flow=value.flow * np.float32(np.nan))
     assert "not 48x36 px, 4 times: flow (4, 36, 47, 2)" in says(flow=value.flow[:, :, 1:], valid=value.valid[:, :, 1:])
-    assert "not intervals that increase" in _guarded(lambda: [says(interval_ns=value.interval_ns[::-1])])[0]
-    assert "arrays of different sizes" in _guarded(lambda: [says(valid=value.valid[1:])])[0]
+    assert "not intervals that increase" in guarded(lambda: [says(interval_ns=value.interval_ns[::-1])])[0]
+    assert "arrays of different sizes" in guarded(lambda: [says(valid=value.valid[1:])])[0]
     (folder / "flow/intervals_timestamps.txt").write_text("2\n1\n")
     assert len(_check_times(folder, manifest, row, ["a"] * 4)) == 2
     file.write_bytes(b"HDF")

@@ -11,7 +11,9 @@ import yaml
 from blinkgl.cli import run
 from blinkgl.config.sequence import load_run
 from blinkgl.dataset.explain import explain
-from blinkgl.dataset.verify import _check_imu, _check_tracks, _guarded, verify_dataset
+from blinkgl.dataset.verify import verify_dataset
+from blinkgl.dataset.verify.contents import _check_tracks, check_imu
+from blinkgl.dataset.verify.found import guarded
 from blinkgl.io.imu import read_imu, read_imu_csv
 from blinkgl.io.sequence_dir import read_manifest
 from blinkgl.io.tracks import read_tracks
@@ -82,7 +84,7 @@ def test_verify_sees_tracks_that_cannot_be(made, tmp_path, change, said):
     shutil.copytree(sequence_of(made), tmp_path / "s")
     change(tmp_path / "s")
     config = load_run(tmp_path / "s/config.yaml").sequence(0)
-    (line,) = _guarded(lambda: _check_tracks(tmp_path / "s", read_manifest(tmp_path / "s"), config))
+    (line,) = guarded(lambda: _check_tracks(tmp_path / "s", read_manifest(tmp_path / "s"), config))
     assert "tracks.npz" in line and said in line and "\n" not in line
 
 
@@ -105,7 +107,7 @@ def _row(folder: Path, name: str, change) -> None:
 def test_verify_sees_measurements_that_cannot_be(made, tmp_path, change, said):
     shutil.copytree(sequence_of(made), tmp_path / "s")
     change(tmp_path / "s")
-    (line,) = _guarded(lambda: _check_imu(tmp_path / "s", load_run(tmp_path / "s/config.yaml").sequence(0)))
+    (line,) = guarded(lambda: check_imu(tmp_path / "s", load_run(tmp_path / "s/config.yaml").sequence(0)))
     assert "imu/" in line and said in line and "\n" not in line
 
 

@@ -14,7 +14,8 @@ import yaml
 from blinkgl.config.sequence import load_run
 from blinkgl.dataset.executor import Inline, Local
 from blinkgl.dataset.run import run_dataset
-from blinkgl.dataset.verify import differences, verify_dataset
+from blinkgl.dataset.verify import verify_dataset
+from blinkgl.dataset.verify.again import differences
 from blinkgl.errors import ConfigError, OutputError
 from blinkgl.gl import create_context
 from blinkgl.io.imu import read_imu

@@ -16,9 +16,8 @@ import pytest
 
 from blinkgl.cli import run
 from blinkgl.config.sequence import load_run
-from blinkgl.dataset import verify as verify_module
 from blinkgl.dataset.run import run_dataset
-from blinkgl.dataset.verify import verify_dataset
+from blinkgl.dataset.verify import between, verify_dataset
 from blinkgl.errors import AssetError
 from blinkgl.io.sequence_dir import digest_of
 from runs import NAMES, recipe_file
@@ -112,14 +111,14 @@ def test_a_sound_data_set_and_its_parts(sound, capsys):
 
 
 def test_missing_sequences_get_a_line_each_up_to_a_limit(data, monkeypatch):
-    monkeypatch.setattr(verify_module, "_MOST_MISSING", 1)
+    monkeypatch.setattr(between, "_MOST_MISSING", 1)
     shutil.rmtree(data / NAMES[0])
     (data / "index.jsonl").unlink()
     assert verify_dataset(data).problems == {NAMES[0]: ["missing: the recipe asks for it"]}
     for name in NAMES[1:3]:
         shutil.rmtree(data / name, ignore_errors=True)
     problems = verify_dataset(data).problems
-    gone = sum(not (data / name).exists() for name in {task.name for task in verify_module.plan_of(data).tasks})
+    gone = sum(not (data / name).exists() for name in {task.name for task in between.plan_of(data).tasks})
     assert list(problems)[0] == NAMES[0] and len(problems) == 2
     assert problems["."] == [f"and {gone - 1} more sequences that the recipe asks for are missing"]
 

@@ -12,8 +12,10 @@ import hdf5plugin  # noqa: F401
 import numpy as np
 import pytest
 
-from blinkgl.dataset import verify
-from blinkgl.dataset.verify import Verification, check_events, differences
+from blinkgl.dataset.verify import again, between, contents
+from blinkgl.dataset.verify.again import differences
+from blinkgl.dataset.verify.contents import _check_labels, check_events
+from blinkgl.dataset.verify.found import Known, Verification, guarded
 from blinkgl.io.flow_png import write_flow_png
 
 WIDTH, HEIGHT, END = 20, 10, 5_000
@@ -64,7 +66,7 @@ def events_file(path: Path, offset: int = 700, ms_to_idx=None, **columns) -> Pat
 )
 def test_events(tmp_path, monkeypatch, block, changes, problem):
     """In blocks of any size: what is wrong, and that it is the only thing said."""
-    monkeypatch.setattr(verify, "_BLOCK", block)
+    monkeypatch.setattr(contents, "_BLOCK", block)
     assert check_events(events_file(tmp_path / "events.h5", **changes), MANIFEST) == (
         [f"events.h5: {problem}"] if problem else []
     )
@@ -160,7 +162,7 @@ def labels_folder(
     ],
 )
 def test_labels(tmp_path, changes, problems):
-    assert verify._check_labels(tmp_path, labels_folder(tmp_path, **changes)) == problems
+    assert _check_labels(tmp_path, labels_folder(tmp_path, **changes)) == problems
 
 
 def test_labels_of_another_size_and_number(tmp_path):
@@ -174,27 +176,27 @@ def test_labels_of_another_size_and_number(tmp_path):
         for k in range(3):
             np.save(tmp_path / f"{kind}/{k:06d}.npy", value.astype(np.float32))
         two = {**manifest, "files": {**manifest["files"], f"{kind}/000000.npy": {}, f"{kind}/000001.npy": {}}}
-        assert verify._check_labels(tmp_path, two) == []
-        assert verify._check_labels(tmp_path, {**two, "files": {**two["files"], f"{kind}/000002.npy": {}}}) == [
+        assert _check_labels(tmp_path, two) == []
+        assert _check_labels(tmp_path, {**two, "files": {**two["files"], f"{kind}/000002.npy": {}}}) == [
             f"{kind}: 3 files, manifest says 2 labels"
         ]
-    assert verify._check_labels(tmp_path, {**manifest, "labels": 3}) == [
+    assert _check_labels(tmp_path, {**manifest, "labels": 3}) == [
         f"flow/{direction}: 2 files, 2 time stamps, manifest says 3 labels" for direction in ("forward", "backward")
     ]
     for name in ("images/000000.png", "images/000002.png"):
         cv2.imwrite(str(tmp_path / name), np.zeros((HEIGHT, WIDTH + 1, 3), np.uint8))
-        [line] = verify._check_labels(tmp_path, manifest)
+        [line] = _check_labels(tmp_path, manifest)
         assert line.startswith(f"{name}: not 20x10 px")
         cv2.imwrite(str(tmp_path / name), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     write_flow_png(
         tmp_path / "flow/backward/000001.png", np.zeros((HEIGHT + 1, WIDTH, 2)), np.ones((HEIGHT + 1, WIDTH), bool)
     )
-    [line] = verify._check_labels(tmp_path, manifest)
+    [line] = _check_labels(tmp_path, manifest)
     assert line.startswith("flow/backward/000001.png: not 20x10 px")
 
 
 def test_without_labels_nothing_is_asked(tmp_path):
-    assert verify._check_labels(tmp_path, {**MANIFEST, "files": {"events.h5": {}}}) == []
+    assert _check_labels(tmp_path, {**MANIFEST, "files": {"events.h5": {}}}) == []
 
 
 # --- two machines -----------------------------------------------------------------------------------------------------
@@ -219,7 +221,7 @@ def test_flow_agrees_to_two_quanta_in_nearly_all_pixels(tmp_path, moved, share, 
     other.reshape(-1, 2)[: round(share * 200), axis] += moved
     for root, values in ((a, flow), (b, other)):
         write_flow_png(root / name, values, np.ones((10, 20), bool))
-    assert verify._agrees(name, a, b) is agree
+    assert again._agrees(name, a, b) is agree
 
 
 def test_flow_that_is_valid_elsewhere_or_of_another_size_does_not_agree(tmp_path):
@@ -227,9 +229,9 @@ def test_flow_that_is_valid_elsewhere_or_of_another_size_does_not_agree(tmp_path
     flow, valid = np.zeros((10, 20, 2)), np.ones((10, 20), bool)
     write_flow_png(a / name, flow, valid)
     write_flow_png(b / name, flow, np.arange(200).reshape(10, 20) >= 11)
-    assert not verify._agrees(name, a, b)
+    assert not again._agrees(name, a, b)
     write_flow_png(b / name, np.zeros((10, 21, 2)), np.ones((10, 21), bool))
-    assert not verify._agrees(name, a, b)
+    assert not again._agrees(name, a, b)
 
 
 @pytest.mark.parametrize(
@@ -241,9 +243,9 @@ def test_depth_agrees_to_a_ten_thousandth_in_nearly_all_pixels(tmp_path, factor,
     other = depth.copy()
     other.ravel()[: round(share * 200)] *= np.float32(factor)
     np.save(a / name, depth), np.save(b / name, other)
-    assert verify._agrees(name, a, b) is agree
+    assert again._agrees(name, a, b) is agree
     np.save(b / name, depth[:5])
-    assert verify._agrees(name, a, b) is False
+    assert again._agrees(name, a, b) is False
 
 
 @pytest.mark.parametrize(
@@ -263,7 +265,7 @@ def test_poses_agree_to_rounding_and_times_exactly(tmp_path, change, agree):
     a, b = pair(tmp_path, "poses.npz")
     poses = {"K": np.arange(9.0).reshape(3, 3), "times_ns": np.arange(4) * 10**9}
     np.savez(a / "poses.npz", **poses), np.savez(b / "poses.npz", **change(poses))
-    assert verify._agrees("poses.npz", a, b) is agree
+    assert again._agrees("poses.npz", a, b) is agree
 
 
 def test_times_never_differ_and_what_a_codec_decides_always_may(tmp_path):
@@ -275,25 +277,25 @@ def test_times_never_differ_and_what_a_codec_decides_always_may(tmp_path):
     ):
         a, b = pair(tmp_path, name)
         (a / name).write_text("1"), (b / name).write_text("2")
-        assert verify._agrees(name, a, b) is agree
+        assert again._agrees(name, a, b) is agree
     a, b = pair(tmp_path, "images/000000.png")
     for root, grey in ((a, 10), (b, 200)):
         cv2.imwrite(str(root / "images/000000.png"), np.full((4, 5, 3), grey, np.uint8))
-    assert verify._agrees("images/000000.png", a, b) is True
+    assert again._agrees("images/000000.png", a, b) is True
 
 
 def test_what_sets_two_machines_apart():
     here = {"blinkgl": "1.0", "versions": {"numpy": "2"}, "opengl": {"renderer": "llvmpipe", "version": "4.5"}}
-    assert verify._apart(here, dict(here)) == ""
-    assert verify._apart({**here, "blinkgl": "0.9"}, here) == "made with BlinkGL 0.9, this machine has 1.0"
+    assert again._apart(here, dict(here)) == ""
+    assert again._apart({**here, "blinkgl": "0.9"}, here) == "made with BlinkGL 0.9, this machine has 1.0"
     assert (
-        verify._apart({**here, "opengl": {"renderer": "Voodoo", "version": "1"}}, here)
+        again._apart({**here, "opengl": {"renderer": "Voodoo", "version": "1"}}, here)
         == "made with opengl Voodoo, 1, this machine has llvmpipe, 4.5"
     )
-    assert verify._apart({**here, "versions": {"numpy": "1", "numba": "3"}}, here) == (
+    assert again._apart({**here, "versions": {"numpy": "1", "numba": "3"}}, here) == (
         "made with numba 3, this machine has None; made with numpy 1, this machine has 2"
     )
-    assert verify._made_with({"versions": None, "opengl": None}) == {}
+    assert between.made_with({"versions": None, "opengl": None}) == {}
 
 
 def test_files_in_which_folders_differ(tmp_path):
@@ -319,7 +321,7 @@ def test_files_in_which_folders_differ(tmp_path):
     ],
 )
 def test_where_two_configurations_differ(a, b, where):
-    assert verify._first_difference(a, b) == where
+    assert between.first_difference(a, b) == where
 
 
 # --- what lies between sequences --------------------------------------------------------------------------------------
@@ -331,12 +333,12 @@ def test_what_belongs_to_no_sequence(tmp_path):
     for name in ("train/a_000000/events.h5", "index.jsonl", "report.html", ".run/run.json"):
         (tmp_path / name).write_text("")
     folders = [tmp_path / "train/a_000000", tmp_path / "train/b_000000"]
-    assert verify._between(tmp_path, folders) == ["deep: belongs to no sequence"]
+    assert between.strangers(tmp_path, folders) == ["deep: belongs to no sequence"]
     (tmp_path / "deep").rename(tmp_path / "train/.c_000001.blinkgl-tmp-0123456789ab-1-0")
     (tmp_path / "train/index.jsonl").write_text("")
     (tmp_path / "train/nothing/x").write_text("")
     (tmp_path / "link").symlink_to(tmp_path / "train")
-    assert verify._between(tmp_path, folders) == [
+    assert between.strangers(tmp_path, folders) == [
         "link: belongs to no sequence",
         "train/.c_000001.blinkgl-tmp-0123456789ab-1-0: left by a run that was cut off",
         "train/index.jsonl: belongs to no sequence",
@@ -363,7 +365,7 @@ def known(
         readout=None,
         sensors=None,
     )
-    return name, verify._Known(
+    return name, Known(
         Path(name),
         {
             "files": {"events.h5": {"sha256": sha}, "poses.npz": {"sha256": poses}},
@@ -419,7 +421,7 @@ def known(
 )
 def test_twins(first, second, problems, notes):
     result = Verification()
-    assert verify._twins(dict([first, second]), result) == problems and result.notes == notes
+    assert between.twins(dict([first, second]), result) == problems and result.notes == notes
 
 
 @pytest.mark.parametrize(
@@ -428,17 +430,17 @@ def test_twins(first, second, problems, notes):
 )
 def test_what_makes_two_seeds_differ(key):
     of = lambda **keys: SimpleNamespace(events=SimpleNamespace(**keys), readout=None, sensors=None)
-    assert verify._noisy(of(**{key: 0.1}))
-    assert not verify._noisy(of(**{key: 0.0})) and not verify._noisy(of())
+    assert between._noisy(of(**{key: 0.1}))
+    assert not between._noisy(of(**{key: 0.0})) and not between._noisy(of())
 
 
 @pytest.mark.parametrize(("key", "differ"), [("pixels", True), ("latency", True), ("filters", False)])
 def test_a_read_out_may_make_two_seeds_differ(key, differ):
     readout = SimpleNamespace(**{"pixels": None, "latency": None, key: object()})
-    assert verify._noisy(SimpleNamespace(events=SimpleNamespace(), readout=readout, sensors=None)) is differ
+    assert between._noisy(SimpleNamespace(events=SimpleNamespace(), readout=readout, sensors=None)) is differ
 
 
 def test_a_check_that_stops_is_a_line():
-    assert verify._guarded(lambda: 1 / 0) == [
-        "cannot be checked: ZeroDivisionError: division by zero"
-    ] and verify._guarded(lambda: ["x"]) == ["x"]
+    assert guarded(lambda: 1 / 0) == ["cannot be checked: ZeroDivisionError: division by zero"] and guarded(
+        lambda: ["x"]
+    ) == ["x"]

@@ -143,8 +143,8 @@ def test_captions_stand_above_what_is_shown():
 def test_a_window_as_long_as_things_need_to_move_by_five_pixels(speed, tmp_path, capsys):
     """Points at a known velocity, found again by contrast."""
     span = round(1e6 * 5 / speed)
-    events = moving_events(128, 144, 0, 5 * span, (speed * 0.8, -speed * 0.6), n=5000)
-    write_events(tmp_path / "e.h5", events, 128, 144)
+    events = moving_events(64, 72, 0, 4 * span, (speed * 0.8, -speed * 0.6), n=2000)
+    write_events(tmp_path / "e.h5", events, 64, 72)
     command = ["predict", "contrast-translation", str(tmp_path / "e.h5"), "--window-ms", "auto"]
     assert run(command) == 0
     found = float(re.search(r"windows of (\S+) ms", capsys.readouterr().out).group(1))

@@ -1,22 +1,13 @@
 """Photons, full well, read noise, gain, filters and response of the frame camera, each against its law."""
 
-import numba
 import numpy as np
 import pytest
 from scipy import stats
 
 from blinkgl.imaging.response import decode, encode
-from blinkgl.imaging.sensor import PATTERNS, mosaic, poisson, readings
+from blinkgl.imaging.sensor import PATTERNS, mosaic, readings
 
 SEED = np.uint64(0xFEEDBEEF12345678)
-
-
-@numba.njit
-def drawn(mean, count, seed, image):
-    out = np.empty(count)
-    for i in range(count):
-        out[i] = poisson(mean, seed, np.uint64(i), image)
-    return out
 
 
 def read(light, count, electrons=1000.0, gain=1e-3, well=1e9, photons=True, noise=0.0, seed=SEED, image=0):
@@ -24,6 +15,11 @@ def read(light, count, electrons=1000.0, gain=1e-3, well=1e9, photons=True, nois
     light = np.broadcast_to(np.float64(light), count).copy()
     readings(light, electrons, gain, well, photons, noise, np.uint64(seed), np.uint64(image), out)
     return out
+
+
+def drawn(mean, count, seed=SEED, image=0):
+    """Electrons of ``count`` pixels: one for each of the light's units, and nothing else happens to them."""
+    return read(mean, count, electrons=1.0, gain=1.0, well=1e18, seed=seed, image=image)
 
 
 @pytest.mark.parametrize("mean", [0.05, 0.7, 4.0, 9.99, 10.0, 10.7, 33.3, 400.0, 20000.0])

@@ -9,12 +9,12 @@ import os
 import struct
 import subprocess
 import sys
-from pathlib import Path
 
 import h5py
 import hdf5plugin
 import numpy as np
 import pytest
+from sources import parsed
 
 from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.io.dsec import DsecEventReader, identity_rectify_map, write_rectify_map
@@ -82,12 +82,11 @@ def test_soft_links_inside_the_file_are_fine(tmp_path):
 
 def test_nobody_opens_hdf5_by_another_way():
     """Reading goes through open_hdf5; what opens a file itself says "w"."""
-    root = Path(__file__).resolve().parents[2]
-    for path in [*root.glob("blinkgl/**/*.py"), *root.glob("eflow/**/*.py")]:
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Call) and ast.unparse(node.func) == "h5py.File" and path.name != "hdf5.py":
+    for path, nodes in parsed("blinkgl", "eflow", words=("h5py",)):
+        for node in nodes:
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "h5py.File" and not path.endswith("/hdf5.py"):
                 modes = [a.value for a in node.args[1:2] if isinstance(a, ast.Constant)]
-                assert modes == ["w"], f"{path.name}:{node.lineno}: {ast.unparse(node)}"
+                assert modes == ["w"], f"{path}:{node.lineno}: {ast.unparse(node)}"
 
 
 @pytest.mark.parametrize(

@@ -110,6 +110,39 @@ def test_the_clock_is_found():
         assert found - lag == pytest.approx(shift, abs=700)
 
 
+def test_a_frame_of_another_exposure_is_no_light():
+    """The camera's first frame was exposed longer (evbench_davis240): a picture that becomes darker without events. A
+    lamp that is dimmed makes events, and stays."""
+    frames = moving(most=0.6)
+    events = scene(frames).simulate(emulator_config({"emulator": "esim", **TRUE}), 1)
+    longer = [(np.round(frames[0][0] * 1.4).astype(np.uint8), *frames[0][1:]), *frames[1:]]
+    cut = clip_of_frames(events, longer, (H, W), delay_us=0)
+    whole = clip_of_frames(events, frames, (H, W), delay_us=0)
+    assert cut.facts["other_exposure"] == 1 and np.array_equal(cut.clock_us, whole.clock_us[1:])
+    assert "other_exposure" not in whole.facts
+    dimmed = scene(longer).simulate(emulator_config({"emulator": "esim", **TRUE}), 1)
+    assert "other_exposure" not in clip_of_frames(dimmed, longer, (H, W), delay_us=0).facts
+    by_turns = [(np.round(f * (1.4 if k % 2 else 1)).astype(np.uint8), *rest) for k, (f, *rest) in enumerate(frames)]
+    with pytest.raises(EventDataError, match="exposure changes from one to the next"):
+        clip_of_frames(events, by_turns, (H, W), delay_us=0)
+
+
+def test_a_model_of_one_threshold_is_asked_for_on_and_off_together():
+    """With half of the OFF events gone the Voltmeter, which cannot follow, has the total to follow and no more."""
+    clip = scene()
+    events = clip.simulate(emulator_config("voltmeter"), 1)
+    off = np.flatnonzero(events.p == 0)
+    fewer = np.ones(len(events), bool)
+    fewer[off[::2]] = False
+    recorded = sums(events.part(fewer), clip, 0, 3)
+    apart, together = (_Search(clip.with_events(events.part(fewer)), emulator_config(kind), 3, 0, None).target
+                       for kind in ("esim", "voltmeter"))  # fmt: skip
+    assert together.together and not apart.together
+    assert np.count_nonzero(together.block == "rate") == np.count_nonzero(apart.block == "rate") / 2
+    on = np.exp(together.values[together.block == "rate"][-1]) * recorded.pixels[:, 0].sum() * recorded.seconds.sum()
+    assert on == pytest.approx(recorded.rates.sum() + 1)
+
+
 def test_tiles_of_a_large_sensor_have_the_same_events(monkeypatch):
     """Half of the pixels: what they see, and their recorded events, stay together."""
     frames = moving()

@@ -120,17 +120,24 @@ def test_every_light_is_the_references(gl, offset):
                 assert np.quantile(error, 0.999) < 1e-4
 
 
-def test_light_of_a_panorama_is_the_references(gl):
-    """Nine numbers per channel, turned into each object's axes; and their rate."""
+@pytest.mark.parametrize("finer", [False, True])
+def test_light_of_a_panorama_is_the_references(gl, finer):
+    """Nine numbers per channel, or eighteen, turned into each object's axes; and their rate."""
     quadric = np.random.default_rng(1).normal(size=(3, 4, 4)) * 0.1
     quadric = quadric + quadric.swapaxes(1, 2) + np.diag([0, 0, 0, 1.0])
-    light = Light(sun=0, sky=0, around=tuple(tuple(map(tuple, one)) for one in quadric.tolist()))
+    quartic = np.random.default_rng(2).normal(size=(3, 9, 9)) * 0.04
+    around, more = (
+        tuple(tuple(map(tuple, one)) for one in form.tolist()) for form in (quadric, quartic + quartic.swapaxes(1, 2))
+    )
+    light = Light(sun=0, sky=0, around=around, finer=more if finer else None)
     world, t, h = replace(mixed_scene(textured=False), light=light), SECOND // 3, 1_000_000
     ref = reference.render(world, t)
     with Renderer(gl, world, RenderConfig(image_antialiasing="none"), whole=True) as renderer:
         seen, colour = renderer.luminance(t).read(), renderer.colour(t).read()
         before, after = (renderer.luminance(t + dt).read().astype(np.float64) for dt in (-h, h))
         rate = renderer.luminance(t, rate=True).read("rate").astype(np.float64)
+    ambients = {dict(defines).get("AMBIENT") for program, defines in gl.shaders.compiled if program == "luminance.glsl"}
+    assert ("3" if finer else "2") in ambients
     off = ref.hit & ~reference.silhouette_band(ref.instance, ref.depth, width=3) & (ref.instance > 2)
     assert (
         np.quantile(np.abs(seen - ref.luminance)[off], 0.999) < 1e-4

@@ -13,6 +13,7 @@ from blinkgl.errors import BlinkGLError
 from blinkgl.scene.types import Fog
 from blinkgl.tools.peer_cycles import CyclesSettings, export
 from blinkgl.tools.peer_light import ROUGHNESSES, cases, compared
+from tests.shared_data import shared
 
 NUMBER = len(list(cases(None)))
 
@@ -45,13 +46,26 @@ def test_fog_is_refused_in_one_line(tmp_path):
 @pytest.mark.parametrize("number", range(NUMBER))
 def test_an_effect_is_the_path_tracers(gl, number):
     """Median relative difference: 1 % of matt surfaces, 3 % of each ball of metal, whose paths are noisy."""
-    case = list(cases(None))[number]
+    judged(gl, list(cases(None))[number])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(bool(process.available()), reason=process.available() or "there")
+@pytest.mark.parametrize("name", ["city", "park", "warehouse"])
+def test_a_panorama_is_the_path_tracers(gl, tmp_path, name):
+    """Matt surfaces and metal, by the same bounds."""
+    (tmp_path / f"{name}.hdr").symlink_to(shared(f"data/assets/hdri/{name}.hdr"))
+    for case in list(cases(tmp_path))[NUMBER:]:
+        judged(gl, case)
+
+
+def judged(gl, case):
     shiny = case.name.startswith("metal")
     ours, theirs, graded, true = compared(gl, case, 256 if shiny else 32)
     error = np.abs(theirs - ours).mean(axis=2) / (theirs.mean(axis=2) + 0.01)
     if not shiny:
-        assert graded.sum() > 1000 and np.median(error[graded]) < 0.01
+        assert graded.sum() > 1000 and np.median(error[graded]) < 0.01, case.name
         return
     for k in range(len(ROUGHNESSES)):
         on = graded & (true.instance == k + 1)
-        assert not on.any() or (on.sum() > 200 and np.median(error[on]) < 0.03), ROUGHNESSES[k]
+        assert not on.any() or (on.sum() > 200 and np.median(error[on]) < 0.03), (case.name, ROUGHNESSES[k])

@@ -4,6 +4,8 @@ read-out, or the frame that a path lags."""
 import ast
 from pathlib import Path
 
+from sources import parsed
+
 ROOT = Path(__file__).parents[2]
 KERNELS_ALONE = {"tools/bench_events.py", "tools/bench_load.py", "tools/draws.py", "tools/noise_laws.py"}
 THE_DOOR = {"blinkgl/front/sensors.py"}  # hands an emulator to a person who steps it
@@ -18,18 +20,17 @@ OWN = {
 
 def test_nobody_else_makes_an_emulator_a_read_out_or_a_timeline():
     users: dict[str, set[str]] = {name: set() for name in OWN}
-    for folder in ("blinkgl", "tools", "eflow", "examples"):
-        for path in (ROOT / folder).rglob("*.py"):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                names = (
-                    [a.name for a in node.names]
-                    if isinstance(node, ast.ImportFrom)
-                    else [node.attr]
-                    if isinstance(node, ast.Attribute)
-                    else []
-                )
-                for name in names:
-                    if name in users:
-                        users[name].add(path.relative_to(ROOT).as_posix())
+    for path, nodes in parsed("blinkgl", "tools", "eflow", "examples", words=tuple(OWN)):
+        for node in nodes:
+            names = (
+                [a.name for a in node.names]
+                if isinstance(node, ast.ImportFrom)
+                else [node.attr]
+                if isinstance(node, ast.Attribute)
+                else []
+            )
+            for name in names:
+                if name in users:
+                    users[name].add(path)
     assert {name: files - OWN[name] for name, files in users.items()} == {name: set() for name in OWN}
     assert users["Readout"] and users["make_timeline"], "the look finds what is there"

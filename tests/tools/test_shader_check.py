@@ -238,8 +238,8 @@ def test_files_select_programs_and_a_file_elsewhere_brings_its_folder(shader, sh
     )
     status, out, _ = shader("check", shaders / "mine.glsl")
     assert status == 1 and "mine.glsl:8:24: error" in out
-    status, out, _ = shader("check", "light.glsl", "--json")
-    assert status == 0 and set(json.loads(out)["programs"]) == {"colour.glsl", "luminance.glsl"}
+    status, out, _ = shader("check", "cover.glsl", "--json")
+    assert status == 0 and set(json.loads(out)["programs"]) == {"downsample.glsl", "gather.glsl"}
 
 
 @pytest.mark.parametrize(

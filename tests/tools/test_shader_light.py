@@ -113,7 +113,8 @@ MISTAKES = {
     "the sky from below": (LIGHTS, SKY, "even.w - dot(even.xyz, n)", "luminance_around"),
     "half of the emission": ("luminance.glsl", "own = emission;", "own = 0.5 * emission;", "luminance_emission"),
     "a lobe without its cosine": (SURFACE, "lobe * facing * share", "lobe * share", "luminance_mirrored"),
-    "a mirror turned round": (SURFACE, "mix(n, reflect(-v, n),", "mix(n, reflect(v, n),", "luminance_mirrored"),
+    "a mirror turned round": (SURFACE, "TO_WORLD * reflect(-v, n)", "TO_WORLD * reflect(v, n)", "luminance_mirrored"),
+    "one look for both": (SURFACE, "look.b)), look.a)", "look.r)), look.g)", "luminance_mirrored"),
     "a gloss without shadow": (SURFACE, "share = shadow_share[i];", "share = 1.0;", "luminance_mirrored"),
     "colours that glow twice": ("colour.glsl", "added += emission;", "added += 2.0 * emission;", "colour_emission"),
 }

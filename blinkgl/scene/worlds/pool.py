@@ -59,11 +59,40 @@ class Entry:
     index: int = 0
 
 
+class Cache:
+    """What was loaded last, ``limit`` bytes of all pools together: a process that makes sequences of many groups for
+    days holds no more than one that makes a few."""
+
+    def __init__(self, limit: int):
+        self.limit, self.held = limit, 0
+        self._kept: OrderedDict[tuple[object, str], tuple[Any, int]] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def get(self, key: tuple[object, str], load: Callable[[], Any]) -> Any:
+        """What is kept of this key, or ``load()``."""
+        if key in self._kept:
+            self._kept.move_to_end(key)
+            return self._kept[key][0]
+        loaded = load()
+        size = _bytes_of(loaded)
+        self._kept[key] = loaded, size
+        self.held += size
+        while self.held > self.limit and len(self._kept) > 1:
+            self.held -= self._kept.popitem(last=False)[1][1]
+        return loaded
+
+
+_OF_ALL_POOLS = Cache(256_000_000)
+
+
 @dataclass
 class Pool:
     """Entries in a deterministic order (by source, then hash), and what is needed to load them.
 
     bad_assets : "error" lets AssetError through; "skip" logs it and draws again.   what, where : for messages.
+    cache : of what was loaded; the process's, unless said.
     """
 
     entries: tuple[Entry, ...]
@@ -72,9 +101,8 @@ class Pool:
     where: str
     what: str
     bad_assets: str = "error"
-    cache_bytes: int = 256_000_000
-    _cache: OrderedDict = field(default_factory=OrderedDict, repr=False)
-    _cached_bytes: int = 0
+    cache: Cache = field(default=_OF_ALL_POOLS, repr=False)
+    _own: object = field(default_factory=object, repr=False)  # two pools may load the same file in two ways
 
     def split(self, split: str) -> dict[str, tuple[Entry, ...]]:
         """source -> its entries on this side; sources without any are left out. ConfigError when nothing is left."""
@@ -100,16 +128,8 @@ class Pool:
         return {source: tuple(entries) for source, entries in sides.items()}
 
     def load(self, entry: Entry) -> Any:
-        """The entry's content, from a cache of the last ones within ``cache_bytes``."""
-        if entry.source_hash in self._cache:
-            self._cache.move_to_end(entry.source_hash)
-            return self._cache[entry.source_hash]
-        loaded = self.load_entry(entry)
-        self._cache[entry.source_hash] = loaded
-        self._cached_bytes += _bytes_of(loaded)
-        while self._cached_bytes > self.cache_bytes and len(self._cache) > 1:
-            self._cached_bytes -= _bytes_of(self._cache.popitem(last=False)[1])
-        return loaded
+        """The entry's content, which may be the cache's."""
+        return self.cache.get((self._own, entry.source_hash), lambda: self.load_entry(entry))
 
     def draw(self, rng: np.random.Generator, split: str, log: list[str] | None = None) -> Any:
         """A random entry's content. The number of draws from ``rng`` does not depend on what the cache holds."""

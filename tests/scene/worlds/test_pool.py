@@ -2,6 +2,7 @@
 
 import shutil
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from PIL import Image
 from blinkgl.config.scene import PoolConfig, TexturesConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.importing.mesh_files import load_asset
-from blinkgl.scene.worlds.pool import object_pool, split_of, texture_pool
+from blinkgl.scene.worlds.pool import Cache, object_pool, split_of, texture_pool
 from tests.scene.gltf_files import GltfBuilder, triangle
 from tests.shared_data import shared
 
@@ -89,13 +90,22 @@ def test_sources_have_equal_chances(tmp_path):
 
 
 def test_cache_keeps_identity_and_stays_bounded():
-    pool = texture_pool(TexturesConfig(photographs=False, max_size=8), ".")
-    pool.cache_bytes = 5 * 8 * 8 * 3
+    cache = Cache(5 * 8 * 8 * 3)
+    pool, other = (
+        replace(texture_pool(TexturesConfig(photographs=False, max_size=size), "."), cache=cache) for size in (8, 9)
+    )
     first = pool.load(pool.entries[0])
     assert pool.load(pool.entries[0]) is first
+    assert other.load(pool.entries[0]).image.shape == (9, 9, 3), "of the same name, and of another pool"
     for entry in pool.entries[:20]:
         pool.load(entry)
-    assert len(pool._cache) == 5 and pool.load(pool.entries[0]) is not first
+    assert len(cache) == 5 and cache.held == cache.limit and pool.load(pool.entries[0]) is not first
+
+
+def test_all_pools_of_a_process_share_one_bound():
+    """A worker of a recipe of many groups keeps as much as one of a few."""
+    pools = [texture_pool(TexturesConfig(photographs=False, max_size=8 + k), ".") for k in range(3)]
+    assert len({id(pool.cache) for pool in pools}) == 1 and pools[0].cache.limit == 256_000_000
 
 
 def test_loaded_objects_are_normalised():

@@ -1,4 +1,4 @@
-"""Do labels hold what the configuration asks for? Beside what :mod:`blinkgl.dataset.verify` looks at in every label."""
+"""Do labels hold what the configuration asks for? Beside what :mod:`.contents` looks at in every label."""
 
 from __future__ import annotations
 

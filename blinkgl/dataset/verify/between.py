@@ -1,0 +1,220 @@
+"""What lies between sequences: strangers, the index, twins, and the recipe that they are of."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from blinkgl.config.sequence import RunTemplate, SequenceConfig, load_run
+from blinkgl.dataset.plan import Plan
+from blinkgl.dataset.run_folder import RunFolder
+from blinkgl.dataset.verify.found import Known, Verification, guarded
+from blinkgl.dataset.work import RUN_FOLDER
+from blinkgl.errors import BlinkGLError
+from blinkgl.io.index import INDEX, entry, read_index
+from blinkgl.io.records import open_regular, shown
+from blinkgl.io.sequence_dir import MANIFEST
+
+_AT_TOP = {INDEX, "report.html"}
+
+
+_MOST_MISSING = 1000
+"""Missing sequences that get a line each; the others are counted."""
+
+
+def strangers(root: Path, folders: list[Path]) -> list[str]:
+    """What lies in the data set and belongs to no sequence."""
+    problems = []
+    known = set(folders)
+    parents = {folder.parent for folder in folders} | {root}
+
+    def look(folder: Path) -> Iterator[Path]:
+        for path in sorted(folder.iterdir()):
+            if path in known or (folder == root and path.name in (*_AT_TOP, RUN_FOLDER)):
+                continue
+            if path in parents and path.is_dir() and not path.is_symlink():
+                yield from look(path)
+            else:
+                yield path
+
+    for path in look(root):
+        name = path.relative_to(root).as_posix()
+        if path.is_dir() and not path.is_symlink() and not any(path.iterdir()):
+            continue
+        left = ".blinkgl-tmp-" in path.name
+        problems.append(f"{shown(name)}: {'left by a run that was cut off' if left else 'belongs to no sequence'}")
+    return problems
+
+
+def index(root: Path, folders: list[Path]) -> list[str]:
+    """The index says what the manifests say."""
+    try:
+        (root / INDEX).lstat()
+    except FileNotFoundError:
+        return []
+    listed = {line["path"]: line for line in read_index(root)}
+    actual = {}
+    for folder in folders:
+        with suppress(BlinkGLError):
+            line = entry(root, folder)
+            actual[line["path"]] = line
+    wrong = sorted(p for p in listed.keys() | actual.keys() if listed.get(p) != actual.get(p))
+    return [f"{INDEX}: out of date for {shown(p)}" for p in wrong[:5]]
+
+
+def twins(known: dict[str, Known], result: Verification) -> dict[str, list[str]]:
+    """Sequences with the events or the poses of another one, although they are different draws. Where nothing is drawn
+    at all (a scene of one's own or recorded frames, thresholds that are all alike) twins
+    are what was asked for, and a note."""
+    seen: dict[tuple[str, str], str] = {}
+    problems: dict[str, list[str]] = {}
+    for name, one in known.items():
+        files, config = _files_of_first(one.manifest), one.config
+        random_scene = config.frames is None and config.scene.kind == "random"
+        looked = [
+            f
+            for f, tells in (("events.h5", one.manifest["events"] > 0), ("poses.npz", random_scene))
+            if tells and f in files
+        ]
+        for file in looked:
+            other = seen.setdefault((file, files[file]["sha256"]), name)
+            if other == name:
+                continue
+            numbers = [(known[n].config.seed, known[n].manifest["sequence"]) for n in (name, other)]
+            if numbers[0] != numbers[1] and (random_scene or _noisy(config)):
+                problems.setdefault(name, []).append(
+                    f"{file}: the same as in {shown(other)}, a sequence of another draw"
+                )
+            elif file == "events.h5":
+                result.notes.append(
+                    f"{shown(name)}: the same events as {shown(other)}, as their configurations have it"
+                )
+    return problems
+
+
+def _files_of_first(manifest: dict[str, Any]) -> dict[str, Any]:
+    """Files of a sequence, of a rig's first camera alone."""
+    if not manifest.get("cameras"):
+        return manifest["files"]
+    own = manifest["cameras"][0] + "/"
+    return {name.removeprefix(own): file for name, file in manifest["files"].items() if name.startswith(own)}
+
+
+def _noisy(config: SequenceConfig) -> bool:
+    """Whether two seeds give two pixel arrays."""
+    if config.sensors is not None:
+        return any(_noisy(config.of_sensor(k)) for k, one in enumerate(config.sensors) if one.events is not None)
+    drawn = (
+        "threshold_sigma",
+        "threshold_jitter",
+        "leak_rate_hz",
+        "shot_noise_rate_hz",
+        "hot_pixel_fraction",
+        "k3",
+        "k6",
+    )
+    readout = config.readout
+    behind = readout is not None and (readout.pixels is not None or readout.latency is not None)
+    return behind or any(getattr(config.events, key, 0) > 0 for key in drawn)
+
+
+def against_run(root: Path, folders: list[Path], known: dict[str, Known], result: Verification) -> list[str]:
+    """Sequences that the recipe asks for and are not there, or are and it draws others; what
+    the run says of its OpenGL."""
+    plan, record = plan_of(root), RunFolder(root).read("run.json") or {}
+    if plan is None:
+        result.notes.append("no record of the run here: sequences were not compared with a recipe")
+        return []
+    failed: dict[str, str] = {}
+    problems = guarded(lambda: failed.update(RunFolder(root).read("failed.json") or {}) or [])
+    here = {folder.relative_to(root).as_posix() for folder in folders}
+    missing = 0
+    for task in plan.tasks:
+        if task.name not in here:
+            missing += 1
+            if missing <= _MOST_MISSING:
+                result.add(
+                    task.name,
+                    [
+                        f"set aside: {shown(failed[task.name])}"
+                        if task.name in failed
+                        else "missing: the recipe asks for it"
+                    ],
+                )
+    if missing > _MOST_MISSING:
+        problems.append(f"and {missing - _MOST_MISSING} more sequences that the recipe asks for are missing")
+    if record.get("mixed"):
+        result.notes.append("the run went on with --mixed: configurations and OpenGL were not compared with its record")
+        return problems
+    groups = {
+        f"{g.template.tree.get('output', {}).get('split', 'train')}/{_called(g.template)}": g for g in plan.groups
+    }
+    environment = record.get("environment", {})
+    for name, one in known.items():
+        group = groups.get(re.sub(r"_\d{6,}$", "", name))
+        if group is None:
+            result.add(name, ["no group of the recipe makes it"])
+            continue
+        drawn = group.template.sequence(one.manifest["sequence"])
+        if where := first_difference(comparable(one.config), comparable(drawn)):
+            result.add(name, [f"config.yaml: the recipe draws another value for {where}"])
+        result.add(
+            name,
+            [
+                f"{MANIFEST}: made with {key} {shown(value)}, the run's record says {shown(environment[key])}"
+                for key, value in made_with(one.manifest).items()
+                if environment.get(key, value) != value
+            ],
+        )
+    return problems
+
+
+def made_with(manifest: dict[str, Any]) -> dict[str, str]:
+    """Versions and OpenGL, under the names that the run's record has for them."""
+    gl = manifest.get("opengl") or {}
+    return {
+        **(manifest.get("versions") or {}),
+        **({"opengl": f"{gl.get('renderer')}, {gl.get('version')}"} if gl else {}),
+    }
+
+
+def _called(template: RunTemplate) -> str:
+    return template.check().output.name
+
+
+def comparable(config: SequenceConfig) -> dict[str, Any]:
+    """Plain data without what a sequence's own configuration says otherwise than the recipe:
+    its number, and which of the folders."""
+    tree = json.loads(config.model_dump_json())
+    for key in ("sequences", "first_index"):
+        tree["output"].pop(key)
+    if tree["frames"] is not None:
+        tree["frames"].pop("folders")
+    return tree
+
+
+def first_difference(a: Any, b: Any, path: str = "") -> str:
+    """Dotted path, "" when they agree. Numbers that a text form rounds are equal."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        for key in sorted(a.keys() | b.keys()):
+            if where := first_difference(a.get(key), b.get(key), f"{path}.{key}" if path else key):
+                return where
+        return ""
+    return "" if a == b else path
+
+
+def plan_of(root: Path) -> Plan | None:
+    """The plan of the run that made ``root``; None without a record of one. Raises BlinkGLError: a damaged record."""
+    known = RunFolder(root).read("run.json")
+    if known is None:
+        return None
+    recipe = root / RUN_FOLDER / "recipe.yaml"
+    with suppress(FileNotFoundError):
+        open(open_regular(recipe), "rb").close()
+        template = load_run(recipe)
+        return Plan.of(RunTemplate(template.tree, Path(known.get("base", "."))), known.get("num"))
+    return None

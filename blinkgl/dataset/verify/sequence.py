@@ -1,0 +1,78 @@
+"""One sequence's folder, or one rig's, by itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from blinkgl.config.sequence import SequenceConfig, load_run
+from blinkgl.dataset.verify.asked import bound, files_of_rig, misnamed, not_asked_for, said_of, times_of, unlike
+from blinkgl.dataset.verify.contents import check_imu, contents
+from blinkgl.dataset.verify.found import Known, guarded
+from blinkgl.io.records import shown
+from blinkgl.io.sequence_dir import MANIFEST, read_manifest, verify_sequence
+
+_REQUIRED = {"duration_us": int, "seed": int, "sequence": int, "split": str, "labels": int}
+
+
+def look(folder: Path, name: str) -> tuple[list[str], Known | None]:
+    """``name``: path below the data set, "." where the sequence is looked at alone and may be called anything."""
+    found: list[Known] = []
+
+    def check() -> list[str]:
+        if name != "." and folder.is_symlink():
+            return ["a symbolic link, not a folder"]
+        if problems := verify_sequence(folder):
+            return problems
+        manifest = read_manifest(folder)
+        if missing := [
+            f"{MANIFEST}: '{key}' is missing or no {kind.__name__}"
+            for key, kind in _REQUIRED.items()
+            if manifest.get(key) is None
+        ]:
+            return missing
+        if "config.yaml" not in manifest["files"]:
+            return ["config.yaml: missing"]
+        config = load_run(folder / "config.yaml").sequence(manifest["sequence"])
+        if manifest["format"] == "blinkgl-rig":
+            problems = look_at_rig(folder, name, manifest, config)
+        elif config.sensors is not None:
+            problems = look_at_sensor(folder, manifest, config)
+        else:
+            problems = bound(name, manifest, config) or contents(folder, manifest, config)
+        if not problems:
+            found.append(Known(folder, manifest, config))
+        return problems
+
+    return guarded(check), found[0] if found else None
+
+
+def look_at_rig(folder: Path, name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
+    """Problems of a rig's folder whose files are whole: of itself, and of each camera's in it."""
+    if config.sensors is None:
+        return ["config.yaml: a single camera's, but the manifest is a rig's"]
+    said = [("sensors", [one.name for one in config.sensors]), *said_of(config), *times_of(config)]
+    if problems := [*unlike(manifest, said), *misnamed(name, manifest, config)]:
+        return problems
+    if problems := not_asked_for(set(files_of_rig(config)), manifest):
+        return problems
+    for one in config.sensors:
+        if one.sees:
+            inside = guarded(
+                lambda one=one: look_at_sensor(folder / one.name, read_manifest(folder / one.name), config)
+            )
+            problems += [f"{one.name}/{line}" for line in inside]
+        elif one.imu is not None:
+            inside = guarded(lambda one=one: check_imu(folder / one.name, config.model_copy(update={"imu": one.imu})))
+            problems += [f"{one.name}/{line}" for line in inside]
+    total = sum(read_manifest(folder / one.name)["events"] for one in config.sensors if one.sees)
+    return problems or unlike(manifest, [("events", total)])
+
+
+def look_at_sensor(folder: Path, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
+    """Problems of the folder of one camera of a rig, whose configuration is the rig's."""
+    number = {one.name: k for k, one in enumerate(config.sensors or ()) if one.sees}.get(str(manifest.get("sensor")))
+    if number is None or config.sensors is None:
+        return [f"{MANIFEST}: sensor is {shown(manifest.get('sensor'))}, of which config.yaml says nothing"]
+    own, events = config.of_sensor(number), config.sensors[number].events is not None
+    return bound(".", manifest, own, events) or contents(folder, manifest, own)

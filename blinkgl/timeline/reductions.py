@@ -1,0 +1,89 @@
+"""What a timeline needs of a small picture: a percentile and the largest of what moves in it, two numbers.
+
+They are found where the picture is: of arrays here, of textures in :mod:`blinkgl.card.reductions`, the same to the last
+bit, so that frames come at the same times.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import moderngl
+
+    from blinkgl.events.response import Response
+
+SLOWEST = np.float32(2.0**-40)
+"""What moves (px/s) or changes (per second) by less than these 1e-12 stands still. The squares of what does not are no
+subnormal numbers, which cards may take for zero."""
+
+
+class Drawn(Protocol):
+    """What has been drawn, wherever it is."""
+
+    def read(self) -> np.ndarray: ...
+
+    def texture(self) -> moderngl.Texture: ...
+
+
+class Ranked(NamedTuple):
+    """Of the values that move. count : how many.   percentile, largest : 0.0 where there are none."""
+
+    count: int
+    percentile: float
+    largest: float
+
+
+STILL = Ranked(0, 0.0, 0.0)
+
+
+class Reductions(Protocol):
+    """How small pictures become :class:`Ranked`."""
+
+    def speeds(self, drawn: Drawn, percent: float) -> Ranked:
+        """Of the lengths of (h, w, 2) float32 vectors."""
+
+    def changes(self, drawn: Drawn, response: Response, percent: float) -> Ranked:
+        """Of |d(signal)/dt|, per second, of (h, w, 2) float32 luminances and their rates."""
+
+
+class OfArrays:
+    """Of pictures that are read back."""
+
+    def speeds(self, drawn: Drawn, percent: float) -> Ranked:
+        return ranked(np.linalg.norm(drawn.read(), axis=-1), percent)
+
+    def changes(self, drawn: Drawn, response: Response, percent: float) -> Ranked:
+        picture = drawn.read()
+        return ranked(np.abs(response.change(picture[..., 0], picture[..., 1])), percent)
+
+
+def ranked(values: np.ndarray, percent: float) -> Ranked:
+    """Of float32 values of any shape >= 0: those that neither stand still nor are beyond all bounds (a surface in the
+    camera plane); a still background has no say in a percentile."""
+    values = values.ravel()
+    values = values[(values >= SLOWEST) & np.isfinite(values)]
+    if not len(values):
+        return STILL
+    k, share = place(len(values), percent)
+    above = min(k + 1, len(values) - 1)
+    values = np.partition(values, (k, above, len(values) - 1))
+    return Ranked(len(values), between(values[k], values[above], share), float(values[-1]))
+
+
+def place(count: int, percent: float) -> tuple[int, float]:
+    """Which of ``count`` values in order, and how far on to the next one [0, 1), in double precision."""
+    at = (count - 1) * (percent / 100)
+    k = min(math.floor(at), count - 1)
+    return k, at - k
+
+
+def between(below: np.float32, above: np.float32, share: float) -> float:
+    """From one value towards the next in single precision, as NumPy's percentile rounds (from the nearer of them)."""
+    apart = above - below
+    if share < 0.5:
+        return float(below + apart * np.float32(share))
+    return float(above - apart * np.float32(1.0 - share))

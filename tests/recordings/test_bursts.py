@@ -1,0 +1,86 @@
+"""Bursts that a camera's own frames make: found where they are, and nowhere else."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from blinkgl.events.types import Events
+from blinkgl.recordings.bursts import frame_bursts, inside_any
+from blinkgl.recordings.clip import clip_of_frames, read_recording
+from blinkgl.recordings.simulation import emulator_config
+from blinkgl.recordings.statistics import sums
+from tests.recordings.test_calibration import GAP_US, TRUE, H, W, moving, scene
+from tests.shared_data import shared
+
+FRAME_US = 40_000
+
+
+def stream(at_us, polarity: float = 0.97, seed: int = 0, seconds: float = 0.3) -> Events:
+    """40 events/ms of both polarities, and bursts of 300 within 0.6 ms."""
+    rng = np.random.default_rng(seed)
+    count = int(40_000 * seconds)
+    t = [rng.integers(0, int(seconds * 1e6), count), *(rng.integers(a, a + 600, 300) for a in at_us)]
+    p = [rng.random(count) < 0.5, *(rng.random(300) < polarity for _ in at_us)]
+    order = np.argsort(np.concatenate(t), kind="stable")
+    x, y = rng.integers(0, W, order.size), rng.integers(0, H, order.size)
+    return Events(x.astype(np.uint16), y.astype(np.uint16), np.concatenate(t)[order],
+                  np.concatenate(p)[order].astype(np.uint8))  # fmt: skip
+
+
+def test_bursts_at_the_frames_interval():
+    at = [12_300 + FRAME_US * k for k in range(7)]
+    events = stream(at)
+    spans = frame_bursts(events, FRAME_US * 1.01)
+    assert len(spans) == 7 and (np.diff(spans) <= 1500).all()
+    for (begin, end), a in zip(spans, at):
+        assert begin <= a + 60 and end >= a + 540
+    within = inside_any(events.t, spans)
+    assert 1900 <= within.sum() - 40 * np.diff(spans).sum() / 1000 <= 2150
+    assert np.array_equal(within, np.any([(events.t >= begin) & (events.t < end) for begin, end in spans], axis=0))
+    assert not inside_any(events.t, spans[:0]).any()
+
+
+@pytest.mark.parametrize(
+    "at, polarity",
+    [
+        ([112_300], 0.97),  # a flash
+        ([52_300, 75_000, 130_000, 221_000], 0.97),  # flashes
+        ([12_300 + FRAME_US * k for k in range(7)], 0.6),  # many events of both polarities: something moves
+        ([], 1.0),
+    ],
+)
+def test_what_is_none(at, polarity):
+    assert not len(frame_bursts(stream(at, polarity), FRAME_US))
+
+
+def test_no_interval_begins_or_ends_in_a_burst():
+    frames = moving()
+    events = scene(frames).simulate(emulator_config({"emulator": "esim", **TRUE}), 1)
+    rng = np.random.default_rng(1)
+    at = [GAP_US * (k + 1) + 6000 for k in range(6)]
+    t = np.concatenate([events.t, *(rng.integers(a, a + 500, 4000) for a in at)])
+    more = t.size - len(events)
+    order = np.argsort(t, kind="stable")
+    take = lambda own, burst: np.concatenate([own, burst.astype(own.dtype)])[order]
+    x, y = rng.integers(0, W, more), rng.integers(0, H, more)
+    struck = Events(take(events.x, x), take(events.y, y), t[order], take(events.p, np.ones(more)))
+    clip = clip_of_frames(struck, frames, (H, W), delay_us=0)
+    assert clip.facts["bursts"] == 6 and 0.1 < clip.facts["in_bursts"] < 0.95
+    found, undisturbed = (sums(e, clip, 0, clip.intervals) for e in (struck, events))
+    assert found.rates.sum() + found.still.sum() > undisturbed.rates.sum() + undisturbed.still.sum() + 20_000
+    gaps = 0
+    timed = ~inside_any(struck.t, clip.bursts)
+    where = struck.y.astype(int) * W + struck.x
+    for pixel in np.unique(where):
+        here = timed[where == pixel]
+        gaps += np.count_nonzero(here[1:] & here[:-1])
+    assert found.isi.sum() == gaps
+
+
+def test_of_a_davis():
+    """slider_depth: four intervals of 38.8 ms, ON at each, OFF a ms after two of them; 12 % of all events."""
+    events, _ = read_recording(shared("data/events/slider_depth/events_chunk.txt"))
+    spans = frame_bursts(events, 38_770)
+    assert len(spans) == 6
+    assert 0.10 < inside_any(events.t, spans).mean() < 0.13

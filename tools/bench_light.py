@@ -46,6 +46,7 @@ def lights(plain: Light) -> dict[str, Light]:
     def around(r: float, g: float, b: float):
         return tuple(tuple(tuple(c * v for v in row) for row in up) for c in (r, g, b))
 
+    finer = tuple(tuple(map(tuple, one)) for one in (0.02 * np.ones((3, 9, 9))).tolist())
     sun = {"sun": plain.sun, "sun_direction": plain.sun_direction}
     point = Lamp("point", (3.0, 3.0, 3.0), StaticPath(lamp_pose((2.0, 1.0, 3.0))))
     spot = Lamp("spot", (9.0, 9.0, 9.0), StaticPath(lamp_pose((-2.0, 1.0, 4.0), (0.2, 0.0, -1.0))))
@@ -53,6 +54,8 @@ def lights(plain: Light) -> dict[str, Light]:
         "plain": plain,
         "environment, white": Light(**sun, sky=0.0, around=around(1, 1, 1)),
         "environment, coloured": Light(**sun, sky=0.0, around=around(0.8, 0.9, 1.2)),
+        "order 4, white": Light(**sun, sky=0.0, around=around(1, 1, 1), finer=finer),
+        "order 4, coloured": Light(**sun, sky=0.0, around=around(0.8, 0.9, 1.2), finer=finer),
         "point and spot, white": replace(plain, lamps=(point, spot)),
         "hard shadows": replace(plain, shadows="hard"),
         "hard shadows, map of 2048": replace(plain, shadows="hard", shadow_size=2048),

@@ -6,7 +6,6 @@ import itertools
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
-from blinkgl.config.recipe import derived_seed
 from blinkgl.config.sequence import RunTemplate
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
@@ -41,13 +40,14 @@ class OnlineSequences:
     min_events : fewest events in each window.   max_flow : longest median of a sample's flow, px.   min_density :
         fewest events per pixel of a window and px of its mean flow.   split : "train" or "test" groups.
     workers : rendering processes, each with an OpenGL context and one thread; 0: this process, when asked.
-    seed : of everything.   rank : process of a distributed training; each has sequences of its own.
+    seed : of everything.   rank, world : this process and the number of them in a distributed training: each renders
+        every ``world``-th block of one stream. Together they have each sample once, the same ones whatever ``world``.
     first : the sample to go on with; samples before it are not rendered, but for those mixed with it.
 
-    Sample n is a function of (recipe, seed, rank, n): not of workers, of who takes it, or of what came before. Every
-    sample is given once. Two blocks (of ``block`` samples, from eight sequences) are rendered ahead, then rendering
-    waits. Workers that die are replaced, sequences that fail are replaced by the next in a fixed order, and counted;
-    when half fail, the next sample raises. Memory does not grow with the number of samples.
+    Sample n is a function of (recipe, seed, rank, world, n): not of workers, of who takes it, or of what came before.
+    Every sample is given once. Two blocks (of ``block`` samples, from eight sequences) are rendered ahead, then
+    rendering waits. Workers that die are replaced, sequences that fail are replaced by the next in a fixed order, and
+    counted; when half fail, the next sample raises. Memory does not grow with the number of samples.
 
     stats : :class:`StreamStats`.   block : samples that are mixed with each other.   stream : what is below, a
         :class:`~blinkgl.online.stream.SampleStream`.
@@ -69,12 +69,13 @@ class OnlineSequences:
         workers: int = 1,
         seed: int = 0,
         rank: int = 0,
+        world: int = 1,
         first: int = 0,
     ):
         template = source if isinstance(source, RunTemplate) else load(source)
         seed = check.seed(seed)
-        if check.whole(rank, "rank", 0, 1_000_000):
-            seed = derived_seed(seed, f"rank {rank}")
+        world = check.whole(world, "world", 1, 1_000_000)
+        rank = check.whole(rank, "rank", 0, world - 1)
         if kind not in CUTS:
             raise ConfigError("unknown kind", where="kind", value=kind, accepted=", ".join(CUTS))
         if split not in ("train", "test"):
@@ -92,6 +93,8 @@ class OnlineSequences:
             check.number(min_density, "min_density", least=0),
             split,
             seed,
+            rank,
+            world,
         )
         self.first = check.whole(first, "first", 0, 2**62)
         template = RunTemplate({**template.tree, "seed": stream_seed(template.seed, seed)}, template.base)

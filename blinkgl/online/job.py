@@ -13,6 +13,9 @@ from blinkgl.config.sequence import RunTemplate
 from blinkgl.dataset.plan import Plan
 from blinkgl.errors import ConfigError
 
+MIX = 8
+"""Slots of a block, whose samples are mixed: a batch then has samples of different sequences."""
+
 
 @dataclass(frozen=True)
 class StreamJob:
@@ -23,7 +26,8 @@ class StreamJob:
     window_us : shortest and longest window, µs, drawn log-uniformly for each sample; None: the recipe's label interval.
     steps : windows of a sample of kind "streams".   min_events : fewest events in each window.
     max_flow : longest median of the flow in a sample, px.   min_density : fewest events per pixel of a window and px of
-    its mean flow.   split : which groups.   seed : of windows and their order.   out : the spool folder."""
+    its mean flow.   split : which groups.   seed : of windows and their order.   out : the spool folder.
+    rank, world : this process has every ``world``-th block of the stream, from block ``rank`` on."""
 
     out: str
     base: str
@@ -37,11 +41,22 @@ class StreamJob:
     min_density: float = 0.0
     split: str = "train"
     seed: int = 0
+    rank: int = 0
+    world: int = 1
     maker: ClassVar[str] = "blinkgl.online.maker:SlotMaker"
 
     def plan(self) -> Plan:
         """Raises ConfigError: a bad recipe, or one without groups of the split."""
         return _plan(self.recipe, self.base, self.split)
+
+    def block_of_all(self, block: int) -> int:
+        """Number in the whole stream of a block of this process."""
+        return block * self.world + self.rank
+
+    def slot_of_all(self, slot: int) -> int:
+        """Number in the whole stream of a slot of this process."""
+        block, place = divmod(slot, MIX)
+        return self.block_of_all(block) * MIX + place
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)

@@ -45,18 +45,19 @@ class SlotMaker(Maker):
             shutil.rmtree(self.job.out, ignore_errors=True)
 
     def make(self, number: int, attempt: int, tell: Any) -> Message:
-        """The slot of this number. Only KeyboardInterrupt and SystemExit get out."""
+        """The slot of this number, of those of this process. Only KeyboardInterrupt and SystemExit get out."""
         job, began, made, failures, barren, last, tried = self.job, time.process_time(), 0, 0, 0, "", 0
+        slot = job.slot_of_all(number)
         while made < job.samples and barren < TRIES:
             tried, before = tried + 1, made
-            index = number + (tried - 1) * _APART
-            group = self._group(number, tried)
+            index = slot + (tried - 1) * _APART
+            group = self._group(slot, tried)
             try:
                 self.renew()
                 config = group.template.sequence(index)
                 name = sequence_name(config.output, index).split("/")[1]
                 with simulate_sequence(config, index, self.gl, base=Path(job.base), labels=False) as sequence:
-                    for sample in CUTS[job.kind](sequence, job, name, job.samples - made, self._dice(number, tried, 1)):
+                    for sample in CUTS[job.kind](sequence, job, name, job.samples - made, self._dice(slot, tried, 1)):
                         sample.write(sample_file(Path(job.out), number, made))
                         made += 1
             except Exception as error:  # noqa: BLE001 - whatever it is, the next sequence goes on

@@ -32,12 +32,10 @@ from blinkgl.dataset.executor import Executor, Inline, Local
 from blinkgl.dataset.work import Message
 from blinkgl.errors import BlinkGLError, ConfigError, EventDataError
 from blinkgl.online.cuts import Sample
-from blinkgl.online.job import StreamJob, flow_labels
+from blinkgl.online.job import MIX, StreamJob, flow_labels
 from blinkgl.online.maker import sample_file
 from blinkgl.online.samples import read_sample
 
-MIX = 8
-"""Slots whose samples are mixed: a batch then has samples of different sequences."""
 _ATTEMPTS = 3  # at a slot whose worker died
 _SLOT_S = 900.0  # longest for a slot
 _FREE_FAILURES, _FAILURE_SHARE = 10, 0.5
@@ -146,7 +144,7 @@ class SampleStream:
     def _place(self, n: int) -> tuple[int, int]:
         """Slot and item of sample n: the samples of a block, shuffled."""
         block, place = divmod(n, self.block)
-        mixed = int(_order(self.job.seed, block, self.block)[place])
+        mixed = int(_order(self.job.seed, self.job.block_of_all(block), self.block)[place])
         return block * MIX + mixed // self.job.samples, mixed % self.job.samples
 
     def _mark(self, slot: int, item: int) -> None:

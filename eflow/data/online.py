@@ -10,8 +10,8 @@ from pathlib import Path
 
 from blinkgl.config.sequence import load_run
 from blinkgl.errors import ConfigError
-from blinkgl.online.job import StreamJob, stream_seed
-from blinkgl.online.stream import MIX, SampleStream
+from blinkgl.online.job import MIX, StreamJob, stream_seed
+from blinkgl.online.stream import SampleStream
 from eflow.config import SourceConfig
 from eflow.data.window import RawSample, raw_sample
 

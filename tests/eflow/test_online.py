@@ -15,7 +15,7 @@ torch = pytest.importorskip("torch")
 
 from blinkgl.errors import ConfigError, EventDataError  # noqa: E402
 from blinkgl.online.cuts import drawn_spans  # noqa: E402
-from blinkgl.online.stream import MIX  # noqa: E402
+from blinkgl.online.job import MIX  # noqa: E402
 from eflow.checkpoint import newest  # noqa: E402
 from eflow.cli import run  # noqa: E402
 from eflow.config import load_train_config  # noqa: E402

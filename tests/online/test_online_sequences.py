@@ -12,7 +12,7 @@ import yaml
 from tiny_recipe import TINY
 
 from blinkgl import AssetError, ConfigError, EventDataError, GLError, OnlineSequences, StreamSample, WindowSample, load
-from blinkgl.online.stream import MIX
+from blinkgl.online.job import MIX
 
 RECIPE = {**TINY, "output": {"sequences": 3}}
 
@@ -67,13 +67,25 @@ def test_windows_of_a_stream_follow_each_other(recipe):
     assert min(lengths) > 0 and max(lengths) < 1.5 * min(lengths)
 
 
-def test_seeds_and_ranks_have_sequences_of_their_own(recipe):
-    def flows(**how):
-        with OnlineSequences(recipe, workers=0, per_sequence=2, **how) as sequences:
+def test_seeds_have_sequences_of_their_own(recipe):
+    def flows(seed):
+        with OnlineSequences(recipe, workers=0, per_sequence=2, seed=seed) as sequences:
             return {s.flow.tobytes() for s in islice(sequences, 3)}
 
-    there = [flows(), flows(seed=1), flows(rank=1), flows(seed=1, rank=1)]
-    assert len(set.union(*there)) == 12 and flows(rank=1) == there[2]
+    assert len(flows(0) | flows(1)) == 6
+
+
+def test_ranks_deal_one_stream_out_between_them(recipe):
+    """Block by block, so that each renders what it takes; the samples are those of one process alone."""
+
+    def taken(first, **how):
+        with OnlineSequences(recipe, workers=0, per_sequence=1, first=first, **how) as sequences:
+            return [told(s) for s in islice(sequences, 2)], sequences.stats.slots
+
+    whole = {block: taken(MIX * block)[0] for block in (0, 1, 2)}
+    assert taken(0, rank=0, world=2) == (whole[0], 2), "and no slot of the other's is rendered"
+    assert taken(0, rank=1, world=2)[0] == taken(0, rank=1, world=3)[0] == whole[1]
+    assert taken(MIX, rank=0, world=2)[0] == whole[2], "resumed"
 
 
 def voxels(samples: list[WindowSample]):
@@ -143,6 +155,7 @@ def test_the_end(recipe):
         ({"split": "val"}, "split: unknown split (got 'val'); expected train, test"),
         ({"split": "test"}, "the recipe has nothing of split 'test'"),
         ({"workers": -1}, "workers: not a whole number in range"),
+        ({"rank": 2, "world": 2}, "rank: not a whole number in range"),
         ({"first": 1.5}, "first: not a whole number in range"),
     ],
 )

@@ -4,8 +4,13 @@
     quads = lines.of(moment, items, width, height)      # what passes/edged.py draws
 
 An edge of a mesh is seen when the surface turns away from the camera there (a silhouette), when it ends there (a
-border), or when two of its faces meet at an angle (a crease). Which ones that are is decided in float64, in the mesh's
-own axes: the camera comes to the mesh, as in raycast.py.
+border), when two of its faces meet at an angle (a crease), or when they show different places of their texture (a
+seam). Which ones that are is decided in float64, in the mesh's own axes: the camera comes to the mesh, as in
+raycast.py.
+
+Where triangles are small an outline runs to and fro. A silhouette's edge at which the surface is hollow lies behind the
+surface itself, and its line runs back along others that are seen: it is one of those that cancel each other
+(edges.glsl).
 """
 
 from __future__ import annotations
@@ -23,9 +28,11 @@ if TYPE_CHECKING:
     from blinkgl.scene.types import Mesh
 
 FLOATS = 9
-"""Of a vertex of :meth:`Lines.of`: its place, px; both ends of its line, px and depth; 1 where it is a crease."""
+"""Of a vertex of :meth:`Lines.of`: its place, px; both ends of its line, px and depth; its kind."""
 CREASE = np.cos(np.radians(20.0))
 """Of the angle between the normals of two faces where they meet, above which light is expected to jump."""
+SILHOUETTE, BACK_AGAIN, BENT, TORN = 0, -1, 1, 2
+"""Kinds of lines: silhouettes and borders; silhouettes where a closed surface is hollow; creases; seams."""
 REACH = 0.7072
 """Half a pixel's diagonal: how far beside a line, and behind its ends, the pixels that it crosses have their
 centres, px."""
@@ -36,7 +43,8 @@ class Contour:
 
     corners : (V,) int64 where in ``mesh.vertices`` each place is.   faces : (F, 3) int32 places.
     edges : (E, 4) int32: two places in the order of the first face, the first face, the second or -1.
-    sharp : (E,) bool, whether its faces meet at an angle.   planes : (F, 4) float64 of a mesh that does not deform:
+    sharp : (E,) int8: :data:`BENT` where its faces meet at an angle, else :data:`TORN` where they meet in space and not
+    in the texture, else 0.   planes : (F, 4) float64 of a mesh that does not deform:
     normal, any length, and its product with a point of the face."""
 
     def __init__(self, mesh: Mesh):
@@ -50,17 +58,20 @@ class Contour:
         self.sharp = self._sharp(mesh)
 
     def _sharp(self, mesh: Mesh) -> np.ndarray:
-        """(E,) bool: its two faces have other normals at both of its ends. A surface that is bent there and lit as if
-        it were round shows no step."""
+        """(E,) int8. Bent: its two faces have other normals at both of its ends; a surface that is bent there and lit
+        as if it were round shows no step. Torn: other texture coordinates, and not only by whole turns of the
+        texture."""
         first, second = self.edges[:, 2], self.edges[:, 3]
-        sharp = second >= 0
+        bent, torn = second >= 0, second >= 0
         for end in (0, 1):
-            normals = [
-                mesh.normals[mesh.faces[face, (self.faces[face] == self.edges[:, end, None]).argmax(axis=1)]]
+            one, other = (
+                mesh.faces[face, (self.faces[face] == self.edges[:, end, None]).argmax(axis=1)]
                 for face in (first, second)
-            ]
-            sharp &= (normals[0] * normals[1]).sum(axis=1) < CREASE
-        return sharp
+            )
+            bent &= (mesh.normals[one] * mesh.normals[other]).sum(axis=1) < CREASE
+            apart = mesh.uvs[one] - mesh.uvs[other]
+            torn &= np.abs(apart - np.round(apart)).max(axis=1) > 1e-5
+        return np.where(bent, BENT, np.where(torn, TORN, 0)).astype(np.int8)
 
 
 def _edges(faces: np.ndarray, places: int) -> np.ndarray:
@@ -112,8 +123,8 @@ class Lines:
                 more[: 4 * count] = self._quads[: 4 * count]
                 self._quads = more
             count = _emit(
-                eye, moment.mvp[item.object_index], places, planes, contour.edges, contour.sharp, not item.two_sided,
-                float(width), float(height), self._quads, count,
+                eye, moment.mvp[item.object_index], places, contour.faces, planes, contour.edges, contour.sharp,
+                not item.two_sided, float(width), float(height), self._quads, count,
             )  # fmt: skip
         return self._quads[: 4 * count].reshape(count, 4, FLOATS)
 
@@ -133,22 +144,29 @@ def _planes(places: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 @nb.njit(cache=True, nogil=True)
-def _emit(eye, mvp, places, planes, edges, sharp, culled, width, height, out, count):
+def _emit(eye, mvp, places, faces, planes, edges, sharp, culled, width, height, out, count):
     """Writes the rectangles of one item's lines behind the first ``count``; their number then."""
     front = np.empty(len(planes), np.bool_)
     for f in range(len(planes)):
         front[f] = planes[f, 0] * eye[0] + planes[f, 1] * eye[1] + planes[f, 2] * eye[2] > planes[f, 3]
     ends = np.empty((2, 4))
     for e in range(len(edges)):
-        v0, v1, towards, crease = edges[e, 0], edges[e, 1], front[edges[e, 2]], False
+        v0, v1, towards, kind = edges[e, 0], edges[e, 1], front[edges[e, 2]], SILHOUETTE
         if edges[e, 3] >= 0:
             other = front[edges[e, 3]]
             if towards == other:
-                if not sharp[e] or (culled and not towards):
+                if sharp[e] == 0 or (culled and not towards):
                     continue
-                crease = True
-            elif culled and not towards:  # as the face that is seen has it: the other way round
-                v0, v1, towards = v1, v0, True
+                kind = sharp[e]
+            elif culled:
+                if not towards:  # as the face that is seen has it: the other way round
+                    v0, v1, towards = v1, v0, True
+                for k in range(3):  # hollow: the one face's third corner is before the other
+                    p = places[faces[edges[e, 3], k]]
+                    if faces[edges[e, 3], k] != v0 and faces[edges[e, 3], k] != v1:
+                        plane = planes[edges[e, 2]]
+                        if plane[0] * p[0] + plane[1] * p[1] + plane[2] * p[2] > plane[3]:
+                            kind = BACK_AGAIN
         elif culled and not towards:
             continue
         if towards:  # the surface lies to the left of its line, x to the right and y down
@@ -201,6 +219,6 @@ def _emit(eye, mvp, places, planes, edges, sharp, culled, width, height, out, co
             out[row, 1] = (ay if k < 2 else by) + along * uy + across * ux
             out[row, 2], out[row, 3], out[row, 4] = ax, ay, ad
             out[row, 5], out[row, 6], out[row, 7] = bx, by, bd
-            out[row, 8] = 1.0 if crease else 0.0
+            out[row, 8] = kind
         count += 1
     return count

@@ -22,9 +22,8 @@ if TYPE_CHECKING:
     from blinkgl.scene.types import Light
 
 EXAMPLES: tuple[dict[str, Any], ...] = (
-    {"LIGHTS": 1, "AMBIENT": 2},
     {"LIGHTS": 1, "AMBIENT": 3},
-    {"LIGHTS": 1, "SUNS": 2, "LAMPS": 2},
+    {"LIGHTS": 1, "SUNS": 2, "LAMPS": 2, "AMBIENT": 2},
     {"LIGHTS": 1, "SUNS": 1, "AMBIENT": 1, "SHADOWS": 1, "SHADOW_SUNS": 1},
     {
         "LIGHTS": 1, "SUNS": 2, "LAMPS": 3, "SPOTS": 2, "AMBIENT": 1,

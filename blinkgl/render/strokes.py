@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from blinkgl.render.moment import Moment
     from blinkgl.render.resources import DrawItem
 
-_LAYOUT = (("in_place", 2), ("in_start", 3), ("in_end", 3), ("in_crease", 1))
+_LAYOUT = (("in_place", 2), ("in_start", 3), ("in_end", 3), ("in_kind", 1))
 
 
 class Strokes:
@@ -55,14 +55,14 @@ class Strokes:
             self._programs[key] = uniforms, array
         return self._programs[key]
 
-    def draw(self, array: moderngl.VertexArray, target: Target, equation: int) -> None:
-        """Over what ``target`` holds, met by a blend equation with factors of one."""
+    def draw(self, array: moderngl.VertexArray, target: Target, add: bool) -> None:
+        """Over what ``target`` holds, or added to it."""
         ctx = self.gl.ctx
         target.fbo.use()
         ctx.viewport = (0, 0, target.fbo.width, target.fbo.height)
-        ctx.enable_only(moderngl.BLEND)
+        ctx.enable_only(moderngl.BLEND if add else moderngl.NOTHING)
         ctx.blend_func = moderngl.ONE, moderngl.ONE
-        ctx.blend_equation = equation, equation
+        ctx.blend_equation = moderngl.FUNC_ADD, moderngl.FUNC_ADD
         array.render(moderngl.TRIANGLES, vertices=6 * self._count)
         ctx.disable(moderngl.BLEND)
 

@@ -46,12 +46,14 @@ uniform mat3x2 gloss_map_place;
 uniform sampler2D energy;       // what is reflected of even light, over (cosine, roughness): F0 r + g; b: the mean of r + g
 uniform sampler2D looks;        // where it comes from, over the same: of two looks how far from the normal to the mirror's
                                 // direction, and roughness; energy's a: how much is the first one's (gloss.py, both())
+// Radiance seen in a mirror, by longitude, latitude and roughness.
 #ifdef HUED
+uniform sampler3D surroundings;
 #define SURROUNDINGS surroundings
 #else
+uniform sampler3D surrounding_luminance;
 #define SURROUNDINGS surrounding_luminance
 #endif
-uniform sampler3D SURROUNDINGS; // radiance seen in a mirror, by longitude, latitude and roughness
 #ifdef MOVED
 uniform vec3 eye_rate;
 uniform mat3 to_world_rate;

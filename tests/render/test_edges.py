@@ -303,3 +303,56 @@ def test_through_a_lens(gl):
     seen = world.with_camera(lens)
     true, plain, edged = (luminance(gl, seen, name, SECOND // 3) for name in ("ssaa4", "none", "edges"))
     assert rmse(edged, true) < 0.8 * rmse(plain, true)
+
+
+# ---- triangles smaller than a pixel --------------------------------------------------------------------------------
+
+
+def rough_ball(subdivisions: int, dents: float):
+    """A ball of 14 px whose outline runs to and fro where its triangles are small."""
+    ball = sphere(1.0, subdivisions)
+    points, place = np.unique(np.round(ball.vertices, 6), axis=0, return_inverse=True)
+    rough = 1 + dents * np.random.default_rng(3).uniform(-1, 1, len(points))
+    shape = mesh(ball.vertices * rough[place.reshape(-1), None], ball.faces)
+    paint = replace(WHITE, double_sided=False)
+    return scene([thing("ball", 1, shape, drift((0, 3.4, 0), (0.4, 0, 0.1), LEVEL), paint)], rig(48, 48, 48.0))
+
+
+@pytest.mark.parametrize("subdivisions, dents", [(4, 0.01), (5, 0.005)])
+def test_small_triangles_do_not_flicker(gl, subdivisions, dents):
+    """All lines of a pixel mean the same two surfaces, whichever way they run: an outline of steps of 0.7 and 0.35 px
+    has about the error of a smooth one, and no more of it changes from frame to frame when frames come closer."""
+    world = rough_ball(subdivisions, dents)
+    times = [int(k * (SECOND // 40)) for k in range(5)]  # a seventh of a pixel each
+    true = np.stack([finest(gl, world, 8, t) for t in times])
+    off = {name: np.stack([luminance(gl, world, name, t) for t in times]) - true for name in ("none", "edges")}
+    assert rmse(off["edges"], 0) < 0.45 * rmse(off["none"], 0)
+    for step in (1, 2):
+        change = {name: rmse(np.diff(error[::step], axis=0), 0) for name, error in off.items()}
+        assert change["edges"] < 0.45 * change["none"]
+
+
+def test_seams_of_textures(gl):
+    """Two halves of a card that show different places of their texture, along a zigzag of half pixels."""
+    rows = 40
+    y = np.linspace(-10, 10, rows)
+    middle = 0.3 * (-1.0) ** np.arange(rows)
+    points = np.concatenate([np.column_stack([x * np.ones(rows), y]) for x in (-8 + 0 * middle, middle, middle, 8)])
+    uvs = np.concatenate([np.full((2 * rows, 2), 0.25), np.full((2 * rows, 2), 0.75)]).astype(np.float32)
+    k = np.arange(rows - 1)
+    strip = lambda a: np.concatenate(
+        [
+            np.column_stack([a + k, a + rows + k, a + k + 1]),
+            np.column_stack([a + rows + k, a + rows + k + 1, a + k + 1]),
+        ]
+    )
+    card = mesh(np.column_stack([points * 3 / 48, np.full(4 * rows, 3.0)]), np.concatenate([strip(0), strip(2 * rows)]))
+    image = np.zeros((64, 64, 3), np.float32)
+    image[:32], image[32:] = 0.1, 0.9
+    paint = Material(Texture(image), unlit=True, double_sided=True)
+    world = looked_at(thing("card", 1, replace(card, uvs=uvs), still(), paint))
+    assert set(Contour(world.objects[0].parts[0].mesh).sharp.tolist()) == {0, 2}
+    true = finest(gl, world)
+    inside = np.s_[16:32, 20:28]
+    error = {name: rmse(luminance(gl, world, name)[inside], true[inside]) for name in ("taps4", "edges")}
+    assert error["edges"] < 0.5 * error["taps4"]

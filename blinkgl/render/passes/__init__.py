@@ -7,7 +7,7 @@ Start: base.py, then luminance.py.
 
 from blinkgl.render.passes.base import Input, Output, Pass, ScenePass, ScreenPass, Shot
 from blinkgl.render.passes.colour import Colour
-from blinkgl.render.passes.edged import Edged, filtered
+from blinkgl.render.passes.edged import Changes, Edged, filtered
 from blinkgl.render.passes.gather import Gather, one_value
 from blinkgl.render.passes.geometry import Geometry
 from blinkgl.render.passes.luminance import Brightness, Luminance
@@ -15,12 +15,24 @@ from blinkgl.render.passes.mean import Mean
 from blinkgl.render.passes.shadow import Shaded, ShadowMap, shadow_maps
 from blinkgl.render.passes.velocity import Velocity
 
-PASSES: tuple[type[Pass], ...] = (Luminance, Brightness, Velocity, Colour, Geometry, Mean, Edged, Gather, ShadowMap)
+PASSES: tuple[type[Pass], ...] = (
+    Luminance,
+    Brightness,
+    Velocity,
+    Colour,
+    Geometry,
+    Mean,
+    Changes,
+    Edged,
+    Gather,
+    ShadowMap,
+)
 """Those that a renderer draws of itself."""
 
 __all__ = [
     "PASSES",
     "Brightness",
+    "Changes",
     "Colour",
     "Edged",
     "Gather",

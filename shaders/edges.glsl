@@ -55,8 +55,10 @@ const float COVER = 6.0;
 const float SAME = 0.25;
 const float NEARER = 0.001;
 
-uniform float pixel; // 1 / focal length, px
 uniform vec2 image_size;
+#if STEP > 0
+uniform float pixel; // 1 / focal length, px
+#endif
 
 ivec2 inside_picture(ivec2 pixel)
 {

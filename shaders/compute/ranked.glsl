@@ -36,7 +36,6 @@ void main()
         wanted = many == 0u ? 0u : min(uint(floor_of(mul_double(double_of(uvec2(last, 0u)), part))), last);
     }
     barrier();
-    uint rank = wanted, stop = many, above_first = 0u;
     for (uint shift = 32u; shift > 0u;) {
         shift -= 8u;
         for (uint bin = lane; bin < 256u; bin += uint(LANES)) {

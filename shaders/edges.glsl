@@ -146,13 +146,13 @@ void main()
             ivec2 by = ivec2(k % 3, k / 3) - 1, beside = inside_picture(here + by);
             float there = k == 4 ? own : texelFetch(depths, beside, 0).r;
             float weight = k == 4 ? 0.0 : by.x == 0 || by.y == 0 ? 1.0 : DIAGONAL;
-            if (there < behind) {
-                backs += weight * texelFetch(picture, beside, 0);
-                at_back += k == 4 ? 1e-9 : weight;
-            } else if (there < before) {
-                fronts += weight * texelFetch(picture, beside, 0);
-                in_front += weight;
-            }
+            // (One look for both: a processor takes every branch.)
+            vec4 seen = weight * texelFetch(picture, beside, 0);
+            bool far = there < behind, near = !far && there < before;
+            backs += far ? seen : vec4(0.0);
+            at_back += far ? (k == 4 ? 1e-9 : weight) : 0.0;
+            fronts += near ? seen : vec4(0.0);
+            in_front += near ? weight : 0.0;
         }
         bool known;
         if (at_back > 0.0) {
@@ -193,15 +193,18 @@ void main()
         // Where it is narrower than a pixel the surface may be between all centres around, and seen further along.
         vec2 onwards = way / max(abs(way.x), abs(way.y));
         float further = (end.z - start.z) / max(abs(way.x), abs(way.y));
+        bool from_afar = !known;
+        ivec2 beside = here;
         for (int k = 0; k < 2 * ALONG && !known; ++k) {
             int steps = (k % 2 * 2 - 1) * (k / 2 + 2);
-            ivec2 beside = inside_picture(ivec2(floor(gl_FragCoord.xy + float(steps) * onwards)));
+            beside = inside_picture(ivec2(floor(gl_FragCoord.xy + float(steps) * onwards)));
             float expected = depth + float(steps) * further;
             known = abs(texelFetch(depths, beside, 0).r - expected) < SAME * expected;
-            front = texelFetch(picture, beside, 0);
         }
         if (!known)
             discard;
+        if (from_afar)
+            front = texelFetch(picture, beside, 0);
         if (abs(room) < SNAP)
             on_left = back_again != inside;
     }

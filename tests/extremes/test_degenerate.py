@@ -190,7 +190,7 @@ def test_a_neighbour_on_the_horizon_has_no_texture_coordinates(gl, antialiasing,
     assert last.sum() > 100 and not buffers["ids"][:33].any()
     ends = np.flatnonzero(last)[[0, -1]]
     if antialiasing == "edges":
-        last[ends] = False  # the ground ends in these pixels, in the centre of the first: what is behind is in them, too
+        last[ends] = False  # it ends there, in the middle of the first pixel: what is behind is in them, too
     for name, buffer in buffers.items():
         assert np.isfinite(buffer).all(), name
     mean = paint.image.mean(axis=(0, 1)) @ (0.2126, 0.7152, 0.0722)

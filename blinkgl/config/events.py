@@ -339,7 +339,12 @@ class V2eConfig(_TwoThresholds, EmulatorConfig):
     @rule("second_cutoff_hz", "cutoff_hz")
     def _a_second_needs_a_first(second_cutoff_hz, cutoff_hz):
         if second_cutoff_hz and cutoff_hz == 0:
-            raise Refused("a second low-pass needs a first: cutoff_hz > 0 and not infinite bandwidth")
+            raise Refused(
+                "a second low-pass needs a first",
+                where="second_cutoff_hz",
+                value=second_cutoff_hz,
+                accepted="0, or a cutoff_hz > 0 beside it",
+            )
 
     @rule("photoreceptor_noise", "cutoff_hz")
     def _noise_needs_bandwidth(noise, cutoff_hz):

@@ -97,7 +97,7 @@ def simulate_sequence(
         )
     if scene is not None or renderer is not None or window_ns is not None or atlas is not None:
         raise ConfigError(
-            "nothing is drawn of recorded frames", where="frames", accepted="neither scene, renderer nor window_ns"
+            "nothing is drawn of recorded frames", where="frames", accepted="no scene, renderer, window_ns or atlas"
         )
     return RecordedSequence(config, index, base=base, **wanted)
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 _TEXTURE_2D, _RENDERBUFFER, _TEXTURE0 = 0x0DE1, 0x8D41, 0x84C0
 _DEPTH_COMPONENT, _DEPTH_COMPONENT32F, _FLOAT = 0x1902, 0x8CAC, 0x1406
+_TEXTURES = {"texture": _DEPTH_COMPONENT32F, "texture of 16 bits": 0x81A5}  # GL_DEPTH_COMPONENT16
 _COLOR, _DEPTH = 0x1800, 0x1801
 _READ_FRAMEBUFFER, _DRAW_FRAMEBUFFER, _COLOR_BIT, _NEAREST = 0x8CA8, 0x8CA9, 0x4000, 0x2600
 
@@ -65,7 +66,7 @@ class Target:
     renderbuffers, which can be drawn to
              and resolved (:meth:`resolve_into`), not read or sampled.
     depth  : True: 32F renderbuffer; "texture": 32F texture that a later pass can sample
-    (``.depth.use(unit)``, ``sampler2D``);
+    (``.depth.use(unit)``, ``sampler2D``); "texture of 16 bits": that, in steps of 1/65535;
              False: none. Clear it to 0 and test with ``ctx.depth_func = ">"`` (reversed-Z).
 
     fbo    : moderngl.Framebuffer.   colour: its textures, filtered NEAREST (renderbuffers when multi-sampled).   depth:
@@ -95,7 +96,7 @@ class Target:
             raise GLError("unknown pixel format", value=unknown[0], accepted="one of " + ", ".join(FORMATS))
         if samples > gl.ctx.max_samples:
             raise GLError("too many samples per pixel", value=samples, accepted=f"at most {gl.ctx.max_samples}")
-        if samples and depth == "texture":
+        if samples and depth in _TEXTURES:
             raise GLError("a multi-sampled target's depth cannot be a texture", accepted="True or False")
         self.gl, self.width, self.height, self.samples = gl, width, height, samples
         self.formats = tuple(FORMATS[name] for name in colour)
@@ -129,13 +130,13 @@ class Target:
         if kind is False:
             return None
         uint, integer = ctypes.c_uint, ctypes.c_int
-        if kind == "texture":
+        if kind in _TEXTURES:
             depth = gl.ctx.depth_texture(size)
             gl.function("glActiveTexture", None, uint)(_TEXTURE0 + gl.ctx.default_texture_unit)
             gl.function("glBindTexture", None, uint, uint)(_TEXTURE_2D, depth.glo)
             gl.function(
                 "glTexImage2D", None, uint, integer, integer, integer, integer, integer, uint, uint, ctypes.c_void_p
-            )(_TEXTURE_2D, 0, _DEPTH_COMPONENT32F, *size, 0, _DEPTH_COMPONENT, _FLOAT, None)
+            )(_TEXTURE_2D, 0, _TEXTURES[kind], *size, 0, _DEPTH_COMPONENT, _FLOAT, None)
             depth.compare_func = ""
             depth.filter = (moderngl.NEAREST, moderngl.NEAREST)
             depth.repeat_x = depth.repeat_y = False
@@ -147,7 +148,9 @@ class Target:
                 _RENDERBUFFER, self.samples, _DEPTH_COMPONENT32F, *size
             )
             return depth
-        raise GLError("unknown kind of depth", value=kind, accepted="True, False or 'texture'")
+        raise GLError(
+            "unknown kind of depth", value=kind, accepted="True, False, 'texture' or 'texture of 16 bits'"
+        )
 
     def use(self) -> None:
         """Draw into this target from now on (sets the viewport, and the scissor of ``fbo.scissor``)."""

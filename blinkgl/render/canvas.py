@@ -66,7 +66,7 @@ class Frame:
         """Of an output of the pass (default: its first), or :data:`DEPTH_BUFFER`, for another pass or a compute shader.
         As the program wrote it: all components of its format."""
         if output == DEPTH_BUFFER:
-            if self._canvas.pass_.depth != "texture":
+            if not isinstance(self._canvas.pass_.depth, str):
                 raise GLError(
                     "the pass keeps no depth buffer that can be read",
                     where=type(self._canvas.pass_).__name__,

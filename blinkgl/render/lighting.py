@@ -1,7 +1,7 @@
 """The light of a scene as the programs have it: which variants they are compiled in, and the numbers of each object.
 
-A scene whose light is the plain white sun and sky needs none of this: its programs are those of
-shaders/include/light.glsl without LIGHTS, and :meth:`Painter.place` sets their three uniforms.
+A scene whose light is the plain white sun and sky needs none of this, with shadows or without: its programs are those
+of shaders/include/light.glsl without LIGHTS, and :meth:`Painter.place` sets their three uniforms.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 EXAMPLES: tuple[dict[str, Any], ...] = (
     {"LIGHTS": 1, "AMBIENT": 3},
     {"LIGHTS": 1, "SUNS": 2, "LAMPS": 2, "AMBIENT": 2},
+    {"SHADOWS": 1, "SHADOW_SUNS": 1},
     {"LIGHTS": 1, "SUNS": 1, "AMBIENT": 1, "SHADOWS": 1, "SHADOW_SUNS": 1},
     {
         "LIGHTS": 1, "SUNS": 2, "LAMPS": 3, "SPOTS": 2, "AMBIENT": 1,
@@ -39,15 +40,15 @@ _PLACED = {
     **dict.fromkeys(("around_even", "around_squares", "around_mixed"), 1),
     "around_fourth": 5,
 }
+_NAMES = frozenset((*_FIXED, *_PLACED, *(f"{name}_rate" for name in _PLACED)))
 
 
 class Lighting:
     """Of one scene. lamps : in the order of the shaders' arrays.   coloured : whether any of it is not white.
-    plain : whether a white sun and sky are all of it, but for shadows, which it ``casts`` or not."""
+    plain : whether a white sun and sky are all of it, but for shadows."""
 
     def __init__(self, light: Light):
         self.plain, self.coloured, self.lamps = replace(light, shadows="off").plain, is_coloured(light), lamps_of(light)
-        self.casts = light.shadows != "off"
         self._suns = sum(lamp.kind == "sun" for lamp in self.lamps)
         self._spots = sum(lamp.kind == "spot" for lamp in self.lamps)
         self._quadric, self._quartic = quadric_of(light), quartic_of(light)
@@ -73,8 +74,8 @@ class Lighting:
         hued = {"HUED": 1} if kind.hued and pass_.one_channel else {}
         if not (kind.lit and pass_.lit):
             return hued if pass_.lit else {}
-        if self.plain and not kind.whole and not getattr(pass_, "shadows", ()):
-            return {}
+        if self.plain and not kind.whole:
+            return self._shadows(pass_)
         counts = {"SUNS": self._suns, "LAMPS": len(self.lamps) - self._suns, "SPOTS": self._spots}
         ambient = 3 if self._quartic is not None else 2 if self._quadric[:, :3, :3].any() else 1
         return (
@@ -93,7 +94,7 @@ class Lighting:
 
     def place(self, uniforms: Uniforms, item: DrawItem, moment: Moment) -> None:
         """Sets what lights.glsl asks for, of whichever variant the program is."""
-        if "sun_direction" in uniforms or (self.plain and not self.casts and not item.kind.whole):
+        if "sun_direction" in uniforms or _NAMES.isdisjoint(uniforms):
             return
         index, channel = item.object_index, item.material.base_color
         for name, per_channel in _FIXED.items():

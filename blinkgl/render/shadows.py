@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -134,6 +135,7 @@ def view_of(lamp: Lamp, box: Box | None, size: int, pose: np.ndarray) -> tuple[V
     return View(camera, camera.clip_from_cam(), np.zeros((1, 3))), T
 
 
+@lru_cache(maxsize=64)
 def scale_of(lamp: Lamp, box: Box | None, size: int) -> tuple[float, float, float, float]:
     """``shadow_scale`` of shadows.glsl."""
     camera = view_of(lamp, box, size, np.eye(4))[0].camera

@@ -31,8 +31,8 @@ _FACES = 256  # at a time
 _FLAT = 1e-5  # of a mesh's size: what is no farther in front of a face lies in it
 _THIN = 0.02  # of its length: what is flatter is a box
 _TEXELS = 2.0  # beside a shadow: its edge is smoothed over one
-TRIANGLE, DRAW = 16, 800
-"""px whose look-ups into a map cost what a triangle costs, and a draw call, that comes once more."""
+TRIANGLE, DRAW = 16, 8000
+"""px whose look-ups into a map cost what a triangle costs, and a draw call with its uniforms, that comes once more."""
 _CUT = 4  # of a triangle that is mostly outside of the rectangle
 
 

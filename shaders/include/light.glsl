@@ -2,6 +2,7 @@
 // (the float64 reference: blinkgl/render/reference.py, received()). Without LIGHTS it is the white sun and sky
 // (blinkgl/scene/types.py: Light):
 //   E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 * n_up)
+// where, with SHADOWS, of the sun what is seen of it arrives (shadows.glsl).
 // n, s and up in the object's own frame, so that normals need no matrix.
 #ifdef SHOW_LOOKUP
 #define SHOW(term, light) shown_##term += light; // the shader debugger's, see lookup.glsl
@@ -18,14 +19,22 @@ float shown_direct = 0.0, shown_arrives = 0.0, shown_around = 0.0;
 uniform vec3 sun_direction;  // s, object frame, unit
 uniform vec3 up_direction;   // world z, object frame, unit
 uniform vec2 light_strength; // (sun, sky)
+#ifdef SHADOWS
+#include "shadows.glsl"
+float shadow_share; // of the sun, as irradiance() found it
+#endif
 
 float irradiance(vec3 normal)
 {
     // normalize(), except that the normal of a degenerate triangle, zero, stays zero instead of becoming NaN.
     vec3 n = normal * inversesqrt(max(dot(normal, normal), 1e-30));
-    float direct = light_strength.x * max(0.0, dot(n, sun_direction));
+    float facing = max(0.0, dot(n, sun_direction)), direct = light_strength.x * facing;
     float around = light_strength.y * (0.5 + 0.5 * dot(n, up_direction));
     SHOW(direct, direct)
+#ifdef SHADOWS
+    shadow_share = facing > 0.0 ? shadow(0, n, facing, vec3(0.0)) : 1.0;
+    direct *= shadow_share;
+#endif
     SHOW(arrives, direct)
     SHOW(around, around)
     return direct + around;
@@ -38,12 +47,17 @@ uniform vec3 up_rate;
 // dE/dt of the same where the normal seen changes by normal_rate per second.
 float irradiance_rate(vec3 normal, vec3 normal_rate)
 {
+#ifdef SHADOWS
+    float sun = light_strength.x * shadow_share; // whose own change is not in the rate
+#else
+    float sun = light_strength.x;
+#endif
     float scale = inversesqrt(max(dot(normal, normal), 1e-30));
     vec3 n = normal * scale;
     // d(N/|N|)/dt = (N' - n (n.N')) / |N|; then the product rule on n.s and n.up, whose axes turn with the object.
     vec3 turn = (normal_rate - n * dot(n, normal_rate)) * scale;
     float facing = dot(n, sun_direction);
-    return (facing > 0.0 ? light_strength.x * (dot(turn, sun_direction) + dot(n, sun_rate)) : 0.0)
+    return (facing > 0.0 ? sun * (dot(turn, sun_direction) + dot(n, sun_rate)) : 0.0)
          + light_strength.y * 0.5 * (dot(turn, up_direction) + dot(n, up_rate));
 }
 #endif

@@ -170,7 +170,7 @@ ILLUMINANT irradiance(vec3 normal)
 #ifdef MOVED
             if (later == 0.0)
 #endif
-            shadow_share[i] = facing > 0.0 ? shadow(i, local, n, facing, vec3(0.0)) : 1.0; // not looked up where it does not shine
+            shadow_share[i] = facing > 0.0 ? shadow(i, n, facing, vec3(0.0)) : 1.0; // not looked up where it does not shine
             facing *= shadow_share[i];
         }
 #endif
@@ -193,7 +193,7 @@ ILLUMINANT irradiance(vec3 normal)
 #ifdef MOVED
             if (later == 0.0)
 #endif
-            shadow_share[map] = shines ? shadow(map, local, n, facing, lamp_place[i]) : 1.0;
+            shadow_share[map] = shines ? shadow(map, n, facing, local - lamp_place[i]) : 1.0;
             facing *= shadow_share[map];
         }
 #endif

@@ -15,7 +15,7 @@
 #ifdef BUMPED
 #define NEEDS_TANGENT
 #endif
-#if defined(CHANGES) || defined(LAMPS) || defined(SHADOWS) || defined(GLOSSY)
+#if defined(CHANGES) || defined(LAMPS) || defined(GLOSSY)
 #define NEEDS_LOCAL
 #endif
 

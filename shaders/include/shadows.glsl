@@ -6,7 +6,6 @@
 // Depth is reversed: what is nearer to the lamp is larger. What is compared with the map is moved towards the lamp by as
 // much as the surface's own plane changes over the texels that are looked at, so that no surface is in its own shadow;
 // it is not moved aside, so that edges stay where they are.
-uniform mat4 shadow_rows[SHADOWS];       // object frame to the map, by rows: x, y and depth in [0, 1], times w; and w
 #ifdef SOFT
 uniform mat3 shadow_plane[SHADOWS];      // by rows: what makes of a normal the slope of its plane's depth in the map
 #endif
@@ -87,18 +86,18 @@ float seen_share(SHADOW_MAP map, vec3 at, vec2 slope, float unit, float texel, v
 }
 #endif
 
-// Of map k for the surface at ``at`` with unit normal n. facing: n.l > 0. lamp: where it is, of a spot light. Beside a map nothing is in
-// the way: its edge is empty, and holds for what lies outside.
-float shadow(int k, vec3 at, vec3 n, float facing, vec3 lamp)
+// Of map k for a surface with unit normal n; its place in the map is the vertex stage's (``shadow_place``). facing: n.l > 0. aside: from
+// the lamp to the surface, of a spot light. Beside a map nothing is in the way: its edge is empty, and holds for what lies outside.
+float shadow(int k, vec3 n, float facing, vec3 aside)
 {
-    vec4 scale = shadow_scale[k], p = vec4(at, 1.0);
-    vec3 c = vec3(dot(shadow_rows[k][0], p), dot(shadow_rows[k][1], p), dot(shadow_rows[k][2], p));
+    vec4 scale = shadow_scale[k];
+    vec3 c = shadow_place[k].xyz;
     float texel = scale.x, unit = scale.z;
 #ifdef SHADOW_SPOTS
     float w = 1.0;
     if (scale.z == 0.0) // a spot light's: perspective; depth is near / Z, which is affine in its picture, too
     {
-        w = max(dot(shadow_rows[k][3], p), 1e-6);
+        w = max(shadow_place[k].w, 1e-6);
         c /= w;
         texel = scale.y * w;
         unit = c.z / w;
@@ -107,7 +106,7 @@ float shadow(int k, vec3 at, vec3 n, float facing, vec3 lamp)
 #ifdef SOFT
     float through = dot(shadow_plane[k][2], n);
 #ifdef SHADOW_SPOTS
-    through = scale.z == 0.0 ? dot(n, at - lamp) / (w * w) : through;
+    through = scale.z == 0.0 ? dot(n, aside) / (w * w) : through;
 #endif
     through = abs(through) > 1e-4 ? through : 1e-4;
     vec2 slope = vec2(dot(shadow_plane[k][0], n), dot(shadow_plane[k][1], n)) * (unit / through);

@@ -24,6 +24,16 @@
 #define NEEDS_UV
 #endif
 
+// SHADOWS, of a surface that is LIT: in SHADOW_PLACE shadow_place[SHADOWS], where it is in each lamp's map, times w. Affine in the
+// position, so that the rasteriser's interpolation is exact, and two dot products a pixel less each.
+#if defined(SHADOWS) && defined(LIT)
+#ifdef SHADOW_SPOTS
+#define SHADOW_PLACE vec4
+#else
+#define SHADOW_PLACE vec3
+#endif
+#endif
+
 #ifdef VERTEX_SHADER
 in vec3 in_position;
 uniform mat4 mvp;
@@ -47,6 +57,10 @@ out vec3 tint;
 #ifdef NEEDS_TANGENT
 in vec4 in_tangent;
 out vec4 tangent;
+#endif
+#ifdef SHADOW_PLACE
+uniform mat4 shadow_rows[SHADOWS]; // object frame to the map, by rows: x, y and depth in [0, 1], times w; and w
+out SHADOW_PLACE shadow_place[SHADOWS];
 #endif
 #ifdef DEFORM
 #include "deform.glsl"
@@ -93,6 +107,10 @@ void main()
 #endif
 #ifdef NEEDS_LOCAL
     local = position;
+#endif
+#ifdef SHADOW_PLACE
+    for (int i = 0; i < SHADOWS; ++i)
+        shadow_place[i] = SHADOW_PLACE(vec4(position, 1.0) * shadow_rows[i]);
 #endif
 #ifdef NEEDS_TINT
     tint = in_tint;
@@ -141,6 +159,9 @@ in vec3 normal;
 #endif
 #ifdef NEEDS_LOCAL
 in vec3 local;
+#endif
+#ifdef SHADOW_PLACE
+in SHADOW_PLACE shadow_place[SHADOWS];
 #endif
 #ifdef NEEDS_TINT
 in vec3 tint;

@@ -121,6 +121,22 @@ def test_nearer_surface_wins_whatever_the_order(gl, kind):
     program.release()
 
 
+def test_depth_of_16_bits_is_rounded_to_its_steps(gl):
+    program, vertices = full_screen(gl, "out float value; void main() { value = 1.0; }")
+    gl.ctx.enable_only(gl.ctx.DEPTH_TEST)
+    gl.ctx.depth_func = ">"
+    with gl.framebuffer(4, 4, (), depth="texture of 16 bits") as target:
+        worst = 0.0
+        for depth in np.linspace(0.001, 0.999, 57):
+            target.clear(depth=0.0)
+            program["depth_w"] = (depth, 1.0)
+            vertices.render(vertices=3)
+            worst = max(worst, float(np.abs(target.read_depth() - depth).max()))
+        assert 0.2 / 65535 < worst < 0.51 / 65535  # of floats it would be a hundredth of that
+    vertices.release()
+    program.release()
+
+
 def test_depth_texture_can_be_sampled(gl):
     program, vertices = full_screen(
         gl,

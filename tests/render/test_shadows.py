@@ -15,6 +15,7 @@ from blinkgl.render import reference
 from blinkgl.render.passes import shadow_maps
 from blinkgl.render.passes.shadow import ShadowMap
 from blinkgl.render.renderer import Renderer
+from blinkgl.render.shadows import Box, scale_of
 from blinkgl.scene.lights import lamp_pose
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.types import Lamp, Light, Material, Part, SceneObject
@@ -191,6 +192,16 @@ def test_a_map_is_drawn_again_only_where_something_moved(gl):
             seen = frame.target.read_depth()
         assert frame.changed and sum(r.area for r in frame.changed) < 0.5 * map_.texels**2
         np.testing.assert_array_equal(seen, other.draw(map_, SECOND // 4).target.read_depth())
+
+
+def test_a_map_of_16_bits_tells_a_small_part_of_a_texel():
+    """Of suns whose steps of depth are that small; a spot light's are not equal ones."""
+    lamp = Lamp("sun", (1.0, 1.0, 1.0), StaticPath())
+    for deep, texels, kind in ((8.0, 1024, "texture of 16 bits"), (2000.0, 1024, "texture"), (8.0, 32768, "texture")):
+        map_ = ShadowMap(lamp, Box((0.0, 0.0, 0.0), (8.0, 6.0, deep)), texels)
+        step, texel = 2 * deep / 65535, scale_of(lamp, map_.box, texels)[0]
+        assert map_.depth == kind and (step < texel / 32) is (kind != "texture")
+    assert ShadowMap(Lamp("spot", (1.0, 1.0, 1.0), StaticPath()), None, 64).depth == "texture"
 
 
 def test_a_still_camera_sees_shadows_move(gl):

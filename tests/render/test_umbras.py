@@ -84,6 +84,7 @@ def test_no_shadow_is_left_out(gl, monkeypatch, kind):
     light grazes is in its own shadow a little when it looks into the map, and is not when it does not.)"""
     monkeypatch.setattr(umbras, "DRAW", 30)  # as if drawing were cheap: more and smaller rectangles
     monkeypatch.setattr(shadow, "TRIANGLE", 0)
+    monkeypatch.setattr(shadow, "DRAW", 0)
     dark, spared = 0.0, 0
     for seed in range(8):
         world = crowd(seed, "soft" if kind == "soft" else "hard", spot=kind == "spot")

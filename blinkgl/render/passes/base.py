@@ -65,7 +65,8 @@ class Pass:
 
     program : file in shaders/, or the absolute path of one of your own (its includes are those of shaders/).
     outputs : what it writes.   inputs : what it reads, drawn before it.   samples, every : its size beside the image's.
-    depth : whether it has a depth buffer; "texture": one that a later pass may read.
+    depth : whether it has a depth buffer; "texture": one that a later pass may read; "texture of 16 bits": the same,
+    not of floats.
     still : whether a camera that stands still has only what moves drawn again.
     lit : whether its program asks light.glsl for the light, and fog.glsl for what of it arrives.
     one_channel : whether one channel of it will do, where the surface is of one colour.

@@ -13,7 +13,7 @@ from moderngl import LINEAR
 from blinkgl.render.canvas import DEPTH_BUFFER
 from blinkgl.render.passes.base import Input, Output, Pass, ScenePass, Shot
 from blinkgl.render.shadows import Box, boxes, planes_of, scale_of, view_of
-from blinkgl.render.umbras import TRIANGLE, Umbra, umbra
+from blinkgl.render.umbras import DRAW, TRIANGLE, Umbra, umbra
 from blinkgl.scene.lights import MAX_SHADOWS, lamps_of
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.types import Lamp
@@ -26,9 +26,13 @@ if TYPE_CHECKING:
     from blinkgl.scene.types import Scene
 
 
+FINEST = 1 / 32
+"""Of a texel's width: what a map's depth need not tell. What is compared is moved by a quarter of one, and more."""
+
+
 @dataclass(frozen=True)
 class ShadowMap(ScenePass):
-    """Depth buffer of what casts a lamp's shadows, (texels, texels) float32, reversed: 0 where nothing does. Drawn
+    """Depth buffer of what casts a lamp's shadows, (texels, texels), reversed: 0 where nothing does. Drawn
     again only where something that casts has moved; without what moves and whose shadow is not in the picture.
 
     box : of a sun.   soft : whether those who read it look at the depths themselves.
@@ -41,11 +45,18 @@ class ShadowMap(ScenePass):
     crowd: bool = False
     program: ClassVar[str] = "shadow.glsl"
     outputs: ClassVar[tuple[Output, ...]] = ()
-    depth: ClassVar[str] = "texture"
     common: ClassVar[bool] = True
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         return self.texels, self.texels
+
+    @property
+    def depth(self) -> str:
+        """Half the memory where that is exact to a fraction of a texel: of a sun's, whose steps are equal."""
+        if self.box is None:
+            return "texture"
+        step = view_of(self.lamp, self.box, self.texels, np.eye(4))[0].camera.depth / 65535
+        return "texture of 16 bits" if step < FINEST * scale_of(self.lamp, self.box, self.texels)[0] else "texture"
 
     def stands_still(self, whole: bool) -> bool:
         """Whatever the camera does: the lamp's place is what counts."""
@@ -161,7 +172,7 @@ class Shaded(ScenePass):
 def _pays(item: DrawItem, places: Sequence[Rectangle], box: Rectangle) -> bool:
     """Whether to draw an item several times, by programs of their own. box : where it is in the picture."""
     spared = box.area - sum(place.area for place in places)
-    return len(places) * len(item.mesh.faces) * TRIANGLE < spared
+    return len(places) * (DRAW + len(item.mesh.faces) * TRIANGLE) < spared
 
 
 @lru_cache(maxsize=64)

@@ -148,9 +148,7 @@ class Target:
                 _RENDERBUFFER, self.samples, _DEPTH_COMPONENT32F, *size
             )
             return depth
-        raise GLError(
-            "unknown kind of depth", value=kind, accepted="True, False, 'texture' or 'texture of 16 bits'"
-        )
+        raise GLError("unknown kind of depth", value=kind, accepted="True, False, 'texture' or 'texture of 16 bits'")
 
     def use(self) -> None:
         """Draw into this target from now on (sets the viewport, and the scissor of ``fbo.scissor``)."""

@@ -1,7 +1,7 @@
 """Where one surface ends in front of another: the edges of meshes that a picture shows as steps, as lines in it.
 
     lines = Lines()
-    quads = lines.of(moment, items, width, height)      # what passes/edged.py draws
+    pixels, crossings = lines.in_pixels(moment, items, width, height)      # what passes/edged.py draws
 
 An edge of a mesh is seen when the surface turns away from the camera there (a silhouette), when it ends there (a
 border), when two of its faces meet at an angle (a crease), or when they show different places of their texture (a
@@ -27,15 +27,17 @@ if TYPE_CHECKING:
     from blinkgl.render.resources import DrawItem
     from blinkgl.scene.types import Mesh
 
-FLOATS = 9
-"""Of a vertex of :meth:`Lines.of`: its place, px; both ends of its line, px and depth; its kind."""
+LINE = 7
+"""Numbers of a line (:meth:`Lines.of`): both of its ends, px and depth (near / Z); its kind. The surface lies to the left
+of the way from the one to the other, x to the right and y down."""
+CROSSING = 8
+"""Numbers of what a line is in one pixel (:meth:`Lines.in_pixels`): its share, and the turn that is in it, in eighths of
+a turn along the pixel's boundary (edges.glsl); of the centre, px to the left of the line; depth in the middle of the
+part; the way to the left, a unit vector; what depth gains along the line in a px of the longer axis; the line's kind."""
 CREASE = np.cos(np.radians(20.0))
 """Of the angle between the normals of two faces where they meet, above which light is expected to jump."""
 SILHOUETTE, BACK_AGAIN, BENT, TORN = 0, -1, 1, 2
 """Kinds of lines: silhouettes and borders; silhouettes where a closed surface is hollow; creases; seams."""
-REACH = 0.7072
-"""Half a pixel's diagonal: how far beside a line, and behind its ends, the pixels that it crosses have their
-centres, px."""
 
 
 class Contour:
@@ -99,11 +101,16 @@ class Lines:
 
     def __init__(self) -> None:
         self._contours: dict[int, Contour] = {}
-        self._quads = np.empty((1024 * 4, FLOATS), np.float32)
+        self._lines = np.empty((1024, LINE))
+        self._crossings = np.empty((4096, CROSSING), np.float32)
+        self._sorted = np.empty_like(self._crossings)
+        self._places = np.empty(4096, np.int32)
+        self._pixels = np.empty((4096, 4), np.int32)
+        self._counts = np.zeros(0, np.int32)
 
     def of(self, moment: Moment, items: Iterable[DrawItem], width: int, height: int) -> np.ndarray:
-        """(lines, 4, FLOATS) float32: the corners of a rectangle around each line of these items that is in a picture
-        of ``width`` x ``height`` px, those that something hides included; valid until the next call."""
+        """(lines, LINE) float64: the lines of these items that are in a picture of ``width`` x ``height`` px, those
+        that something hides included; valid until the next call."""
         count = 0
         for item in items:
             contour = self._contours.get(id(item.mesh))
@@ -118,15 +125,35 @@ class Lines:
                 planes = _planes(places, contour.faces)
             T = moment.T_cam_obj[item.object_index]
             eye = -T[:3, 3] @ T[:3, :3]
-            if 4 * (count + len(contour.edges)) > len(self._quads):
-                more = np.empty((2 * 4 * (count + len(contour.edges)), FLOATS), np.float32)
-                more[: 4 * count] = self._quads[: 4 * count]
-                self._quads = more
+            if count + len(contour.edges) > len(self._lines):
+                more = np.empty((2 * (count + len(contour.edges)), LINE))
+                more[:count] = self._lines[:count]
+                self._lines = more
             count = _emit(
                 eye, moment.mvp[item.object_index], places, contour.faces, planes, contour.edges, contour.sharp,
-                not item.two_sided, float(width), float(height), self._quads, count,
+                not item.two_sided, float(width), float(height), self._lines, count,
             )  # fmt: skip
-        return self._quads[: 4 * count].reshape(count, 4, FLOATS)
+        return self._lines[:count]
+
+    def in_pixels(
+        self, moment: Moment, items: Iterable[DrawItem], width: int, height: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What those lines are in each pixel that they cross. (pixels, 4) int32: x, y, the first of the pixel's
+        crossings, the one after its last; no pixel is there twice.  (crossings, CROSSING) float32, those of a pixel in
+        the order of :meth:`of`. Valid until the next call."""
+        lines = self.of(moment, items, width, height)
+        if len(self._counts) != width * height:
+            self._counts = np.zeros(width * height, np.int32)
+        room = _most(lines)
+        if room > len(self._crossings):
+            self._crossings = np.empty((2 * room, CROSSING), np.float32)
+            self._sorted = np.empty_like(self._crossings)
+            self._places, self._pixels = np.empty(2 * room, np.int32), np.empty((2 * room, 4), np.int32)
+        count = _cross(lines, width, height, self._crossings, self._places)
+        pixels = _by_pixel(
+            self._crossings[:count], self._places, width, self._counts, self._pixels, self._sorted
+        )
+        return self._pixels[:pixels], self._sorted[:count]
 
 
 @nb.njit(cache=True, nogil=True)
@@ -145,7 +172,7 @@ def _planes(places: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 @nb.njit(cache=True, nogil=True)
 def _emit(eye, mvp, places, faces, planes, edges, sharp, culled, width, height, out, count):
-    """Writes the rectangles of one item's lines behind the first ``count``; their number then."""
+    """Writes the lines of one item behind the first ``count``; their number then."""
     front = np.empty(len(planes), np.bool_)
     for f in range(len(planes)):
         front[f] = planes[f, 0] * eye[0] + planes[f, 1] * eye[1] + planes[f, 2] * eye[2] > planes[f, 3]
@@ -210,15 +237,104 @@ def _emit(eye, mvp, places, faces, planes, edges, sharp, culled, width, height, 
         cx, cy, cd = ax, ay, ad
         ax, ay, ad = cx + low * dx, cy + low * dy, cd + low * (bd - cd)
         bx, by, bd = cx + high * dx, cy + high * dy, cd + high * (bd - cd)
-        ux, uy = (bx - ax) / length * REACH, (by - ay) / length * REACH
-        for k in range(4):
-            along = -1.0 if k < 2 else 1.0
-            across = -1.0 if k % 2 == 0 else 1.0
-            row = 4 * count + k
-            out[row, 0] = (ax if k < 2 else bx) + along * ux - across * uy
-            out[row, 1] = (ay if k < 2 else by) + along * uy + across * ux
-            out[row, 2], out[row, 3], out[row, 4] = ax, ay, ad
-            out[row, 5], out[row, 6], out[row, 7] = bx, by, bd
-            out[row, 8] = kind
+        out[count, 0], out[count, 1], out[count, 2] = ax, ay, ad
+        out[count, 3], out[count, 4], out[count, 5] = bx, by, bd
+        out[count, 6] = kind
         count += 1
     return count
+
+
+@nb.njit(cache=True, nogil=True)
+def _most(lines):
+    """So many pixels are crossed at most."""
+    count = 0
+    for n in range(len(lines)):
+        count += 4 + int(abs(lines[n, 3] - lines[n, 0]) + abs(lines[n, 4] - lines[n, 1]))
+    return count
+
+
+@nb.njit(cache=True, nogil=True)
+def _around(x, y):
+    """Where a ray from a pixel's centre leaves its square, along the boundary, in half sides: 8 all round."""
+    if x == 0.0 and y == 0.0:  # a line that ends in the centre itself
+        return 0.0
+    if abs(x) >= abs(y):
+        return y / x + (0.0 if x > 0.0 else 4.0)
+    return (2.0 if y > 0.0 else 6.0) - x / y
+
+
+@nb.njit(cache=True, nogil=True)
+def _cross(lines, width, height, out, places):
+    """The crossings of each line, one after another along it, and each one's pixel, y * width + x; their number.
+
+    A line is cut where it passes from pixel to pixel. The share is the area between the part and the square's boundary
+    as seen from the centre: the triangle that it makes with the centre, less the square's sector between the same
+    rays."""
+    count = 0
+    for n in range(len(lines)):
+        ax, ay, dx, dy = lines[n, 0], lines[n, 1], lines[n, 3] - lines[n, 0], lines[n, 4] - lines[n, 1]
+        length, longer = np.sqrt(dx * dx + dy * dy), max(abs(dx), abs(dy))
+        lx, ly, gain = -dy / length, dx / length, lines[n, 5] - lines[n, 2]
+        # The pixel that it begins in, and where along it (0 to 1) the next column and the next row begin.
+        x, y = int(np.floor(ax)), int(np.floor(ay))
+        if ax == x and dx < 0:
+            x -= 1
+        if ay == y and dy < 0:
+            y -= 1
+        step_x, step_y = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
+        by_x, by_y = (1 / abs(dx) if dx != 0 else np.inf), (1 / abs(dy) if dy != 0 else np.inf)
+        next_x = ((x + 1 - ax) if dx > 0 else (ax - x)) * by_x if dx != 0 else np.inf
+        next_y = ((y + 1 - ay) if dy > 0 else (ay - y)) * by_y if dy != 0 else np.inf
+        low = 0.0
+        while low < 1.0:
+            high = min(1.0, next_x, next_y)
+            if high > low and 0 <= x < width and 0 <= y < height:
+                fx, fy = ax - (x + 0.5), ay - (y + 0.5)
+                px, py, qx, qy = fx + low * dx, fy + low * dy, fx + high * dx, fy + high * dy
+                room = -(lx * fx + ly * fy)
+                turn = _around(qx, qy) - _around(px, py)
+                turn -= 8.0 * np.round(turn / 8.0)
+                if (room > 0.0) != (turn > 0.0) and abs(turn) > 2.0:
+                    turn += 8.0 if room > 0.0 else -8.0
+                out[count, 0] = 0.5 * (px * qy - py * qx) - 0.125 * turn
+                out[count, 1] = turn
+                out[count, 2], out[count, 3] = room, lines[n, 2] + 0.5 * (low + high) * gain
+                out[count, 4], out[count, 5] = lx, ly
+                out[count, 6], out[count, 7] = gain / longer, lines[n, 6]
+                places[count] = y * width + x
+                count += 1
+            low = high
+            if next_x <= next_y:
+                x += step_x
+                next_x += by_x
+            else:
+                y += step_y
+                next_y += by_y
+    return count
+
+
+@nb.njit(cache=True, nogil=True)
+def _by_pixel(crossings, places, width, counts, pixels, out):
+    """Crossings of the same pixel one behind the other in ``out``; the number of pixels. counts : zeros, and left so."""
+    found = 0
+    for n in range(len(crossings)):
+        place = places[n]
+        if counts[place] == 0:
+            pixels[found, 0], pixels[found, 1] = place % width, place // width
+            found += 1
+        counts[place] += 1
+    first = 0
+    for k in range(found):
+        place = pixels[k, 1] * width + pixels[k, 0]
+        pixels[k, 2] = first
+        first += counts[place]
+        pixels[k, 3] = first
+        counts[place] = pixels[k, 2]
+    for n in range(len(crossings)):
+        at = counts[places[n]]
+        counts[places[n]] = at + 1
+        for i in range(CROSSING):
+            out[at, i] = crossings[n, i]
+    for k in range(found):
+        counts[pixels[k, 1] * width + pixels[k, 0]] = 0
+    return found

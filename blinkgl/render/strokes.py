@@ -1,4 +1,5 @@
-"""Lines in a picture as OpenGL has them: a rectangle for each, which a program fills."""
+"""Lines in a picture as OpenGL has them: a point for each pixel that some cross, which a program's vertex stage looks
+at all of them for."""
 
 from __future__ import annotations
 
@@ -8,14 +9,15 @@ from typing import TYPE_CHECKING, Any
 import moderngl
 import numpy as np
 
-from blinkgl.render.contours import FLOATS, Lines
+from blinkgl.render.contours import CROSSING, Lines
 
 if TYPE_CHECKING:
     from blinkgl.gl import GLContext, Target
     from blinkgl.render.moment import Moment
     from blinkgl.render.resources import DrawItem
 
-_LAYOUT = (("in_place", 2), ("in_start", 3), ("in_end", 3), ("in_kind", 1))
+ROW = 512
+"""Crossings in a row of the texture that holds them, each two texels: edges.glsl has the same."""
 
 
 class Strokes:
@@ -23,48 +25,59 @@ class Strokes:
 
     def __init__(self, gl: GLContext):
         self.gl, self.lines = gl, Lines()
-        self._room, self._count = 0, 0
-        self._vertices: moderngl.Buffer | None = None
-        self._indices: moderngl.Buffer | None = None
+        self._count = 0
+        self._pixels: moderngl.Buffer | None = None
+        self._crossings: moderngl.Texture | None = None
+        self._rows = np.empty((0, ROW, CROSSING), np.float32)
         self._programs: dict[tuple, tuple[dict[str, Any], moderngl.VertexArray]] = {}
 
     def upload(self, moment: Moment, items: Iterable[DrawItem], width: int, height: int) -> None:
         """The lines of these items in a picture of width x height px, to be drawn next."""
-        quads = self.lines.of(moment, items, width, height)
-        self._count = len(quads)
-        if self._count > self._room:
-            self.release()
-            self._room = 1 << max(self._count - 1, 255).bit_length()
-            corners = np.arange(self._room, dtype=np.uint32)[:, None] * 4 + np.array([0, 1, 2, 2, 1, 3], np.uint32)
-            self._indices = self.gl.ctx.buffer(corners.tobytes())
-            self._vertices = self.gl.ctx.buffer(reserve=self._room * 4 * FLOATS * 4, dynamic=True)
-        if self._count and self._vertices is not None:
-            self._vertices.write(quads)
+        pixels, crossings = self.lines.in_pixels(moment, items, width, height)
+        self._count = len(pixels)
+        if not self._count:
+            return
+        if self._pixels is None or pixels.nbytes > self._pixels.size:
+            self.forget()
+            if self._pixels is not None:
+                self._pixels.release()
+            self._pixels = self.gl.ctx.buffer(reserve=2 * pixels.nbytes, dynamic=True)
+        self._pixels.write(pixels)
+        rows = -(-len(crossings) // ROW)
+        if self._crossings is None or rows > len(self._rows):
+            if self._crossings is not None:
+                self._crossings.release()
+            self._rows = np.zeros((2 * rows, ROW, CROSSING), np.float32)
+            self._crossings = self.gl.ctx.texture((2 * ROW, 2 * rows), 4, dtype="f4")
+            self._crossings.filter = moderngl.NEAREST, moderngl.NEAREST
+        self._rows.reshape(-1, CROSSING)[: len(crossings)] = crossings
+        self._crossings.write(self._rows[:rows], viewport=(0, 0, 2 * ROW, rows))
 
     def program(self, name: str, defines: dict[str, Any]) -> tuple[dict[str, Any], moderngl.VertexArray | None]:
-        """Uniforms of a program, and the array that it draws; None where there is no line."""
+        """Uniforms of a program, and the array that it draws; None where no pixel has a line."""
         if not self._count:
             return {}, None
         key = name, *sorted(defines.items())
         if key not in self._programs:
             program = self.gl.program(name, defines)
-            formats = " ".join(f"{n}f" if field in program else f"{4 * n}x" for field, n in _LAYOUT)
-            used = [field for field, _ in _LAYOUT if field in program]
-            array = self.gl.ctx.vertex_array(program, [(self._vertices, formats, *used)], self._indices, 4)
+            array = self.gl.ctx.vertex_array(program, [(self._pixels, "4i", "in_pixel")])
             uniforms = {one: program[one] for one in program if isinstance(program[one], moderngl.Uniform)}
             self._programs[key] = uniforms, array
         return self._programs[key]
 
-    def draw(self, array: moderngl.VertexArray, target: Target, add: bool) -> None:
-        """Over what ``target`` holds, or added to it."""
+    def use(self, unit: int) -> None:
+        """The crossings' texture on a unit."""
+        if self._crossings is not None:
+            self._crossings.use(unit)
+
+    def draw(self, array: moderngl.VertexArray, target: Target) -> None:
+        """Each of the pixels, over what ``target`` holds."""
         ctx = self.gl.ctx
         target.fbo.use()
         ctx.viewport = (0, 0, target.fbo.width, target.fbo.height)
-        ctx.enable_only(moderngl.BLEND if add else moderngl.NOTHING)
-        ctx.blend_func = moderngl.ONE, moderngl.ONE
-        ctx.blend_equation = moderngl.FUNC_ADD, moderngl.FUNC_ADD
-        array.render(moderngl.TRIANGLES, vertices=6 * self._count)
-        ctx.disable(moderngl.BLEND)
+        ctx.enable_only(moderngl.NOTHING)
+        ctx.point_size = 1.0
+        array.render(moderngl.POINTS, vertices=self._count)
 
     def forget(self) -> None:
         """Asks for every program again."""
@@ -74,8 +87,7 @@ class Strokes:
 
     def release(self) -> None:
         self.forget()
-        for buffer in (self._vertices, self._indices):
-            if buffer is not None:
-                buffer.release()
-        self._vertices = self._indices = None
-        self._room = 0
+        for held in (self._pixels, self._crossings):
+            if held is not None:
+                held.release()
+        self._pixels = self._crossings = None

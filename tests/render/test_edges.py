@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from blinkgl.camera import PinHole, Radtan
 from blinkgl.config.deform import WaveConfig
 from blinkgl.config.sequence import RenderConfig
-from blinkgl.render.contours import FLOATS, Contour, Lines
+from blinkgl.render.contours import CROSSING, LINE, Contour, Lines
 from blinkgl.render.passes import filtered
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.rig import Rig
@@ -244,18 +244,18 @@ def test_the_same_bits_by_any_renderer_and_after_any_other_frame(gl):
 
 
 def lines_of(gl, world, t_ns: int = 0) -> np.ndarray:
-    """(lines, FLOATS), the last column: whether it is a crease."""
+    """(lines, LINE)."""
     with Renderer(gl, world, EDGES) as renderer:
         moment = renderer.moment(t_ns)
-        return Lines().of(moment, moment.visible, renderer.width, renderer.height)[:, 0].copy()
+        return Lines().of(moment, moment.visible, renderer.width, renderer.height).copy()
 
 
 @pytest.mark.parametrize("turn, silhouette, creases", [((0, 0, 0), 4, 0), ((0, 0, 30), 6, 1), ((25, 10, 30), 6, 3)])
 def test_lines_of_a_cube(gl, turn, silhouette, creases):
     world = scene([thing("box", 1, cube(0.5), still((0, 4, 0), Rotation.from_euler("xyz", turn, degrees=True)))])
     found = lines_of(gl, world)
-    assert found.shape[1] == FLOATS
-    assert ((found[:, 8] == 0).sum(), (found[:, 8] == 1).sum()) == (silhouette, creases)
+    assert found.shape[1] == LINE
+    assert ((found[:, 6] == 0).sum(), (found[:, 6] == 1).sum()) == (silhouette, creases)
 
 
 def test_faces_that_share_places_but_no_vertices_are_neighbours():
@@ -278,7 +278,7 @@ def test_lines_end_at_the_near_plane_and_beside_the_picture(gl):
     """A card from behind the camera to far ahead: all that is left is in front and within a pixel of the picture."""
     card = mesh([[-1, -5, -0.5], [1, -5, -0.5], [1, 50, -0.5], [-1, 50, -0.5]], [[0, 1, 2], [0, 2, 3]])
     found = lines_of(gl, scene([thing("card", 1, card, still(), WHITE)]))
-    x, y, depth = found[:, [2, 5]], found[:, [3, 6]], found[:, [4, 7]]
+    x, y, depth = found[:, [0, 3]], found[:, [1, 4]], found[:, [2, 5]]
     assert len(found) == 3 and np.isfinite(found).all()
     assert ((x >= -1.01) & (x <= 161.01) & (y >= -1.01) & (y <= 121.01) & (depth > 0) & (depth <= 1)).all()
 

@@ -7,7 +7,7 @@ Start: base.py, then luminance.py.
 
 from blinkgl.render.passes.base import Input, Output, Pass, ScenePass, ScreenPass, Shot
 from blinkgl.render.passes.colour import Colour
-from blinkgl.render.passes.edged import Changes, Edged, filtered
+from blinkgl.render.passes.edged import Edged, filtered
 from blinkgl.render.passes.gather import Gather, one_value
 from blinkgl.render.passes.geometry import Geometry
 from blinkgl.render.passes.luminance import Brightness, Luminance
@@ -22,7 +22,6 @@ PASSES: tuple[type[Pass], ...] = (
     Colour,
     Geometry,
     Mean,
-    Changes,
     Edged,
     Gather,
     ShadowMap,
@@ -32,7 +31,6 @@ PASSES: tuple[type[Pass], ...] = (
 __all__ = [
     "PASSES",
     "Brightness",
-    "Changes",
     "Colour",
     "Edged",
     "Gather",

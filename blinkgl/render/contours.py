@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     from blinkgl.scene.types import Mesh
 
 LINE = 7
-"""Numbers of a line (:meth:`Lines.of`): both of its ends, px and depth (near / Z); its kind. The surface lies to the left
-of the way from the one to the other, x to the right and y down."""
+"""Numbers of a line (:meth:`Lines.of`): both of its ends, px and depth (near / Z); its kind. The surface lies to the
+left of the way from the one to the other, x to the right and y down."""
 CROSSING = 8
-"""Numbers of what a line is in one pixel (:meth:`Lines.in_pixels`): its share, and the turn that is in it, in eighths of
-a turn along the pixel's boundary (edges.glsl); of the centre, px to the left of the line; depth in the middle of the
-part; the way to the left, a unit vector; what depth gains along the line in a px of the longer axis; the line's kind."""
+"""Numbers of what a line is in one pixel (:meth:`Lines.in_pixels`): its share, and the turn that is in it, in eighths
+of a turn along the pixel's boundary; of the centre, px to the left of the line; depth in the middle of the part; the
+way to the left, a unit vector; what depth gains along the line in a px of the longer axis; the line's kind."""
 CREASE = np.cos(np.radians(20.0))
 """Of the angle between the normals of two faces where they meet, above which light is expected to jump."""
 SILHOUETTE, BACK_AGAIN, BENT, TORN = 0, -1, 1, 2
@@ -55,7 +55,8 @@ class Contour:
         )
         self.faces = np.ascontiguousarray(place.reshape(-1)[mesh.faces], np.int32).reshape(-1, 3)
         self.rest = np.ascontiguousarray(mesh.vertices[self.corners], np.float64)
-        self.planes = _planes(self.rest, self.faces)
+        self.planes = np.empty((len(self.faces), 4))
+        _planes(self.rest, self.faces, self.planes)
         self.edges = _edges(self.faces, len(self.corners))
         self.sharp = self._sharp(mesh)
 
@@ -96,11 +97,38 @@ def _edges(faces: np.ndarray, places: int) -> np.ndarray:
     return np.ascontiguousarray(np.column_stack([ends[lead], face[lead], second]), np.int32)
 
 
+class _Pool:
+    """Contours one behind the other: places, faces, planes, edges, sharp as theirs, with numbers that count on.
+
+    starts : (N + 1, 3) int64: where each one's places, faces and edges begin, and the last one's end."""
+
+    def __init__(self, contours: list[Contour]):
+        sizes = [(len(c.rest), len(c.faces), len(c.edges)) for c in contours]
+        self.starts = np.concatenate([np.zeros((1, 3), np.int64), np.cumsum(np.reshape(sizes, (-1, 3)), axis=0)])
+        self.starts = self.starts.astype(np.int64)
+        empty = [(np.empty((0, 3)), np.empty((0, 3), np.int32), np.empty((0, 4)), np.empty((0, 4), np.int32))]
+        parts = empty + [
+            (
+                c.rest,
+                c.faces + place,
+                c.planes,
+                np.where(c.edges >= 0, c.edges + (place, place, face, face), -1),
+            )
+            for c, (place, face, _) in zip(contours, self.starts[:-1].tolist(), strict=True)
+        ]
+        places, faces, planes, edges = (np.concatenate(kind) for kind in zip(*parts, strict=True))
+        self.places, self.planes = places, planes
+        self.faces, self.edges = faces.astype(np.int32), edges.astype(np.int32)
+        self.sharp = np.concatenate([np.empty(0, np.int8), *(c.sharp for c in contours)])
+
+
 class Lines:
-    """The contours of a scene's meshes; each is made when it is first drawn, and kept."""
+    """The contours of a scene's meshes; each is made when it is first drawn, and kept, all one behind the other."""
 
     def __init__(self) -> None:
-        self._contours: dict[int, Contour] = {}
+        self._contours: list[Contour] = []
+        self._numbers: dict[int, int] = {}  # of a mesh's contour, by the mesh's id
+        self._pool = _Pool([])
         self._lines = np.empty((1024, LINE))
         self._crossings = np.empty((4096, CROSSING), np.float32)
         self._sorted = np.empty_like(self._crossings)
@@ -111,28 +139,32 @@ class Lines:
     def of(self, moment: Moment, items: Iterable[DrawItem], width: int, height: int) -> np.ndarray:
         """(lines, LINE) float64: the lines of these items that are in a picture of ``width`` x ``height`` px, those
         that something hides included; valid until the next call."""
-        count = 0
+        items = list(items)
         for item in items:
-            contour = self._contours.get(id(item.mesh))
-            if contour is None:
-                contour = self._contours[id(item.mesh)] = Contour(item.mesh)
-            if item.mesh.deformer is None:
-                places, planes = contour.rest, contour.planes
-            else:
-                places = np.ascontiguousarray(
-                    item.mesh.deformer.positions(item.mesh, moment.t_ns)[contour.corners], np.float64
-                )
-                planes = _planes(places, contour.faces)
-            T = moment.T_cam_obj[item.object_index]
-            eye = -T[:3, 3] @ T[:3, :3]
-            if count + len(contour.edges) > len(self._lines):
-                more = np.empty((2 * (count + len(contour.edges)), LINE))
-                more[:count] = self._lines[:count]
-                self._lines = more
-            count = _emit(
-                eye, moment.mvp[item.object_index], places, contour.faces, planes, contour.edges, contour.sharp,
-                not item.two_sided, float(width), float(height), self._lines, count,
-            )  # fmt: skip
+            if id(item.mesh) not in self._numbers:
+                self._numbers[id(item.mesh)] = len(self._contours)
+                self._contours.append(Contour(item.mesh))
+        if len(self._pool.starts) <= len(self._contours):
+            self._pool = _Pool(self._contours)
+        pool = self._pool
+        numbers = np.array([self._numbers[id(item.mesh)] for item in items], np.int64)
+        bodies = np.array([item.object_index for item in items], np.int64)
+        culled = np.array([not item.two_sided for item in items], np.bool_)
+        for number, item in zip(numbers, items, strict=True):
+            if item.mesh.deformer is not None:
+                contour, (place, face, _) = self._contours[number], pool.starts[number]
+                there = slice(face, face + len(contour.faces))
+                pool.places[place : place + len(contour.corners)] = item.mesh.deformer.positions(
+                    item.mesh, moment.t_ns
+                )[contour.corners]
+                _planes(pool.places, pool.faces[there], pool.planes[there])
+        room = int((pool.starts[numbers + 1, 2] - pool.starts[numbers, 2]).sum())
+        if room > len(self._lines):
+            self._lines = np.empty((2 * room, LINE))
+        count = _emit(
+            numbers, bodies, culled, moment.T_cam_obj, moment.mvp, pool.starts, pool.places, pool.faces, pool.planes,
+            pool.edges, pool.sharp, float(width), float(height), self._lines,
+        )  # fmt: skip
         return self._lines[:count]
 
     def in_pixels(
@@ -150,16 +182,13 @@ class Lines:
             self._sorted = np.empty_like(self._crossings)
             self._places, self._pixels = np.empty(2 * room, np.int32), np.empty((2 * room, 4), np.int32)
         count = _cross(lines, width, height, self._crossings, self._places)
-        pixels = _by_pixel(
-            self._crossings[:count], self._places, width, self._counts, self._pixels, self._sorted
-        )
+        pixels = _by_pixel(self._crossings[:count], self._places, width, self._counts, self._pixels, self._sorted)
         return self._pixels[:pixels], self._sorted[:count]
 
 
 @nb.njit(cache=True, nogil=True)
-def _planes(places: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(F, 4) float64, see :class:`Contour`."""
-    out = np.empty((len(faces), 4))
+def _planes(places, faces, out):
+    """Writes (F, 4) float64, see :class:`Contour`."""
     for f in range(len(faces)):
         a, b, c = places[faces[f, 0]], places[faces[f, 1]], places[faces[f, 2]]
         ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
@@ -167,15 +196,32 @@ def _planes(places: np.ndarray, faces: np.ndarray) -> np.ndarray:
         x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
         out[f, 0], out[f, 1], out[f, 2] = x, y, z
         out[f, 3] = x * a[0] + y * a[1] + z * a[2]
-    return out
 
 
 @nb.njit(cache=True, nogil=True)
-def _emit(eye, mvp, places, faces, planes, edges, sharp, culled, width, height, out, count):
-    """Writes the lines of one item behind the first ``count``; their number then."""
+def _emit(numbers, bodies, culled, T_cam_obj, mvps, starts, places, faces, planes, edges, sharp, width, height, out):
+    """Writes the lines of all items; their number. numbers, bodies, culled : of each item, its contour's place in the
+    pool, its object's, and whether the backs of its faces are not drawn."""
     front = np.empty(len(planes), np.bool_)
-    for f in range(len(planes)):
-        front[f] = planes[f, 0] * eye[0] + planes[f, 1] * eye[1] + planes[f, 2] * eye[2] > planes[f, 3]
+    count = 0
+    for n in range(len(numbers)):
+        number, T = numbers[n], T_cam_obj[bodies[n]]
+        x = -(T[0, 3] * T[0, 0] + T[1, 3] * T[1, 0] + T[2, 3] * T[2, 0])  # the camera's place, in the mesh's axes
+        y = -(T[0, 3] * T[0, 1] + T[1, 3] * T[1, 1] + T[2, 3] * T[2, 1])
+        z = -(T[0, 3] * T[0, 2] + T[1, 3] * T[1, 2] + T[2, 3] * T[2, 2])
+        for f in range(starts[number, 1], starts[number + 1, 1]):
+            front[f] = planes[f, 0] * x + planes[f, 1] * y + planes[f, 2] * z > planes[f, 3]
+        mine = edges[starts[number, 2] : starts[number + 1, 2]]
+        torn = sharp[starts[number, 2] : starts[number + 1, 2]]
+        count = _emit_one(
+            mvps[bodies[n]], places, faces, planes, mine, torn, front, culled[n], width, height, out, count
+        )
+    return count
+
+
+@nb.njit(cache=True, nogil=True)
+def _emit_one(mvp, places, faces, planes, edges, sharp, front, culled, width, height, out, count):
+    """Writes the lines of one item behind the first ``count``; their number then."""
     ends = np.empty((2, 4))
     for e in range(len(edges)):
         v0, v1, towards, kind = edges[e, 0], edges[e, 1], front[edges[e, 2]], SILHOUETTE
@@ -315,7 +361,7 @@ def _cross(lines, width, height, out, places):
 
 @nb.njit(cache=True, nogil=True)
 def _by_pixel(crossings, places, width, counts, pixels, out):
-    """Crossings of the same pixel one behind the other in ``out``; the number of pixels. counts : zeros, and left so."""
+    """Crossings of the same pixel one behind the other in ``out``; the number of pixels. counts : zeros, left so."""
     found = 0
     for n in range(len(crossings)):
         place = places[n]

@@ -283,6 +283,71 @@ def test_lines_end_at_the_near_plane_and_beside_the_picture(gl):
     assert ((x >= -1.01) & (x <= 161.01) & (y >= -1.01) & (y <= 121.01) & (depth > 0) & (depth <= 1)).all()
 
 
+def around(x: float, y: float) -> float:
+    """Place on a square's boundary, 8 all round, of a ray from its middle."""
+    if abs(x) >= abs(y):
+        return y / x + (0.0 if x > 0 else 4.0)
+    return (2.0 if y > 0 else 6.0) - x / y
+
+
+def clipped(line: np.ndarray, x: int, y: int) -> tuple[float, float, float] | None:
+    """(share, room, depth) of a line in a pixel's square, by clipping it; None where it is not in it."""
+    a, b = line[:2] - (x + 0.5, y + 0.5), line[3:5] - (x + 0.5, y + 0.5)
+    low, high, way = 0.0, 1.0, b - a
+    for k in (0, 1):
+        if way[k]:
+            first, last = sorted(((-0.5 - a[k]) / way[k], (0.5 - a[k]) / way[k]))
+            low, high = max(low, first), min(high, last)
+        elif abs(a[k]) > 0.5:
+            return None
+    if not low < high - 1e-9:
+        return None
+    p, q = a + low * way, a + high * way
+    left = np.array([-way[1], way[0]]) / np.hypot(*way)
+    room = -float(left @ a)
+    turn = around(*q) - around(*p)
+    turn -= 8 * np.round(turn / 8)
+    if (room > 0) != (turn > 0) and abs(turn) > 2:
+        turn += 8 if room > 0 else -8
+    depth = line[2] + 0.5 * (low + high) * (line[5] - line[2])
+    return 0.5 * (p[0] * q[1] - p[1] * q[0]) - turn / 8, room, depth
+
+
+def test_lines_are_cut_where_they_pass_from_pixel_to_pixel(gl):
+    """Against clipping every line by every pixel; each pixel is there once, its lines in their order."""
+    world, t = mixed_scene(40, 30), SECOND // 3
+    with Renderer(gl, world, EDGES) as renderer:
+        lines, moment = Lines(), renderer.moment(t)
+        for _ in range(2):  # nothing is left of the time before
+            pixels, crossings = lines.in_pixels(moment, moment.visible, 40, 30)
+        whole = lines.of(moment, moment.visible, 40, 30)
+    assert crossings.shape[1] == CROSSING and len({(x, y) for x, y, *_ in pixels.tolist()}) == len(pixels) > 100
+    found = {(x, y): crossings[first:end] for x, y, first, end in pixels.tolist()}
+    seen = 0
+    for y in range(30):
+        for x in range(40):
+            true = [c for line in whole if (c := clipped(line, x, y)) is not None]
+            mine = found.get((x, y), np.empty((0, CROSSING)))
+            assert len(mine) == len(true)
+            if true:
+                np.testing.assert_allclose(mine[:, [0, 2, 3]], true, atol=1e-5)
+            seen += len(true)
+    assert seen == len(crossings)
+
+
+def test_shares_add_up_to_areas(gl):
+    """Of a closed outline the shares in each pixel are its area there, less what the centre shows."""
+    angles = 0.37 + 2 * np.pi * np.arange(5) / 5
+    corners = 15.3 * np.column_stack([np.cos(angles), np.sin(angles)]) + (0.2, -0.4)
+    world = looked_at(polygon(corners, 3.0))
+    true, centres = finest(gl, world, 32), luminance(gl, world, "none")
+    with Renderer(gl, world, EDGES) as renderer:
+        moment = renderer.moment(0)
+        pixels, crossings = Lines().in_pixels(moment, moment.visible, 48, 48)
+    for x, y, first, end in pixels.tolist():
+        assert abs(centres[y, x] + crossings[first:end, 0].sum() - true[y, x]) < 0.02
+
+
 def test_nothing_to_draw(gl):
     world = scene([thing("ball", 1, sphere(0.5), still((0, -4, 0)))])  # behind the camera
     np.testing.assert_array_equal(luminance(gl, world, "edges"), luminance(gl, world, "none"))

@@ -42,7 +42,7 @@ def test_everything_compiles_and_nothing_is_unused(shader):
         "colour.glsl": 118,
         "debug.glsl": 14,
         "downsample.glsl": 2,
-        "edges.glsl": 4,
+        "edges.glsl": 3,
         "gather.glsl": 3,
         "label.glsl": 140,
         "luminance.glsl": 364,

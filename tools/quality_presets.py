@@ -101,6 +101,7 @@ def main() -> None:
                 "what": scene["what"],
                 "converged": scene["converged"],
                 "reference": scene["reference"],
+                "clip_s": scene["clip_s"],
                 "settings": [{k: _short(v) for k, v in r.items() if k in KEPT} for r in scene["settings"]],
             }
             for name, scene in result["scenes"].items()

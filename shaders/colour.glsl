@@ -25,7 +25,7 @@ uniform sampler2D emission_map;
 uniform mat3x2 emission_map_place;
 #endif
 #endif
-#ifdef LIT
+#if defined(LIT) && !defined(LIT_AT_CORNERS)
 #include "light.glsl"
 #endif
 #ifdef SURFACED
@@ -50,6 +50,8 @@ void main()
 #endif
 #ifdef SURFACED
     float side = SIDE;
+#elif defined(LIT_AT_CORNERS)
+    LIGHT_HERE light = LIGHT_SEEN;
 #elif defined(LIT)
     ILLUMINANT light = irradiance(TURNED(normal));
 #else

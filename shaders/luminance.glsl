@@ -91,7 +91,7 @@ uniform sampler2D emission_map; // of its luminance
 uniform mat3x2 emission_map_place;
 #endif
 #endif
-#ifdef LIT
+#if defined(LIT) && !defined(LIT_AT_CORNERS)
 #include "light.glsl"
 #endif
 #ifdef SURFACED
@@ -210,6 +210,8 @@ void main()
 #ifdef CHANGES
     change = radiated_rate(spot, spot_change, side, length(motion)) * WEIGHTS;
 #endif
+#elif defined(LIT_AT_CORNERS)
+    luminance *= LIGHT_SEEN;
 #else
     vec3 facing = TURNED(normal);
     ILLUMINANT light = irradiance(facing);

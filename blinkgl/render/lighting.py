@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 EXAMPLES: tuple[dict[str, Any], ...] = (
     {"LIGHTS": 1, "AMBIENT": 3},
+    {"LIGHTS": 1, "SUNS": 1, "AMBIENT": 3, "FACETED": 1},
     {"LIGHTS": 1, "SUNS": 2, "LAMPS": 2, "AMBIENT": 2},
     {"SHADOWS": 1, "SHADOW_SUNS": 1},
     {"LIGHTS": 1, "SUNS": 1, "AMBIENT": 1, "SHADOWS": 1, "SHADOW_SUNS": 1},
@@ -76,13 +77,15 @@ class Lighting:
             return hued if pass_.lit else {}
         if self.plain and not kind.whole:
             return self._shadows(pass_)
+        shadows, lamps = self._shadows(pass_), len(self.lamps) > self._suns
         counts = {"SUNS": self._suns, "LAMPS": len(self.lamps) - self._suns, "SPOTS": self._spots}
         ambient = 3 if self._quartic is not None else 2 if self._quadric[:, :3, :3].any() else 1
         return (
             {"LIGHTS": 1}
             | {name: count for name, count in counts.items() if count}
             | ({"AMBIENT": ambient} if self._quadric.any() else {})
-            | self._shadows(pass_)
+            | shadows
+            | ({"FACETED": 1} if kind.faceted and not (shadows or lamps) else {})
             | (hued or ({"HUED": 1} if not pass_.one_channel and (self.coloured or "GLOSSY" in kind.more) else {}))
         )
 

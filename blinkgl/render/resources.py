@@ -22,7 +22,7 @@ from blinkgl.scene.lights import is_coloured, surroundings_of
 from blinkgl.scene.shapes.deformer import Deformer
 from blinkgl.scene.shapes.table import define_of, includes
 from blinkgl.scene.surfaces.gloss import energy, looks, mean_energy
-from blinkgl.scene.types import IDENTITY, REPEAT, Map, Material, Mesh, Part, Scene, Texture, Wrap
+from blinkgl.scene.types import IDENTITY, REPEAT, Light, Map, Material, Mesh, Part, Scene, SceneObject, Texture, Wrap
 
 MADE.append(includes)
 
@@ -35,7 +35,8 @@ _ATTRIBUTES = (("in_position", "3f", 12), ("in_normal", "3f", 12), ("in_uv", "2f
 class Kind(NamedTuple):
     """What of a material, and of a shape that changes with time, makes another program. shape : macros of the
     latter.   hued : whether its luminance takes three channels: where its colour and that of the light, or two colours
-    of its own, vary independently.   masked : it has holes.   more : of MORE, what it is to passes that are lit."""
+    of its own, vary independently.   masked : it has holes.   more : of MORE, what it is to passes that are lit.
+    faceted : the corners of each of its faces have one normal; said where the light is not the plain one alone."""
 
     textured: bool
     lit: bool
@@ -44,6 +45,7 @@ class Kind(NamedTuple):
     hued: bool = False
     masked: bool = False
     more: tuple[str, ...] = ()
+    faceted: bool = False
 
     def defines(self, lit: bool) -> dict[str, int]:
         """Of its variants. lit : of a pass that is."""
@@ -107,7 +109,7 @@ class DrawItem:
     centre, radius; low, high : bounding sphere and box, object frame; of a shape that changes those of all that it
     sweeps.   corners : (8, 3) of the box.
     layer : 0 objects, 1 ground and walls, 2 sky; drawn in this order so that depth rejects hidden fragments early.
-    two_sided : no culling, and the normal is turned towards the camera.   hued : as of :class:`Kind`.
+    two_sided : no culling, and the normal is turned towards the camera.   hued, faceted : as of :class:`Kind`.
     casts : whether it throws shadows: objects and walls do, unless they are unlit (screens, skies of files).
     extended : whether its material has more than a base colour: maps and numbers of its own to hand to programs.
     """
@@ -127,13 +129,14 @@ class DrawItem:
     number: int = -1
     hued: bool = False
     casts: bool = False
+    faceted: bool = False
 
     def __post_init__(self) -> None:
         self.textured = self.material.texture is not None
         self.deformer = self.mesh.deformer
         shape, more = shape_of(self.deformer), more_of(self.material, self.mesh)
         masked = self.material.mask is not None
-        self.kind = Kind(self.textured, self.lit, self.two_sided, shape, self.hued, masked, more)
+        self.kind = Kind(self.textured, self.lit, self.two_sided, shape, self.hued, masked, more, self.faceted)
         self.extended = masked or bool(more)
         self.corners = box_corners(self.low, self.high)
 
@@ -235,6 +238,22 @@ class _Greys:
         return (self._coloured_light or metal) and (coloured or len(set(material.base_color)) > 1)
 
 
+class _Facets:
+    """Which meshes have flat facets alone; each is looked at once, and none where the light is plain."""
+
+    def __init__(self, light: Light):
+        self._asked = not light.plain
+        self._known: dict[int, bool] = {}
+
+    def flat(self, mesh: Mesh) -> bool:
+        if not self._asked or mesh.deformer is not None:
+            return False
+        if id(mesh) not in self._known:
+            corners = mesh.normals[mesh.faces]
+            self._known[id(mesh)] = bool((np.abs(corners[:, 1:] - corners[:, :1]) <= 1e-6).all())
+        return self._known[id(mesh)]
+
+
 class SceneResources:
     """GL side of one Scene. Release it before the context."""
 
@@ -246,9 +265,9 @@ class SceneResources:
         self._vaos: dict[tuple, moderngl.VertexArray] = {}
         self._shapes: dict[int, Shape] = {}
         self._volumes: dict[str, moderngl.Texture3D] = {}
-        grey = _Greys(is_coloured(scene.light))
+        grey, facets = _Greys(is_coloured(scene.light)), _Facets(scene.light)
         self.items = [
-            _draw_item(index, part.mesh, part.material, obj.category, not obj.is_static, scene.t0_ns, scene.t1_ns, grey)
+            _draw_item(index, obj, part, scene, grey, facets)
             for index, obj in enumerate(scene.objects)
             for part in obj.parts
         ]
@@ -510,15 +529,14 @@ def _near_zero(uvs: np.ndarray) -> np.ndarray:
     return uvs - np.rint((low + high) / 2) if max(-low.min(), high.max()) > 64 else uvs
 
 
-def _draw_item(
-    index: int, mesh: Mesh, material: Material, category: str, moves: bool, t0_ns: int, t1_ns: int, grey: _Greys
-) -> DrawItem:
+def _draw_item(index: int, thing: SceneObject, part: Part, scene: Scene, grey: _Greys, facets: _Facets) -> DrawItem:
+    mesh, material, category = part.mesh, part.material, thing.category
     if mesh.deformer is None:
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
         centre = (low + high) / 2
         radius = float(np.sqrt(((mesh.vertices - centre) ** 2).sum(axis=1).max()))
     else:
-        low, high = mesh.deformer.bounds(mesh, t0_ns, t1_ns)
+        low, high = mesh.deformer.bounds(mesh, scene.t0_ns, scene.t1_ns)
         centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     if not radius <= MAX_RADIUS:  # NaN too
         raise AssetError(
@@ -536,9 +554,10 @@ def _draw_item(
         low,
         high,
         _LAYER[category],
-        not Part(mesh, material).culled,
+        not part.culled,
         not material.unlit,
-        moves,
+        not thing.is_static,
         hued=grey.hued(material, mesh),
         casts=category in ("object", "wall") and not material.unlit,
+        faceted=not material.unlit and facets.flat(mesh),
     )

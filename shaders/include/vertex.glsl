@@ -34,6 +34,20 @@
 #endif
 #endif
 
+// LIT_AT_CORNERS (needs.glsl): flat in light_here, of the facet; TWO_SIDED: light_behind, of its back. LIGHT_SEEN: of the side that is seen.
+#ifdef LIT_AT_CORNERS
+#ifdef HUED
+#define LIGHT_HERE vec3
+#else
+#define LIGHT_HERE float
+#endif
+#ifdef TWO_SIDED
+#define LIGHT_SEEN (gl_FrontFacing ? light_here : light_behind)
+#else
+#define LIGHT_SEEN light_here
+#endif
+#endif
+
 #ifdef VERTEX_SHADER
 in vec3 in_position;
 uniform mat4 mvp;
@@ -57,6 +71,14 @@ out vec3 tint;
 #ifdef NEEDS_TANGENT
 in vec4 in_tangent;
 out vec4 tangent;
+#endif
+#ifdef LIT_AT_CORNERS
+in vec3 in_normal;
+flat out LIGHT_HERE light_here;
+#ifdef TWO_SIDED
+flat out LIGHT_HERE light_behind;
+#endif
+#include "light.glsl"
 #endif
 #ifdef SHADOW_PLACE
 uniform mat4 shadow_rows[SHADOWS]; // object frame to the map, by rows: x, y and depth in [0, 1], times w; and w
@@ -107,6 +129,12 @@ void main()
 #endif
 #ifdef NEEDS_LOCAL
     local = position;
+#endif
+#ifdef LIT_AT_CORNERS
+    light_here = irradiance(in_normal);
+#ifdef TWO_SIDED
+    light_behind = irradiance(-in_normal);
+#endif
 #endif
 #ifdef SHADOW_PLACE
     for (int i = 0; i < SHADOWS; ++i)
@@ -159,6 +187,12 @@ in vec3 normal;
 #endif
 #ifdef NEEDS_LOCAL
 in vec3 local;
+#endif
+#ifdef LIT_AT_CORNERS
+flat in LIGHT_HERE light_here;
+#ifdef TWO_SIDED
+flat in LIGHT_HERE light_behind;
+#endif
 #endif
 #ifdef SHADOW_PLACE
 in SHADOW_PLACE shadow_place[SHADOWS];

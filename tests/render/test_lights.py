@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.config.deform import TwistConfig
 from blinkgl.config.sequence import RenderConfig
-from blinkgl.render import reference
+from blinkgl.render import reference, resources
 from blinkgl.render.colour import LUMA
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.lights import lamp_pose
@@ -145,6 +146,42 @@ def test_light_of_a_panorama_is_the_references(gl, finer):
     )
     true = (after - before) / (2e-9 * h)
     assert np.quantile(np.abs(rate - true)[off], 0.9) < 0.03 * np.abs(true[off]).max()
+
+
+@pytest.mark.parametrize("finer", [False, True])
+def test_flat_facets_are_lit_at_their_corners(gl, monkeypatch, finer):
+    """As at every pixel, from before and from behind, of one channel and of three; where anything else counts it is
+    done at every pixel."""
+    around = np.random.default_rng(3).normal(size=(3, 4, 4)) * 0.1
+    around = around + around.swapaxes(1, 2) + np.diag([0, 0, 0, 1.0])
+    fourth = np.random.default_rng(4).normal(size=(3, 9, 9)) * 0.04
+    nested = [
+        tuple(tuple(map(tuple, one)) for one in form.tolist()) for form in (around, fourth + fourth.swapaxes(1, 2))
+    ]
+    light = Light(sun=0.4, sky=0, sun_color=(1.0, 0.8, 0.5), around=nested[0], finer=nested[1] if finer else None)
+    texture, sheet = Material(texture=smooth_texture()), quad(0.6, 0.6)
+    bodies = [
+        thing("box", 1, cube(0.5), still((-0.8, 3, 0), Rotation.from_euler("zx", [30, 20], degrees=True)), texture),
+        thing("ball", 2, sphere(0.5, 3), still((0.8, 3, 0)), texture),
+        thing("front", 3, sheet, still((0.2, 3.4, 0.9), Rotation.from_euler("x", 60, degrees=True))),
+        thing("back", 4, sheet, still((-0.2, 3.4, -0.9), Rotation.from_euler("x", 240, degrees=True))),
+    ]
+    world = scene(bodies, light=light)
+    unfiltered = RenderConfig(image_antialiasing="none")
+    with Renderer(gl, world, unfiltered) as renderer:
+        assert [item.kind.faceted for item in sorted(renderer.items, key=lambda i: i.object_index)] == [1, 0, 1, 1]
+        flat = renderer.luminance(0).read(), renderer.colour(0).read()
+        beside_rates = renderer.luminance(0, rate=True).read("luminance")
+    programs = [dict(defines) for _, defines in gl.shaders.compiled]
+    assert any("FACETED" in one and one.get("AMBIENT") == ("3" if finer else "2") for one in programs)
+    monkeypatch.setattr(resources, "_Facets", lambda _: SimpleNamespace(flat=lambda _: False))
+    with Renderer(gl, world, unfiltered) as renderer:
+        smooth = renderer.luminance(0).read(), renderer.colour(0).read()
+    ids = reference.render(world, 0).instance
+    assert all((ids == k).sum() > 100 for k in (1, 2, 3, 4))
+    for one, other in zip(flat, smooth):
+        np.testing.assert_allclose(one, other, rtol=2e-6, atol=1e-7)
+    np.testing.assert_allclose(beside_rates, flat[0], rtol=2e-6, atol=1e-7)
 
 
 def test_one_channel_does_where_a_surface_has_one_colour(gl):

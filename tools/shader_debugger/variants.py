@@ -53,7 +53,7 @@ def _lights(pass_: Pass, kind: Kind | None) -> list[dict[str, Any]]:
     if kind.shape:
         return [{}, EXAMPLES[-1]]
     hued = (kind.textured or not pass_.one_channel) and not kind.two_sided
-    coloured = [light | {"HUED": 1} for light in EXAMPLES] if hued else []
+    coloured = [light | {"HUED": 1} for light in EXAMPLES if "LIGHTS" in light] if hued else []
     return [{}, *EXAMPLES, *coloured]
 
 

@@ -460,6 +460,13 @@ def calibrate(
             help="No frames: an even scene under light that goes as 1 + CONTRAST sin, HZ times a second. Thresholds.",
         ),
     ] = None,
+    edge: Annotated[
+        str | None,
+        typer.Option(
+            metavar="CONTRAST[,WIDTH]",
+            help="No frames: straight borders of two tones that move at constant speed; WIDTH in px. Thresholds.",
+        ),
+    ] = None,
     emulator: Annotated[
         str,
         typer.Option("--emulator", "-e", help="esim, v2e or voltmeter; with --still also pixels: noise beside any."),
@@ -491,6 +498,7 @@ def calibrate(
         out,
         still=still,
         flicker=flicker,
+        edge=edge,
         emulator=emulator,
         sensor=sensor,
         overrides=overrides or [],

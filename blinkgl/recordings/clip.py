@@ -37,11 +37,6 @@ that they stand for at most."""
 MOST_SHIFT_US = 100_000
 LEAST_CORRELATION = 0.25
 """Of polarity sums with the frames' change: below, events and frames are not of one scene or not on one clock."""
-LEAST_FLICKER = 0.2
-"""Share of the polarity that goes with the light; of a square wave's events it is 0.64, of random ones 0."""
-LEAST_HALF_PERIODS, MOST_HALF_PERIODS, MOST_PERIODS = 8, 48, 200
-FLICKER_STEPS = 64
-"""Frames per period."""
 DARK_BACKGROUND = 0.2
 """Luminance of the scene of a recording without frames: the middle of the scale, about."""
 
@@ -202,8 +197,21 @@ def clip_of_frames(
     mean = np.mean(logs, axis=0)
     light = np.searchsorted(np.quantile(mean, np.arange(1, 8) / 8), mean).astype(np.uint8)
     events = events.window(int(edges[0]), int(edges[-1]))
-    whole = _cut(path, events, ~full, still, light, change, size, most, seed)
-    return replace(whole, clock_us=clock, edges_us=edges, facts=facts, bursts=bursts)
+    tiles = Tiles(size, len(path), most, seed)
+    return Clip(
+        [(t, tiles.cut(g)) for g, t in path],
+        clock,
+        edges,
+        tiles.events(events, ~full),
+        tiles.cut(~full),
+        tiles.cut(still & ~full),
+        tiles.cut(light),
+        tiles.cut(change),
+        size,
+        tiles.share,
+        bursts,
+        facts,
+    )
 
 
 def clip_of_still(events: Events, size: tuple[int, int], *, luminance: float = DARK_BACKGROUND, parts: int = 8) -> Clip:
@@ -226,94 +234,6 @@ def clip_of_still(events: Events, size: tuple[int, int], *, luminance: float = D
     )
 
 
-@dataclass(frozen=True)
-class Flicker:
-    """Light whose luminance goes as m (1 + contrast sin) everywhere in the picture, ``hz`` times a second."""
-
-    hz: float
-    contrast: float
-
-
-def clip_of_flicker(
-    events: Events,
-    size: tuple[int, int],
-    flicker: Flicker,
-    *,
-    lag_us: int = 0,
-    luminance: float = 0.4,
-    where: str = "--flicker",
-    most: int = MOST_PIXEL_STEPS,
-    seed: int = 0,
-) -> Clip:
-    """Of a recording without frames, of an even scene under flickering light. Frequency (within 2 %) and phase are
-    found from the events; intervals are its half periods.
-
-    lag_us : by which events come after the light.   luminance : m.   Raises EventDataError: events that do not go with
-    the light, fewer than four half periods."""
-    hz, begin_us, share = _flicker_of(events, flicker.hz)
-    if share < LEAST_FLICKER:
-        raise EventDataError(
-            "the events do not go up and down with the light",
-            where=where,
-            value=f"{hz:.6g} Hz, {share:.2f} of the polarity",
-            accepted=f"at least {LEAST_FLICKER}: an even scene, and the light's own frequency within 2 %",
-        )
-    half_us = 5e5 / hz
-    # Half periods begin where the light is darkest, a quarter of a period before its rise is steepest, or brightest.
-    origin = begin_us - lag_us - half_us / 2
-    first = int(np.ceil((events.t[0] - origin) / half_us))
-    stop = int(np.floor((events.t[-1] + 1 - origin) / half_us))
-    if stop - first < LEAST_HALF_PERIODS:
-        raise EventDataError(
-            "the recording spans too few periods of the light",
-            where=where,
-            value=max(stop - first, 0) / 2,
-            accepted=f"{LEAST_HALF_PERIODS // 2} or more whole ones",
-        )
-    stop = min(stop, first + MOST_HALF_PERIODS)
-    edges = np.round(origin + half_us * np.arange(first, stop + 1)).astype(np.int64)
-    count = len(edges) - 1
-    step_us = 2 * half_us / FLICKER_STEPS
-    warm = 2 * FLICKER_STEPS  # two periods, after which a pixel stands anywhere between its levels
-    at = edges[0] + step_us * np.arange(-warm, count * FLICKER_STEPS // 2 + 1)
-    light = luminance * (1 + flicker.contrast * np.sin(np.pi * ((at - origin) / half_us - 0.5)))
-    path = [(np.broadcast_to(np.float32(v), size), int(1000 * t)) for v, t in zip(light, at)]
-    up = np.log((luminance * (1 + flicker.contrast) * 255 + LOG_OFFSET)
-                / (luminance * (1 - flicker.contrast) * 255 + LOG_OFFSET))  # fmt: skip
-    sign = np.where((first + np.arange(count)) % 2 == 0, up, -up).astype(np.float32)
-    change = np.broadcast_to(sign[:, None, None], (count, *size))
-    everywhere = np.ones(size, bool)
-    nowhere, even = np.zeros(size, bool), np.zeros(size, np.uint8)
-    whole = _cut(
-        path, events.window(int(edges[0]), int(edges[-1])), everywhere, nowhere, even, change, size, most, seed
-    )
-    return replace(whole, clock_us=edges, edges_us=edges, facts={"flicker_hz": hz, "flicker_share": share})
-
-
-def flicker_lag(simulated: Events, clip: Clip) -> int:
-    """By how many µs an emulator's events of such a clip come after the light."""
-    hz = clip.facts["flicker_hz"]
-    # Steepest at the middle of the first half period of those that rise.
-    turned = np.exp(-2j * np.pi * hz * 1e-6 * (simulated.t - clip.edges_us[0])) @ (2.0 * simulated.p - 1)
-    rising = 0.25 if clip.change[0].flat[0] > 0 else 0.75
-    late = (-np.angle(turned) / (2 * np.pi) - rising + 0.5) % 1.0 - 0.5
-    return round(1e6 * late / hz)
-
-
-def _flicker_of(events: Events, hz: float) -> tuple[float, float, float]:
-    """(Hz, µs at which the polarity's wave is highest, its share of the polarity)."""
-    part = events.window(int(events.t[0]), int(events.t[0] + 1e6 * MOST_PERIODS / hz) + 1)
-    t, p = (part.t - part.t[0]) * 1e-6, 2.0 * part.p - 1
-    seconds = max(float(t[-1]), 1e-6)
-    wave, edges = np.histogram(t, bins=max(int(seconds * hz * 64), 64), range=(0, seconds), weights=p)
-    middle = (edges[1:] + edges[:-1]) / 2
-    tried = np.linspace(0.98 * hz, 1.02 * hz, max(int(0.4 * hz * seconds), 21))  # ten of them in a line of the spectrum
-    found = np.array([np.abs(np.exp(-2j * np.pi * f * middle) @ wave) for f in tried])
-    best = float(tried[int(np.argmax(found))])
-    turned = np.exp(-2j * np.pi * best * t) @ p
-    return best, float(events.t[0] - np.angle(turned) / (2 * np.pi * best) * 1e6), float(np.abs(turned) / len(p))
-
-
 def _one_exposure(
     inside: np.ndarray, change: np.ndarray, clock_us: np.ndarray, used: np.ndarray, events: Events
 ) -> np.ndarray:
@@ -331,33 +251,44 @@ def _one_exposure(
     return np.array(best, np.int64)
 
 
-_NO_TIMES = (np.empty(0, np.int64),) * 2
+class Tiles:
+    """As much of a sensor as fits into ``most`` pixels times frames: all of it, or tiles drawn at random, stacked on
+    one another. size : (height, width) of the sensor."""
 
+    def __init__(self, size: tuple[int, int], frames: int, most: int = MOST_PIXEL_STEPS, seed: int = 0):
+        self.size, self.share = size, 1.0
+        self._corners: list[tuple[int, int]] = []
+        self._place = np.zeros((size[0] // TILE_PX, size[1] // TILE_PX), np.int64)
+        wanted = most // (frames * TILE_PX * TILE_PX)
+        if frames * size[0] * size[1] <= most or wanted >= self._place.size:
+            return
+        chosen = np.sort(np.random.default_rng(seed).choice(self._place.size, max(wanted, 1), replace=False))
+        self._place[...] = -1
+        self._place.flat[chosen] = np.arange(len(chosen))
+        columns = self._place.shape[1]
+        self._corners = [(int(i) // columns * TILE_PX, int(i) % columns * TILE_PX) for i in chosen]
+        self.share = len(chosen) * TILE_PX**2 / (size[0] * size[1])
 
-def _cut(path, events: Events, used, still, light, change, size, most: int, seed: int) -> Clip:
-    """As much of the sensor as fits into ``most`` pixels times frames: all of it, or tiles drawn at random."""
-    height, width = size
-    rows, columns = height // TILE_PX, width // TILE_PX
-    wanted = most // (len(path) * TILE_PX * TILE_PX)
-    if len(path) * height * width <= most or wanted >= rows * columns:
-        return Clip([(t, g) for g, t in path], *_NO_TIMES, events.part(used[events.y, events.x]), used, used & still,
-                    light, change, size)  # fmt: skip
-    chosen = np.sort(np.random.default_rng(seed).choice(rows * columns, max(wanted, 1), replace=False))
-    place = np.full((rows, columns), -1)
-    place.flat[chosen] = np.arange(len(chosen))
-    corners = [(int(i) // columns * TILE_PX, int(i) % columns * TILE_PX) for i in chosen]
-    cut = lambda a: np.concatenate([a[..., y : y + TILE_PX, x : x + TILE_PX] for y, x in corners], axis=-2)
-    y, x = events.y.astype(np.int64), events.x.astype(np.int64)
-    here = (y < rows * TILE_PX) & (x < columns * TILE_PX)
-    here[here] = place[y[here] // TILE_PX, x[here] // TILE_PX] >= 0
-    here &= used[events.y, events.x]
-    tile = place[y[here] // TILE_PX, x[here] // TILE_PX]
-    moved = Events(
-        (x[here] % TILE_PX).astype(np.uint16), (tile * TILE_PX + y[here] % TILE_PX).astype(np.uint16),
-        events.t[here], events.p[here],
-    )  # fmt: skip
-    return Clip([(t, cut(g)) for g, t in path], *_NO_TIMES, moved, cut(used), cut(used & still), cut(light),
-                cut(change), size, len(chosen) * TILE_PX**2 / (height * width))  # fmt: skip
+    def cut(self, image: np.ndarray) -> np.ndarray:
+        """(..., height, width) to what is looked at of it."""
+        if not self._corners:
+            return image
+        return np.concatenate([image[..., y : y + TILE_PX, x : x + TILE_PX] for y, x in self._corners], axis=-2)
+
+    def events(self, events: Events, used: np.ndarray) -> Events:
+        """Those on pixels that are looked at and ``used`` (height, width), where these are in the cut."""
+        if not self._corners:
+            return events.part(used[events.y, events.x])
+        y, x = events.y.astype(np.int64), events.x.astype(np.int64)
+        rows, columns = self._place.shape
+        here = (y < rows * TILE_PX) & (x < columns * TILE_PX)
+        here[here] = self._place[y[here] // TILE_PX, x[here] // TILE_PX] >= 0
+        here &= used[events.y, events.x]
+        tile = self._place[y[here] // TILE_PX, x[here] // TILE_PX]
+        return Events(
+            (x[here] % TILE_PX).astype(np.uint16), (tile * TILE_PX + y[here] % TILE_PX).astype(np.uint16),
+            events.t[here], events.p[here],
+        )  # fmt: skip
 
 
 def clock_offset(events: Events, changes: np.ndarray, clock_us: np.ndarray, size: tuple[int, int]) -> tuple[int, float]:

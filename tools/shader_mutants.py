@@ -1,11 +1,17 @@
 """Mutants of the shaders that light a scene, judged by the shader debugger: does ``blinkgl shader diff`` see a wrong
-line?
+line? And of the one that filters silhouettes, judged by its slow twin (edges_twin.py).
 
     python -m blinkgl.tools.shader_mutants CONFIG [--files lights shadows …] [--count 100] [--seed 1]
+    python -m blinkgl.tools.shader_mutants CONFIG [CONFIG …] --files edges [--count 100] [--seed 1] [--at SECONDS]
 
 Small edits of one line (as in ``mutate.py``) of shaders/include/NAME.glsl, in the lines that are compiled for the
 configuration's first label; each is drawn, and dies where a term of the light, a shadow map or the result is over its
 tolerance, does not compile, or cannot be drawn. Survivors are printed. ``tests/tools/lit.yaml`` has all terms.
+
+Of edges.glsl every line is mutated, and a mutant dies where a picture of one of the configurations differs from the
+twin's by more than a thousandth of its mean. ``configs/trade/{thin,deforming,small_objects,grazing}.yaml`` have wires,
+folds, tangles, seams and a horizon; ``tests/render/test_edges.py -k twin`` has what these have not. What is listed in
+``tools/mutants_equivalent.txt`` is not tried.
 """
 
 from __future__ import annotations
@@ -16,10 +22,20 @@ import shutil
 import tempfile
 from pathlib import Path
 
+import numpy as np
+
+from blinkgl.config.sequence import load_run
 from blinkgl.errors import BlinkGLError
-from blinkgl.gl import ShaderLoader
+from blinkgl.gl import GLContext, ShaderLoader, create_context
 from blinkgl.gl.shader import STAGES, expand, shader_folder
-from blinkgl.tools.mutate import Mutant, mutants_of
+from blinkgl.render.antialiasing import samples_of
+from blinkgl.render.contours import Lines
+from blinkgl.render.passes import Edged, Luminance, Pass
+from blinkgl.render.passes.edged import SKY
+from blinkgl.render.renderer import Renderer
+from blinkgl.scene.build import sequence_scene
+from blinkgl.tools.edges_twin import filtered, read_both
+from blinkgl.tools.mutate import Mutant, excuses, mutants_of
 from blinkgl.tools.shader_debugger import compare, moments
 from blinkgl.tools.shader_debugger.preprocess import active_lines
 from blinkgl.tools.shader_debugger.session import moment, open_folder, open_renderer, open_subject
@@ -84,7 +100,46 @@ class Judge:
             self.renderer.use_shaders(ours)
 
 
-def judged(judge: Judge, folder: Path, mutant: Mutant) -> str:
+class EdgesJudge:
+    """Of frames of several configurations at a time, s, 120 x 90 px. compiled : (file, line) of what was drawn."""
+
+    def __init__(self, gl: GLContext, configs: list[str], at: float):
+        self.gl = gl
+        self.drawn: list[tuple[str, Renderer, Pass, int, np.ndarray, float]] = []
+        loader = Asked(gl.ctx, gl.shaders.folder)
+        for path in configs:
+            config = load_run(path, ["camera.width=120", "camera.height=90"]).sequence(0)
+            render = config.render.model_copy(update={"antialiasing": "edges"})
+            renderer, t_ns = Renderer(gl, sequence_scene(config, 0), render, whole=True), round(at * 1e9)
+            self.renderer = renderer
+            pass_ = Luminance(False, samples_of("edges"))
+            picture, depths = read_both(renderer.draw(pass_, t_ns))
+            moment = renderer.moment(t_ns)
+            items = [item for item in moment.visible if item.layer != SKY]
+            pixels, crossings = Lines().in_pixels(moment, items, renderer.width, renderer.height)
+            pixel = 2 / (renderer.width * abs(moment.view.projection[0, 0]))
+            true = filtered(picture, depths, pixels, crossings, pixel)
+            self.drawn.append((Path(path).stem, renderer, Edged(pass_), t_ns, true, 1e-3 * float(picture.mean())))
+        if wrong := self.wrong(loader):
+            raise BlinkGLError(f"already wrong without a mutant: {', '.join(wrong)}")
+        self.compiled = loader.lines()
+
+    def wrong(self, loader: ShaderLoader) -> list[str]:
+        """The first configuration whose picture is not the twin's, with these shaders; [] where all are."""
+        ours, self.gl.shaders = self.gl.shaders, loader
+        try:
+            for name, renderer, pass_, t_ns, true, tolerance in self.drawn:
+                renderer._painter.strokes.forget()  # noqa: SLF001 - the others' programs are not what is tried
+                if not np.abs(renderer.draw(pass_, t_ns).read() - true).max() <= tolerance:
+                    return [name]
+            return []
+        finally:
+            self.gl.shaders = ours
+            for _, renderer, *_ in self.drawn:
+                renderer._painter.strokes.forget()  # noqa: SLF001
+
+
+def judged(judge: Judge | EdgesJudge, folder: Path, mutant: Mutant) -> str:
     """What tells a mutant: a buffer, or "not drawn"; "" when it lives. folder : a copy of the shaders."""
     path = folder / mutant.path.removeprefix("shaders/")
     source = path.read_text()
@@ -100,24 +155,35 @@ def judged(judge: Judge, folder: Path, mutant: Mutant) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("config")
+    parser.add_argument("configs", nargs="+", metavar="CONFIG")
     parser.add_argument("--files", nargs="*", default=list(FILES))
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--at", type=float, default=0.01, help="s; of the frames that edges are judged in")
     options = parser.parse_args()
-    subject = open_subject(options.config)
-    with open_renderer(subject) as renderer, tempfile.TemporaryDirectory(prefix="blinkgl-mutants-") as name:
+    if options.files == ["edges"]:
+        with create_context() as gl:
+            tried(EdgesJudge(gl, options.configs, options.at), ["edges.glsl"], options)
+        return
+    subject = open_subject(options.configs[0])
+    with open_renderer(subject) as renderer:
         judge = Judge(renderer, subject, moment(subject))
+        tried(judge, [f"include/{file}.glsl" for file in options.files], options)
+
+
+def tried(judge: Judge | EdgesJudge, files: list[str], options: argparse.Namespace) -> None:
+    """Tries mutants of these files of shaders/, and prints what lives and what tells the others."""
+    with tempfile.TemporaryDirectory(prefix="blinkgl-mutants-") as name:
         folder = Path(name) / "shaders"
         shutil.copytree(Path(str(shader_folder())), folder)
         mutants = [
             mutant
-            for file in options.files
-            for mutant in mutants_of(
-                f"shaders/include/{file}.glsl", (folder / "include" / f"{file}.glsl").read_text(encoding="utf-8")
-            )
-            if (f"include/{file}.glsl", mutant.line) in judge.compiled
+            for file in files
+            for mutant in mutants_of(f"shaders/{file}", (folder / file).read_text(encoding="utf-8"))
+            if (file, mutant.line) in judge.compiled
         ]
+        excused = excuses(mutants)
+        mutants = [mutant for mutant in mutants if mutant.name not in excused]
         chosen = random.Random(options.seed).sample(mutants, min(options.count, len(mutants)))
         told: dict[str, int] = {}
         for mutant in sorted(chosen, key=lambda m: (m.path, m.line, m.column)):
@@ -126,7 +192,7 @@ def main() -> None:
             if not by:
                 print(f"lives: {mutant.name}", flush=True)
     dead = len(chosen) - told.pop("", 0)
-    print(f"{dead} of {len(chosen)} died ({len(mutants)} in compiled lines); told by:")
+    print(f"{dead} of {len(chosen)} died ({len(mutants)} in compiled lines, {len(excused)} are equivalent); told by:")
     for by, count in sorted(told.items(), key=lambda pair: -pair[1]):
         print(f"  {count:4} {by}")
 

@@ -11,12 +11,14 @@ from scipy.spatial.transform import Rotation
 from blinkgl.camera import PinHole, Radtan
 from blinkgl.config.deform import WaveConfig
 from blinkgl.config.sequence import RenderConfig
+from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.contours import CROSSING, LINE, Contour, Lines
-from blinkgl.render.passes import filtered
+from blinkgl.render.passes import Luminance, filtered
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.shapes.closed_forms import Wave
 from blinkgl.scene.types import Light, Material, Texture
+from blinkgl.tools.edges_twin import filtered as filtered_slowly, read_both
 from render_scenes import (
     LEVEL,
     SECOND,
@@ -348,14 +350,84 @@ def test_shares_add_up_to_areas(gl):
         assert abs(centres[y, x] + crossings[first:end, 0].sum() - true[y, x]) < 0.02
 
 
+def zigzag(depth: float):
+    """Wires of 0.2 px at many angles, and a crumpled ball of triangles smaller than a pixel."""
+    wires = []
+    for k in range(8):
+        along = np.array([np.cos(0.4 * k + 0.1), np.sin(0.4 * k + 0.1)])
+        across = 0.1 * np.array([-along[1], along[0]])
+        ends = [along * a * (6 + 2 * k) + across * b for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+        wires.append(polygon(np.array(ends) + (k - 4, 3 - k), depth + 0.1 * k, f"wire{k}", 10 + k))
+    return wires
+
+
+def aligned():
+    """Cards whose edges run through pixels' centres, some of them before a wall that they nearly touch."""
+    card = lambda x, y, size, depth, k: polygon(
+        np.array([(x, y), (x + size, y), (x + size, y + size), (x, y + size)]), depth, f"card{k}", 10 + k, paints[k % 3]
+    )
+    paints = [replace(WHITE, base_color=(c,) * 3) for c in (1.0, 0.1, 0.6)]
+    wall = polygon(30 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]), 3.0, "wall", 2, GREY)
+    places = [(-18.5, -15.5, 8), (-4.5, -12.5, 9), (6.5, 3.5, 5), (-14.5, 2.5, 11), (0.5, 6.5, 3)]
+    return looked_at(wall, *(card(x, y, size, 2.999 - 0.3 * (k % 2), k) for k, (x, y, size) in enumerate(places)))
+
+
+def folded():
+    """A strip that is folded within a pixel: three layers of it, over and over."""
+    x = np.concatenate([[0.0, 0.45, 0.05, 0.5, 0.1] + np.full(5, 6.0 * k) for k in range(-3, 3)])
+    corners = [(a * 0.0625, b * 0.0625, 3.0 - 0.002 * (k % 5)) for k, a in enumerate(x) for b in (-18.0, 18.0)]
+    faces = []
+    for k in range(len(x) - 1):
+        if k % 5 != 4:
+            faces += [[2 * k, 2 * k + 1, 2 * k + 2], [2 * k + 1, 2 * k + 3, 2 * k + 2]]
+    wall = polygon(30 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]), 6.0, "wall", 2, GREY)
+    return looked_at(wall, thing("strip", 3, mesh(np.array(corners), faces), still(), WHITE))
+
+
+def horizon():
+    return scene([thing("floor", 2, quad(400, 400, 4), still((0, 10, -1.0)), GREY)], rig(80, 60, 75.0))
+
+
+@pytest.mark.parametrize("world", ["everything", "wires", "rough", "cards", "aligned", "folded", "horizon"])
+def test_the_program_does_what_its_slow_twin_does(gl, world):
+    """In float64, a pixel at a time, from the same picture, depths and lines."""
+    rng = np.random.default_rng(4)
+    worlds = {
+        "everything": mixed_scene,
+        "wires": lambda: looked_at(
+            *zigzag(3.0), polygon(30 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]), 6, "w", 2, GREY)
+        ),
+        "rough": lambda: rough_ball(4, 0.04),
+        "aligned": aligned,
+        "folded": folded,
+        "horizon": horizon,
+        "cards": lambda: looked_at(
+            *(
+                polygon(rng.uniform(-18, 18, 2) + rng.normal(0, 5, (3, 2)), 3 + 0.005 * k, f"card{k}", k + 1, paint)
+                for k, paint in enumerate(replace(WHITE, base_color=(c,) * 3) for c in rng.uniform(0, 2, 40).tolist())
+            )
+        ),
+    }
+    seen, t = worlds[world](), SECOND // 3
+    with Renderer(gl, seen, EDGES) as renderer:
+        plain = renderer.draw(Luminance(False, samples_of("edges")), t)
+        picture, depths = read_both(plain)
+        moment = renderer.moment(t)
+        pixels, crossings = Lines().in_pixels(moment, moment.visible, renderer.width, renderer.height)
+        focal = 0.5 * renderer.width * abs(moment.view.projection[0, 0])
+        twin = filtered_slowly(picture, depths, pixels, crossings, 1 / focal)
+        image = renderer.luminance(t).read()
+    assert (np.abs(twin - picture) > 0.01).sum() > 50
+    np.testing.assert_allclose(image, twin, atol=2e-4 * picture.mean(), rtol=2e-4)
+
+
 def test_nothing_to_draw(gl):
     world = scene([thing("ball", 1, sphere(0.5), still((0, -4, 0)))])  # behind the camera
     np.testing.assert_array_equal(luminance(gl, world, "edges"), luminance(gl, world, "none"))
 
 
 def test_the_pass_is_the_unfiltered_one_with_its_depth_kept():
-    from blinkgl.render.antialiasing import samples_of
-    from blinkgl.render.passes import Edged, Luminance
+    from blinkgl.render.passes import Edged
 
     pass_ = filtered(Luminance(False, samples_of("edges")))
     assert isinstance(pass_, Edged) and pass_.of.depth == "texture" and Luminance().depth is True

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from blinkgl.render.painter import Painter
     from blinkgl.render.resources import DrawItem, Kind
 
-_SKY = 2
+SKY = 2
 _CROSSINGS_UNIT = 8
 
 
@@ -67,7 +67,7 @@ class Edged(Pass):
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
         shot.inputs["picture"].target.resolve_into(shot.target)
         moment, strokes = shot.moment, painter.strokes
-        drawn = [item for item in (moment.visible if items is None else items) if item.layer != _SKY]
+        drawn = [item for item in (moment.visible if items is None else items) if item.layer != SKY]
         strokes.upload(moment, drawn, *shot.size)
         uniforms, array = strokes.program(self.program, self.defines(None))
         if array is None:  # nothing in the picture has an edge

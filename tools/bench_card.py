@@ -1,6 +1,6 @@
-"""ESIM by compute shaders against the numba kernel, and what the shaders move in memory.
+"""ESIM and V2E by compute shaders against the numba kernels, and what the shaders move in memory.
 
-    python -m blinkgl.tools.bench_card [--quick] [--traffic]
+    python -m blinkgl.tools.bench_card [--quick] [--traffic] [--only v2e]
 
 Processor time of numba's kernel, the card's, the card's given frames that lie there already, and that one with the sort
 and the read-back one frame late that graphics cards have: in turns, frame by frame, on `bench_events`' clips and on a
@@ -14,21 +14,26 @@ from __future__ import annotations
 
 import argparse
 import time
+from typing import Any
 
 import numba
 import numpy as np
 
-from blinkgl.card import CardEsim
-from blinkgl.config.events import EsimConfig
-from blinkgl.events import Esim, Events
+from blinkgl.card.choice import CARDS as KERNELS
+from blinkgl.config.events import EmulatorConfig, EsimConfig, V2eConfig
+from blinkgl.events import Events
+from blinkgl.events.table import emulator_of
 from blinkgl.gl import GLContext, create_context
 from blinkgl.machine import bench
 from blinkgl.tools.bench_events import HEIGHT, WIDTH, clip
 
-VARIANTS = {
+VARIANTS: dict[str, EmulatorConfig] = {
     "default": EsimConfig(),
     "refractory": EsimConfig(refractory_us=100.0),
     "jitter": EsimConfig(threshold_jitter=0.02),
+    "v2e clean": V2eConfig(preset="clean"),
+    "v2e default": V2eConfig(),
+    "v2e noisy": V2eConfig(preset="noisy"),
 }
 CARDS = {"H100 SXM (HBM3)": 3350.0, "RTX 4090": 1008.0}
 """Memory bandwidth by the vendor's data sheets, GB/s."""
@@ -55,14 +60,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="fewer frames")
     parser.add_argument("--traffic", action="store_true", help="the computed table alone")
+    parser.add_argument("--only", default="", help="kernels of these letters alone")
     arguments = parser.parse_args()
     if not arguments.traffic:
         with create_context() as gl:
-            measure(gl, 12 if arguments.quick else 40)
+            measure(gl, 12 if arguments.quick else 40, arguments.only)
     traffic()
 
 
-def measure(gl: GLContext, frames: int) -> None:
+def measure(gl: GLContext, frames: int, only: str) -> None:
     """Prints processor ms a frame, in turns, median over ``frames``."""
     numba.set_num_threads(1)
     print(bench.machine_line(f"{gl.renderer}"))
@@ -74,11 +80,15 @@ def measure(gl: GLContext, frames: int) -> None:
         pictures = np.zeros((frames + 4, HEIGHT, WIDTH), np.uint8) if name == "still" else clip(name, frames + 4)[0]
         pictures = (pictures / 255.0).astype(np.float32)
         for variant, config in VARIANTS.items():
+            if only not in variant:
+                continue
+            kind = emulator_of(config)
+            on_card: Any = KERNELS[kind]
             ways = (
-                Esim(HEIGHT, WIDTH, config, 1),
-                CardEsim(HEIGHT, WIDTH, config, 1, gl=gl, late=False, sorts=False),
-                CardEsim(HEIGHT, WIDTH, config, 1, gl=gl, late=False, sorts=False),
-                CardEsim(HEIGHT, WIDTH, config, 1, gl=gl, late=True, sorts=True),
+                kind(HEIGHT, WIDTH, config, 1),
+                on_card(HEIGHT, WIDTH, config, 1, gl=gl, late=False, sorts=False),
+                on_card(HEIGHT, WIDTH, config, 1, gl=gl, late=False, sorts=False),
+                on_card(HEIGHT, WIDTH, config, 1, gl=gl, late=True, sorts=True),
             )
             spent: tuple[list[float], ...] = ([], [], [], [])
             made: tuple[list[Events], ...] = ([], [], [], [])

@@ -22,12 +22,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import numpy as np
 
 from blinkgl.card import Atlas, CardEsim, Voxels
+from blinkgl.card.choice import CARDS as KERNELS
 from blinkgl.card.reductions import OfTextures
-from blinkgl.config.events import EsimConfig
+from blinkgl.config.events import EmulatorConfig, EsimConfig, V2eConfig
 from blinkgl.config.sequence import RenderConfig, RunTemplate, load_run
 from blinkgl.dataset.generate import generate_run
 from blinkgl.errors import BlinkGLError, GLError
 from blinkgl.events import Esim
+from blinkgl.events.table import emulator_of
 from blinkgl.gl import GLContext, create_context, egl_devices
 from blinkgl.labels import LABELS, LabelRequest
 from blinkgl.machine import doctor
@@ -197,6 +199,9 @@ class Events(Piece):
         "refractory": EsimConfig(threshold_sigma=0.0, refractory_us=100.0),
         "jitter": EsimConfig(threshold_sigma=0.0, threshold_jitter=0.02),
         "threshold 0.02": EsimConfig(contrast_threshold=0.02),
+        "v2e clean": V2eConfig(preset="clean"),
+        "v2e": V2eConfig(),
+        "v2e noisy": V2eConfig(preset="noisy", causes=True),
     }
 
     @classmethod
@@ -211,9 +216,10 @@ class Events(Piece):
                     rows.add(key, **cls.compared(gl, config, *size, density))
 
     @staticmethod
-    def compared(gl: GLContext, config: EsimConfig, width: int, height: int, density: float) -> dict[str, Any]:
+    def compared(gl: GLContext, config: EmulatorConfig, width: int, height: int, density: float) -> dict[str, Any]:
         """Events of both, how many steps have others, and whether the states agree after the last."""
-        both = Esim(height, width, config, 3), CardEsim(height, width, config, 3, gl=gl)
+        kind: Any = emulator_of(config)
+        both = kind(height, width, config, 3), KERNELS[kind](height, width, config, 3, gl=gl, late=False)
         counts, differ = [0, 0], 0
         for k, frame in enumerate(noise(height, width, density, 5)):
             a, b = (emulator.step(frame, k * STEP_NS) for emulator in both)
@@ -287,7 +293,8 @@ class Kernel(Piece):
     def run(cls, rows: Rows, options: Namespace) -> None:
         with context(options) as gl:
             for (name, size), density in itertools.product(sizes(options).items(), (0.0, 0.01, 0.07, 0.31, 1.0, 5.0)):
-                for variant in ("plain", "refractory", "jitter") if density == 0.31 else ("plain",):
+                many = ("plain", "refractory", "jitter", "v2e clean", "v2e", "v2e noisy")
+                for variant in many if density == 0.31 else ("plain", "v2e"):
                     key = f"{name}, {variant}, {density:g} events a pixel and frame"
                     if key not in rows:
                         config = Events.VARIANTS[variant]
@@ -295,15 +302,16 @@ class Kernel(Piece):
 
     @staticmethod
     def measured(
-        gl: GLContext, config: EsimConfig, width: int, height: int, density: float, span_s: float
+        gl: GLContext, config: EmulatorConfig, width: int, height: int, density: float, span_s: float
     ) -> dict[str, Any]:
         """Steps/s and events/s: events stay there; are read back and sorted; numba's on one core."""
         clip = noise(height, width, density, 3)
         textures = [gl.ctx.texture((width, height), 1, frame.tobytes(), dtype="f4") for frame in clip]
         found: dict[str, Any] = {}
+        kind: Any = emulator_of(config)
         for name, frames in (("stay", textures), ("read", textures), ("numba", clip)):
             emulator: Any = (
-                Esim(height, width, config, 1) if name == "numba" else CardEsim(height, width, config, gl=gl)
+                kind(height, width, config, 1) if name == "numba" else KERNELS[kind](height, width, config, gl=gl)
             )
             counts, steps = [0], itertools.count()
 

@@ -2,11 +2,12 @@
 
 In:    frames and the emulators' configurations (``blinkgl.events``), a context (``blinkgl.gl``).
 Out:   an ``Emulator`` whose state lies on the card; tensors of events that stay there.
-Start: esim.py; the kernels are shaders/compute/events_*.glsl.
+Start: emulator.py, esim.py, v2e.py; the kernels are shaders/compute/events_*.glsl and v2e_*.glsl.
 """
 
 from blinkgl.card.atlas import Atlas
 from blinkgl.card.esim import CardEsim
 from blinkgl.card.sinks import Counts, Latest, Voxels
+from blinkgl.card.v2e import CardV2e
 
-__all__ = ["Atlas", "CardEsim", "Counts", "Latest", "Voxels"]
+__all__ = ["Atlas", "CardEsim", "CardV2e", "Counts", "Latest", "Voxels"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from blinkgl.events import arith
+from blinkgl.events import arith, philox, v2e_model as v2e
 from blinkgl.events.philox import Stream
 
 
@@ -28,7 +28,49 @@ def includes() -> dict[str, str]:
         f"const uvec2 DOUBLES[{len(doubles)}] = uvec2[]({', '.join(_double(c) for c in doubles)});",
         f"#define JITTER_STREAM {int(Stream.JITTER)}u",
     ]
-    return {"arith.glsl": "\n".join(lines) + "\n"}
+    return {"arith.glsl": "\n".join(lines) + "\n", "v2e_numbers.glsl": _of_v2e()}
+
+
+def _of_v2e() -> str:
+    """What V2E's shaders take beside that."""
+    of = lambda module, names: {name: getattr(module, f"_{name}") for name in names.split()}
+    floats = {
+        **of(v2e, "JOINT SLOPE ZERO ONE HALF SMALLEST_K TABLE_LOW TABLE_PER TABLE_LAST"),
+        **of(arith, "LN2_32 LOG2E_32 LN2_HI_32 LN2_LO_32 ROUND_32 EXP_MIN_32"),
+        "DARK": v2e.DARK,
+        "SETTLED": v2e.SETTLED,
+        "FARTHEST": np.float32(1e6),
+    }
+    doubles = {
+        **of(arith, "LOG2E_64 LN2_HI_64 LN2_LO_64 ROUND_64 FALL_MIN_64"),
+        "DARKEST": v2e.DARKEST,
+        "THREE_ROOT": philox._THREE_ROOT,  # noqa: SLF001
+        "MEAN_OF_FOUR": 2.0 - 2.0 * 2.0**-32,
+        "TWENTY": 20.0,
+        "SPAN": 275.0,
+        "THREE_QUARTERS": 0.75,
+        "TENTH": 0.1,
+        "MOST_NS": 1e18,
+        "NS": 1e-9,
+        "TWO": 2.0,
+        "THREE": 3.0,
+        "CLOSE": 2e-6,
+        "CLOSEST": 1e-9,
+    }
+    lists = {
+        "EXP_BITS": [getattr(arith, f"_E32_{k}") for k in range(7)],
+        "GROWTH_BITS": [getattr(v2e, f"_P{k}") for k in range(7)],
+        "LOG1P_BITS": [getattr(arith, f"_A{k}") for k in range(9)],
+    }
+    falls = [getattr(arith, f"_X{k}") for k in range(13)]
+    lines = [
+        *(f"#define F_{name} FLOAT_OF({_float(value)})" for name, value in floats.items()),
+        *(f"#define D_{name} DOUBLE_OF({_double(np.float64(value))})" for name, value in doubles.items()),
+        *(f"const uint {n}[{len(c)}] = uint[]({', '.join(_float(v) for v in c)});" for n, c in lists.items()),
+        f"const uvec2 FALL_WORDS[{len(falls)}] = uvec2[]({', '.join(_double(c) for c in falls)});",
+        *(f"#define {name}_STREAM {int(Stream[name])}u" for name in ("LEAK_JITTER", "SHOT", "NOISE")),
+    ]
+    return "\n".join(lines) + "\n"
 
 
 def _float(value: np.float32) -> str:

@@ -21,9 +21,9 @@ import moderngl
 import numpy as np
 
 from blinkgl.card.esim import CardEsim
-from blinkgl.card.kernels import CUT, EVENTS, HEAD_BYTES, UNUSABLE, Kernels, refuse_without_compute
+from blinkgl.card.kernels import CUT, EVENTS, HEAD_BYTES, UNUSABLE, Kernels, Rounding, refuse_without_compute
 from blinkgl.card.late import Slot, maps_persistently
-from blinkgl.card.proof import rounds_like_ieee
+from blinkgl.card.proof import rounding as rounding_of
 from blinkgl.card.room import Room
 from blinkgl.card.stages import Stages, is_long
 from blinkgl.errors import EventDataError
@@ -55,7 +55,7 @@ _UNIFORM_BLOCK = 1
 class Atlas:
     """Up to ``tiles`` sequences of one size.   spread, jitter, refractory : what any of them may ask for of
     ``threshold_sigma``, ``threshold_jitter``, ``refractory_us``; all pay for it.
-    late : read-back waits for nobody; None: where the context is not the processor's.   soft_float : see
+    late : read-back waits for nobody; None: where the context is not the processor's.   rounding : see
     :class:`~blinkgl.card.esim.CardEsim`, which has the memory, too.
     Raises GLError: no compute shaders, not enough memory; EventDataError: more rows than events can name."""
 
@@ -70,7 +70,7 @@ class Atlas:
         jitter: bool = False,
         refractory: bool = False,
         late: bool | None = None,
-        soft_float: bool | None = None,
+        rounding: Rounding | None = None,
     ):
         refuse_without_compute(gl)
         gl.resume()
@@ -96,7 +96,7 @@ class Atlas:
             more=jitter or refractory,
             tiles=tiles,
         )
-        kernels = Kernels(gl, not rounds_like_ieee(gl) if soft_float is None else soft_float)
+        kernels = Kernels(gl, rounding_of(gl) if rounding is None else rounding)
         self._stages = Stages(kernels, self.room, spread=spread, jitter=jitter, refractory=refractory)
         self._block = gl.ctx.buffer(reserve=_TILE.itemsize * tiles)
         self._table = np.zeros(tiles, _TILE)
@@ -341,7 +341,7 @@ class TileEsim(CardEsim):
         if isinstance(frame, moderngl.Texture):
             self._room.copy(frame)
         else:
-            self._room.put("now", self._intensity(frame))
+            self._room.put("now", self._luminance(frame))
         self.interval, self.waits, self._due, self._over = (self.t_ns, t_ns), True, True, False
         self.atlas.ready(self)
         return before

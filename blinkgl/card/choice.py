@@ -14,17 +14,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from blinkgl.card.emulator import CardEmulator
 from blinkgl.card.esim import CardEsim
+from blinkgl.card.v2e import CardV2e
 from blinkgl.errors import EventDataError, GLError
 from blinkgl.events.emulator import Emulator
 from blinkgl.events.esim import Esim
 from blinkgl.events.types import Events
+from blinkgl.events.v2e import V2e
 from blinkgl.gl import create_context
 
 if TYPE_CHECKING:
     from blinkgl.gl import GLContext
 
-CARDS: dict[Any, type[CardEsim]] = {Esim: CardEsim}
+CARDS: dict[Any, type[CardEsim | CardV2e]] = {Esim: CardEsim, V2e: CardV2e}
 """The classes whose kernels there are for the card, by those for the processor."""
 _answers: dict[tuple[str, ...], bool] = {}
 
@@ -57,7 +60,7 @@ def emulator_on(
 
 
 def _asked_for(
-    card: type[CardEsim],
+    card: Any,
     kind: Any,
     height: int,
     width: int,
@@ -65,7 +68,7 @@ def _asked_for(
     seed: int,
     reconstruction: str,
     given: GLContext | None,
-) -> CardEsim:
+) -> CardEmulator:
     if problem := card.unfit(config, reconstruction):
         raise problem
     gl = given or create_context()
@@ -90,7 +93,7 @@ def same_events(gl: GLContext, config: Any = None, kind: Any = Esim) -> bool:
 
     config : whose kernels; None: those of the defaults."""
     card = CARDS[kind]
-    trial = card.trial(config or kind.Config())
+    trial: Any = card.trial(config or kind.Config())
     key = (gl.vendor, gl.renderer, gl.version, trial.model_dump_json())
     if key not in _answers:
         rng = np.random.default_rng(1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import moderngl
 
@@ -26,12 +26,28 @@ EVENTS, CUT, UNUSABLE = 7, 8, 10
 """Words of the head: events, those that were cut, whether the frame has a value that cannot be used."""
 
 
-class Kernels:
-    """Compute programs of one context. soft_float : logarithms in whole numbers, see :mod:`blinkgl.card.proof`."""
+class Rounding(NamedTuple):
+    """What is computed in whole numbers, because a card's own is not that of IEEE 754: sums and products of floats,
+    their quotients and roots, all of doubles. See :mod:`blinkgl.card.proof`."""
 
-    def __init__(self, gl: GLContext, soft_float: bool = False):
+    soft_float: bool = False
+    soft_division: bool = False
+    soft_double: bool = False
+
+    @property
+    def defines(self) -> dict[str, int]:
+        return {name.upper(): 1 for name, soft in self._asdict().items() if soft}
+
+
+IEEE = Rounding()
+
+
+class Kernels:
+    """Compute programs of one context."""
+
+    def __init__(self, gl: GLContext, rounding: Rounding = IEEE):
         self.gl = gl
-        self._soft = {"SOFT_FLOAT": 1} if soft_float else {}
+        self._soft = rounding.defines
         self._uniforms: dict[moderngl.ComputeShader, dict[str, moderngl.Uniform]] = {}
         self._lanes = 64 if gl.is_software else 1024  # of the one group that adds up sums
 

@@ -20,11 +20,12 @@ FAR = 2**30
 """A level that no logarithm reaches: of the pixels that fill up the last block."""
 
 
-class Room:
-    """The buffers of one emulator, or of several whose pixels follow each other.
+class Buffers:
+    """Of a kernel, by name; `listed`, `marks`, `counts`, `places`, `sums` and `packed` are of all kernels, `now` and
+    `before` take turns.
 
-    pixels : of all.   what, size : for messages, and width and height of the picture.   spread, more : see
-    :class:`~blinkgl.card.esim.CardEsim`.   tiles : of a batch, whose cut events are counted behind `counts`.
+    pixels : of all pictures.   sizes : bytes, besides those.   what, size : for messages, and width and height of the
+    picture.   more_counts : behind `counts`.
     words : of 32 pixels, whole blocks.   capacity : events that `packed` holds.
     Raises GLError where the card has no room for them."""
 
@@ -32,31 +33,22 @@ class Room:
         self,
         gl: GLContext,
         pixels: int,
+        sizes: dict[str, int],
         what: str,
         size: tuple[int, int],
-        *,
-        spread: bool,
-        more: bool,
-        tiles: int = 0,
+        more_counts: int = 0,
     ):
-        self._gl, self._pixels, self.tiles = gl, pixels, tiles
-        padded = -(-pixels // BLOCK) * BLOCK
-        self.words, self.capacity = padded // WORD, max(BLOCK, padded // 4)
-        self.cuts_at = padded + PIXELS_PER_GROUP
-        record = 32 if more else 16
+        self._gl, self._pixels = gl, pixels
+        self.padded = -(-pixels // BLOCK) * BLOCK
+        self.words, self.capacity = self.padded // WORD, max(BLOCK, self.padded // 4)
         sizes = {
-            "now": 4 * padded,
-            "before": 4 * padded,
-            "levels": 8 * padded,
             "marks": 4 * self.words,
-            "listed": HEAD_BYTES + 8 * padded,
-            "records": record * padded,
-            "counts": 4 * (self.cuts_at + tiles),
-            "places": 4 * (padded + PIXELS_PER_GROUP),
+            "listed": HEAD_BYTES + 8 * self.padded,
+            "counts": 4 * (self.padded + PIXELS_PER_GROUP + more_counts),
+            "places": 4 * (self.padded + PIXELS_PER_GROUP),
             "sums": 4 * (self.words + PIXELS_PER_GROUP),
             "packed": 8 * self.capacity,
-            **({"thresholds": 8 * padded} if spread else {}),
-            **({"more": 16 * padded} if more else {}),
+            **sizes,
         }
         refuse_too_large(gl, sizes, what, size)
         self._buffers = {name: gl.ctx.buffer(reserve=size) for name, size in sizes.items()}
@@ -65,11 +57,7 @@ class Room:
         except GLError:
             self.release()
             raise
-        self._buffers["levels"].write(np.tile(np.array([FAR, -FAR], np.int32), padded).tobytes())
         self.clear_head()
-        self.clear_cuts()
-        for name in ("now", "before"):
-            self._buffers[name].write(np.ones(padded, np.float32).tobytes())
 
     def __getitem__(self, name: str) -> moderngl.Buffer:
         return self._buffers[name]
@@ -81,15 +69,6 @@ class Room:
 
     def clear_head(self) -> None:
         self._buffers["listed"].write(bytes(HEAD_BYTES))
-
-    def clear_cuts(self) -> None:
-        """No tile has had events cut."""
-        if self.tiles:
-            self._buffers["counts"].write(bytes(4 * self.tiles), 4 * self.cuts_at)
-
-    def cuts(self) -> np.ndarray:
-        """(tiles,) events that each has had cut."""
-        return np.frombuffer(self._buffers["counts"].read(4 * self.tiles, offset=4 * self.cuts_at), np.uint32)
 
     def bytes_per_pixel(self, name: str) -> int:
         """Of a buffer that has a value for every pixel."""
@@ -115,3 +94,47 @@ class Room:
     def release(self) -> None:
         for buffer in self._buffers.values():
             buffer.release()
+
+
+class Room(Buffers):
+    """Those of an ESIM, or of several whose pixels follow each other.
+
+    spread, more : see :class:`~blinkgl.card.esim.CardEsim`.   tiles : of a batch, whose cut events are counted behind
+    `counts`."""
+
+    def __init__(
+        self,
+        gl: GLContext,
+        pixels: int,
+        what: str,
+        size: tuple[int, int],
+        *,
+        spread: bool,
+        more: bool,
+        tiles: int = 0,
+    ):
+        self.tiles = tiles
+        padded = -(-pixels // BLOCK) * BLOCK
+        self.cuts_at = padded + PIXELS_PER_GROUP
+        sizes = {
+            "now": 4 * padded,
+            "before": 4 * padded,
+            "levels": 8 * padded,
+            "records": (32 if more else 16) * padded,
+            **({"thresholds": 8 * padded} if spread else {}),
+            **({"more": 16 * padded} if more else {}),
+        }
+        super().__init__(gl, pixels, sizes, what, size, tiles)
+        self._buffers["levels"].write(np.tile(np.array([FAR, -FAR], np.int32), padded).tobytes())
+        self.clear_cuts()
+        for name in ("now", "before"):
+            self._buffers[name].write(np.ones(padded, np.float32).tobytes())
+
+    def clear_cuts(self) -> None:
+        """No tile has had events cut."""
+        if self.tiles:
+            self._buffers["counts"].write(bytes(4 * self.tiles), 4 * self.cuts_at)
+
+    def cuts(self) -> np.ndarray:
+        """(tiles,) events that each has had cut."""
+        return np.frombuffer(self._buffers["counts"].read(4 * self.tiles, offset=4 * self.cuts_at), np.uint32)

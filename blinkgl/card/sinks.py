@@ -20,9 +20,11 @@ import numpy as np
 from blinkgl.card.kernels import PIXELS_PER_GROUP, Kernels
 from blinkgl.card.memory import refuse_if_out_of_memory, refuse_too_large
 from blinkgl.errors import EventDataError
+from blinkgl.events.emulator import MAX_SIDE
+from blinkgl.events.packing import MAX_CAUSE_ROWS
 
 if TYPE_CHECKING:
-    from blinkgl.card.esim import CardEsim
+    from blinkgl.card.emulator import CardEmulator
 
 ONE = 2**16
 """An event, in a voxel grid."""
@@ -35,7 +37,7 @@ class _Sink:
 
     define: ClassVar[str]
 
-    def __init__(self, card: CardEsim, planes: int):
+    def __init__(self, card: CardEmulator, planes: int):
         self._card, self.shape = card, (planes, card.height, card.width)
         card.gl.resume()
         self._kernels = Kernels(card.gl)
@@ -69,6 +71,7 @@ class _Sink:
             "count": count,
             "width": card.width,
             "pixels": card.height * card.width,
+            "rows": (MAX_CAUSE_ROWS if card.causes else MAX_SIDE) - 1,
             "shift_us": base_us - t0_us,
             "span_us": t1_us - t0_us,
             "bins": self.shape[0],
@@ -96,7 +99,7 @@ class Voxels(_Sink):
 
     define = "VOXELS"
 
-    def __init__(self, card: CardEsim, bins: int = 5):
+    def __init__(self, card: CardEmulator, bins: int = 5):
         if not 1 <= bins <= MAX_BINS:
             raise EventDataError("number of bins out of range", where="bins", value=bins, accepted=f"1 to {MAX_BINS}")
         super().__init__(card, bins)
@@ -111,7 +114,7 @@ class Counts(_Sink):
 
     define = "COUNTS"
 
-    def __init__(self, card: CardEsim):
+    def __init__(self, card: CardEmulator):
         super().__init__(card, 2)
 
     def read(self) -> np.ndarray:
@@ -124,7 +127,7 @@ class Latest(_Sink):
 
     define = "LATEST"
 
-    def __init__(self, card: CardEsim):
+    def __init__(self, card: CardEmulator):
         super().__init__(card, 2)
 
     def read(self) -> np.ndarray:

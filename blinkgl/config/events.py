@@ -34,6 +34,13 @@ _CAUSES = Field(
     description="Mark every event by what caused it (`Events.cause`; `events/cause` in HDF5, `cause` in .npz): "
     "0 signal, 1 leak, 2 shot noise, 3 hot pixel. The events are the same.",
 )
+Device = Literal["auto", "cpu", "gl"]
+_DEVICE: Any = Field(
+    "auto",
+    description="Where events are made: by the processor, or by compute shaders of the OpenGL that draws the "
+    "frames (straight lines between frames alone). The events are the same. `auto`: `gl` where a graphics card "
+    "draws them and can do it, else `cpu`, and so wherever OpenGL is drawn by the processor.",
+)
 _THRESHOLD = dict(ge=0.001, le=10.0)
 
 
@@ -209,12 +216,7 @@ class EsimConfig(_TwoThresholds, EmulatorConfig):
     )
     max_events_per_step: int = _MAX_EVENTS
     causes: bool = _CAUSES
-    device: Literal["auto", "cpu", "gl"] = Field(
-        "auto",
-        description="Where events are made: by the processor, or by compute shaders of the OpenGL that draws the "
-        "frames (straight lines between frames alone). The events are the same. `auto`: `gl` where a graphics card "
-        "draws them and can do it, else `cpu`, and so wherever OpenGL is drawn by the processor.",
-    )
+    device: Device = _DEVICE
 
     @classmethod
     def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:
@@ -335,6 +337,7 @@ class V2eConfig(_TwoThresholds, EmulatorConfig):
     hot_pixel_rate_hz: float = Field(100.0, ge=0, le=1e5, description="Mean rate of a hot pixel, Hz, ON.")
     max_events_per_step: int = _MAX_EVENTS
     causes: bool = _CAUSES
+    device: Device = _DEVICE
 
     @rule("second_cutoff_hz", "cutoff_hz")
     def _a_second_needs_a_first(second_cutoff_hz, cutoff_hz):

@@ -211,10 +211,14 @@ def exp_f64(v: float) -> float:
     return p * _L((_L(n) + _BIAS_64) << _EXP52).view(np.float64)
 
 
+_FALL_MIN_64 = _D(-600.0)
+
+
 @register_jitable
 def fall_f64(x: float) -> float:
-    """e^-x for float64 x >= 0; without the range reduction where x <= 1/2, and without a branch."""
-    v = np.maximum(-x, _EXP_MIN_64)
+    """e^-x for float64 x >= 0; without the range reduction where x <= 1/2, and without a branch. Beyond 600 it stays at
+    e^-600 = 1e-261, so that what is multiplied with it does not become subnormal, which not every card computes."""
+    v = np.maximum(-x, _FALL_MIN_64)
     # The sum's low bits are the exponent: the constant's own leave with the shift.
     t = select(x <= _HALF, _ROUND_64, v * _LOG2E_64 + _ROUND_64)
     n = t - _ROUND_64

@@ -54,6 +54,7 @@ from blinkgl.events.v2e_model import (
     noise_threshold,
     relax,
     relax_gently,
+    settled,
     shot_draw,
     shot_factor,
     shot_tables,
@@ -141,7 +142,7 @@ def _second_block(lag, before, x, keep, ramp, now, lag_now):
     """``x`` through the second low-pass; what it was into ``now``."""
     for i in range(x.size):
         now[i] = x[i]
-        lag_now[i] = lag[i] * keep - (x[i] - before[i]) * ramp
+        lag_now[i] = settled(lag[i] * keep - (x[i] - before[i]) * ramp)
         x[i] = x[i] + lag_now[i]
 
 
@@ -275,7 +276,7 @@ def _emit_block_plain(active, count, first, x_now, constants, p, v, cap, packed,
         pixel = (y << 17) | ((i - row_end + v.width) << 1) | polarity
         emitted, s = 0, 0.0
         while sign * (end - level) >= 0.0:
-            s = min(max((level - before) / rise, s), 1.0)
+            s = min(max(s, (level - before) / rise), 1.0)  # 0 / 0 where it stands on the level: now
             if emitted < cap:
                 packed[out] = (np.int64(np.uint64(start_ns + np.int64(s * dt_ns)) // _U1000) << T_SHIFT) | pixel
                 out += 1
@@ -537,17 +538,9 @@ class V2e(Emulator):
         return Events.empty()
 
     def _advance(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
-        config, dt_ns = self.config, t_ns - self.t_ns
-        if self._shot_unit * float(self._shot_table[:, -1:].sum()) * dt_ns > config.max_events_per_step:
-            raise EventDataError(
-                "more shot noise than max_events_per_step in one interval",
-                where=f"frame {self.frames}",
-                value=f"{dt_ns} ns",
-                accepted="a shorter interval or a lower shot_noise_rate_hz",
-            )
-        if self._noise.size and dt_ns != self._sizes_dt_ns:
-            self._noise_sizes = noise_table(config.shot_noise_rate_hz, dt_ns * 1e-9, noise_threshold(config))
-            self._sizes_dt_ns = dt_ns
+        dt_ns = t_ns - self.t_ns
+        self._refuse_shots(dt_ns)
+        self._make_noise_sizes(dt_ns)
         pixels = Pixels(
             self._intensity,
             self._x,
@@ -568,19 +561,48 @@ class V2e(Emulator):
             self._before_second,
             self._second_lag,
         )
-        base_us, epoch = self.t_ns // 1000, int(self._epoch_ns[0])
+        brightest = float(self._table.max() if frame.dtype == np.uint8 else frame.max() * self._scale)
+        interval = self._interval(t_ns, max(brightest, self._brightest[0]))
+        base_us = interval.base_us
+        source = (NO_FRAME, frame) if frame.dtype == np.uint8 else (frame, NO_CODES)
+        events = self._run(
+            _bands, (*source, self._table, self._x_table, pixels, interval), base_us, t_ns // 1000 - base_us
+        )
+        self._brightest[0] = brightest
+        if t_ns - int(self._epoch_ns[0]) >= self._rebase_ns:
+            self._begin_leaks_anew(t_ns)
+        return events
+
+    def _refuse_shots(self, dt_ns: int) -> None:
+        """Raises EventDataError: more shot noise in an interval than a step may emit."""
+        if self._shot_unit * float(self._shot_table[:, -1:].sum()) * dt_ns > self.config.max_events_per_step:
+            raise EventDataError(
+                "more shot noise than max_events_per_step in one interval",
+                where=f"frame {self.frames}",
+                value=f"{dt_ns} ns",
+                accepted="a shorter interval or a lower shot_noise_rate_hz",
+            )
+
+    def _make_noise_sizes(self, dt_ns: int) -> None:
+        """The table of the photoreceptor's noise for frames so far apart."""
+        if self._noise.size and dt_ns != self._sizes_dt_ns:
+            config = self.config
+            self._noise_sizes = noise_table(config.shot_noise_rate_hz, dt_ns * 1e-9, noise_threshold(config))
+            self._sizes_dt_ns = dt_ns
+
+    def _interval(self, t_ns: int, brightest: float) -> Interval:
+        """From the last frame to that at ``t_ns``.   brightest : DN, of both."""
+        config, (epoch,), (start_ns, dt_ns) = self.config, self._epoch_ns.tolist(), (self.t_ns, t_ns - self.t_ns)
         kappa = 2 * np.pi * config.cutoff_hz * dt_ns * 1e-9 / 275.0
         second_keep, second_ramp = decay(_F(2 * np.pi * config.second_cutoff_hz * dt_ns * 1e-9))
-        brightest = float(self._table.max() if frame.dtype == np.uint8 else frame.max() * self._scale)
-        gentle = kappa * (max(brightest, self._brightest[0]) + 20.0) < 0.499
-        interval = Interval(
-            self.t_ns,
+        return Interval(
+            start_ns,
             dt_ns,
-            base_us,
-            (self.t_ns - epoch) * 1e-9,
+            start_ns // 1000,
+            (start_ns - epoch) * 1e-9,
             (t_ns - epoch) * 1e-9,
             kappa,
-            gentle,
+            kappa * (brightest + 20.0) < 0.499,
             self._scale,
             self.seed,
             self.frames,
@@ -593,14 +615,10 @@ class V2e(Emulator):
             _F(second_keep),
             _F(second_ramp),
         )
-        source = (NO_FRAME, frame) if frame.dtype == np.uint8 else (frame, NO_CODES)
-        events = self._run(
-            _bands, (*source, self._table, self._x_table, pixels, interval), base_us, t_ns // 1000 - base_us
-        )
-        self._brightest[0] = brightest
-        if t_ns - epoch >= self._rebase_ns:
-            gone = self._leak * np.float32((t_ns - epoch) * 1e-9)
-            self._upper -= gone
-            self._lower -= gone
-            self._epoch_ns[0] = t_ns
-        return events
+
+    def _begin_leaks_anew(self, t_ns: int) -> None:
+        """What has leaked until ``t_ns`` goes over into the levels."""
+        gone = self._leak * np.float32((t_ns - int(self._epoch_ns[0])) * 1e-9)
+        self._upper -= gone
+        self._lower -= gone
+        self._epoch_ns[0] = t_ns

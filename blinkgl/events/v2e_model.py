@@ -21,6 +21,9 @@ _F = np.float32
 _ZERO, _ONE, _HALF, _JOINT, _SLOPE = _F(0), _F(1), _F(0.5), _F(20.0), _F(np.log(20.0) / 20.0)
 _SHOT, _U2, _SMALLEST_K = np.uint64(Stream.SHOT), np.uint64(2), _F(1e-6)
 _TABLE_LOW, _TABLE_PER, _TABLE_LAST = _F(TABLE_LOW), _F(1 / TABLE_STEP), _F(TABLE_SIZE - 2)
+DARK, SETTLED = _F(2.0**-60), _F(2.0**-90)
+"""DN below which there is no light, and ln units below which a lag is over: nothing subnormal comes up, which takes a
+processor a hundred times as long and which a card takes for zero."""
 REBASE = 0.02
 """Leak (ln units) after which the leak clock starts anew: small beside a threshold, so that float32 does."""
 
@@ -29,7 +32,14 @@ REBASE = 0.02
 @register_jitable
 def lin_log(intensity: float) -> float:
     """ln(I) above 20 DN, the chord from the origin below (v2e, ``lin_log``); float32."""
-    return select(intensity <= _JOINT, intensity * _SLOPE, log_f32(np.maximum(intensity, _JOINT)))
+    dim = select(intensity < DARK, _ZERO, intensity * _SLOPE)
+    return select(intensity <= _JOINT, dim, log_f32(np.maximum(intensity, _JOINT)))
+
+
+@register_jitable
+def settled(lag: float) -> float:
+    """A lag, 0 where it is over. float32."""
+    return select(np.abs(lag) < SETTLED, _ZERO, lag)
 
 
 _P0, _P1, _P2, _P3, _P4, _P5, _P6 = (_F(c) for c in (1, -1 / 2, 1 / 6, -1 / 24, 1 / 120, -1 / 720, 1 / 5040))
@@ -63,7 +73,7 @@ def relax(lag: float, before: float, now: float, intensity_before: float, intens
     # The low-pass y' = (x - y) / tau with x on a straight line: lag(1) = lag(0) e^-k - (x1 - x0) (1 - e^-k) / k. Its
     # corner frequency is f_c (I + 20) / 275 (v2e, ``low_pass_filter``), at the interval's mean intensity.
     a, g = decay(kappa * (_HALF * (intensity_before + intensity_now) + _JOINT))
-    return lag * a - (now - before) * g
+    return settled(lag * a - (now - before) * g)
 
 
 @register_jitable
@@ -73,7 +83,7 @@ def relax_gently(
     """:func:`relax` where k < 1/2 everywhere: the same bits for half the work."""
     k = kappa * (_HALF * (intensity_before + intensity_now) + _JOINT)
     g = _gentle_growth(k)
-    return lag * (_ONE - k * g) - (now - before) * g
+    return settled(lag * (_ONE - k * g) - (now - before) * g)
 
 
 # --- where the signal meets a level ------------------------------------------------------------------------
@@ -106,8 +116,8 @@ def crossing_fraction(
 
     The inverse cubic Hermite interpolant of z, then Newton's method inside a shrinking bracket; the error is below
     1e-6 of the interval unless the curve is flat there."""
-    if k < 0:
-        return min(max((target - c) / rise, start), 1.0)
+    if k < 0:  # ``start`` of a signal that stands on the level, 0 / 0
+        return min(max(start, (target - c) / rise), 1.0)
     sign = 1.0 if polarity else -1.0  # an OFF crossing is an ON crossing of -z
     low, high = start, 1.0
     e_low = 1.0 if start == 0.0 else fall_f64(k * start)
@@ -341,4 +351,6 @@ def draw_leaks(height: int, width: int, config: V2eConfig, on: np.ndarray, seed:
     if config.hot_pixel_fraction:
         u, v = uniform2(seed, pixels, np.uint64(Stream.HOT), np.uint64(0))
         rate = np.where(u < config.hot_pixel_fraction, -log_f64(v) * config.hot_pixel_rate_hz, rate)
-    return (rate * on).astype(np.float32)
+    leak = (rate * on).astype(np.float32)
+    leak[leak < 1e-20] = 0.0  # an event in 10^11 years, and none that a product makes subnormal
+    return leak

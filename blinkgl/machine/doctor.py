@@ -143,13 +143,15 @@ def _opengl(backend: str, device: int) -> Iterator[Check]:
 def _make_events(gl) -> str:
     """A short clip's events by the card and by the processor."""
     from blinkgl.card.choice import same_events
-    from blinkgl.card.proof import rounds_like_ieee
+    from blinkgl.card.proof import rounding
+    from blinkgl.events import Esim, V2e
 
-    if not same_events(gl):
+    if not all(same_events(gl, kind=kind) for kind in (Esim, V2e)):
         raise RuntimeError("other events than the processor's; events.device: auto stays on the processor")
-    how = "in hardware" if rounds_like_ieee(gl) else "in whole numbers: the card rounds otherwise"
+    soft = [name.split("_")[1] + "s" for name, wanted in rounding(gl)._asdict().items() if wanted]
+    how = f"{' and '.join(soft)} in whole numbers: the card rounds otherwise" if soft else "arithmetic in hardware"
     limit = gl.ctx.info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"] / 2**20
-    return f"ESIM's events bit for bit, logarithms {how}; buffers up to {limit:.0f} MiB"
+    return f"ESIM's and V2E's events bit for bit, {how}; buffers up to {limit:.0f} MiB"
 
 
 _TRIANGLE = """#version 430 core

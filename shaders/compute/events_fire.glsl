@@ -102,12 +102,13 @@ bool awake(uvec2 after_ns, inout uvec2 last_ns)
 // The next thresholds, drawn once per level and numbered by the levels passed.
 ivec2 next_steps(uint pixel, uint passed, ivec2 own)
 {
-    uvec4 normal = normal2(seed, pixel, JITTER_STREAM, passed);
-    ivec2 off = ivec2(
-        floor_of(add_double(mul_double(jitter, normal.xy), HALF)),
-        floor_of(add_double(mul_double(jitter, normal.zw), HALF))
+    DOUBLE on, off, spread = DOUBLE_OF(jitter);
+    normal2(seed, pixel, JITTER_STREAM, passed, on, off);
+    ivec2 drawn = ivec2(
+        floor_of(WORDS_OF(add_double(mul_double(spread, on), HALF_DOUBLE))),
+        floor_of(WORDS_OF(add_double(mul_double(spread, off), HALF_DOUBLE)))
     );
-    return max(floors, own + off);
+    return max(floors, own + drawn);
 }
 #endif
 

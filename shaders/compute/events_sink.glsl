@@ -11,6 +11,7 @@ layout(std430, binding = 1) restrict buffer Sink { int sink[]; };
 uniform uint count;
 uniform uint width;
 uniform uint pixels;
+uniform uint rows; // bits of y, without those of the cause
 uniform int shift_us; // from the window's start to the interval's
 uniform uint span_us; // of the window
 uniform uint bins;
@@ -22,7 +23,7 @@ void main()
         return;
     }
     uvec2 event = packed_events[k];
-    uint x = (event.x >> 1) & 0xFFFFu, y = ((event.x >> 17) | (event.y << 15)) & 0xFFFFu, pixel = y * width + x;
+    uint x = (event.x >> 1) & 0xFFFFu, y = ((event.x >> 17) | (event.y << 15)) & rows, pixel = y * width + x;
     bool on = (event.x & 1u) == 1u;
     int t = int(event.y >> 1) + shift_us;
     if (t < 0 || uint(t) >= span_us) { // half open, as all windows

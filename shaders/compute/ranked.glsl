@@ -118,22 +118,6 @@ uniform uint offset;
 uniform uint joint;
 uniform uint low_slope; // below the joint; 0: the same curve
 
-// a / b of normal numbers > 0, to nearest even.
-uint quotient(uint a, uint b)
-{
-    uint m = (a & 0x7FFFFFu) | 0x800000u, n = (b & 0x7FFFFFu) | 0x800000u, rest;
-    int exponent = int(a >> 23) - int(b >> 23) + 127;
-    if (m < n) {
-        m <<= 1;
-        exponent -= 1;
-    }
-    uint mantissa = divide64(left64(uvec2(m, 0u), 30u), n, rest); // 31 bits, the first one set
-    if (exponent < 1) {
-        return 0u;
-    }
-    return exponent > 254 ? INFINITE : round_float(0u, exponent, mantissa | uint(rest != 0u));
-}
-
 uint key_of(vec2 value)
 {
     uint light = floatBitsToUint(value.x), rate = floatBitsToUint(value.y) & 0x7FFFFFFFu;
@@ -146,7 +130,7 @@ uint key_of(vec2 value)
     }
     uint sum = above ? light : joint;
     sum = sum >= INFINITE ? INFINITE : add_float(max(sum, offset), min(sum, offset));
-    uint slope = sum >= INFINITE ? 0u : (sum >> 23) == 0u ? INFINITE : quotient(gain, sum);
+    uint slope = sum >= INFINITE ? 0u : (sum >> 23) == 0u ? INFINITE : div_float(gain, sum);
     return product(rate, slope);
 }
 #endif

@@ -1,6 +1,6 @@
 // IEEE 754 double precision in whole numbers, to nearest even: OpenGL has doubles, but neither their division nor their
 // square root is promised to the last bit, and many cards have few units for them. A double is its bits, uvec2(low, high).
-// No infinities and no subnormal numbers but zero: ours do not become so large or so small.
+// No infinities: ours do not become so large. What a product has below 2^-1022 is zero.
 #include "words64.glsl"
 
 const uvec2 ZERO = uvec2(0u), ONE = uvec2(0u, 0x3FF00000u), HALF = uvec2(0u, 0x3FE00000u);
@@ -51,7 +51,7 @@ uvec2 mul_double(uvec2 a, uvec2 b)
         exponent += 1;
     }
     high.x |= uint(rest != 0u);
-    bool zero = exponent_of(a) == 0 || exponent_of(b) == 0;
+    bool zero = exponent_of(a) == 0 || exponent_of(b) == 0 || exponent < 1;
     return zero ? uvec2(0u, sign) : round_double(sign, exponent, high);
 }
 
@@ -126,20 +126,37 @@ uvec2 sqrt_double(uvec2 a)
     return round_double(0u, (exponent >> 1) + 1023, root);
 }
 
-uvec2 double_of(uvec2 whole) // unsigned, below 2^53
+uvec2 double_of(uvec2 whole) // unsigned, below 2^63
 {
     if (whole == ZERO) {
         return ZERO;
     }
     int top = msb64(whole);
-    uvec2 mantissa = left64(whole, uint(52 - top));
-    return uvec2(mantissa.x, (mantissa.y & 0xFFFFFu) | (uint(top + 1023) << 20));
+    return round_double(0u, top + 1023, left64(whole, uint(62 - top)));
 }
 
 uvec2 double_of(int whole)
 {
     uvec2 size = double_of(uvec2(uint(abs(whole)), 0u));
     return whole < 0 ? negative(size) : size;
+}
+
+// Rounded towards zero, of a number >= 0 and below 2^63.
+uvec2 whole_of(uvec2 a)
+{
+    int shift = exponent_of(a) - 1075;
+    uvec2 mantissa = mantissa_of(a);
+    return shift < -52 ? ZERO : shift < 0 ? right64(mantissa, uint(-shift)) : left64(mantissa, uint(shift));
+}
+
+bool less_double(uvec2 a, uvec2 b)
+{
+    uvec2 size_a = uvec2(a.x, a.y & 0x7FFFFFFFu), size_b = uvec2(b.x, b.y & 0x7FFFFFFFu);
+    bool below_a = a.y >> 31 == 1u, below_b = b.y >> 31 == 1u;
+    if (below_a != below_b) {
+        return below_a && (size_a != ZERO || size_b != ZERO);
+    }
+    return below_a ? !at_least64(size_b, size_a) : !at_least64(size_a, size_b);
 }
 
 int floor_of(uvec2 a) // of a number within +-2^31

@@ -1,5 +1,6 @@
 // IEEE 754 single precision in whole numbers, to nearest even, for cards whose own rounding is not that. A float is its
-// bits, a uint. Neither subnormal numbers nor infinities: ours do not become so large or so small.
+// bits, a uint. No infinities: ours do not become so large. What is smaller than 2^-126 is zero.
+#include "words64.glsl"
 
 // sign | 1.mantissa 2^(exponent - 127) of a mantissa of 31 bits (the first one set), seven of which are rounded away.
 uint round_float(uint sign, int exponent, uint mantissa)
@@ -20,7 +21,7 @@ uint mul_float(uint a, uint b)
         high >>= 1;
         exponent += 1;
     }
-    bool zero = ((a >> 23) & 0xFFu) == 0u || ((b >> 23) & 0xFFu) == 0u;
+    bool zero = ((a >> 23) & 0xFFu) == 0u || ((b >> 23) & 0xFFu) == 0u || exponent < 1;
     return zero ? sign : round_float(sign, exponent, high | uint(low != 0u));
 }
 
@@ -45,7 +46,40 @@ uint add_float(uint a, uint b)
     }
     int shift = 30 - findMSB(sum);
     sum = shift < 0 ? (sum >> 1) | (sum & 1u) : sum << uint(shift);
-    return round_float(a & 0x80000000u, exponent - shift, sum);
+    return exponent - shift < 1 ? 0u : round_float(a & 0x80000000u, exponent - shift, sum);
+}
+
+// a / b, b not zero; an infinity where the quotient is too large.
+uint div_float(uint a, uint b)
+{
+    uint sign = (a ^ b) & 0x80000000u, m = (a & 0x7FFFFFu) | 0x800000u, n = (b & 0x7FFFFFu) | 0x800000u, rest;
+    int exponent = int((a >> 23) & 0xFFu) - int((b >> 23) & 0xFFu) + 127;
+    if (m < n) {
+        m <<= 1;
+        exponent -= 1;
+    }
+    uint mantissa = divide64(left64(uvec2(m, 0u), 30u), n, rest); // 31 bits, the first one set
+    if (((a >> 23) & 0xFFu) == 0u || exponent < 1) {
+        return sign;
+    }
+    return exponent > 254 ? sign | 0x7F800000u : round_float(sign, exponent, mantissa | uint(rest != 0u));
+}
+
+// Of a number >= 0, digit by digit.
+uint sqrt_float(uint a)
+{
+    int exponent = int(a >> 23) - 127;
+    uvec2 digits = left64(uvec2((a & 0x7FFFFFu) | 0x800000u, 0u), (exponent & 1) == 0 ? 39u : 40u);
+    uint root = 0u, rest = 0u;
+    for (int k = 0; k < 26; ++k) {
+        rest = (rest << 2) | (digits.y >> 30);
+        digits = left64(digits, 2u);
+        uint trial = (root << 2) | 1u;
+        bool fits = rest >= trial;
+        rest = fits ? rest - trial : rest;
+        root = (root << 1) | uint(fits);
+    }
+    return (a >> 23) == 0u ? 0u : round_float(0u, (exponent >> 1) + 127, (root << 5) | uint(rest != 0u));
 }
 
 // Rounded towards zero, of a number below 2^24.

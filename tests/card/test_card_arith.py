@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blinkgl.card.kernels import Kernels
-from blinkgl.card.proof import card_logs, questions, rounds_like_ieee
+from blinkgl.card.kernels import Kernels, Rounding
+from blinkgl.card.proof import card_logs, card_operations, pairs, processor_operations, questions, rounding
 from blinkgl.events.arith import log_q25
 from blinkgl.events.philox import Stream, normal2
 
@@ -19,12 +19,12 @@ void main() {
 """
 
 
-def computed(gl, folder, include: str, body: str, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def computed(gl, folder, include: str, body: str, a: np.ndarray, b: np.ndarray, **soft: bool) -> np.ndarray:
     """(N,) uint64 of (N,) 64-bit numbers, N a multiple of 64, by a program of one line."""
     file = folder / "one.glsl"
     file.write_text(f'#include "{include}"\n{HEAD}    result[i] = {body};\n}}\n')
     buffers = [gl.ctx.buffer(np.ascontiguousarray(x).tobytes()) for x in (a, b)] + [gl.ctx.buffer(reserve=a.nbytes)]
-    Kernels(gl).run(str(file), {}, dict(enumerate(buffers)), {}, items=a.size)
+    Kernels(gl, Rounding(**soft)).run(str(file), {}, dict(enumerate(buffers)), {}, items=a.size)
     out = np.frombuffer(buffers[2].read(), np.uint64)
     for buffer in buffers:
         buffer.release()
@@ -48,10 +48,36 @@ def test_logarithms_are_those_of_the_processor(gl, eps, soft_float):
 def test_a_driver_that_rounds_otherwise_is_found_out(gl, monkeypatch):
     from blinkgl.card import proof
 
-    assert rounds_like_ieee(gl)
+    right = rounding(gl)
+    assert right == Rounding()  # llvmpipe's is the processor's own
+    wrong_in_one = lambda array, k: np.where(np.arange(len(array)) == 77, np.nextafter(array[:, k], 9e9), array[:, k])
+
+    def asked(kind: type, k: int):
+        def operations(gl, a, b):
+            taken = card_operations(gl, a, b).copy()
+            taken[:, k] = wrong_in_one(taken, k) if a.dtype == kind else taken[:, k]
+            return taken
+
+        monkeypatch.setattr(proof, "_answers", {})
+        monkeypatch.setattr(proof, "card_operations", operations)
+        return rounding(gl)
+
+    assert asked(np.float32, 0) == asked(np.float32, 1) == Rounding(soft_float=True)
+    assert asked(np.float32, 2) == asked(np.float32, 3) == Rounding(soft_division=True)
+    assert asked(np.float64, 1) == asked(np.float64, 2) == Rounding(soft_double=True)
     monkeypatch.setattr(proof, "_answers", {})
+    monkeypatch.setattr(proof, "card_operations", card_operations)
     monkeypatch.setattr(proof, "card_logs", lambda gl, v, eps: log_q25(v) + (v == v[77]))  # one of 65,536, by one
-    assert not rounds_like_ieee(gl)
+    assert rounding(gl) == Rounding(soft_float=True)
+
+
+@pytest.mark.parametrize("soft", [False, True])
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_operations_are_those_of_the_processor(gl, kind, soft):
+    a, b = pairs(kind)
+    taken = card_operations(gl, a, b, Rounding(soft, soft, soft))
+    for k, wanted in enumerate(processor_operations(a, b)):
+        np.testing.assert_array_equal(taken[:, k], wanted)
 
 
 def doubles(seed: int, positive: bool = False) -> np.ndarray:
@@ -91,10 +117,12 @@ def test_draws_are_those_of_the_processor(gl, tmp_path):
     seed, pixel, index = (rng.integers(0, 2**k, 1024, dtype=np.uint64) for k in (64, 31, 31))
     a, b = normal2(seed, pixel, np.uint64(Stream.JITTER), index)
     counter = pixel | (index << np.uint64(32))
-    for part, wanted in (("xy", a), ("zw", b)):
-        body = f"normal2(a[i], b[i].x, JITTER_STREAM, b[i].y).{part}"
-        got = computed(gl, tmp_path, "normal.glsl", body, seed, counter).view(np.float64)
-        np.testing.assert_array_equal(got, wanted)
+    for soft in (False, True):
+        for name, wanted in (("on", a), ("off", b)):
+            body = "uvec2(0u); DOUBLE on, off; normal2(a[i], b[i].x, JITTER_STREAM, b[i].y, on, off); "
+            body += f"result[i] = WORDS_OF({name})"
+            got = computed(gl, tmp_path, "normal.glsl", body, seed, counter, soft_double=soft).view(np.float64)
+            np.testing.assert_array_equal(got, wanted)
 
 
 def test_division_of_64_bits(gl, tmp_path):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from blinkgl.card import CardEsim
+from blinkgl.card.kernels import Rounding
 from blinkgl.card.room import Room
 from blinkgl.config.events import EsimConfig
 from blinkgl.errors import EventDataError, GLError
@@ -65,7 +66,7 @@ def test_intervals_of_any_length(gl, variant):
 def test_codes_and_causes(gl, soft_float):
     clip, times = random_clip(2, frames=6, dtype=np.uint8)
     config, table = EsimConfig(causes=True), (np.arange(256) / 255.0) ** 2.2
-    fast, card = Esim(37, 45, config, 4), CardEsim(37, 45, config, 4, gl=gl, soft_float=soft_float)
+    fast, card = Esim(37, 45, config, 4), CardEsim(37, 45, config, 4, gl=gl, rounding=Rounding(soft_float))
     for emulator in (fast, card):
         emulator.set_decode(table)
     events = run(card, clip, times)

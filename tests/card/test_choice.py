@@ -9,7 +9,7 @@ import yaml
 
 import blinkgl
 from blinkgl.card import CardEsim, choice
-from blinkgl.config.events import EsimConfig, V2eConfig
+from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.config.sequence import load_run
 from blinkgl.errors import BlinkGLError, ConfigError, EventDataError, GLError
 from blinkgl.events import Esim, make_emulator
@@ -45,7 +45,10 @@ def test_auto_takes_a_graphics_card_that_can_do_it(gl, monkeypatch):
     assert made(card, "pchip") is Esim
     assert made(card, threshold_jitter=4.0) is Esim
     assert made(gl, device="gl") is CardEsim
-    assert make_emulator(V2eConfig(), 16, 24, 1, "linear", card).device == "cpu"
+    assert make_emulator(VoltmeterConfig(), 16, 24, 1, "linear", card).device == "cpu"
+    v2e = make_emulator(V2eConfig(), 16, 24, 1, "linear", card)
+    assert v2e.device == "gl"
+    v2e.release()
     monkeypatch.setattr(choice, "_answers", {})
     monkeypatch.setattr(choice, "_equal", lambda a, b: False)
     assert made(card) is Esim, "its events of the trial are others"
@@ -151,7 +154,7 @@ def test_what_the_card_does_not_do_names_the_key(gl, tmp_path):
             tmp_path, events={"device": "gl"}, timeline={"kind": "uniform", "fps": 200, "reconstruction": "pchip"}
         )
     with pytest.raises(ConfigError, match=r"events\.device"):
-        config_of(tmp_path, events={"emulator": "v2e", "device": "gl"})
+        config_of(tmp_path, events={"emulator": "voltmeter", "device": "gl"})
     with pytest.raises(EventDataError, match=r"^events\.threshold_jitter: "):
         made(gl, device="gl", threshold_jitter=4.0)
     with pytest.raises(BlinkGLError, match=r"device.*'auto', 'cpu' or 'gl'"):

@@ -133,7 +133,7 @@ def test_a_card_that_does_not_answer(gl, monkeypatch):
 
 
 def test_an_old_driver_reads_back_at_once(gl, monkeypatch):
-    monkeypatch.setattr("blinkgl.card.esim.maps_persistently", lambda gl: False)
+    monkeypatch.setattr("blinkgl.card.emulator.maps_persistently", lambda gl: False)
     clip, times = random_clip(3, frames=3)
     card = CardEsim(37, 45, gl=gl, late=True)
     assert not card.lags

@@ -345,3 +345,17 @@ def test_presets_give_way_to_explicit_keys():
     assert V2eConfig(preset="noisy").shot_noise_rate_hz == 5.0
     assert V2eConfig(preset="noisy", shot_noise_rate_hz=1.0).shot_noise_rate_hz == 1.0
     assert V2eConfig(preset="clean").cutoff_hz == 0.0 and V2eConfig().cutoff_hz == 300.0
+
+
+@pytest.mark.parametrize("reference", [False, True])
+def test_a_still_pixel_on_its_level_fires_at_once(reference):
+    """A level is stored in single precision: where rounding puts it on the signal, the way to it is 0 / 0."""
+    config = V2eConfig(preset="clean", threshold_sigma=0.0)
+    emulator = (ReferenceV2e if reference else V2e)(32, 64, config, 1)
+    emulator.step(np.full((32, 64), 0.5, np.float32), 0)
+    bits = np.float32(0.5 * np.exp(0.4)).view(np.int32) + np.arange(-1024, 1024, dtype=np.int32)
+    frame = bits.view(np.float32).reshape(32, 64)  # about the second level
+    emulator.step(frame, 10**6)
+    with np.errstate(invalid="ignore"):
+        events = emulator.step(frame, 2 * 10**6)
+    assert 1 < len(events) < 50 and (events.t == 1000).all() and (events.p == 1).all()

@@ -288,6 +288,7 @@ def test_nothing_else_asks_which_kind_an_emulator_is():
     assert set(found) == {
         "config/events.py",
         "card/esim.py",
+        "card/v2e.py",
         *(f"events/{name}.py" for name in ("esim", "v2e", "v2e_model", "voltmeter", "reference")),
     }
 

@@ -13,6 +13,7 @@ from blinkgl.front.runs import load
 from blinkgl.online.cuts import CUTS
 from blinkgl.online.job import StreamJob, stream_seed
 from blinkgl.online.samples import StreamSample, WindowSample
+from blinkgl.online.share import Share, share_of_process
 from blinkgl.online.stream import SampleStream, StreamStats
 
 if TYPE_CHECKING:
@@ -42,6 +43,8 @@ class OnlineSequences:
     workers : rendering processes, each with an OpenGL context and one thread; 0: this process, when asked.
     seed : of everything.   rank, world : this process and the number of them in a distributed training: each renders
         every ``world``-th block of one stream. Together they have each sample once, the same ones whatever ``world``.
+        Default: what `torchrun` (``RANK``, ``WORLD_SIZE``) or Ray Train say of this process; then its workers render on
+        one of several graphics cards, that of its ``LOCAL_RANK``. ``world=1``: the whole stream in every process.
     first : the sample to go on with; samples before it are not rendered, but for those mixed with it.
 
     Sample n is a function of (recipe, seed, rank, world, n): not of workers, of who takes it, or of what came before.
@@ -68,14 +71,15 @@ class OnlineSequences:
         split: str = "train",
         workers: int = 1,
         seed: int = 0,
-        rank: int = 0,
-        world: int = 1,
+        rank: int | None = None,
+        world: int | None = None,
         first: int = 0,
     ):
         template = source if isinstance(source, RunTemplate) else load(source)
         seed = check.seed(seed)
-        world = check.whole(world, "world", 1, 1_000_000)
-        rank = check.whole(rank, "rank", 0, world - 1)
+        share = share_of_process() if rank is None and world is None else Share(rank or 0, world or 1)
+        world = check.whole(share.world, "world", 1, 1_000_000)
+        rank = check.whole(share.rank, "rank", 0, world - 1)
         if kind not in CUTS:
             raise ConfigError("unknown kind", where="kind", value=kind, accepted=", ".join(CUTS))
         if split not in ("train", "test"):
@@ -98,7 +102,8 @@ class OnlineSequences:
         )
         self.first = check.whole(first, "first", 0, 2**62)
         template = RunTemplate({**template.tree, "seed": stream_seed(template.seed, seed)}, template.base)
-        self.stream = SampleStream.of(template, job, workers=check.whole(workers, "workers", 0, 1024), first=self.first)
+        workers = check.whole(workers, "workers", 0, 1024)
+        self.stream = SampleStream.of(template, job, workers=workers, first=self.first, card=share.local)
 
     @property
     def stats(self) -> StreamStats:

@@ -28,7 +28,7 @@ import numpy as np
 
 from blinkgl.config.reader import to_yaml
 from blinkgl.config.sequence import RunTemplate
-from blinkgl.dataset.executor import Executor, Inline, Local
+from blinkgl.dataset.executor import Executor, Inline, Local, several_cards
 from blinkgl.dataset.work import Message
 from blinkgl.errors import BlinkGLError, ConfigError, EventDataError
 from blinkgl.online.cuts import Sample
@@ -70,12 +70,13 @@ class SampleStream:
 
     workers : rendering processes; 0 renders in this process, when a sample is asked for. (A copy in a loader process
     takes what the owner's workers make.)   first : sample that is taken first, when a run is resumed.
-    ahead : blocks that are rendered before they are asked for.   block : samples that are mixed with each other.
+    ahead : blocks that are rendered before they are asked for.   card : of several graphics cards the one that all
+    workers render on, counted round; None: each on another.   block : samples that are mixed with each other.
     stats : :class:`StreamStats`.   spool : folder where samples lie for a moment.
     Raises BlinkGLError: a recipe that cannot be rendered here. :meth:`take` raises ConfigError: one that gives no
     samples; EventDataError: a sample that was taken, and after :meth:`close`."""
 
-    def __init__(self, job: StreamJob, workers: int = 1, first: int = 0, ahead: int = 1):
+    def __init__(self, job: StreamJob, workers: int = 1, first: int = 0, ahead: int = 1, card: int | None = None):
         plan = job.plan()
         self.has_backward = all("backward" in flow_labels(group) for group in plan.used)
         self.block = MIX * job.samples
@@ -90,7 +91,9 @@ class SampleStream:
         try:
             for n in range(first // self.block * self.block, first):
                 self._mark(*self._place(n))
-            self._executor = Inline() if workers == 0 else Local(workers, cores=workers)
+            cards = several_cards(self.job) if workers and card is not None else None
+            one = [cards[card % len(cards)]] if cards and card is not None else None
+            self._executor = Inline() if workers == 0 else Local(workers, one, cores=workers)
             self._executor.open(self.job)
         except BaseException:
             self.close()

@@ -1,10 +1,14 @@
 """OnlineSequences: the same samples whoever renders and whoever takes them; two kinds; batches for torch."""
 
+import ast
 import itertools
 import os
 import signal
+import subprocess
+import sys
 from itertools import islice, pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +16,10 @@ import yaml
 from tiny_recipe import TINY
 
 from blinkgl import AssetError, ConfigError, EventDataError, GLError, OnlineSequences, StreamSample, WindowSample, load
+from blinkgl.dataset.executor import Inline
+from blinkgl.online import stream
 from blinkgl.online.job import MIX
+from blinkgl.online.share import Share, share_of_process
 
 RECIPE = {**TINY, "output": {"sequences": 3}}
 
@@ -86,6 +93,77 @@ def test_ranks_deal_one_stream_out_between_them(recipe):
     assert taken(0, rank=0, world=2) == (whole[0], 2), "and no slot of the other's is rendered"
     assert taken(0, rank=1, world=2)[0] == taken(0, rank=1, world=3)[0] == whole[1]
     assert taken(MIX, rank=0, world=2)[0] == whole[2], "resumed"
+
+
+_RANK = """import sys
+import torch.distributed as dist
+from blinkgl import OnlineSequences
+from itertools import islice
+dist.init_process_group("gloo")  # that these are processes of one training
+with OnlineSequences(sys.argv[1], workers=0, per_sequence=1) as sequences:
+    names = [sample.name for sample in islice(sequences, 3)]
+everybodys = [None] * dist.get_world_size()
+dist.all_gather_object(everybodys, names)
+if dist.get_rank() == 0:
+    print("NAMES", everybodys)
+dist.destroy_process_group()
+"""
+
+
+@pytest.mark.slow
+def test_torchrun_needs_no_more_than_its_own_variables(recipe, tmp_path):
+    """Two real processes, told nothing: theirs are disjoint, and together the blocks of one stream."""
+    pytest.importorskip("torch.distributed.run")
+    (tmp_path / "rank.py").write_text(_RANK)
+    command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node=2", "--rdzv-backend=c10d"]
+    command += ["--rdzv-endpoint=127.0.0.1:0", str(tmp_path / "rank.py"), str(recipe)]
+    environment = {**os.environ, "GLOO_SOCKET_IFNAME": "lo", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    (line,) = (line for line in done.stdout.splitlines() if line.startswith("NAMES"))
+    first, second = ast.literal_eval(line.removeprefix("NAMES "))
+    assert len(set(first) | set(second)) == 6
+    for rank, names in enumerate((first, second)):
+        with OnlineSequences(recipe, workers=0, per_sequence=1, rank=0, world=1, first=rank * MIX) as whole:
+            assert [sample.name for sample in islice(whole, 3)] == names
+
+
+def test_what_others_say_of_a_process(recipe, monkeypatch):
+    assert share_of_process({}) == Share(0, 1, None)
+    assert share_of_process({"RANK": "3", "WORLD_SIZE": "8", "LOCAL_RANK": "1"}) == Share(3, 8, 1)
+    assert share_of_process({"WORLD_SIZE": "8"}) == Share()
+    for wrong, said in (({"RANK": "one"}, r"^RANK: not a number .*'one'"), ({"RANK": "8"}, r"^RANK: .*0 to 7")):
+        with pytest.raises(ConfigError, match=said):
+            share_of_process({"WORLD_SIZE": "8", **wrong})
+    for name, value in (("RANK", "1"), ("WORLD_SIZE", "2"), ("LOCAL_RANK", "1")):
+        monkeypatch.setenv(name, value)
+    with OnlineSequences(recipe, workers=0) as told, OnlineSequences(recipe, workers=0, world=1) as whole:
+        assert (told.stream.job.rank, told.stream.job.world) == (1, 2)
+        assert (whole.stream.job.rank, whole.stream.job.world) == (0, 1)
+
+    # As Ray Train has it (2.x): numbers in a worker; outside of one, None or an error, by version. It is not imported.
+    def context(*numbers):
+        ranks = dict(zip(("get_world_rank", "get_world_size", "get_local_rank"), numbers, strict=True))
+        return SimpleNamespace(**{name: (lambda value=value: value) for name, value in ranks.items()})
+
+    train = SimpleNamespace(get_context=lambda: context(5, 6, 2))
+    monkeypatch.setitem(sys.modules, "ray.train", train)
+    assert share_of_process() == Share(5, 6, 2)
+    train.get_context = lambda: context(None, None, None)
+    assert share_of_process() == Share(1, 2, 1)
+    train.get_context = lambda: (_ for _ in ()).throw(RuntimeError("not a worker"))
+    assert share_of_process() == Share(1, 2, 1)
+
+
+def test_workers_render_on_the_card_of_the_local_rank(recipe, monkeypatch):
+    made = []
+    monkeypatch.setattr(stream, "several_cards", lambda job: [3, 4, 7])
+    monkeypatch.setattr(stream, "Local", lambda workers, devices, cores: made.append(devices) or Inline())
+    for name, value in (("RANK", "9"), ("WORLD_SIZE", "16"), ("LOCAL_RANK", "4")):
+        monkeypatch.setenv(name, value)
+    for how in ({}, {"rank": 0, "world": 2}):
+        OnlineSequences(recipe, workers=1, **how).close()
+    assert made == [[4], None], "chosen by hand, each worker has another"
 
 
 def voxels(samples: list[WindowSample]):

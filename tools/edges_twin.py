@@ -21,10 +21,7 @@ _AROUND = [(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
 
 def read_both(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     """(H, W) float32 each: the picture and the depth buffer (near / Z) of a pass that keeps it as a texture."""
-    target = frame.target
-    depths = np.frombuffer(target.fbo.read(components=1, attachment=-1, dtype="f4"), np.float32)
-    # Afterwards: reading depth leaves the framebuffer with no colour to read, for whoever copies it.
-    return frame.read(), depths.reshape(target.height, target.width)
+    return frame.read(), frame.target.read_depth()
 
 
 def filtered(

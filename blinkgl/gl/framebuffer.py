@@ -24,6 +24,7 @@ _DEPTH_COMPONENT, _DEPTH_COMPONENT32F, _FLOAT = 0x1902, 0x8CAC, 0x1406
 _TEXTURES = {"texture": _DEPTH_COMPONENT32F, "texture of 16 bits": 0x81A5}  # GL_DEPTH_COMPONENT16
 _COLOR, _DEPTH = 0x1800, 0x1801
 _READ_FRAMEBUFFER, _DRAW_FRAMEBUFFER, _COLOR_BIT, _NEAREST = 0x8CA8, 0x8CA9, 0x4000, 0x2600
+_COLOR_ATTACHMENT0 = 0x8CE0
 
 
 class PixelFormat(NamedTuple):
@@ -107,6 +108,7 @@ class Target:
         self.fbo = gl.ctx.framebuffer(list(self.colour), self.depth)
         self._bind = gl.function("glBindFramebuffer", None, ctypes.c_uint, ctypes.c_uint)
         self._blit = gl.function("glBlitFramebuffer", None, *[ctypes.c_int] * 8, ctypes.c_uint, ctypes.c_uint)
+        self._read_buffer = gl.function("glReadBuffer", None, ctypes.c_uint)
         self._clear_float = gl.function("glClearBufferfv", None, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
         self._clear_uint = gl.function("glClearBufferuiv", None, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
         self._clear_int = gl.function("glClearBufferiv", None, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
@@ -184,6 +186,7 @@ class Target:
         """Writes the mean of each pixel's samples into ``other``, a target of the same size and formats that is not
         multi-sampled. The first attachment only; honours the scissor."""
         self._bind(_READ_FRAMEBUFFER, self.fbo.glo)
+        self._read_buffer(_COLOR_ATTACHMENT0)  # which reading anything else, the depth say, has changed
         self._bind(_DRAW_FRAMEBUFFER, other.fbo.glo)
         edges = (0, 0, self.width, self.height)
         self._blit(*edges, *edges, _COLOR_BIT, _NEAREST)

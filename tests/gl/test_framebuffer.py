@@ -153,6 +153,17 @@ def test_depth_texture_can_be_sampled(gl):
     program.release()
 
 
+def test_what_was_read_before_does_not_change_what_is_copied(gl):
+    """The first attachment, whatever of the target was read last: its depth, or another attachment."""
+    one, other = gl.framebuffer(4, 3, ("R32F", "R32F")), gl.framebuffer(4, 3, ("R32F",), depth=False)
+    one.clear((0.25,), (0.75,))
+    for read in (one.read_depth, lambda: one.read(1)):
+        other.clear((0.0,))
+        read()
+        one.resolve_into(other)
+        assert (other.read() == 0.25).all()
+
+
 def test_releasing_the_bound_target_leaves_a_usable_context(gl):
     for _ in range(3):
         target = gl.framebuffer(4, 4, ("R8",))

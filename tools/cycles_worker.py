@@ -54,6 +54,8 @@ def main(folder: Path) -> int:
         for lamp, poses in zip(lamps, arrays["lamp_poses"]):
             place(lamp, poses[k])
         place(camera, arrays["camera_poses"][k])
+        if "exposed" in arrays:
+            expose(scene, [*bodies, camera], arrays["exposed"][:, k])
         scene.render.filepath = str(exr)
         started, cpu = time.perf_counter(), time.process_time()
         bpy.ops.render.render(write_still=True)
@@ -63,6 +65,34 @@ def main(folder: Path) -> int:
         part.rename(folder / f"{k:06d}.npy")
         say(frame=k, **spent)
     return 0
+
+
+def expose(scene, things: list, poses: np.ndarray) -> None:
+    """The shutter is open, evenly, from the first to the last of (things, M, 4, 4) poses, which are evenly spaced in
+    time; in between Blender's own interpolation."""
+    count = poses.shape[1]
+    for thing, its in zip(things, poses):
+        thing.animation_data_clear()
+        last = None
+        for i, pose in enumerate(its):
+            place(thing, pose)
+            if last is not None and np.dot(last, thing.rotation_quaternion) < 0:
+                thing.rotation_quaternion = [-q for q in thing.rotation_quaternion]
+            last = np.array(thing.rotation_quaternion)
+            for path in ("location", "rotation_quaternion"):
+                thing.keyframe_insert(path, frame=i)
+        for curve in thing.animation_data.action.fcurves:
+            for key in curve.keyframe_points:
+                key.interpolation = "LINEAR"
+        for one in (thing, *thing.children):
+            one.cycles.use_motion_blur, one.cycles.motion_steps = True, 4
+    scene.frame_start, scene.frame_end = 0, count - 1
+    scene.frame_set(0)
+    render = scene.render
+    render.use_motion_blur, render.motion_blur_position, render.motion_blur_shutter = True, "START", float(count - 1)
+    for point in render.motion_blur_shutter_curve.curves[0].points:
+        point.location[1] = 1.0
+    render.motion_blur_shutter_curve.update()
 
 
 def place(thing, pose: np.ndarray) -> None:
@@ -325,7 +355,28 @@ def make_light(bpy, scene, job: dict, panorama: np.ndarray | None, sky: float) -
     link(add("ShaderNodeLightPath").outputs["Is Camera Ray"], seen.inputs[0])
     link(dome.outputs[0], seen.inputs[1])
     link(backdrop.outputs[0], seen.inputs[2])
-    link(seen.outputs[0], add("ShaderNodeOutputWorld").inputs["Surface"])
+    out = add("ShaderNodeOutputWorld")
+    link(seen.outputs[0], out.inputs["Surface"])
+    if job["fog"] is not None:
+        link(fog_nodes(tree, *job["fog"]).outputs[0], out.inputs["Volume"])
+
+
+def fog_nodes(tree, density: float, radiance: float):
+    """What swallows and sends light between the camera and what it sees, and is not there for rays to lamps: from the
+    camera L becomes L e^(-density d) + radiance (1 - e^(-density d))."""
+    add, link = tree.nodes.new, tree.links.new
+    both, swallows, sends = (add(f"ShaderNode{kind}") for kind in ("AddShader", "VolumeAbsorption", "Emission"))
+    swallows.inputs["Color"].default_value = (0.0, 0.0, 0.0, 1.0)
+    path = add("ShaderNodeLightPath")
+    for node, name, strength in ((swallows, "Density", density), (sends, "Strength", density * radiance)):
+        seen = add("ShaderNodeMath")
+        seen.operation = "MULTIPLY"
+        seen.inputs[1].default_value = strength
+        link(path.outputs["Is Camera Ray"], seen.inputs[0])
+        link(seen.outputs[0], node.inputs[name])
+    link(swallows.outputs[0], both.inputs[0])
+    link(sends.outputs[0], both.inputs[1])
+    return both
 
 
 def make_lamp(bpy, scene, lamp: dict, shadows: bool):
@@ -361,6 +412,11 @@ def make_camera(bpy, scene, job: dict):
     for name, value in job["blender_camera"].items():
         setattr(scene.render if name.startswith("pixel_aspect") else lens, name, value)
     lens.clip_start, lens.clip_end = job["near"], FAR
+    if job["lens"] is not None:
+        diameter, focus = job["lens"]
+        lens.dof.use_dof, lens.dof.focus_distance = True, focus
+        lens.dof.aperture_fstop = 1e-3 * lens.lens / diameter  # Blender's focal length is in mm, its units are metres
+        lens.dof.aperture_blades, lens.dof.aperture_ratio = 0, 1.0
     camera = bpy.data.objects.new("camera", lens)
     camera.rotation_mode = "QUATERNION"
     scene.collection.objects.link(camera)

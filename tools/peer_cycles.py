@@ -23,8 +23,11 @@ The same picture, as far as two renderers can make it:
   adds those of the dome; ``bounces > 0`` adds inter-reflection. A panorama is the picture that BlinkGL found its
   harmonics in, its suns lamps.
 * A gloss is Blender's principled surface with multiple scattering, which mirrors the world and the lamps alone; normal
-  maps, light of its own, holes and colours of vertices are nodes of their own. Fog is refused: there it would swallow
-  the light of the lamps, too.
+  maps, light of its own, holes and colours of vertices are nodes of their own.
+* Fog is an even volume that swallows and sends, for rays of the camera alone: BlinkGL's formula is the light's way from
+  the surface to the camera, and leaves out that from the lamps to the surface.
+* A thin lens, and an exposure (global shutter, bodies and camera moving between ``KEYS`` poses as Blender interpolates
+  them), where settings ask for them: the frame camera's defocus and motion blur.
 * Sky boxes are pictures: the camera sees them, light passes through them. Other unlit surfaces cast shadows but do not
   shine on anything, as in BlinkGL. Back faces of closed one-sided meshes are invisible to the camera alone.
 * What stays different: shading normals that point away from the side that is lit are treated more strictly by a path
@@ -39,19 +42,22 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
 
 from blinkgl.blender.process import Blender, how_it_ended, interpreter
 from blinkgl.camera import PinHole
+from blinkgl.config.images import LensConfig
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.render.colour import LUMA, linear_image
 from blinkgl.scene.lights import lamps_of, seen_around
 from blinkgl.scene.shapes.deformer import all_rigid
 from blinkgl.scene.types import Material, Scene
 
+KEYS = 17
+"""Poses of what moves, from the beginning of an exposure to its end."""
 WORKER = Path(__file__).with_name("cycles_worker.py")
 # OpenCV's camera looks along +z with y down, Blender's along -z with y up.
 CV_FROM_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -62,7 +68,8 @@ class CyclesSettings:
     """samples : paths per pixel.   seed : of all frames.   shadows : of sun and dome; False
     needs bounces=0.   occlusion : of the dome by what stands around, where there are shadows; False needs bounces=0.
     bounces : of diffuse light.
-    engine : "cycles" or "eevee" (bounces and seed do nothing there).   threads : 0 for all."""
+    engine : "cycles" or "eevee" (bounces and seed do nothing there).   threads : 0 for all.
+    lens : of ``images``; None: a pin-hole.   exposure_ns : from each frame's time on; 0: an instant."""
 
     samples: int = 64
     seed: int = 0
@@ -71,6 +78,8 @@ class CyclesSettings:
     bounces: int = 4
     engine: str = "cycles"
     threads: int = 0
+    lens: LensConfig | None = None
+    exposure_ns: int = 0
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -78,6 +87,7 @@ class CyclesSettings:
             ("seed", 0, 2**31 - 1),
             ("bounces", 0, 1024),
             ("threads", 0, 1024),
+            ("exposure_ns", 0, 2**62),
         ):
             if not low <= getattr(self, name) <= high:
                 raise ConfigError(
@@ -168,14 +178,16 @@ def export(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings, fold
     both), its origin the first camera's place.
 
     job.json: size [W, H]; blender_camera, near; background; light {sun_direction, sun, sky, sky_color, lamps [{kind,
-    strength, size, outer, blend}], which are the sun, too, unless the light is plain}; settings; frames;
+    strength, size, outer, blend}], which are the sun, too, unless the light is plain}; settings; lens [diameter, focus]
+    and fog [density, radiance] or null; frames;
     materials [{texture index or null, base_color, unlit, culled, tinted, gloss [metallic, roughness] or null, bumps
     index or null, bump_scale, emission, alpha index or null, threshold}]; bodies [{name, picture_only, parts [[mesh,
     material], …]}]. job.npz, k counting what job.json refers to: vertices{k} (V, 3), normals{k} (V, 3), uvs{k} (V, 2)
     float32 with uv_scale in them and v growing upwards, colours{k} (V, 3) where vertices have them, faces{k} (F, 3)
     int32; texture{k} (h, w, 3) float32, linear or numbers, row 0 at the top; panorama (h, w, 3) float32, where one
     lights the scene; poses (bodies, N, 4, 4) and camera_poses (N, 4, 4), lamp_poses (lamps, N, 4, 4) float64, the
-    camera's in Blender's camera axes. Blender's spot lights fade otherwise between the inner and the outer angle.
+    camera's in Blender's camera axes; exposed (bodies and the camera, N, KEYS, 4, 4), where there is an exposure.
+    Blender's spot lights fade otherwise between the inner and the outer angle.
     """
     all_rigid(scene, "the path tracer")
     times_ns = np.array(list(times_ns), np.int64)
@@ -211,8 +223,14 @@ def export(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings, fold
     arrays["poses"] = np.array([poses(thing.path) for thing in scene.objects]).reshape(-1, len(times_ns), 4, 4)
     arrays["camera_poses"] = poses(scene.camera_path) @ CV_FROM_BLENDER
     light = scene.light
-    if scene.fog is not None:
-        raise BlinkGLError("the path tracer knows no fog", where="scene.fog", accepted="a scene without fog")
+    if settings.exposure_ns:
+        spread = np.linspace(0, settings.exposure_ns, KEYS).astype(np.int64)
+        open_ns = (times_ns[:, None] + spread).ravel()
+        things = [*(thing.path for thing in scene.objects), scene.camera_path]
+        exposed = np.array([path.poses(open_ns) for path in things])
+        exposed[..., :3, 3] -= origin
+        exposed[-1] = exposed[-1] @ CV_FROM_BLENDER
+        arrays["exposed"] = exposed.reshape(len(things), len(times_ns), KEYS, 4, 4)
     if light.surroundings is not None:
         arrays["panorama"] = seen_around(light)
     lamps = () if light.plain else lamps_of(light)
@@ -223,7 +241,11 @@ def export(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings, fold
         "near": float(camera.near),
         "background": float(scene.background),
         "frames": len(times_ns),
-        "settings": asdict(settings),
+        "settings": {
+            f.name: getattr(settings, f.name) for f in fields(settings) if f.name not in ("lens", "exposure_ns")
+        },
+        "lens": None if settings.lens is None else [settings.lens.aperture, settings.lens.focus],
+        "fog": None if scene.fog is None else [scene.fog.density, scene.fog.radiance],
         "light": {
             "sun_direction": [float(s) for s in light.sun_direction],
             "sun": float(light.sun) if light.plain else 0.0,

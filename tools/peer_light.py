@@ -5,7 +5,8 @@ at path depth 1, each effect by itself.
 
 Diffuse scenes: floor, ball, box, open sheet. Metal: five balls of five roughnesses, graded by themselves. Of each the
 relative difference of colours, (theirs - ours) / (theirs + 0.01), over pixels off silhouettes and, of hard shadows,
-farther than two texels from their edges: median of what is there, and 95 % quantile.
+farther than two texels from their edges: median of what is there, and 95 % quantile. Of a frame camera's defocus and
+motion blur every pixel is graded that they change by more than 2 %.
 """
 
 from __future__ import annotations
@@ -15,27 +16,32 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import PinHole
+from blinkgl.config.images import ImagesConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.gl import create_context
+from blinkgl.imaging import FrameCamera
+from blinkgl.imaging.response import decode
 from blinkgl.render import reference
 from blinkgl.scene.geometry.primitives import cuboid, grid, sphere
 from blinkgl.scene.lights import lamp_pose
-from blinkgl.scene.motion.paths import StaticPath
+from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.motion.trajectories import look_rotation
 from blinkgl.scene.rig import Rig
-from blinkgl.scene.types import Gloss, Lamp, Light, Map, Mask, Material, Mesh, Part, Scene, SceneObject, Texture
+from blinkgl.scene.types import Fog, Gloss, Lamp, Light, Map, Mask, Material, Mesh, Part, Scene, SceneObject, Texture
 from blinkgl.scene.worlds.sky import panorama_light
 from blinkgl.srgb import to_srgb8
 from blinkgl.tools.peer_cycles import CyclesSettings, colours
 from blinkgl.tools.shader_debugger.lamps import near_an_edge
 from blinkgl.tools.shader_debugger.session import DebugRenderer
 
+EXPOSURE_US = 20_000
 ROUGHNESSES = (0.1, 0.25, 0.45, 0.7, 1.0)
 WHITE = (1.0, 1.0, 1.0)
 WARM, BLUE = (1.0, 0.8, 0.6), (0.65, 0.8, 1.0)
@@ -44,12 +50,14 @@ SUN = (-0.48, -0.6, 0.64)
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One effect. graded : ids of the objects that are looked at.   settings : of Cycles, samples are the tool's."""
+    """One effect. graded : ids of the objects that are looked at.   images : of the frame camera that takes the
+    picture, all of which is looked at where that makes more than 2 % of difference; None: it is a plain one."""
 
     name: str
     scene: Scene
     graded: tuple[int, ...]
     shadows: bool = False
+    images: dict[str, Any] | None = None
 
 
 def _body(number: int, mesh: Mesh, place, material: Material, turn=(0.0, 0.0, 0.0), category="object") -> SceneObject:
@@ -135,6 +143,32 @@ def tinted(scene: Scene) -> Scene:
     return replace(scene, objects=tuple(one(thing) for thing in scene.objects))
 
 
+def moving(scene: Scene) -> Scene:
+    """Of :func:`matt`: ball and box fly, and the camera turns and goes by, all evenly, for as long as the exposure."""
+
+    def path(T: np.ndarray, way, turn=(0.0, 0.0, 0.0)) -> KeyframePath:
+        R = Rotation.from_matrix(T[:3, :3])
+        after = R * Rotation.from_rotvec(np.radians(turn))
+        ends = [T[:3, 3], T[:3, 3] + np.asarray(way)]
+        return KeyframePath([0, EXPOSURE_US * 1000], ends, Rotation.concatenate([R, after]), interpolation="linear")
+
+    ways = {2: ((0.35, 0.0, 0.1), (0.0, 0.0, 0.0)), 3: ((-0.1, -0.3, 0.0), (0.0, 0.0, 6.0))}
+    objects = tuple(
+        replace(thing, path=path(thing.path.pose(0), *ways[thing.instance_id])) if thing.instance_id in ways else thing
+        for thing in scene.objects
+    )
+    seen = path(scene.camera_path.pose(0), (0.05, 0.0, 0.02), (0.0, 1.0, 0.0))
+    return replace(scene, objects=objects, t1_ns=EXPOSURE_US * 1000).with_path(seen)
+
+
+def taken(renderer: DebugRenderer, images: dict[str, Any]) -> np.ndarray:
+    """(H, W, 3) radiance that a frame camera's image is made of, to a step of 16 bits."""
+    scene = renderer.scene
+    linear = {"response": "linear", "bits": 16, "white": 2.0, "max_px": 0.25, "max_instants": 1024, "times": (0.0,)}
+    camera = FrameCamera(renderer, ImagesConfig(**{**linear, **images}), 0, (scene.t0_ns, scene.t1_ns))
+    return 2.0 * decode(camera.take().image, "linear", 2.2, 16)
+
+
 def cases(panoramas: Path | None) -> Iterator[Case]:
     """Each effect by itself, beside a plain sun and sky."""
     every = (1, 2, 3, 4)
@@ -160,6 +194,9 @@ def cases(panoramas: Path | None) -> Iterator[Case]:
     yield Case("light of its own", matt(plain, emission=(0.3, 0.2, 0.5)), (2, 3, 4))
     yield Case("holes", matt(plain, mask=lattice()), every)
     yield Case("colours of vertices", tinted(matt(plain)), (2, 3, 4))
+    yield Case("fog", replace(matt(plain), fog=Fog(0.12, 0.5)), every)
+    yield Case("defocus", matt(plain), every, images={"exposure_us": 1.0, "lens": {"aperture": 0.25, "focus": 4.8}})
+    yield Case("motion blur", moving(matt(plain)), every, images={"exposure_us": EXPOSURE_US})
     for smooth in (True, False):
         yield Case("metal, sun and sky", metal(plain, smooth), (1, 2, 3, 4, 5))
     for file in sorted(panoramas.glob("*.hdr")) if panoramas is not None else ():
@@ -169,18 +206,33 @@ def cases(panoramas: Path | None) -> Iterator[Case]:
             yield Case(f"metal, panorama {file.stem}", metal(light, smooth), (1, 2, 3, 4, 5))
 
 
-def compared(gl, case: Case, samples: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, reference.ReferenceFrame]:
+def compared(
+    gl, case: Case, samples: int, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, reference.ReferenceFrame]:
     """((H, W, 3) ours, theirs, (H, W) bool what is graded, the reference's frame)."""
-    settings = CyclesSettings(samples, shadows=case.shadows, occlusion=False, bounces=0)
+    settings = CyclesSettings(samples, seed, shadows=case.shadows, occlusion=False, bounces=0)
+    if case.images is not None:
+        given = ImagesConfig(**case.images, times=(0.0,))
+        open_ns = 1000 * case.images["exposure_us"] if case.images["exposure_us"] > 1 else 0
+        settings = replace(settings, lens=given.lens, exposure_ns=int(open_ns))
     (theirs,) = colours(case.scene, [0], settings)
     with DebugRenderer(gl, case.scene, RenderConfig(image_antialiasing="ssaa4")) as renderer:
-        ours = renderer.colour(0).read()
+        at_once = ours = renderer.colour(0).read()
+        if case.images is not None:
+            ours = taken(renderer, case.images)
         maps = renderer.maps
     true = reference.render(case.scene, 0)
+    if case.images is not None:
+        return ours, theirs, relative(at_once, ours) > 0.02, true
     graded = np.isin(true.instance, case.graded) & ~reference.silhouette_band(true.instance, true.depth)
     if case.scene.light.shadows == "hard":
         graded &= ~near_an_edge(case.scene, true, maps)
     return ours, theirs, graded, true
+
+
+def relative(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+    """(H, W) difference of two (H, W, 3), of theirs."""
+    return np.abs(theirs - ours).mean(axis=2) / (theirs.mean(axis=2) + 0.01)
 
 
 def main() -> None:
@@ -198,7 +250,7 @@ def main() -> None:
             if not any(word in case.name for word in options.only):
                 continue
             ours, theirs, graded, true = compared(gl, case, options.samples)
-            error = np.abs(theirs - ours).mean(axis=2) / (theirs.mean(axis=2) + 0.01)
+            error = relative(ours, theirs)
             rows = [(case.name, graded)]
             if case.name.startswith("metal"):
                 rows = [(f"{case.name}, {r:g}", graded & (true.instance == k + 1)) for k, r in enumerate(ROUGHNESSES)]

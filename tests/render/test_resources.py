@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import AssetError
-from blinkgl.render.resources import MAX_RADIUS, _draw_item, _Greys
-from blinkgl.scene.types import Material, Mesh
+from blinkgl.render.resources import MAX_RADIUS, DrawItem, _draw_item, _Facets, _Greys
+from blinkgl.scene.types import Light, Material, Mesh
+from render_scenes import scene, still, thing
 
 
 def mesh(reach: float) -> Mesh:
@@ -22,13 +23,18 @@ def mesh(reach: float) -> Mesh:
     )
 
 
+def item_of(shape: Mesh, material: Material | None = None) -> DrawItem:
+    body = thing("sheet", 1, shape, still(), material)
+    return _draw_item(2, body, body.parts[0], scene([body]), _Greys(False), _Facets(Light()))
+
+
 def test_the_largest_mesh_and_one_that_is_larger():
     centre = np.hypot(1.0, 0.25)  # of the box; the farthest corner is the left one
-    item = _draw_item(2, mesh(MAX_RADIUS / centre * (1 - 1e-12)), Material(), "object", False, 0, 1, _Greys(False))
+    item = item_of(mesh(MAX_RADIUS / centre * (1 - 1e-12)))
     assert item.radius == pytest.approx(MAX_RADIUS) and not item.two_sided and item.lit
     for reach in (MAX_RADIUS, np.nan):
         with pytest.raises(AssetError, match="sheet: mesh is too large to be drawn in float32"):
-            _draw_item(2, mesh(reach), Material(), "object", False, 0, 1, _Greys(False))
+            item_of(mesh(reach))
 
 
 def test_exactly_the_largest_radius_is_drawn():
@@ -40,4 +46,4 @@ def test_exactly_the_largest_radius_is_drawn():
         True,
         "line",
     )
-    assert _draw_item(0, flat, Material(double_sided=True), "object", True, 0, 1, _Greys(False)).radius == MAX_RADIUS
+    assert item_of(flat, Material(double_sided=True)).radius == MAX_RADIUS

@@ -8,6 +8,7 @@ Start: emulator.py, esim.py, v2e.py; the kernels are shaders/compute/events_*.gl
 from blinkgl.card.atlas import Atlas
 from blinkgl.card.esim import CardEsim
 from blinkgl.card.sinks import Counts, Latest, Voxels
+from blinkgl.card.tile_sinks import TileSinks
 from blinkgl.card.v2e import CardV2e
 
-__all__ = ["Atlas", "CardEsim", "CardV2e", "Counts", "Latest", "Voxels"]
+__all__ = ["Atlas", "CardEsim", "CardV2e", "Counts", "Latest", "TileSinks", "Voxels"]

@@ -15,7 +15,7 @@ bit.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import moderngl
 import numpy as np
@@ -105,6 +105,7 @@ class Atlas:
         self._late = (not gl.is_software if late is None else late) and maps_persistently(gl)
         self._slot: Slot | None = None
         self._expected = 0
+        self._last: tuple[int, dict[int, tuple[int, int]]] = 0, {}  # events of the last round, intervals of its tiles
         self.rounds = 0
         """Times that tiles have been done together."""
 
@@ -157,6 +158,15 @@ class Atlas:
         if emulator in self._flying:
             self._land()
 
+    def last_round(self) -> tuple[moderngl.Buffer, int, dict[int, tuple[int, int]]]:
+        """Packed events of the last round, how many, and the intervals, ns, by tile. Rows of tile k begin at
+        k times ``height``. Tiles that wait are done first. A frame that cannot be used has no events; its own next step
+        says so."""
+        if any(one is not None and one.waits for one in self._in_use):
+            self._fire()
+        self._land()
+        return self.room["packed"], *self._last
+
     def _fire_if_all_wait(self) -> None:
         used = [one for one in self._in_use if one is not None and one.goes_on]
         if used and all(one.waits for one in used):
@@ -173,7 +183,7 @@ class Atlas:
             one.waits = False
         self._flying, self.rounds = flying, self.rounds + 1
         self._run()
-        if self._late:
+        if self._late and not all(one.stays for one in flying):
             self._send()
 
     def _run(self) -> None:
@@ -214,7 +224,7 @@ class Atlas:
         if not self._flying:
             return
         self.gl.resume()
-        room, sent = self.room, self._late
+        room, sent = self.room, self._late and not all(one.stays for one in self._flying)
         memory = self._slot.wait() if sent and self._slot is not None else None
         head = (
             np.frombuffer(room["listed"].read(HEAD_BYTES), np.uint32)
@@ -239,13 +249,17 @@ class Atlas:
             room.grow(count)
             self._stages.emit(self._values, long=self._long)
             sent = False
+        self._last = count, {one.tile: one.interval for one in flying}
+        if all(one.stays for one in flying):
+            self._flying = []
+            return
         if sent and memory is not None and count <= self._expected:
             packed = memory[HEAD_BYTES : HEAD_BYTES + 8 * count].view(np.int64)
         else:
             packed = np.frombuffer(room["packed"].read(8 * count) if count else b"", np.int64)
         self._expected = count
         edges = np.searchsorted((packed >> 17) & 0xFFFF, self.height * np.arange(len(self._in_use) + 1))
-        for one in flying:
+        for one in [one for one in flying if not one.stays]:
             mine = packed[edges[one.tile] : edges[one.tile + 1]]
             one.take(mine - (one.tile * self.height << 17))
         self._flying = []
@@ -290,7 +304,8 @@ class _Layer:
 class TileEsim(CardEsim):
     """An emulator whose pixels are a tile of an :class:`Atlas`. Events come one frame late, ``flush`` gives the last.
 
-    tile : its number.   waits : whether it has a frame that has not been done."""
+    tile : its number.   waits : whether it has a frame that has not been done.   stays : whether the events of its
+    last frame are left on the card."""
 
     def __init__(self, atlas: Atlas, tile: int, config: Any, seed: int):
         Esim.__init__(self, atlas.height, atlas.width, config, seed)
@@ -304,6 +319,7 @@ class TileEsim(CardEsim):
                     "the batch was made without it", where=f"events.{key}", value=getattr(config, key), accepted="0"
                 )
         self.gl, self.atlas, self.tile, self.waits, self.spoilt = atlas.gl, atlas, tile, False, False
+        self.stays = False
         self.interval = 0, 0
         """Of the events that are on their way, ns."""
         self._room: Any = _Layer(atlas.room, tile * atlas.pixels, self.height * self.width)
@@ -331,10 +347,19 @@ class TileEsim(CardEsim):
         return self.interval[0] if self._due else self.t_ns
 
     def advance(self, luminance: np.ndarray | moderngl.Texture, t_ns: int) -> int:
-        raise EventDataError("events of a batch do not stay on the card", where="advance", accepted="step")
+        """As ``step``, but the events stay on the card, for :mod:`blinkgl.card.tile_sinks`. Those of a step before it
+        that are on their way come with the next ``step`` or ``flush``. Returns 0: nobody counts them tile by tile."""
+        self._stays = True
+        try:
+            before = self.step(cast(Any, luminance), t_ns)
+        finally:
+            self._stays = False
+        self._kept += [before] if len(before) else []
+        return 0
 
     def _advance(self, frame: np.ndarray | moderngl.Texture, t_ns: int, rate: np.ndarray | None) -> Events:
         before = self._taken()
+        self.stays = self._stays
         assert self.t_ns is not None
         self.gl.resume()
         self._room.turn()
@@ -348,7 +373,8 @@ class TileEsim(CardEsim):
 
     def flush(self) -> Events:
         self._over = True
-        return self._taken()
+        events, kept, self._kept = self._taken(), self._kept, []
+        return Events.concatenate([*kept, events]) if kept else events
 
     def _taken(self) -> Events:
         """The events that were on their way. Raises EventDataError where the frame that ends their interval cannot be
@@ -361,6 +387,19 @@ class TileEsim(CardEsim):
             self._undo()
         arrived, self._arrived = self._arrived, Events.empty()
         return arrived
+
+    def step(
+        self,
+        luminance: np.ndarray | moderngl.Texture,
+        t_ns: int,
+        rows: tuple[int, int] | None = None,
+        rate: np.ndarray | None = None,
+    ) -> Events:
+        events = super().step(cast(Any, luminance), t_ns, rows, rate)
+        if self._stays or not self._kept:
+            return events
+        kept, self._kept = self._kept, []
+        return Events.concatenate([*kept, events])
 
     def _undo(self) -> None:
         seen, self.spoilt = self._room.get("now", np.float32), False

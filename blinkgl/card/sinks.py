@@ -32,10 +32,37 @@ MAX_WINDOW_US = 2**30
 MAX_BINS = 256
 
 
+def refuse_window(t0_us: int, t1_us: int) -> None:
+    """Raises EventDataError: no length, or over 17 minutes."""
+    if not 0 < t1_us - t0_us <= MAX_WINDOW_US:
+        raise EventDataError(
+            "a window has an end after its start",
+            where="window",
+            value=f"{t0_us} to {t1_us} us",
+            accepted=f"up to {MAX_WINDOW_US} us",
+        )
+
+
+def refuse_bins(bins: int) -> None:
+    """Raises EventDataError: none, or too many."""
+    if not 1 <= bins <= MAX_BINS:
+        raise EventDataError("number of bins out of range", where="bins", value=bins, accepted=f"1 to {MAX_BINS}")
+
+
 class _Sink:
     """Of one emulator on a card. shape : of what :meth:`read` gives."""
 
     define: ClassVar[str]
+    """Of the shader's variant."""
+
+    @staticmethod
+    def finished(whole: np.ndarray, t0_us: int) -> np.ndarray:
+        """What :meth:`read` gives of the sums, (planes, H, W) int32, of a window from ``t0_us`` on."""
+        raise NotImplementedError
+
+    def read(self) -> np.ndarray:
+        """The window so far."""
+        return self.finished(self.whole(), self._window_us[0])
 
     def __init__(self, card: CardEmulator, planes: int):
         self._card, self.shape = card, (planes, card.height, card.width)
@@ -49,13 +76,7 @@ class _Sink:
 
     def begin(self, t0_us: int, t1_us: int) -> None:
         """A new window [t0_us, t1_us), empty. Raises EventDataError: no length, or over 17 minutes."""
-        if not 0 < t1_us - t0_us <= MAX_WINDOW_US:
-            raise EventDataError(
-                "a window has an end after its start",
-                where="window",
-                value=f"{t0_us} to {t1_us} us",
-                accepted=f"up to {MAX_WINDOW_US} us",
-            )
+        refuse_window(t0_us, t1_us)
         self._card.gl.resume()
         self._window_us = (t0_us, t1_us)
         self._buffer.clear()
@@ -100,13 +121,12 @@ class Voxels(_Sink):
     define = "VOXELS"
 
     def __init__(self, card: CardEmulator, bins: int = 5):
-        if not 1 <= bins <= MAX_BINS:
-            raise EventDataError("number of bins out of range", where="bins", value=bins, accepted=f"1 to {MAX_BINS}")
+        refuse_bins(bins)
         super().__init__(card, bins)
 
-    def read(self) -> np.ndarray:
-        """The grid of the window so far."""
-        return self.whole().astype(np.float32) / np.float32(ONE)
+    @staticmethod
+    def finished(whole: np.ndarray, t0_us: int) -> np.ndarray:
+        return whole.astype(np.float32) / np.float32(ONE)
 
 
 class Counts(_Sink):
@@ -117,9 +137,9 @@ class Counts(_Sink):
     def __init__(self, card: CardEmulator):
         super().__init__(card, 2)
 
-    def read(self) -> np.ndarray:
-        """The counts of the window so far."""
-        return self.whole().copy()
+    @staticmethod
+    def finished(whole: np.ndarray, t0_us: int) -> np.ndarray:
+        return whole.copy()
 
 
 class Latest(_Sink):
@@ -130,7 +150,7 @@ class Latest(_Sink):
     def __init__(self, card: CardEmulator):
         super().__init__(card, 2)
 
-    def read(self) -> np.ndarray:
-        """The times of the window so far."""
-        since = self.whole().astype(np.int64)
-        return np.where(since > 0, since - 1 + self._window_us[0], -1)
+    @staticmethod
+    def finished(whole: np.ndarray, t0_us: int) -> np.ndarray:
+        since = whole.astype(np.int64)
+        return np.where(since > 0, since - 1 + t0_us, -1)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blinkgl.card import CardEsim, Counts, Latest, Voxels
+from blinkgl.card import Atlas, CardEsim, Counts, Latest, TileSinks, Voxels
 from blinkgl.card.sinks import ONE
 from blinkgl.config.events import EsimConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events import Esim
-from tests.events.clips import random_clip, run
+from blinkgl.events.types import Events
+from tests.card.test_frames_on_card import textures
+from tests.events.clips import assert_same, random_clip, run
 
 H, W = 37, 45
 CONFIG = EsimConfig(threshold_sigma=0.03)
@@ -91,3 +93,75 @@ def test_what_cannot_be_a_window(gl):
     sink.add()  # before the first frame there is nothing
     assert not sink.read().any()
     card.release()
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_tiles_have_what_each_has_alone(gl, late):
+    """Four sequences of other times, thresholds and windows side by side; one ends early, one reads its events."""
+    kinds = {"voxels": (Voxels, 5), "counts": (Counts, 5), "latest": (Latest, 5)}
+    clips = [random_clip(seed, frames=6 - (seed == 3), height=H, width=W) for seed in range(4)]
+    configs = [EsimConfig(threshold_sigma=0.03, contrast_threshold=0.1 + 0.05 * k) for k in range(4)]
+    windows = [(int(t[1]) // 1000 + 301 * k, int(t[4]) // 1000 + 77) for k, (_, t) in enumerate(clips)]
+    with Atlas(gl, H, W, tiles=5, late=late) as atlas:
+        sinks = {name: TileSinks(atlas, kind, bins) for name, (kind, bins) in kinds.items()}
+        tiles = [atlas.esim(config, 7 + k) for k, config in enumerate(configs)]
+        for sink in sinks.values():
+            for tile, window in zip(tiles, windows, strict=True):
+                sink.begin(tile, *window)
+        read = []
+        for k in range(6):
+            for j, (tile, (frames, times)) in enumerate(zip(tiles, clips, strict=True)):
+                if k == len(frames):
+                    read += [tile.flush()]
+                elif j == 2 and k % 2:
+                    read.append(tile.step(frames[k], int(times[k])))
+                elif k < len(frames):
+                    tile.advance(frames[k], int(times[k]))
+            for sink in sinks.values():
+                sink.add()
+        read.append(tiles[2].flush())
+        for k, (tile, config, (frames, times)) in enumerate(zip(tiles, configs, clips, strict=True)):
+            for name, (kind, bins) in kinds.items():
+                single = CardEsim(H, W, config, 7 + k, gl=gl)
+                one = kind(single, bins) if kind is Voxels else kind(single)
+                one.begin(*windows[k])
+                for frame, t in zip(frames, times, strict=True):
+                    single.advance(frame, int(t))
+                    one.add()
+                assert one.read().any()
+                np.testing.assert_array_equal(sinks[name].read(tile), one.read(), err_msg=f"{name} of {k}")
+                one.release()
+                single.release()
+        frames, times = clips[2]
+        every = Esim(H, W, configs[2], 9)
+        wanted = [every.step(f, int(t)) for f, t in zip(frames, times, strict=True)]
+        got = Events.concatenate([part for part in read if len(part)])
+        assert_same(got, Events.concatenate([wanted[k] for k in (1, 3, 5)]))
+        with pytest.raises(EventDataError, match=r"^bins: "):
+            TileSinks(atlas, Voxels, 0)
+        with Atlas(gl, H, W, tiles=1) as other, pytest.raises(EventDataError, match=r"^emulator: not a tile of this"):
+            sinks["counts"].begin(other.esim(CONFIG), 0, 1)
+        for sink in sinks.values():
+            sink.release()
+            sink.release()
+
+
+def test_a_tile_without_a_window_and_a_frame_that_is_none(gl):
+    """Neither leaves anything in a sink; the others of the round do."""
+    frames, times = random_clip(5, frames=4, height=H, width=W)
+    bad = frames[2].copy()
+    bad[3, 4] = np.nan
+    (wrong,) = textures(gl, [bad])
+    with Atlas(gl, H, W, tiles=3) as atlas:
+        sink, tiles = TileSinks(atlas, Counts), [atlas.esim(CONFIG, seed) for seed in range(3)]
+        for tile in tiles[:2]:
+            sink.begin(tile, int(times[1]) // 1000 + 1, 2**30)
+        for k in range(3):
+            for j, tile in enumerate(tiles):
+                tile.advance(wrong if (j, k) == (1, 2) else frames[k], int(times[k]))
+            sink.add()
+        assert sink.read(tiles[0]).any() and not sink.read(tiles[1]).any() and not sink.read(tiles[2]).any()
+        with pytest.raises(EventDataError, match=r"pixel x=4, y=3"):
+            tiles[1].flush()
+        sink.release()
+    wrong.release()

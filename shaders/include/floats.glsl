@@ -54,17 +54,24 @@ FLOAT sub_float(FLOAT a, FLOAT b)
     return add_float(a, negative_float(b));
 }
 
+#ifdef SOFT_FLOAT
 // Whole numbers in the order of the floats; both zeros are 0.
-int order_of(FLOAT a)
+int order_of(uint a)
 {
-    int size = int(BITS_OF(a) & 0x7FFFFFFFu);
-    return BITS_OF(a) >> 31 == 1u ? -size : size;
+    int size = int(a & 0x7FFFFFFFu);
+    return a >> 31 == 1u ? -size : size;
 }
 
-bool less_float(FLOAT a, FLOAT b)
+bool less_float(uint a, uint b)
 {
     return order_of(a) < order_of(b);
 }
+#else
+bool less_float(float a, float b)
+{
+    return a < b;
+}
+#endif
 
 FLOAT float_of(int whole) // below 2^24
 {

@@ -95,7 +95,12 @@ def config_of(folder, **changes):
     return load_run(path).sequence(0)
 
 
-def test_files_are_the_same_and_the_manifest_says_which(gl, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "emulator",
+    [{}, pytest.param({"emulator": "v2e", "preset": "noisy", "causes": True}, marks=pytest.mark.slow)],
+    ids=["esim", "v2e"],
+)
+def test_files_are_the_same_and_the_manifest_says_which(gl, tmp_path, monkeypatch, emulator):
     from blinkgl.dataset.generate import generate_sequence
     from blinkgl.dataset.verify import verify_dataset
     from blinkgl.io.sequence_dir import read_manifest
@@ -107,7 +112,7 @@ def test_files_are_the_same_and_the_manifest_says_which(gl, tmp_path, monkeypatc
     for device in ("cpu", "gl", "auto", "card"):
         if device == "card":  # sorted there, read back one frame late
             monkeypatch.setattr(gl, "is_software", False)
-        config = config_of(tmp_path, events={"device": "auto" if device == "card" else device})
+        config = config_of(tmp_path, events={**emulator, "device": "auto" if device == "card" else device})
         viewed.clear()
         path = generate_sequence(config, 0, tmp_path / device, gl).path
         read_back[device] = len(viewed)

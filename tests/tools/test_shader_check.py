@@ -39,13 +39,13 @@ def test_everything_compiles_and_nothing_is_unused(shader):
     result = json.loads(out)
     assert status == 0 and result["errors"] == [] and result["unused"] == []
     assert result["programs"] == {
-        "colour.glsl": 118,
+        "colour.glsl": 138,
         "debug.glsl": 14,
         "downsample.glsl": 2,
         "edges.glsl": 3,
         "gather.glsl": 3,
         "label.glsl": 140,
-        "luminance.glsl": 364,
+        "luminance.glsl": 410,
         "shadow.glsl": 28,
         "velocity.glsl": 84,
     }

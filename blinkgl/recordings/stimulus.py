@@ -233,11 +233,13 @@ class Edge:
         step_us = EDGE_STEP_PX * borders.us_per_px
         end = min(end, int(begin + step_us * MOST_EDGE_FRAMES))
         inside = events.window(begin, end)
+        if len(inside) < _EDGE_INTERVALS:
+            raise EventDataError("too few events at the borders", where=where, value=len(inside), accepted="thousands")
         # As many events in each, so that either half has some.
         edges = np.unique(np.r_[begin, inside.t[np.arange(1, _EDGE_INTERVALS) * len(inside) // _EDGE_INTERVALS], end])
         if len(edges) < 5:
             raise EventDataError("the recording is too short", where=where, value=f"{end - begin} µs")
-        at = np.unique(np.r_[np.arange(begin, end, step_us), edges]) if len(edges) else edges
+        at = np.unique(np.r_[np.arange(begin, end, step_us), edges])
         tiles = Tiles(size, len(at) + 2, most, seed)
         delay, everywhere = tiles.cut(delay), np.ones(size, bool)
         shown = lambda t: borders.light(t - delay, self.contrast).astype(np.float32)
@@ -248,7 +250,7 @@ class Edge:
         still = ~passes.any(axis=-1) & (np.abs(change).max(axis=0) < STILL)
         # Before it all anything, then such a border as comes next, gone by the other way.
         anything = np.exp(np.random.default_rng(seed).uniform(-_WARM, _WARM, delay.shape))
-        other = borders.light(np.full(delay.shape, borders.times_us[0] + 9 * borders.width_us), self.contrast)
+        other = np.full(delay.shape, MIDDLE * (1 + (self.contrast if borders.rises[0] else -self.contrast)))
         warm = round(1e5 * step_us)
         used = tiles.cut(everywhere)
         return Clip(

@@ -24,6 +24,7 @@ import numpy as np
 from blinkgl.card import Atlas, CardEsim, Voxels
 from blinkgl.card.choice import CARDS as KERNELS
 from blinkgl.card.reductions import OfTextures
+from blinkgl.card.tensors import WAYS, way_here
 from blinkgl.config.events import EmulatorConfig, EsimConfig, V2eConfig
 from blinkgl.config.sequence import RenderConfig, RunTemplate, load_run
 from blinkgl.dataset.generate import generate_run
@@ -427,6 +428,80 @@ class Batches(Piece):
             rows.add(key, **{k: v * (count if k.endswith("_per_s") else 1) for k, v in mean.items()})
 
 
+class Tensors(Piece):
+    title = "tensors for torch: on the card by CUDA beside OpenGL, through pinned memory, through pageable memory"
+
+    @classmethod
+    def run(cls, rows: Rows, options: Namespace) -> None:
+        try:
+            import torch
+        except ImportError as error:
+            raise Absent(f"no torch here: {error}") from None
+        with context(options) as gl:
+            if "this machine" not in rows:
+                way = way_here(gl)
+                rows.add("this machine", way=way.way, why=way.why)
+            device = "cuda" if torch.cuda.is_available() else "cpu"
+            for (name, size), bins, at_best in itertools.product(
+                sizes(options).items(), (5, 15), WAYS if device == "cuda" else WAYS[-1:]
+            ):
+                if (key := f"{name}, {bins} bins, {at_best}") not in rows:
+                    rows.add(key, **cls.measured(gl, *size, bins, at_best, seconds(options)))
+
+    @staticmethod
+    def measured(
+        gl: GLContext, width: int, height: int, bins: int, at_best: str, span_s: float
+    ) -> dict[str, float | bool | str]:
+        """Voxel grids, as torch's card has them: with every event of the clip in them, as often as it goes (the grid is
+        read and waited for); and with a frame's events added to it before, as a training has it. ``same``: the bytes of
+        ``read()``, after either."""
+        import torch
+
+        clip = noise(height, width, 0.31, 3)
+        textures = [gl.ctx.texture((width, height), 1, frame.tobytes(), dtype="f4") for frame in clip]
+        card = CardEsim(height, width, EsimConfig(), gl=gl)
+        sink, steps = Voxels(card, bins), itertools.count()
+        made: list[Any] = []
+
+        def finish() -> None:
+            if torch.cuda.is_available():
+                torch.cuda.synchronize()
+
+        def frame() -> None:
+            k = next(steps)
+            card.advance(textures[1 + k % 2 if k else 0], k * STEP_NS)
+            if k % 50 == 0:
+                sink.begin(k * STEP_NS // 1000, (k + 50) * STEP_NS // 1000)
+            sink.add()
+
+        def whole() -> None:
+            made[:] = [sink.tensor(at_best=at_best)]
+            finish()
+
+        def sample() -> None:
+            frame()
+            whole()
+
+        same = lambda: bool(np.array_equal(made[0].cpu().numpy(), sink.read()))
+        for _ in range(3):
+            frame()
+        alone = rate(whole, span_s)
+        right = same() and bool(sink.read().any())
+        with_events = rate(sample, span_s)
+        right, way = right and same(), sink.way(at_best=at_best)
+        for thing in (sink, card, *textures):
+            thing.release()
+        return {
+            "way": way.way,
+            "why": "" if way.way == at_best else way.why,
+            "same": right,
+            "M_bytes_per_s": 4 * bins * width * height * alone.per_s / 1e6,
+            "tensors_per_s": alone.per_s,
+            "cpu_ms": alone.cpu_ms,
+            "samples_per_s": with_events.per_s,
+        }
+
+
 class WholeRun(Piece):
     title = "a whole run of flying_objects, files included"
 
@@ -529,6 +604,7 @@ PIECES: dict[str, type[Piece]] = {
     "end_to_end": EndToEnd,
     "run": WholeRun,
     "batches": Batches,
+    "tensors": Tensors,
     "online": Online,
     "networks": Networks,
     "trade": Trade,

@@ -5,7 +5,7 @@
     for frame, t_ns in frames:
         card.advance(frame, t_ns)     # as `step`, but no event is read back
         sink.add()
-    grid = sink.read()
+    grid = sink.read()                # or sink.tensor(): torch's, on the card where that goes
 
 Everything is added up in whole numbers, so that the order in which a card does it leaves no trace: the same events are
 the same tensor, bit for bit, on any card and on the processor (:mod:`tests.card.test_sinks` has the twins).
@@ -13,12 +13,13 @@ the same tensor, bit for bit, on any card and on the processor (:mod:`tests.card
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from blinkgl.card.kernels import PIXELS_PER_GROUP, Kernels
 from blinkgl.card.memory import refuse_if_out_of_memory, refuse_too_large
+from blinkgl.card.tensors import Readers, Way
 from blinkgl.errors import EventDataError
 from blinkgl.events.emulator import MAX_SIDE
 from blinkgl.events.packing import MAX_CAUSE_ROWS
@@ -60,9 +61,27 @@ class _Sink:
         """What :meth:`read` gives of the sums, (planes, H, W) int32, of a window from ``t0_us`` on."""
         raise NotImplementedError
 
+    @staticmethod
+    def finished_tensor(whole: Any, t0_us: int) -> Any:
+        """The same of a torch tensor, on its device. (``whole`` is nobody else's.)"""
+        raise NotImplementedError
+
     def read(self) -> np.ndarray:
         """The window so far."""
         return self.finished(self.whole(), self._window_us[0])
+
+    def tensor(self, device: str | None = None, at_best: str = "interop") -> Any:
+        """The window so far as a torch tensor of its own: the numbers and the type of :meth:`read`.
+
+        device : "cpu", "cuda", "cuda:1"; None: the card that draws, where torch sees it.   at_best : "pinned" and
+        "pageable" leave shorter ways out; :meth:`way` says which it is.
+        Raises EventDataError: no torch, no such device, no such way."""
+        reader = self._readers.on(device, at_best)
+        return self.finished_tensor(reader.read(self._buffer.size).reshape(self.shape), self._window_us[0])
+
+    def way(self, device: str | None = None, at_best: str = "interop") -> Way:
+        """How :meth:`tensor` goes to a device, and why no shorter way. Raises as :meth:`tensor`."""
+        return self._readers.on(device, at_best).way
 
     def __init__(self, card: CardEmulator, planes: int):
         self._card, self.shape = card, (planes, card.height, card.width)
@@ -72,6 +91,7 @@ class _Sink:
         refuse_too_large(card.gl, {"sink": size}, what, (card.width, card.height))
         self._buffer = card.gl.ctx.buffer(reserve=size)
         refuse_if_out_of_memory(card.gl, what)
+        self._readers = Readers(card.gl, self._buffer)
         self._window_us = (0, 1)
 
     def begin(self, t0_us: int, t1_us: int) -> None:
@@ -111,6 +131,7 @@ class _Sink:
         """Frees the buffer. Harmless when repeated."""
         if not self._card.gl.released:
             with self._card.gl.borrowed():
+                self._readers.release()
                 self._buffer.release()
 
 
@@ -128,6 +149,10 @@ class Voxels(_Sink):
     def finished(whole: np.ndarray, t0_us: int) -> np.ndarray:
         return whole.astype(np.float32) / np.float32(ONE)
 
+    @staticmethod
+    def finished_tensor(whole: Any, t0_us: int) -> Any:
+        return whole.float() / ONE
+
 
 class Counts(_Sink):
     """(2, H, W) int32: OFF and ON events."""
@@ -140,6 +165,10 @@ class Counts(_Sink):
     @staticmethod
     def finished(whole: np.ndarray, t0_us: int) -> np.ndarray:
         return whole.copy()
+
+    @staticmethod
+    def finished_tensor(whole: Any, t0_us: int) -> Any:
+        return whole
 
 
 class Latest(_Sink):
@@ -154,3 +183,8 @@ class Latest(_Sink):
     def finished(whole: np.ndarray, t0_us: int) -> np.ndarray:
         since = whole.astype(np.int64)
         return np.where(since > 0, since - 1 + t0_us, -1)
+
+    @staticmethod
+    def finished_tensor(whole: Any, t0_us: int) -> Any:
+        since = whole.long()
+        return (since - 1 + t0_us).masked_fill_(since <= 0, -1)

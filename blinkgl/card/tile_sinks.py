@@ -14,13 +14,14 @@ The sums are those of :mod:`blinkgl.card.sinks`: a tile has the numbers that a s
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from blinkgl.card.kernels import PIXELS_PER_GROUP, Kernels
 from blinkgl.card.memory import refuse_if_out_of_memory, refuse_too_large
 from blinkgl.card.sinks import Counts, Latest, Voxels, refuse_bins, refuse_window
+from blinkgl.card.tensors import Readers, Way
 from blinkgl.errors import EventDataError
 from blinkgl.events.emulator import MAX_SIDE
 
@@ -46,6 +47,7 @@ class TileSinks:
         refuse_too_large(gl, {"sinks": tiles * self._bytes}, what, (atlas.width, atlas.height))
         self._buffer, self._windows = gl.ctx.buffer(reserve=tiles * self._bytes), gl.ctx.buffer(reserve=8 * tiles)
         refuse_if_out_of_memory(gl, what)
+        self._readers = Readers(gl, self._buffer)
         self._window_us = np.zeros((tiles, 2), np.int64)  # no window: nothing is in it
 
     def begin(self, emulator: TileEsim, t0_us: int, t1_us: int) -> None:
@@ -96,6 +98,17 @@ class TileSinks:
         data = self._buffer.read(self._bytes, offset=tile * self._bytes)
         return self._kind.finished(np.frombuffer(data, np.int32).reshape(self.shape), int(self._window_us[tile, 0]))
 
+    def tensor(self, emulator: TileEsim, device: str | None = None) -> Any:
+        """The tile's window so far as a torch tensor of its own, as the kind's ``tensor`` has it. Raises
+        EventDataError: no torch, no such device, another atlas's emulator."""
+        tile, reader = self._tile(emulator), self._readers.on(device)
+        whole = reader.read(self._bytes, tile * self._bytes).reshape(self.shape)
+        return self._kind.finished_tensor(whole, int(self._window_us[tile, 0]))
+
+    def way(self, device: str | None = None) -> Way:
+        """How :meth:`tensor` goes to a device, and why no shorter way. Raises as :meth:`tensor`."""
+        return self._readers.on(device).way
+
     def _tile(self, emulator: TileEsim) -> int:
         if emulator.atlas is not self._atlas:
             raise EventDataError("not a tile of this atlas", where="emulator", value=emulator.tile)
@@ -105,5 +118,6 @@ class TileSinks:
         """Frees the buffers. Harmless when repeated."""
         if not self._atlas.gl.released:
             with self._atlas.gl.borrowed():
+                self._readers.release()
                 self._buffer.release()
                 self._windows.release()

@@ -136,6 +136,7 @@ def _opengl(backend: str, device: int) -> Iterator[Check]:
             yield _try(section, f"{name} target", lambda name=name: _draw_exactly(gl, name), driver)
         yield _try(section, "32F depth, reversed-Z", lambda: _draw_depth(gl), driver)
         yield _optional(_try(section, "compute shaders", lambda: _make_events(gl), driver))
+        yield _to_torch(gl, section)
         timer = _try(section, "timer queries", lambda: _time_a_draw(gl), "")
         yield _optional(timer)
 
@@ -152,6 +153,25 @@ def _make_events(gl) -> str:
     how = f"{' and '.join(soft)} in whole numbers: the card rounds otherwise" if soft else "arithmetic in hardware"
     limit = gl.ctx.info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"] / 2**20
     return f"ESIM's and V2E's events bit for bit, {how}; buffers up to {limit:.0f} MiB"
+
+
+def _to_torch(gl, section: str) -> Check:
+    """How tensors go from this context to torch; on the card only after a pattern was written and read."""
+    name = "tensors for torch"
+    if gl.is_software:  # torch takes seconds to import
+        return Check(section, name, "info", "in the processor's memory, where they are made")
+    from blinkgl.card.tensors import way_here
+
+    try:
+        way = way_here(gl)
+    except BlinkGLError as error:
+        return Check(section, name, "absent", error.problem, install("torch"))
+    except Exception as error:  # noqa: BLE001 - a broken torch; the line has to appear
+        return Check(section, name, "absent", " ".join(f"{type(error).__name__}: {error}".split())[:200])
+    if way.way == "interop":
+        return Check(section, name, "ok", "they stay on the card: CUDA reads what OpenGL writes")
+    lacks = "cuda-bindings" in way.why
+    return Check(section, name, "absent", f"over the bus, {way}", install("cuda-bindings") if lacks else "")
 
 
 _TRIANGLE = """#version 430 core

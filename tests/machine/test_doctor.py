@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import sys
+from types import SimpleNamespace
 
 import pytest
 
 from blinkgl import cli
+from blinkgl.card.tensors import Way
+from blinkgl.errors import EventDataError
 from blinkgl.gl import context as context_module, osmesa
 from blinkgl.machine import doctor
 from blinkgl.show.doctor import show
@@ -109,3 +112,38 @@ def test_shown_text_is_plain_when_piped(report, capsys):
     for check in report.checks:  # one check, one line
         assert any(check.name in line and check.value[:60] in line for line in shown.splitlines()), check
     assert "All required parts are there." in shown
+
+
+@pytest.mark.parametrize(
+    ("way", "status", "value", "remedy"),
+    [
+        (Way("interop"), "ok", "they stay on the card: CUDA reads what OpenGL writes", ""),
+        (
+            Way("pinned", "no cuda-bindings"),
+            "absent",
+            "over the bus, pinned: no cuda-bindings",
+            "cuda-bindings",
+        ),
+        (
+            Way("pageable", "torch sees no CUDA device"),
+            "absent",
+            "over the bus, pageable: torch sees no CUDA device",
+            "",
+        ),
+        (EventDataError("tensors need torch"), "absent", "tensors need torch", "torch"),
+        (OSError("libcudart"), "absent", "OSError: libcudart", ""),
+    ],
+)
+def test_how_tensors_go_to_torch(monkeypatch, way, status, value, remedy):
+    """Of a card's context; there is none here."""
+
+    def answer(gl):
+        if isinstance(way, Exception):
+            raise way
+        return way
+
+    monkeypatch.setattr("blinkgl.card.tensors.way_here", answer)
+    check = doctor._to_torch(SimpleNamespace(is_software=False), "OpenGL")
+    assert (check.status, check.value) == (status, value)
+    assert remedy in check.remedy and bool(check.remedy) == bool(remedy)
+    assert doctor._to_torch(SimpleNamespace(is_software=True), "OpenGL").status == "info"

@@ -97,6 +97,8 @@ def test_rows_of_card_and_processor(gl, tmp_path):
     """What is compared, beside something that differs."""
     found = gpu_pieces.Events.compared(gl, gpu_pieces.EsimConfig(), 24, 16, 0.3)
     assert found["numba"] == found["card"] > 100 and found["steps_that_differ"] == 0 and found["same_state"]
+    tensors = gpu_pieces.Tensors.measured(gl, 24, 16, 5, "pageable", 0.01)
+    assert tensors["same"] and tensors["way"] == "pageable" and tensors["samples_per_s"] > 0
     with gpu_pieces.create_context() as other:
         apart = gpu_pieces.Frames.apart(gl, other, 24, 16, "edges")
     assert apart["largest"] == apart["beyond"] == 0.0 and "llvmpipe" in apart["beside"]
@@ -107,6 +109,6 @@ def test_rows_of_card_and_processor(gl, tmp_path):
         gpu_pieces.Kernel.run(rows, options)
     finally:
         gpu_pieces.SMALL = before
-    assert len(rows.rows) == 8 and all(row["stay_steps_per_s"] > 0 for row in rows.rows)
+    assert len(rows.rows) == 16 and all(row["stay_steps_per_s"] > 0 for row in rows.rows)
     seen = {row["key"].split()[2]: row["events_per_step"] / (24 * 16) for row in rows.rows if "plain" in row["key"]}
     assert seen["0"] == 0 and seen["0.31"] == pytest.approx(0.31, rel=0.3) and seen["5"] == pytest.approx(5, rel=0.1)

@@ -303,6 +303,12 @@ class OptimConfig(Config):
         "whichever is nearer its end (counted over resumed parts; such a run does not repeat bit for bit); null: "
         "by steps alone",
     )
+    clock: Literal["wall", "processor"] = Field(
+        "wall",
+        description="what `minutes` are of: the time on the wall, or the processor time that this process uses, which "
+        "makes trainings equal on a machine that does other things, too (data must then be loaded by the process "
+        "itself)",
+    )
     lr: float = Field(2e-4, gt=0, le=1, description="peak learning rate")
     warmup: float = Field(0.05, ge=0, lt=1, description="share of the training that the rate rises over")
     cooldown: float = Field(0.4, ge=0, le=1, description="share of the training, its last, that the rate falls over")
@@ -361,6 +367,19 @@ class TrainConfig(Config):
         description="checkpoint whose weights training starts from (fine-tuning), or the name of a network that comes "
         "with the package",
     )
+
+    @rule("optim.clock", "data.workers", "data.train.*.workers", "data.train.*.online")
+    def _whose_time(clock, loaders, rendering, online):
+        if clock == "wall":
+            return
+        others = {"data.workers": loaders} | {
+            f"data.train.{k}.workers": n for k, (n, live) in enumerate(zip(rendering, online, strict=True)) if live
+        }
+        for where, n in others.items():
+            if n > 0:  # a child's time is known when it has ended
+                raise Refused(
+                    "optim.clock: processor knows this process's time alone", where=where, value=n, accepted="0"
+                )
 
 
 def load_train_config(

@@ -63,6 +63,10 @@ class TrainResult:
     loss: float
 
 
+CLOCKS = {"wall": time.monotonic, "processor": time.process_time}
+"""What ``optim.minutes`` are counted on, s, by ``optim.clock``."""
+
+
 def learning_rate(done: float, peak: float, warmup: float, cooldown: float) -> float:
     """The rate when a share ``done`` (0 … 1) of the training is over: linear from peak / 25 up to ``peak`` over its
     first ``warmup``, then ``peak``, and linear down to peak / 25e4 over its last ``cooldown``."""
@@ -114,13 +118,15 @@ def train(
     resume: bool = False,
     stop_after: int | None = None,
     quiet: bool = False,
-    clock: Callable[[], float] = time.monotonic,
+    clock: Callable[[], float] | None = None,
 ) -> TrainResult:
     """Trains to the end of ``config.optim.steps`` or ``minutes``. ``stop_after``: leave after this many steps of this
-    call, as a signal would. clock : seconds, of ``optim.minutes``.
+    call, as a signal would. clock : seconds, of ``optim.minutes``; None: the one that ``optim.clock`` names.
 
     Raises ConfigError, AssetError, EventDataError (data), OutputError (run folder exists), TrainingError (loss not
     finite: the batch's sample names are in ``nan_batch.json``)."""
+    if clock is None:
+        clock = CLOCKS[config.optim.clock]
     with contextlib.ExitStack() as stack:  # of what renders while it is trained on
         return _train(config, Path(out), stack, resume=resume, stop_after=stop_after, quiet=quiet, clock=clock)
 
@@ -198,7 +204,7 @@ def _train(
         _write_config(out, config)
     step, reason, began = start, None, time.monotonic()
     read = Readings(out)
-    course = Course(config.optim, clock(), spent, clock)
+    course, own = Course(config.optim, clock(), spent, clock), config.optim.clock == "processor"
     done = course.done(step, device, world)
     if done >= 1:
         sampler = StepSampler(mixture, config.data.batch, start, start, rank, world)
@@ -222,8 +228,9 @@ def _train(
             start,
             config.data.batch,
             enabled=lead and not quiet,
-            where=f"{device.type}, {precision}",
-            minutes=course.minutes_left(config.run.time_limit),
+            where=f"{device.type}, {precision}" + (", by processor time" if own else ""),
+            minutes=course.minutes_left(None if own else config.run.time_limit),  # a limit is the wall's
+            clock=CLOCKS[config.optim.clock],
         ) as progress,
     ):
         waiting = Waiting(batches(dataset, sampler, config.data.workers, pin=device.type == "cuda"))

@@ -108,7 +108,7 @@ def check_installation(bin_: Path, root: Path, elsewhere: Path) -> None:
     """They are there, and what compiles nothing works: kernels would be compiled anew for a minute and a half."""
     probe = check_resources(bin_, root, elsewhere)
     demo = root / next(root.glob("lib/python*/site-packages/blinkgl/configs/demo.yaml"))
-    assert "sequence" in run(bin_ / "blinkgl", "explain", demo, cwd=elsewhere)
+    assert "what is modelled" in run(bin_ / "blinkgl", "explain", demo, cwd=elsewhere)
     # a shader that includes another, compiled from where it was installed
     name = next(name for name, text in sorted(probe["shaders"].items()) if "#include" in text)
     run(

@@ -1,6 +1,7 @@
 """Networks at equal processor time: what is asked of which command, what is kept, and the table, without an hour of
 training."""
 
+import itertools
 import json
 from pathlib import Path
 from typing import ClassVar
@@ -9,7 +10,6 @@ import pytest
 
 pytest.importorskip("torch")
 
-import itertools
 
 from blinkgl.config.sequence import load_run
 from blinkgl.tools import network_tables as tables

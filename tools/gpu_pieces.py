@@ -346,7 +346,7 @@ def pipeline(
         renderer = Renderer(gl, probe_scene("tri/16", width, height), RenderConfig())
         emulator: Any
         if atlas is not None:
-            emulator = atlas.esim(EsimConfig())
+            emulator = atlas.emulator(EsimConfig())
         else:
             emulator = Esim(height, width) if how == "numba" else CardEsim(height, width, gl=gl)
         parts.append(

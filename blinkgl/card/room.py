@@ -25,7 +25,7 @@ class Buffers:
     `before` take turns.
 
     pixels : of all pictures.   sizes : bytes, besides those.   what, size : for messages, and width and height of the
-    picture.   more_counts : behind `counts`.
+    picture.   tiles : of a batch, whose cut events are counted behind `counts`.
     words : of 32 pixels, whole blocks.   capacity : events that `packed` holds.
     Raises GLError where the card has no room for them."""
 
@@ -36,15 +36,16 @@ class Buffers:
         sizes: dict[str, int],
         what: str,
         size: tuple[int, int],
-        more_counts: int = 0,
+        tiles: int = 0,
     ):
-        self._gl, self._pixels = gl, pixels
+        self._gl, self._pixels, self.tiles = gl, pixels, tiles
         self.padded = -(-pixels // BLOCK) * BLOCK
+        self.cuts_at = self.padded + PIXELS_PER_GROUP
         self.words, self.capacity = self.padded // WORD, max(BLOCK, self.padded // 4)
         sizes = {
             "marks": 4 * self.words,
             "listed": HEAD_BYTES + 8 * self.padded,
-            "counts": 4 * (self.padded + PIXELS_PER_GROUP + more_counts),
+            "counts": 4 * (self.cuts_at + tiles),
             "places": 4 * (self.padded + PIXELS_PER_GROUP),
             "sums": 4 * (self.words + PIXELS_PER_GROUP),
             "packed": 8 * self.capacity,
@@ -58,6 +59,7 @@ class Buffers:
             self.release()
             raise
         self.clear_head()
+        self.clear_cuts()
 
     def __getitem__(self, name: str) -> moderngl.Buffer:
         return self._buffers[name]
@@ -69,6 +71,15 @@ class Buffers:
 
     def clear_head(self) -> None:
         self._buffers["listed"].write(bytes(HEAD_BYTES))
+
+    def clear_cuts(self) -> None:
+        """No tile has had events cut."""
+        if self.tiles:
+            self._buffers["counts"].write(bytes(4 * self.tiles), 4 * self.cuts_at)
+
+    def cuts(self) -> np.ndarray:
+        """(tiles,) events that each has had cut."""
+        return np.frombuffer(self._buffers["counts"].read(4 * self.tiles, offset=4 * self.cuts_at), np.uint32)
 
     def bytes_per_pixel(self, name: str) -> int:
         """Of a buffer that has a value for every pixel."""
@@ -99,8 +110,7 @@ class Buffers:
 class Room(Buffers):
     """Those of an ESIM, or of several whose pixels follow each other.
 
-    spread, more : see :class:`~blinkgl.card.esim.CardEsim`.   tiles : of a batch, whose cut events are counted behind
-    `counts`."""
+    spread, more : see :class:`~blinkgl.card.esim.CardEsim`."""
 
     def __init__(
         self,
@@ -113,9 +123,7 @@ class Room(Buffers):
         more: bool,
         tiles: int = 0,
     ):
-        self.tiles = tiles
         padded = -(-pixels // BLOCK) * BLOCK
-        self.cuts_at = padded + PIXELS_PER_GROUP
         sizes = {
             "now": 4 * padded,
             "before": 4 * padded,
@@ -126,15 +134,5 @@ class Room(Buffers):
         }
         super().__init__(gl, pixels, sizes, what, size, tiles)
         self._buffers["levels"].write(np.tile(np.array([FAR, -FAR], np.int32), padded).tobytes())
-        self.clear_cuts()
         for name in ("now", "before"):
             self._buffers[name].write(np.ones(padded, np.float32).tobytes())
-
-    def clear_cuts(self) -> None:
-        """No tile has had events cut."""
-        if self.tiles:
-            self._buffers["counts"].write(bytes(4 * self.tiles), 4 * self.cuts_at)
-
-    def cuts(self) -> np.ndarray:
-        """(tiles,) events that each has had cut."""
-        return np.frombuffer(self._buffers["counts"].read(4 * self.tiles, offset=4 * self.cuts_at), np.uint32)

@@ -23,10 +23,9 @@ from blinkgl.card.memory import refuse_if_out_of_memory, refuse_too_large
 from blinkgl.card.sinks import Counts, Latest, Voxels, refuse_bins, refuse_window
 from blinkgl.card.tensors import Readers, Way
 from blinkgl.errors import EventDataError
-from blinkgl.events.emulator import MAX_SIDE
 
 if TYPE_CHECKING:
-    from blinkgl.card.atlas import Atlas, TileEsim
+    from blinkgl.card.tiles import Tile, Tiles
 
 
 class TileSinks:
@@ -34,7 +33,7 @@ class TileSinks:
     bins : of voxel grids.   shape : of what :meth:`read` gives.
     Raises EventDataError: bins out of range; GLError: not enough memory."""
 
-    def __init__(self, atlas: Atlas, kind: type[Voxels | Counts | Latest], bins: int = 5):
+    def __init__(self, atlas: Tiles, kind: type[Voxels | Counts | Latest], bins: int = 5):
         refuse_bins(bins)
         self._atlas, self._kind = atlas, kind
         planes = bins if kind is Voxels else 2
@@ -50,7 +49,7 @@ class TileSinks:
         self._readers = Readers(gl, self._buffer)
         self._window_us = np.zeros((tiles, 2), np.int64)  # no window: nothing is in it
 
-    def begin(self, emulator: TileEsim, t0_us: int, t1_us: int) -> None:
+    def begin(self, emulator: Tile, t0_us: int, t1_us: int) -> None:
         """A new window [t0_us, t1_us) of a tile, empty; its others go on. Raises EventDataError: no length, or over 17
         minutes; an emulator of another atlas."""
         tile = self._tile(emulator)
@@ -79,7 +78,7 @@ class TileSinks:
             "height": atlas.height,
             "pixels": atlas.height * atlas.width,
             "planes": self.shape[0],
-            "rows": MAX_SIDE - 1,
+            "rows": atlas.rows - 1,
             "bins": self.shape[0],
         }
         self._kernels.run(
@@ -91,14 +90,14 @@ class TileSinks:
             local=PIXELS_PER_GROUP,
         )
 
-    def read(self, emulator: TileEsim) -> np.ndarray:
+    def read(self, emulator: Tile) -> np.ndarray:
         """The tile's window so far, as the kind's ``read`` has it. Raises EventDataError: another atlas's emulator."""
         tile = self._tile(emulator)
         self._atlas.gl.resume()
         data = self._buffer.read(self._bytes, offset=tile * self._bytes)
         return self._kind.finished(np.frombuffer(data, np.int32).reshape(self.shape), int(self._window_us[tile, 0]))
 
-    def tensor(self, emulator: TileEsim, device: str | None = None) -> Any:
+    def tensor(self, emulator: Tile, device: str | None = None) -> Any:
         """The tile's window so far as a torch tensor of its own, as the kind's ``tensor`` has it. Raises
         EventDataError: no torch, no such device, another atlas's emulator."""
         tile, reader = self._tile(emulator), self._readers.on(device)
@@ -109,7 +108,7 @@ class TileSinks:
         """How :meth:`tensor` goes to a device, and why no shorter way. Raises as :meth:`tensor`."""
         return self._readers.on(device).way
 
-    def _tile(self, emulator: TileEsim) -> int:
+    def _tile(self, emulator: Tile) -> int:
         if emulator.atlas is not self._atlas:
             raise EventDataError("not a tile of this atlas", where="emulator", value=emulator.tile)
         return emulator.tile

@@ -38,7 +38,7 @@ from blinkgl.timeline import Timeline, make_timeline
 from blinkgl.timeline.reductions import OfArrays, Reductions
 
 if TYPE_CHECKING:
-    from blinkgl.card import Atlas
+    from blinkgl.card.tiles import Tiles
 
 SURFACES = LabelRequest("ids", "depth", "velocity")
 """Labels that say what made an event."""
@@ -112,7 +112,7 @@ class RenderedSequence(Simulation):
         renderer: Renderer | None,
         window_ns: tuple[int, int] | None,
         number: int = 0,
-        atlas: Atlas | None = None,
+        atlas: Tiles | None = None,
     ):
         self.number = number
         clock = StageClock()
@@ -147,7 +147,7 @@ class RenderedSequence(Simulation):
                     path,
                     _truth_of(self.sensor, config),
                     renderer.gl,
-                    None if atlas is None else atlas.esim(emulator, seed, path, size),
+                    None if atlas is None else atlas.emulator(emulator, seed, path, size),
                 )
                 response, dynamics = emulator_of(emulator).response(emulator), scene.dynamics
                 stops = dynamics.impacts_ns if dynamics is not None else ()

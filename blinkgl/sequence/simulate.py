@@ -40,7 +40,7 @@ from blinkgl.sequence.items import CameraImage, EventChunk, GroundTruth, Item, P
 from blinkgl.timeline import Ticks, Timeline
 
 if TYPE_CHECKING:
-    from blinkgl.card import Atlas
+    from blinkgl.card.tiles import Tiles
 
 
 def simulate_sequence(
@@ -55,7 +55,7 @@ def simulate_sequence(
     scene: Scene | None = None,
     renderer: Renderer | None = None,
     window_ns: tuple[int, int] | None = None,
-    atlas: Atlas | None = None,
+    atlas: Tiles | None = None,
 ) -> Simulation:
     """Sequence ``index`` of a run, ready to be iterated over: :class:`EventChunk`, :class:`GroundTruth`,
     :class:`CameraImage` and :class:`Picture` in time order.

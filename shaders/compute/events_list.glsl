@@ -16,9 +16,7 @@ layout(std430, binding = 4) readonly restrict buffer Farthest { uint farthest[];
 layout(std430, binding = 5) readonly restrict buffer Shots { uvec4 shots[]; };
 uniform uint room;
 #endif
-uniform uint share;
-uniform uint bound; // from the dead time
-uniform uvec2 inverse_threshold; // double
+#include "v2e_tiles.glsl"
 
 uint limit_of(uint block, uint count)
 {

@@ -4,6 +4,7 @@
 // many candidates are drawn in a go, and it is run until there are none left.
 #include "events.glsl"
 #include "v2e.glsl"
+#include "v2e_tiles.glsl"
 layout(local_size_x = 64) in;
 
 layout(std430, binding = 0) restrict buffer Heads { Head head; };
@@ -12,25 +13,23 @@ layout(std430, binding = 2) writeonly restrict buffer Farthest { uint farthest[]
 #ifdef SHOTS
 layout(std430, binding = 3) restrict buffer Shots { uvec4 shots[]; }; // of each block: how many, and as many as there is
     // room for: ns << 1 | polarity in two words, number of the pixel's next one
+#ifdef BATCH
+layout(std430, binding = 5) restrict buffer Both { uint both[]; };
+#else
 layout(std430, binding = 4) readonly restrict buffer Before { uint before[]; };
 layout(std430, binding = 5) restrict buffer Now { uint now[]; };
+#endif
 layout(std430, binding = 6) readonly restrict buffer Table { uint table[]; };
 #endif
 uniform uint blocks;
 #ifdef SHOTS
 uniform uint padded; // pixels, whole blocks: the length of a plane
-uniform uint pixels;
+uniform uint pixels; // of a picture
 uniform uint room; // for events of a block
 uniform bool goes_on; // not the first go
 uniform bool last; // the last one
-uniform uvec2 start; // of the interval, ns
-uniform uvec2 dt_ns;
-uniform uvec2 dt_whole; // the same, a double
-uniform uvec2 seed;
-uniform uvec2 shot_unit; // double: events per ns of a dark pixel with nominal thresholds, one polarity
-uniform uint scale;
 const uint ENTRIES = 2048u, GO = 128u, NONE = 0xFFFFFFFFu;
-#define CLOCK(K) (goes_on ? now[clock + K] : before[clock + K])
+#define CLOCK(K) (goes_on ? NOW_AT(clock + K) : BEFORE_AT(clock + K))
 
 DOUBLE uniform_at(uint block, uvec2 index, bool second)
 {
@@ -45,6 +44,13 @@ void main()
     if (block >= blocks) {
         return;
     }
+#ifdef BATCH
+    uint own = 1024u * block;
+    enter(own);
+    own /= 1024u;
+#else
+    uint own = block;
+#endif
 #ifdef SHOTS
     uint clock = PLANES * padded + 4u * block, first = (room + 1u) * block + 1u, count = goes_on ? shots[first - 1u].x : 0u;
     uvec2 after = sub64(uvec2(CLOCK(0u), CLOCK(1u)), start), index = uvec2(CLOCK(2u), CLOCK(3u));
@@ -57,27 +63,33 @@ void main()
         farthest[block] = 0u;
     }
 #ifdef SHOTS
+#ifdef BATCH
+    if (here.fires == 0u) { // its clock stands still
+        shots[first - 1u] = uvec4(0u);
+        return;
+    }
+#endif
     DOUBLE whole = widened(FLOAT_OF(table[ENTRIES * block + ENTRIES - 1u]));
     DOUBLE rate = mul_double(DOUBLE_OF(shot_unit), whole);
     for (uint turn = 0u; turn < GO && (int(after.y) < 0 || at_least64(dt_ns, after)); ++turn) {
         uvec2 twice = left64(index, 1u), odd = twice | uvec2(1u, 0u);
-        DOUBLE gap = div_double(negative(log_double(uniform_at(block, twice, false))), rate);
+        DOUBLE gap = div_double(negative(log_double(uniform_at(own, twice, false))), rate);
         if (less_double(D_MOST_NS, gap)) {
             gap = D_MOST_NS;
         }
-        DOUBLE pick = uniform_at(block, twice, true), accept = uniform_at(block, odd, false);
+        DOUBLE pick = uniform_at(own, twice, true), accept = uniform_at(own, odd, false);
         uint weight = BITS_OF(narrowed(mul_double(pick, whole))), place = 0u;
         for (uint reach = ENTRIES / 2u; reach > 0u; reach >>= 1) { // how many entries are <= weight
             place += table[ENTRIES * block + place + reach - 1u] <= weight ? reach : 0u;
         }
         uint offset = place & 1023u, pixel = 1024u * block + offset;
-        if (pixel < pixels) {
+        if (1024u * own + offset < pixels) {
             uvec2 ns = int(after.y) < 0 ? uvec2(0u) : after;
-            FLOAT light = FLOAT_OF(before[LIGHT * padded + pixel]);
-            FLOAT change = sub_float(mul_float(FLOAT_OF(now[FRAME * padded + pixel]), FLOAT_OF(scale)), light);
+            FLOAT light = FLOAT_OF(BEFORE_AT(LIGHT * padded + pixel));
+            FLOAT change = sub_float(mul_float(FLOAT_OF(NOW_AT(FRAME * padded + pixel)), FLOAT_OF(scale)), light);
             DOUBLE part = div_double(DOUBLE_OF(double_of(ns)), DOUBLE_OF(dt_whole));
-            DOUBLE here = add_double(widened(light), mul_double(widened(change), part));
-            DOUBLE level = div_double(add_double(here, D_TWENTY), D_SPAN); // > 0
+            DOUBLE lit = add_double(widened(light), mul_double(widened(change), part));
+            DOUBLE level = div_double(add_double(lit, D_TWENTY), D_SPAN); // > 0
             if (less_double(ONE_DOUBLE, level)) {
                 level = ONE_DOUBLE;
             }
@@ -87,11 +99,11 @@ void main()
                     uint word = WORD * block + offset / WORD, bit = 1u << (offset & 31u);
                     if ((marks[word] & bit) == 0u) {
                         marks[word] |= bit;
-                        now[FIRST_SHOT * padded + pixel] = count;
+                        NOW_AT(FIRST_SHOT * padded + pixel) = count;
                     } else {
-                        shots[first + now[LAST_SHOT * padded + pixel]].z = count;
+                        shots[first + NOW_AT(LAST_SHOT * padded + pixel)].z = count;
                     }
-                    now[LAST_SHOT * padded + pixel] = count;
+                    NOW_AT(LAST_SHOT * padded + pixel) = count;
                     shots[first + count] = uvec4(left64(ns, 1u) | uvec2(uint(place < 1024u), 0u), NONE, 0u);
                 }
                 count += 1u;
@@ -105,9 +117,9 @@ void main()
     }
     shots[first - 1u] = uvec4(count, 0u, 0u, 0u);
     after = add64(after, start);
-    now[clock] = after.x;
-    now[clock + 1u] = after.y;
-    now[clock + 2u] = index.x;
-    now[clock + 3u] = index.y;
+    NOW_AT(clock) = after.x;
+    NOW_AT(clock + 1u) = after.y;
+    NOW_AT(clock + 2u) = index.x;
+    NOW_AT(clock + 3u) = index.y;
 #endif
 }

@@ -4,12 +4,18 @@
 // LOW_PASS, LEAKS, LEAK_JITTER, SHOTS, HUMS, DEAD_TIME, CAUSES: what the configuration asks for.
 #include "events.glsl"
 #include "v2e.glsl"
+#include "v2e_tiles.glsl"
 layout(local_size_x = 256) in;
 
 layout(std430, binding = 0) restrict buffer Listed { Head head; uvec2 listed[]; };
 layout(std430, binding = 1) restrict buffer Counts { uint counts[]; };
+#ifdef BATCH
+layout(std430, binding = 2) readonly restrict buffer Both { uint both[]; };
+uniform uint cuts_at; // in Counts: where the tiles' cut events are counted
+#else
 layout(std430, binding = 2) readonly restrict buffer Now { uint now[]; };
 layout(std430, binding = 3) readonly restrict buffer Before { uint before[]; };
+#endif
 layout(std430, binding = 4) restrict buffer State { uint state[]; };
 #ifdef SHOTS
 layout(std430, binding = 5) readonly restrict buffer Shots { uvec4 shots[]; };
@@ -22,19 +28,8 @@ uniform uint capacity;
 #endif
 uniform uint padded;
 uniform uint width;
-uniform uint start_ns; // of the interval, after a whole microsecond
-uniform uvec2 start;
-uniform uvec2 dt_ns;
-uniform uvec2 dt_whole; // the same, a double
-uniform uvec2 dt_s; // doubles from here on
-uniform uvec2 kappa_double;
-uniform uvec2 since_0;
-uniform uvec2 since_1;
-uniform uvec2 leak_jitter;
-uniform uvec2 refractory_ns; // whole
-uniform uvec2 seed;
-#define BEFORE(PLANE) widened(FLOAT_OF(before[PLANE * padded + pixel]))
-#define NOW(PLANE) widened(FLOAT_OF(now[PLANE * padded + pixel]))
+#define BEFORE(PLANE) widened(FLOAT_OF(BEFORE_AT(PLANE * padded + pixel)))
+#define NOW(PLANE) widened(FLOAT_OF(NOW_AT(PLANE * padded + pixel)))
 #define STATE(PLANE) widened(FLOAT_OF(state[PLANE * padded + pixel]))
 #define TIME(PLANE) uvec2(state[PLANE * padded + pixel], state[(PLANE + 1u) * padded + pixel])
 #define DOUBLE_ZERO DOUBLE_OF(ZERO)
@@ -81,7 +76,11 @@ void main()
     }
     uint at = offsets[k];
 #endif
-    uint pixel = listed[k].x, limit = listed[k].y, alive = 0u;
+    uint pixel = listed[k].x, limit = listed[k].y, alive = 0u, own = pixel, row = 0u; // in its picture; its first row
+#ifdef BATCH
+    uint tile = enter(own);
+    row = tile * height;
+#endif
     uvec2 after = uvec2(0u);
 #ifdef DEAD_TIME
     bool asleep = state[UPPER * padded + pixel] == 0xFF800000u;
@@ -143,9 +142,9 @@ void main()
     }
 #endif
 #ifdef SHOTS
-    uint shots_at = (room + 1u) * (pixel / 1024u) + 1u, shot = now[FIRST_SHOT * padded + pixel];
+    uint shots_at = (room + 1u) * (pixel / 1024u) + 1u, shot = NOW_AT(FIRST_SHOT * padded + pixel);
 #endif
-    uint y = pixel / width, word = (y << 17) | ((pixel - y * width) << 1), upper_word = y >> 15;
+    uint y = own / width + row, word = (y << 17) | ((own % width) << 1), upper_word = y >> 15;
     bool dead = false;
     for (;;) {
         bool above = !less_double(z.end, up), fires = above || !less_double(down, z.end), positive = above, by_noise = false;
@@ -202,7 +201,7 @@ void main()
 #endif
         alive += 1u;
 #ifdef LEAK_JITTER
-        DOUBLE spread = mul_double(DOUBLE_OF(leak_jitter), rough_normal(pixel, t_ns(at_ns)));
+        DOUBLE spread = mul_double(DOUBLE_OF(leak_jitter), rough_normal(own, t_ns(at_ns)));
         spread = add_double(ONE_DOUBLE, spread);
         if (!less_double(D_TENTH, spread)) {
             spread = D_TENTH;
@@ -262,6 +261,9 @@ void main()
     counts[k] = min(alive, limit);
     if (alive > limit) {
         atomicAdd(head.cut, alive - limit);
+#ifdef BATCH
+        atomicAdd(counts[cuts_at + tile], alive - limit);
+#endif
     }
 #endif
 }

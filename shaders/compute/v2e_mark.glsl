@@ -4,34 +4,32 @@
 // Before and State are numbered by blinkgl/card/v2e.py.
 #include "events.glsl"
 #include "v2e.glsl"
+#include "v2e_tiles.glsl"
 layout(local_size_x = 256) in;
 
+#ifdef BATCH
+layout(std430, binding = 1) restrict buffer Both { uint both[]; };
+#else
 layout(std430, binding = 1) restrict buffer Now { uint now[]; };
 layout(std430, binding = 2) readonly restrict buffer Before { uint before[]; };
+#endif
 layout(std430, binding = 3) readonly restrict buffer State { uint state[]; };
 layout(std430, binding = 4) restrict buffer Marks { uint marks[]; };
 layout(std430, binding = 5) restrict buffer Farthest { uint farthest[]; };
 layout(std430, binding = 6) restrict buffer Heads { Head head; };
 #ifdef HUMS
 layout(std430, binding = 7) readonly restrict buffer Sizes { uint sizes[]; };
-uniform uvec2 seed;
-uniform uint number; // of the frame
 #endif
 uniform uint padded;
-uniform uint pixels;
+uniform uint pixels; // of a picture
 uniform uint limit; // bits of the largest value; those of negative numbers, infinities and NaN are larger
-uniform uint scale;
-uniform uint since; // float: seconds from the leak's epoch to the frame
-uniform uint kappa; // float
-uniform uint second_keep;
-uniform uint second_ramp;
-#define BEFORE(PLANE) FLOAT_OF(before[PLANE * padded + pixel])
+#define BEFORE(PLANE) FLOAT_OF(BEFORE_AT(PLANE * padded + pixel))
 #define STATE(PLANE) FLOAT_OF(state[PLANE * padded + pixel])
-#define PUT(PLANE, VALUE) now[PLANE * padded + pixel] = BITS_OF(VALUE)
+#define PUT(PLANE, VALUE) NOW_AT(PLANE * padded + pixel) = BITS_OF(VALUE)
 const uint INFINITE = 0x7F800000u;
 
 #ifdef HUMS
-FLOAT next_noise(uint pixel, FLOAT noise, FLOAT k)
+FLOAT next_noise(uint pixel, uint tile, FLOAT noise, FLOAT k)
 {
     DOUBLE first, second;
     normal2(seed, pixel / 2u, NOISE_STREAM, number, first, second); // two pixels share a draw
@@ -40,8 +38,8 @@ FLOAT next_noise(uint pixel, FLOAT noise, FLOAT k)
     FLOAT place = mul_float(sub_float(log_float(least), F_TABLE_LOW), F_TABLE_PER);
     place = less_float(F_TABLE_LAST, place) ? F_TABLE_LAST : place;
     int below = less_float(place, F_ZERO) ? 0 : whole_of_float(BITS_OF(place));
-    FLOAT part = sub_float(place, float_of(below)), size = FLOAT_OF(sizes[below]), keep, ramp;
-    size = add_float(size, mul_float(part, sub_float(FLOAT_OF(sizes[below + 1]), size)));
+    FLOAT part = sub_float(place, float_of(below)), size = FLOAT_OF(sizes[256u * tile + uint(below)]), keep, ramp;
+    size = add_float(size, mul_float(part, sub_float(FLOAT_OF(sizes[256u * tile + uint(below) + 1u]), size)));
     decay(k, keep, ramp);
     FLOAT fresh = sqrt_float(sub_float(F_ONE, mul_float(keep, keep)));
     return add_float(mul_float(noise, keep), mul_float(mul_float(size, fresh), normal));
@@ -50,11 +48,20 @@ FLOAT next_noise(uint pixel, FLOAT noise, FLOAT k)
 
 void main()
 {
-    uint pixel = gl_GlobalInvocationID.x;
-    if (pixel >= pixels) {
+    uint pixel = gl_GlobalInvocationID.x, own = pixel, tile = 0u; // in its picture
+#ifdef BATCH
+    if (pixel >= padded) {
         return;
     }
-    uint seen = now[FRAME * padded + pixel];
+    tile = enter(own);
+    if (here.fires == 0u) {
+        return;
+    }
+#endif
+    if (own >= pixels) {
+        return;
+    }
+    uint seen = NOW_AT(FRAME * padded + pixel);
 #ifdef CHECKED
     if (seen > limit && seen != 0x80000000u) {
         atomicOr(head.unusable, 1u);
@@ -84,7 +91,7 @@ void main()
     z = add_float(z, mul_float(STATE(LEAK), FLOAT_OF(since)));
 #endif
 #ifdef HUMS
-    FLOAT noise = next_noise(pixel, BEFORE(NOISE), k);
+    FLOAT noise = next_noise(own, tile, BEFORE(NOISE), k);
     PUT(NOISE, noise);
     z = add_float(z, noise);
 #endif
@@ -100,7 +107,7 @@ void main()
         uint marked = atomicOr(marks[pixel / WORD], 1u << (pixel & 31u));
 #ifdef SHOTS
         if ((marked >> (pixel & 31u) & 1u) == 0u) {
-            now[FIRST_SHOT * padded + pixel] = 0xFFFFFFFFu; // it has no noise
+            NOW_AT(FIRST_SHOT * padded + pixel) = 0xFFFFFFFFu; // it has no noise
         }
 #endif
         atomicMax(farthest[pixel / 1024u], beyond);

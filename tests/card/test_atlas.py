@@ -49,7 +49,7 @@ def in_turn(emulators, given):
 @pytest.mark.parametrize("given", ["arrays", "textures"])
 def test_each_has_the_events_that_it_has_alone(gl, given, late):
     with Atlas(gl, *SIZE, 6, jitter=True, refractory=True, late=late) as atlas:
-        emulators = [atlas.esim(config, 3 + k) for k, config in enumerate(CONFIGS)]
+        emulators = [atlas.emulator(config, 3 + k) for k, config in enumerate(CONFIGS)]
         sequences = list(clips(len(CONFIGS)))
         frames = [(textures(gl, clip) if given == "textures" else clip, times) for clip, times in sequences]
         found = in_turn(emulators, frames)
@@ -69,9 +69,9 @@ def test_nobody_has_to_keep_step(gl):
     sequences = list(clips(3, 8, 0))
     wanted = [run(Esim(*SIZE, CONFIGS[1], k), *one) for k, one in enumerate(sequences)]
     with Atlas(gl, *SIZE, 2, spread=False) as atlas:
-        a, b = atlas.esim(CONFIGS[1], 0), atlas.esim(CONFIGS[1], 1)
+        a, b = atlas.emulator(CONFIGS[1], 0), atlas.emulator(CONFIGS[1], 1)
         with pytest.raises(EventDataError, match=r"^tiles: every tile is in use \(got 2\); expected release one"):
-            atlas.esim(CONFIGS[1], 2)
+            atlas.emulator(CONFIGS[1], 2)
         capacity, parts = atlas.room.capacity, [[], [], []]
         step = lambda emulator, k, n: parts[k].append(emulator.step(sequences[k][0][n], int(sequences[k][1][n])))
         for n in range(3):
@@ -81,7 +81,7 @@ def test_nobody_has_to_keep_step(gl):
         parts[1].append(b.flush())
         b.release()
         b.release()
-        c = atlas.esim(CONFIGS[1], 2)
+        c = atlas.emulator(CONFIGS[1], 2)
         assert c.tile == b.tile
         for n in range(8):
             step(c, 2, n)
@@ -94,7 +94,7 @@ def test_nobody_has_to_keep_step(gl):
         wild = np.exp(np.random.default_rng(0).normal(0, 3, (2, *SIZE))).astype(np.float32)
         long = [0, 5_000_000_000]
         a.release()
-        d = atlas.esim(CONFIGS[4], 9)
+        d = atlas.emulator(CONFIGS[4], 9)
         for n in range(2):
             c.step(wild[n], int(sequences[2][1][-1]) + 1 + n)
             d.step(wild[n], long[n])
@@ -108,7 +108,7 @@ def test_a_frame_that_cannot_be_used_is_its_own_sequences_trouble(gl, late):
     bad = good[1][0][2].copy()
     bad[3, 4] = np.inf
     with Atlas(gl, *SIZE, 3, late=late) as atlas:
-        emulators = [atlas.esim(CONFIGS[0], k) for k in range(3)]
+        emulators = [atlas.emulator(CONFIGS[0], k) for k in range(3)]
         shown = [textures(gl, clip) for clip, _ in good]
         (wrong,) = textures(gl, [bad])
         parts = [[], [], []]
@@ -135,20 +135,20 @@ def test_what_a_batch_does_not_do(gl):
     with Atlas(gl, 8, 8, 2, spread=False) as atlas:
         for key, value in (("threshold_sigma", 0.03), ("threshold_jitter", 0.1), ("refractory_us", 5.0)):
             with pytest.raises(EventDataError, match=rf"^events\.{key}: the batch was made without it"):
-                atlas.esim(EsimConfig(**{"threshold_sigma": 0.0, key: value}))
-        one = atlas.esim(EsimConfig(threshold_sigma=0.0))
+                atlas.emulator(EsimConfig(**{"threshold_sigma": 0.0, key: value}))
+        one = atlas.emulator(EsimConfig(threshold_sigma=0.0))
         one.step(np.ones((8, 8), np.float32), 0)
         one.step(np.full((8, 8), 3, np.float32), 10)
         for wrong in (one.state_dict, lambda: one.load_state_dict({}), lambda: one.advance(np.ones((8, 8)), 20)):
             with pytest.raises(EventDataError):
                 wrong()
         for arguments, said in (
-            ((V2eConfig(),), r"^events\.emulator: this emulator has no kernel for the card \(got 'v2e'\)"),
+            ((V2eConfig(),), r"^events\.emulator: the batch is of another emulator \(got 'v2e'\); expected esim"),
             ((EsimConfig(), 0, "pchip"), r"^timeline\.reconstruction: the card follows straight lines"),
             ((EsimConfig(), 0, "linear", (8, 9)), r"^camera: sequences of a batch are of one size .*8, 9"),
         ):
             with pytest.raises(EventDataError, match=said):
-                atlas.esim(*arguments)
+                atlas.emulator(*arguments)
     with pytest.raises(EventDataError, match=r"^tiles: so many sequences of 8x4096 .*got 17\); expected 1 to 16"):
         Atlas(gl, 4096, 8, 17)
 
@@ -178,7 +178,7 @@ def test_whole_sequences_side_by_side(gl, tmp_path):
         made = side_by_side((simulate_sequence(config, n, gl, atlas=atlas) for n in range(2)), 2)
         next(made)
         made.close()
-        assert atlas.esim(config.events).tile == 0, "closed, so that its tile is free again"
+        assert atlas.emulator(config.events).tile == 0, "closed, so that its tile is free again"
     for number in range(3):
         assert_same(Events.concatenate(together[number][0]), Events.concatenate(alone[number][0]))
         assert together[number][1] == alone[number][1] and len(alone[number][1]) == 3

@@ -262,3 +262,25 @@ def test_large_pictures(gl, size, seed, variant):
         frame = np.exp(rng.normal(-1, 0.7, size) * (rng.random(size) < density)).astype(np.float32)
         assert_same(card.step(frame, k * 10**6), fast.step(frame, k * 10**6))
     card.release()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["default", "noisy"])
+def test_a_hundred_million_events(gl, variant):
+    """Dense ones, with a restart on the other device among them: no step differs, nor does the state."""
+    size, rng = (480, 640), np.random.default_rng(5)
+    config = V2eConfig(**VARIANTS[variant], contrast_threshold=0.04, threshold_sigma=0.004)
+    frames = [np.exp(rng.uniform(-3, 0, size)).astype(np.float32) for _ in range(3)]
+    fast, card = V2e(*size, config, 4), CardV2e(*size, config, 4, gl=gl)
+    count, k = 0, 0
+    while count < 10**8:
+        a, b = (one.step(frames[k % 3], k * 10**7) for one in (fast, card))
+        assert_same(b, a)
+        count, k = count + len(a), k + 1
+        if k == 4:
+            states = fast.state_dict(), card.state_dict()
+            fast.load_state_dict(states[1])
+            card.load_state_dict(states[0])
+    assert k > 6
+    assert_same_state(fast, card)
+    card.release()

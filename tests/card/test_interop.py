@@ -353,7 +353,10 @@ def test_tiles_give_tensors(gl, cuda_of, monkeypatch):
     monkeypatch.setattr(tensors, "_device", lambda name, gl: device)
     frames, times = random_clip(3, frames=4, height=24, width=40)
     with Atlas(gl, 24, 40, tiles=2) as atlas:
-        sink, tiles = TileSinks(atlas, Latest), [atlas.esim(EsimConfig(contrast_threshold=c), 1) for c in (0.1, 0.3)]
+        sink, tiles = (
+            TileSinks(atlas, Latest),
+            [atlas.emulator(EsimConfig(contrast_threshold=c), 1) for c in (0.1, 0.3)],
+        )
         for tile in tiles:
             sink.begin(tile, int(times[0]) // 1000 + 500, int(times[-1]) // 1000)
         for frame, t in zip(frames, times, strict=True):

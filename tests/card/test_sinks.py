@@ -104,7 +104,7 @@ def test_tiles_have_what_each_has_alone(gl, late):
     windows = [(int(t[1]) // 1000 + 301 * k, int(t[4]) // 1000 + 77) for k, (_, t) in enumerate(clips)]
     with Atlas(gl, H, W, tiles=5, late=late) as atlas:
         sinks = {name: TileSinks(atlas, kind, bins) for name, (kind, bins) in kinds.items()}
-        tiles = [atlas.esim(config, 7 + k) for k, config in enumerate(configs)]
+        tiles = [atlas.emulator(config, 7 + k) for k, config in enumerate(configs)]
         for sink in sinks.values():
             for tile, window in zip(tiles, windows, strict=True):
                 sink.begin(tile, *window)
@@ -140,7 +140,7 @@ def test_tiles_have_what_each_has_alone(gl, late):
         with pytest.raises(EventDataError, match=r"^bins: "):
             TileSinks(atlas, Voxels, 0)
         with Atlas(gl, H, W, tiles=1) as other, pytest.raises(EventDataError, match=r"^emulator: not a tile of this"):
-            sinks["counts"].begin(other.esim(CONFIG), 0, 1)
+            sinks["counts"].begin(other.emulator(CONFIG), 0, 1)
         for sink in sinks.values():
             sink.release()
             sink.release()
@@ -153,7 +153,7 @@ def test_a_tile_without_a_window_and_a_frame_that_is_none(gl):
     bad[3, 4] = np.nan
     (wrong,) = textures(gl, [bad])
     with Atlas(gl, H, W, tiles=3) as atlas:
-        sink, tiles = TileSinks(atlas, Counts), [atlas.esim(CONFIG, seed) for seed in range(3)]
+        sink, tiles = TileSinks(atlas, Counts), [atlas.emulator(CONFIG, seed) for seed in range(3)]
         for tile in tiles[:2]:
             sink.begin(tile, int(times[1]) // 1000 + 1, 2**30)
         for k in range(3):

@@ -1,11 +1,12 @@
 """ESIM and V2E by compute shaders against the numba kernels, and what the shaders move in memory.
 
-    python -m blinkgl.tools.bench_card [--quick] [--traffic] [--only v2e]
+    python -m blinkgl.tools.bench_card [--quick] [--traffic] [--only v2e] [--batches]
 
 Processor time of numba's kernel, the card's, the card's given frames that lie there already, and that one with the sort
 and the read-back one frame late that graphics cards have: in turns, frame by frame, on `bench_events`' clips and on a
 still picture; the events of all are compared. On OpenGL that the processor draws, this is the price of the detour; for
-a graphics card there is ``gpu_suite``. ``--traffic``: no measurement, but a table computed from the sizes of the
+a graphics card there is ``gpu_suite``. ``--batches``: 1, 4 and 8 small sequences at once, as tiles of a kernel, with a
+kernel each, and by numba, instead. ``--traffic``: no measurement, but a table computed from the sizes of the
 buffers: bytes per pixel and frame and per pixel that fires, and what a card of a given memory bandwidth makes of them
 at most.
 """
@@ -13,15 +14,17 @@ at most.
 from __future__ import annotations
 
 import argparse
+import itertools
 import time
 from typing import Any
 
 import numba
 import numpy as np
 
+from blinkgl.card import Atlas, AtlasV2e
 from blinkgl.card.choice import CARDS as KERNELS
 from blinkgl.config.events import EmulatorConfig, EsimConfig, V2eConfig
-from blinkgl.events import Events
+from blinkgl.events import Esim, Events, V2e
 from blinkgl.events.table import emulator_of
 from blinkgl.gl import GLContext, create_context
 from blinkgl.machine import bench
@@ -60,8 +63,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="fewer frames")
     parser.add_argument("--traffic", action="store_true", help="the computed table alone")
+    parser.add_argument("--batches", action="store_true", help="small sequences at once, instead")
     parser.add_argument("--only", default="", help="kernels of these letters alone")
     arguments = parser.parse_args()
+    if arguments.batches:
+        with create_context() as gl:
+            batches(gl)
+        return
     if not arguments.traffic:
         with create_context() as gl:
             measure(gl, 12 if arguments.quick else 40, arguments.only)
@@ -113,6 +121,43 @@ def measure(gl: GLContext, frames: int, only: str) -> None:
             per_pixel = sum(map(len, made[0][4:])) / frames / pictures[0].size
             figures = f"{per_pixel:.3f} | {mine:.2f} | {card:.2f} | {card / mine:.2f} | {textures:.2f} | {late:.2f}"
             print(f"| {name} | {variant} | {figures} |", flush=True)
+
+
+def batches(gl: GLContext, frames: int = 30) -> None:
+    """Prints processor ms a frame and sequence, in turns, median over ``frames``; events are read back and sorted."""
+    numba.set_num_threads(1)
+    print(bench.machine_line(f"{gl.renderer}"))
+    print("| size | kernel | sequences | events per pixel and frame | batch, ms | a kernel each, ms | numba, ms |")
+    print("|---|---|---|---|---|---|---|")
+    for height, width in ((128, 128), (260, 346)):
+        moving = np.random.default_rng(0).random((height, width)) < 0.1
+        clip = [np.exp(0.3 * np.sin(0.9 * k) * moving - 1.0).astype(np.float32) for k in range(8)]
+        textures = [gl.ctx.texture((width, height), 1, frame.tobytes(), dtype="f4") for frame in clip]
+        for (kind, batch), count in itertools.product({Esim: Atlas, V2e: AtlasV2e}.items(), (1, 4, 8)):
+            atlas, config = batch(gl, height, width, count), kind.Config()
+            ways: dict[str, list[Any]] = {
+                "batch": [atlas.emulator(config, seed) for seed in range(count)],
+                "each": [KERNELS[kind](height, width, config, seed, gl=gl, late=False) for seed in range(count)],
+                "numba": [kind(height, width, config, seed) for seed in range(count)],
+            }
+            spent, made = ({name: [] for name in ways} for _ in range(2))
+            for k, (name, emulators) in itertools.product(range(frames + 4), ways.items()):
+                frame = (clip if name == "numba" else textures)[k % 8]
+                started = time.process_time()
+                made[name].append(sum(len(one.step(frame, k * 1_000_000)) for one in emulators))
+                gl.ctx.finish()
+                spent[name] += [1e3 * (time.process_time() - started) / count] if k >= 4 else []
+            made["batch"].append(sum(len(one.flush()) for one in ways["batch"]))
+            if not sum(made["batch"]) == sum(made["each"]) == sum(made["numba"]):
+                raise SystemExit(f"{kind.__name__}: other events")
+            density = sum(made["numba"]) / (frames + 4) / count / clip[0].size
+            figures = " | ".join(f"{np.median(spent[name]):.2f}" for name in ways)
+            print(f"| {width}x{height} | {config.emulator} | {count} | {density:.3f} | {figures} |", flush=True)
+            for one in ways["each"]:
+                one.release()
+            atlas.release()
+        for texture in textures:
+            texture.release()
 
 
 def traffic() -> None:

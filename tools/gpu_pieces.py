@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from blinkgl.card import Atlas, CardEsim, Voxels
+from blinkgl.card import Atlas, AtlasV2e, CardEsim, CardV2e, Voxels
 from blinkgl.card.choice import CARDS as KERNELS
 from blinkgl.card.reductions import OfTextures
 from blinkgl.card.tensors import WAYS, way_here
@@ -340,13 +340,16 @@ def pipeline(
     """(frame of ``count`` sequences drawn in turn and made events of, the end): the function returns the events.
 
     how : "voxels", all stays on the card; "events", they are read back; "batch", read back, the sequences being tiles
-    of one kernel; "numba", frames are read back."""
-    parts, atlas = [], Atlas(gl, height, width, count) if how == "batch" else None
+    of one kernel; "v2e" and "v2e batch", the same of V2E; "numba", frames are read back."""
+    batch: Any = {"batch": Atlas, "v2e batch": AtlasV2e}.get(how)
+    parts, atlas = [], None if batch is None else batch(gl, height, width, count)
     for k in range(count):
         renderer = Renderer(gl, probe_scene("tri/16", width, height), RenderConfig())
         emulator: Any
         if atlas is not None:
-            emulator = atlas.emulator(EsimConfig())
+            emulator = atlas.emulator(V2eConfig() if how == "v2e batch" else EsimConfig())
+        elif how == "v2e":
+            emulator = CardV2e(height, width, gl=gl)
         else:
             emulator = Esim(height, width) if how == "numba" else CardEsim(height, width, gl=gl)
         parts.append(
@@ -412,9 +415,15 @@ class Batches(Piece):
         small = dict(list(sizes(options).items())[: 1 if options.small else 2])
         counts = (1, 2) if options.small else (1, 2, 4, 8, 16)
         with context(options) as gl:
-            for (name, size), count, how in itertools.product(small.items(), counts, ("batch", "events", "voxels")):
-                in_turn = "as a batch" if how == "batch" else f"in turn, {how}"
-                if (key := f"{name}, {count} in one context {in_turn}") not in rows:
+            hows = {
+                "batch": "as a batch",
+                "events": "in turn, events",
+                "voxels": "in turn, voxels",
+                "v2e batch": "as a batch, V2E",
+                "v2e": "in turn, V2E",
+            }
+            for (name, size), count, how in itertools.product(small.items(), counts, hows):
+                if (key := f"{name}, {count} in one context {hows[how]}") not in rows:
                     rows.add(key, **paced(gl, count, size, how, seconds(options)))
         spawn = multiprocessing.get_context("spawn")
         for (name, size), count, how in itertools.product(small.items(), counts, ("events", "voxels")):

@@ -144,7 +144,7 @@ void main()
 #ifdef SHOTS
     uint shots_at = (room + 1u) * (pixel / 1024u) + 1u, shot = NOW_AT(FIRST_SHOT * padded + pixel);
 #endif
-    uint y = own / width + row, word = (y << 17) | ((own % width) << 1), upper_word = y >> 15;
+    uint line = own / width, y = line + row, word = (y << 17) | ((own - line * width) << 1), upper_word = y >> 15;
     bool dead = false;
     for (;;) {
         bool above = !less_double(z.end, up), fires = above || !less_double(down, z.end), positive = above, by_noise = false;

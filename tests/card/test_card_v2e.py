@@ -91,7 +91,7 @@ def test_intervals_of_any_length(gl, variant):
 
 def test_more_noise_than_was_likely(gl, monkeypatch):
     """Nothing fires, and the step is done again with more room; also where that is found one frame later."""
-    monkeypatch.setattr("blinkgl.card.v2e._FEW_SHOTS", 1)
+    monkeypatch.setattr("blinkgl.card.v2e.FEW_SHOTS", 1)
     clip, times = random_clip(3, frames=5)
     config = V2eConfig(shot_noise_rate_hz=300.0)
     values = CardV2e._values

@@ -12,14 +12,18 @@ quiet. Unlike thresholds for ON and OFF, as every real pixel has them, move the 
 pair of events, so that pixels spend the more time with a ladder the quieter it is; the rate in the end is the harmonic
 mean over all places of the ladder. The second table is how much quieter: ln of the rates' ratio from a rung at half a
 threshold to one at the mean.
+
+A dead time puts the reference wherever the noise is at its end, off the ladder: how many times as many events come then
+is counted, in trajectories of one pixel (third table, by dead time in frames, k and size).
 """
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 from scipy.special import ndtr
 
-from blinkgl.events.noise import RATE_K, RATE_SIZES
+from blinkgl.events.noise import DEAD_FRAMES, DEAD_K, DEAD_SIZES, RATE_K, RATE_SIZES, noise_rate
 
 
 def rate_per_step(size: float, k: float, place: float, cells: int) -> float:
@@ -61,7 +65,48 @@ def rate_per_time_constant(size: float, k: float, ladders: int = 8) -> tuple[flo
     return float(1 / np.mean(1 / rates)) / k, float(np.log(ends[1] / ends[0]))
 
 
+@numba.njit(cache=True)
+def count_events(size: float, k: float, dead: float, steps: int, seed: int) -> int:
+    """Events of one pixel: noise at the frames, straight lines between them, a dead time of ``dead`` frames after each
+    event, at whose end the reference is the noise."""
+    np.random.seed(seed)  # noqa: NPY002 - numba's own
+    a, fresh = np.exp(-k), size * np.sqrt(-np.expm1(-2 * k))
+    noise = reference = size * np.random.normal()  # noqa: NPY002
+    wait, events = -1.0, 0  # frames until the comparator wakes, from this frame on; negative: it is awake
+    for _ in range(steps):
+        now = a * noise + fresh * np.random.normal()  # noqa: NPY002
+        look = 0.0
+        if wait >= 1:
+            wait -= 1
+        else:
+            if wait >= 0:
+                look, wait = wait, -1.0
+                reference = noise + (now - noise) * look
+            while abs(now - reference) >= 1:
+                events += 1
+                level = reference + (1.0 if now > reference else -1.0)
+                end = max((level - noise) / (now - noise), look) + dead
+                if end >= 1:
+                    wait = end - 1
+                    break
+                look, reference = end, noise + (now - noise) * end
+        noise = now
+    return events
+
+
+def dead_time_factor(size: float, k: float, dead: float, wanted: int = 6000, most: int = 40_000_000) -> float:
+    """ln of the rate with a dead time of so many frames over that without one."""
+    steps = int(min(wanted / (noise_rate(size, k) * k), most))
+    events = count_events(size, k, dead, steps, 1)
+    return float(np.log(max(events, 1) / (steps * k) / noise_rate(size, k)))
+
+
 def main() -> None:
+    print("_DEAD = [  # [dead time][k][size]")
+    for dead in DEAD_FRAMES:
+        rows = [[f"{dead_time_factor(size, k, dead):.2f}" for size in DEAD_SIZES] for k in DEAD_K]
+        print("    [" + ", ".join("[" + ", ".join(row) + "]" for row in rows) + f"],  # {dead:g}", flush=True)
+    print("]")
     spans = []
     for k in RATE_K:
         row = [rate_per_time_constant(size, k) for size in RATE_SIZES]

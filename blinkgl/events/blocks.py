@@ -5,10 +5,31 @@ They take slices and index them from 0: numba then vectorises them, which it doe
 
 from __future__ import annotations
 
+from typing import Any
+
+import llvmlite.ir as ir
 import numba
 import numpy as np
+from numba.core import cgutils, types
+from numba.extending import intrinsic
 
 from blinkgl.events.packing import JIT
+
+
+@intrinsic
+def prefetch(typingctx: Any, array: Any, index: Any) -> Any:
+    """Asks for the line of memory of element ``index`` (in the order of memory) of a C-contiguous ``array``, and waits
+    for nothing; for what will be read at places that only the data know."""
+
+    def codegen(context, builder, signature, arguments):
+        data = cgutils.create_struct_proxy(signature.args[0])(context, builder, value=arguments[0]).data
+        place, word = builder.gep(data, [arguments[1]]), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [place.type, word, word, word])
+        fetch = builder.module.declare_intrinsic("llvm.prefetch", [place.type], kind)
+        builder.call(fetch, [place, word(0), word(3), word(1)])  # to be read, near, data
+        return context.get_dummy_value()
+
+    return types.void(array, index), codegen
 
 
 @numba.njit(**JIT)

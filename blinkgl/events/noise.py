@@ -11,6 +11,11 @@ once they are spread, move the ladder a little with every pair of events: a pixe
 quieter it is, and its rate in the end is the harmonic mean over where the ladder may stand. That is the rate of the
 table, and pixels start on ladders as they are found then (:func:`start_places`). It was solved for as the stationary
 state of Markov chains, without throwing dice (``tools/noise_rates.py``).
+
+With a dead time the reference is taken anew wherever the noise is at its end, and pixels leave their ladder. A dead
+time shorter than a frame lets them find the loud ones, where noise goes to and fro over one level (three times the
+events, and more where they are rare); one of several frames puts the reference near the noise's mean and hides what
+follows an event (a third). A second table has the factor.
 """
 
 from __future__ import annotations
@@ -70,6 +75,85 @@ TABLE_LOW, TABLE_STEP = np.log(1e-6), np.log(1e9) / (TABLE_SIZE - 2)
 """The per-step table runs over ln k from 1e-6 to 1e3."""
 
 
+DEAD_FRAMES = np.array([0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 16.0])
+DEAD_K = np.array([0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
+DEAD_SIZES = np.array([0.25, 0.3, 0.45, 0.7, 1.0, 2.5])
+# fmt: off
+_DEAD = np.array(
+    [
+        [
+            [2.01, 0.92, 0.10, -0.01, -0.02, -0.03],
+            [2.03, 1.00, 0.10, -0.05, -0.03, -0.10],
+            [1.86, 0.88, 0.08, -0.02, -0.03, -0.16],
+            [1.96, 0.98, 0.21, -0.01, -0.05, -0.24],
+            [2.28, 1.18, 0.20, 0.01, -0.07, -0.27],
+            [2.34, 1.34, 0.29, 0.00, -0.08, -0.28],
+        ],
+        [
+            [1.55, 0.62, 0.04, -0.02, -0.02, -0.09],
+            [1.78, 0.67, 0.04, -0.03, -0.04, -0.20],
+            [1.86, 0.92, 0.10, -0.03, -0.07, -0.32],
+            [2.10, 1.11, 0.20, -0.03, -0.13, -0.49],
+            [2.08, 1.15, 0.27, -0.01, -0.17, -0.56],
+            [2.06, 1.16, 0.28, -0.01, -0.18, -0.57],
+        ],
+        [
+            [1.22, 0.51, 0.01, -0.01, -0.02, -0.16],
+            [1.49, 0.67, 0.07, -0.03, -0.05, -0.34],
+            [1.50, 0.72, 0.11, -0.04, -0.13, -0.55],
+            [1.39, 0.72, 0.16, -0.07, -0.23, -0.78],
+            [1.05, 0.54, 0.13, -0.09, -0.30, -0.89],
+            [0.92, 0.45, 0.12, -0.09, -0.31, -0.91],
+        ],
+        [
+            [0.77, 0.31, 0.03, -0.05, -0.04, -0.25],
+            [1.00, 0.26, 0.04, -0.06, -0.11, -0.50],
+            [0.69, 0.29, 0.02, -0.09, -0.23, -0.81],
+            [-0.22, -0.21, -0.15, -0.19, -0.38, -1.14],
+            [-0.93, -0.80, -0.33, -0.32, -0.51, -1.31],
+            [-1.04, -0.86, -0.38, -0.33, -0.52, -1.32],
+        ],
+        [
+            [0.52, 0.27, -0.01, -0.04, -0.07, -0.41],
+            [0.66, 0.19, -0.02, -0.12, -0.20, -0.77],
+            [0.01, -0.12, -0.13, -0.22, -0.42, -1.19],
+            [-0.95, -0.77, -0.44, -0.45, -0.71, -1.58],
+            [-1.18, -0.92, -0.54, -0.60, -0.86, -1.79],
+            [-1.19, -0.93, -0.57, -0.62, -0.88, -1.82],
+        ],
+        [
+            [0.65, 0.19, -0.04, -0.09, -0.16, -0.65],
+            [0.15, -0.08, -0.12, -0.21, -0.36, -1.17],
+            [-0.68, -0.60, -0.32, -0.42, -0.69, -1.65],
+            [-1.12, -0.96, -0.56, -0.71, -1.07, -2.10],
+            [-1.14, -0.89, -0.67, -0.87, -1.26, -2.32],
+            [-1.08, -0.90, -0.68, -0.90, -1.28, -2.34],
+        ],
+        [
+            [-0.13, -0.15, -0.18, -0.30, -0.52, -1.49],
+            [-0.85, -0.75, -0.45, -0.65, -1.01, -2.23],
+            [-1.21, -0.89, -0.65, -1.08, -1.59, -2.84],
+            [-1.14, -1.00, -0.93, -1.55, -2.10, -3.35],
+            [-1.18, -1.01, -1.04, -1.75, -2.33, -3.58],
+            [-1.18, -1.06, -1.06, -1.78, -2.36, -3.60],
+        ],
+    ]
+)
+# fmt: on
+"""ln of the factor by which a dead time of so many frames changes the rate: [dead time][k][size]."""
+IN_SECONDS = 0.5
+"""Part of a factor above 1 (of its logarithm) that a clip of seconds sees: pixels leave the ladders that they begin on
+by events, and those of the quiet ones are rare."""
+
+
+_DEAD_Q = 1 / DEAD_SIZES**2
+_TO_SIZES = np.array([np.interp(1 / RATE_SIZES**2, _DEAD_Q[::-1], row[::-1]) for row in np.eye(len(DEAD_SIZES))])
+# Below the smallest size on in a straight line, of 1 / s^2.
+_BEYOND = np.maximum(1 / RATE_SIZES**2 - _DEAD_Q[0], 0.0) / (_DEAD_Q[0] - _DEAD_Q[1])
+_TO_SIZES[0] += _BEYOND
+_TO_SIZES[1] -= _BEYOND
+
+
 # Sampling pushes the levels away by a length in proportion to the root of k (Chernoff 1965), so that the rate is smooth
 # in that root: down to k = 0 its last two rows go on in a straight line.
 _ROOTS = np.sqrt(RATE_K)
@@ -79,14 +163,24 @@ _OVER_K = PchipInterpolator(
 )
 
 
-def noise_size(k: np.ndarray | float, events_per_time_constant: np.ndarray) -> np.ndarray:
+def noise_rate(size: float, k: float) -> float:
+    """Events per time constant, without a dead time: the table between its entries. size : in thresholds."""
+    row, q = _OVER_K(np.sqrt(min(k, RATE_K[-1]))), 1 / RATE_SIZES**2
+    return float(np.exp(np.interp(1 / size**2, q[::-1], row[::-1]))) / max(k / RATE_K[-1], 1.0)
+
+
+def noise_size(k: np.ndarray | float, events_per_time_constant: np.ndarray, dead_frames: float = 0.0) -> np.ndarray:
     """Standard deviation of the noise, in thresholds, elementwise; at most 2.5.
 
     k : time constants per frame. Beyond 10 the samples are independent and the rate per *frame* is what counts.
+    dead_frames : the dead time after an event.
     """
     k, rate = np.broadcast_arrays(np.asarray(k, float), np.asarray(events_per_time_constant, float))
     wanted = np.log(np.maximum(rate, 1e-300)) + np.log(np.maximum(k / RATE_K[-1], 1.0))
     rows = _OVER_K(np.sqrt(np.minimum(k, RATE_K[-1])))
+    if dead_frames:
+        # Where noise is large the dead time decides the rate, and the size hardly matters.
+        rows = np.maximum.accumulate(rows + _dead_time_factors(k, dead_frames), axis=-1)
     q = 1 / RATE_SIZES**2  # ln r is nearly linear in it
     out = np.empty(k.shape)
     for index in np.ndindex(k.shape):
@@ -95,10 +189,22 @@ def noise_size(k: np.ndarray | float, events_per_time_constant: np.ndarray) -> n
     return 1 / np.sqrt(out)
 
 
-def noise_table(rate_hz: float, dt_s: float, threshold: float) -> np.ndarray:
-    """(TABLE_SIZE,) float32 noise sizes in ln units over ln k, for frames ``dt_s`` apart."""
+def _dead_time_factors(k: np.ndarray, dead_frames: float) -> np.ndarray:
+    """ln of the factor by which a dead time changes the rate of each of RATE_SIZES, k.shape + (15,)."""
+    by_k = np.empty((len(DEAD_K), len(DEAD_SIZES)))
+    table = np.where(_DEAD > 0, IN_SECONDS * _DEAD, _DEAD)
+    for i, j in np.ndindex(by_k.shape):  # 0 without a dead time
+        by_k[i, j] = np.interp(np.log1p(dead_frames), np.log1p([0, *DEAD_FRAMES]), [0, *table[:, i, j]])
+    places = np.interp(np.log(np.maximum(k, 1e-300)), np.log(DEAD_K), np.arange(len(DEAD_K)))
+    below = np.minimum(places.astype(int), len(DEAD_K) - 2)
+    part = (places - below)[..., None]
+    return (by_k[below] * (1 - part) + by_k[below + 1] * part) @ _TO_SIZES
+
+
+def noise_table(rate_hz: float, dt_s: float, threshold: float, dead_s: float = 0.0) -> np.ndarray:
+    """(TABLE_SIZE,) float32 noise sizes in ln units over ln k, for frames ``dt_s`` apart and a dead time."""
     k = np.exp(TABLE_LOW + TABLE_STEP * np.arange(TABLE_SIZE))
-    return (threshold * noise_size(k, rate_hz * dt_s / k)).astype(np.float32)
+    return (threshold * noise_size(k, rate_hz * dt_s / k, dead_s / dt_s)).astype(np.float32)
 
 
 def start_sizes(rate_hz: float, corner_hz: np.ndarray, threshold: float) -> np.ndarray:

@@ -285,7 +285,7 @@ class ReferenceV2e:
         )
         normals = np.stack(pairs, axis=1).ravel()[: self.pixels].astype(f)
         k = kappa * (f(0.5) * (self.intensity + intensity) + f(20))
-        sizes = noise_table(c.shot_noise_rate_hz, dt_s, v2e.noise_threshold(c))
+        sizes = noise_table(c.shot_noise_rate_hz, dt_s, v2e.noise_threshold(c), c.refractory_us * 1e-6)
         below, part = v2e.noise_place(k)
         return v2e.next_noise(self.hum, k, sizes[below] + part * (sizes[below + 1] - sizes[below]), normals)
 

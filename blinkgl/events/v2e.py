@@ -30,16 +30,27 @@ import numpy as np
 
 from blinkgl.config.events import EsimConfig, V2eConfig
 from blinkgl.errors import EventDataError
-from blinkgl.events.arith import select
-from blinkgl.events.blocks import compact_flags, copy_block, lookup_block, scale_block
+from blinkgl.events.blocks import compact_flags, copy_block, lookup_block, prefetch, scale_block
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
 from blinkgl.events.esim import draw_thresholds
 from blinkgl.events.noise import noise_table
 from blinkgl.events.packing import JIT, T_SHIFT
-from blinkgl.events.philox import Stream, normal2, uniform2
+from blinkgl.events.philox import Stream
 from blinkgl.events.response import Response, smallest_threshold
 from blinkgl.events.threads import take_part
 from blinkgl.events.types import Events
+from blinkgl.events.v2e_blocks import (
+    DRAWS,
+    add_scaled_block,
+    flag_block,
+    flag_block_leaking,
+    lin_log_block,
+    noise_block,
+    relax_block,
+    relax_block_gently,
+    second_block,
+    shot_block,
+)
 from blinkgl.events.v2e_model import (
     DARKEST,
     REBASE,
@@ -49,14 +60,8 @@ from blinkgl.events.v2e_model import (
     draw_start,
     draw_start_noise,
     lin_log,
-    next_noise,
-    noise_place,
     noise_threshold,
-    relax,
-    relax_gently,
-    settled,
     shot_draw,
-    shot_factor,
     shot_tables,
 )
 from blinkgl.events.v2e_waves import FLOATS, INTS, emit_waves
@@ -65,8 +70,9 @@ _F = np.float32
 _ZERO, _HALF, _JOINT = _F(0), _F(0.5), _F(20.0)
 _SHOT, _NOISE = np.uint64(Stream.SHOT), np.uint64(Stream.NOISE)
 _U2, _U1, _U1000 = np.uint64(2), np.uint64(1), np.uint64(1000)
-_INSERTION_LIMIT, _DRAWS = 32, 16
-_FARTHEST, _FAR_BELOW = _F(1e6), np.int32(-(2**31))
+_FARTHEST = _F(1e6)
+GROUP = 4
+"""Blocks whose events are made in one go."""
 
 
 class Pixels(NamedTuple):
@@ -116,143 +122,7 @@ class Interval(NamedTuple):
 
 
 @numba.njit(**JIT)
-def _lin_log_block(intensity, out):
-    for i in range(intensity.size):
-        out[i] = lin_log(intensity[i])
-
-
-@numba.njit(**JIT)
-def _relax_block(lag, before, now, intensity_before, intensity_now, kappa, out, z):
-    for i in range(now.size):
-        lag_now = relax(lag[i], before[i], now[i], intensity_before[i], intensity_now[i], kappa)
-        out[i] = lag_now
-        z[i] = now[i] + lag_now
-
-
-@numba.njit(**JIT)
-def _relax_block_gently(lag, before, now, intensity_before, intensity_now, kappa, out, z):
-    for i in range(now.size):
-        lag_now = relax_gently(lag[i], before[i], now[i], intensity_before[i], intensity_now[i], kappa)
-        out[i] = lag_now
-        z[i] = now[i] + lag_now
-
-
-@numba.njit(**JIT)
-def _second_block(lag, before, x, keep, ramp, now, lag_now):
-    """``x`` through the second low-pass; what it was into ``now``."""
-    for i in range(x.size):
-        now[i] = x[i]
-        lag_now[i] = settled(lag[i] * keep - (x[i] - before[i]) * ramp)
-        x[i] = x[i] + lag_now[i]
-
-
-@numba.njit(**JIT)
-def _add_scaled_block(a, scale, out):
-    for i in range(a.size):
-        out[i] += a[i] * scale
-
-
-@numba.njit(**JIT)
-def _noise_block(noise, intensity_before, intensity_now, kappa, sizes, seed, step, first, normals, out, z):
-    for j in range((out.size + 1) // 2):  # pixels 2j and 2j + 1 share a draw
-        a, b = normal2(seed, np.uint64(first // 2 + j), _NOISE, np.uint64(step))
-        normals[2 * j], normals[2 * j + 1] = np.float32(a), np.float32(b)
-    for i in range(out.size):
-        k = np.float32(kappa * (_HALF * (intensity_before[i] + intensity_now[i]) + _JOINT))
-        below, part = noise_place(k)
-        size = np.float32(sizes[below] + part * (sizes[below + 1] - sizes[below]))
-        value = np.float32(next_noise(noise[i], k, size, normals[i]))
-        out[i] = value
-        z[i] += value
-
-
-@numba.njit(**JIT)
-def _flag_block(z, upper, lower, flags):
-    """Flags (uint8) of the pixels at or beyond a level; returns how far the farthest is beyond (negative: none is)."""
-    farthest = _FAR_BELOW
-    for i in range(z.size):
-        above, below = np.float32(z[i] - upper[i]), np.float32(lower[i] - z[i])
-        beyond = np.float32(select(above > below, above, below))
-        flags[i] = np.uint8(beyond >= _ZERO)
-        farthest = max(farthest, beyond.view(np.int32))  # floats >= 0 are ordered as their bits; this loop vectorises
-    return np.int32(farthest).view(np.float32)
-
-
-@numba.njit(**JIT)
-def _flag_block_leaking(z, leak, since, upper, lower, flags):
-    """:func:`_flag_block` of z with what has leaked."""
-    farthest = _FAR_BELOW
-    for i in range(z.size):
-        leaked = np.float32(z[i] + np.float32(leak[i] * since))
-        above, below = np.float32(leaked - upper[i]), np.float32(lower[i] - leaked)
-        beyond = np.float32(select(above > below, above, below))
-        flags[i] = np.uint8(beyond >= _ZERO)
-        farthest = max(farthest, beyond.view(np.int32))
-    return np.int32(farthest).view(np.float32)
-
-
-@numba.njit(**JIT)
-def _shot_draws(seed, block, index, rate_per_ns, gaps, picks, accepts):
-    """Of the candidates from number ``index`` on: more than are wanted, but in vector instructions."""
-    for j in range(gaps.size):
-        number = index + np.uint64(j)
-        gaps[j], picks[j] = shot_draw(seed, block, number, rate_per_ns)
-        # Odd: shot_draw has the even numbers.
-        accepts[j], _ = uniform2(seed, block, _SHOT, number * _U2 + _U1)
-
-
-@numba.njit(**JIT)
-def _shot_block(block, pixels_in_block, p, v, intensity_now, keys, draws):
-    """Shot noise of one block in the interval: accepted events into ``keys`` (pixel in block << 42 | ns from the
-    interval's start << 1 | polarity), sorted. Returns (events, time and number of the next candidate); -1 events
-    when ``keys`` is too small."""
-    count, first, end_ns = 0, block * BLOCK, v.t0_ns + v.dt_ns
-    table = p.shot_table[block]
-    whole = np.float64(table[table.size - 1])
-    t_ns, index = p.clock_ns[block], p.clock_index[block]
-    # A Poisson process of candidates for the block as a whole, as fast as if all its pixels were dark, thinned below to
-    # what their intensities allow (Lewis and Shedler, Naval Research Logistics 26, 1979). One clock a block instead of
-    # one a pixel.
-    drawn = _DRAWS
-    gaps, picks, accepts = draws
-    while t_ns <= end_ns:
-        if drawn == _DRAWS:
-            rate = v.shot_unit_per_ns * whole
-            _shot_draws(v.seed, np.uint64(block), np.uint64(index), rate, gaps, picks, accepts)
-            drawn = 0
-        gap, pick, accept = gaps[drawn], picks[drawn], accepts[drawn]
-        drawn += 1
-        # How many entries are <= weight. Weights are much alike, so the proportional guess is a cache line away.
-        weight, place = np.float32(pick * whole), np.int64(pick * table.size)
-        while place > 0 and table[place - 1] > weight:
-            place -= 1
-        while place < table.size - 1 and table[place] <= weight:
-            place += 1
-        offset, on = place & (BLOCK - 1), place < BLOCK  # the table holds the ON half of all pixels, then the OFF half
-        if offset < pixels_in_block:
-            i = first + offset
-            after = max(t_ns - v.t0_ns, 0)
-            intensity = p.intensity[i] + (intensity_now[offset] - p.intensity[i]) * (after / v.dt_ns)
-            if accept * DARKEST < shot_factor(intensity):
-                if count == keys.size:
-                    return -1, t_ns, index  # the caller doubles ``keys`` and begins the block anew: draws know no state
-                key = (offset << 42) | (after << 1) | np.int64(on)
-                slot = count
-                if count < _INSERTION_LIMIT:  # a few are put where they belong, many are sorted at the end
-                    while slot > 0 and keys[slot - 1] > key:
-                        keys[slot] = keys[slot - 1]
-                        slot -= 1
-                keys[slot] = key
-                count += 1
-        index += 1
-        t_ns += gap
-    if count > _INSERTION_LIMIT:
-        keys[:count].sort()
-    return count, t_ns, index
-
-
-@numba.njit(**JIT)
-def _emit_block_plain(active, count, first, x_now, constants, p, v, cap, packed, begin):
+def _emit_plain(active, count, first, x_now, constants, p, v, cap, packed, begin):
     """:func:`emit_waves` without low-pass, leak, noise and dead time: the same bits, straight lines only."""
     out, cut, dt_ns = begin, 0, v.dt_ns
     start_ns = v.t0_ns - 1000 * v.base_us
@@ -292,102 +162,134 @@ def _emit_block_plain(active, count, first, x_now, constants, p, v, cap, packed,
 @numba.njit(**JIT)
 def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x_table, p, v):
     """Band kernel, see :meth:`Emulator._run`."""
-    cut, pixels = 0, p.x.size
-    flags, scratch, active = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64), np.empty(BLOCK + 8, np.int32)
-    z, intensity, x = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    lag, noise, normals = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    seconds = BLOCK if p.second_lag.size else 0
+    cut, pixels, most = 0, p.x.size, GROUP * BLOCK
+    flags, scratch, active = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64), np.empty(most + 8, np.int32)
+    z, normals = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
+    intensity, x = np.empty(most, np.float32), np.empty(most, np.float32)
+    lag, noise = np.empty(most, np.float32), np.empty(most, np.float32)
+    seconds = most if p.second_lag.size else 0
     before_second, second_lag = np.empty(seconds, np.float32), np.empty(seconds, np.float32)
-    keys, constants = np.empty(BLOCK, np.int64), np.empty((BLOCK, 2), np.float32)
+    keys, constants = np.empty(BLOCK, np.int64), np.empty((most, 2), np.float32)
     floats, ints = np.empty(FLOATS, np.float64), np.empty(INTS, np.int64)
-    draws = np.empty(_DRAWS, np.int64), np.empty(_DRAWS), np.empty(_DRAWS)
+    draws = np.empty(DRAWS, np.int64), np.empty(DRAWS), np.empty(DRAWS)
+    clocks = np.empty((GROUP, 2), np.int64)
+    listed, shot, caps = np.zeros(GROUP + 1, np.int64), np.zeros(GROUP + 1, np.int64), np.zeros(GROUP, np.int64)
     kappa, since = np.float32(v.kappa), np.float32(v.since_epoch_1)
     plain = not (p.lag.size or p.leak.size or p.noise.size or p.release.size or p.clock_ns.size)
-    for block in range(first_block, stop_block):
-        s = block * BLOCK
-        e = min(s + BLOCK, pixels)
-        n = e - s
-        if n < BLOCK:
-            flags[:] = 0
-        if codes.size:
-            lookup_block(codes[s:e], x_table, x[:n])
-            if p.intensity.size:
-                lookup_block(codes[s:e], table, intensity[:n])
-        else:
-            scale_block(frame[s:e], v.scale, intensity[:n])
-            _lin_log_block(intensity[:n], x[:n])
-        if p.second_lag.size:
-            _second_block(
-                p.second_lag[s:e], p.before_second[s:e], x[:n], v.second_keep, v.second_ramp,
-                before_second[:n], second_lag[:n],
-            )  # fmt: skip
-        if p.lag.size:
-            if v.gentle:
-                _relax_block_gently(p.lag[s:e], p.x[s:e], x[:n], p.intensity[s:e], intensity[:n], kappa, lag[:n], z[:n])
+    for group in range(first_block, stop_block, GROUP):
+        first, blocks = group * BLOCK, min(GROUP, stop_block - group)
+        room, largest, clamped = 0, 0, False
+        for b in range(blocks):
+            a = b * BLOCK
+            s = first + a
+            e = min(s + BLOCK, pixels)
+            n = e - s
+            if n < BLOCK:
+                flags[:] = 0
+            x_now, intensity_now, lag_now = x[a : a + n], intensity[a : a + n], lag[a : a + n]
+            if codes.size:
+                lookup_block(codes[s:e], x_table, x_now)
+                if p.intensity.size:
+                    lookup_block(codes[s:e], table, intensity_now)
             else:
-                _relax_block(p.lag[s:e], p.x[s:e], x[:n], p.intensity[s:e], intensity[:n], kappa, lag[:n], z[:n])
-        elif p.noise.size:
-            copy_block(x[:n], z[:n])
-        if p.noise.size:
-            if p.leak.size:
-                _add_scaled_block(p.leak[s:e], since, z[:n])
-            _noise_block(
-                p.noise[s:e],
-                p.intensity[s:e],
-                intensity[:n],
-                kappa,
-                p.noise_sizes,
-                v.seed,
-                v.step,
-                s,
-                normals,
-                noise[:n],
-                z[:n],
-            )
-        signal = z if p.lag.size or p.noise.size else x
-        if p.leak.size and not p.noise.size:
-            farthest = _flag_block_leaking(signal[:n], p.leak[s:e], since, p.upper[s:e], p.lower[s:e], flags)
-        else:
-            farthest = _flag_block(signal[:n], p.upper[s:e], p.lower[s:e], flags)
-        shots, clock_ns, clock_index = 0, np.int64(0), np.int64(0)
-        if p.clock_ns.size:
-            shots, clock_ns, clock_index = _shot_block(block, n, p, v, intensity, keys, draws)
-            while shots < 0:
-                keys = np.empty(2 * keys.size, np.int64)
-                shots, clock_ns, clock_index = _shot_block(block, n, p, v, intensity, keys, draws)
-            for j in range(shots):
-                flags[keys[j] >> 42] = 1
-        if farthest >= _ZERO or shots:
-            count = compact_flags(flags, scratch, s, active)
+                scale_block(frame[s:e], v.scale, intensity_now)
+                lin_log_block(intensity_now, x_now)
+            if p.second_lag.size:
+                second_block(
+                    p.second_lag[s:e], p.before_second[s:e], x_now, v.second_keep, v.second_ramp,
+                    before_second[a : a + n], second_lag[a : a + n],
+                )  # fmt: skip
+            if p.lag.size:
+                if v.gentle:
+                    relax_block_gently(
+                        p.lag[s:e], p.x[s:e], x_now, p.intensity[s:e], intensity_now, kappa, lag_now, z[:n]
+                    )
+                else:
+                    relax_block(p.lag[s:e], p.x[s:e], x_now, p.intensity[s:e], intensity_now, kappa, lag_now, z[:n])
+            elif p.noise.size:
+                copy_block(x_now, z[:n])
+            if p.noise.size:
+                if p.leak.size:
+                    add_scaled_block(p.leak[s:e], since, z[:n])
+                noise_block(
+                    p.noise[s:e], p.intensity[s:e], intensity_now, kappa, p.noise_sizes, v.seed, v.step, s, normals,
+                    noise[a : a + n], z[:n],
+                )  # fmt: skip
+            signal = z[:n] if p.lag.size or p.noise.size else x_now
+            if p.leak.size and not p.noise.size:
+                farthest = flag_block_leaking(signal, p.leak[s:e], since, p.upper[s:e], p.lower[s:e], flags)
+            else:
+                farthest = flag_block(signal, p.upper[s:e], p.lower[s:e], flags)
+            shots = 0
+            if p.clock_ns.size:
+                so_far = shot[b]
+                shots, clocks[b, 0], clocks[b, 1] = shot_block(
+                    group + b, n, a, p, v, intensity_now, keys[so_far:], draws
+                )
+                while shots < 0:
+                    longer = np.empty(2 * keys.size, np.int64)
+                    longer[:so_far] = keys[:so_far]
+                    keys = longer
+                    shots, clocks[b, 0], clocks[b, 1] = shot_block(
+                        group + b, n, a, p, v, intensity_now, keys[so_far:], draws
+                    )
+                for j in range(so_far, so_far + shots):
+                    flags[(keys[j] >> 42) - a] = 1
+            shot[b + 1] = shot[b] + shots
+            count = 0
+            if farthest >= _ZERO or shots:
+                count = compact_flags(flags, scratch, s, active[listed[b] :])
+                # Two misses of the caches a pixel, which are over when the group's events are made.
+                for j in range(listed[b], listed[b] + count):
+                    prefetch(p.constants, np.int64(active[j]) * 4)
+                    if p.release.size:
+                        prefetch(p.release, np.int64(active[j]))
             # As many events a pixel as levels fit between the first one and the farthest, rounded up, and its noise.
             cap = (
                 min(np.int64(max(min(farthest, _FARTHEST), _ZERO) * v.inverse_threshold) + 2, v.bound_per_pixel) + shots
             )
             if count * cap > share:
-                cap = max(1, share // count)
-            if filled + count * cap > packed.size:  # no room for the worst case; nothing of this block has been touched
-                return block, filled, cut
+                cap, clamped = max(1, share // count), True
+            listed[b + 1], caps[b] = listed[b] + count, cap
+            room += count * cap
+            largest = max(largest, cap if count else 0)
+        # Together where no block is held to its share: loops over few pixels are mostly their beginning and end.
+        together = not clamped and listed[blocks] * largest <= blocks * share
+        if together:
+            room = listed[blocks] * largest
+        if filled + room > packed.size:  # no room for the worst case; nothing of this group has been touched
+            return group, filled, cut
+        now = (intensity, x, lag, noise)
+        for b in range(1 if together else blocks):
+            stop = blocks if together else b + 1
+            here, cap = active[listed[b] : listed[stop]], largest if together else caps[b]
+            if not here.size:
+                continue
             if plain:
-                filled, cut_here = _emit_block_plain(active, count, s, x, constants, p, v, cap, packed, filled)
+                filled, cut_here = _emit_plain(here, here.size, first, x, constants, p, v, cap, packed, filled)
             else:
-                now = (intensity, x, lag, noise)
+                shots = shot[stop] - shot[b]
                 filled, cut_here = emit_waves(
-                    active, count, s, now, keys, shots, p, v, cap, packed, filled, floats, ints
-                )
+                    here, here.size, first, now, keys[shot[b] : shot[stop]], shots, p, v, cap, packed, filled,
+                    floats, ints,
+                )  # fmt: skip
             cut += cut_here
         # Last: until here these are of the frame before.
+        last = min(first + blocks * BLOCK, pixels)
+        n = last - first
         if p.intensity.size:
-            copy_block(intensity[:n], p.intensity[s:e])
-        copy_block(x[:n], p.x[s:e])
+            copy_block(intensity[:n], p.intensity[first:last])
+        copy_block(x[:n], p.x[first:last])
         if p.lag.size:
-            copy_block(lag[:n], p.lag[s:e])
+            copy_block(lag[:n], p.lag[first:last])
         if p.second_lag.size:
-            copy_block(before_second[:n], p.before_second[s:e])
-            copy_block(second_lag[:n], p.second_lag[s:e])
+            copy_block(before_second[:n], p.before_second[first:last])
+            copy_block(second_lag[:n], p.second_lag[first:last])
         if p.noise.size:
-            copy_block(noise[:n], p.noise[s:e])
+            copy_block(noise[:n], p.noise[first:last])
         if p.clock_ns.size:
-            p.clock_ns[block], p.clock_index[block] = clock_ns, clock_index
+            for b in range(blocks):
+                p.clock_ns[group + b], p.clock_index[group + b] = clocks[b, 0], clocks[b, 1]
     return stop_block, filled, cut
 
 
@@ -587,7 +489,9 @@ class V2e(Emulator):
         """The table of the photoreceptor's noise for frames so far apart."""
         if self._noise.size and dt_ns != self._sizes_dt_ns:
             config = self.config
-            self._noise_sizes = noise_table(config.shot_noise_rate_hz, dt_ns * 1e-9, noise_threshold(config))
+            self._noise_sizes = noise_table(
+                config.shot_noise_rate_hz, dt_ns * 1e-9, noise_threshold(config), config.refractory_us * 1e-6
+            )
             self._sizes_dt_ns = dt_ns
 
     def _interval(self, t_ns: int, brightest: float) -> Interval:

@@ -5,7 +5,7 @@ import pytest
 
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.events import make_emulator
-from blinkgl.events.v2e import _flag_block
+from blinkgl.events.v2e_blocks import flag_block
 from tests.events.clips import random_clip, run
 
 KINDS = {
@@ -72,7 +72,7 @@ def test_at_a_level_exactly_an_event_is_due():
     before = np.nextafter(np.float32(1), np.float32(0))
     z = np.array([1, before, -1, -before, 0, 1.5], np.float32)
     flags = np.full(6, 7, np.uint8)
-    farthest = _flag_block(z, np.ones(6, np.float32), -np.ones(6, np.float32), flags)
+    farthest = flag_block(z, np.ones(6, np.float32), -np.ones(6, np.float32), flags)
     assert flags.tolist() == [1, 0, 1, 0, 0, 1] and farthest == 0.5
-    assert _flag_block(z[:1], np.ones(1, np.float32), -np.ones(1, np.float32), flags[:1]) == 0
-    assert _flag_block(z[1:2], np.ones(1, np.float32), -np.ones(1, np.float32), flags[:1]) < 0
+    assert flag_block(z[:1], np.ones(1, np.float32), -np.ones(1, np.float32), flags[:1]) == 0
+    assert flag_block(z[1:2], np.ones(1, np.float32), -np.ones(1, np.float32), flags[:1]) < 0

@@ -1,0 +1,223 @@
+"""V2E's loops over one block of pixels: photoreceptor, comparison, shot noise. They take slices and index them from 0,
+see :mod:`blinkgl.events.blocks`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+
+from blinkgl.events.arith import select
+from blinkgl.events.blocks import prefetch
+from blinkgl.events.emulator import BLOCK
+from blinkgl.events.packing import JIT
+from blinkgl.events.philox import Stream, normal2, uniform2
+from blinkgl.events.v2e_model import (
+    DARKEST,
+    lin_log,
+    next_noise,
+    noise_place,
+    relax,
+    relax_gently,
+    settled,
+    shot_draw,
+    shot_factor,
+)
+
+_F = np.float32
+_ZERO, _HALF, _JOINT = _F(0), _F(0.5), _F(20.0)
+_SHOT, _NOISE = np.uint64(Stream.SHOT), np.uint64(Stream.NOISE)
+_U2, _U1 = np.uint64(2), np.uint64(1)
+_INSERTION_LIMIT, _FAR_BELOW = 32, np.int32(-(2**31))
+DRAWS = 16
+"""Candidates of shot noise that are drawn in one go, at most."""
+
+
+@numba.njit(**JIT)
+def lin_log_block(intensity: np.ndarray, out: np.ndarray) -> None:
+    """``out[:]`` = lin-log of ``intensity`` (DN)."""
+    for i in range(intensity.size):
+        out[i] = lin_log(intensity[i])
+
+
+@numba.njit(**JIT)
+def relax_block(
+    lag: np.ndarray,
+    before: np.ndarray,
+    now: np.ndarray,
+    intensity_before: np.ndarray,
+    intensity_now: np.ndarray,
+    kappa: float,
+    out: np.ndarray,
+    z: np.ndarray,
+) -> None:
+    """The low-pass: its lag at the end into ``out``, and with what it follows into ``z``."""
+    for i in range(now.size):
+        lag_now = relax(lag[i], before[i], now[i], intensity_before[i], intensity_now[i], kappa)
+        out[i] = lag_now
+        z[i] = now[i] + lag_now
+
+
+@numba.njit(**JIT)
+def relax_block_gently(
+    lag: np.ndarray,
+    before: np.ndarray,
+    now: np.ndarray,
+    intensity_before: np.ndarray,
+    intensity_now: np.ndarray,
+    kappa: float,
+    out: np.ndarray,
+    z: np.ndarray,
+) -> None:
+    """:func:`relax_block` where k < 1/2 at every pixel."""
+    for i in range(now.size):
+        lag_now = relax_gently(lag[i], before[i], now[i], intensity_before[i], intensity_now[i], kappa)
+        out[i] = lag_now
+        z[i] = now[i] + lag_now
+
+
+@numba.njit(**JIT)
+def second_block(
+    lag: np.ndarray, before: np.ndarray, x: np.ndarray, keep: float, ramp: float, now: np.ndarray, lag_now: np.ndarray
+) -> None:
+    """``x`` through the second low-pass; what it was into ``now``."""
+    for i in range(x.size):
+        now[i] = x[i]
+        lag_now[i] = settled(lag[i] * keep - (x[i] - before[i]) * ramp)
+        x[i] = x[i] + lag_now[i]
+
+
+@numba.njit(**JIT)
+def add_scaled_block(a: np.ndarray, scale: float, out: np.ndarray) -> None:
+    """``out[:] += a * scale``."""
+    for i in range(a.size):
+        out[i] += a[i] * scale
+
+
+@numba.njit(**JIT)
+def noise_block(
+    noise: np.ndarray,
+    intensity_before: np.ndarray,
+    intensity_now: np.ndarray,
+    kappa: float,
+    sizes: np.ndarray,
+    seed: int,
+    step: int,
+    first: int,
+    normals: np.ndarray,
+    out: np.ndarray,
+    z: np.ndarray,
+) -> None:
+    """The photoreceptor's noise at the end into ``out``, and added to ``z``.   normals : scratch, at least as long."""
+    for j in range((out.size + 1) // 2):  # pixels 2j and 2j + 1 share a draw
+        a, b = normal2(seed, np.uint64(first // 2 + j), _NOISE, np.uint64(step))
+        normals[2 * j], normals[2 * j + 1] = np.float32(a), np.float32(b)
+    for i in range(out.size):
+        k = np.float32(kappa * (_HALF * (intensity_before[i] + intensity_now[i]) + _JOINT))
+        below, part = noise_place(k)
+        size = np.float32(sizes[below] + part * (sizes[below + 1] - sizes[below]))
+        value = np.float32(next_noise(noise[i], k, size, normals[i]))
+        out[i] = value
+        z[i] += value
+
+
+@numba.njit(**JIT)
+def flag_block(z: np.ndarray, upper: np.ndarray, lower: np.ndarray, flags: np.ndarray) -> float:
+    """Flags (uint8) of the pixels at or beyond a level; returns how far the farthest is beyond (negative: none is)."""
+    farthest = _FAR_BELOW
+    for i in range(z.size):
+        above, below = np.float32(z[i] - upper[i]), np.float32(lower[i] - z[i])
+        beyond = np.float32(select(above > below, above, below))
+        flags[i] = np.uint8(beyond >= _ZERO)
+        farthest = max(farthest, beyond.view(np.int32))  # floats >= 0 are ordered as their bits; this loop vectorises
+    return np.int32(farthest).view(np.float32)
+
+
+@numba.njit(**JIT)
+def flag_block_leaking(
+    z: np.ndarray, leak: np.ndarray, since: float, upper: np.ndarray, lower: np.ndarray, flags: np.ndarray
+) -> float:
+    """:func:`flag_block` of z with what has leaked."""
+    farthest = _FAR_BELOW
+    for i in range(z.size):
+        leaked = np.float32(z[i] + np.float32(leak[i] * since))
+        above, below = np.float32(leaked - upper[i]), np.float32(lower[i] - leaked)
+        beyond = np.float32(select(above > below, above, below))
+        flags[i] = np.uint8(beyond >= _ZERO)
+        farthest = max(farthest, beyond.view(np.int32))
+    return np.int32(farthest).view(np.float32)
+
+
+@numba.njit(**JIT)
+def _shot_draws(seed, block, index, rate_per_ns, gaps, picks, accepts):
+    """Of the candidates from number ``index`` on: more than are wanted, but in vector instructions."""
+    for j in range(gaps.size):
+        number = index + np.uint64(j)
+        gaps[j], picks[j] = shot_draw(seed, block, number, rate_per_ns)
+        # Odd: shot_draw has the even numbers.
+        accepts[j], _ = uniform2(seed, block, _SHOT, number * _U2 + _U1)
+
+
+@numba.njit(**JIT)
+def shot_block(
+    block: int,
+    pixels_in_block: int,
+    before: int,
+    p: Any,
+    v: Any,
+    intensity_now: np.ndarray,
+    keys: np.ndarray,
+    draws: tuple[np.ndarray, np.ndarray, np.ndarray],
+) -> tuple[int, int, int]:
+    """Shot noise of one block in the interval: accepted events into ``keys`` (pixel in block and ``before`` << 42 | ns
+    from the interval's start << 1 | polarity), sorted. Returns (events, time and number of the next candidate); -1
+    events when ``keys`` is too small."""
+    count, first, end_ns = 0, block * BLOCK, v.t0_ns + v.dt_ns
+    table = p.shot_table[block]
+    whole = np.float64(table[table.size - 1])
+    t_ns, index = p.clock_ns[block], p.clock_index[block]
+    # A Poisson process of candidates for the block as a whole, as fast as if all its pixels were dark, thinned below to
+    # what their intensities allow (Lewis and Shedler, Naval Research Logistics 26, 1979). One clock a block instead of
+    # one a pixel.
+    rate = v.shot_unit_per_ns * whole
+    gaps, picks, accepts = draws
+    expected = rate * v.dt_ns
+    wanted = min(gaps.size, (np.int64(min(expected + 2.0 * np.sqrt(expected), 1e6)) + 5) // 4 * 4)  # whole vectors
+    drawn = wanted
+    while t_ns <= end_ns:
+        if drawn == wanted:
+            _shot_draws(v.seed, np.uint64(block), np.uint64(index), rate, gaps[:wanted], picks, accepts)
+            for j in range(wanted):
+                prefetch(table, np.int64(picks[j] * table.size))
+            drawn = 0
+        gap, pick, accept = gaps[drawn], picks[drawn], accepts[drawn]
+        drawn += 1
+        # How many entries are <= weight. Weights are much alike, so the proportional guess is a cache line away.
+        weight, place = np.float32(pick * whole), np.int64(pick * table.size)
+        while place > 0 and table[place - 1] > weight:
+            place -= 1
+        while place < table.size - 1 and table[place] <= weight:
+            place += 1
+        offset, on = place & (BLOCK - 1), place < BLOCK  # the table holds the ON half of all pixels, then the OFF half
+        if offset < pixels_in_block:
+            i = first + offset
+            after = max(t_ns - v.t0_ns, 0)
+            intensity = p.intensity[i] + (intensity_now[offset] - p.intensity[i]) * (after / v.dt_ns)
+            if accept * DARKEST < shot_factor(intensity):
+                if count == keys.size:
+                    return -1, t_ns, index  # the caller doubles ``keys`` and begins the block anew: draws know no state
+                key = ((before + offset) << 42) | (after << 1) | np.int64(on)
+                slot = count
+                if count < _INSERTION_LIMIT:  # a few are put where they belong, many are sorted at the end
+                    while slot > 0 and keys[slot - 1] > key:
+                        keys[slot] = keys[slot - 1]
+                        slot -= 1
+                keys[slot] = key
+                count += 1
+        index += 1
+        t_ns += gap
+    if count > _INSERTION_LIMIT:
+        keys[:count].sort()
+    return count, t_ns, index

@@ -3,7 +3,7 @@ emulator; ground truth at label times."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
 from functools import cached_property, partial
 from pathlib import Path
@@ -39,6 +39,7 @@ from blinkgl.timeline.reductions import OfArrays, Reductions
 
 if TYPE_CHECKING:
     from blinkgl.card.tiles import Tiles
+    from blinkgl.sequence.helper import Hand
 
 SURFACES = LabelRequest("ids", "depth", "velocity")
 """Labels that say what made an event."""
@@ -72,6 +73,21 @@ def _truth_of(sensor: Sensor, config: SequenceConfig) -> SurfaceTruth | None:
     return SurfaceTruth(reach=int(samples_of(config.render.antialiasing).shared))
 
 
+def timeline_of(
+    config: SequenceConfig,
+    scene: Scene,
+    renderer: Renderer,
+    span_ns: tuple[int, int],
+    reductions: Callable[[], Reductions] = OfArrays,
+) -> Timeline:
+    """What decides the times of a sensor's frames.   scene : of one sensor, as it was built.   renderer : of it.
+    span_ns : first and last time, ns.   reductions : makes who reduces its small pictures."""
+    emulator, dynamics = recording(scene, config).sensors[0].emulator, scene.dynamics
+    stops = dynamics.impacts_ns if dynamics is not None else ()
+    response = emulator_of(emulator).response(emulator)
+    return make_timeline(config.timeline, *span_ns, renderer, response, stops, reductions)
+
+
 def _reductions(gl: GLContext, device: str, stack: ExitStack) -> Reductions:
     """Who reduces the timeline's small pictures, where ``events.device`` says. What it holds goes with the stack."""
     if device == "cpu" or (device == "auto" and gl.is_software):
@@ -96,7 +112,7 @@ class RenderedSequence(Simulation):
     scene : as it was built.   renderer : what draws it, at its level of detail.
     sensor : what is recorded, and through which camera. A scene that was made already is
     recorded as the configuration says.   number : of the sensor on its rig, by which noise differs.
-    atlas : see :func:`~blinkgl.sequence.simulate.simulate_sequence`."""
+    atlas, hand : see :func:`~blinkgl.sequence.simulate.simulate_sequence`."""
 
     def __init__(
         self,
@@ -113,8 +129,9 @@ class RenderedSequence(Simulation):
         window_ns: tuple[int, int] | None,
         number: int = 0,
         atlas: Tiles | None = None,
+        hand: Hand | None = None,
     ):
-        self.number = number
+        self.number, self._hand = number, hand
         clock = StageClock()
         scene = scene or (renderer.scene if renderer is not None else None)
         if scene is None:
@@ -149,10 +166,8 @@ class RenderedSequence(Simulation):
                     renderer.gl,
                     None if atlas is None else atlas.emulator(emulator, seed, path, size),
                 )
-                response, dynamics = emulator_of(emulator).response(emulator), scene.dynamics
-                stops = dynamics.impacts_ns if dynamics is not None else ()
                 reductions = partial(_reductions, renderer.gl, getattr(emulator, "device", "auto"), stack)
-                self.timeline = make_timeline(config.timeline, *span_ns, renderer, response, stops, reductions)
+                self.timeline = timeline_of(config, scene, renderer, span_ns, reductions)
             if labels and config.images is not None:
                 seed = kernel_seed(config.seed, index, Role.IMAGES, number)
                 self.frame_camera = FrameCamera(renderer, config.images, seed, span_ns)
@@ -173,19 +188,18 @@ class RenderedSequence(Simulation):
 
     def _event_pass(self) -> Iterator[tuple[int, Events]]:
         try:
-            yield from emulate(
-                drawn(
-                    self.renderer,
-                    self.timeline,
-                    self.camera.emulator.needs_rate,
-                    self.camera.tells,
-                    self.camera.takes_textures(self.renderer.gl),
-                ),
-                self.camera,
-                self.clock,
-            )
+            yield from emulate(self._frames(), self.camera, self.clock)
         except EventDataError as error:
             raise self._explained(error) from error
+
+    def _frames(self) -> Iterator[EventFrame]:
+        """Of the event pass."""
+        rates, tells = self.camera.emulator.needs_rate, self.camera.tells
+        textures = self.camera.takes_textures(self.renderer.gl)
+        if self._hand is None or textures or self.timeline.looks_at_frames:
+            return drawn(self.renderer, self.timeline, rates, tells, textures)
+        shown = partial(surfaces_at, self.renderer) if tells else None
+        return self._hand.drawn(self.renderer, self.number, self.timeline, rates, shown)
 
     def _in_order(self) -> Iterator[Item]:
         yield from super()._in_order()
@@ -240,7 +254,8 @@ class RenderedSequence(Simulation):
     def seconds(self) -> dict[str, float]:
         stats, (render_s, readback_s) = self.renderer.stats, self._before
         images = {} if self.frame_camera is None else {"images": self.frame_camera.seconds}
-        drawing = {"render": stats.render_s - render_s, "read-back": stats.readback_s - readback_s}
+        waited_s = 0.0 if self._hand is None else self._hand.waited_s.get(self.number, 0.0)
+        drawing = {"render": stats.render_s - render_s + waited_s, "read-back": stats.readback_s - readback_s}
         return {**self.clock.seconds, **images, **drawing}
 
     def poses(self) -> dict[str, np.ndarray]:

@@ -41,6 +41,7 @@ from blinkgl.timeline import Ticks, Timeline
 
 if TYPE_CHECKING:
     from blinkgl.card.tiles import Tiles
+    from blinkgl.sequence.helper import Hand
 
 
 def simulate_sequence(
@@ -56,6 +57,7 @@ def simulate_sequence(
     renderer: Renderer | None = None,
     window_ns: tuple[int, int] | None = None,
     atlas: Tiles | None = None,
+    hand: Hand | None = None,
 ) -> Simulation:
     """Sequence ``index`` of a run, ready to be iterated over: :class:`EventChunk`, :class:`GroundTruth`,
     :class:`CameraImage` and :class:`Picture` in time order.
@@ -71,6 +73,7 @@ def simulate_sequence(
     what is drawn, not of recorded frames.)
     atlas : the batch that its events are made in, of the context ``gl``; see
     :func:`~blinkgl.sequence.side_by_side.side_by_side`.
+    hand : of another process, which draws frames of this sequence, too (:mod:`blinkgl.sequence.helper`).
     Raises BlinkGLError for anything the user or the machine caused, here or while iterating."""
     if pictures_hz is not None and not events:
         raise ConfigError(
@@ -93,11 +96,22 @@ def simulate_sequence(
     wanted = dict(events=events, labels=labels, pictures_hz=pictures_hz)
     if config.frames is None:
         return RenderedSequence(
-            config, index, gl, base=base, scene=scene, renderer=renderer, window_ns=window_ns, atlas=atlas, **wanted
+            config,
+            index,
+            gl,
+            base=base,
+            scene=scene,
+            renderer=renderer,
+            window_ns=window_ns,
+            atlas=atlas,
+            hand=hand,
+            **wanted,
         )
-    if scene is not None or renderer is not None or window_ns is not None or atlas is not None:
+    if scene is not None or renderer is not None or window_ns is not None or atlas is not None or hand is not None:
         raise ConfigError(
-            "nothing is drawn of recorded frames", where="frames", accepted="no scene, renderer, window_ns or atlas"
+            "nothing is drawn of recorded frames",
+            where="frames",
+            accepted="no scene, renderer, window_ns, atlas or hand",
         )
     return RecordedSequence(config, index, base=base, **wanted)
 

@@ -114,11 +114,11 @@ class Everything(Renderer):
 
     def __init__(self, *arguments):
         super().__init__(*arguments)
-        for item in self._resources.items:
+        for item in self.items:
             item.two_sided = True
 
     def _visible(self, moment):
-        return self._resources.items
+        return self.items
 
 
 def timing(gl, scene: Scene, variants: dict, times: list[int], rounds: int) -> dict[str, dict]:

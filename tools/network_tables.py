@@ -26,6 +26,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -109,14 +111,12 @@ def data(steps: Steps, out: Path, test: int) -> dict[str, Path]:
 
 
 def few(source: Path, out: Path, count: int) -> Path:
-    """A folder of links to the first ``count`` sequences of another."""
+    """A folder of the first ``count`` sequences of another: the same files under other names."""
     if not out.exists():
         fresh = out.with_suffix(".new")
-        fresh.mkdir(exist_ok=True)
+        shutil.rmtree(fresh, ignore_errors=True)
         for sequence in sorted(source.iterdir())[:count]:
-            link = fresh / sequence.name
-            if not link.is_symlink():
-                link.symlink_to(sequence.resolve(), target_is_directory=True)
+            shutil.copytree(sequence, fresh / sequence.name, copy_function=os.link)
         fresh.rename(out)
     return out
 

@@ -112,13 +112,17 @@ def random_scene(folder: Path, arguments) -> Scene:
 class Everything(Renderer):
     """No culling: every part is drawn, front and back."""
 
-    def __init__(self, *arguments):
-        super().__init__(*arguments)
+    def __init__(self, *arguments, **more):
+        super().__init__(*arguments, **more)
         for item in self.items:
             item.two_sided = True
 
-    def _visible(self, moment):
-        return self.items
+    def moment(self, t_ns):
+        moment = super().moment(t_ns)
+        seen = set(map(id, moment.visible))
+        # Behind what is seen, so that the order in which that hides the rest of itself stays.
+        moment.visible = moment.visible + [item for item in self.items if id(item) not in seen]
+        return moment
 
 
 def timing(gl, scene: Scene, variants: dict, times: list[int], rounds: int) -> dict[str, dict]:

@@ -27,10 +27,13 @@ def read_both(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
 def filtered(
     picture: np.ndarray, depths: np.ndarray, pixels: np.ndarray, crossings: np.ndarray, pixel: float, floor: float = 0.0
 ) -> np.ndarray:
-    """(H, W) float64: the picture with its silhouettes and creases by area.
+    """(H, W) or (H, W, C) float64: the picture with its silhouettes and creases by area.
 
-    picture, depths : (H, W) float32, depths near / Z.   pixels, crossings : of
+    picture : (H, W) or (H, W, C) float32.   depths : (H, W) float32, near / Z.   pixels, crossings : of
     :meth:`~blinkgl.render.contours.Lines.in_pixels`.   pixel : 1 / focal length, px.   floor : the least."""
+    if picture.ndim == 3:
+        each = (filtered(picture[..., k], depths, pixels, crossings, pixel, floor) for k in range(picture.shape[2]))
+        return np.stack(list(each), axis=-1)
     out = picture.astype(np.float64)
     of = _Pixel(out.copy(), depths.astype(np.float64), pixel)
     for x, y, first, end in pixels.tolist():

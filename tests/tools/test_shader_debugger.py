@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import PinHole
 from blinkgl.config.sequence import RenderConfig, load_run
-from blinkgl.gl import create_context
+from blinkgl.gl import ShaderLoader, create_context
 from blinkgl.labels import LabelRequest
 from blinkgl.render import reference
 from blinkgl.render.renderer import Renderer
@@ -24,7 +24,7 @@ from blinkgl.scene.geometry.primitives import grid
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Material, Part, Scene, SceneObject, Texture
-from blinkgl.tools.shader_debugger import compare, mipmaps, moments, probe, session
+from blinkgl.tools.shader_debugger import compare, mipmaps, moments, probe, session, silhouettes
 from blinkgl.tools.shader_debugger.session import DebugRenderer, When, moment, open_renderer, open_subject
 from debugger_scene import HEIGHT, LOOKUP_MISTAKES, MISTAKES, WIDTH, edit, with_stale_pose
 
@@ -133,7 +133,8 @@ def both(config):
 
 def test_every_buffer_agrees(both):
     gpu, _, _, reports = both
-    assert set(reports) == set(compare.QUANTITIES) & set(moments.buffers_of(both[1].scene))
+    assert set(reports) == set(compare.QUANTITIES) & set(moments.buffers_of(both[1].scene, gpu.renderer.edged))
+    assert gpu.renderer.edged == ("luminance_edges",)  # of the default
     for name, report in reports.items():
         assert report.passed, (name, report.value)
         assert report.graded.mean() > (0.4 if name == "local" else 0.8), name  # where something is drawn
@@ -256,10 +257,109 @@ def test_mip_chain_keeps_the_mean_and_level_0_is_the_reference():
     )
 
 
+# ------------------------------------------------------------------------------------------------- edges
+
+
+ALL_EDGED = (
+    *("--set", "timeline.reconstruction=hermite"),
+    *("--set", "render.image_antialiasing=edges"),
+)
+ALL_THREE = ("--pass", "luminance_edges", "--pass", "rate_edges", "--pass", "colour_edges")
+
+
+def test_what_edges_puts_together_is_what_its_twin_does(shader, config, tmp_path):
+    """In luminance, its rate and colour, at all pixels, silhouettes first of all."""
+    out = tmp_path / "d"
+    status, text, _ = shader("diff", config, *ALL_EDGED, *ALL_THREE, "--time", 0.1, "--json", "--out", out)
+    reports = json.loads(text)["buffers"]
+    assert status == 0 and [r["buffer"] for r in reports] == list(silhouettes.EDGED)
+    for report in reports:
+        assert report["passed"] and report["value"] < 1e-5 and report["tolerance"] == 1e-4
+        assert report["off_silhouettes"]["pixels"] == WIDTH * HEIGHT
+    assert np.load(out / "rate_edges_error.npy").shape == (HEIGHT, WIDTH) and (out / "diff.png").exists()
+    status, text, _ = shader("diff", config, *ALL_THREE[:2], "--tolerance", "0")
+    assert status == 1 and "FAIL luminance_edges" in text  # float32
+
+
+def test_the_twin_changes_silhouettes(both):
+    gpu, *_ = both
+    gpu.renderer.gl.make_current()
+    change = np.abs(gpu["luminance_edges_twin"] - gpu["luminance_edges_plain"])
+    assert (change > 0.05).sum() > 100 and (change == 0).mean() > 0.5
+
+
+def test_pictures_of_edges_are_there_where_the_configuration_filters_so(shader, config):
+    there = lambda *more: silhouettes.edged_of(load_run(config, more).sequence(0))
+    assert there() == ("luminance_edges",)
+    assert there("render.antialiasing=taps4") == there("quality=null") == ()
+    assert there("render.antialiasing=taps4", "render.image_antialiasing=edges") == ("colour_edges",)
+    assert there("timeline.reconstruction=hermite") == ("luminance_edges", "rate_edges")
+    status, _, error = shader("diff", config, "--set", "render.antialiasing=taps4", "--pass", "luminance_edges")
+    assert status == 2 and "unknown pass (got 'luminance_edges')" in error
+
+
+EDGES_MISTAKES = {
+    # name: (right, wrong, words of the suspicion)
+    "nothing changes": ("change += share * (front - back);", "", "nothing is filtered"),
+    "sign": ("change += share * (front", "change -= share * (front", "what the lines change has the wrong sign"),
+    "the picture is left out": ("LIGHT result = plain + change * whole;", "LIGHT result = change * whole;", ""),
+    "depths from below": ("clamp(place, ivec2(0)", "clamp(ivec2(place.x, image_size.y - 1.0 - place.y), ivec2(0)", ""),
+    "another row of crossings": ("const int ROW = 512;", "const int ROW = 511;", ""),
+    "no focal length": ("uniform float pixel; // 1 / focal length, px", "const float pixel = 1.0;", ""),
+}
+
+
+@pytest.fixture
+def with_shaders(both):
+    """``with_shaders(folder, "luminance_edges")``: reports of the moment drawn with a folder's shaders."""
+    right, _, comparison, _ = both
+    ours = right.renderer.gl.shaders
+
+    def drawn(folder, *names):
+        right.renderer.gl.make_current()
+        right.renderer.use_shaders(ShaderLoader(right.renderer.gl.ctx, session.open_folder(str(folder))))
+        gpu = moments.GpuMoment(right.renderer, right.when, right.log_eps)
+        return [comparison.of(gpu).report(name) for name in names]
+
+    yield drawn
+    right.renderer.use_shaders(ours)
+
+
+@pytest.mark.parametrize("mistake", EDGES_MISTAKES)
+def test_a_mistake_in_edges_is_found(with_shaders, shaders, mistake):
+    right, wrong, suspicion = EDGES_MISTAKES[mistake]
+    edit(shaders / "edges.glsl", right, wrong)
+    (report,) = with_shaders(shaders, "luminance_edges")
+    assert not report.passed and report.objects[0]["over_tolerance"] > 0
+    assert not suspicion or report.suspicions[0].startswith(suspicion)
+
+
+def test_a_mistake_in_edges_is_named_and_can_be_probed(shader, config, shaders):
+    right, wrong, suspicion = EDGES_MISTAKES["sign"]
+    edit(shaders / "edges.glsl", right, wrong)
+    names = ("--pass", "depth", "--pass", "luminance_edges")
+    status, out, _ = shader("diff", config, "--shaders", shaders, *names)
+    lines = out.splitlines()
+    assert status == 1 and lines[0].startswith("The first that is wrong: luminance, edges (edges.glsl), on ")
+    assert f"it looks as if: {suspicion}" in lines[1]
+    pixel = re.search(r"1 of 2 buffers are over their tolerance; look closer with: probe --pixel (\d+,\d+)", out)[1]
+    status, out, _ = shader("probe", config, "--shaders", shaders, "--pixel", pixel)
+    assert status == 0 and any(line.startswith("!! luminance, edges") for line in out.splitlines())
+
+
+def test_a_mistake_before_edges_is_none_of_edges(with_shaders, shaders):
+    """It is judged by the picture that it filters, whatever that shows."""
+    edits, buffer, *_ = LOOKUP_MISTAKES["normal not normalised"]
+    for file, right, wrong in edits:
+        edit(shaders / file, right, wrong)
+    before, after = with_shaders(shaders, buffer, "luminance_edges")
+    assert not before.passed and after.passed
+
+
 # ------------------------------------------------------------------------------------------------- probe
 
 
-FILTERED = ("colour", "luminance", "log_luminance", "dL_dt")
+FILTERED = ("colour", "luminance", "luminance_edges", "log_luminance", "dL_dt")
 
 
 def test_probe_shows_the_values_of_passes(shader, config, written, world):

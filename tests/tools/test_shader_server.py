@@ -23,6 +23,7 @@ from blinkgl.tools.shader_debugger import server as server_module
 from blinkgl.tools.shader_debugger.moments import buffers_of
 from blinkgl.tools.shader_debugger.server import LOCAL, MOST_OPEN, MOST_WAITING, THREADS, DebugServer, host_allowed
 from blinkgl.tools.shader_debugger.session import moment, open_subject
+from blinkgl.tools.shader_debugger.silhouettes import edged_of
 from debugger_scene import HEIGHT, WIDTH, copy_shaders, edit
 
 
@@ -37,7 +38,8 @@ def served(config, tmp_path_factory):
 
 def buffers(config: str) -> dict:
     """What the page has of this configuration."""
-    return buffers_of(open_subject(config).scene)
+    subject = open_subject(config)
+    return buffers_of(subject.scene, edged_of(subject.config))
 
 
 def ask(server, path: str, method: str = "GET", host: str | None = None):
@@ -487,7 +489,7 @@ def test_the_page_in_chromium(served, shader, config, tmp_path):
 
         page.run("document.querySelector('#compare').click()")
         page.wait("return document.querySelector('#verdict').className === 'good'", timeout=60)
-        assert "all 28 buffers agree" in page.text("#verdict") and page.text("#objects") == ""
+        assert "all 29 buffers agree" in page.text("#verdict") and page.text("#objects") == ""
         good = (folder / "luminance.glsl").read_text()
         edit(
             folder / "luminance.glsl",

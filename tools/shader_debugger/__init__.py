@@ -6,6 +6,7 @@ Start: cli.py (the commands), then session.py:
 
     session.py    one moment of the scene that a generation run would render; the shader folder; the OpenGL side
     moments.py    every buffer of that moment, from the GPU and from the float64 reference, by the same names
+    silhouettes.py what `antialiasing: edges` puts together, and its slow twin
     lamps.py      shadow maps in float64, and where they may be off
     compare.py    one against the other, with tolerances and the silhouette band
     suspicions.py what the error looks like; poses.py: which other pose would explain it

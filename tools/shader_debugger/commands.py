@@ -22,6 +22,7 @@ from blinkgl.tools.shader_debugger.moments import (
 )
 from blinkgl.tools.shader_debugger.probe import as_text, probe
 from blinkgl.tools.shader_debugger.session import Subject, When, check_pixel, open_renderer
+from blinkgl.tools.shader_debugger.silhouettes import EDGED, edged_of
 from blinkgl.tools.shader_debugger.verdict import as_text as verdict_text, verdict
 
 
@@ -66,7 +67,7 @@ def _meaningful(moment, info) -> np.ndarray | None:
         return moment[info.name] > 0
     if info.name.startswith("flow_"):
         return moment[info.name.replace("flow", "valid")]
-    everywhere = info.name in ("luminance", "log_luminance", "dL_dt")  # the background has them, too
+    everywhere = info.name in ("luminance", "log_luminance", "dL_dt", *EDGED)  # the background has them, too
     if lookup_of(info.name)[1] in ("uv", "level"):
         return (
             moment["texture_size"][..., 0] > 1
@@ -107,7 +108,7 @@ def run_diff(
     from blinkgl.tools.shader_debugger.compare import QUANTITIES
 
     if names:
-        there = buffers_of(subject.scene)
+        there = buffers_of(subject.scene, edged_of(subject.config))
         names = [check_pass(name, [known for known in QUANTITIES if known in there]) for name in names]
     with open_renderer(subject, shaders) as renderer:
         comparison = Comparison(

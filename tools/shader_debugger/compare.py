@@ -46,6 +46,7 @@ from blinkgl.tools.shader_debugger.moments import (
     luma_of,
 )
 from blinkgl.tools.shader_debugger.poses import displaced, pose_suspicions
+from blinkgl.tools.shader_debugger.silhouettes import EDGED
 from blinkgl.tools.shader_debugger.suspicions import suspicions
 
 WORST = 10  # objects told apart in a report
@@ -103,6 +104,12 @@ def _of_the_lamps(g, r, gpu, ref):
     return np.abs(g.astype(np.float64) - r) * np.minimum(ref["direct"], 1.0)
 
 
+def _of_the_picture(g, r, gpu, ref):
+    """Where it is bright of the pixel itself, else of what the picture has in the mean."""
+    size = length(r)
+    return length(g.astype(np.float64) - r) / np.maximum(max(size.mean(), 1e-12), size)
+
+
 def _misplaced(g, r, gpu, ref):
     return length(displaced(gpu, ref))
 
@@ -113,6 +120,7 @@ _MAPPED = "not graded where a map says how a surface shines, which the reference
 _LEVEL = "drivers may approximate the level (OpenGL 4.6, 8.14.1)"
 _EDGES = "not graded near the edge of a shadow, nor where light grazes: there a map is off by its texels"
 _MAP = "off its silhouettes; with what throws its shadow out of the picture, too"
+_FILTERED = "at all pixels, against a float64 twin on the GPU's own unfiltered picture and depths (tools/edges_twin.py)"
 _MIPS = "against a CPU twin of mip-mapped sampling; drivers may make mip maps differently, hence the loose tolerance"
 
 
@@ -148,6 +156,10 @@ _SHADED = (
     *(Quantity(name, "depth", 1e-3, _absolute, same_triangle=False, note=_MAP) for name in MAPS),
     *_shading("luminance", "linear"),
     *_shading("colour", "linear radiance"),
+    *(
+        Quantity(name, "of the pixel or mean", 1e-4, _of_the_picture, same_triangle=False, note=_FILTERED)
+        for name in EDGED
+    ),
     Quantity("dL_dt", "luminance over the step", 0.05, _per_step, note=_MIPS),
 )
 
@@ -320,13 +332,16 @@ class Comparison:
 
     def names(self) -> list[str]:
         """Every buffer that can be graded here."""
-        isotropic, there = self.gpu.renderer.config.anisotropy <= 1, buffers_of(self.ref.scene)
+        renderer = self.gpu.renderer
+        isotropic, there = renderer.config.anisotropy <= 1, buffers_of(self.ref.scene, renderer.edged)
         return [name for name in QUANTITIES if name in there and (isotropic or name not in NEEDS_ISOTROPIC)]
 
     def pair(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """(GPU, what it is graded against); equal shapes."""
         gpu, ref = self.gpu, self.ref
         of, what = lookup_of(name)
+        if name in EDGED:
+            return gpu[name], gpu[f"{name}_twin"]
         if what == "albedo":
             return gpu[name], self.twin(of)
         if name in ("luminance", "colour"):
@@ -385,7 +400,7 @@ class Comparison:
         quantity = QUANTITIES[name]
         errors = self.errors(name)
         of_map = name in MAPS
-        band = self.map_band(name) if of_map else self.band
+        band = self.map_band(name) if of_map else np.zeros_like(self.band) if name in EDGED else self.band
         graded = ~band
         if quantity.same_triangle:
             graded &= self.same_triangle

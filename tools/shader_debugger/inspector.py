@@ -38,6 +38,7 @@ from blinkgl.tools.shader_debugger.session import (
     open_folder,
     open_renderer,
 )
+from blinkgl.tools.shader_debugger.silhouettes import EDGED, edged_of
 from blinkgl.tools.shader_debugger.verdict import verdict
 
 POLL_S = 0.15  # between two looks at the shader files
@@ -86,9 +87,17 @@ class Inspector:
 
     def _draw_all(self, when: When) -> GpuMoment:
         made = GpuMoment(self.renderer, when, self.subject.log_eps)
-        for name in buffers_of(self.subject.scene):
+        for name in self._buffers():
             made[name]
         return made
+
+    def _buffers(self):
+        return buffers_of(self.subject.scene, edged_of(self.subject.config))
+
+    def _array(self, when: When, name: str, source: str) -> np.ndarray:
+        if name in EDGED:  # whose reference is what the twin makes of the GPU's own
+            return self.gpu(when)[name if source == "gpu" else f"{name}_twin"]
+        return (self.gpu(when) if source == "gpu" else self.reference(when))[name]
 
     def _when(self, seconds: float | None) -> When:
         self._shown = moment(self.subject, seconds, self.step_us) if seconds is not None else self.first
@@ -128,7 +137,7 @@ class Inspector:
             "folder": str(getattr(self.folder, "path", self.folder)),
             "passes": [
                 {"name": p.name, "title": p.title, "unit": p.unit, "kind": p.kind, "source": p.source}
-                for p in buffers_of(scene).values()
+                for p in self._buffers().values()
             ],
         }
 
@@ -137,12 +146,12 @@ class Inspector:
 
     def image(self, q: dict[str, Any]) -> tuple[bytes, dict]:
         """PNG and legend of one buffer. q : as :func:`questions.read_query` gives it, here and below."""
-        when, name = self._when(q["t"]), check_pass(q["pass"], buffers_of(self.subject.scene), "pass")
+        when, name = self._when(q["t"]), check_pass(q["pass"], self._buffers(), "pass")
         source = self.gpu(when) if q["source"] == "gpu" else self.reference(when)
         info = PASSES[name]
         rgb, legend = pictures.picture(
             info.kind,
-            source[name],
+            self._array(when, name, q["source"]),
             which=q["component"],
             colours=q["map"],
             low=q["low"],
@@ -155,11 +164,8 @@ class Inspector:
         """PNG and legend of |A - B|, on a logarithmic scale unless q's low is 0."""
         when = self._when(q["t"])
         for key in "ab":
-            check_pass(q[key][0], buffers_of(self.subject.scene), key)
-        a, b = (
-            np.asarray((self.gpu(when) if source == "gpu" else self.reference(when))[name], np.float64)
-            for name, source in (q["a"], q["b"])
-        )
+            check_pass(q[key][0], self._buffers(), key)
+        a, b = (np.asarray(self._array(when, name, source), np.float64) for name, source in (q["a"], q["b"]))
         if a.shape != b.shape:
             raise ConfigError(
                 "have different numbers of components",

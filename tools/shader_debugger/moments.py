@@ -20,6 +20,7 @@ from blinkgl.scene.types import Scene
 from blinkgl.tools.shader_debugger.lamps import map_of
 from blinkgl.tools.shader_debugger.mipmaps import mipmapped_albedo
 from blinkgl.tools.shader_debugger.session import LOOKUPS as LOOKUP_PASSES, DebugRenderer, Subject, When
+from blinkgl.tools.shader_debugger.silhouettes import EDGED, edged, twin_of
 
 _T = TypeVar("_T")
 
@@ -70,6 +71,9 @@ _SHADED = (
     Pass("luminance", "luminance", "linear", "scalar", "luminance.glsl"),
     *_lookups("colour", LOOKUP_PASSES["colour"].program),
     Pass("colour", "colour", "linear radiance", "light", "colour.glsl"),
+    Pass("luminance_edges", "luminance, edges", "linear", "scalar", "edges.glsl"),
+    Pass("rate_edges", "rate of luminance, edges", "1/s", "signed", "edges.glsl"),
+    Pass("colour_edges", "colour, edges", "linear radiance", "light", "edges.glsl"),
     Pass("log_luminance", "log luminance", "ln(L + log_eps)", "scalar", "luminance.glsl, then the logarithm"),
     Pass("dL_dt", "dL/dt", "1/s", "signed", "luminance.glsl at two times, difference quotient"),
 )
@@ -117,8 +121,10 @@ def _of_label(label: Label, view: View) -> Pass:
 PASSES = OfLabels(_of_label, _BEFORE, _SHADED)
 
 
-def buffers_of(scene: Scene) -> dict[str, Pass]:
-    """Those of :data:`PASSES` that a scene has: of one without shadows no shadow maps, and so on."""
+def buffers_of(scene: Scene, edged: tuple[str, ...] = ()) -> dict[str, Pass]:
+    """Those of :data:`PASSES` that a scene has: of one without shadows no shadow maps, and so on.
+
+    edged : pictures with filtered silhouettes that are among them."""
     maps = len(shadowing(scene.light)) if reference.casts(scene) else 0
     materials = [part.material for _, part in reference.scene_parts(scene) if not part.material.unlit]
     there = {
@@ -131,6 +137,7 @@ def buffers_of(scene: Scene) -> dict[str, Pass]:
         for name, info in PASSES.items()
         if there.get(lookup_of(name)[1], True)
         and name not in MAPS[maps:]
+        and (name not in EDGED or name in edged)
         and ((found := view_of(name)) is None or found[0].can_be_of(scene))
     }
 
@@ -175,7 +182,8 @@ class _Lazy:
 class GpuMoment(_Lazy):
     """What the GPU wrote. Besides :data:`PASSES`: part (H, W) int32, -1: nothing hit; window (H, W, 4) gl_FragCoord;
     next_depth_forward|backward (H, W), the depth at t' that the flow program returns; luminance_count, colour_count (H,
-    W), the number of texture look-ups at the pixel; colour_light_rgb (H, W, 3), its light in colour.
+    W), the number of texture look-ups at the pixel; colour_light_rgb (H, W, 3), its light in colour; NAME_plain and
+    NAME_twin of what :data:`silhouettes.EDGED` has.
 
     Conventions: depth inf, flow 0 and id 0 where nothing is hit; velocity 0 there.
     """
@@ -195,6 +203,11 @@ class GpuMoment(_Lazy):
         if name == "dL_dt":
             change = draw.luminance(when.after_ns).read() - draw.luminance(when.before_ns).read()
             return {name: change / np.float32(when.step_s)}
+        if name in EDGED:
+            return {name: edged(draw, name, when.t_ns)}
+        if (of := name.removesuffix("_plain").removesuffix("_twin")) in EDGED:
+            plain, twin = twin_of(draw, of, when.t_ns)
+            return {f"{of}_plain": plain, f"{of}_twin": twin}
         if name in MAPS:
             return {name: draw.shadow_map(MAPS.index(name), when.t_ns)}
         if name in ("triangle", "part", "local", "window"):

@@ -11,6 +11,7 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.tools.shader_debugger.compare import QUANTITIES, Comparison
 from blinkgl.tools.shader_debugger.lamps import place_in
 from blinkgl.tools.shader_debugger.moments import MAPS, PASSES, GpuMoment, ReferenceMoment, buffers_of, lookup_of
+from blinkgl.tools.shader_debugger.silhouettes import EDGED
 
 
 def ulps(gpu: np.ndarray, ref: np.ndarray) -> float:
@@ -49,7 +50,7 @@ def probe(gpu: GpuMoment, ref: ReferenceMoment, x: int, y: int, comparison: Comp
         "band": bool(comparison.band[y, x]),
         "buffers": [
             _row(name, gpu, ref, comparison, x, y)
-            for name in buffers_of(scene)
+            for name in buffers_of(scene, gpu.renderer.edged)
             if name not in ("triangle", "local", *MAPS)
         ],  # told below
         "surface": {
@@ -71,7 +72,7 @@ def _plain(values):
 
 
 def _row(name, gpu, ref, comparison, x, y) -> dict:
-    g, r = gpu[name][y, x], ref[name][y, x]
+    g, r = (side[y, x] for side in (comparison.pair(name) if name in EDGED else (gpu[name], ref[name])))
     row = {
         "name": name,
         "title": PASSES[name].title,
@@ -95,7 +96,7 @@ def _row(name, gpu, ref, comparison, x, y) -> dict:
     if name in comparison.names() and name in QUANTITIES:
         quantity = QUANTITIES[name]
         error = float(comparison.errors(name)[y, x])
-        skipped = comparison.band[y, x] or (
+        skipped = (comparison.band[y, x] and name not in EDGED) or (
             lookup_of(name)[1] in ("shadow", "light", "mirrored") and comparison.shadow_edges(gpu.when.t_ns)[y, x]
         )
         row["ok"] = None if skipped else error <= (comparison.tolerance(name) if quantity.statistic == "max" else 0.5)

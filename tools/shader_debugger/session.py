@@ -23,9 +23,11 @@ from blinkgl.render.painter import Painter
 from blinkgl.render.passes import Colour, Geometry, Luminance, Output, ScenePass
 from blinkgl.render.passes.shadow import ShadowMap
 from blinkgl.render.renderer import Renderer
+from blinkgl.render.strokes import Strokes
 from blinkgl.scene.build import check_assets, sequence_scene
 from blinkgl.scene.geometry.lod import at_level_of_detail
 from blinkgl.scene.types import Scene
+from blinkgl.tools.shader_debugger.silhouettes import edged_of
 
 DEBUG_PROGRAM = "debug.glsl"
 LENT = (DEBUG_PROGRAM, "include/vertex.glsl")
@@ -229,8 +231,18 @@ class _Uniforms(dict):
         return _Nothing()
 
 
+class _DebugStrokes(Strokes):
+    def program(self, name, defines):
+        uniforms, array = super().program(name, defines)
+        return _Uniforms(uniforms), array
+
+
 class DebugPainter(Painter):
     """Tolerates edited shaders that no longer use a uniform."""
+
+    def __init__(self, gl, scene, resources, stats):
+        super().__init__(gl, scene, resources, stats)
+        self.strokes = _DebugStrokes(gl)
 
     def uniforms(self, program):
         return _Uniforms(super().uniforms(program))
@@ -300,7 +312,11 @@ LOOKUPS = {"luminance": LuminanceLookup(), "colour": ColourLookup()}
 
 class DebugRenderer(Renderer):
     """The production renderer, with passes of its own. Always draws whole frames: what is kept from an earlier frame
-    may be other shaders' work."""
+    may be other shaders' work.
+
+    edged : which pictures with filtered silhouettes are shown and compared, see :mod:`silhouettes`."""
+
+    edged: tuple[str, ...] = ()
 
     def __init__(self, gl: GLContext, scene: Scene, config, painter: type[Painter] = DebugPainter):
         super().__init__(gl, scene, config, whole=True, painter=painter)
@@ -386,4 +402,5 @@ def open_renderer(subject: Subject, shaders: str | None = None, *, as_configured
         if not as_configured:
             config = config.model_copy(update={"antialiasing": "none", "image_antialiasing": "none"})
         with DebugRenderer(gl, subject.scene, config) as renderer:
+            renderer.edged = edged_of(subject.config)
             yield renderer

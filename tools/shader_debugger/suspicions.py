@@ -94,6 +94,9 @@ def _candidates(comparison, report, r, g, on) -> Candidates:
     }.get(what) or {
         "depth": _depth,
         "normals": _normals,
+        "luminance_edges": _edges,
+        "rate_edges": _edges,
+        "colour_edges": _edges,
         "luminance": _shaded,
         "colour": _shaded,
         "velocity": _velocity,
@@ -112,6 +115,14 @@ def _candidates(comparison, report, r, g, on) -> Candidates:
         yield "the sign of x is wrong", r * [-1, 1]
         yield "the sign of y is wrong", r * [1, -1]
         yield "x and y are exchanged", r[:, ::-1]
+
+
+def _edges(comparison, name, r, g, on) -> Candidates:
+    plain = comparison.gpu[f"{name}_plain"].astype(np.float64)[on]
+    yield "nothing is filtered: the picture is as it was", plain
+    yield "what the lines change has the wrong sign", 2 * plain - r
+    yield "what the lines change is there alone, without the picture", r - plain
+    yield "what the lines change is there twice", 2 * r - plain
 
 
 def _fitted(comparison, report, r, g, on) -> Candidates:

@@ -1,6 +1,6 @@
 """Every emulator fitted to the recordings that have frames: the table of docs/results.md.
 
-    python -m blinkgl.tools.fit_recordings FOLDER [--only TEXT] [--starts N] [--leave-one-out EMULATOR]
+    python -m blinkgl.tools.fit_recordings FOLDER [--only TEXT] [--starts N] [--leave-one-out EMULATOR] [--judge]
 
 FOLDER : of the recordings slider_depth, cuke_davis346 (needs dv-processing) and evbench_davis240, as docs/results.md
 names them. Each is fitted on its first half in time and judged on its second.
@@ -10,6 +10,9 @@ rate of its middle and of units drawn from it, and how well the judge of `compar
 middle and the recording's own fit from the recording. What is added to the light before the logarithm is not fitted
 there: it is of the frames (their black level, exposure and gain) and not of the pixels, and thresholds that are fitted
 beside it trade with it, so that those of two recordings would not be of the same thing.
+
+--judge: nothing is fitted; each recording beside what every emulator makes of its frames as it is shipped and with the
+shipped sensor of that camera, and beside ESIM without noise: rate, and how well the judge tells them apart.
 """
 
 from __future__ import annotations
@@ -23,11 +26,12 @@ from typing import Any
 import numpy as np
 
 from blinkgl.config.draw import draw, middle
+from blinkgl.config.sensor import load_sensor
 from blinkgl.events.types import Events
 from blinkgl.io.frames import open_frames, read_any_image
 from blinkgl.recordings.bursts import inside_any
 from blinkgl.recordings.calibration import Calibration, calibrate_events
-from blinkgl.recordings.clip import LOG_OFFSET, read_recording, timed_frames
+from blinkgl.recordings.clip import LOG_OFFSET, Clip, clip_of_frames, read_recording, timed_frames
 from blinkgl.recordings.judge import judge, judge_halves
 from blinkgl.recordings.simulation import emulator_config
 
@@ -75,6 +79,8 @@ RECORDINGS: dict[str, Callable[[Path], Recording]] = {
     read.__name__: read for read in (slider_depth, cuke_davis346, evbench_davis240)
 }
 EMULATORS = ("esim", "v2e", "voltmeter")
+SENSORS = {"slider_depth": "davis240c", "cuke_davis346": "davis346", "evbench_davis240": "davis240c"}
+NO_NOISE = {"emulator": "esim", "threshold_sigma": 0.0, "threshold_jitter": 0.0}
 
 
 def rows(folder: Path, only: str = "", starts: int = 3) -> Iterator[str]:
@@ -131,6 +137,38 @@ def with_ratio(config: dict[str, Any]) -> dict[str, Any]:
     return {**config, "contrast_threshold_off": None, "threshold_ratio": off / config["contrast_threshold"]}
 
 
+def span_of(clip: Clip) -> tuple[int, int]:
+    """µs, of all intervals that are compared."""
+    return int(clip.edges_us[0]), int(clip.edges_us[-1])
+
+
+def told_apart(clip: Clip, simulated: Events) -> float:
+    """The judge's area, without the bursts of the camera's frames, which no emulator makes."""
+    streams = (e.part(~inside_any(e.t, clip.bursts)) for e in (clip.events, simulated))
+    return judge(*streams, clip.size, span_of(clip)).auc
+
+
+def shipped(folder: Path, only: str = "") -> Iterator[str]:
+    """Lines of a Markdown table: what is shipped, unfitted."""
+    yield "| recording | events of | rate | judge |"
+    yield "|---|---|---|---|"
+    for name, read in RECORDINGS.items():
+        if only not in name:
+            continue
+        events, size, frames, _ = read(folder)
+        clip = clip_of_frames(events, frames, size)
+        sensor = load_sensor(SENSORS[name])
+        configs = {"ESIM without noise": emulator_config(NO_NOISE)}
+        for emulator in EMULATORS:
+            configs[f"{emulator}, default"] = emulator_config(emulator)
+            configs[f"{emulator}, {sensor.name}"] = sensor.emulator(emulator)
+        yield f"| {name} | its own halves | 1 | {judge_halves(clip.events, clip.size, span_of(clip)).auc:.3f} |"
+        for what, config in configs.items():
+            simulated = clip.simulate(config, 1)
+            rate = len(simulated) / len(clip.events)
+            yield f"| {name} | {what} | {rate:.2f} | {told_apart(clip, simulated):.3f} |"
+
+
 def left_out(folder: Path, emulator: str, starts: int = 3, units: int = 20) -> Iterator[str]:
     """Lines of a Markdown table, one for each recording."""
     found: dict[str, Calibration] = {}
@@ -154,20 +192,14 @@ def left_out(folder: Path, emulator: str, starts: int = 3, units: int = 20) -> I
         ratio = lambda keys: len(clip.simulate(config(keys), 1)) / recorded
         rates = np.sort([ratio(draw(law, unit, 0)) for unit in range(units)])
         low, high = np.quantile(rates, (0.05, 0.95))
-        span = (int(clip.edges_us[0]), int(clip.edges_us[-1]))
-
-        def area(one, clip=clip, span=span) -> float:
-            """Without the bursts of the camera's frames, which no emulator makes."""
-            streams = (clip.events, clip.simulate(one, 1))
-            return judge(*(e.part(~inside_any(e.t, clip.bursts)) for e in streams), clip.size, span).auc
-
+        area = lambda one, clip=clip: told_apart(clip, clip.simulate(one, 1))
         values = ", ".join(
             f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v['log_uniform'][0]:.3g}-{v['log_uniform'][1]:.3g}"
             for k, v in law.items()
         )
         yield (
             f"| {name} | {ratio(middle(law)):.3f} | {low:.2f}-{high:.2f} "
-            f"| {judge_halves(clip.events, clip.size, span).auc:.3f} | {area(emulator_config(emulator)):.3f} "
+            f"| {judge_halves(clip.events, clip.size, span_of(clip)).auc:.3f} | {area(emulator_config(emulator)):.3f} "
             f"| {area(config(middle(law))):.3f} | {area(config(with_ratio(own.config.model_dump()))):.3f} | {values} |"
         )
         yield (
@@ -184,9 +216,12 @@ def main() -> None:
     parser.add_argument("--only", default="", help="part of 'RECORDING EMULATOR'")
     parser.add_argument("--starts", type=int, default=3)
     parser.add_argument("--leave-one-out", metavar="EMULATOR", choices=EMULATORS)
+    parser.add_argument("--judge", action="store_true", help="what is shipped, without a fit")
     options = parser.parse_args()
     lines = rows(options.folder, options.only, options.starts)
-    if options.leave_one_out:
+    if options.judge:
+        lines = shipped(options.folder, options.only)
+    elif options.leave_one_out:
         lines = left_out(options.folder, options.leave_one_out, options.starts)
     for line in lines:
         print(line, flush=True)

@@ -1,6 +1,7 @@
 """Rates of noise events of a comparator behind a low-pass: the table of :mod:`blinkgl.events.noise`.
 
-    python -m blinkgl.tools.noise_rates        # prints the tables, about five minutes of one core
+    python -m blinkgl.tools.noise_rates          # prints the tables, about five minutes of one core
+    python -m blinkgl.tools.noise_rates --judge  # events of V2E over those asked for, by IN_SECONDS; as long
 
 Gaussian noise of standard deviation s (in thresholds) with the correlation e^-k from frame to frame; levels one
 threshold apart, the one at which the last event came is the reference, an event for each other level that is passed.
@@ -19,10 +20,15 @@ is counted, in trajectories of one pixel (third table, by dead time in frames, k
 
 from __future__ import annotations
 
+import argparse
+from itertools import product
+
 import numba
 import numpy as np
 from scipy.special import ndtr
 
+from blinkgl.config.events import V2eConfig
+from blinkgl.events import V2e, noise
 from blinkgl.events.noise import DEAD_FRAMES, DEAD_K, DEAD_SIZES, RATE_K, RATE_SIZES, noise_rate
 
 
@@ -101,7 +107,43 @@ def dead_time_factor(size: float, k: float, dead: float, wanted: int = 6000, mos
     return float(np.log(max(events, 1) / (steps * k) / noise_rate(size, k)))
 
 
+def of_asked(rate_hz: float, seed: int, **keys) -> list[float]:
+    """Events of 1,024 pixels of V2E over those asked for, in clips of 0.5, 2 and 8 s. keys : of V2eConfig, and fps, 0
+    for steps from 0.2 to 20 ms."""
+    fps, side = keys.pop("fps"), 32
+    config = V2eConfig(preset="clean", photoreceptor_noise=True, shot_noise_rate_hz=rate_hz, **keys)
+    emulator, frame = V2e(side, side, config, seed=seed), np.full((side, side), 0.4, np.float32)
+    steps_s = np.exp(np.random.default_rng(23).uniform(np.log(2e-4), np.log(2e-2), 9600))
+    times = np.arange(8 * fps + 1) / fps if fps else np.concatenate([[0.0], np.cumsum(np.floor(steps_s * 1e9)) * 1e-9])
+    parts = [emulator.step(frame, round(t * 1e9)).t for t in times[times <= 8]]
+    events = np.concatenate(parts) * 1e-6
+    return [float((events < s).sum() / (s * side**2 * rate_hz)) for s in (0.5, 2, 8)]
+
+
+def judge() -> None:
+    """IN_SECONDS on seeds, clips and dead times by which it was not chosen."""
+    print("| asked, Hz | thresholds | IN_SECONDS | 0.5 s | 2 s | 8 s |\n|---|---|---|---|---|---|")
+    shipped = noise.IN_SECONDS
+    for (rate, seed, spacings), sigma, part in product(
+        ((1.0, 12, (50, 500)), (5.0, 11, (50, 500, 0)), (20.0, 13, (50, 500))), (0.0, 0.03), (0.0, 0.25, 0.5, 1.0)
+    ):
+        noise.IN_SECONDS = part
+        ratios = np.array([
+            of_asked(rate, seed, fps=fps, refractory_us=dead, cutoff_hz=cutoff, threshold_sigma=sigma)
+            for dead, cutoff, fps in product((200.0, 3000.0), (30.0, 300.0), spacings)
+        ])  # fmt: skip
+        off = np.exp(np.abs(np.log(ratios)).mean(0))
+        cells = (f"{o:.2f} ({r.min():.2f}-{r.max():.2f})" for o, r in zip(off, ratios.T))
+        print(f"| {rate:g} | {'spread' if sigma else 'equal'} | {part:g} | " + " | ".join(cells) + " |", flush=True)
+    noise.IN_SECONDS = shipped
+
+
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--judge", action="store_true", help="how near V2E's rate comes to the one asked for")
+    if parser.parse_args().judge:
+        judge()
+        return
     print("_DEAD = [  # [dead time][k][size]")
     for dead in DEAD_FRAMES:
         rows = [[f"{dead_time_factor(size, k, dead):.2f}" for size in DEAD_SIZES] for k in DEAD_K]

@@ -143,7 +143,8 @@ _DEAD = np.array(
 """ln of the factor by which a dead time of so many frames changes the rate: [dead time][k][size]."""
 IN_SECONDS = 0.5
 """Part of a factor above 1 (of its logarithm) that a clip of seconds sees: pixels leave the ladders that they begin on
-by events, and those of the quiet ones are rare."""
+by events, and those of the quiet ones are rare. Chosen on clips of 2 s at 5 Hz; the best of 0, 1/4, 1/2 and 1 on other
+clips, too, where thresholds are spread, not where they are equal (``python -m blinkgl.tools.noise_rates --judge``)."""
 
 
 _DEAD_Q = 1 / DEAD_SIZES**2

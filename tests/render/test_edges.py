@@ -403,6 +403,61 @@ def wires():
     return looked_at(*zigzag(3.0), wall)
 
 
+def snapped():
+    """Cards whose edges end 1/150 px before or behind pixels' centres, which narrower cards cover or leave free."""
+    wall = polygon(30 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]), 6.0, "wall", 2, GREY)
+    box = lambda x, y, w, h, k: polygon(
+        np.array([(x, y), (x + w, y), (x + w, y + h), (x, y + h)]), 3.0, f"c{k}", 10 + k
+    )
+    things, k = [], 0
+    for row, off in enumerate((-1 / 150, 1 / 150)):
+        for column in range(4):
+            x, y = -17.5 + 9 * column, -18.3 + 17 * row
+            things += [box(x - 4, y, 4 + off, 14, k), box(x - 0.3, y + 4, 0.7, 6, k + 1)]
+            k += 2
+    return looked_at(wall, *things)
+
+
+def posts():
+    """A floor that ends at a sloping horizon, and posts before it, two to twenty times as near as its end."""
+    turn = Rotation.from_euler("y", 5, degrees=True)
+    things = [thing("floor", 2, quad(400, 400, 4), still((0, 10, -1.0), turn), GREY)]
+    for k, near in enumerate((1.6, 2.0, 2.2, 2.4, 2.6, 3.0, 4.0, 8.0)):
+        away = 75 / near
+        x = (8 * k - 28.3) * away / 75
+        card = mesh(
+            [
+                (x, away, -0.2 * away),
+                (x + 0.03 * away, away, -0.2 * away),
+                (x + 0.03 * away, away, 0.3 * away),
+                (x, away, 0.3 * away),
+            ],
+            [[0, 1, 2], [0, 2, 3]],
+        )
+        things.append(thing(f"post{k}", 10 + k, card, still(), replace(WHITE, base_color=(0.2 + 0.8 * (k % 2),) * 3)))
+    return scene(things, rig(80, 60, 75.0))
+
+
+def chamfered():
+    """Corners of boxes with three chamfers of a fiftieth of a pixel, a little out of the upright."""
+    things = []
+    for k in range(4):
+        ways = np.deg2rad([-45, -22.5, 0, 22.5, 45])  # of the five sides, from the camera's axis
+        sizes = np.array([6.0, 0.02, 0.02, 0.02, 6.0])
+        steps = np.column_stack([np.cos(ways), np.sin(ways)]) * sizes[:, None]
+        corners = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]) - (steps.sum(axis=0) / 2)
+        points, faces, normals = [], [], []
+        for (x0, z0), (x1, z1), way in zip(corners[:-1], corners[1:], ways):
+            first = len(points)
+            points += [(x0, -20, z0), (x1, -20, z1), (x1 + 0.7, 20, z1), (x0 + 0.7, 20, z0)]
+            faces += [[first, first + 1, first + 2], [first, first + 2, first + 3]]
+            normals += 4 * [(np.sin(way), 0, -np.cos(way))]
+        shape = mesh(np.array(points) / 16 + (0.0, 0.0, 0.0), faces, np.array(normals))
+        paint = Material(double_sided=True)
+        things.append(thing(f"box{k}", 10 + k, shape, still(((k * 11 - 16.3) / 16, 0, 3.0)), paint))
+    return scene(things, EYE, Light(sun=1.0, sky=0.2))
+
+
 WORLDS = {
     "everything": mixed_scene,
     "wires": wires,
@@ -411,6 +466,9 @@ WORLDS = {
     "aligned": aligned,
     "folded": folded,
     "horizon": horizon,
+    "snapped": snapped,
+    "posts": posts,
+    "chamfered": chamfered,
 }
 
 

@@ -136,7 +136,8 @@ def fit_pixels_of(
     say("counts of pixels", 0.3)
     hot = law.fit(True, False)
     say("counts of pixels", 0.5)
-    answered = law.fit(True, True, hot.at)
+    # Where the counts without answers have no hump of hot pixels that one with answers has, the first is no start.
+    answered = max(law.fit(True, True, hot.at), law.fit(True, True), key=lambda found: found.likelihood)
     say("counts of pixels", 0.8)
     if answered.likelihood - hot.likelihood < WORTH:
         answered = hot

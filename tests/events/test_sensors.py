@@ -7,13 +7,18 @@ from collections import deque
 
 import numpy as np
 import pytest
+from scipy.stats import ks_2samp
+from shared_data import shared
 
 from blinkgl.config.events import V2eConfig
 from blinkgl.config.readout import ReadoutConfig
-from blinkgl.config.sensor import load_sensor, sensor_names, sensor_table
+from blinkgl.config.sensor import SensorConfig, load_sensor, sensor_names, sensor_table
+from blinkgl.config.sequence import load_run
 from blinkgl.errors import ConfigError
 from blinkgl.events import Events, make_emulator
+from blinkgl.events.camera import EventCamera, EventFrame
 from blinkgl.events.readout import Readout
+from blinkgl.recordings.clip import read_recording
 from tests.events.clips import assert_same
 
 
@@ -151,3 +156,45 @@ def test_unknown_names_are_told():
         load_sensor("davis346").emulator("dvs")
     with pytest.raises(ConfigError, match="cutoff_hz"):
         load_sensor("davis346").emulator("v2e", cutof_hz=1)
+
+
+def still(sensor: SensorConfig, emulator: str, us: int, *, pixels: bool = True, luminance: float = 0.4) -> Events:
+    """What that camera makes of constant light."""
+    assert sensor.readout is not None
+    readout = sensor.readout if pixels else sensor.readout.model_copy(update={"pixels": None})
+    camera = EventCamera(sensor.emulator(emulator), readout, sensor.height, sensor.width, 0)
+    frame = np.full((sensor.height, sensor.width), luminance, np.float32)
+    return Events.concatenate([camera.step(EventFrame(int(t), frame)) for t in np.linspace(0, 1000 * us, 5)])
+
+
+@pytest.mark.parametrize("emulator", ["esim", "v2e", "voltmeter"])
+def test_a_dvxplorers_noise_is_its_single_pixels_and_counts_once(emulator):
+    """Beside readout.pixels an emulator's own noise is off: nothing of ESIM and V2E, and of the Voltmeter what its
+    diffusion sets off."""
+    sensor = load_sensor("dvxplorer")
+    noise, rest = still(sensor, emulator, 300_000), still(sensor, emulator, 300_000, pixels=False)
+    assert len(noise) > 20_000 and len(rest) < 0.01 * len(noise)
+    assert len(rest) == 0 or emulator == "voltmeter"
+    assert (noise.t % 200 == 0).all()
+
+
+def test_one_key_switches_the_noise_of_single_pixels_off(tmp_path):
+    run = tmp_path / "run.yaml"
+    run.write_text("sensor: dvxplorer\n")
+    assert load_run(run).sequence(0).readout == load_sensor("dvxplorer").readout
+    run.write_text("sensor: dvxplorer\nreadout: {pixels: null}\n")
+    readout = load_run(run).sequence(0).readout
+    assert readout is not None and readout.pixels is None and readout.clock_us == 200
+
+
+def test_a_still_scene_is_as_noisy_as_the_recorded_one():
+    """Rates and hot pixels of dvxplorer.yaml against the recording; its first half was fitted, so the second judges."""
+    events, (_, width) = read_recording(shared("data/events/noise/dvxplorer_constant_light.aedat4"), least=1000)
+    begin, end = (int(events.t[0]) + int(events.t[-1])) // 2, int(events.t[-1])
+    made = still(load_sensor("dvxplorer"), "esim", end - begin)
+    counts = [np.bincount(e.y.astype(int) * width + e.x) for e in (events.window(begin, end), made)]
+    recorded, simulated = (c[c > 0] for c in counts)
+    assert ks_2samp(recorded, simulated).statistic < 0.05
+    assert abs(len(simulated) / len(recorded) - 1) < 0.1 and abs(simulated.sum() / recorded.sum() - 1) < 0.25
+    for least in (5, 50):  # hot pixels
+        assert abs((simulated >= least).sum() / (recorded >= least).sum() - 1) < 0.2

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -85,7 +85,7 @@ class Calibration:
     config : the emulator as fitted; before : as it was.   values, uncertainty : of the fitted keys (a standard
     deviation, in the key's unit).   untold : why the others were not fitted, by key.   halves : intervals of the half
     that was fitted, and of that which was not.   judged_before, judged : one of each half.   simulated_before,
-    simulated : events of the whole clip."""
+    simulated : events of the whole clip.   warnings : what the recording lacks, though a fit was possible."""
 
     recording: str
     clip: Clip
@@ -102,6 +102,7 @@ class Calibration:
     simulated_before: Events
     simulated: Events
     notes: list[str]
+    warnings: list[str] = field(default_factory=list)
 
     def sensor(self) -> dict[str, Any]:
         """The table of a sensor file (:class:`~blinkgl.config.sensor.SensorConfig`)."""
@@ -221,6 +222,7 @@ def calibrate_events(
         )
     say = progress or (lambda *_: None)
     start, untold = None, {}
+    warnings: list[str] = []
     if stimulus is not None:
         clip = stimulus.clip(events, size, where=name, seed=seed)
         first = _Search(clip, base, (clip.intervals + 1) // 2, seed, lambda done: say("stimulus", done))
@@ -259,6 +261,11 @@ def calibrate_events(
             clip = look(found_us - lag_us)
             clip.facts["lag_us"], clip.facts["found_delay_us"] = lag_us, found_us
         notes = _of_frames(clip, exposures, interpolate, frame_delay_ms)
+        if not exposures and frame_delay_ms is None:
+            warnings.append(
+                f"{frames_name}: frames without exposure times: the offset of {clip.facts['delay_us'] / 1000:+.1f} ms "
+                "found from the events has whatever lies between their time stamps and the middles of their exposures"
+            )
     half = (clip.intervals + 1) // 2
     halves = ((0, half), (half, clip.intervals))
     found = _Search(clip, base, half, seed, lambda done: say("fitting", done))
@@ -290,6 +297,7 @@ def calibrate_events(
         streams[0],
         streams[1],
         notes,
+        warnings,
     )
 
 

@@ -83,6 +83,8 @@ def run(
     console.print(found, highlight=False)
     for note in result.notes:
         say(console, note)
+    for warning in result.warnings:
+        say(plain_console(stderr=True), f"note: {warning}")
     say(console, f"written: {target}, {beside}")
     return 0
 

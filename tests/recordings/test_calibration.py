@@ -16,7 +16,7 @@ from blinkgl.errors import BlinkGLError, ConfigError, EventDataError
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.types import Events
 from blinkgl.io.formats import write_events
-from blinkgl.recordings.calibration import _Search, calibrate
+from blinkgl.recordings.calibration import _Search, calibrate, calibrate_events
 from blinkgl.recordings.clip import Clip, clip_of_frames, clip_of_still, clock_offset
 from blinkgl.recordings.simulation import emulator_config
 from blinkgl.recordings.statistics import numbers, sums, target
@@ -181,8 +181,10 @@ def test_from_files_to_a_sensor_file_and_a_page(tmp_path, capsys):
     out = tmp_path / "mine.yaml"
     fixed = [part for key in ("log_eps=0.03", "threshold_sigma=0.03") for part in ("--set", key)]
     assert run(["calibrate", str(camera), "--frames", str(frames), "--out", str(out), "--starts", "1", *fixed]) == 0
-    said = capsys.readouterr().out
+    said, warned = capsys.readouterr()
     assert "Clock: the polarity sums follow the frames best when +" in said and "dense flow" in said
+    assert warned.startswith(f"note: {frames}: frames without exposure times: the offset of ")
+    assert warned.count("\n") == 1 and " ms found from the events has whatever lies between " in warned
     table = yaml.safe_load(out.read_text())
     assert (table["width"], table["height"]) == (W, H)
     found = table["emulators"]["esim"]
@@ -195,6 +197,14 @@ def test_from_files_to_a_sensor_file_and_a_page(tmp_path, capsys):
     assert "data:image/png" in page and "asked to stay as it was" in page
     assert run(["calibrate", str(camera), "--frames", str(frames), "--out", str(out)]) == 2
     assert "output file exists" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("given", [dict(exposures=True), dict(frame_delay_ms=3.0)])
+def test_no_note_where_exposures_or_the_offset_are_known(given):
+    events = scene().simulate(emulator_config("esim"), 1)
+    fixed = [key for key in emulator_config("esim").fitted if key != "contrast_threshold"]
+    result = calibrate_events(events, (H, W), moving(), fixed=fixed, starts=1, **given)
+    assert result.warnings == []
 
 
 def still_recording(folder, seconds: float = 2.0, size=(48, 60), seed: int = 3, **noise):

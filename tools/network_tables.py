@@ -111,11 +111,12 @@ def data(steps: Steps, out: Path, test: int) -> dict[str, Path]:
 
 
 def few(source: Path, out: Path, count: int) -> Path:
-    """A folder of the first ``count`` sequences of another: the same files under other names."""
+    """A folder of ``count`` sequences of another, evenly spaced: the same files under other names."""
     if not out.exists():
         fresh = out.with_suffix(".new")
         shutil.rmtree(fresh, ignore_errors=True)
-        for sequence in sorted(source.iterdir())[:count]:
+        every = sorted(source.iterdir())
+        for sequence in every[:: max(1, len(every) // count)][:count]:
             shutil.copytree(sequence, fresh / sequence.name, copy_function=os.link)
         fresh.rename(out)
     return out

@@ -33,7 +33,7 @@ class Fake:
         if command == "generate":
             if Path(arguments[0]).name != "converted.yaml":
                 load_run(Path(arguments[0]), sets)
-            for number in range(3):
+            for number in range(6):
                 (out / "train" / f"s{number}").mkdir(parents=True)
         elif command == "train":
             config = load_train_config(Path(arguments[0]), sets)
@@ -57,7 +57,7 @@ def test_every_row_is_trained_and_judged_once(tmp_path, monkeypatch, capsys):
     by = lambda command: [line for line in Fake.asked if line[0] == command]
     assert len(by("generate")) == 3 + len(tables.CUSTOM)
     assert len(by("train")) == 3 * 2 and len(by("evaluate")) == 3 * 2 * len(tables.SUBSETS)
-    assert [p.name for p in sorted((tmp_path / "o/few_2").iterdir())] == ["s0", "s1"]
+    assert [p.name for p in sorted((tmp_path / "o/few_2").iterdir())] == ["s0", "s3"]
     rows = [line.split(" | ") for line in text.splitlines()]
     assert [row[0] for row in rows] == [
         "| ",

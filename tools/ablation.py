@@ -2,13 +2,18 @@
 
     python -m blinkgl.tools.ablation --out out/ablation --recordings ../shared/data/events
     python -m blinkgl.tools.ablation --out out/ablation --minutes 9      # in pieces: repeat until it exits 0
+    python -m blinkgl.tools.ablation --out out/ablation --start real_small      # from a trained network on
     python -m blinkgl.tools.ablation --out out/ablation --show           # the table of what is there
 
 Every arm is ``real_data.yaml`` and ``real.yaml`` with something changed (:data:`ARMS`). Its windows are rendered once
 and shared by its seeds; all arms have as many windows and steps. All are judged on the same windows: those of the whole
 recipe's test groups, and, with ``--recordings``, the two bursts with known flow. Error: AEE as a share of zero flow's,
-at pixels with events on the bursts. Seeds go round all arms before the next seed begins, so that a run that is stopped
-has whole rounds. What is done is kept and not done again; other ``--windows`` or ``--steps`` want another ``--out``.
+at pixels with events on the bursts. ``again`` is the whole recipe with other windows: what chance alone does. Short
+trainings from nothing differ more by their seed, by when they begin to learn, than by what they learn from; with
+``--start`` all go on from one network that has learnt already (`init_from`), and the table says what a trained network
+loses without something, which is less than what it would never have learnt. Seeds go round all arms before the next
+seed begins, so that a run that is stopped has whole rounds. What is done is kept and not done again; other
+``--windows``, ``--steps`` or ``--start`` want another ``--out``.
 
 The result is OUT/table.md and OUT/ablation.json. An interval is Student's, 95 %, of the difference to ``all`` seed by
 seed, given from two seeds on.
@@ -28,9 +33,9 @@ import numpy as np
 from scipy import stats
 
 from blinkgl.config.reader import read_table, to_yaml
-from blinkgl.errors import ConfigError
+from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.machine.bench import machine_line
-from blinkgl.tools.compare_networks import Steps, log
+from blinkgl.tools.compare_networks import Steps, begun, log
 from blinkgl.tools.data_statistics import TEST
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs" / "eflow"
@@ -43,7 +48,8 @@ NO_NOISE = {"leak_rate_hz": 0.0, "shot_noise_rate_hz": 0.0, "hot_pixel_fraction"
 class Arm:
     """about : what is different, for the table.   recipe, training : values by dotted path, laid over the recipe's and
     the training's; a table replaces the one that is there.   windows : options of `eflow render`.
-    emulators : only these, with their shares.   every : laid over each emulator's settings."""
+    emulators : only these, with their shares.   every : laid over each emulator's settings.
+    draw : the seed that its windows are drawn with; the recipe's own if None."""
 
     about: str
     recipe: dict[str, Any] = field(default_factory=dict)
@@ -51,10 +57,12 @@ class Arm:
     windows: tuple[str, ...] = WINDOWS
     emulators: tuple[str, ...] = ("esim", "v2e", "voltmeter")
     every: dict[str, Any] = field(default_factory=dict)
+    draw: int | None = None
 
 
 ARMS: dict[str, Arm] = {
     "all": Arm("the recipe as it is"),
+    "again": Arm("the recipe as it is, other windows", draw=1),
     "esim": Arm("ESIM alone", emulators=("esim",)),
     "thresholds": Arm("every threshold 0.2", every={"contrast_threshold": 0.2, "contrast_threshold_off": 0.2}),
     "noise": Arm(
@@ -125,6 +133,7 @@ def trained(steps: Steps, a: argparse.Namespace, name: str, seed: int, pool: Pat
         "run.validate_every": a.steps,
         "run.checkpoint_every": max(1, a.steps // 4),
         "run.picture_every": a.steps,
+        "init_from": a.start,
         **ARMS[name].training,
     }
     done = max((int(p.name) for p in (run / "checkpoints").glob("*") if p.name.isdigit()), default=0)
@@ -199,12 +208,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument(
-        "--arms", nargs="+", choices=list(ARMS), default=list(ARMS), metavar="ARM", help=", ".join(ARMS)
+        "--arms", nargs="+", choices=list(ARMS), metavar="ARM", help=f"{', '.join(ARMS)}; all that --start allows"
     )
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--windows", type=int, default=2000, help="of each arm")
     parser.add_argument("--test", type=int, default=400, help="windows that are judged on")
     parser.add_argument("--steps", type=int, default=2000, help="of training, 4 windows each")
+    parser.add_argument("--start", metavar="NETWORK", help="that every training starts from: a run or a shipped name")
     parser.add_argument("--recordings", type=Path, help=f"the folder that holds {TEST}")
     parser.add_argument("--recipe", type=Path, default=CONFIGS / "real_data.yaml")
     parser.add_argument("--training", type=Path, default=CONFIGS / "real.yaml")
@@ -224,27 +234,36 @@ def main() -> None:
 
 def run(a: argparse.Namespace) -> None:
     """Renders, trains and judges what is not there yet."""
-    a.out.mkdir(parents=True, exist_ok=True)
-    asked = a.out / "asked.json"
-    wanted = {"windows": a.windows, "test": a.test, "steps": a.steps}
-    if asked.exists() and json.loads(asked.read_text(encoding="utf-8")) != wanted:
-        raise ConfigError("begun with other numbers", where=str(a.out), value=wanted, accepted="another --out")
-    asked.write_text(json.dumps(wanted) + "\n", encoding="utf-8")
+    allowed = [name for name in ARMS if a.start is None or "model.consensus" not in ARMS[name].training]
+    arms = a.arms or allowed
+    if set(arms) - set(allowed):
+        raise ConfigError(
+            "an arm with another network cannot start from this one",
+            where="--arms",
+            value=", ".join(arms),
+            accepted=", ".join(allowed),
+        )
+    begun(a.out, {"windows": a.windows, "test": a.test, "steps": a.steps, "start": a.start})
     steps, base = Steps(a.minutes), read_table(a.recipe)
     rendered(steps, a.out / "test", a.recipe, a.test, WINDOWS, "--split", "test", "--seed", "99")
     pools: dict[str, Path] = {}
     for seed in a.seeds:
-        for name in a.arms:
+        for name in arms:
             arm = ARMS[name]
             text = to_yaml(recipe_of(arm, base))
-            key = text + " ".join(arm.windows)
+            draw = () if arm.draw is None else ("--seed", str(arm.draw))
+            key = " ".join([text, *arm.windows, *draw])
             if key not in pools:  # arms that change the training alone share the windows
                 folder = a.out / name
                 folder.mkdir(exist_ok=True)
                 (folder / "recipe.yaml").write_text(text, encoding="utf-8")
-                pools[key] = rendered(steps, folder / "windows", folder / "recipe.yaml", a.windows, arm.windows)
+                options = (folder / "windows", folder / "recipe.yaml", a.windows, arm.windows, *draw)
+                pools[key] = rendered(steps, *options)
             judged(steps, a, trained(steps, a, name, seed, pools[key]))
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except BlinkGLError as error:
+        sys.exit(f"error: {error}")

@@ -19,10 +19,12 @@ import sys
 import time
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from blinkgl.config.reader import read_table
+from blinkgl.errors import ConfigError
 from eflow.bench import PRESETS
 from eflow.config import load_train_config
 
@@ -78,6 +80,19 @@ def log(run: Path, kind: str) -> list[dict]:
     """Lines of a run's log."""
     lines = (json.loads(line) for line in (run / "log.jsonl").read_text(encoding="utf-8").splitlines())
     return [line for line in lines if line["kind"] == kind]
+
+
+def begun(out: Path, wanted: dict[str, Any]) -> None:
+    """Makes ``out`` and notes there what was asked for: results of other numbers must not stand in one table.
+    ConfigError if it was begun with others."""
+    out.mkdir(parents=True, exist_ok=True)
+    asked = out / "asked.json"
+    before = json.loads(asked.read_text(encoding="utf-8")) if asked.exists() else wanted
+    if before != wanted:
+        raise ConfigError(
+            "begun with other numbers", where=str(out), value=wanted, accepted=f"{before} or another --out"
+        )
+    asked.write_text(json.dumps(wanted) + "\n", encoding="utf-8")
 
 
 def train(steps: Steps, a: argparse.Namespace, name: str, data: Path, overrides: list[str]) -> Path:

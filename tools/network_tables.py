@@ -12,14 +12,13 @@ wins. Each is then scored on
 |---|---|
 | seen | a part of the windows that it was trained on |
 | objects | flying objects that it was not: other objects, textures and motions |
-| converted | frames of a camera among things that stand still, made into events (as BlinkFlow's E-Tartan) |
+| converted | 20 Hz frames of a camera among things that stand still, made into events (as BlinkFlow's E-Tartan) |
 | custom | scenes made by hand whose bodies deform, fall and collide (as E-Blender) |
 | a burst | of the Event Camera Dataset with the flow of its gyroscope; with ``--recordings`` |
 
-(`converted`: 20 Hz, with their flow, interpolated where they qualify)
-and ``--few`` networks learn again on so many sequences alone: what is memory and what is knowledge. Errors are AEE in
-px, on bursts a share of zero flow's at pixels with events. Seeds go round all networks before the next seed begins.
-What is done is kept and not done again. The result is OUT/tables.md and OUT/networks.json.
+and ``--few`` networks learn again on ``--sequences`` sequences alone: what is memory and what is knowledge. Errors are
+AEE in px, on bursts a share of zero flow's at pixels with events. Seeds go round all networks before the next seed
+begins. What is done is kept and not done again. The result is OUT/tables.md and OUT/networks.json.
 """
 
 from __future__ import annotations
@@ -35,9 +34,9 @@ from typing import Any
 import numpy as np
 
 from blinkgl.config.reader import to_yaml
-from blinkgl.errors import ConfigError
+from blinkgl.errors import BlinkGLError
 from blinkgl.machine.bench import machine_line
-from blinkgl.tools.compare_networks import Steps, log
+from blinkgl.tools.compare_networks import Steps, begun, log
 from blinkgl.tools.data_statistics import TEST
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
@@ -57,6 +56,14 @@ SENSOR = {"emulator": "esim", "contrast_threshold": {"uniform": [0.15, 0.5]}}
 """That of the training's data, so that a subset differs by what is seen and not by who looks."""
 SUBSETS = ("seen", "objects", "converted", "custom")
 SEEN = 128
+
+
+def positive(text: str) -> int:
+    """A number of things, for argparse."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text}: at least 1")
+    return value
 
 
 def settings(*values: str) -> list[str]:
@@ -80,7 +87,6 @@ def data(steps: Steps, out: Path, test: int) -> dict[str, Path]:
         "scene.object_motion={kind: static}",
         "scene.objects.flying=0.3",
         "time.label_rate=20",
-        "labels.images=true",
     )
     only = ("groups.smoke.enabled=false", "groups.short.enabled=false", f"groups.smoke_test.output.sequences={test}")
     once(smoke, "film", *settings("seed=81", "labels.images=true", "render.image_antialiasing=ssaa2", *only, *still))
@@ -122,10 +128,15 @@ def few(source: Path, out: Path, count: int) -> Path:
     return out
 
 
+def runs_of(a: argparse.Namespace, row: str) -> Path:
+    """The folder of a row's runs."""
+    return a.out / "runs" / row.replace(", ", "_").replace(" ", "_")
+
+
 def trained(steps: Steps, a: argparse.Namespace, row: str, seed: int, sequences: Path, test: Path) -> Path:
     """The run of a row of the table and a seed."""
     name = row.partition(",")[0]
-    run = a.out / "runs" / row.replace(", ", "_").replace(" ", "_") / f"seed{seed}"
+    run = runs_of(a, row) / f"seed{seed}"
     model, rate = NETWORKS[name]
     sets = {
         "seed": seed,
@@ -221,12 +232,7 @@ def rows(a: argparse.Namespace) -> list[str]:
 
 def run(a: argparse.Namespace) -> None:
     """Generates, trains and judges what is not there yet."""
-    a.out.mkdir(parents=True, exist_ok=True)
-    asked = a.out / "asked.json"
-    wanted = {"minutes": a.minutes, "test": a.test, "sequences": a.sequences}
-    if asked.exists() and json.loads(asked.read_text(encoding="utf-8")) != wanted:
-        raise ConfigError("begun with other numbers", where=str(a.out), value=wanted, accepted="another --out")
-    asked.write_text(json.dumps(wanted) + "\n", encoding="utf-8")
+    begun(a.out, {"minutes": a.minutes, "test": a.test, "sequences": a.sequences})
     steps = Steps(a.stop_after)
     folders = data(steps, a.out, a.test)
     train = folders.pop("train")
@@ -240,7 +246,7 @@ def collected(a: argparse.Namespace) -> dict[str, dict[str, dict[str, Any]]]:
     """What is there, by row and seed."""
     found: dict[str, dict[str, dict[str, Any]]] = {}
     for row in rows(a):
-        for path in sorted((a.out / "runs" / row.replace(", ", "_").replace(" ", "_")).glob("seed*/judged.json")):
+        for path in sorted(runs_of(a, row).glob("seed*/judged.json")):
             its = json.loads(path.read_text(encoding="utf-8"))
             if all(subset in its for subset in SUBSETS):
                 found.setdefault(row, {})[path.parent.name] = its
@@ -252,10 +258,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--networks", nargs="+", choices=list(NETWORKS), default=list(NETWORKS))
     parser.add_argument("--few", nargs="*", choices=list(NETWORKS), default=["ev_flownet"])
-    parser.add_argument("--sequences", type=int, default=12, help="that --few learn on")
+    parser.add_argument("--sequences", type=positive, default=12, help="that --few learn on")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--minutes", type=float, default=10.0, help="processor minutes of each training")
-    parser.add_argument("--test", type=int, default=16, help="sequences that are filmed for `converted`")
+    parser.add_argument("--test", type=positive, default=16, help="sequences that are filmed for `converted`")
     parser.add_argument("--recordings", type=Path, help=f"the folder that holds {TEST}")
     parser.add_argument("--training", type=Path, default=CONFIGS / "eflow" / "smoke.yaml")
     parser.add_argument(
@@ -275,4 +281,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except BlinkGLError as error:
+        sys.exit(f"error: {error}")

@@ -452,7 +452,7 @@ def chamfered():
             points += [(x0, -20, z0), (x1, -20, z1), (x1 + 0.7, 20, z1), (x0 + 0.7, 20, z0)]
             faces += [[first, first + 1, first + 2], [first, first + 2, first + 3]]
             normals += 4 * [(np.sin(way), 0, -np.cos(way))]
-        shape = mesh(np.array(points) / 16 + (0.0, 0.0, 0.0), faces, np.array(normals))
+        shape = mesh(np.array(points) / 16, faces, np.array(normals))
         paint = Material(double_sided=True)
         things.append(thing(f"box{k}", 10 + k, shape, still(((k * 11 - 16.3) / 16, 0, 3.0)), paint))
     return scene(things, EYE, Light(sun=1.0, sky=0.2))

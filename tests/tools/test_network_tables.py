@@ -73,5 +73,5 @@ def test_every_row_is_trained_and_judged_once(tmp_path, monkeypatch, capsys):
     tables.main()
     assert len(Fake.asked) == count, "what is done is not done again"
     monkeypatch.setattr("sys.argv", ["network_tables", "--out", str(tmp_path / "o"), "--minutes", "3"])
-    with pytest.raises(tables.ConfigError, match="begun with other numbers"):
+    with pytest.raises(tables.BlinkGLError, match="begun with other numbers"):
         tables.main()

@@ -56,9 +56,9 @@ class Steps:
         print("out of time; the same command goes on from here", flush=True)
         sys.exit(AGAIN)
 
-    def run(self, module: str, *arguments: str, timed: bool = False) -> None:
+    def run(self, module: str, *arguments: str, timed: bool = False, fine: tuple[int, ...] = (0,)) -> None:
         """``timed``: the command stops by itself. Others are stopped by SIGTERM when the time is
-        up (all of them leave no half results)."""
+        up (all of them leave no half results). ``fine``: exit statuses to go on after."""
         left = self.left()
         print("$", module.partition(".")[0], *arguments, flush=True)
         process = subprocess.Popen([sys.executable, "-m", module, *arguments])
@@ -72,7 +72,7 @@ class Steps:
             process.terminate()
             process.wait()
             raise
-        if status:
+        if status not in fine:
             sys.exit(status)
 
 

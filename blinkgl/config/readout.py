@@ -16,7 +16,9 @@ class PixelsConfig(Config):
     Noise events are a Poisson process of each pixel's own rate, beside the emulator's events and without a word to its
     comparators. Rates are log-normal over the pixels, hot ones about a median of their own. Some are answered: noise
     that passed one threshold comes back through the other, so that an event of the opposite polarity follows, later by
-    a log-normal time. Both are in the rates."""
+    a log-normal time. Both are in the rates. Hot pixels answer nothing; each prefers ON or OFF by itself: its share is
+    logit-normal. (What dvxplorer_constant_light shows: a hot pixel's events are 40 % more of one polarity than of the
+    other, those of other pixels balance each other.)"""
 
     dead_fraction: float = Field(0.0, ge=0, le=1, description="Share of pixels that never fire.")
     hot_fraction: float = Field(0.0, ge=0, le=1, description="Share of pixels that are hot.")
@@ -24,9 +26,21 @@ class PixelsConfig(Config):
     hot_spread_decades: float = Field(0.0, ge=0, le=3, description="Spread of the hot pixels' rates, decades.")
     rate_hz: float = Field(0.0, ge=0, le=1e4, description="Median rate of the other pixels, events per second.")
     spread_decades: float = Field(0.0, ge=0, le=3, description="Spread of the other pixels' rates, decades.")
-    on_share: float = Field(0.5, ge=0, le=1, description="Share of ON events among those that answer no other.")
+    hot_on_share: float = Field(0.5, ge=0, le=1, description="Median share of ON events of a hot pixel.")
+    hot_on_spread: float = Field(
+        0.0,
+        ge=0,
+        le=10,
+        description="Spread of the hot pixels' shares: standard deviation of log(ON share / OFF share).",
+    )
+    on_share: float = Field(
+        0.5, ge=0, le=1, description="Share of ON events of the other pixels, among those that answer no other."
+    )
     answered: float = Field(
-        0.0, ge=0, le=1, description="Share of noise events that one of the opposite polarity follows."
+        0.0,
+        ge=0,
+        le=1,
+        description="Share of the other pixels' noise events that one of the opposite polarity follows.",
     )
     answer_ms: float = Field(30.0, ge=0.001, le=1e3, description="Median time from an event to its answer, ms.")
     answer_spread_decades: float = Field(0.5, ge=0, le=1, description="Spread of that time, decades.")

@@ -36,21 +36,24 @@ def _awake(pixel, t_us, dead_us, last):
 class PixelNoise:
     """Events of an emulator -> those of pixels of which some are dead and some fire by themselves.
 
-    ``rates`` : (H*W,) float64, events per second of each pixel's own.   ``dead``, ``hot`` : (H*W,) bool."""
+    ``rates`` : (H*W,) float64, events per second of each pixel's own.   ``dead``, ``hot`` : (H*W,) bool.
+    ``on_shares`` : (H*W,) float64, of the events that answer no other."""
 
     def __init__(self, config: PixelsConfig, height: int, width: int, seed: int, causes: bool = False):
         self.config, self._width, self._causes = config, width, causes
         self._seed = np.uint64(int(seed) & (2**64 - 1))
         pixels = pixel_counters(height, width)
         which, other = uniform2(self._seed, pixels, _DEFECT, np.uint64(0))
-        spread, _ = normal2(self._seed, pixels, _DEFECT, np.uint64(1))
+        spread, prefers = normal2(self._seed, pixels, _DEFECT, np.uint64(1))
         self.hot = which < config.hot_fraction
         self.dead = other < config.dead_fraction
         median = np.where(self.hot, config.hot_rate_hz, config.rate_hz)
         decades = np.where(self.hot, config.hot_spread_decades, config.spread_decades)
         rates = np.minimum(median * exp_f64(np.log(10.0) * decades * spread), _MOST_HZ)
         self.rates = np.where(self.dead, 0.0, rates)
-        self._sums = np.cumsum(self.rates / (1.0 + config.answered))
+        self._sums = np.cumsum(self.rates / (1.0 + np.where(self.hot, 0.0, config.answered)))
+        off = (1.0 - config.hot_on_share) * exp_f64(-config.hot_on_spread * prefers)
+        self.on_shares = np.where(self.hot, config.hot_on_share / (config.hot_on_share + off), config.on_share)
         self._decades = np.log(10.0) * config.answer_spread_decades
         # Answers that are on their way when the recording begins are those of noise before it.
         before_s = min(1e-3 * config.answer_ms * np.exp(3.0 * self._decades), _LONGEST_BEFORE_S)
@@ -103,14 +106,14 @@ class PixelNoise:
             (pixel % self._width).astype(np.uint16),
             (pixel // self._width).astype(np.uint16),
             t_ns // 1000,
-            (polarity < self.config.on_share).astype(np.uint8),
+            (polarity < self.on_shares[pixel]).astype(np.uint8),
             cause,
         )
         if not self._before_ns:
             return own
         late, _ = normal2(self._seed, index, _OWN, np.uint64(2))
         wait_ns = 1e6 * self.config.answer_ms * exp_f64(self._decades * late)
-        chosen = answers < self.config.answered
+        chosen = (answers < self.config.answered) & ~self.hot[pixel]
         answer = own.part(chosen)
         at_us = (t_ns[chosen] + np.minimum(wait_ns[chosen], 2.0**55).astype(np.int64)) // 1000
         both = Events.concatenate([own, replace(answer, t=at_us, p=1 - answer.p)])

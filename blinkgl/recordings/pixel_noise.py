@@ -1,9 +1,10 @@
 """The noise of single pixels (``readout.pixels``) that a camera's still scene shows: how many pixels are noisy or hot,
-how much, and how often an event of noise is answered by one of the opposite polarity.
+how much, how often an event of noise is answered by one of the opposite polarity, and what hot pixels prefer.
 
 Fitted by maximum likelihood to how many events each pixel made in the first half of the recording (the Poisson process
 of :class:`~blinkgl.events.pixels.PixelNoise`, its rates a mixture of two log-normal laws, counts of answered events
-compound), and to the time between the two events of pixels that made two. Judged by the half that was not fitted.
+compound), to the time between the two events of pixels that made two, and to how many of a hot pixel's are ON. Judged
+by the half that was not fitted.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.special import expit, ndtr
+from scipy.special import expit, log_expit, ndtr
 from scipy.stats import binom, ks_2samp, poisson
 
 from blinkgl.config.readout import PixelsConfig
@@ -151,7 +152,12 @@ def fit_pixels_of(
         values["refractory_us"] = 1e6 * dead
     else:
         untold["refractory_us"] = "no pixel fires so often that it would show"
-    first_on = float((halves[0].p > 0).mean())
+    is_hot = law.hot_chance(answered, counts) > 0.5
+    if answered.hot:
+        found, spread = _preferences(halves[0], pixel, counts, is_hot)
+        values |= found
+        uncertainty |= spread
+    first_on = float((halves[0].p[~is_hot[pixel]] > 0).mean()) if (~is_hot[pixel]).any() else 0.5
     if answered.answers:
         share = values.pop("share")
         spread = uncertainty.pop("share")
@@ -240,6 +246,34 @@ def _delays(events: Events, pixel: np.ndarray, counts: np.ndarray, seconds: floa
     return float(np.exp(found[0])), float(np.exp(found[1]) / _TEN), float((p[opposite, 0] > 0).mean())
 
 
+def _preferences(
+    events: Events, pixel: np.ndarray, counts: np.ndarray, hot: np.ndarray
+) -> tuple[dict[str, float], dict[str, float]]:
+    """``hot_on_share`` and ``hot_on_spread`` of the pixels that are ``hot``, and their standard deviations: by maximum
+    likelihood from how many of a pixel's events are ON, binomial with a logit-normal share."""
+    on = np.bincount(pixel, weights=events.p, minlength=len(counts))[hot]
+    n = counts[hot]
+    if len(n) < 2:
+        return {"hot_on_share": float(on.sum() / max(n.sum(), 1)) if len(n) else 0.5}, {}
+    logit = np.linspace(-15, 15, 1201)  # a step of 0.025: a pixel of 1,000 events tells its own to 0.06
+    chances = on[:, None] * log_expit(logit) + (n - on)[:, None] * log_expit(-logit)
+    chances = np.exp(chances - chances.max(axis=1, keepdims=True))
+
+    def loss(at: np.ndarray) -> float:
+        spread = np.exp(np.clip(at[1], -4.0, 4.0))
+        weight = np.exp(-0.5 * ((logit - at[0]) / spread) ** 2)
+        return -float(np.log(np.maximum(chances @ weight / weight.sum(), 1e-300)).sum())
+
+    start = np.array([np.log((on.sum() + 1) / ((n - on).sum() + 1)), 0.0])
+    best = minimize(loss, start, method="Nelder-Mead", options={"maxiter": 400}).x
+    deviation = np.sqrt(np.clip(np.diag(np.linalg.pinv(_curvature(loss, best))), 0.0, None))
+    share, spread = float(expit(best[0])), float(np.exp(best[1]))
+    return (
+        {"hot_on_share": share, "hot_on_spread": 0.0 if spread < 0.05 else spread},
+        {"hot_on_share": share * (1 - share) * float(deviation[0]), "hot_on_spread": spread * float(deviation[1])},
+    )
+
+
 def _dead_time(events: Events, pixel: np.ndarray, counts: np.ndarray, seconds: float) -> float:
     """Seconds that a pixel sleeps after an event: a low percentile of the intervals of those that fire most, if no
     shorter ones are due there; 0 where nobody fires often enough to tell."""
@@ -320,16 +354,30 @@ class _Counts:
         weight = np.exp(-0.5 * ((_GRID - np.log(median * self._seconds)) / (_TEN * decades)) ** 2)
         return weight / max(weight.sum(), 1e-300)
 
+    def _chances(self, v: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
+        """(bins,) probabilities that a pixel is not hot and its count in the bin, and that it is hot and so."""
+        plain = self._law(v["rate_hz"], max(v["spread_decades"], 0.02)) @ self._of_rates(v.get("share", 0.0))
+        if "hot_rate_hz" not in v:
+            return plain, np.zeros_like(plain)
+        own = self._law(v["hot_rate_hz"], max(v["hot_spread_decades"], 0.02)) @ self._of_rates(0.0)
+        return (1 - v["hot_fraction"]) * plain, v["hot_fraction"] * own
+
+    def hot_chance(self, found: _Found, counts: np.ndarray) -> np.ndarray:
+        """(pixels,) probability that a pixel that made so many events is a hot one."""
+        plain, own = self._chances(found.values)
+        share = own / np.maximum(plain + own, 1e-300)
+        return share[np.searchsorted(self._edges, counts)]
+
     def fit(self, hot: bool, answers: bool, before: np.ndarray | None = None) -> _Found:
         """hot : two laws of rates.   answers : some events are answered.   before : where the same without answers
         ended."""
 
         def read(at: np.ndarray) -> dict[str, float]:
-            values = {"rate_hz": np.exp(at[0]), "spread_decades": 3 * expit(at[1])}
+            values = {"rate_hz": np.exp(min(at[0], 700.0)), "spread_decades": 3 * expit(at[1])}
             if hot:
                 values |= {
                     "hot_fraction": expit(at[2]),
-                    "hot_rate_hz": np.exp(at[3]),
+                    "hot_rate_hz": np.exp(min(at[3], 700.0)),
                     "hot_spread_decades": 3 * expit(at[4]),
                 }
             if answers:
@@ -340,11 +388,7 @@ class _Counts:
             if np.abs(at).max() > 40:
                 return 1e300
             v = read(at)
-            weights = self._law(v["rate_hz"], max(v["spread_decades"], 0.02))
-            if hot:
-                own = self._law(v["hot_rate_hz"], max(v["hot_spread_decades"], 0.02))
-                weights = (1 - v["hot_fraction"]) * weights + v["hot_fraction"] * own
-            chances = weights @ self._of_rates(v.get("share", 0.0))
+            chances = np.sum(self._chances(v), axis=0)
             return -float((self._observed * np.log(np.maximum(chances, 1e-300))).sum())
 
         ends: list[tuple[float, np.ndarray]] = []

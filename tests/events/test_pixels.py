@@ -21,7 +21,7 @@ from tests.events.clips import assert_same, run
 
 H, W = 60, 80
 NOISY = PixelsConfig(hot_fraction=0.02, hot_rate_hz=200.0, hot_spread_decades=0.3, rate_hz=2.0, spread_decades=0.5,
-                     dead_fraction=0.05, on_share=0.7)  # fmt: skip
+                     dead_fraction=0.05, on_share=0.7, hot_on_share=0.7)  # fmt: skip
 
 
 def noise_of(config, edges_us, seed=5, causes=False):
@@ -96,6 +96,33 @@ def test_an_answer_is_of_the_other_polarity_and_later_by_the_stated_law():
     law = stats.lognorm(s=0.4 * np.log(10), scale=20.0)
     assert stats.kstest(gap[follows], law.cdf).statistic < 1.6 / np.sqrt(follows.sum()) + 0.02
     assert abs(len(events) / (H * W * 30) - 0.02) < 0.02 * 0.05
+
+
+def test_a_hot_pixel_answers_nothing_and_prefers_a_polarity_of_its_own():
+    """Beside others whose noise is answered. Shares by the stated law, drawn once; events of a pixel by its share."""
+    config = ANSWERED.model_copy(
+        update={"hot_fraction": 0.2, "hot_rate_hz": 200.0, "hot_on_share": 0.6, "hot_on_spread": 1.2}
+    )
+    stage, events = noise_of(config, [0, 4_000_000])
+    hot, pixel = stage.hot, events.y.astype(int) * W + events.x
+    n, on = np.bincount(pixel, minlength=H * W), np.bincount(pixel, weights=events.p, minlength=H * W)
+    logit = np.log(stage.on_shares / (1 - stage.on_shares))[hot]
+    assert stats.kstest(logit, stats.norm(np.log(0.6 / 0.4), 1.2).cdf).pvalue > 1e-3
+    assert (stage.on_shares[~hot] == 0.7).all()
+    share = stage.on_shares[hot]
+    z = (on[hot] - n[hot] * share) / np.sqrt(n[hot] * share * (1 - share))
+    usual = n[hot] * np.minimum(share, 1 - share) > 20
+    assert usual.sum() > 500 and stats.kstest(z[usual], "norm").pvalue > 1e-3
+    z = (n[hot] - 4 * stage.rates[hot]) / np.sqrt(4 * stage.rates[hot])
+    assert stats.kstest(z, "norm").pvalue > 1e-3, "Poisson: answers would make counts scatter more"
+
+
+@pytest.mark.parametrize(("share", "spread"), [(0.0, 2.0), (1.0, 2.0), (0.5, 0.0)])
+def test_hot_pixels_at_the_ends_of_their_share(share, spread):
+    config = PixelsConfig(hot_fraction=1.0, hot_rate_hz=5.0, hot_on_share=share, hot_on_spread=spread)
+    stage, events = noise_of(config, [0, 1_000_000])
+    assert (stage.on_shares == share).all() and len(events) > 1000
+    assert share == 0.5 or (events.p == share).all()
 
 
 @pytest.mark.parametrize("step_us", [500, 200_000])

@@ -193,9 +193,13 @@ def test_a_still_scene_is_as_noisy_as_the_recorded_one():
     events, (_, width) = read_recording(shared("data/events/noise/dvxplorer_constant_light.aedat4"), least=1000)
     begin, end = (int(events.t[0]) + int(events.t[-1])) // 2, int(events.t[-1])
     made = still(load_sensor("dvxplorer"), "esim", end - begin)
-    counts = [np.bincount(e.y.astype(int) * width + e.x) for e in (events.window(begin, end), made)]
+    halves = [(e, e.y.astype(int) * width + e.x) for e in (events.window(begin, end), made)]
+    counts = [np.bincount(pixel) for _, pixel in halves]
     recorded, simulated = (c[c > 0] for c in counts)
     assert ks_2samp(recorded, simulated).statistic < 0.05
     assert abs(len(simulated) / len(recorded) - 1) < 0.1 and abs(simulated.sum() / recorded.sum() - 1) < 0.25
     for least in (5, 50):  # hot pixels
         assert abs((simulated >= least).sum() / (recorded >= least).sum() - 1) < 0.2
+    on = [np.bincount(pixel, weights=e.p) for e, pixel in halves]
+    theirs, ours = (np.corrcoef(k[n > 1], (n - k)[n > 1])[0, 1] for k, n in zip(on, counts, strict=True))
+    assert abs(ours - theirs) < 0.2, "ON and OFF events of a pixel: hot ones prefer either"

@@ -18,8 +18,8 @@ from blinkgl.recordings.pixel_noise import fit_pixels, fit_pixels_of
 
 SIZE = (200, 300)
 KNOWN = PixelsConfig(
-    rate_hz=0.3, spread_decades=0.3, hot_fraction=0.01, hot_rate_hz=60, hot_spread_decades=0.4, on_share=0.65,
-    answered=0.6, answer_ms=20, answer_spread_decades=0.3, refractory_us=1500,
+    rate_hz=0.3, spread_decades=0.3, hot_fraction=0.01, hot_rate_hz=60, hot_spread_decades=0.4, hot_on_share=0.6,
+    hot_on_spread=1.5, on_share=0.65, answered=0.6, answer_ms=20, answer_spread_decades=0.3, refractory_us=1500,
 )  # fmt: skip
 
 
@@ -38,13 +38,13 @@ def test_known_values_come_back(known):
     found = known.config
     for key, room in (
         ("rate_hz", 0.1), ("spread_decades", 0.15), ("hot_fraction", 0.15), ("hot_rate_hz", 0.2),
-        ("hot_spread_decades", 0.2), ("on_share", 0.05), ("answered", 0.1), ("answer_ms", 0.15),
+        ("hot_spread_decades", 0.2), ("hot_on_share", 0.06), ("hot_on_spread", 0.1), ("on_share", 0.05), ("answered", 0.1), ("answer_ms", 0.15),
         ("answer_spread_decades", 0.2), ("refractory_us", 0.4),
     ):  # fmt: skip
         assert abs(getattr(found, key) / getattr(KNOWN, key) - 1) < room, (key, getattr(found, key))
     assert abs(known.rate_ratio - 1) < 0.1 and known.counts_distance < 0.03 and known.intervals_distance < 0.05
     assert known.untold == {}
-    for key in ("rate_hz", "hot_rate_hz", "answered"):
+    for key in ("rate_hz", "hot_rate_hz", "hot_on_share", "hot_on_spread", "answered"):
         assert 0 < known.uncertainty[key] < 0.2 * getattr(KNOWN, key)
 
 

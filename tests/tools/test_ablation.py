@@ -26,7 +26,7 @@ class Fake:
     def __init__(self, minutes):
         assert minutes is None
 
-    def run(self, module, command, *arguments, timed=False):
+    def run(self, module, command, *arguments, timed=False, fine=(0,)):
         self.asked.append((command, *arguments))
         options = dict(itertools.pairwise(arguments))
         out = Path(options["--out"])

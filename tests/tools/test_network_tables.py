@@ -24,13 +24,14 @@ class Fake:
     def __init__(self, minutes):
         assert minutes is None
 
-    def run(self, module, command, *arguments, timed=False):
+    def run(self, module, command, *arguments, timed=False, fine=(0,)):
         self.asked.append((command, *arguments))
         options = dict(itertools.pairwise(arguments))
         out = Path(options["--out"])
         sets = [value for key, value in itertools.pairwise(arguments) if key == "--set"]
         out.mkdir(parents=True)
         if command == "generate":
+            assert fine == (0, 3), "some sequences may be set aside"
             if Path(arguments[0]).name != "converted.yaml":
                 load_run(Path(arguments[0]), sets)
             for number in range(6):

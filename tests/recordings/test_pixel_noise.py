@@ -38,7 +38,8 @@ def test_known_values_come_back(known):
     found = known.config
     for key, room in (
         ("rate_hz", 0.1), ("spread_decades", 0.15), ("hot_fraction", 0.15), ("hot_rate_hz", 0.2),
-        ("hot_spread_decades", 0.2), ("hot_on_share", 0.06), ("hot_on_spread", 0.1), ("on_share", 0.05), ("answered", 0.1), ("answer_ms", 0.15),
+        ("hot_spread_decades", 0.2), ("hot_on_share", 0.06), ("hot_on_spread", 0.1), ("on_share", 0.05),
+        ("answered", 0.1), ("answer_ms", 0.15),
         ("answer_spread_decades", 0.2), ("refractory_us", 0.4),
     ):  # fmt: skip
         assert abs(getattr(found, key) / getattr(KNOWN, key) - 1) < room, (key, getattr(found, key))

@@ -16,6 +16,7 @@ from blinkgl.io.columns import check_events, microseconds
 from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
 from blinkgl.io.images import npy_header, numpy_errors
 from blinkgl.io.mvsec import event_table, events_of_rows
+from eflow.data.folders import below
 from eflow.data.window import RawSample, Window
 
 HEIGHT, WIDTH = 260, 346
@@ -110,7 +111,7 @@ class MvsecSource:
         self.protocol = PROTOCOLS[protocol]
         if self.protocol.at == "flow" and dt != 1:
             raise ConfigError(f"{protocol} has samples at 20 Hz", where="dt", value=dt, accepted="1")
-        files = [root] if root.is_file() else sorted(root.rglob("*_data.hdf5"))
+        files = [root] if root.is_file() else sorted(below(root, "*_data.hdf5"))
         if not files:
             raise AssetError("no *_data.hdf5", where=str(root))
         self.dt, self.truth, self._index, self._sequences = dt, truth or self.protocol.truth, [], []

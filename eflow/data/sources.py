@@ -30,6 +30,7 @@ from blinkgl.io.flow_png import read_flow_png
 from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
 from blinkgl.io.index import INDEX, read_index
 from blinkgl.labels import LABELS
+from eflow.data.folders import below
 from eflow.data.pool import ABOUT, PoolSource
 from eflow.data.window import RawSample, Window
 
@@ -194,7 +195,7 @@ def find_blinkgl(root: Path) -> list[Sequence]:
     folders = (
         [root / line["path"] for line in read_index(root)]
         if indexed
-        else [m.parent for m in sorted(root.rglob("manifest.json"))]
+        else [m.parent for m in sorted(below(root, "manifest.json"))]
     )
     for folder in folders:
         if any(part.startswith(".") for part in folder.relative_to(root).parts):
@@ -231,7 +232,7 @@ def find_dsec(root: Path) -> list[Sequence]:
     ``train_events`` and ``train_optical_flow``. A ``test_forward_flow_timestamps.csv`` or
     ``<sequence>.csv`` gives a test sequence its times."""
     found = []
-    for events in sorted(root.rglob("events.h5")):
+    for events in sorted(below(root, "events.h5")):
         if events.parent.name not in ("left", "events_left") or "forward_flow" in {
             p.name for p in events.parent.parent.iterdir()
         }:
@@ -274,7 +275,7 @@ def find_blinkflow(root: Path) -> list[Sequence]:
     """BlinkFlow's published layout: ``[<split>/]<scene>/<seq>/{events_left/events.h5, forward_flow, config.yaml}``.
     Label 0 has no events before it and is left out."""
     found = []
-    for folder in sorted(p.parent for p in root.rglob("forward_flow") if p.is_dir()):
+    for folder in sorted(p.parent for p in below(root, "forward_flow") if p.is_dir()):
         fps = _fps(folder / "config.yaml")
         files = sorted((folder / "forward_flow").glob("*.npy"))
         backward = {int(f.stem): f for f in (folder / "backward_flow").glob("*.npy")}
@@ -352,13 +353,13 @@ def detect_format(root: Path) -> str:
         raise AssetError("no such data set", where=str(root), accepted="a folder")
     if (root / ABOUT).is_file():
         return "windows"
-    if (root / INDEX).is_file() or next(root.rglob("manifest.json"), None):
+    if (root / INDEX).is_file() or next(below(root, "manifest.json"), None):
         return "blinkgl"
-    if next(root.rglob("forward_flow"), None):
+    if next(below(root, "forward_flow"), None):
         return "blinkflow"
-    if next(root.rglob("*_data.hdf5"), None):
+    if next(below(root, "*_data.hdf5"), None):
         return "mvsec"
-    if next(root.rglob("events.h5"), None):
+    if next(below(root, "events.h5"), None):
         return "dsec"
     raise AssetError(
         "no data set found",

@@ -35,6 +35,18 @@ def test_detected_and_consistent(sets, name):
         assert s.flow.shape == (s.height, s.width, 2) and s.flow.dtype == np.float32 and s.valid.dtype == bool
 
 
+@pytest.mark.parametrize("name", ["blinkgl", "dsec", "blinkflow", "mvsec"])
+def test_a_subset_may_be_made_of_links(sets, name, tmp_path):
+    """Whatever lies in the set, linked into another folder, beside a link in a circle."""
+    for part in sets[name].iterdir():
+        if part.name != "index.jsonl":
+            (tmp_path / part.name).symlink_to(part)
+    (tmp_path / "circle").symlink_to(tmp_path)
+    linked, whole = open_source(tmp_path), open_source(sets[name])
+    assert detect_format(tmp_path) == name
+    assert [linked[i].name for i in range(len(linked))] == [whole[i].name for i in range(len(whole))]
+
+
 def test_blinkgl(sets):
     source = open_source(sets["blinkgl"])
     assert len(source) == 6 and source.has_backward

@@ -158,7 +158,6 @@ def of_recipe(recipe: str, count: int, workers: int) -> list[dict[str, float]]:
     with open_online(SourceConfig(recipe=recipe, online=True, workers=workers, **asked), 0) as source:
         for n in range(count):
             s = source[n]
-            source.taken(n)
             length = float(np.hypot(*s.flow[s.valid].T).mean()) if s.valid.any() else None
             rows.append(statistics(s.old, s.new, (s.height, s.width), length))
     return rows

@@ -8,6 +8,9 @@ import pytest
 
 pytest.importorskip("torch")
 
+from tiny_recipe import TINY
+
+from blinkgl.config.reader import to_yaml
 from blinkgl.events.types import Events
 from blinkgl.tools import data_statistics as ds
 from eflow.data.window import Window
@@ -80,3 +83,15 @@ def test_recordings_are_found_by_their_endings(tmp_path):
         (tmp_path / name).touch()
     found = [p.relative_to(tmp_path).as_posix() for p in ds.recordings(tmp_path)]
     assert found == ["a/events.txt", "a/x.raw", "b/y.aedat4"]
+
+
+def test_of_a_recipe_as_training_gets_it(tmp_path, monkeypatch):
+    """Windows of 40 events or more of 5 to 100 ms, each with the length of its flow; as many as were asked for."""
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text(to_yaml({**TINY, "labels": {**TINY["labels"], "flow": ["forward", "backward"]}}))
+    rows = ds.of_recipe(str(recipe), 12, 0)
+    assert len(rows) == 12
+    events, flow = ds.column(rows, "events"), ds.column(rows, "flow")
+    area = TINY["camera"]["width"] * TINY["camera"]["height"]
+    assert len(events) == len(flow) == 12 and (events * area >= ds.LEAST - 1e-6).all() and (flow > 0).all()
+    assert len(set(events)) > 6, "windows differ"

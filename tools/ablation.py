@@ -24,6 +24,7 @@ from __future__ import annotations
 import argparse
 import copy
 import json
+import shutil
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -114,10 +115,13 @@ def recipe_of(arm: Arm, base: dict[str, Any]) -> dict[str, Any]:
 
 
 def rendered(steps: Steps, out: Path, recipe: Path, count: int, windows: tuple[str, ...], *more: str) -> Path:
-    """The folder of windows of a recipe."""
+    """The folder of windows of a recipe. Whole or not there: what is stopped keeps what it has, which is too few."""
     if not out.exists():
         options = ["-n", str(count), "--per-sequence", "10", *windows, *KEPT, *more, "--quiet"]
-        steps.run("eflow.cli", "render", str(recipe), "--out", str(out), *options)
+        fresh = out.with_suffix(".new")
+        shutil.rmtree(fresh, ignore_errors=True)
+        steps.run("eflow.cli", "render", str(recipe), "--out", str(fresh), *options)
+        fresh.rename(out)
     return out
 
 

@@ -3,10 +3,11 @@
     python -m blinkgl.tools.bench_fragments [flying_objects dense_texture grazing] [--frames 30]
 
 The luminance pass of `antialiasing: edges` at mip bias -1, of clips of configs/trade, frames 1 px apart: as it is, with
-the nearest mip level in the place of two (dithered from pixel to pixel, too), with textures of half floats, and without
-any light in the fragment, which is the wrong picture and bounds what light out of the fragment could save. All take
-turns frame by frame, so that a busy machine slows them alike; processor milliseconds a frame, read-back included.
-Events (ESIM) and frames are judged against 6 x 6 times finer ones.
+the nearest mip level in the place of two (dithered from pixel to pixel, too), with textures of whole floats (as it
+was), and without any light in the fragment, which is the wrong picture and bounds what light out of the fragment could
+save. All take turns frame by frame, so that a busy machine slows them alike; processor milliseconds a frame, read-back
+included. Events (ESIM) and frames are judged against 6 x 6 times finer ones. `--threshold 0.02`: small ones, which
+see more.
 """
 
 from __future__ import annotations
@@ -27,14 +28,13 @@ from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.gl import GLContext, ShaderLoader, create_context
 from blinkgl.gl.shader import shader_folder
 from blinkgl.machine import bench
-from blinkgl.render.resources import SceneResources
+from blinkgl.render import resources
 from blinkgl.scene.build import sequence_scene
 from blinkgl.tools.bench_filtering import Judged, displacement_frames
 from blinkgl.trade.matching import match_events
 
 EDGES = RenderConfig(antialiasing="edges", mip_bias=-1.0)
 FINER, LIMIT_US, ROUNDS = 6, 10_000, 3
-_GL_R16F = 0x822D
 _LEVEL = "row), 1e-30));\n"
 _NOISE = "    level += fract(52.9829189 * fract(dot(gl_FragCoord.xy, vec2(0.06711056, 0.00583715)))) - 0.5;\n"
 EDITS = {
@@ -46,8 +46,8 @@ VARIANTS = {
     "as it is": (),
     "nearest level": ("nearest",),
     "nearest level, dithered": ("nearest", "dithered"),
-    "half floats": ("half",),
-    "nearest level, half floats": ("nearest", "half"),
+    "whole floats": ("whole",),
+    "nearest level, whole floats": ("nearest", "whole"),
     "without light": ("unlit",),
 }
 
@@ -55,18 +55,9 @@ VARIANTS = {
 @contextmanager
 def made_so(how: tuple[str, ...]):
     """Textures that are uploaded meanwhile are of this kind."""
-    upload = SceneResources._upload  # noqa: SLF001 - what is tried is not offered
-
-    def half(self, image, name, internal_format=None, *more, **options):
-        if internal_format is None and image.dtype != np.uint8 and image.shape[2] == 1:
-            internal_format = _GL_R16F
-        return upload(self, image, name, internal_format, *more, **options)
-
     minified = moderngl.LINEAR_MIPMAP_NEAREST if "nearest" in how else moderngl.LINEAR_MIPMAP_LINEAR
-    with (
-        patch.object(SceneResources, "_upload", half if "half" in how else upload),
-        patch.object(moderngl, "LINEAR_MIPMAP_LINEAR", minified),
-    ):
+    stored = (lambda image: image) if "whole" in how else resources.half_floats
+    with patch.object(resources, "half_floats", stored), patch.object(moderngl, "LINEAR_MIPMAP_LINEAR", minified):
         yield
 
 
@@ -84,11 +75,15 @@ def shaders_of(how: tuple[str, ...], folder: Path) -> Path:
     return copy
 
 
-def compared(gl: GLContext, clip: str, frames: int, folder: Path) -> dict[str, dict]:
+def compared(gl: GLContext, clip: str, frames: int, threshold: float, folder: Path) -> dict[str, dict]:
     """variant -> cpu_ms, rms and flicker of the logarithm, missed and extra (shares of the reference's), late (us)."""
     config = load_run(f"configs/trade/{clip}.yaml").sequence(0)
     scene = sequence_scene(config, 0)
-    times, esim, ours = displacement_frames(gl, scene, 1.0, frames), EsimConfig(contrast_threshold=0.2), gl.shaders
+    times, esim, ours = (
+        displacement_frames(gl, scene, 1.0, frames),
+        EsimConfig(contrast_threshold=threshold),
+        gl.shaders,
+    )
     reference = Judged(gl, scene, EDGES, esim, FINER)
     tried: dict[str, tuple[Judged, ShaderLoader]] = {}
     for name, how in VARIANTS.items():
@@ -131,12 +126,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("clips", nargs="*", default=["flying_objects", "dense_texture", "grazing"])
     parser.add_argument("--frames", type=int, default=30)
+    parser.add_argument("--threshold", type=float, default=0.2)
     options = parser.parse_args()
     with create_context() as gl:
         print(bench.machine_line(gl.renderer))
         for clip in options.clips:
             with tempfile.TemporaryDirectory(prefix="blinkgl-fragments-") as folder:
-                rows = compared(gl, clip, options.frames, Path(folder))
+                rows = compared(gl, clip, options.frames, options.threshold, Path(folder))
             for name, r in rows.items():
                 print(
                     f"{clip:<16} {name:<28} {r['cpu_ms']:6.2f} ms, {r['cpu_ms'] / rows['as it is']['cpu_ms']:.2f};"

@@ -11,8 +11,9 @@ from typing import Any, Literal
 from blinkgl.config.events import EmulatorConfig, followers
 from blinkgl.config.reader import parse_yaml
 
-Quality = Literal["fast", "balanced", "accurate", "reference"]
+Quality = Literal["fast", "balanced", "accurate", "reference", "auto"]
 QUALITIES = ("fast", "balanced", "accurate", "reference")
+"""Those that are settings of the suite. ``auto`` is :data:`DEFAULT` with a first look at each sequence."""
 DEFAULT: Quality = "balanced"
 """Of a configuration that says nothing; ``quality: null`` leaves every key at its own default."""
 
@@ -24,7 +25,10 @@ def with_default(tree: Any) -> Any:
 
 def load_quality(name: str) -> dict[str, Any]:
     """``timeline:`` and ``render:`` of a preset, plain data; the figures it was chosen by are comments in its file."""
-    return copy.deepcopy(_shipped(name))
+    preset = copy.deepcopy(_shipped(DEFAULT if name == "auto" else name))
+    if name == "auto":
+        preset["timeline"]["first_look"] = True
+    return preset
 
 
 @lru_cache
@@ -48,7 +52,7 @@ def fill_quality(quality: Any, kind: Any, emulator: Any, frames: Any) -> dict[st
 
     A timeline of another kind than the preset's takes the preset's reconstruction alone: the other values
     mean nothing to it. Emulators that cannot follow the preset's reconstruction take everything but that."""
-    if quality not in QUALITIES:
+    if quality not in (*QUALITIES, "auto"):
         return {}
     preset = load_quality(quality)
     given = preset["timeline"]

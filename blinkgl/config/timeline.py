@@ -67,6 +67,22 @@ class DisplacementTimeline(_AdaptiveTimeline):
         le=1e4,
         description="what the fastest sampled pixel keeps to besides, px; for a percentile below 100",
     )
+    first_look: bool = Field(
+        False,
+        description="each sequence is looked at before it begins: where frames twice as far apart would make its "
+        "events less than 1.3 times as wrong, they are (docs/trade.md, `auto`). Takes half a second; the manifest "
+        "has what was seen",
+    )
+
+    @rule("first_look", "reconstruction")
+    def _looks_at_straight_lines(looks, reconstruction):
+        if looks and reconstruction != "linear":
+            raise Refused(
+                "a first look (`quality: auto` has one) judges straight lines between frames",
+                where="first_look",
+                value=looks,
+                accepted="false, or reconstruction: linear",
+            )
 
 
 class BrightnessTimeline(_AdaptiveTimeline):

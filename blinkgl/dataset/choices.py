@@ -40,8 +40,12 @@ def quality_in_words(config: SequenceConfig) -> str:
     else:
         apart = _apart("timeline", mine["timeline"], usual["timeline"])
     apart += _apart("render", mine["render"], usual["render"])
+    looks = mine["timeline"].get("first_look", False)
+    looking = " with a first look: frames twice as far apart where a sequence hardly minds (docs/trade.md, auto)"
     if not apart:
-        return f"{DEFAULT}, the default"
+        return f"{DEFAULT}{looking}" if looks else f"{DEFAULT}, the default"
+    if looks:  # what it will see is not known here
+        return f"not {DEFAULT}: {', '.join(apart)};{looking}"
     named = "" if config.quality in (None, DEFAULT) else f"{config.quality}; "
     return f"{named}not {DEFAULT}: {', '.join(apart)}: {_cost(mine, usual)}"
 

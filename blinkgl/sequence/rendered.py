@@ -14,6 +14,7 @@ import numpy as np
 from blinkgl.camera import CameraModel, PinHole
 from blinkgl.camera.rectified import rectified
 from blinkgl.config.sequence import SequenceConfig
+from blinkgl.config.timeline import DisplacementTimeline
 from blinkgl.config.tracks import track_times
 from blinkgl.errors import EventDataError
 from blinkgl.events import emulator_of
@@ -31,6 +32,7 @@ from blinkgl.scene.build import recording, sequence_scene
 from blinkgl.scene.rig import Sensor
 from blinkgl.scene.types import Dynamics, Scene, SceneObject
 from blinkgl.sequence.clock import StageClock
+from blinkgl.sequence.first_look import first_look
 from blinkgl.sequence.inertial import Inertial, measured
 from blinkgl.sequence.items import GroundTruth, Item, Picture
 from blinkgl.sequence.simulate import Simulation
@@ -80,12 +82,22 @@ def timeline_of(
     span_ns: tuple[int, int],
     reductions: Callable[[], Reductions] = OfArrays,
 ) -> Timeline:
-    """What decides the times of a sensor's frames.   scene : of one sensor, as it was built.   renderer : of it.
-    span_ns : first and last time, ns.   reductions : makes who reduces its small pictures."""
+    """What decides the times of a sensor's frames, after a first look where one is asked for.   scene : of one sensor,
+    as it was built.   renderer : of it.   span_ns : first and last time, ns.   reductions : makes who reduces its small
+    pictures."""
     emulator, dynamics = recording(scene, config).sensors[0].emulator, scene.dynamics
     stops = dynamics.impacts_ns if dynamics is not None else ()
     response = emulator_of(emulator).response(emulator)
-    return make_timeline(config.timeline, *span_ns, renderer, response, stops, reductions)
+    made = partial(make_timeline, pictures=renderer, response=response, stops_ns=stops, reductions=reductions)
+    asked, (t0_ns, t1_ns) = config.timeline, span_ns
+    timeline = made(asked, t0_ns, t1_ns)
+    if not isinstance(asked, DisplacementTimeline) or not asked.first_look:
+        return timeline
+    look = first_look(renderer, scene, asked, emulator, span_ns, timeline.pace)
+    max_px = asked.max_px * (2 if look.twice else 1)
+    timeline = made(asked.model_copy(update={"max_px": max_px}), t0_ns, t1_ns)
+    timeline.seen = {"max_px": max_px, "first_look": look.facts()}
+    return timeline
 
 
 def _reductions(gl: GLContext, device: str, stack: ExitStack) -> Reductions:

@@ -57,6 +57,8 @@ class Timeline:
         """Who finds percentiles in small pictures; the frames' times are the same, whoever does."""
         self.looks = 0
         """Small pictures asked for so far."""
+        self.seen: dict[str, Any] = {}
+        """What a first look at the sequence saw and made of it, for the manifest."""
         self.others: tuple[Timeline, ...] = ()
         """Of other cameras, whose pace is kept, too (:mod:`blinkgl.timeline.together`)."""
 
@@ -82,7 +84,7 @@ class Timeline:
 
     def info(self) -> dict[str, Any]:
         """What was achieved: plain values for the manifest."""
-        return {}
+        return dict(self.seen)
 
 
 class Uniform(Timeline):

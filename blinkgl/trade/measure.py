@@ -18,15 +18,17 @@ import numpy as np
 from blinkgl.config.sequence import RunTemplate, SequenceConfig, apply_overrides
 from blinkgl.errors import ConfigError
 from blinkgl.events import Events, emulator_of
+from blinkgl.events.grids import masked
 from blinkgl.gl import GLContext
+from blinkgl.render.cutouts import lattice, mask_of
 from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.types import Scene
 from blinkgl.sequence import Simulation, simulate_sequence
 from blinkgl.trade.labels import flow_errors
-from blinkgl.trade.metrics import EventErrors, SpeedMaps, event_errors, masked
-from blinkgl.trade.reference import FineTiles, lattice, mask_of, reference_events
+from blinkgl.trade.metrics import EventErrors, SpeedMaps, event_errors
+from blinkgl.trade.reference import FineTiles, reference_events
 from blinkgl.trade.settings import SIZES, Setting
 
 JUDGED = ("time_median_us", "time_p95_us", "wrong", "voxel")

@@ -178,8 +178,8 @@ def test_every_error_of_every_key_is_plain(monkeypatch):
         (
             "timeline: {fps: 100}",
             (
-                "timeline.fps: unknown key; expected one of: kind, max_px, max_px_peak, max_step_us, min_step_us, "
-                "percentile, reconstruction, sample_every; it is a key of kind: uniform"
+                "timeline.fps: unknown key; expected one of: first_look, kind, max_px, max_px_peak, max_step_us, "
+                "min_step_us, percentile, reconstruction, sample_every; it is a key of kind: uniform"
             ),
         ),
         ("events: {k1: 3}", "events.k1: unknown key; expected one of: causes, contrast_threshold"),

@@ -57,6 +57,16 @@ def test_what_says_no_quality_has_the_default_one(tmp_path):
     assert config.render.antialiasing == preset["render"]["antialiasing"] != RenderConfig().antialiasing
 
 
+def test_auto_is_the_default_with_a_first_look(tmp_path):
+    config, usual = sequence(tmp_path, {"quality": "auto"}), sequence(tmp_path, {})
+    assert config.timeline.first_look and not usual.timeline.first_look
+    assert config.timeline.model_copy(update={"first_look": False}) == usual.timeline and config.render == usual.render
+    assert not sequence(tmp_path, {"quality": "auto", "timeline": {"first_look": False}}).timeline.first_look
+    assert sequence(tmp_path, {"quality": "auto"}, "timeline={kind: uniform, fps: 77}").timeline.fps == 77
+    with pytest.raises(ConfigError, match="timeline.first_look: a first look .* judges straight lines"):
+        sequence(tmp_path, {"quality": "auto", "timeline": {"reconstruction": "pchip"}})
+
+
 def test_null_leaves_every_key_its_own_default(tmp_path):
     assert fill_quality(None, "uniform", None, None) == {} == fill_quality("best", None, None, None)
     config = sequence(tmp_path, {"quality": None})
@@ -78,7 +88,7 @@ def test_a_preset_is_resolved_in_what_is_written(tmp_path):
 
 
 def test_errors(tmp_path):
-    with pytest.raises(ConfigError, match="quality: .*'fast', 'balanced', 'accurate' or 'reference'"):
+    with pytest.raises(ConfigError, match="quality: .*'fast', 'balanced', 'accurate', 'reference' or 'auto'"):
         sequence(tmp_path, {"quality": "best"})
     for bad, where in (
         ({"timeline": 3}, "timeline"),

@@ -173,7 +173,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "pchip": {"timeline": {"reconstruction": "pchip"}},
         "hermite": {"timeline": {"reconstruction": "hermite"}},
     },
-    "quality": {"unsaid": NOTHING, **{name: {"quality": name} for name in QUALITIES}},
+    "quality": {"unsaid": NOTHING, **{name: {"quality": name} for name in (*QUALITIES, "auto")}},
     "sensor": {
         "unsaid": NOTHING,
         **{name: {"sensor": name} for name in ("davis346", "dvxplorer")},

@@ -5,10 +5,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import AssetError
-from blinkgl.render.resources import MAX_RADIUS, DrawItem, _draw_item, _Facets, _Greys
-from blinkgl.scene.types import Light, Material, Mesh
-from render_scenes import scene, still, thing
+from blinkgl.render import resources
+from blinkgl.render.renderer import Renderer
+from blinkgl.render.resources import (
+    HALF_LEAST,
+    HALF_MOST,
+    MAX_RADIUS,
+    DrawItem,
+    _draw_item,
+    _Facets,
+    _Greys,
+    half_floats,
+)
+from blinkgl.scene.types import Light, Material, Mesh, Texture
+from render_scenes import cube, drift, rig, scene, still, thing
 
 
 def mesh(reach: float) -> Mesh:
@@ -47,3 +59,62 @@ def test_exactly_the_largest_radius_is_drawn():
         "line",
     )
     assert item_of(flat, Material(double_sided=True)).radius == MAX_RADIUS
+
+
+def lit(*rows) -> np.ndarray:
+    return np.array(rows, np.float32)[..., None]
+
+
+@pytest.mark.parametrize(
+    ("image", "half"),
+    [
+        (lit([0, HALF_LEAST], [1, HALF_MOST]), True),  # black is exact, and both ends are in
+        (lit([0.5, HALF_LEAST * (1 - 1e-6)]), False),  # 1/2048 of a darker texel is less than it tells apart
+        (lit([0.5, HALF_MOST * 1.001]), False),
+        (lit([0.5, np.inf]), False),
+        (lit([0.0, 0.0]), False),  # nothing to gain, and nothing to divide by
+        (lit([*[0.0] * 99, 50 * HALF_LEAST]), False),  # coarse levels would be darker than any texel
+        (lit([*[0.0] * 99, 200 * HALF_LEAST]), True),
+        (np.array([[[1e-6, 0.5, 0.0]]], np.float32), True),  # of a colour the brightest channel counts
+        (np.array([[[1e-6, 1e-5, 0.0]], [[1, 1, 1]]], np.float32), False),
+    ],
+)
+def test_half_floats_where_they_hold_a_picture(image, half):
+    stored = half_floats(image)
+    assert stored.dtype == (np.float16 if half else np.float32)
+    brightest = image.max(axis=2, keepdims=True)
+    with np.errstate(invalid="ignore"):
+        assert (np.abs(stored.astype(np.float64) - image) <= brightest / 2048).all() or not half
+    if not half:
+        assert stored is image
+
+
+def test_8_bits_of_srgb_are_half_floats():
+    codes = np.arange(256, dtype=np.uint8)[None]
+    image = resources.luminance_image(np.repeat(codes[..., None], 3, axis=2), (0.3, 0.3, 0.3))[..., None]
+    assert half_floats(image).dtype == np.float16
+
+
+def test_frames_of_half_floats_are_those_of_floats(gl, monkeypatch):
+    """Their texels are rounded to 1/2048, their mip levels once more; rates are differences of neighbours. A picture of
+    floats stays as it is."""
+    rng = np.random.default_rng(3)
+    coded = Texture(rng.integers(0, 256, (64, 64, 3), np.uint8), "codes")
+    whole = Texture(rng.random((64, 64, 3), np.float32), "floats")
+    kinds: list[np.dtype] = []
+    of = half_floats
+    monkeypatch.setattr(resources, "half_floats", lambda image: kinds.append(image.dtype) or of(image))
+
+    def drawn(texture: Texture) -> tuple[np.ndarray, np.ndarray]:
+        body = thing("box", 1, cube(0.8), drift((0, 3, 0), (0.5, 3, 0)), Material(texture=texture))
+        with Renderer(gl, scene([body], rig(80, 60, 75.0)), RenderConfig(antialiasing="taps4")) as renderer:
+            frame = renderer.luminance(100_000_000, rate=True)
+            return frame.read(), frame.read("rate")
+
+    half, half_rate = drawn(coded)
+    assert kinds == [np.float32] and drawn(whole) and len(kinds) == 1
+    monkeypatch.setattr(resources, "half_floats", lambda image: image)
+    true, rate = drawn(coded)
+    off = np.abs(half - true)
+    assert 0 < off.max() <= true.max() / 1024, "they differ, or nothing was compared"
+    assert np.abs(half_rate - rate).max() <= 2e-3 * np.abs(rate).max() > 0

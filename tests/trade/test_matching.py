@@ -7,9 +7,10 @@ import itertools
 import numpy as np
 import pytest
 
+from blinkgl.events.grids import voxel_grid
 from blinkgl.events.types import Events
 from blinkgl.trade.matching import match_events
-from blinkgl.trade.metrics import SpeedMaps, event_errors, voxel_grid
+from blinkgl.trade.metrics import SpeedMaps, event_errors
 
 H, W = 4, 5
 
@@ -141,7 +142,7 @@ def test_speed_of_the_nearest_map():
 
 
 def test_voxel_grid_by_hand():
-    grid = voxel_grid(stream((1, 2, 0, 1), (1, 2, 100, 1), (0, 0, 125, 0), (3, 1, 1399, 1)), 0, 1400, H, W)
+    grid = voxel_grid(stream((1, 2, 0, 1), (1, 2, 100, 1), (0, 0, 125, 0), (3, 1, 1399, 1)), 0, 1400, H, W, 15)
     assert grid.shape == (15, H, W) and grid.dtype == np.float32
     assert grid[0, 2, 1] == 1 and grid[1, 2, 1] == 1
     assert grid[1, 0, 0] == pytest.approx(-0.75) and grid[2, 0, 0] == pytest.approx(-0.25)

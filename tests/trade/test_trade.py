@@ -19,6 +19,7 @@ from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.errors import ConfigError
 from blinkgl.events.table import EMULATORS
+from blinkgl.render.cutouts import lattice, mask_of
 from blinkgl.render.rectangles import Rectangle
 from blinkgl.render.renderer import Renderer
 from blinkgl.show.trade import show
@@ -26,7 +27,7 @@ from blinkgl.tools import peer_cycles
 from blinkgl.trade import run as run_module
 from blinkgl.trade.measure import Bench, Level, Options
 from blinkgl.trade.pareto import pareto_front
-from blinkgl.trade.reference import FineTiles, lattice, mask_of
+from blinkgl.trade.reference import FineTiles
 from blinkgl.trade.run import chosen, convergence_line, trade
 from blinkgl.trade.settings import Setting, design
 

@@ -1,0 +1,85 @@
+"""Some rectangles of a scene's picture, drawn as finely as one likes: a whole picture at 32 x 32 samples a pixel is out
+of reach, and a few thousand pixels in many places say as much about errors as all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from blinkgl.render.rectangles import Rectangle
+from blinkgl.render.renderer import Renderer
+
+if TYPE_CHECKING:
+    from blinkgl.config.sequence import RenderConfig
+    from blinkgl.gl import GLContext
+    from blinkgl.scene.types import Scene
+
+
+def lattice(
+    width: int, height: int, columns: int, rows: int, tile_width: int, tile_height: int
+) -> tuple[Rectangle, ...]:
+    """``columns`` x ``rows`` rectangles spread evenly over an image; one of the whole image when they would touch."""
+    if columns * tile_width >= width or rows * tile_height >= height:
+        return (Rectangle(0, 0, width, height),)
+    xs = [round((i + 0.5) * width / columns - tile_width / 2) for i in range(columns)]
+    ys = [round((i + 0.5) * height / rows - tile_height / 2) for i in range(rows)]
+    return tuple(Rectangle(x, y, x + tile_width, y + tile_height) for y in ys for x in xs)
+
+
+def mask_of(tiles: tuple[Rectangle, ...], height: int, width: int) -> np.ndarray:
+    """(H, W) bool."""
+    mask = np.zeros((height, width), bool)
+    for r in tiles:
+        mask[r.y0 : r.y1, r.x0 : r.x1] = True
+    return mask
+
+
+class Cutouts:
+    """Luminance of rectangles of a scene's picture, each pixel the mean of ``scale`` x ``scale`` samples on a regular
+    grid. A context manager; called with times it draws.
+
+    samples : how each sample is drawn.   beside : of the same scene; its textures and meshes are used where ``samples``
+    look textures up in the same way. It has to be released last."""
+
+    def __init__(
+        self,
+        gl: GLContext,
+        scene: Scene,
+        tiles: tuple[Rectangle, ...],
+        scale: int,
+        samples: RenderConfig,
+        beside: Renderer | None = None,
+    ):
+        self._tiles, self._scale = tiles, scale
+        self._shape = (scene.camera.height, scene.camera.width)
+        self._cameras = [scene.camera.part(r.x0, r.y0, r.x1, r.y1, scale) for r in tiles]
+        if beside is not None and _look_ups(beside.config) != _look_ups(samples):
+            beside = None
+        self._renderer = Renderer(gl, scene.with_camera(self._cameras[0]), samples, beside=beside)
+        self._fine = np.empty((self._cameras[0].height, self._cameras[0].width), np.float32)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._renderer.release()
+
+    def __call__(self, times: Iterable[int]) -> Iterator[np.ndarray]:
+        """(H, W) float32 of every time, ns, linear light, zero outside the rectangles; the same array each time."""
+        frame = np.zeros(self._shape, np.float32)
+        for t_ns in times:
+            for r, camera in zip(self._tiles, self._cameras):
+                self._renderer.look_through(camera)
+                self._renderer.luminance(t_ns).read(out=self._fine)
+                # INTER_AREA at a whole-numbered ratio is the mean.
+                frame[r.y0 : r.y1, r.x0 : r.x1] = cv2.resize(
+                    self._fine, (r.x1 - r.x0, r.y1 - r.y0), interpolation=cv2.INTER_AREA
+                )
+            yield frame
+
+
+def _look_ups(config: RenderConfig) -> tuple[float, float]:
+    return config.anisotropy, config.mip_bias

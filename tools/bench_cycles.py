@@ -39,6 +39,7 @@ from rich.table import Table
 
 from blinkgl.blender.process import available
 from blinkgl.config.events import EsimConfig
+from blinkgl.config.quality import DEFAULT, load_quality
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.errors import BlinkGLError
 from blinkgl.events import Events
@@ -54,7 +55,11 @@ from blinkgl.timeline.speed import largest_speed
 from blinkgl.tools.peer_cycles import Cost, CyclesSettings, frames
 from blinkgl.trade.metrics import SpeedMaps, event_errors
 
-ANTIALIASINGS = ("none", "ssaa2", "ssaa4")
+DRAWN = {
+    **{name: RenderConfig(antialiasing=name) for name in ("none", "ssaa2", "ssaa4")},
+    f"quality: {DEFAULT}": RenderConfig(**load_quality(DEFAULT)["render"]),
+}
+"""Ways to draw that are compared, the default among them."""
 SHADED = "our light, our shadows"
 
 
@@ -64,8 +69,9 @@ def smaller(scene: Scene, width: int) -> Scene:
     return scene.with_camera(camera.resized(width, max(1, round(camera.height * width / camera.width))))
 
 
-def rasterised(gl, scene: Scene, times: list[int], antialiasing: str, cost: Cost) -> Iterator[np.ndarray]:
-    with Renderer(gl, scene, RenderConfig(antialiasing=antialiasing)) as renderer:
+def rasterised(gl, scene: Scene, times: list[int], how: str, cost: Cost) -> Iterator[np.ndarray]:
+    """how : of :data:`DRAWN`."""
+    with Renderer(gl, scene, DRAWN[how]) as renderer:
         renderer.luminance(times[-1]).read()  # compiles and uploads
         for t in times:
             wall, cpu = time.perf_counter(), time.process_time()
@@ -118,7 +124,7 @@ def clip(gl, scene: Scene, options, console: Console) -> dict:
     costs, streams, first = {}, {}, {}
     if options.only == "shadows":
         traced = {name: one for name, one in traced.items() if "everything" not in name}
-    names = [*traced, SHADED] if options.only == "shadows" else [*ANTIALIASINGS, *traced, SHADED]
+    names = [*traced, SHADED] if options.only == "shadows" else [*DRAWN, *traced, SHADED]
     open_: list[np.ndarray] = []  # path-traced frames without shadows
     for name in names:
         cost = costs[name] = Cost()
@@ -141,11 +147,11 @@ def clip(gl, scene: Scene, options, console: Console) -> dict:
         console.print(
             f"{name}: {len(streams[name]):,} events, {np.median(cost.wall_s):.3f} s per frame", highlight=False
         )
-    rows = [("filtering", a, "our light") for a in ANTIALIASINGS]
+    rows = [("filtering", a, "our light") for a in DRAWN]
     rows += [("lamps' shadows", "our light", "lamps' shadows"), ("lamps' shadows", SHADED, "lamps' shadows")]
     rows += [("sky's shadows", "lamps' shadows", "shadows"), ("shadows", "our light", "shadows")]
     rows += [("shadows", SHADED, "shadows"), ("bounces", "shadows", "everything")]
-    rows += [("all", a, "everything") for a in ANTIALIASINGS] + [("noise", "everything, another seed", "everything")]
+    rows += [("all", a, "everything") for a in DRAWN] + [("noise", "everything, another seed", "everything")]
     rows = [row for row in rows if {*row[1:]} <= set(names)]
     limit = round(options.partners * step / 1000)
     t0, t1 = times[0] // 1000, times[-1] // 1000 + 1
@@ -166,7 +172,9 @@ def clip(gl, scene: Scene, options, console: Console) -> dict:
         folder = Path(options.pictures)
         folder.mkdir(parents=True, exist_ok=True)
         for name, frame in first.items():
-            cv2.imwrite(str(folder / f"{name.replace(', ', '-').replace(' ', '-')}.png"), to_srgb8(frame))
+            cv2.imwrite(
+                str(folder / f"{name.replace(': ', '-').replace(', ', '-').replace(' ', '-')}.png"), to_srgb8(frame)
+            )
     return {
         "width": width,
         "height": height,
@@ -210,11 +218,11 @@ def speed(gl, scene: Scene, max_px: float, options) -> dict:
             }
         )
 
-    for antialiasing in ANTIALIASINGS:
+    for how in DRAWN:
         cost = Cost()
-        for _ in rasterised(gl, scene, times[::10], antialiasing, cost):
+        for _ in rasterised(gl, scene, times[::10], how, cost):
             pass
-        add(f"BlinkGL luminance, {antialiasing}", cost, first=False)
+        add(f"BlinkGL luminance, {how}", cost, first=False)
     for name, settings in (
         ("EEVEE, 1 sample", CyclesSettings(1, engine="eevee")),
         ("EEVEE, 16 samples", CyclesSettings(16, engine="eevee")),

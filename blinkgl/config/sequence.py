@@ -121,8 +121,8 @@ def span_s(duration: float, label_rate: float) -> float:
     return duration + 1 / label_rate
 
 
-Antialiasing = Literal["none", "msaa4", "taps4", "edges", "ssaa2", "ssaa4"]
-ImageAntialiasing = Literal["none", "msaa4", "edges", "ssaa2", "ssaa4"]
+Antialiasing = Literal["none", "msaa4", "taps4", "edges", "edges2", "ssaa2", "ssaa4"]
+ImageAntialiasing = Literal["none", "msaa4", "edges", "edges2", "ssaa2", "ssaa4"]
 
 
 class RenderConfig(Config):
@@ -132,7 +132,8 @@ class RenderConfig(Config):
         "none",
         description="event frames: msaa4 filters silhouettes (4 coverage samples a pixel), taps4 textures (4 lookups a "
         "pixel), edges both: silhouettes by the areas of their surfaces, lookups along the way of foreshortening; "
-        "ssaa2 and ssaa4 draw 2 x 2 and 4 x 4 finer and average everything. Labels are never filtered. "
+        "ssaa2 and ssaa4 draw 2 x 2 and 4 x 4 finer and average everything, edges2 draws edges 2 x 2 finer. Labels are "
+        "never filtered. "
         "Costs: docs/results.md",
     )
     image_antialiasing: ImageAntialiasing = Field("ssaa2", description="the same for the colour images at label times")

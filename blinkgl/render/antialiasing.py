@@ -18,8 +18,8 @@ class Samples(NamedTuple):
             super-sampled, the light and the silhouettes are not. Event frames only: colour
             is not worth a shader variant.
     edges : whether silhouettes and creases, and no other pixels, are given the means over the areas of their surfaces
-            (:class:`~blinkgl.render.passes.edged.Edged`). The taps, where there are four, then lie along the way in
-            which a surface is foreshortened."""
+            (:class:`~blinkgl.render.passes.edged.Edged`), of a finer grid before it is averaged. The taps, where there
+            are four, then lie along the way in which a surface is foreshortened."""
 
     grid: int = 1
     multi: int = 0
@@ -42,6 +42,7 @@ ANTIALIASING = {
     "msaa4": Samples(multi=4),
     "taps4": Samples(taps=4),
     "edges": Samples(taps=4, edges=True),
+    "edges2": Samples(grid=2, taps=4, edges=True),
     "ssaa2": Samples(grid=2),
     "ssaa4": Samples(grid=4),
 }

@@ -38,7 +38,7 @@ RECONSTRUCTIONS = {
     "hermite": ("timeline.reconstruction=hermite",),
 }
 ANTIALIASINGS = {
-    name: (f"render.antialiasing={name}",) for name in ("none", "msaa4", "taps4", "edges", "ssaa2", "ssaa4")
+    name: (f"render.antialiasing={name}",) for name in ("none", "msaa4", "taps4", "edges", "edges2", "ssaa2", "ssaa4")
 }
 OTHERS = {
     "": (),
@@ -93,7 +93,7 @@ def design(quick: bool, random_scene: bool = True) -> tuple[Setting, ...]:
     if quick:
         points = [Setting(s, antialiasing=a) for s in displacement(2, 1, 0.5) for a in ("none", "ssaa2")]
         points += [Setting(s, r, "ssaa2") for s in displacement(2, 1) for r in curves]
-        points += [Setting(displacement(1)[0], antialiasing=a) for a in ("msaa4", "taps4", "edges", "ssaa4")]
+        points += [Setting(displacement(1)[0], antialiasing=a) for a in ("msaa4", "taps4", "edges", "edges2", "ssaa4")]
         points += [Setting(s, antialiasing="ssaa2") for s in uniform(100, 400)]
         points += [Setting(s, "pchip", "ssaa2") for s in extra[1::3]]
         points += [Setting(displacement(1)[0], antialiasing=a, other=sharper[0]) for a in ("none", "ssaa2")]
@@ -126,7 +126,7 @@ def design(quick: bool, random_scene: bool = True) -> tuple[Setting, ...]:
         points += [
             Setting(s, antialiasing=a, other=o)
             for s in displacement(2, 1, 0.5)
-            for a in ("none", "taps4", "edges", "ssaa2", "ssaa4")
+            for a in ("none", "taps4", "edges", "edges2", "ssaa2", "ssaa4")
             for o in sharper
         ]
         points += [Setting(s, antialiasing="ssaa2") for s in uniform(100, 200, 400, 800)]
@@ -152,6 +152,8 @@ def suite_design() -> tuple[Setting, ...]:
     points += [Setting(s, antialiasing="edges", other=sharp) for s in displacement(4, 1.5, 0.5)]
     points += [Setting(s, antialiasing="ssaa2", other=sharp) for s in displacement(2, 1, 0.5)]
     points += [Setting(s, "pchip", "edges", sharp) for s in displacement(4, 2, 1, 0.5)]
+    points += [Setting(s, antialiasing="edges2", other=sharp) for s in displacement(2, 1, 0.5)]
+    points += [Setting(s, "pchip", "edges2", sharp) for s in displacement(2, 1)]
     points += [Setting(s, "pchip", "ssaa4", sharp) for s in displacement(2, 1)]
     points += [Setting(displacement(0.5)[0], antialiasing="ssaa4", other=sharp)]
     points += [Setting(f"brightness {c} C", antialiasing="edges", other=sharp) for c in (4, 2, 1)]

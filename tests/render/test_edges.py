@@ -509,8 +509,10 @@ def test_through_a_lens(gl):
     world = mixed_scene(80, 60)
     lens = Radtan(80, 60, 75.0, 75.0, 39.5, 29.5, k1=-0.2, k2=0.05)
     seen = world.with_camera(lens)
-    true, plain, edged = (luminance(gl, seen, name, SECOND // 3) for name in ("ssaa4", "none", "edges"))
-    assert rmse(edged, true) < 0.8 * rmse(plain, true)
+    true, plain, edged, finer = (
+        luminance(gl, seen, name, SECOND // 3) for name in ("ssaa4", "none", "edges", "edges2")
+    )
+    assert rmse(edged, true) < 0.8 * rmse(plain, true) and rmse(finer, true) < 0.7 * rmse(edged, true)
 
 
 # ---- triangles smaller than a pixel --------------------------------------------------------------------------------
@@ -564,3 +566,35 @@ def test_seams_of_textures(gl):
     inside = np.s_[16:32, 20:28]
     error = {name: rmse(luminance(gl, world, name)[inside], true[inside]) for name in ("taps4", "edges")}
     assert error["edges"] < 0.5 * error["taps4"]
+
+
+@pytest.mark.parametrize("rate", [False, True])
+def test_a_finer_grid_is_the_mean_of_a_larger_picture(gl, rate):
+    """edges2: lines, taps and shares of a picture of twice the size, then the mean of four."""
+    world, factor = mixed_scene(81, 61), 2
+    camera = world.camera
+    larger = world.with_camera(camera.resized(factor * camera.width, factor * camera.height))
+    name, t_ns = "rate" if rate else "", 100_000_000
+    with Renderer(gl, larger, RenderConfig(antialiasing="edges")) as renderer:
+        fine = renderer.luminance(t_ns, rate=rate).read(name).astype(np.float64)
+    with Renderer(gl, world, RenderConfig(antialiasing=f"edges{factor}")) as renderer:
+        found = renderer.luminance(t_ns, rate=rate).read(name)
+    expected = fine.reshape(camera.height, factor, camera.width, factor).mean(axis=(1, 3))
+    np.testing.assert_allclose(found, expected, atol=2e-5 * np.abs(expected).max())
+
+
+def test_colours_of_a_finer_grid(gl):
+    world = mixed_scene(81, 61)
+    larger = world.with_camera(world.camera.resized(162, 122))
+    with Renderer(gl, larger, EDGES) as renderer:
+        fine = renderer.colour(0).read().astype(np.float64)
+    with Renderer(gl, world, RenderConfig(image_antialiasing="edges2")) as renderer:
+        found = renderer.colour(0).read()
+    np.testing.assert_allclose(found, fine.reshape(61, 2, 81, 2, 3).mean(axis=(1, 3)), atol=2e-5 * fine.max())
+
+
+def test_a_finer_grid_is_nearer_to_the_truth_than_four_times_as_many_samples(gl):
+    world = mixed_scene(80, 60)
+    true = finest(gl, world)
+    off = {name: rmse(luminance(gl, world, name), true) for name in ("edges", "edges2", "ssaa4")}
+    assert off["edges2"] < 0.75 * off["ssaa4"] and off["edges2"] < 0.6 * off["edges"], off

@@ -31,7 +31,7 @@ def full_redraw(gl, world, config=PLAIN):
     return Renderer(gl, world, config, whole=True)
 
 
-@pytest.mark.parametrize("antialiasing", ["none", "msaa4", "edges", "ssaa2"])
+@pytest.mark.parametrize("antialiasing", ["none", "msaa4", "edges", "edges2", "ssaa2"])
 def test_identical_to_the_full_redraw(gl, antialiasing):
     config = RenderConfig(antialiasing=antialiasing)
     world = mixed_scene(camera_moves=False)
@@ -65,7 +65,7 @@ def test_skipped_rows_do_not_depend_on_the_threads_share():
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
-@pytest.mark.parametrize("antialiasing", ["none", "edges", "ssaa2"])
+@pytest.mark.parametrize("antialiasing", ["none", "edges", "edges2", "ssaa2"])
 def test_rates_are_identical_to_the_full_redraw(gl, antialiasing):
     config = SimpleNamespace(**{**vars(PLAIN), "antialiasing": antialiasing})
     world = mixed_scene(camera_moves=False)
@@ -89,7 +89,7 @@ def test_other_passes_in_between_do_not_disturb(gl):
             quick.colour(t).view()
 
 
-@pytest.mark.parametrize("antialiasing", ["none", "msaa4", "edges", "ssaa2"])
+@pytest.mark.parametrize("antialiasing", ["none", "msaa4", "edges", "edges2", "ssaa2"])
 @pytest.mark.parametrize("seed", range(3))
 def test_any_order_of_kinds_and_of_looking(gl, seed, antialiasing):
     """Frames with and without rates, at times that go back and forth, viewed, read, or not looked at at all; drawn
@@ -185,7 +185,7 @@ def test_changes_are_where_they_are_said_to_be(gl, antialiasing):
         assert renderer.luminance(0).changed_since(last) is None, "there was one in between"
 
 
-@pytest.mark.parametrize("antialiasing", ["none", "edges", "ssaa2"])
+@pytest.mark.parametrize("antialiasing", ["none", "edges", "edges2", "ssaa2"])
 def test_nothing_moves_nothing_is_drawn(gl, antialiasing):
     world = scene([thing("box", 1, cube(0.5), still((0, 4, 0)))])
     with Renderer(gl, world, PLAIN.model_copy(update={"antialiasing": antialiasing})) as renderer:

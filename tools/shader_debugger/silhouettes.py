@@ -23,12 +23,10 @@ _NO_FLOOR = -3.4e38
 
 
 def edged_of(config: SequenceConfig) -> tuple[str, ...]:
-    """Those of :data:`EDGED` that a generation run of this configuration draws."""
-    there = (
-        config.render.antialiasing == "edges",
-        config.render.antialiasing == "edges" and config.timeline.reconstruction == "hermite",
-        config.render.image_antialiasing == "edges",
-    )
+    """Those of :data:`EDGED` that a generation run of this configuration draws: with ``edges2`` on a finer grid, of
+    which the image's own pixels are looked at here."""
+    frames, images = (samples_of(name).edges for name in (config.render.antialiasing, config.render.image_antialiasing))
+    there = (frames, frames and config.timeline.reconstruction == "hermite", images)
     return tuple(name for name, is_there in zip(EDGED, there, strict=True) if is_there)
 
 

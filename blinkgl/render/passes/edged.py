@@ -27,9 +27,9 @@ _CHANNELS = {"R32F": 1, "RG32F": 2}
 
 @dataclass(frozen=True)
 class Edged(Pass):
-    """Another pass's picture, of one output and one sample a pixel, in which the pixels that a silhouette or a crease
-    goes through have the mean of the surfaces on its two sides, by the areas that they have in the pixel's square.
-    Outputs as its.
+    """Another pass's picture, of one output, in which the pixels that a silhouette or a crease goes through have the
+    mean of the surfaces on its two sides, by the areas that they have in the pixel's square. Outputs and grid as its:
+    of a finer picture the pixels are those of its grid.
 
     The areas are exact, of the lines of ``contours.py``; the two values are those of the pixels around, on the
     surfaces that the depth buffer shows there, so that no surface is drawn again. Where none of the pixels around
@@ -52,9 +52,14 @@ class Edged(Pass):
     def every(self) -> int:
         return self.of.every
 
+    @property
+    def samples(self) -> Samples:  # type: ignore[bad-override]
+        return Samples(grid=self.of.samples.grid)
+
     def changed(self, painter: Painter, rectangles: list[Rectangle]) -> list[Rectangle]:
         seen = painter.scene.camera if painter.lens is None else painter.lens.flat
-        return merged([r.grown(_REACH, seen.width, seen.height) for r in rectangles])
+        reach = -(-_REACH // self.samples.grid)  # rectangles are in pixels of the picture
+        return merged([r.grown(reach, seen.width, seen.height) for r in rectangles])
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
         channels = _CHANNELS.get(self.outputs[0].format, 4)
@@ -89,7 +94,6 @@ class Edged(Pass):
 
 
 def filtered(pass_: Pass) -> Pass:
-    """A pass that gives one value per pixel: ``pass_`` itself, the mean of its samples, or with its edges filtered."""
-    if pass_.samples.edges:
-        return Edged(pass_)
-    return pass_ if pass_.samples.stored == 1 else Mean(pass_)
+    """A pass that gives one value per pixel: ``pass_`` itself, with its edges filtered, the mean of its samples."""
+    sharp = Edged(pass_) if pass_.samples.edges else pass_
+    return sharp if pass_.samples.stored == 1 else Mean(sharp)

@@ -46,16 +46,19 @@ def _shipped(name: str) -> dict[str, Any]:
     )
 
 
-def fill_quality(quality: Any, kind: Any, emulator: Any, frames: Any) -> dict[str, Any]:
-    """The preset's values for a configuration with this timeline.kind, events.emulator and frames (None: not said);
-    none where ``quality`` names no known one.
+def fill_quality(quality: Any, kind: Any, emulator: Any, frames: Any, reconstruction: Any = None) -> dict[str, Any]:
+    """The preset's values for a configuration with this timeline.kind, events.emulator, frames and
+    timeline.reconstruction (None: not said); none where ``quality`` names no known one.
 
-    A timeline of another kind than the preset's takes the preset's reconstruction alone: the other values
-    mean nothing to it. Emulators that cannot follow the preset's reconstruction take everything but that."""
+    A timeline of another kind than the preset's takes the preset's reconstruction alone: the other values mean nothing
+    to it. A first look is at straight lines, and none is taken with others. Emulators that cannot follow the preset's
+    reconstruction take everything but that."""
     if quality not in (*QUALITIES, "auto"):
         return {}
     preset = load_quality(quality)
     given = preset["timeline"]
+    if reconstruction not in (None, "linear"):
+        given.pop("first_look", None)
     if kind not in (None, given["kind"]):
         given = {key: value for key, value in given.items() if key == "reconstruction"}
     able = followers(given.get("reconstruction", "linear"))

@@ -400,7 +400,11 @@ class SequenceConfig(Config):
 
 
 FILLS = (
-    Fill(("quality", "timeline.kind", "events.emulator", "frames"), ("timeline", "render"), fill_quality),
+    Fill(
+        ("quality", "timeline.kind", "events.emulator", "frames", "timeline.reconstruction"),
+        ("timeline", "render"),
+        fill_quality,
+    ),
     Fill(
         ("sensor", "events.emulator"),
         ("camera.width", "camera.height", "events", "readout"),

@@ -78,7 +78,7 @@ class DisplacementTimeline(_AdaptiveTimeline):
     def _looks_at_straight_lines(looks, reconstruction):
         if looks and reconstruction != "linear":
             raise Refused(
-                "a first look (`quality: auto` has one) judges straight lines between frames",
+                "a first look judges straight lines between frames",
                 where="first_look",
                 value=looks,
                 accepted="false, or reconstruction: linear",

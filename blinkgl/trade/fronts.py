@@ -49,7 +49,7 @@ def _panel(ax, name: str, scene: dict, result: dict, folder: Path) -> None:
     for row in scene["settings"]:
         if not (row["voxel"] and math.isfinite(row["voxel"])):
             continue
-        colour = next((c for part, c in COLOURS.items() if f", {part}" in row["name"]), "0.5")
+        colour = COLOURS.get(_antialiasing(row["name"]), "0.5")
         letter = letters.get(row["name"])
         ax.plot(
             row[cost],
@@ -88,13 +88,16 @@ def _panel(ax, name: str, scene: dict, result: dict, folder: Path) -> None:
         inset.set(xticks=[], yticks=[])
 
 
+def _antialiasing(name: str) -> str:
+    """Of a setting's name."""
+    return next((part for part in name.split(", ") if part in COLOURS), "")
+
+
 def _legend(figure, scenes: dict) -> None:
     from matplotlib.lines import Line2D
 
-    used = {
-        part for scene in scenes.values() for row in scene["settings"] for part in COLOURS if f", {part}" in row["name"]
-    }
+    used = {_antialiasing(row["name"]) for scene in scenes.values() for row in scene["settings"]}
     dot = lambda colour, **more: Line2D([], [], marker="o", ls="", ms=9, **({"color": colour} | more))
     handles = [dot(c, label=f"anti-aliasing: {part}") for part, c in COLOURS.items() if part in used]
     handles.append(dot("none", mec="0.4", label="hollow: more exact than the reference can judge to a tenth; not used"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=11)
+    figure.legend(handles=handles, loc="outside lower center", ncols=math.ceil(len(handles) / 2), fontsize=11)

@@ -12,7 +12,7 @@ COLOURS = {
     "msaa4": "#e0a526",
     "taps4": "#8a5fc0",
     "edges": "#b0307a",
-    "edges2": "#5b1a45",
+    "edges2": "#6b4a2b",
     "ssaa2": "#3d6bd6",
     "ssaa4": "#2a9d8f",
 }

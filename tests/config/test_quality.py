@@ -63,8 +63,10 @@ def test_auto_is_the_default_with_a_first_look(tmp_path):
     assert config.timeline.model_copy(update={"first_look": False}) == usual.timeline and config.render == usual.render
     assert not sequence(tmp_path, {"quality": "auto", "timeline": {"first_look": False}}).timeline.first_look
     assert sequence(tmp_path, {"quality": "auto"}, "timeline={kind: uniform, fps: 77}").timeline.fps == 77
-    with pytest.raises(ConfigError, match="timeline.first_look: a first look .* judges straight lines"):
-        sequence(tmp_path, {"quality": "auto", "timeline": {"reconstruction": "pchip"}})
+    curved = sequence(tmp_path, {"quality": "auto", "timeline": {"reconstruction": "pchip"}}).timeline
+    assert (curved.reconstruction, curved.first_look, curved.max_px) == ("pchip", False, usual.timeline.max_px)
+    with pytest.raises(ConfigError, match="timeline.first_look: a first look judges straight lines"):
+        sequence(tmp_path, {"timeline": {"reconstruction": "pchip", "first_look": True}})
 
 
 def test_null_leaves_every_key_its_own_default(tmp_path):

@@ -164,6 +164,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
     "timeline": {
         "uniform": {"timeline": {"kind": "uniform", "fps": 400}},
         "displacement": {"timeline": {"kind": "displacement", "max_px": 1}},
+        "displacement, after a look": {"timeline": {"kind": "displacement", "max_px": 1, "first_look": True}},
         "brightness": {"timeline": {"kind": "brightness"}},
         "budget": {"timeline": {"kind": "budget", "max_time_error_us": 300}},
         "unsaid": NOTHING,
@@ -203,10 +204,14 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         },
     },
     "anti-aliasing": {
-        name: {"render": {"antialiasing": name}} for name in ("none", "msaa4", "taps4", "edges", "ssaa2", "ssaa4")
+        name: {"render": {"antialiasing": name}}
+        for name in ("none", "msaa4", "taps4", "edges", "edges2", "ssaa2", "ssaa4")
     },
     "images": {
-        **{name: {"render": {"image_antialiasing": name}} for name in ("none", "msaa4", "edges", "ssaa2", "ssaa4")},
+        **{
+            name: {"render": {"image_antialiasing": name}}
+            for name in ("none", "msaa4", "edges", "edges2", "ssaa2", "ssaa4")
+        },
         "no images": {"labels": {"images": False}},
     },
     "frame camera": {
@@ -334,6 +339,11 @@ REFUSED: dict[tuple[Kind, Kind], str] = {
         + " follows straight lines alone"
         for curve in ("pchip", "hermite")
         for emulator in _STRAIGHT_ONLY
+    },
+    **{
+        (("timeline", "displacement, after a look"), ("between frames", curve)): "timeline.first_look: a first look "
+        "judges straight lines"
+        for curve in ("pchip", "hermite")
     },
     **{
         (("source", source), ("frame camera", camera)): "images: recorded frames are images already"

@@ -25,7 +25,7 @@ from blinkgl.trade.reference import FineTiles
 from blinkgl.trade.settings import Setting, suite_design
 from blinkgl.trade.suite import Trial, clips, preset_names, run_suite, standing
 
-SAMPLES = {"none": 1, "taps4": 2, "edges": 2.5, "ssaa2": 4, "ssaa4": 16}
+SAMPLES = {"none": 1, "taps4": 2, "edges2": 8, "edges": 2.5, "ssaa2": 4, "ssaa4": 16}
 """What a frame costs, in frames without a filter, about (docs/trade.md)."""
 WORLD = {
     "seed": 5,

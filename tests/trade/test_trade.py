@@ -187,7 +187,7 @@ def test_design():
     for quick in (True, False):
         settings = design(quick)
         assert len(set(settings)) == len(settings) and len({s.name for s in settings}) == len(settings)
-        assert {s.antialiasing for s in settings} == {"none", "msaa4", "taps4", "edges", "ssaa2", "ssaa4"}
+        assert {s.antialiasing for s in settings} == {"none", "msaa4", "taps4", "edges", "edges2", "ssaa2", "ssaa4"}
     assert len(design(True)) < 30 < len(design(False))
     assert not any("textures" in s.other for s in design(False, random_scene=False))
 

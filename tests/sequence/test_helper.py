@@ -63,6 +63,10 @@ CASES = {
     "truth of events": {"labels": {"flow": ["forward"], "events": True}},
     "images and preview": {"images": {"rate": 20}, "preview": {"enabled": True, "rate": 20}},
     "budget": {"timeline": {"kind": "budget", "max_time_error_us": 500}},
+    "after a look": {
+        "timeline": {"kind": "displacement", "max_px": 0.25, "first_look": True, "max_step_us": 1e6},
+        "render": {"antialiasing": "edges2"},
+    },
     "rig": {"rig": "stereo", "labels": {"flow": ["forward"], "disparity": True}},
     "rig of one": {"sensors": [{"name": "unit", "imu": {}}, {"name": "eye", "place": {"position": [0.1, 0, 0]}}]},
     "still": {"scene": STILL},

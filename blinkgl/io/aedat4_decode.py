@@ -47,10 +47,12 @@ def main(path: str, stream: str) -> None:
             return
         size = recording.getFrameResolution() if stream == "frames" else recording.getEventResolution()
         out.write(json.dumps({"size": None if size is None else [int(size[1]), int(size[0])]}).encode() + b"\n")
+        out.flush()  # what came before a crash is not lost with it
         begun = True
         for rows, payload in _BATCHES[stream](recording):
             signal.setitimer(signal.ITIMER_PROF, allowance)
             out.write(np.int64(len(rows)).tobytes() + rows.tobytes() + payload)
+            out.flush()
         end = {}
     except (RuntimeError, MemoryError, ValueError, IndexError) as error:
         end = {"problem": f"{' '.join(str(error).split())[:160]}"}

@@ -4,7 +4,7 @@ of reach, and a few thousand pixels in many places say as much about errors as a
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import cv2
 import numpy as np
@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from blinkgl.config.sequence import RenderConfig
     from blinkgl.gl import GLContext
     from blinkgl.scene.types import Scene
+
+
+Self = TypeVar("Self", bound="Cutouts")
 
 
 def lattice(
@@ -61,7 +64,7 @@ class Cutouts:
         self._renderer = Renderer(gl, scene.with_camera(self._cameras[0]), samples, beside=beside)
         self._fine = np.empty((self._cameras[0].height, self._cameras[0].width), np.float32)
 
-    def __enter__(self):
+    def __enter__(self: Self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -63,6 +63,7 @@ class io:
 def recording(tmp_path, monkeypatch):
     """A file of batches of so many events, by a library of our own."""
     monkeypatch.setattr("importlib.util.find_spec", lambda name: True)
+    monkeypatch.delenv("PYTHONUNBUFFERED", raising=False)  # it would hide that the decoder keeps something back
     (tmp_path / "dv_processing.py").write_text(LIBRARY)
     monkeypatch.syspath_prepend(tmp_path)
 

@@ -290,7 +290,7 @@ def test_nothing_else_asks_which_kind_an_emulator_is():
         "card/atlas_v2e.py",
         "card/esim.py",
         "card/v2e.py",
-        *(f"events/{name}.py" for name in ("esim", "v2e", "v2e_model", "voltmeter", "reference")),
+        *(f"events/{name}.py" for name in ("esim", "v2e", "v2e_authors", "v2e_model", "voltmeter", "reference")),
     }
 
 

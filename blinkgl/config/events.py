@@ -333,6 +333,12 @@ class V2eConfig(_TwoThresholds, EmulatorConfig):
         "often as down. `zero`: every pixel has just fired, as v2e starts. Without leak the first and the last are "
         "the same.",
     )
+    compat: Literal["none", "authors"] = Field(
+        "none",
+        description="`authors`: as their program computes it, frame by frame, where numbers made with v2e have to be "
+        "made again (the law; its random numbers are others). Events then lie at fractions of a frame, and noise and "
+        "dead time depend on the frame rate; `start` is `zero` whatever it says.",
+    )
     hot_pixel_fraction: float = Field(0.0, ge=0, le=1, description="Share of pixels that fire by themselves.")
     hot_pixel_rate_hz: float = Field(100.0, ge=0, le=1e5, description="Mean rate of a hot pixel, Hz, ON.")
     max_events_per_step: int = _MAX_EVENTS
@@ -347,6 +353,23 @@ class V2eConfig(_TwoThresholds, EmulatorConfig):
                 where="second_cutoff_hz",
                 value=second_cutoff_hz,
                 accepted="0, or a cutoff_hz > 0 beside it",
+            )
+
+    @rule("second_cutoff_hz", "compat")
+    def _theirs_has_one_low_pass(second_cutoff_hz, compat):
+        if second_cutoff_hz and compat == "authors":
+            raise Refused(
+                "the authors' program has no second low-pass",
+                where="second_cutoff_hz",
+                value=second_cutoff_hz,
+                accepted="0, or compat: none",
+            )
+
+    @rule("compat", "device")
+    def _theirs_has_no_kernel_for_the_card(compat, device):
+        if compat == "authors" and device == "gl":
+            raise Refused(
+                "compat: authors is made on the processor alone", where="device", value=device, accepted="cpu, or auto"
             )
 
     @rule("photoreceptor_noise", "cutoff_hz")

@@ -144,6 +144,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
             "events": {"emulator": "esim", "threshold_jitter": 0.05, "refractory_us": 50, "contrast_threshold_off": 0.3}
         },
         "v2e": {"events": {"emulator": "v2e"}},
+        "v2e, authors": {"events": {"emulator": "v2e", "preset": "noisy", "compat": "authors", "causes": True}},
         "v2e, clean": {"events": {"emulator": "v2e", "preset": "clean", "start": "zero"}},
         "v2e, noisy": {
             "events": {

@@ -138,7 +138,10 @@ class RenderConfig(Config):
     )
     image_antialiasing: ImageAntialiasing = Field("ssaa2", description="the same for the colour images at label times")
     anisotropy: float = Field(
-        1.0, ge=1, le=16, description="texture anisotropy, 1 is off (halves the rate on software GL)"
+        1.0,
+        ge=1,
+        le=16,
+        description="texture anisotropy, 1 is off (on software GL: half as fast, and seconds a frame beside a horizon)",
     )
     mip_bias: float = Field(
         0.0,
@@ -284,6 +287,16 @@ class SequenceConfig(Config):
                 where="timeline.reconstruction",
                 value=path,
                 accepted=f"{', '.join(own)}, or events.emulator: {' or '.join(able)}",
+            )
+
+    @rule("timeline.first_look", "timeline.reconstruction", "?frames")
+    def _looks_at_straight_lines(looks: bool | None, path: str, frames: bool):
+        if looks and path != "linear" and not frames:
+            raise Refused(
+                "a first look judges straight lines between frames",
+                where="timeline.first_look",
+                value=looks,
+                accepted="false, or reconstruction: linear",
             )
 
     @rule("timeline.reconstruction", "events.device", "?frames")

@@ -74,16 +74,6 @@ class DisplacementTimeline(_AdaptiveTimeline):
         "has what was seen",
     )
 
-    @rule("first_look", "reconstruction")
-    def _looks_at_straight_lines(looks, reconstruction):
-        if looks and reconstruction != "linear":
-            raise Refused(
-                "a first look judges straight lines between frames",
-                where="first_look",
-                value=looks,
-                accepted="false, or reconstruction: linear",
-            )
-
 
 class BrightnessTimeline(_AdaptiveTimeline):
     """Event frames so far apart that the signal changes by no more than a fraction of the contrast threshold, by

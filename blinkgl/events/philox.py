@@ -54,26 +54,10 @@ def _round(c0, c1, c2, c3, k0, k1):
 @register_jitable(inline="always")
 def philox4x32(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> tuple[int, int, int, int]:
     """Four 32-bit words (held in uint64) of the block at counter (c0, c1, c2, c3) under key (k0, k1)."""
-    # Ten rounds, the key bumped between them by the golden ratio and sqrt(3) - 1. Written out, since arrays come
-    # through here as well.
-    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
-    k0, k1 = (k0 + _W0) & _MASK32, (k1 + _W1) & _MASK32
-    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
-    k0, k1 = (k0 + _W0) & _MASK32, (k1 + _W1) & _MASK32
-    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
-    k0, k1 = (k0 + _W0) & _MASK32, (k1 + _W1) & _MASK32
-    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
-    k0, k1 = (k0 + _W0) & _MASK32, (k1 + _W1) & _MASK32
-    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
-    k0, k1 = (k0 + _W0) & _MASK32, (k1 + _W1) & _MASK32
-    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
-    k0, k1 = (k0 + _W0) & _MASK32, (k1 + _W1) & _MASK32
-    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
-    k0, k1 = (k0 + _W0) & _MASK32, (k1 + _W1) & _MASK32
-    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
-    k0, k1 = (k0 + _W0) & _MASK32, (k1 + _W1) & _MASK32
-    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
-    k0, k1 = (k0 + _W0) & _MASK32, (k1 + _W1) & _MASK32
+    # Ten rounds, the key bumped between them by the golden ratio and sqrt(3) - 1.
+    for _ in range(9):
+        c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
+        k0, k1 = (k0 + _W0) & _MASK32, (k1 + _W1) & _MASK32
     return _round(c0, c1, c2, c3, k0, k1)
 
 

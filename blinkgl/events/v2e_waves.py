@@ -384,7 +384,7 @@ def emit_waves(
     now : (intensity, x, lag, noise) of the block at the interval's end.   keys : of ``noise_end`` shot noise events,
     sorted.   p, v : Pixels and Interval of v2e.py.   cap : most events of a pixel; there is room for so many of each.
     floats, ints : scratch of FLOATS and INTS.   Returns (end of the events, cut)."""
-    out, cut, key = begin, 0, 0
+    out, cut, key = begin, 0, np.int64(0)  # a literal 0 would have everything compiled for it, too
     for start in range(0, count, SLOTS):
         here = active[start : min(start + SLOTS, count)]
         out, cut_here, key = _emit(here, first, now, keys, key, noise_end, p, v, cap, packed, out, floats, ints)

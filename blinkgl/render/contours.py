@@ -203,7 +203,7 @@ def _emit(numbers, bodies, culled, T_cam_obj, mvps, starts, places, faces, plane
     """Writes the lines of all items; their number. numbers, bodies, culled : of each item, its contour's place in the
     pool, its object's, and whether the backs of its faces are not drawn."""
     front = np.empty(len(planes), np.bool_)
-    count = 0
+    count = np.int64(0)  # a literal 0 would have _emit_one compiled for it, too
     for n in range(len(numbers)):
         number, T = numbers[n], T_cam_obj[bodies[n]]
         x = -(T[0, 3] * T[0, 0] + T[1, 3] * T[1, 0] + T[2, 3] * T[2, 0])  # the camera's place, in the mesh's axes

@@ -367,10 +367,10 @@ are no contradiction."""
 
 TOO_SLOW: set[tuple[Kind, Kind]] = {
     (one, ("textures", "sharp")) for one in (("anti-aliasing", "msaa4"), ("images", "msaa4"))
-}
-"""Pairs that are accepted and left out of the rows: llvmpipe takes seconds for a picture of 32 x 24 px with
-multi-sampling and anisotropy (beside a triangle that ends at the horizon the footprint of a pixel is endless, and it
-adds up every texel of it)."""
+} | {(("source", one), ("textures", "sharp")) for one in ("random", "still camera")}
+"""Pairs that are accepted and left out of the rows: llvmpipe takes seconds for a picture of 32 x 24 px with anisotropy
+where a ground ends at the horizon, and with multi-sampling of any triangle (the footprint of a pixel beside its edge is
+endless, and it adds up every texel of it)."""
 
 ELSEWHERE = {
     "scene": "tests/scene: what a scene is made of; here only where it comes from, whether it is lit, whether the "

@@ -29,10 +29,9 @@ from rich.console import Console
 from rich.table import Table
 
 from blinkgl.config.events import V2eConfig
-from blinkgl.events import make_emulator
 from blinkgl.events.esim import draw_thresholds
 from blinkgl.events.philox import Stream, normal2, pixel_counters, uniform2
-from blinkgl.events.v2e_authors import noise_size
+from blinkgl.events.v2e_authors import V2eAuthors, noise_size
 from blinkgl.events.v2e_model import draw_leaks
 from blinkgl.machine.bench import machine_line
 
@@ -138,7 +137,7 @@ def beside(modules: Any, values: dict[str, Any], fps: float) -> dict[str, float]
     """Events of both, how many only one of them has, and the largest difference of times of the others in µs."""
     config, frames = V2eConfig(**values, compat="authors"), clip(fps)
     times_ns = np.round(np.arange(FRAMES) * 1e9 / fps).astype(np.int64)
-    ours = make_emulator(config, HEIGHT, WIDTH, SEED)
+    ours = V2eAuthors(HEIGHT, WIDTH, config, SEED)
     mine = [ours.step(frame, int(t)) for frame, t in zip(frames, times_ns)][1:]
     theirs = _theirs(modules, config, SEED, frames, times_ns)
     alone, apart, count, count_theirs = 0, 0.0, 0, 0

@@ -53,6 +53,15 @@ def lookup_block(codes: np.ndarray, table: np.ndarray, out: np.ndarray) -> None:
         out[i] = table[codes[i]]
 
 
+@numba.njit(**JIT)
+def lookup_both_block(
+    codes: np.ndarray, table_a: np.ndarray, a: np.ndarray, table_b: np.ndarray, b: np.ndarray
+) -> None:
+    """``a[:] = table_a[codes]`` and ``b[:] = table_b[codes]``."""
+    for i in range(codes.size):
+        a[i], b[i] = table_a[codes[i]], table_b[codes[i]]
+
+
 _BYTES_TO_BITS, _S56 = np.uint64(0x0102040810204080), np.uint64(56)
 _BIT_POSITIONS = np.zeros((256, 8), np.int32)
 for _mask in range(256):

@@ -30,7 +30,7 @@ import numpy as np
 
 from blinkgl.config.events import EsimConfig, V2eConfig
 from blinkgl.errors import EventDataError
-from blinkgl.events.blocks import compact_flags, copy_block, lookup_block, prefetch, scale_block
+from blinkgl.events.blocks import compact_flags, copy_block, lookup_block, lookup_both_block, prefetch, scale_block
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
 from blinkgl.events.esim import draw_thresholds
 from blinkgl.events.noise import noise_table
@@ -188,9 +188,10 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
                 flags[:] = 0
             x_now, intensity_now, lag_now = x[a : a + n], intensity[a : a + n], lag[a : a + n]
             if codes.size:
-                lookup_block(codes[s:e], x_table, x_now)
                 if p.intensity.size:
-                    lookup_block(codes[s:e], table, intensity_now)
+                    lookup_both_block(codes[s:e], x_table, x_now, table, intensity_now)
+                else:
+                    lookup_block(codes[s:e], x_table, x_now)
             else:
                 scale_block(frame[s:e], v.scale, intensity_now)
                 lin_log_block(intensity_now, x_now)
@@ -239,11 +240,9 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
             count = 0
             if farthest >= _ZERO or shots:
                 count = compact_flags(flags, scratch, s, active[listed[b] :])
-                # Two misses of the caches a pixel, which are over when the group's events are made.
+                # A miss of the caches a pixel, which is over when the group's events are made.
                 for j in range(listed[b], listed[b] + count):
                     prefetch(p.constants, np.int64(active[j]) * 4)
-                    if p.release.size:
-                        prefetch(p.release, np.int64(active[j]))
             # As many events a pixel as levels fit between the first one and the farthest, rounded up, and its noise.
             cap = (
                 min(np.int64(max(min(farthest, _FARTHEST), _ZERO) * v.inverse_threshold) + 2, v.bound_per_pixel) + shots
@@ -409,6 +408,7 @@ class V2e(Emulator):
         self._clock_ns, self._clock_index = np.zeros(blocks, np.int64), np.zeros(blocks, np.int64)
         self._shot_unit = 0.5 * config.shot_noise_rate_hz * DARKEST * 1e-9
         self._shot_table = shot_tables(self._on, self._off, on, off) if shot else np.empty((0, 0), np.float32)
+        self._shots_per_ns = self._shot_unit * float(self._shot_table[:, -1:].sum())  # if all pixels were dark
         self._inverse_threshold = 1.0 / float(min(self._on.min(), self._off.min()))
         self._scale = np.float32(config.full_scale)
         told = pixels if config.causes else 0
@@ -494,7 +494,7 @@ class V2e(Emulator):
 
     def _refuse_shots(self, dt_ns: int) -> None:
         """Raises EventDataError: more shot noise in an interval than a step may emit."""
-        if self._shot_unit * float(self._shot_table[:, -1:].sum()) * dt_ns > self.config.max_events_per_step:
+        if self._shots_per_ns * dt_ns > self.config.max_events_per_step:
             raise EventDataError(
                 "more shot noise than max_events_per_step in one interval",
                 where=f"frame {self.frames}",
@@ -515,7 +515,8 @@ class V2e(Emulator):
         """From the last frame to that at ``t_ns``.   brightest : DN, of both."""
         config, (epoch,), (start_ns, dt_ns) = self.config, self._epoch_ns.tolist(), (self.t_ns, t_ns - self.t_ns)
         kappa = 2 * np.pi * config.cutoff_hz * dt_ns * 1e-9 / 275.0
-        second_keep, second_ramp = decay(_F(2 * np.pi * config.second_cutoff_hz * dt_ns * 1e-9))
+        second = config.second_cutoff_hz
+        second_keep, second_ramp = decay(_F(2 * np.pi * second * dt_ns * 1e-9)) if second else (_ZERO, _ZERO)
         return Interval(
             start_ns,
             dt_ns,

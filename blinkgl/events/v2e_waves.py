@@ -23,7 +23,7 @@ from blinkgl.events.arith import fall_f64, select
 from blinkgl.events.packing import CAUSE_SHIFT, JIT, T_SHIFT, cause_of
 from blinkgl.events.philox import Stream, rough_normal
 from blinkgl.events.types import Cause
-from blinkgl.events.v2e_model import crossing_fraction, signal_at
+from blinkgl.events.v2e_model import signal_at
 
 _U = np.uint64
 _U0, _U1, _U1000 = _U(0), _U(1), _U(1000)
@@ -33,7 +33,7 @@ _WIDE = _U(32)
 """Loops over rows go on to a multiple of it, over whatever stands there: what is left over from unrolled vector loops
 is otherwise done one by one, and that would be most of it."""
 _STRIDE = SLOTS + 8  # with SLOTS alone, a power of two, all rows would want the same lines of the cache
-_ROWS = [_U(_STRIDE * row) for row in range(20)]
+_ROWS = [_U(_STRIDE * row) for row in range(22)]
 # z(s) = C + RISE s + FALL e^(-K s), END at s = 1; S: where the pixel's comparator looks from; E: e^(-K S) there.
 _C, _RISE, _FALL, _K, _END, _S, _E, _UP, _DOWN, _ON, _OFF, _LEAK, _MEAN_LEAK, _NOISE_THEN = _ROWS[:14]
 _TARGET, _SIGN, _AT, _DRAW = _ROWS[14:18]  # of the wave's event: the level that is met, 1 or -1, s, a random number
@@ -48,17 +48,40 @@ _X0, _X1, _LAG0, _LAG1, _I0, _I1, _NOISE, _SHIFT = (
     _RISE,
 )  # before the curve is made of them
 _KEPT = 14  # rows that go on into the next wave
-FLOATS = 18 * _STRIDE
+# Of those that wake up and fire, until the rows of all that fire are made: levels, S and E.
+_WOKEN_UP, _WOKEN_DOWN, _WOKEN_S, _WOKEN_E = _ROWS[18:22]
+_LOWER, _UPPER = _WOKEN_UP, _WOKEN_DOWN  # later: the bracket of the crossing
+_OF_A_TURN = (_C, _RISE, _FALL, _K, _TARGET, _SIGN, _AT, _LOWER, _UPPER)
+FLOATS = 2 * 22 * _STRIDE  # the second half for those that want more turns
+_TURNS = 60
 # The pixel; its bits of a packed event; ns of S; place of its next shot noise; ns of its
 # reference; its number in the first wave.
 _PIXEL, _BITS, _NOW, _SHOT, _SINCE, _SLOT = _ROWS[:6]
 _FIRES, _OPEN, _AT_NS, _POLARITY, _BY_NOISE = _ROWS[6:11]  # of the wave's event
-_COUNT = _OPEN
+_COUNT = _AGAIN = _OPEN
+_DEAD = _BY_NOISE  # once the event is written
 _KEPT_INTS = 6
-INTS = 11 * _STRIDE
+# Pixels that are not in their dead time, and that wake up; of those that wake up and fire: the pixel, NOW, their place.
+_AWAKE, _WAKING, _WOKEN, _WOKEN_NOW, _WOKEN_SLOT = _ROWS[11:16]
+_LISTED = _AWAKE  # later: those that want another turn
+INTS = 2 * 16 * _STRIDE
 _LEAK_JITTER = _U(Stream.LEAK_JITTER)
 _CAUSE_LEAK, _CAUSE_SHOT, _CAUSE_HOT = int(Cause.LEAK), int(Cause.SHOT), int(Cause.HOT)
 _MASK41, _INF = 2**41 - 1, np.float32(np.inf)
+_TWO52, _BITS52, _LOW52 = np.float64(2.0**52), np.int64(0x433 << 52), np.int64(2**52 - 1)
+
+
+@register_jitable(inline="always")
+def _number(ns):
+    """float64 of an int64 of 0 to 2^52 - 1: its bits beside the exponent of 2^52. (The conversion itself is no vector
+    instruction before AVX-512.)"""
+    return np.int64(ns | _BITS52).view(np.float64) - _TWO52
+
+
+@register_jitable(inline="always")
+def _whole(x):
+    """int64 of a float64 of 0 to 2^52 - 1, what is behind the point left out; likewise."""
+    return np.float64(np.floor(x) + _TWO52).view(np.int64) & _LOW52
 
 
 @numba.njit(**JIT)
@@ -95,27 +118,25 @@ def _curves(floats, count, kappa, since, dt, low_pass):
 
 @numba.njit(**JIT)
 def _wake(floats, ints, count, dt_ns):
-    """New levels for those whose dead time ends in the interval (UP is -inf), at its end (NOW)."""
+    """Levels of those whose dead time ends in the interval, at its end (NOW)."""
     for j in range(count):
-        asleep = floats[j + _UP] == -np.inf
-        s = ints[j + _NOW] / dt_ns
+        s = _number(ints[j + _NOW]) / dt_ns
         e = fall_f64(floats[j + _K] * s)
         reference = floats[j + _C] + floats[j + _RISE] * s + floats[j + _FALL] * e
-        floats[j + _S] = select(asleep, s, 0.0)
-        floats[j + _E] = select(asleep, e, 1.0)
-        floats[j + _UP] = select(asleep, reference + floats[j + _ON], floats[j + _UP])
-        floats[j + _DOWN] = select(asleep, reference - floats[j + _OFF], floats[j + _DOWN])
+        floats[j + _S] = s
+        floats[j + _E] = e
+        floats[j + _UP] = reference + floats[j + _ON]
+        floats[j + _DOWN] = reference - floats[j + _OFF]
 
 
 @numba.njit(**JIT)
 def _wake_lines(floats, ints, count, dt_ns):
     for j in range(count):
-        asleep = floats[j + _UP] == -np.inf
-        s = ints[j + _NOW] / dt_ns
+        s = _number(ints[j + _NOW]) / dt_ns
         reference = floats[j + _C] + floats[j + _RISE] * s
-        floats[j + _S] = select(asleep, s, 0.0)
-        floats[j + _UP] = select(asleep, reference + floats[j + _ON], floats[j + _UP])
-        floats[j + _DOWN] = select(asleep, reference - floats[j + _OFF], floats[j + _DOWN])
+        floats[j + _S] = s
+        floats[j + _UP] = reference + floats[j + _ON]
+        floats[j + _DOWN] = reference - floats[j + _OFF]
 
 
 @numba.njit(**JIT)
@@ -130,23 +151,12 @@ def _aim(floats, ints, count):
         ints[j + _FIRES] = np.int64(above | (end <= down))
 
 
-@register_jitable(inline="always")
-def _newton(s, low, high, target, sign, c, rise, fall, k):
-    """One turn of crossing_fraction's loop, where it does not leave its bracket."""
-    e = fall * fall_f64(k * s)
-    f = sign * (c + rise * s + e - target)
-    slope = sign * (rise - k * e)
-    following = s - f / slope
-    low, high = select(f < 0, s, low), select(f < 0, high, s)
-    inside = (slope > 0) & (low <= following) & (following <= high)
-    moved = abs(following - s)
-    met = inside & ((moved * moved * k * k * abs(e) <= 2e-6 * slope) | (moved < 1e-9))
-    return following, low, high, inside, met
+# crossing_fraction for all at once: its guess, a turn of its loop, and more turns for those that want them, one in ten.
 
 
 @numba.njit(**JIT)
-def _meet(floats, ints, count):
-    """crossing_fraction up to its second step of Newton's method; OPEN where it wants another."""
+def _guess(floats, ints, count):
+    """Where the inverse cubic meets the level (AT); OPEN is 1 where the signal stands beyond it to begin with."""
     for j in range(count):
         c, rise, fall, k = floats[j + _C], floats[j + _RISE], floats[j + _FALL], floats[j + _K]
         low, e_low, target, sign = floats[j + _S], floats[j + _E], floats[j + _TARGET], floats[j + _SIGN]
@@ -159,12 +169,82 @@ def _meet(floats, ints, count):
         s = low + width * u
         stretch = height / (width * v_low * v_high)
         guess = u * ((1.0 - u) * stretch * ((1.0 - u) * v_high - u * v_low) + u * (3.0 - 2.0 * u))
-        s = select((v_low > 0) & (v_high > 0) & (guess > 0.0) & (guess < 1.0), low + width * guess, s)
-        s, lower, upper, newton, met = _newton(s, low, 1.0, target, sign, c, rise, fall, k)
-        again, _, _, newton_again, met_again = _newton(s, lower, upper, target, sign, c, rise, fall, k)
-        at_once = f_low >= 0
-        floats[j + _AT] = select(at_once, low, select(met, s, again))
-        ints[j + _OPEN] = np.int64(not (at_once | met | (newton & newton_again & met_again)))
+        floats[j + _AT] = select((v_low > 0) & (v_high > 0) & (guess > 0.0) & (guess < 1.0), low + width * guess, s)
+        ints[j + _OPEN] = np.int64(f_low >= 0)
+
+
+@register_jitable(inline="always")
+def _turn(s, low, high, target, sign, c, rise, fall, k):
+    """A step of Newton's method, or half of the bracket where it leaves it: (s, bracket, whether that will do)."""
+    e = fall * fall_f64(k * s)
+    f = sign * (c + rise * s + e - target)
+    slope = sign * (rise - k * e)
+    following = s - f / slope
+    low, high = select(f < 0, s, low), select(f < 0, high, s)
+    newton = (slope > 0) & (low <= following) & (following <= high)
+    following = select(newton, following, 0.5 * (low + high))
+    moved = abs(following - s)
+    return following, low, high, (newton & (moved * moved * k * k * abs(e) <= 2e-6 * slope)) | (moved < 1e-9)
+
+
+@numba.njit(**JIT)
+def _first_turn(floats, ints, count):
+    """From the guess to AT, LOWER, UPPER; OPEN where another turn is wanted."""
+    for j in range(count):
+        low, at_once = floats[j + _S], ints[j + _OPEN] != 0
+        s, lower, upper, done = _turn(
+            floats[j + _AT], low, 1.0, floats[j + _TARGET], floats[j + _SIGN],
+            floats[j + _C], floats[j + _RISE], floats[j + _FALL], floats[j + _K],
+        )  # fmt: skip
+        floats[j + _AT] = select(at_once, low, s)
+        floats[j + _LOWER], floats[j + _UPPER] = lower, upper
+        ints[j + _OPEN] = np.int64((ints[j + _FIRES] != 0) & (not (at_once | done)))
+
+
+@numba.njit(**JIT)
+def _another_turn(floats, ints, count):
+    for j in range(count):
+        s, lower, upper, done = _turn(
+            floats[j + _AT], floats[j + _LOWER], floats[j + _UPPER], floats[j + _TARGET], floats[j + _SIGN],
+            floats[j + _C], floats[j + _RISE], floats[j + _FALL], floats[j + _K],
+        )  # fmt: skip
+        floats[j + _AT], floats[j + _LOWER], floats[j + _UPPER] = s, lower, upper
+        ints[j + _OPEN] = np.int64(not done)
+
+
+@numba.njit(**JIT)
+def _meet(floats, ints, count, wide):
+    """AT of those that fire."""
+    _guess(floats, ints, wide)
+    _first_turn(floats, ints, wide)
+    left = _U0
+    for j in range(count):
+        ints[left + _LISTED] = j
+        left += _U(ints[j + _OPEN])
+    more, more_ints = floats[FLOATS // 2 :], ints[INTS // 2 :]
+    for m in range(left):
+        j = _U(ints[m + _LISTED])
+        for row in _OF_A_TURN:
+            more[m + row] = floats[j + row]
+    for _ in range(_TURNS - 1):
+        if left == _U0:
+            break
+        _another_turn(more, more_ints, _wide(left))
+        kept = _U0
+        for m in range(left):
+            j = ints[m + _LISTED]
+            floats[_U(j) + _AT] = more[m + _AT]
+            if more_ints[m + _OPEN]:
+                ints[kept + _LISTED] = j
+                for row in _OF_A_TURN:
+                    more[kept + row] = more[m + row]
+                kept += _U1
+        left = kept
+
+
+@register_jitable
+def _wide(count):
+    return (count + _WIDE - _U1) // _WIDE * _WIDE
 
 
 @numba.njit(**JIT)
@@ -173,7 +253,6 @@ def _meet_lines(floats, ints, count):
         s = (floats[j + _TARGET] - floats[j + _C]) / floats[j + _RISE]
         s = select(s > floats[j + _S], s, floats[j + _S])
         floats[j + _AT] = select(s < 1.0, s, 1.0)
-        ints[j + _OPEN] = 0
 
 
 @numba.njit(**JIT)
@@ -200,7 +279,7 @@ def _change_leaks(floats, ints, count, jitter, since_0, since_1, dt):
 @numba.njit(**JIT)
 def _reference_after_dead_time(floats, ints, count, dt_ns):
     for j in range(count):
-        fires, s = ints[j + _FIRES] != 0, ints[j + _NOW] / dt_ns
+        fires, s = ints[j + _FIRES] != 0, _number(ints[j + _NOW]) / dt_ns
         e = fall_f64(floats[j + _K] * s)
         floats[j + _TARGET] = floats[j + _C] + floats[j + _RISE] * s + floats[j + _FALL] * e
         floats[j + _S] = select(fires, s, floats[j + _S])
@@ -210,7 +289,7 @@ def _reference_after_dead_time(floats, ints, count, dt_ns):
 @numba.njit(**JIT)
 def _reference_of_lines_after_dead_time(floats, ints, count, dt_ns):
     for j in range(count):
-        fires, s = ints[j + _FIRES] != 0, ints[j + _NOW] / dt_ns
+        fires, s = ints[j + _FIRES] != 0, _number(ints[j + _NOW]) / dt_ns
         floats[j + _TARGET] = floats[j + _C] + floats[j + _RISE] * s
         floats[j + _S] = select(fires, s, floats[j + _S])
 
@@ -231,64 +310,121 @@ def _set_levels(floats, ints, count):
 
 
 @numba.njit(**JIT)
-def _awake(active, p, v, ints):
-    """Takes those out of the list whose dead time goes on, and puts down when that of the others ended (NOW)."""
-    kept, end_ns = _U0, v.t0_ns + v.dt_ns
-    for j in range(_U(active.size)):
-        i = active[j]
-        asleep, release = p.upper[i] == -_INF, p.release[i]
-        active[kept] = i
-        ints[kept + _NOW] = select(asleep, max(release - v.t0_ns, 0), 0)
-        kept += _U(not (asleep & (release > end_ns)))
+def _go_on(floats, ints, wide, left, noise_end, dt_ns, dead_time):
+    """Which of the pixels that fired are in their dead time at the interval's end (DEAD), and which have another event
+    (AGAIN); returns whether any has."""
+    if dead_time:
+        for j in range(wide):
+            ints[j + _DEAD] = np.int64((ints[j + _FIRES] != 0) & (ints[j + _NOW] > dt_ns))
+    else:
+        for j in range(wide):
+            ints[j + _DEAD] = 0
+    for j in range(wide):
+        end = floats[j + _END]
+        passed = (end >= floats[j + _UP]) | (end <= floats[j + _DOWN]) | (ints[j + _SHOT] != noise_end)
+        ints[j + _AGAIN] = np.int64((ints[j + _FIRES] != 0) & (ints[j + _DEAD] == 0) & passed)
+    any_again = np.int64(0)
+    for j in range(left):
+        any_again |= ints[j + _AGAIN]
+    return any_again != 0
+
+
+@numba.njit(**JIT)
+def _put_back(floats, ints, count, first, noise_now, dead_time, p, v):
+    """Levels and what else was changed, of all: those that have another event are put back again after it."""
+    for j in range(count):
+        i, dead = _U(ints[j + _PIXEL]), ints[j + _DEAD] != 0
+        # In a dead time both levels are passed, whatever comes: the pixel is looked at until it is released.
+        p.upper[i] = select(dead, -_INF, np.float32(floats[j + _UP]))
+        p.lower[i] = select(dead, _INF, np.float32(floats[j + _DOWN]))
+    if v.leak_jitter > 0.0:
+        for j in range(count):
+            p.leak[_U(ints[j + _PIXEL])] = np.float32(floats[j + _LEAK])
+    if dead_time:
+        for j in range(count):
+            i = _U(ints[j + _PIXEL])
+            p.release[i] = select(ints[j + _DEAD] != 0, v.t0_ns + ints[j + _NOW], p.release[i])
+    if p.since_ns.size:
+        for j in range(count):
+            i = _U(ints[j + _PIXEL])
+            if ints[j + _FIRES] != 0 and ints[j + _DEAD] == 0:
+                ints[j + _SINCE] = ints[j + _NOW]
+                floats[j + _NOISE_THEN] = _noise_at(floats, ints, j, floats[j + _S], first, noise_now, p)
+            p.since_ns[i] = v.t0_ns + ints[j + _SINCE]
+            p.noise_then[i] = np.float32(floats[j + _NOISE_THEN])
+
+
+@numba.njit(**JIT)
+def _keep(floats, ints, count):
+    """Rows of those that have another event, together; returns how many."""
+    kept = _U0
+    for j in range(count):
+        if ints[j + _AGAIN]:
+            for row in range(_KEPT):
+                floats[kept + _U(_STRIDE * row)] = floats[j + _U(_STRIDE * row)]
+            for row in range(_KEPT_INTS):
+                ints[kept + _U(_STRIDE * row)] = ints[j + _U(_STRIDE * row)]
+            kept += _U1
     return kept
 
 
 @numba.njit(**JIT)
-def _gather(active, first, now, keys, key, noise_end, p, v, floats, ints):
-    """Rows of the listed pixels that can fire in the interval; returns how many, and the key after theirs."""
+def _part(active, p, v, ints):
+    """Splits the list into those that are not in their dead time (AWAKE) and those whose dead time ends in the interval
+    (WAKING); returns how many of each. The others are left out."""
+    awake, asleep, waking, end_ns = _U0, _U0, _U0, v.t0_ns + v.dt_ns
+    for j in range(_U(active.size)):
+        i = _U(active[j])
+        sleeps = p.upper[i] == -_INF
+        ints[awake + _AWAKE] = ints[asleep + _WAKING] = i
+        awake += _U(not sleeps)
+        asleep += _U(sleeps)
+    for j in range(asleep):
+        i = _U(ints[j + _WAKING])
+        ints[waking + _WAKING] = i
+        waking += _U(p.release[i] <= end_ns)
+    return awake, waking
+
+
+@numba.njit(**JIT)
+def _gather(count, first, now, p, v, floats, ints):
+    """Rows of the pixels that PIXEL says, but for NOW, SHOT and SLOT."""
     intensity_now, x_now, lag_now, noise_now = now
-    kept = _U(active.size)
-    if p.release.size:
-        kept = _awake(active, p, v, ints)
-    else:
-        for j in range(kept):
-            ints[j + _NOW] = 0
-    for j in range(kept):  # what the block's own loops have not brought along: by itself, so that the misses overlap
-        i = active[j]
+    origin = _U(first)
+    for j in range(count):  # what the block's own loops have not brought along: by itself, so that the misses overlap
+        i = _U(ints[j + _PIXEL])
         floats[j + _ON], floats[j + _OFF] = p.constants[i, 0], p.constants[i, 1]
         floats[j + _MEAN_LEAK] = p.constants[i, 2]
-    y = first // v.width
-    row_end = (y + 1) * v.width
-    for j in range(kept):
-        i = active[j]
-        while i >= row_end:
-            y += 1
-            row_end += v.width
-        ints[j + _PIXEL], ints[j + _BITS] = i, (y << 17) | ((i - row_end + v.width) << 1)
-        ints[j + _SHOT], ints[j + _SLOT] = noise_end, j
+    for j in range(count):
+        i = _U(ints[j + _PIXEL])
         floats[j + _UP], floats[j + _DOWN] = p.upper[i], p.lower[i]
-        floats[j + _X0], floats[j + _X1] = p.x[i], x_now[i - first]
+        floats[j + _X0], floats[j + _X1] = p.x[i], x_now[i - origin]
         floats[j + _LEAK] = floats[j + _NOISE] = floats[j + _SHIFT] = 0.0
     if p.leak.size:
-        for j in range(kept):
-            floats[j + _LEAK] = p.leak[active[j]]
+        for j in range(count):
+            floats[j + _LEAK] = p.leak[_U(ints[j + _PIXEL])]
     if p.lag.size:
-        for j in range(kept):
-            i = active[j]
-            o = i - first
+        for j in range(count):
+            i = _U(ints[j + _PIXEL])
+            o = i - origin
             floats[j + _LAG0], floats[j + _LAG1] = p.lag[i], lag_now[o]
             floats[j + _I0], floats[j + _I1] = p.intensity[i], intensity_now[o]
     if p.noise.size:
-        for j in range(kept):
-            i = active[j]
+        for j in range(count):
+            i = _U(ints[j + _PIXEL])
             floats[j + _NOISE] = p.noise[i]
-            floats[j + _SHIFT] = np.float64(noise_now[i - first]) - np.float64(p.noise[i])
+            floats[j + _SHIFT] = np.float64(noise_now[i - origin]) - np.float64(p.noise[i])
     if p.since_ns.size:
-        for j in range(kept):
-            i = active[j]
+        for j in range(count):
+            i = _U(ints[j + _PIXEL])
             ints[j + _SINCE], floats[j + _NOISE_THEN] = p.since_ns[i] - v.t0_ns, p.noise_then[i]
+
+
+@numba.njit(**JIT)
+def _number_shots(count, first, keys, key, noise_end, ints):
+    """SHOT of pixels that lie in raster order; ``key`` : of their first shot noise, and returned, of the next."""
     j = _U0
-    while key < noise_end and j < kept:  # both in raster order
+    while key < noise_end and j < count:
         pixel = first + (keys[key] >> 42)
         if pixel < ints[j + _PIXEL]:
             key += 1  # of a pixel that is in its dead time
@@ -298,7 +434,44 @@ def _gather(active, first, now, keys, key, noise_end, p, v, floats, ints):
                 while key < noise_end and first + (keys[key] >> 42) == pixel:
                     key += 1
             j += _U1
-    return kept, key
+    return key
+
+
+@numba.njit(**JIT)
+def _settle(count, first, noise_now, noise_end, p, v, floats, ints):
+    """Levels of the pixels that wake up and do nothing else in the interval, a third of all that are listed; returns
+    how many do, which are put down (WOKEN)."""
+    woken, told = _U0, p.since_ns.size > 0
+    for j in range(count):
+        i, fires = _U(ints[j + _PIXEL]), (ints[j + _FIRES] != 0) | (ints[j + _SHOT] != noise_end)
+        up, down = floats[j + _UP], floats[j + _DOWN]
+        if fires:
+            ints[woken + _WOKEN], ints[woken + _WOKEN_NOW] = ints[j + _PIXEL], ints[j + _NOW]
+            floats[woken + _WOKEN_UP], floats[woken + _WOKEN_DOWN] = up, down
+            floats[woken + _WOKEN_S], floats[woken + _WOKEN_E] = floats[j + _S], floats[j + _E]
+            woken += _U1
+            continue
+        p.upper[i], p.lower[i] = np.float32(up), np.float32(down)
+        if told:
+            p.since_ns[i] = v.t0_ns + ints[j + _NOW]
+            p.noise_then[i] = np.float32(_noise_at(floats, ints, j, floats[j + _S], first, noise_now, p))
+    return woken
+
+
+@numba.njit(**JIT)
+def _merge(awake, woken, ints):
+    """PIXEL of both, in raster order; puts down the places of the second (WOKEN_SLOT)."""
+    a, w = _U0, _U0
+    while w < woken:
+        if a < awake and ints[a + _AWAKE] < ints[w + _WOKEN]:
+            ints[a + w + _PIXEL] = ints[a + _AWAKE]
+            a += _U1
+        else:
+            ints[a + w + _PIXEL], ints[w + _WOKEN_SLOT] = ints[w + _WOKEN], a + w
+            w += _U1
+    while a < awake:
+        ints[a + w + _PIXEL] = ints[a + _AWAKE]
+        a += _U1
 
 
 @numba.njit(**JIT)
@@ -392,31 +565,57 @@ def emit_waves(
     return out, cut
 
 
-@register_jitable
-def _wide(count):
-    return (count + _WIDE - _U1) // _WIDE * _WIDE
-
-
 @numba.njit(**JIT)
 def _emit(active, first, now, keys, key, noise_end, p, v, cap, packed, begin, floats, ints):
     """:func:`emit_waves` of at most SLOTS pixels; ``key`` : of their first shot noise, and returned, of the next."""
     noise_now, dt_ns, dt = now[3], v.dt_ns, v.dt_ns * 1e-9
     start_ns = v.t0_ns - 1000 * v.base_us
     low_pass, dead_time, told = p.lag.size > 0, p.release.size > 0, p.since_ns.size > 0
-    slots, key = _gather(active, first, now, keys, key, noise_end, p, v, floats, ints)
+    woken = _U0
+    if dead_time:
+        awake, waking = _part(active, p, v, ints)
+        if waking > _U0:
+            for j in range(waking):
+                i = ints[j + _WAKING]
+                ints[j + _PIXEL], ints[j + _NOW] = i, max(p.release[_U(i)] - v.t0_ns, 0)
+                ints[j + _SHOT] = noise_end
+            _number_shots(waking, first, keys, key, noise_end, ints)
+            _gather(waking, first, now, p, v, floats, ints)
+            wide = _wide(waking)
+            _curves(floats, wide, v.kappa, v.since_epoch_0, dt, low_pass)
+            if low_pass:
+                _wake(floats, ints, wide, dt_ns)
+            else:
+                _wake_lines(floats, ints, wide, dt_ns)
+            _aim(floats, ints, wide)
+            woken = _settle(waking, first, noise_now, noise_end, p, v, floats, ints)
+        slots = awake + woken
+        _merge(awake, woken, ints)
+    else:
+        slots = _U(active.size)
+        for j in range(slots):
+            ints[j + _PIXEL] = active[j]
+    y = first // v.width
+    row_end = (y + 1) * v.width
+    for j in range(slots):
+        i = ints[j + _PIXEL]
+        while i >= row_end:
+            y += 1
+            row_end += v.width
+        ints[j + _BITS] = (y << 17) | ((i - row_end + v.width) << 1)
+        ints[j + _NOW], ints[j + _SHOT], ints[j + _SLOT] = 0, noise_end, j
+    key = _number_shots(slots, first, keys, key, noise_end, ints)
+    _gather(slots, first, now, p, v, floats, ints)
     wide = _wide(slots)
     _curves(floats, wide, v.kappa, v.since_epoch_0, dt, low_pass)
-    if dead_time:
+    for w in range(woken):
+        j = _U(ints[w + _WOKEN_SLOT])
+        ints[j + _NOW] = ints[w + _WOKEN_NOW]
+        floats[j + _UP], floats[j + _DOWN] = floats[w + _WOKEN_UP], floats[w + _WOKEN_DOWN]
+        floats[j + _S], floats[j + _E] = floats[w + _WOKEN_S], floats[w + _WOKEN_E]
         if told:
-            for j in range(slots):
-                if floats[j + _UP] == -np.inf:
-                    ints[j + _SINCE] = ints[j + _NOW]
-                    s = ints[j + _NOW] / dt_ns
-                    floats[j + _NOISE_THEN] = _noise_at(floats, ints, j, s, first, noise_now, p)
-        if low_pass:
-            _wake(floats, ints, wide, dt_ns)
-        else:
-            _wake_lines(floats, ints, wide, dt_ns)
+            ints[j + _SINCE] = ints[j + _NOW]
+            floats[j + _NOISE_THEN] = _noise_at(floats, ints, j, floats[j + _S], first, noise_now, p)
     out, cut, wave, left = begin, 0, 0, slots
     owners = np.empty(2 * SLOTS, np.int32)
     while left > 0:
@@ -425,17 +624,11 @@ def _emit(active, first, now, keys, key, noise_end, p, v, cap, packed, begin, fl
         if low_pass:
             if wave > 0 and not dead_time:
                 _look_again(floats, wide)
-            _meet(floats, ints, wide)
-            for j in range(left):
-                if ints[j + _OPEN] & ints[j + _FIRES]:
-                    floats[j + _AT] = crossing_fraction(
-                        floats[j + _S], floats[j + _TARGET], ints[j + _POLARITY],
-                        floats[j + _C], floats[j + _RISE], floats[j + _FALL], floats[j + _K], floats[j + _END],
-                    )  # fmt: skip
+            _meet(floats, ints, left, wide)
         else:
             _meet_lines(floats, ints, wide)
-        for j in range(left):
-            ints[j + _AT_NS] = np.int64(floats[j + _AT] * dt_ns)
+        for j in range(wide):
+            ints[j + _AT_NS] = _whole(floats[j + _AT] * dt_ns)
         if noise_end:
             _shots(floats, ints, left, keys, noise_end, dt_ns)
         if wave < cap:
@@ -479,33 +672,10 @@ def _emit(active, first, now, keys, key, noise_end, p, v, cap, packed, begin, fl
                             floats[j + _AT], floats[j + _C], floats[j + _RISE], floats[j + _FALL], floats[j + _K]
                         )
         _set_levels(floats, ints, wide)
-        kept = _U0
-        for j in range(left):
-            i, fires, now_ns = ints[j + _PIXEL], ints[j + _FIRES] != 0, ints[j + _NOW]
-            up, down, end = floats[j + _UP], floats[j + _DOWN], floats[j + _END]
-            dead = dead_time & fires & (now_ns > dt_ns)
-            again = fires & (not dead) & ((end >= up) | (end <= down) | (ints[j + _SHOT] != noise_end))
-            if told:
-                if fires and not dead:
-                    ints[j + _SINCE] = now_ns
-                    floats[j + _NOISE_THEN] = _noise_at(floats, ints, j, floats[j + _S], first, noise_now, p)
-            if again:
-                for row in range(_KEPT):
-                    floats[kept + _U(_STRIDE * row)] = floats[j + _U(_STRIDE * row)]
-                for row in range(_KEPT_INTS):
-                    ints[kept + _U(_STRIDE * row)] = ints[j + _U(_STRIDE * row)]
-                kept += _U1
-            else:
-                # In a dead time both levels are passed, whatever comes: the pixel is looked at until it is released.
-                p.upper[i], p.lower[i] = select(dead, -_INF, np.float32(up)), select(dead, _INF, np.float32(down))
-                if v.leak_jitter > 0.0:
-                    p.leak[i] = np.float32(floats[j + _LEAK])
-                if dead:
-                    p.release[i] = v.t0_ns + now_ns
-                if told:
-                    p.since_ns[i] = v.t0_ns + ints[j + _SINCE]
-                    p.noise_then[i] = np.float32(floats[j + _NOISE_THEN])
-        left, wave = kept, wave + 1
+        go_on = _go_on(floats, ints, wide, left, noise_end, dt_ns, dead_time)
+        _put_back(floats, ints, left, first, noise_now, dead_time, p, v)
+        left = _keep(floats, ints, left) if go_on else _U0
+        wave += 1
     if wave > 1:
         _in_order(packed, begin, out, owners, slots, ints)
     return out, cut, key

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import sys
 
 import pytest
 
@@ -25,6 +26,56 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 20)
+
+
+class _Lender:
+    """One context for all that a test file runs in this process, as a worker has one for all its sequences. A context
+    of its own for every run had its shaders compiled anew, which was more than what it drew."""
+
+    WHERE = (
+        "blinkgl.dataset.generate",
+        "blinkgl.dataset.work",
+        "blinkgl.dataset.verify.again",
+        "blinkgl.sequence.rendered",
+        "blinkgl.sequence.rig",
+        "blinkgl.trade.run",
+    )
+
+    def __init__(self):
+        self.context, self.lent = None, False
+
+    def create_context(self, backend: str = "auto", device: int = 0):
+        from blinkgl.gl import create_context
+
+        if self.lent or backend != "auto" or device:
+            return create_context(backend, device)
+        if self.context is None or self.context.lost:
+            self.end()
+            self.context = create_context()
+            self.context.release = self._come_back  # what "with" and everybody else ends it by
+        self.lent = True
+        self.context.make_current()
+        return self.context
+
+    def _come_back(self):
+        self.lent = False
+
+    def end(self):
+        if self.context is not None:
+            del self.context.release
+            self.context.release()
+        self.context, self.lent = None, False
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _lent_context():
+    lender = _Lender()
+    with pytest.MonkeyPatch.context() as patch:
+        for name in lender.WHERE:
+            if name in sys.modules:
+                patch.setattr(sys.modules[name], "create_context", lender.create_context)
+        yield
+    lender.end()
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import matplotlib
 import numpy as np
 
 from blinkgl.errors import ConfigError
@@ -31,6 +30,8 @@ def map_scalar(values: np.ndarray, name: str, low: float, high: float, log: bool
     if log and low > 0:
         with np.errstate(invalid="ignore", divide="ignore"):
             return map_scalar(np.log(values), name, float(np.log(low)), float(np.log(high)))
+    import matplotlib  # here: it takes long to import, and whoever makes no pictures does without
+
     if name not in MAPS:
         raise ConfigError("unknown colour map", where="map", value=name, accepted="one of " + ", ".join(MAPS))
     with np.errstate(invalid="ignore", over="ignore"):
@@ -43,10 +44,12 @@ def map_scalar(values: np.ndarray, name: str, low: float, high: float, log: bool
 def id_colours(ids: np.ndarray) -> np.ndarray:
     """(H, W, 3) uint8: distinct hues by the golden ratio, dark grey for 0; the same number
     always has the same colour."""
+    from matplotlib.colors import hsv_to_rgb
+
     numbers = ids.astype(np.int64)
     hue = (numbers * 0.61803398875) % 1.0
     value = 0.62 + 0.38 * ((numbers * 0.7548776662) % 1.0)
-    rgb = matplotlib.colors.hsv_to_rgb(np.stack([hue, np.full(hue.shape, 0.62), value], axis=-1))
+    rgb = hsv_to_rgb(np.stack([hue, np.full(hue.shape, 0.62), value], axis=-1))
     out = (rgb * 255).round().astype(np.uint8)
     out[numbers == 0] = EMPTY
     return out

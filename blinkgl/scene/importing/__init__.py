@@ -2,5 +2,6 @@
 
 In:    glTF, OBJ, PLY and STL of unknown goodness.
 Out:   :class:`~blinkgl.scene.importing.mesh_files.Asset`, or one line that names the file.
-Start: mesh_files.py (``load_asset``); gltf.py reads what gltf_schema.py has checked.
+Start: mesh_files.py (``load_asset``); trimesh_pieces.py reads obj, ply and stl, gltf.py glTF that gltf_schema.py has
+       checked.
 """

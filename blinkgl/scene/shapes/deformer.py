@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
-import trimesh
 from numba import njit
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
@@ -236,6 +235,8 @@ def _largest_difference(a, b):
 def _directions() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """((162, 3) unit vectors, evenly spread, each with its opposite; (3, 81) one of each two; (162,) where a vector is
     among those 81 and, after them, their opposites)."""
+    import trimesh  # here: it takes long to import, and few scenes have what changes its shape
+
     every = np.array(trimesh.creation.icosphere(subdivisions=2, radius=1.0).vertices)
     opposite = (every[:, None] == -every).all(axis=2).argmax(axis=1)
     chosen = np.flatnonzero(np.arange(len(every)) < opposite)

@@ -27,7 +27,7 @@ from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.geometry.meshes import closed_together, make_mesh
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.animations import Animation, clip_names, play, rest_pieces
-from blinkgl.scene.importing.mesh_files import has_own_vertices, piece_of_trimesh, with_own_vertices
+from blinkgl.scene.importing.mesh_files import has_own_vertices, with_own_vertices
 from blinkgl.scene.lights import MAX_LAMPS, lamp_of_gltf, make_light
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.omissions import Omissions
@@ -207,6 +207,8 @@ def from_trimesh(
     camera_path : None takes the scene's camera transform.
     up : "y" turns the world z up. Normals are made anew (crease angle), because trimesh's round off every edge.
     """
+    from blinkgl.scene.importing.trimesh_pieces import piece_of_trimesh
+
     turn = _turn(up)
     log, omissions = [], Omissions("the trimesh scene")
     objects = []

@@ -1,0 +1,296 @@
+"""obj, ply and stl files, and what was loaded with trimesh elsewhere, as pieces of raw triangles."""
+
+from __future__ import annotations
+
+import io
+import logging
+import re
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+from blinkgl.errors import AssetError
+from blinkgl.scene.importing import gltf
+from blinkgl.scene.omissions import Omissions
+from blinkgl.scene.reading import contents, reading
+from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash, decode_image, shrink
+from blinkgl.scene.types import Material, Texture
+from blinkgl.srgb import linear_from_srgb
+
+logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # its warnings say nothing a user could act on
+
+
+def read_pieces(
+    path: Path, data: bytes, kind: str, max_faces: int, max_texture: int | None, omissions: Omissions
+) -> list[gltf.Piece]:
+    """Of a file of this ``kind`` ("obj", "ply", "stl").
+
+    max_texture : None leaves materials out.   omissions : is told what the file asks for and is not drawn. Raises
+    AssetError: truncated, corrupt, no faces, more than ``max_faces``, references outside its folder."""
+    where = str(path)
+    {"stl": _check_stl, "ply": _check_ply, "obj": _check_obj}[kind](data, max_faces, where)
+    resolver = FolderResolver(path.parent, where, kind, omissions)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        loaded = trimesh.load_scene(
+            io.BytesIO(data),
+            file_type=kind,
+            resolver=resolver,
+            process=False,
+            maintain_order=True,
+            skip_materials=max_texture is None,
+        )
+    if max_texture is not None and resolver.refused is not None:
+        raise resolver.refused
+    pieces = [
+        piece_of_trimesh(
+            g, max_texture=max_texture, where=where, file_normals=True, omissions=omissions, resolver=resolver
+        )
+        for g in loaded.geometry.values()
+        if isinstance(g, trimesh.Trimesh)
+    ]
+    if not pieces:
+        raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
+    if any(not isinstance(g, trimesh.Trimesh) for g in loaded.geometry.values()):
+        omissions.add("points and lines")
+    return pieces
+
+
+def piece_of_trimesh(
+    mesh: trimesh.Trimesh,
+    *,
+    max_texture: int | None,
+    where: str,
+    file_normals: bool,
+    omissions: Omissions,
+    resolver: FolderResolver | None = None,
+) -> gltf.Piece:
+    """Raw triangles and material of a ``trimesh.Trimesh``.
+
+    file_normals : use normals that came with the mesh; trimesh's own smooth ones would round off a cuboid.
+    max_texture : None leaves the material out.   resolver : what the mesh was loaded with; it knows the images.
+    """
+    # mesh.vertex_normals would make up what the file does not have.
+    normals = mesh._cache.cache.get("vertex_normals") if file_normals else None  # noqa: SLF001
+    uvs = getattr(mesh.visual, "uv", None)
+    if uvs is not None and len(uvs) == len(mesh.vertices):
+        uvs = np.asarray(uvs, np.float64)[:, :2] * [1, -1] + [0, 1]  # trimesh has v upwards
+    else:
+        uvs = None
+    material, colours = None, None
+    if max_texture is not None:
+        material = _material(mesh.visual, max_texture, where, omissions, resolver)
+        if getattr(mesh.visual, "kind", None) == "vertex":
+            colours = linear_from_srgb(np.asarray(mesh.visual.vertex_colors, float)[:, :3] / 255)
+            if (colours == colours[0]).all():
+                colours = None
+            elif material is not None:
+                material = replace(material, base_color=(1.0, 1.0, 1.0))
+    return gltf.Piece(
+        np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces), normals, uvs, material, colours=colours
+    )
+
+
+def _material(
+    visual, max_texture: int, where: str, omissions: Omissions, resolver: FolderResolver | None
+) -> Material | None:
+    material = getattr(visual, "material", None)
+    if material is None:
+        kind = getattr(visual, "kind", None)
+        if kind not in ("face", "vertex"):
+            return None
+        colours = visual.face_colors if kind == "face" else visual.vertex_colors
+        if kind == "face" and not (colours == colours[0]).all():
+            omissions.add(f"{kind} colours (drawn in the most frequent one)")
+        return Material(base_color=gltf.to_linear(np.asarray(visual.main_color, float)[:3] / 255))
+    image = getattr(material, "baseColorTexture", None)
+    factor = getattr(material, "baseColorFactor", None)
+    if isinstance(material, trimesh.visual.material.SimpleMaterial):
+        image = material.image
+        diffuse = material.diffuse
+        # An untouched default is no material; a texture is not darkened by the usual grey diffuse default.
+        if (
+            image is None
+            and material.name is None
+            and np.array_equal(diffuse[:3], trimesh.visual.color.DEFAULT_COLOR[:3])
+        ):
+            return None
+        colour = (1.0, 1.0, 1.0) if image is not None else gltf.to_linear(np.asarray(diffuse, float)[:3] / 255)
+    else:
+        factor = np.ones(3) if factor is None else np.asarray(factor)[:3]
+        # glTF factors are linear.
+        colour = tuple(float(c) for c in (factor / 255 if factor.dtype.kind in "iu" else factor))
+        if getattr(material, "alphaMode", None) not in (None, "OPAQUE"):
+            omissions.add(f"alpha {material.alphaMode} (drawn opaque)")
+        if np.any(getattr(material, "emissiveFactor", None)):
+            omissions.add("emissive light")
+    texture = None
+    if image is not None:
+        opened = resolver is None  # by whoever made the mesh
+        texture = texture_of(image, max_texture, where) if opened else resolver.texture(image, max_texture)
+    return Material(texture=texture, base_color=colour, double_sided=bool(getattr(material, "doubleSided", False)))
+
+
+def texture_of(image: Image.Image, max_texture: int, where: str) -> Texture:
+    """A Pillow image that somebody else opened, as a texture. AssetError when its file turns out to be broken."""
+    with reading("image", where):
+        pixels = np.ascontiguousarray(np.asarray(image.convert("RGB")))
+        return Texture(shrink(pixels, max_texture), "texture", content_hash(pixels.tobytes()))
+
+
+class FolderResolver(trimesh.resolvers.Resolver):
+    """Reads material and image files beside a mesh; refuses what leads out of its folder.
+
+    trimesh opens images with Pillow as it finds them, and does without those that it cannot open. So it is given a
+    pixel in place of each, whose colour is the image's number; :meth:`texture` decodes the file by the rules of all
+    other textures.
+    """
+
+    def __init__(self, folder: Path, where: str, kind: str, omissions: Omissions):
+        self.folder, self.where, self.kind, self.omissions = Path(folder), where, kind, omissions
+        self.refused: AssetError | None = None
+        self._named: set[str] = set()  # images that a material file names
+        self._images: list[tuple[str, bytes]] = []
+        self._textures: dict[int, Texture] = {}
+
+    def get(self, name: str) -> bytes:
+        try:
+            file = gltf.inside(self.folder, str(name), self.where)
+            data = contents(file, "file")
+        except AssetError as error:  # trimesh swallows it; read_pieces raises it
+            if "missing" in error.problem:
+                self.omissions.add(f"'{name}', which is missing")
+            else:
+                self.refused = self.refused or error
+            raise
+        if self.kind == "obj" and name not in self._named:
+            self._read_mtl(data)
+            return data
+        self._images.append((str(file), data))
+        number, stream = len(self._images) - 1, io.BytesIO()
+        Image.new("RGB", (1, 1), (number & 255, number >> 8 & 255, number >> 16 & 255)).save(stream, "PNG")
+        return stream.getvalue()
+
+    def texture(self, pixel: Image.Image, max_texture: int) -> Texture:
+        """The texture that ``pixel`` stands for. AssetError naming its file."""
+        red, green, blue = pixel.convert("RGB").getpixel((0, 0))
+        number = red + (green << 8) + (blue << 16)
+        if number not in self._textures:
+            name, data = self._images[number]
+            self._textures[number] = Texture(decode_image(data, max_texture, name), Path(name).name, content_hash(data))
+        return self._textures[number]
+
+    def _read_mtl(self, data: bytes) -> None:
+        """Notes the images that a material file names, and what it asks for beside a matt colour."""
+        for line in data.decode("utf-8", errors="replace").splitlines():
+            key, _, rest = line.strip().partition(" ")
+            key, rest = key.lower(), rest.strip()
+            if key == "map_kd":
+                self._named.add(rest)
+            elif key in _MTL_MAPS:
+                self.omissions.add(_MTL_MAPS[key])
+            elif key in _MTL_VALUES:
+                what, plain = _MTL_VALUES[key]
+                try:
+                    asked = any(float(value) != plain for value in rest.split()[:3])
+                except ValueError:
+                    asked = False
+                if asked:
+                    self.omissions.add(what)
+
+    def write(self, name: str, data: bytes) -> NoReturn:
+        raise AssetError("a mesh loader wanted to write", where=self.where, value=name)
+
+    def namespaced(self, namespace: str) -> FolderResolver:
+        return FolderResolver(gltf.inside(self.folder, namespace, self.where), self.where, self.kind, self.omissions)
+
+    def keys(self) -> list[str]:
+        return [p.name for p in self.folder.iterdir() if p.suffix.lower() in (".mtl", *IMAGE_SUFFIXES)]
+
+
+_MTL_MAPS = {
+    "map_bump": "normal maps",
+    "bump": "normal maps",
+    "norm": "normal maps",
+    "map_d": "transparency (drawn opaque)",
+    "map_ke": "emissive light",
+    "map_ks": "shine (drawn matt)",
+    "map_pr": "shine (drawn matt)",
+    "map_pm": "shine (drawn matt)",
+}
+# Statement -> what it asks for, unless all its values are this.
+_MTL_VALUES = {
+    "ke": ("emissive light", 0.0),
+    "ks": ("shine (drawn matt)", 0.0),
+    "pm": ("shine (drawn matt)", 0.0),
+    "d": ("transparency (drawn opaque)", 1.0),
+    "tr": ("transparency (drawn opaque)", 0.0),
+}
+
+
+def _check_stl(data: bytes, max_faces: int, where: str) -> None:
+    if len(data) >= 84:
+        claimed = int(np.frombuffer(data[80:84], "<u4")[0])
+        # Binary when the size fits; ASCII begins with 'solid' (some binary files do too, hence the size first).
+        if data.lstrip()[:5].lower() != b"solid" or len(data) == 84 + 50 * claimed:
+            if claimed > max_faces:
+                raise AssetError(
+                    "the mesh has too many faces", where=where, value=claimed, accepted=f"at most {max_faces}"
+                )
+            if len(data) < 84 + 50 * claimed:
+                raise AssetError(
+                    f"the mesh is truncated: {claimed} faces need {84 + 50 * claimed} bytes",
+                    where=where,
+                    value=len(data),
+                )
+            return
+    _limit(data.count(b"facet normal"), max_faces, where)
+
+
+def _check_ply(data: bytes, max_faces: int, where: str) -> None:
+    end = data[: 1 << 16].find(b"end_header")
+    if not data.startswith(b"ply") or end < 0:
+        raise AssetError("the mesh is corrupt (no PLY header)", where=where)
+    for name, digits in re.findall(rb"element\s+(\w+)\s+(\d+)", data[:end]):
+        what = "faces" if name == b"face" else f"{name.decode(errors='replace')} elements"
+        if len(digits) > 18:
+            raise AssetError(
+                f"the mesh has too many {what}",
+                where=where,
+                value=f"a number of {len(digits)} digits",
+                accepted=f"at most {max_faces} faces",
+            )
+        count = int(digits)
+        if count > (max_faces if name == b"face" else 3 * max_faces + 1_000_000):
+            raise AssetError(
+                f"the mesh has too many {what}", where=where, value=count, accepted=f"at most {max_faces} faces"
+            )
+        if count > len(data) - end:  # an element takes a byte at least
+            raise AssetError(f"the mesh is truncated: {count} {what} in {len(data)} bytes", where=where)
+
+
+def _check_obj(data: bytes, max_faces: int, where: str) -> None:
+    _limit(data.count(b"\nf ") + data.startswith(b"f "), max_faces, where)
+    # trimesh allocates as many vertices as the largest index of a face says; a file has no more of them than lines.
+    lines = data.count(b"\n") + data.count(b"\r") + 1
+    found = re.search(
+        rb"(?:\A|[\r\n])f[^\r\n]*?(\d{%d,})" % (len(str(lines)) + 1),
+        data.replace(b"\\\n", b" ") if b"\\\n" in data else data,
+    )
+    if found:
+        raise AssetError(
+            "a face refers to a vertex that does not exist",
+            where=where,
+            value=found[1][:20].decode(),
+            accepted=f"at most {lines}",
+        )
+
+
+def _limit(faces: int, max_faces: int, where: str) -> None:
+    if faces > max_faces:
+        raise AssetError("the mesh has too many faces", where=where, value=faces, accepted=f"at most {max_faces}")

@@ -74,8 +74,16 @@ def _lent_context():
         for name in lender.WHERE:
             if name in sys.modules:
                 patch.setattr(sys.modules[name], "create_context", lender.create_context)
-        yield
+        yield lender
     lender.end()
+
+
+@pytest.fixture
+def own_contexts(_lent_context):
+    """For tests of when a context begins and ends."""
+    _lent_context.lent = True
+    yield
+    _lent_context.lent = False
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import Annotated, Any, ClassVar, Generic, TypeVar
 
 import annotated_types
@@ -352,8 +352,13 @@ def _fits(annotation: Any, path: Iterable[str]) -> bool:
     return bool(here)
 
 
+@lru_cache(maxsize=4096)
+def _steps(key: str) -> Path:
+    return tuple(key.lstrip("?#").split("."))
+
+
 def _value(model: Any, key: str) -> Any:
-    found = _get(model, key.lstrip("?#").split("."))
+    found = _get(model, _steps(key))
     if key.startswith("?"):
         return found is not None
     if key.startswith("#"):
@@ -361,12 +366,15 @@ def _value(model: Any, key: str) -> Any:
     return found
 
 
-def _get(node: Any, path: list[str]) -> Any:
-    if not path or node is None:
-        return node
-    if path[0] == "*":
-        return tuple(_get(child, path[1:]) for child in (node.values() if isinstance(node, dict) else node))
-    return _get(getattr(node, path[0], None), path[1:])
+def _get(node: Any, path: Path) -> Any:
+    for depth, step in enumerate(path):
+        if node is None:
+            return None
+        if step == "*":
+            rest = path[depth + 1 :]
+            return tuple(_get(child, rest) for child in (node.values() if isinstance(node, dict) else node))
+        node = getattr(node, step, None)
+    return node
 
 
 # --- errors -----------------------------------------------------------------------------------------------------------

@@ -207,7 +207,12 @@ def _children(node: Any) -> list[tuple[str, Any]]:
 
 def _related(site: Path, key: Path, deep: bool) -> bool:
     """Whether the distribution at ``site`` decides the value at ``key``: it holds it, or, ``deep``, is a part of it."""
-    return (deep or len(site) <= len(key)) and all(s == k or k == "*" for s, k in zip(site, key))
+    if not deep and len(site) > len(key):
+        return False
+    for s, k in zip(site, key):  # noqa: SIM110 - as all(...) it takes three times as long, millions of times
+        if s != k and k != "*":
+            return False
+    return True
 
 
 def _together(

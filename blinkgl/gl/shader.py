@@ -107,12 +107,11 @@ def expand(
     body.file(name, Path(name) if Path(name).is_absolute() else folder / name, chain=())
     head = [body.version or DEFAULT_VERSION, f"#define {stage.upper()}_SHADER 1"]
     head += [f"#define {key} {value}" for key, value in normalised(defines)]
-    lines = [(line, ("", 0)) for line in head] + body.lines
     return ShaderSource(
         name,
         stage,
-        "\n".join(line for line, _ in lines) + "\n",
-        tuple(origin for _, origin in lines),
+        "\n".join(head + body.lines) + "\n",
+        (("", 0),) * len(head) + tuple(body.origin),
         body.files,
         tuple(body.made),
     )
@@ -141,14 +140,15 @@ def normalised(defines: Mapping[str, Any] | None) -> tuple[tuple[str, str], ...]
 
 
 class _Expansion:
-    """Collects (line, origin) pairs of a file and what it includes."""
+    """Collects the lines of a file and what it includes, and their origins."""
 
     def __init__(self, folder: Traversable):
         self.folder = folder
         self.version: str | None = None
         self.files: dict[str, str] = {}
         self.made: dict[str, None] = {}
-        self.lines: list[tuple[str, tuple[str, int]]] = []
+        self.lines: list[str] = []
+        self.origin: list[tuple[str, int]] = []
 
     def file(self, shown: str, path: Traversable, chain: tuple[str, ...], included_at: str | None = None) -> None:
         if shown in chain:
@@ -165,8 +165,9 @@ class _Expansion:
             text = made[name]
             self.made[name] = None
         self.files[shown] = text
-        for lines, end, argument in _parts(shown, text):
+        for lines, origin, end, argument in _parts(shown, text):
             self.lines += lines
+            self.origin += origin
             if argument is None:
                 if chain:
                     raise ShaderError(
@@ -186,10 +187,12 @@ class _Expansion:
                 "include outside the shader folder", where=at, value=name, accepted="a file in shaders/include"
             )
         # A guard of the preprocessor, not of this loader: only it knows which #ifdef branches are alive.
-        guard = "INCLUDED_" + "".join(c if c.isalnum() else f"_{ord(c):x}x" for c in name)
-        self.lines += [(f"#ifndef {guard}", ("", 0)), (f"#define {guard}", ("", 0))]
+        guard = _guard(name)
+        self.lines += (f"#ifndef {guard}", f"#define {guard}")
+        self.origin += (("", 0), ("", 0))
         self.file(f"include/{name}", self.folder / "include" / name, chain, at)
-        self.lines.append(("#endif", ("", 0)))
+        self.lines.append("#endif")
+        self.origin.append(("", 0))
 
     def _available(self, path: Traversable) -> str | None:
         folder = self.folder / "include" if isinstance(path, Path) and path.parent.name == "include" else self.folder
@@ -201,24 +204,30 @@ class _Expansion:
 
 
 @lru_cache(maxsize=256)
-def _parts(shown: str, text: str) -> tuple[tuple[tuple[tuple[str, tuple[str, int]], ...], int, str | None], ...]:
-    """A file in pieces: ((line, origin) pairs, number of the line that ends them, what that line includes; None where
+def _guard(name: str) -> str:
+    return "INCLUDED_" + "".join(c if c.isalnum() else f"_{ord(c):x}x" for c in name)
+
+
+@lru_cache(maxsize=256)
+def _parts(shown: str, text: str) -> tuple[tuple[tuple[str, ...], tuple[tuple[str, int], ...], int, str | None], ...]:
+    """A file in pieces: (lines, their origins, number of the line that ends them, what that line includes; None where
     it is a #version). The last one ends at 0. Kept, since every program of a scene includes the same dozen files."""
-    parts, lines = [], []
+    parts, lines, origin = [], [], []
     in_comment = False
     for number, line in enumerate(text.splitlines(), 1):
         include = None if in_comment else _INCLUDE.match(line)
         if include:
-            parts.append((tuple(lines), number, include["argument"]))
-            lines = []
+            parts.append((tuple(lines), tuple(origin), number, include["argument"]))
+            lines, origin = [], []
         elif not in_comment and _VERSION.match(line):
-            parts.append((tuple(lines), number, None))
-            lines = [("", (shown, number))]
+            parts.append((tuple(lines), tuple(origin), number, None))
+            lines, origin = [""], [(shown, number)]
         else:
             # Left over: includes in comments, which moderngl's own resolver would try to follow.
-            lines.append((line.replace("#include", "# include"), (shown, number)))
+            lines.append(line.replace("#include", "# include"))
+            origin.append((shown, number))
         in_comment = _ends_in_comment(line, in_comment)
-    return (*parts, (tuple(lines), 0, ""))
+    return (*parts, (tuple(lines), tuple(origin), 0, ""))
 
 
 def _ends_in_comment(line: str, inside: bool) -> bool:
@@ -234,6 +243,18 @@ def _ends_in_comment(line: str, inside: bool) -> bool:
         if start < 0 or 0 <= slashes < start:
             return False
         inside, position = True, start + 2
+
+
+def link(ctx: moderngl.Context, sources: Mapping[str, ShaderSource]) -> moderngl.Program:
+    """The program of its stages. Raises ShaderError."""
+    try:
+        return ctx.program(
+            vertex_shader=sources["vertex"].text,
+            geometry_shader=sources[GEOMETRY].text if GEOMETRY in sources else None,
+            fragment_shader=sources["fragment"].text,
+        )
+    except moderngl.Error as error:
+        raise translate(str(error), sources) from None
 
 
 class ShaderLoader:
@@ -277,14 +298,7 @@ class ShaderLoader:
 
     def _compile(self, name: str, defines: Mapping[str, Any] | None) -> moderngl.Program:
         sources = {stage: expand(name, stage, defines, self.folder) for stage in stages_of(defines)}
-        try:
-            program = self.ctx.program(
-                vertex_shader=sources["vertex"].text,
-                geometry_shader=sources[GEOMETRY].text if GEOMETRY in sources else None,
-                fragment_shader=sources["fragment"].text,
-            )
-        except moderngl.Error as error:
-            raise translate(str(error), sources) from None
+        program = link(self.ctx, sources)
         self._made[name, normalised(defines)] = {
             made: source.files[f"include/{made}"] for source in sources.values() for made in source.made
         }

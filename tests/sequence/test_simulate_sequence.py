@@ -182,6 +182,7 @@ def test_files_hold_what_happens(tmp_path, gl, changes):
 # --- its end ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("own_contexts")
 @pytest.mark.parametrize("how", ["break", "error", "never begun", "exhausted"])
 def test_opengl_is_let_go_however_it_ends(tmp_path, how, monkeypatch):
     released = []

@@ -12,8 +12,8 @@ from pathlib import Path
 import moderngl
 
 from blinkgl.errors import ConfigError
-from blinkgl.gl import ShaderLoader, create_context
-from blinkgl.gl.shader import GEOMETRY, STAGES, ShaderError, ShaderSource, expand, stages_of
+from blinkgl.gl import create_context
+from blinkgl.gl.shader import GEOMETRY, STAGES, ShaderError, ShaderSource, expand, link, stages_of
 from blinkgl.tools.shader_debugger.diagnostics import Diagnostic, diagnose
 from blinkgl.tools.shader_debugger.preprocess import active_lines
 from blinkgl.tools.shader_debugger.session import EditedFolder, files_of, open_folder
@@ -82,13 +82,12 @@ def check_program(ctx: moderngl.Context, folder, name: str, result: Result) -> N
     wanted = variants(name)
     wanted = [{}] if wanted is None else wanted + lookups(name)  # [{}]: somebody's own program, as it stands
     result.programs[name] = len(wanted)
-    loader = ShaderLoader(ctx, folder)
     for defines in wanted:
         sources: dict[str, ShaderSource] = {}
         try:
             for stage in stages_of(defines):
                 sources[stage] = expand(name, stage, defines, folder)
-            program = loader.program(name, defines)
+            program = link(ctx, sources)
         except ShaderError as error:
             for diagnostic in dict.fromkeys(diagnose(error, sources, folder)):
                 if diagnostic.kind == "error":
@@ -96,7 +95,7 @@ def check_program(ctx: moderngl.Context, folder, name: str, result: Result) -> N
             continue
         for diagnostic in unused(sources, set(program)):
             _add(result.unused, diagnostic, name, defines)
-    loader.clear()
+        program.release()
 
 
 def _add(findings: list[Finding], diagnostic: Diagnostic, program: str, defines: dict) -> None:

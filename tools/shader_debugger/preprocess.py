@@ -7,6 +7,7 @@ operators of C on 32-bit integers, in a time that grows with the length of the t
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 
 _DIRECTIVE = re.compile(r"^\s*#\s*(\w+)\s*(.*?)\s*$")
 _TOKEN = re.compile(
@@ -38,13 +39,35 @@ class ConditionError(ValueError):
     """An #if expression that GLSL's preprocessor does not take."""
 
 
+_COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
+
+
 def without_comments(text: str) -> list[str]:
     """Lines of ``text``, comments blanked, line numbers and columns kept."""
+    out = []
+    for line in text.split("\n"):
+        told = _without_comments(line)
+        if told is None:
+            return _blanked(text).split("\n")
+        out.append(told)
+    return out
 
-    def blank(match: re.Match) -> str:
-        return re.sub(r"[^\n]", " ", match[0])
 
-    return re.sub(r"//[^\n]*|/\*.*?\*/", blank, text, flags=re.DOTALL).split("\n")
+def _blanked(text: str) -> str:
+    return _COMMENT.sub(lambda match: re.sub(r"[^\n]", " ", match[0]), text)
+
+
+@lru_cache(maxsize=1 << 14)  # the variants of a program have most of their lines in common
+def _without_comments(line: str) -> str | None:
+    """None: a comment goes on into the next line."""
+    told = _blanked(line)
+    return None if "/*" in told else told
+
+
+@lru_cache(maxsize=1 << 14)
+def _directive(line: str) -> tuple[str, str] | None:
+    match = _DIRECTIVE.match(line)
+    return match and (match[1], match[2])
 
 
 def active_lines(text: str, defines: bool = False) -> list[tuple[int, str]]:
@@ -55,12 +78,12 @@ def active_lines(text: str, defines: bool = False) -> list[tuple[int, str]]:
     stack: list[tuple[bool, bool, bool]] = []  # (enclosing alive, this branch alive, some branch was taken)
     alive, out = True, []
     for number, line in enumerate(without_comments(text), 1):
-        match = _DIRECTIVE.match(line)
-        if not match:
-            if alive and line.strip():
+        directive = _directive(line)
+        if not directive:
+            if alive and line and not line.isspace():
                 out.append((number, line))
             continue
-        word, rest = match[1], match[2]
+        word, rest = directive
         if word in ("if", "ifdef", "ifndef"):
             truth = alive and (
                 evaluate(rest, macros) if word == "if" else ((rest.split() or [""])[0] in macros) == (word == "ifdef")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
 import shutil
 from pathlib import Path
 
@@ -17,9 +19,15 @@ REPOSITORY = Path(__file__).parents[2]
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
     pytest.importorskip("zensical", reason="the extra [docs] is not installed")
-    out = tmp_path_factory.mktemp("site") / "site"
-    site.build(REPOSITORY, out)
-    return out
+    here = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        here = here.parent  # of all workers: it takes half a minute, and they may share this file's tests
+    with open(here / "site.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (here / "site.built").exists():
+            site.build(REPOSITORY, here / "site")
+            (here / "site.built").touch()
+    return here / "site"
 
 
 def test_every_link_of_every_page_leads_somewhere(built):

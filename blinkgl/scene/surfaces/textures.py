@@ -88,9 +88,13 @@ def _perlin_noise(rng, size: int, cells: int) -> np.ndarray:
     w = _smooth(f)
     total = 0.0
     for rows, dy, wy in ((i, f, 1 - w), (j, f - 1, w)):
+        across, along = gx[rows], gy[rows] * dy[:, None]
         for columns, dx, wx in ((i, f, 1 - w), (j, f - 1, w)):
-            dot = gx[np.ix_(rows, columns)] * dx + gy[np.ix_(rows, columns)] * dy[:, None]
-            total = total + dot * wy[:, None] * wx
+            dot = across.take(columns, axis=1) * dx
+            dot += along.take(columns, axis=1)
+            dot *= wy[:, None]
+            dot *= wx
+            total = total + dot
     return total
 
 

@@ -112,7 +112,9 @@ def motion(
 
     Dense flow (OpenCV's DIS) both ways; both frames are warped to the intermediate time by linearly combined flows and
     blended by distance in time; where the flows contradict each other (occlusion) only the frame that sees the pixel
-    counts. What no frame shows is guessed: the result is an interpolation and
+    counts. What lies between pixels is a cubic of ln(1e-3 + I) (Catmull and Rom 1974), held within the four pixels
+    round it: a straight line loses contrast, and events with it, and a cubic of the light makes some up beside dark
+    pixels. What no frame shows is guessed: the result is an interpolation and
     ``displacement`` says over how many pixels.
     """
     dense = DenseFlow()
@@ -169,6 +171,7 @@ def _between(a, b, t_a, t_b, forward, backward, steps) -> Iterator[Timed]:
     height, width = a.shape
     grid = np.stack(np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)), axis=-1)
     look = lambda image, flow: cv2.remap(image, grid + flow, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    pictures = [(np.ascontiguousarray(one, np.float32), np.log(one + _EPS)) for one in (a, b)]
     seen_a, seen_b = _consistent(forward, look(backward, forward)), _consistent(backward, look(forward, backward))
     f = np.float32
     for k in range(1, steps):
@@ -177,10 +180,49 @@ def _between(a, b, t_a, t_b, forward, backward, steps) -> Iterator[Timed]:
         to_b = forward * f((1 - s) ** 2) - backward * f(s * (1 - s))
         # What b does not see (a's inconsistent pixels) comes from a, and the other way round.
         weight_a, weight_b = f(1 - s) * look(seen_b, to_b), f(s) * look(seen_a, to_a)
+        moved = [np.empty(a.shape, np.float32) for _ in pictures]
+        for (light, log), to, out in zip(pictures, (to_a, to_b), moved):
+            _look(light, log, grid + to, out)
         yield (
-            (weight_a * look(a, to_a) + weight_b * look(b, to_b)) / (weight_a + weight_b),
+            (weight_a * moved[0] + weight_b * moved[1]) / (weight_a + weight_b),
             t_a + (t_b - t_a) * k // steps,
         )
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _look(light, log, places, out):
+    """``out`` = light at ``places`` (H, W, 2), x and y in px; beyond the border it is that of the border."""
+    height, width = log.shape
+    wx, wy = np.empty(4, np.float32), np.empty(4, np.float32)
+    for row in range(out.shape[0]):
+        for column in range(out.shape[1]):
+            x, y = places[row, column, 0], places[row, column, 1]
+            x = min(x, np.float32(width - 1)) if x > 0 else np.float32(0)  # 0 for NaN, too
+            y = min(y, np.float32(height - 1)) if y > 0 else np.float32(0)
+            i, j = int(x), int(y)
+            _catmull_rom(x - np.float32(i), wx)
+            _catmull_rom(y - np.float32(j), wy)
+            total = np.float32(0)
+            for n in range(4):
+                line = log[min(max(j + n - 1, 0), height - 1)]
+                part = np.float32(0)
+                for m in range(4):
+                    part += wx[m] * line[min(max(i + m - 1, 0), width - 1)]
+                total += wy[n] * part
+            right, below = i + (x > i), j + (y > j)
+            a, b, c, d = light[j, i], light[j, right], light[below, i], light[below, right]
+            value = np.exp(total) - _EPS
+            out[row, column] = min(max(value, min(a, b, c, d)), max(a, b, c, d))
+
+
+@numba.njit(cache=True, nogil=True)
+def _catmull_rom(f, out):
+    """Weights of the four samples round a place that is ``f`` beyond the second: exact for parabolas."""
+    half, one = np.float32(0.5), np.float32(1)
+    out[0] = half * f * (f * (np.float32(2) - f) - one)
+    out[1] = half * (f * f * (np.float32(3) * f - np.float32(5)) + np.float32(2))
+    out[2] = half * f * (f * (np.float32(4) - np.float32(3) * f) + one)
+    out[3] = half * f * f * (f - one)
 
 
 def _consistent(flow: np.ndarray, back: np.ndarray) -> np.ndarray:

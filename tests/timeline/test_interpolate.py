@@ -107,13 +107,43 @@ def test_a_ramp_that_moves_evenly_is_met_exactly():
     """x + 2 y, moved by (3, -1) px: both warps give the same values, whatever their weights."""
     y, x = np.mgrid[:24, :32].astype(np.float32)
     flow = np.broadcast_to(np.float32([3, -1]), (24, 32, 2))
-    a, b = x + 2 * y, (x - 3) + 2 * (y + 1)
+    a, b = x + 2 * y + 9, (x - 3) + 2 * (y + 1) + 9
     out = list(interpolate._between(a, b, 1000, 5000, flow, -flow, 4))
     assert [t for _, t in out] == [2000, 3000, 4000]
     for k, (frame, _) in enumerate(out, 1):
-        exact = (x - 3 * k / 4) + 2 * (y + k / 4)
-        assert np.abs(frame - exact)[6:-6, 6:-6].max() < 0.05  # OpenCV's remap knows 1/32 px
+        exact = (x - 3 * k / 4) + 2 * (y + k / 4) + 9
+        assert np.abs(frame - exact)[6:-6, 6:-6].max() < 0.003  # a straight line in light is no cubic in its logarithm
     assert list(interpolate._between(a, b, 0, 10, flow, -flow, 1)) == []
+
+
+@pytest.mark.parametrize("period, least", [(4, 0.78), (6, 0.93), (12, 0.99)])
+def test_what_moves_by_half_a_pixel_keeps_its_contrast(period, least):
+    """Of waves of ln I; a straight line between pixels keeps cos(pi / period): 0.71, 0.87, 0.97."""
+    x = np.arange(48)[None, :] * np.ones((20, 1))
+    wave = lambda shift: np.exp(0.5 * np.sin(2 * np.pi * (x + 0.25 - shift) / period)).astype(np.float32)
+    flow = np.broadcast_to(np.float32([1, 0]), (20, 48, 2))
+    ((middle, _),) = interpolate._between(wave(0), wave(1), 0, 2, flow, -flow, 2)
+    inner, true = np.log(middle[:, 6:-6]), np.log(wave(0.5)[:, 6:-6])
+    kept = (inner * true).sum() / (true * true).sum()
+    assert least < kept <= 1.01 and kept > np.cos(np.pi / period) + 0.02 * (period < 12)
+
+
+def test_nothing_overshoots_and_still_pixels_stay_as_they_are():
+    """Dark beside light: no value that is not between its neighbours', wherever it is looked up."""
+    rng = np.random.default_rng(0)
+    light = rng.choice([0.0, 1e-4, 0.5, 1.0, 1e4], (20, 24)).astype(np.float32)
+    log, out = np.log(light + np.float32(1e-3)), np.empty_like(light)
+    places = np.stack(np.meshgrid(np.arange(24), np.arange(20)), -1).astype(np.float32)
+    interpolate._look(light, log, places, out)
+    np.testing.assert_array_equal(out, light)
+    moved = places + rng.uniform(-3, 3, places.shape).astype(np.float32)
+    moved[3, 4], moved[5, 6], moved[7, 8] = np.nan, np.inf, -1e30
+    interpolate._look(light, log, moved, out)
+    x, y = np.clip(np.nan_to_num(moved), 0, [23, 19]).transpose(2, 0, 1)
+    around = np.stack(
+        [light[f(y).astype(int), g(x).astype(int)] for f in (np.floor, np.ceil) for g in (np.floor, np.ceil)]
+    )
+    assert (out >= around.min(0)).all() and (out <= around.max(0)).all()
 
 
 def test_pictures_are_blended_by_their_distance_in_time():

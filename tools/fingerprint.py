@@ -1,12 +1,12 @@
 """Compare what BlinkGL writes with the sums that the repository keeps: did a change change anything?
 
-    python -m blinkgl.tools.fingerprint                       # against the sums of this platform; status 1 where bytes differ
+    python -m blinkgl.tools.fingerprint            # against the kept sums; status 1 where bytes differ
     python -m blinkgl.tools.fingerprint --keep                # write the sums of this platform anew
     python -m blinkgl.tools.fingerprint --only wave,v2e       # some cases
 
 ``tests/fingerprint/cases.yaml`` has the cases: small pictures of every feature that a user was promised. The sums lie
-beside it, one file for each platform (:func:`platform_name`), because rasterisers and NumPy versions round differently.
-A sum covers the names and bytes of the files in one folder of the output. ``manifest.json`` and ``config.yaml`` are left
+beside it, one file for each platform (:func:`platform_name`): rasterisers and NumPy versions round differently.
+A sum covers the names and bytes of the files in one folder. ``manifest.json`` and ``config.yaml`` are left
 out: they name versions and every key of the configuration, so that a removed key would change every case.
 """
 
@@ -70,7 +70,7 @@ def table() -> dict[str, Any]:
 
 
 def assets(folder: Path) -> None:
-    """Write the files that cases name: a clip, pictures, a panorama, a trajectory, a skinned mesh with a morph target."""
+    """Write the files that cases name: a clip, pictures, a panorama, a trajectory, a skinned mesh that morphs."""
     clip = folder / "clip" / "image_left"
     clip.mkdir(parents=True)
     y, x = np.mgrid[:36, :48].astype(np.float64)

@@ -348,8 +348,8 @@ def test_a_sequence_that_is_made(tmp_path, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(work.time, "monotonic", lambda: now[0])
 
-    def make(config, index, out, gl, *, base, progress, helper):
-        assert (index, out, gl, base, helper) == (1, str(tmp_path / "out"), None, tmp_path, None)
+    def make(config, index, out, gl, *, base, progress):
+        assert (index, out, gl, base) == (1, str(tmp_path / "out"), None, tmp_path)
         assert config.output.name == "a"
         report = SequenceReport(index, tmp_path / "seq", 0.5, 10, 1000, 7, 3, {"render": 1.5}, 2.0, omissions=("lamp",))
         for step in (1.0, 0.1, 0.15, 0.16, 0.26):  # news after more than a quarter of a second

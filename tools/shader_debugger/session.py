@@ -297,13 +297,10 @@ class ColourLookup(Colour):
 
 @dataclass(frozen=True)
 class WholeShadowMap(ShadowMap):
-    """With all that casts, also what throws its shadow out of the picture."""
+    """Drawn anew, whatever stood still since the last one."""
 
     def stands_still(self, whole: bool) -> bool:
         return False
-
-    def items(self, moment):
-        return [item for item in moment.visible if item.casts]
 
 
 LOOKUPS = {"luminance": LuminanceLookup(), "colour": ColourLookup()}

@@ -27,9 +27,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 
-from blinkgl.config.reader import to_yaml
+from blinkgl.config.reader import read_table, to_yaml
 from blinkgl.config.recipe import merge
 from blinkgl.config.sequence import load_run
 from blinkgl.dataset.generate import generate_run
@@ -66,7 +65,7 @@ def sums(folder: Path) -> dict[str, str]:
 @functools.cache
 def table() -> dict[str, Any]:
     """Return what cases.yaml says."""
-    return yaml.safe_load((HERE / "cases.yaml").read_text(encoding="utf-8"))
+    return read_table(HERE / "cases.yaml")
 
 
 def assets(folder: Path) -> None:

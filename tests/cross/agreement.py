@@ -267,7 +267,6 @@ def of_explanation(told: Explanation, config: SequenceConfig, report: SequenceRe
             f"event frames: explain {told.frames}, made {manifest['frames']}",
         )
     for what, off in (
-        ("level of detail", not config.render.lod.enabled),
         ("anisotropic filtering", config.render.anisotropy == 1),
         ("anti-aliasing of event frames", config.render.antialiasing == "none"),
         ("rates of change in the event frames", config.timeline.reconstruction != "hermite"),

@@ -257,7 +257,6 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "sharp": {"render": {"anisotropy": 4, "mip_bias": -1}},
         "drawn": {"render": {"mip_bias": {"uniform": [-1, 0]}}},
     },
-    "level of detail": {"off": NOTHING, "on": {"render": {"lod": {"enabled": True, "edge_px": 4}}}},
     "light": {
         "lit": NOTHING,
         "unlit": {"scene": {"light": {"unlit": True}}},

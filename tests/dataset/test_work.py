@@ -285,7 +285,7 @@ EXPLAINED = {
         (
             {
                 "timeline": {"kind": "uniform", "fps": 100, "reconstruction": "hermite"},
-                "render": {"antialiasing": "ssaa2", "lod": {"enabled": True}},
+                "render": {"antialiasing": "ssaa2"},
             },
             26,
             4,
@@ -315,8 +315,6 @@ def test_what_each_pass_holds_and_how_often_it_is_drawn(tmp_path, changes, frame
     )
     assert told.seconds_per_simulated_second == pytest.approx(told.seconds / 0.25)
     assert told.scene["bodies"].startswith("3 objects") and told.scene["camera"].endswith(", moving")
-    assert told.scene["triangles"].endswith(" (level of detail: see notes)") == (samples == 4)
-    assert ("level of detail" in dict(told.left_out)) == (samples == 1)
     assert PROBES == 12 and told.machine and "velocity pass" in dict(told.left_out)
     assert ("anti-aliasing of event frames" in dict(told.left_out)) == (samples == 1)
     labels = next(p for p in told.passes if p.name == "labels")

@@ -2,5 +2,5 @@
 
 In:    arrays, parameters, triangles of files.
 Out:   :class:`~blinkgl.scene.types.Mesh`, checked, at the level of detail that is asked for.
-Start: meshes.py (``make_mesh``); primitives.py builds, lod.py and nearest.py simplify.
+Start: meshes.py (``make_mesh``); primitives.py builds.
 """

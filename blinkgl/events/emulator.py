@@ -76,11 +76,6 @@ class Emulator(ABC):
     """Names of the array attributes that make up the state; ``None`` entries are features that are off."""
 
     @classmethod
-    def kind_for(cls, config: Any) -> type[Emulator]:
-        """The class that makes the events of this configuration: this one, unless a key asks for another program."""
-        return cls
-
-    @classmethod
     @abstractmethod
     def response(cls, config: EmulatorConfig) -> Response:
         """How luminance becomes the signal that timelines watch, and how far that moves from event to event."""

@@ -14,7 +14,7 @@ returns exactly passes exactly the same levels.
 
 How it is fast: the logarithm and the comparison with both levels are branch-free loops over blocks that stay in
 the first-level cache; the pixels that fire are then picked out of the block's flags, eight at a time, without branches
-on the data. :mod:`blinkgl.events.reference` is the slow twin.
+on the data. ``tests/events/reference.py`` is the slow twin.
 """
 
 from __future__ import annotations

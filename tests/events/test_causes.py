@@ -52,7 +52,6 @@ def shares(config, seconds: float, slope: float = 0.0, side: int = 30) -> dict[s
         (VoltmeterConfig(**{**STILL, "k4": 2e-5}), 0.0, "leak"),
         (VoltmeterConfig(**{**STILL, "k5": 4e-7}), 0.0, "leak"),
         (VoltmeterConfig(**{**STILL, "k6": 6e-3}), 0.0, "shot"),
-        (VoltmeterConfig(**{**STILL, "k4": 2e-5, "compat": "authors"}), 0.0, "leak"),
     ],
 )
 def test_one_term_alone_is_the_cause(config, slope, cause):

@@ -36,8 +36,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from blinkgl.errors import BlinkGLError
-from blinkgl.events.types import Events
 from blinkgl.io.formats import open_events
+from blinkgl.types.events import Events
 from eflow.config import SourceConfig
 from eflow.data.online import open_online
 from eflow.data.window import Window

@@ -27,13 +27,13 @@ import numpy as np
 
 from blinkgl.config.draw import draw, middle
 from blinkgl.config.sensor import load_sensor
-from blinkgl.events.types import Events
 from blinkgl.io.frames import open_frames, read_any_image
 from blinkgl.recordings.bursts import inside_any
 from blinkgl.recordings.calibration import Calibration, calibrate_events
 from blinkgl.recordings.clip import LOG_OFFSET, Clip, clip_of_frames, read_recording, timed_frames
 from blinkgl.recordings.judge import judge, judge_halves
 from blinkgl.recordings.simulation import emulator_config
+from blinkgl.types.events import Events
 
 Recording = tuple[Events, tuple[int, int], list[tuple[np.ndarray, int, str]], bool]
 """Events, (height, width), frames, and whether their times are the middles of exposures."""

@@ -54,7 +54,7 @@ from blinkgl.config.sensor import sensor_names
 from blinkgl.config.sequence import SequenceConfig, load_run
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.machine.bench import machine_line
-from blinkgl.show.terminal import plain_console
+from blinkgl.machine.terminal import plain_console
 
 DRAWS = 12
 """Sequences drawn of every accepted configuration."""

@@ -299,12 +299,12 @@ def _note(report: Report, task: _Task, index: int, outcome: Outcome, out: Path |
 
 
 def _judged(fmt: Format, folder: Path) -> Outcome:
-    from blinkgl.cli import _user_line
+    from blinkgl.machine.command_line import user_line
 
     try:
         problem = fmt.judge(folder)
     except BaseException as error:  # noqa: BLE001 - a SystemExit would be a defect too
-        line = _user_line(error) if isinstance(error, Exception) else None
+        line = user_line(error) if isinstance(error, Exception) else None
         if line is None:
             return Outcome(TRACEBACK, _place(error), "".join(traceback.format_exception(error))[-6000:])
         if "\n" in line or "\r" in line or len(line) > _LONGEST_LINE or not line.isprintable():

@@ -44,7 +44,7 @@ class Format:
 
 
 def _events(n: int = 400):
-    from blinkgl.events.types import Events
+    from blinkgl.types.events import Events
 
     rng = np.random.default_rng(5)
     t = np.sort(rng.integers(1000, 60_000, n))
@@ -124,8 +124,8 @@ def _as_stored(folder: Path, name: str) -> dict[str, np.ndarray] | None:
 
 def _judge_events(name: str) -> Callable[[Path], str | None]:
     def judge(folder: Path) -> str | None:
-        from blinkgl.events.types import Events
         from blinkgl.io.formats import open_events
+        from blinkgl.types.events import Events
 
         with open_events(folder / name) as file:
             declared = file.height, file.width
@@ -662,9 +662,9 @@ def _make_data_set(folder: Path) -> None:
     from blinkgl.config.sequence import load_run
     from blinkgl.dataset.plan import Plan
     from blinkgl.dataset.run_folder import RunFolder
-    from blinkgl.io.index import write_index
-    from blinkgl.io.sequence_dir import SequenceWriter
     from blinkgl.labels import Flow
+    from blinkgl.sequence_files.index import write_index
+    from blinkgl.sequence_files.sequence_dir import SequenceWriter
 
     (folder / "recipe.yaml").write_text(to_yaml(_RECIPE))
     out = folder / "out"

@@ -44,7 +44,6 @@ from blinkgl.config.sensor import Sensor, fill_sensor, spelled_out
 from blinkgl.config.timeline import DisplacementTimeline, TimelineConfig
 from blinkgl.config.tracks import TracksConfig, check_tracks
 from blinkgl.errors import ConfigError
-from blinkgl.labels import LABELS  # noqa: F401 - whose rows bring the keys of `labels:`
 
 if TYPE_CHECKING:
     from blinkgl.config.recipe import Group

@@ -19,12 +19,12 @@ from blinkgl.dataset.report import Progress, SequenceReport, config_yaml, losses
 from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging.metering import decibels
 from blinkgl.io.frame_camera import ExposureLine
-from blinkgl.io.lens_files import write_lens
-from blinkgl.io.sequence_dir import SequenceWriter, refuse_existing
 from blinkgl.io.tracks import TRACKS
 from blinkgl.labels import LABELS
 from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Item, Picture, Simulation, simulate_sequence
 from blinkgl.sequence.clock import StageClock
+from blinkgl.sequence_files.lens_files import write_lens
+from blinkgl.sequence_files.sequence_dir import SequenceWriter, refuse_existing
 
 
 def generate_run(

@@ -11,10 +11,10 @@ from blinkgl.dataset.plan import sequence_name
 from blinkgl.dataset.preview import PreviewRecorder
 from blinkgl.dataset.report import Progress, SequenceReport, config_yaml
 from blinkgl.gl import GLContext
-from blinkgl.io.rig_dir import RigWriter
 from blinkgl.sequence import EventChunk
 from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.rig import RigSequence, simulate_rig
+from blinkgl.sequence_files.rig_dir import RigWriter
 
 
 def generate_rig(

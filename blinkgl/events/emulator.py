@@ -14,7 +14,7 @@ from blinkgl.events.arith import LOG_MAX_INPUT
 from blinkgl.events.packing import MAX_CAUSE_ROWS, MAX_INTERVAL_NS, PackedBuffer
 from blinkgl.events.response import Response
 from blinkgl.events.threads import run, thread_count
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 
 BLOCK = 1024
 """Pixels a kernel takes in one go: everything about them stays in the first cache levels. Threads get whole blocks."""

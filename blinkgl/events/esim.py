@@ -34,7 +34,7 @@ from blinkgl.events.packing import JIT, T_SHIFT
 from blinkgl.events.philox import Stream, normal2, pixel_counters
 from blinkgl.events.response import Response, smallest_threshold
 from blinkgl.events.threads import take_part
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 
 _I0, _FAR_BELOW = np.int32(0), np.int32(-(2**31))
 _U1000 = np.uint64(1000)

@@ -38,7 +38,6 @@ from blinkgl.events.packing import JIT, T_SHIFT
 from blinkgl.events.philox import Stream
 from blinkgl.events.response import Response, smallest_threshold
 from blinkgl.events.threads import take_part
-from blinkgl.events.types import Events
 from blinkgl.events.v2e_blocks import (
     DRAWS,
     add_scaled_block,
@@ -65,6 +64,7 @@ from blinkgl.events.v2e_model import (
     shot_tables,
 )
 from blinkgl.events.v2e_waves import FLOATS, INTS, emit_waves
+from blinkgl.types.events import Events
 
 _F = np.float32
 _ZERO, _HALF, _JOINT = _F(0), _F(0.5), _F(20.0)

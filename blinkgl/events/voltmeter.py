@@ -42,7 +42,7 @@ from blinkgl.events.packing import CAUSE_SHIFT, JIT, T_SHIFT, cause_of
 from blinkgl.events.philox import Stream, normal2_and_uniform, uniform2
 from blinkgl.events.response import Response
 from blinkgl.events.threads import take_part
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 
 _F = np.float32
 _ZERO, _HALF, _ONE, _I0 = _F(0.0), _F(0.5), _F(1.0), np.int32(0)

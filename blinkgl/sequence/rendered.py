@@ -20,7 +20,6 @@ from blinkgl.errors import EventDataError
 from blinkgl.events import emulator_of
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.truth import Surfaces, SurfaceTruth
-from blinkgl.events.types import Events
 from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging import FrameCamera
 from blinkgl.labels import LABELS, Label, LabelRequest, asked_for
@@ -38,6 +37,7 @@ from blinkgl.sequence.items import GroundTruth, Item, Picture
 from blinkgl.sequence.simulate import Simulation
 from blinkgl.timeline import Timeline, make_timeline
 from blinkgl.timeline.reductions import OfArrays, Reductions
+from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
     from blinkgl.card.tiles import Tiles

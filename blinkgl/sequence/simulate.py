@@ -28,7 +28,6 @@ from blinkgl.camera import CameraModel
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.events.camera import EventCamera
-from blinkgl.events.types import Events, count_causes, named_causes
 from blinkgl.gl import GLContext
 from blinkgl.imaging import FrameCamera
 from blinkgl.render.renderer import Renderer
@@ -38,6 +37,7 @@ from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.inertial import Inertial
 from blinkgl.sequence.items import CameraImage, EventChunk, GroundTruth, Item, Picture
 from blinkgl.timeline import Ticks, Timeline
+from blinkgl.types.events import Events, count_causes, named_causes
 
 if TYPE_CHECKING:
     from blinkgl.card.tiles import Tiles

@@ -10,7 +10,7 @@ from blinkgl.card.kernels import Rounding
 from blinkgl.config.events import V2eConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events import V2e
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 from tests.card.test_frames_on_card import textures
 from tests.events.clips import assert_same, random_clip, run
 from tests.events.reference import ReferenceV2e

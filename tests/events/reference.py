@@ -25,7 +25,7 @@ from blinkgl.events.philox import (
     rough_normal,
     uniform2,
 )
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 
 
 def sorted_events(rows: list[tuple[int, int, int, int, int]], causes: bool) -> Events:

@@ -14,9 +14,9 @@ from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import EventDataError, OutputError
 from blinkgl.events import Events, make_emulator
 from blinkgl.events.camera import EventCamera, EventFrame
-from blinkgl.events.types import Cause, count_causes, named_causes
 from blinkgl.io.formats import WITH_CAUSES, WRITABLE, convert, event_writer, open_events, write_events
 from blinkgl.recordings.simulation import SimulationReport, frames_to_events
+from blinkgl.types.events import Cause, count_causes, named_causes
 from tests.events.clips import assert_same, random_clip, run
 
 MS = 10**6

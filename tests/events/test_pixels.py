@@ -15,7 +15,7 @@ from blinkgl.events.camera import EventCamera, EventFrame
 from blinkgl.events.esim import draw_thresholds
 from blinkgl.events.pixels import Latency, PixelNoise
 from blinkgl.events.readout import Readout
-from blinkgl.events.types import Cause
+from blinkgl.types.events import Cause
 from tests.events.clips import assert_same, run
 from tests.events.reference import ReferenceEsim, ReferenceV2e
 

@@ -13,7 +13,6 @@ from blinkgl.camera import PinHole
 from blinkgl.config.sequence import RenderConfig, RunTemplate
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.errors import AssetError, EventDataError
-from blinkgl.io.sequence_dir import verify_sequence
 from blinkgl.labels import LABELS, LabelRequest
 from blinkgl.render import renderer as module
 from blinkgl.render.passes import Geometry
@@ -22,6 +21,7 @@ from blinkgl.scene.geometry import primitives
 from blinkgl.scene.geometry.meshes import faces_in_float32
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Light, Material, Part, SceneObject, Texture
+from blinkgl.sequence_files.sequence_dir import verify_sequence
 from tests.extremes.measures import FACING
 from tests.render.render_scenes import LEVEL, cube, drift, mesh, quad, rig, scene, smooth_texture, still, thing
 from tests.shared_data import shared

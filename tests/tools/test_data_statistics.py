@@ -11,8 +11,8 @@ pytest.importorskip("torch")
 from tiny_recipe import TINY
 
 from blinkgl.config.reader import to_yaml
-from blinkgl.events.types import Events
 from blinkgl.tools import data_statistics as ds
+from blinkgl.types.events import Events
 from eflow.data.window import Window
 
 

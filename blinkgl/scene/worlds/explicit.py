@@ -217,7 +217,7 @@ def _check_speeds(
 
 def _on_body(given: Any, where: str, base: Path) -> np.ndarray:
     """(4, 4) T_body_sensor, of a matrix or of EuRoC's sensor.yaml."""
-    from blinkgl.io.camchain import read_place_on_body
+    from blinkgl.config.camchain import read_place_on_body
 
     if not isinstance(given, str):
         return rigid_matrix(given)

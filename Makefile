@@ -3,7 +3,7 @@
 # make lint    ruff, formatting, types; what the tests last covered      make format  rewrite what the formatter would; make coverage
 # make docs    install into .venv, build the documentation into out/site
 # make slow    the tests that take long       make bench   the benchmarks
-# make fuzz    damaged files and strange configurations (an hour)      make mutate   are there tests that notice a wrong line?
+# make fuzz    damaged files (minutes)
 # make clean   remove what was built (not .venv, not out/)
 #
 # PYTHON=python3.12 chooses the interpreter .venv is made with, JOBS=4 the number of test processes.
@@ -16,7 +16,7 @@ COVERED = if [ -f .coverage ]; then .venv/bin/python -m coverage report --sort=c
 	else echo "coverage: not measured here yet (make coverage)"; fi
 INPUTS = setup.cfg pyproject.toml constraints.txt tools/setup.sh Makefile
 
-.PHONY: demo test lint format coverage docs slow bench fuzz mutate doctor setup opengl clean
+.PHONY: demo test lint format coverage docs slow bench fuzz doctor setup opengl clean
 .DELETE_ON_ERROR:
 
 demo: .venv/.kernels opengl
@@ -52,13 +52,8 @@ slow: .venv/.installed-dev opengl
 bench: .venv/.installed-dev opengl
 	@for program in tools/bench_*.py; do echo "== $$program"; .venv/bin/python $$program || exit 1; done
 
-fuzz: .venv/.installed-dev opengl
-	.venv/bin/python -m blinkgl.tools.fuzz_files --mutants 1000 --out out/fuzz/files --json out/fuzz/files.json
-	.venv/bin/python -m blinkgl.tools.fuzz_configs --count 10000 --runs 300 --out out/fuzz/configs --json out/fuzz/configs.json
-
-mutate: .venv/.installed-dev opengl
-	.venv/bin/python -m blinkgl.tools.mutate --map
-	.venv/bin/python -m blinkgl.tools.mutate --count 200 --seed 1 --out out/mutants.json
+fuzz: .venv/.installed-dev
+	.venv/bin/python -m blinkgl.tools.fuzz --mutants 1000
 
 doctor: .venv/.installed-core
 	.venv/bin/blinkgl doctor

@@ -2,13 +2,14 @@
 # make test    install into .venv, check OpenGL, run the tests
 # make lint    ruff, formatting, types; what the tests last covered      make format  rewrite what the formatter would; make coverage
 # make docs    install into .venv, build the documentation into out/site
-# make slow    the tests that take long       make bench   the benchmarks
+# make slow    the tests that take long       make bench WHAT=events   a benchmark
 # make fuzz    damaged files (minutes)
 # make clean   remove what was built (not .venv, not out/)
 #
 # PYTHON=python3.12 chooses the interpreter .venv is made with, JOBS=4 the number of test processes.
 
 JOBS ?= auto
+WHAT ?= generate
 PIP = .venv/bin/python -m pip --disable-pip-version-check
 # setuptools warns about every editable install beside a folder of the same name; that is the layout wanted here.
 INSTALL = PYTHONWARNINGS=ignore $(PIP) install --quiet --no-build-isolation -c constraints.txt
@@ -50,7 +51,7 @@ slow: .venv/.installed-dev opengl
 	.venv/bin/python -m pytest -q -m slow
 
 bench: .venv/.installed-dev opengl
-	@for program in tools/bench_*.py; do echo "== $$program"; .venv/bin/python $$program || exit 1; done
+	.venv/bin/python -m blinkgl.tools.bench $(WHAT)
 
 fuzz: .venv/.installed-dev
 	.venv/bin/python -m blinkgl.tools.fuzz --mutants 1000

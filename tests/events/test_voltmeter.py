@@ -16,8 +16,8 @@ from blinkgl.events import DvsVoltmeter, Events
 from blinkgl.events.philox import normal_and_uniform
 from blinkgl.events.reference import ReferenceVoltmeter
 from blinkgl.events.voltmeter import crosses, hitting_time, on_first, one_minus_exp, reached, start_voltage
-from blinkgl.tools.noise_laws import exit_survival
 from tests.events.clips import assert_same, random_clip, run
+from tests.events.noise_laws import exit_survival
 from tests.events.test_esim import threads  # noqa: F401  (fixture)
 
 MS = 10**6

@@ -87,7 +87,7 @@ def test_data_flows_one_way():
 
 FILLED_IN_LATER = set(
     """
-    Collected Comparison Displacement Document DrawItem Example Explanation Level Measured Omissions Outcome Parameter
+    Collected Comparison Cost Displacement Document DrawItem Example Explanation Level Measured Omissions Outcome Parameter
     Pool RenderStats SequenceReport RecordingSide SimulationReport StreamStats Totals Verification _Body
 """.split()
 )

@@ -23,7 +23,7 @@ are whole nanoseconds where theirs are float32 seconds; the size of the photorec
 frame spacing where theirs is estimated once from 300 thresholds and a simulation, and kept while spacings change by
 less than a tenth; where frames are two time constants of the low-pass apart and more, their photoreceptor noise grows
 without end, and here it is white. Ties: an event at the very end of a dead time, which their rounding decides, is
-dropped. ``python -m blinkgl.tools.peer_v2e`` runs their program beside this one,
+dropped. ``tools/peer_v2e.py`` of 348eebef ran their program beside this one,
 with the same draws: the same events.
 """
 

@@ -1,6 +1,6 @@
 """V2E with `compat: authors`: kernel = slow twin = the published recursion, its noise by closed forms, refusals.
 
-``tools/peer_v2e.py`` compares it with their program itself, event by event, where that is at hand.
+``tools/peer_v2e.py`` of 348eebef compared it with their program itself, event by event.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@
 #   docker build --target nvidia -t blinkgl:nvidia .
 #   docker run --rm --gpus all -v "$PWD/out:/work/out" blinkgl:nvidia doctor
 #
-# Its steps are checked in a bare Debian without Docker: python -m blinkgl.tools.recipe --root FOLDER (docs/install.md).
+# tests/test_packaging.py compares what it installs with tools/setup.sh.
 
 FROM debian:bookworm-slim AS cpu
 ENV DEBIAN_FRONTEND=noninteractive PIP_DISABLE_PIP_VERSION_CHECK=1 PATH=/opt/blinkgl/venv/bin:$PATH

@@ -116,8 +116,8 @@ def test_imports_lead_down():
 
 FILLED_IN_LATER = set(
     """
-    Collected Comparison Displacement Document DrawItem Example Explanation Level Measured Omissions Outcome Parameter
-    Pool RenderStats SequenceReport RecordingSide SimulationReport StreamStats Totals Verification _Body
+    Collected Comparison Cost Displacement Document DrawItem Example Explanation Level Measured Omissions Outcome
+    Parameter Pool RenderStats SequenceReport RecordingSide SimulationReport StreamStats Totals Verification _Body
 """.split()
 )
 """Records that are written to while they are made. All others are values: who holds one may count on it."""

@@ -2,5 +2,5 @@
 
 In:    the repository, the package as anybody would use it.
 Out:   figures, pages, exit statuses.
-Start: fingerprint.py (did a change change any byte?), bench_generate.py, shader_debugger/.
+Start: fingerprint.py (did a change change any byte?), bench.py, shader_debugger/.
 """

@@ -28,7 +28,7 @@ from blinkgl.events import Esim, Events, V2e
 from blinkgl.events.table import emulator_of
 from blinkgl.gl import GLContext, create_context
 from blinkgl.machine import bench
-from blinkgl.tools.bench_events import HEIGHT, WIDTH, clip
+from blinkgl.tools.bench import HEIGHT, WIDTH, clip
 
 VARIANTS: dict[str, EmulatorConfig] = {
     "default": EsimConfig(),
@@ -85,7 +85,7 @@ def measure(gl: GLContext, frames: int, only: str) -> None:
     )
     print("|---|---|---|---|---|---|---|---|")
     for name in ("still", "mid", "dense"):
-        pictures = np.zeros((frames + 4, HEIGHT, WIDTH), np.uint8) if name == "still" else clip(name, frames + 4)[0]
+        pictures = np.zeros((frames + 4, HEIGHT, WIDTH), np.uint8) if name == "still" else clip(name, frames + 4)
         pictures = (pictures / 255.0).astype(np.float32)
         for variant, config in VARIANTS.items():
             if only not in variant:

@@ -37,7 +37,7 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.show import checks as doctor
 from blinkgl.timeline.reductions import OfArrays
 from blinkgl.tools import bench_accuracy
-from blinkgl.tools.bench_generate import probe_scene
+from blinkgl.tools.bench import pace, probe_scene
 
 if TYPE_CHECKING:
     from blinkgl.tools.gpu_suite import Rows
@@ -569,13 +569,11 @@ class Online(Piece):
 
     @classmethod
     def run(cls, rows: Rows, options: Namespace) -> None:
-        from blinkgl.tools import bench_online
-
         recipe = str(resources.files("blinkgl.configs") / "eflow" / "real_data.yaml")
         for workers in (1,) if options.small else (1, 2, 4, 8):
             for step_ms in (0.0,) if options.small else (0.0, 10.0, 25.0):
                 if (key := f"{workers} workers, steps of {step_ms:g} ms") not in rows:
-                    found = bench_online.pace(recipe, workers, step_ms, 20 if options.small else 300)
+                    found = pace(recipe, workers, step_ms, 20 if options.small else 300)
                     names = ("samples_per_s", "waited", "render_ms", "failures")
                     rows.add(key, **{name: found[name] for name in names})
 

@@ -1,4 +1,4 @@
-"""Noise is that of the stated equations at any frame rate: distribution tests of ``tools/noise_laws.py``'s cases.
+"""Noise is that of the stated equations at any frame rate: distribution tests of ``noise_laws.py``'s cases.
 
 Every p-value is held to 1e-4, with fixed seeds; there are 120, so an emulator that is right would have failed one
 choice of seeds in 80.
@@ -11,8 +11,8 @@ import pytest
 
 from blinkgl.config.events import V2eConfig, VoltmeterConfig
 from blinkgl.events import DvsVoltmeter, V2e
-from blinkgl.tools.noise_laws import FRAMES, Case, cases, judge, shot_rate, v2e_law, voltmeter_law, watch
 from tests.events.clips import run
+from tests.events.noise_laws import FRAMES, Case, cases, judge, shot_rate, v2e_law, voltmeter_law, watch
 
 SIDE, LEAST_P = 40, 1e-4
 CASES = cases()

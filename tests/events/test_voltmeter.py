@@ -14,8 +14,8 @@ from blinkgl.config.events import VoltmeterConfig
 from blinkgl.events import DvsVoltmeter, Events
 from blinkgl.events.philox import normal2_and_uniform
 from blinkgl.events.voltmeter import crosses, hitting_time, one_minus_exp, reached, start_voltage
-from blinkgl.tools.noise_laws import exit_survival
 from tests.events.clips import assert_same, random_clip, run
+from tests.events.noise_laws import exit_survival
 from tests.events.reference import ReferenceVoltmeter
 from tests.events.test_esim import threads  # noqa: F401  (fixture)
 

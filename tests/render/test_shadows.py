@@ -19,8 +19,8 @@ from blinkgl.render.shadows import Box, scale_of
 from blinkgl.scene.lights import lamp_pose
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.types import Lamp, Light, Material, Part, SceneObject
-from blinkgl.tools.shadow_faults import faults, frame as random_frame
 from render_scenes import LEVEL, SECOND, cube, curve, drift, quad, rig, scene, sphere, still, thing
+from shadow_faults import faults, frame as random_frame
 
 PLAIN = RenderConfig(image_antialiasing="none")
 SEEN = ShadowMap.seen
@@ -253,7 +253,7 @@ def test_the_rate_keeps_to_what_is_lit(gl):
 
 @pytest.mark.parametrize("frames", [4, pytest.param(200, marks=pytest.mark.slow)])
 def test_faults_over_random_frames(gl, frames):
-    """Counted against rays cast in float64 (`python -m blinkgl.tools.shadow_faults`)."""
+    """Counted against rays cast in float64."""
     rng = np.random.default_rng(0)
     graded, acne, floating = np.array([faults(gl, random_frame(rng, 1024)) for _ in range(frames)]).T
     assert graded.min() > 1000

@@ -11,14 +11,38 @@ import pytest
 
 from blinkgl.gl import ShaderLoader
 from blinkgl.render.passes import ScenePass
-from blinkgl.tools.mutate import Mutant
-from blinkgl.tools.shader_debugger import moments, session
+from blinkgl.tools.shader_debugger import compare, moments, session
 from blinkgl.tools.shader_debugger.session import moment, open_renderer, open_subject
-from blinkgl.tools.shader_mutants import Judge, judged
 from debugger_scene import edit
 
 LIT = str(Path(__file__).with_name("lit.yaml"))
+LOOKUPS = {f"{of}_{name}" for of in ("luminance", "colour") for name in moments.LOOKUPS[:3]}
 TERMS = ("direct", "shadow", "around", "mirrored", "emission")
+
+
+class Judge:
+    """Names the buffers of one moment that are over their tolerance with other shaders."""
+
+    def __init__(self, renderer, subject, when):
+        self.renderer, self.when, self.log_eps = renderer, when, subject.log_eps
+        self.right = moments.GpuMoment(renderer, when, subject.log_eps)
+        self.comparison = compare.Comparison(self.right, moments.open_reference(subject, when, renderer.maps))
+
+    def wrong(self, loader: ShaderLoader) -> list[str]:
+        """Those of the first pass that has one."""
+        gpu = moments.GpuMoment(self.renderer, self.when, self.log_eps)
+        gpu.keep(self.right, ("part", "triangle", "local"))
+        comparison = self.comparison.of(gpu)
+        ours = self.renderer.gl.shaders
+        self.renderer.use_shaders(loader)
+        try:
+            for of in ("shadow_map", "luminance", "colour"):
+                names = [n for n in comparison.names() if n.startswith(of) and n not in LOOKUPS]
+                if found := [n for n in names if not comparison.report(n).passed]:
+                    return found
+            return []
+        finally:
+            self.renderer.use_shaders(ours)
 
 
 @pytest.fixture(scope="module")
@@ -149,22 +173,3 @@ def test_a_map_that_is_drawn_from_the_front_is_found_in_itself(shader, lit, monk
     monkeypatch.setattr(session.WholeShadowMap, "paint", ScenePass.paint)
     status, out, _ = shader("diff", lit, "--json", "--pass", "shadow_map_0")
     assert status == 1 and json.loads(out)["first"]["buffer"] == "shadow_map_0"
-
-
-@pytest.mark.slow
-def test_mutants_of_every_file_die(judge, shaders):
-    """One of each, by a term of its own; and what changes nothing lives."""
-    judge.right.renderer.gl.make_current()
-    for name, line, column, before, after, term in (
-        ("lights", "sum += facing * beam.strength", 15, "*", "/", "luminance_light"),
-        ("shadows", "c.z = max(c.z", 7, "max", "min", "luminance_shadow"),
-        ("surface", "edge = edge * edge * edge", 19, "*", "/", "luminance_mirrored"),
-        ("shadows", "float SPARE = 0.25", 14, "0.25", "0.2501", ""),
-    ):
-        path = f"shaders/include/{name}.glsl"
-        rows = (shaders / "include" / f"{name}.glsl").read_text().splitlines()
-        row = next(k for k, text in enumerate(rows) if line in text)
-        assert (f"include/{name}.glsl", row + 1) in judge.compiled
-        start = rows[row].index(line) + column
-        mutant = Mutant(path, row + 1, rows[row].index(before, start - 2) + 1, before, after, "")
-        assert judged(judge, shaders, mutant) == term, mutant.name

@@ -1,19 +1,15 @@
 """Where a surface that shines looks at its surroundings: the table ``_LOOKS`` of ``blinkgl/scene/surfaces/gloss.py``.
 
-    python -m blinkgl.tools.fit_gloss [--seed 1] [--frames 130] [--iterations 220]
-
 A lobe seen from aside is no lobe seen along the normal, which is what surroundings are blurred by: it is longer in the
 plane of eye and normal, and cut off at the horizon. Two looks at blurred surroundings, in two directions in that plane
 and at two roughnesses, stand for it. For each roughness and cosine their directions, roughnesses and weights are those
 that come nearest to the integral over the lobe, in float64, by the mean of relative differences, over made-up
-surroundings (a horizon, patches, windows) and random ways to face them. Prints the table, in thousandths; the mean
-differences in per cent go to standard error. About three minutes of a core.
+surroundings (a horizon, patches, windows) and random ways to face them.
+``fitted(default_rng(1), pictures, levels, 130, 220)`` of three surroundings made the table, in thousandths.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Container
 
 import numpy as np
@@ -142,7 +138,6 @@ def fitted(
             ]
             best = min(found, key=lambda one: one.fun)
             table[j, i] = _allowed(best.x)
-            print(f"roughness {roughness:.3f} cosine {cosine:.3f}: {100 * best.fun:.2f} %", file=sys.stderr, flush=True)
     table[0] = table[1]  # a mirror looks once
     table[0, :, [0, 2]], table[0, :, [1, 3]] = 1.0, 0.0
     return table
@@ -154,22 +149,3 @@ def _allowed(cell: np.ndarray) -> np.ndarray:
         np.clip(first, 0.0, 1.5), np.clip(r1, 0, 1), np.clip(second, 0.0, min(first, 1.5)), np.clip(r2, 0, 1),
         np.clip(weight, 0.05, 0.95),
     ])  # fmt: skip
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seed", type=int, default=1, help="of the surroundings and the ways to face them")
-    parser.add_argument("--frames", type=int, default=130, help="ways to face them, of each cell")
-    parser.add_argument("--iterations", type=int, default=220, help="of the search, of each cell")
-    options = parser.parse_args()
-    rng = np.random.default_rng(options.seed)
-    made = [surroundings(rng) for _ in range(3)]
-    picture, levels = np.concatenate(made, axis=2), np.concatenate([gloss.blurred(one) for one in made], axis=3)
-    table = fitted(rng, picture, levels, options.frames, options.iterations)
-    for row in np.rint(1000 * table).astype(int):
-        for half in (row[: gloss.COSINES // 2], row[gloss.COSINES // 2 :]):
-            print("    " + "  ".join(" ".join(map(str, cell)) for cell in half))
-
-
-if __name__ == "__main__":
-    main()

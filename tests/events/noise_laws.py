@@ -1,26 +1,18 @@
 """Noise of the emulators against the equations that they state, at any frame rate.
 
-    python -m blinkgl.tools.noise_laws [--quick] [--json FILE]
-
 An even scene, still or on a ramp, is watched at 50, 500 and 5,000 frames/s and at uneven steps (log-uniform from 0.1
 to 40 ms), and what comes out is compared with the law of the stated equation, which is exact and knows no frames: the
 rate per pixel; the interval between two events of a pixel (Kolmogorov-Smirnov distance and its probability); its
-spread; the wait for the first event, which says whether the start is that of a scene watched for long. A row of the
-table that is flat from column to column is noise that does not depend on the frames.
-``tests/events/test_noise_laws.py`` holds the same cases to error probabilities.
+spread; the wait for the first event, which says whether the start is that of a scene watched for long.
+``test_noise_laws.py`` holds the cases to error probabilities.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 from scipy import integrate, stats
 
 from blinkgl.config.events import EmulatorConfig, EsimConfig, V2eConfig, VoltmeterConfig
@@ -228,38 +220,3 @@ def judge(events: Events, case: Case, side: int) -> Seen:
         float(events.p.mean()),
         len(events),
     )
-
-
-def sweep(side: int, seed: int = 3) -> Iterator[tuple[str, str, Case, Seen]]:
-    """(case, column, the case itself, what was seen)."""
-    for name, case in cases().items():
-        for column, fps in FRAMES.items():
-            yield name, column, case, judge(watch(case, fps, side, seed), case, side)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="fewer pixels")
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
-    options = parser.parse_args()
-    side = 30 if options.quick else 100
-    table = Table(title=f"{side * side} pixels; law | " + " | ".join(f"{c} frames/s" for c in FRAMES))
-    for column in ("noise", "what", "law", *FRAMES):
-        table.add_column(column)
-    seen: dict[str, dict[str, Seen]] = {}
-    for name, column, _, result in sweep(side):
-        seen.setdefault(name, {})[column] = result
-    for name, row in seen.items():
-        some = next(iter(row.values()))
-        table.add_row(name, "rate, Hz", f"{some.rate_law:.2f}", *(f"{r.rate:.2f}" for r in row.values()))
-        table.add_row("", "spread of intervals", f"{some.cv_law:.3f}", *(f"{r.interval_cv:.3f}" for r in row.values()))
-        table.add_row("", "intervals, KS (p)", "", *(f"{r.interval_ks:.4f} ({r.interval_p:.2f})" for r in row.values()))
-        table.add_row("", "first event, KS (p)", "", *(f"{r.first_ks:.4f} ({r.first_p:.2f})" for r in row.values()))
-    Console(width=140).print(table)
-    if options.json:
-        figures = {name: {column: r._asdict() for column, r in row.items()} for name, row in seen.items()}
-        options.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()

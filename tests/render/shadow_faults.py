@@ -1,7 +1,5 @@
 """Acne and floating, counted: shadows of random frames against rays cast in float64.
 
-    python -m blinkgl.tools.shadow_faults [--frames 200] [--size 1024] [--seed 0]
-
 Each frame has a sun of its own, a ball, a box, an open sheet and a standing box over a floor. Of the pixels that
 the sun could light, off silhouettes and more than two pixels from the edge of a shadow: how many are dark and should be
 lit (acne), how many lit and should be dark (floating). The sheet, which is in its own way, is the hard case.
@@ -9,7 +7,6 @@ lit (acne), how many lit and should be dark (floating). The sheet, which is in i
 
 from __future__ import annotations
 
-import argparse
 import math
 from dataclasses import replace
 
@@ -18,7 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import PinHole
 from blinkgl.config.sequence import RenderConfig
-from blinkgl.gl import create_context
 from blinkgl.render import reference
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.geometry.primitives import cuboid, grid, icosphere
@@ -68,23 +64,3 @@ def faults(gl, scene: Scene) -> tuple[int, int, int]:
     graded = ref.hit & ~edge & (sun > 0.05)
     share = (seen - (open_ - sun)) / np.maximum(sun, 1e-9)
     return int(graded.sum()), int((graded & ~dark & (share < 0.9)).sum()), int((graded & dark & (share > 0.1)).sum())
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--frames", type=int, default=200)
-    parser.add_argument("--size", type=int, default=1024, help="of the shadow map, texels")
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    rng = np.random.default_rng(options.seed)
-    with create_context() as gl:
-        counts = np.array([faults(gl, frame(rng, options.size)) for _ in range(options.frames)])
-    graded, acne, floating = counts.sum(axis=0)
-    worst = (counts[:, 1:] / counts[:, :1]).max(axis=0)
-    shares = f"acne {acne / graded:.1e}, floating {floating / graded:.1e}"
-    print(f"{options.frames} frames, {graded:,} pixels: {shares}")
-    print(f"in the worst frame: {worst[0]:.1e}, {worst[1]:.1e}")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,11 +1,11 @@
-"""The Blender side of ``peer_cycles.py``: reads a scene from two plain files, path-traces
+"""The Blender side of ``blinkgl/trade/cycles.py``: reads a scene from two plain files, path-traces
 its frames, writes them as .npy.
 
-    python cycles_worker.py FOLDER        FOLDER/job.json, FOLDER/job.npz in; FOLDER/000000.npy … out
+    python trace.py FOLDER        FOLDER/job.json, FOLDER/job.npz in; FOLDER/000000.npy … out
 
 A program of its own that needs nothing but numpy and ``bpy``, and imports nothing of BlinkGL: Blender is GPL, so it
 stays in another process, and possibly in another interpreter, and only files pass between the two.
-``peer_cycles.export`` describes them.
+``blinkgl.trade.cycles.export`` describes them.
 
 Standard output carries one JSON object per line: ``{"blender", "setup_s", "setup_cpu_s"}`` when the scene stands,
 ``{"frame", "wall_s", "cpu_s"}`` after each frame (rendering alone, without writing the file), or ``{"error"}`` with a
@@ -19,6 +19,7 @@ import os
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -26,6 +27,7 @@ FAR = 1e8  # far plane, world units: where Blender's picture ends, which BlinkGL
 
 
 def main(folder: Path) -> int:
+    """Renders the job of a folder; the exit status."""
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # Blender and its libraries print to standard output from C
 
@@ -67,7 +69,7 @@ def main(folder: Path) -> int:
     return 0
 
 
-def expose(scene, things: list, poses: np.ndarray) -> None:
+def expose(scene: Any, things: list, poses: np.ndarray) -> None:
     """The shutter is open, evenly, from the first to the last of (things, M, 4, 4) poses, which are evenly spaced in
     time; in between Blender's own interpolation."""
     count = poses.shape[1]
@@ -95,7 +97,7 @@ def expose(scene, things: list, poses: np.ndarray) -> None:
     render.motion_blur_shutter_curve.update()
 
 
-def place(thing, pose: np.ndarray) -> None:
+def place(thing: Any, pose: np.ndarray) -> None:
     """Through a quaternion made here in float64: Blender takes float32."""
     thing.location = pose[:3, 3]
     thing.rotation_quaternion = quaternion(pose[:3, :3])
@@ -119,7 +121,7 @@ def quaternion(R: np.ndarray) -> np.ndarray:
     return q / np.linalg.norm(q)
 
 
-def read_exr(bpy, path: Path, width: int, height: int) -> np.ndarray:
+def read_exr(bpy: Any, path: Path, width: int, height: int) -> np.ndarray:
     """(H, W, 3) float32 linear radiance, row 0 at the top."""
     image = bpy.data.images.load(str(path))
     image.colorspace_settings.name = "Non-Color"
@@ -132,7 +134,7 @@ def read_exr(bpy, path: Path, width: int, height: int) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------------------- scene
 
 
-def build(bpy, job: dict, arrays: dict):
+def build(bpy: Any, job: dict, arrays: dict) -> Any:
     """(scene, objects in the order of the job's bodies, lamps in its order, camera)."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
@@ -170,7 +172,8 @@ def build(bpy, job: dict, arrays: dict):
     return scene, bodies, lamps, camera
 
 
-def make_mesh(bpy, k: int, arrays: dict):
+def make_mesh(bpy: Any, k: int, arrays: dict) -> Any:
+    """Mesh ``k`` with its normals, texture coordinates and colours."""
     mesh = bpy.data.meshes.new(f"mesh {k}")
     faces = arrays[f"faces{k}"]
     mesh.from_pydata(arrays[f"vertices{k}"], [], faces, shade_flat=False)
@@ -187,7 +190,7 @@ def make_mesh(bpy, k: int, arrays: dict):
     return mesh
 
 
-def make_material(bpy, paint: dict, k: int, images: dict, arrays: dict, even_sky: list[float]):
+def make_material(bpy: Any, paint: dict, k: int, images: dict, arrays: dict, even_sky: list[float]) -> Any:
     """Unlit: emission that only the camera sees. Lit: a diffuse BSDF, and albedo * even_sky * (0.5 + 0.5 n_z) as
     emission, or a principled one. Culled: nothing where the camera sees a back face."""
     material = bpy.data.materials.new(f"material {k}")
@@ -286,7 +289,7 @@ def make_material(bpy, paint: dict, k: int, images: dict, arrays: dict, even_sky
     return material
 
 
-def picture_of(bpy, tree, k: int, images: dict, arrays: dict):
+def picture_of(bpy: Any, tree: Any, k: int, images: dict, arrays: dict) -> Any:
     """A node that looks texture k up, bilinear, repeated."""
     picture = tree.nodes.new("ShaderNodeTexImage")
     picture.image = images.get(k) or images.setdefault(k, make_image(bpy, f"texture{k}", arrays))
@@ -294,7 +297,7 @@ def picture_of(bpy, tree, k: int, images: dict, arrays: dict):
     return picture
 
 
-def make_image(bpy, name: str, arrays: dict):
+def make_image(bpy: Any, name: str, arrays: dict) -> Any:
     """Linear float texels, used as they are; Blender's row 0 is the bottom one."""
     texels = arrays[name][::-1]
     height, width, _ = texels.shape
@@ -306,7 +309,7 @@ def make_image(bpy, name: str, arrays: dict):
     return image
 
 
-def make_light(bpy, scene, job: dict, panorama: np.ndarray | None, sky: float) -> None:
+def make_light(bpy: Any, scene: Any, job: dict, panorama: np.ndarray | None, sky: float) -> None:
     """Sun without extent, and a dome that is of one colour above the horizon and black below: without anything in
     between it gives an upward-facing share of 0.5 + 0.5 n_z, exactly BlinkGL's sky; or a panorama. The camera sees
     the background instead of the dome.
@@ -361,7 +364,7 @@ def make_light(bpy, scene, job: dict, panorama: np.ndarray | None, sky: float) -
         link(fog_nodes(tree, *job["fog"]).outputs[0], out.inputs["Volume"])
 
 
-def fog_nodes(tree, density: float, radiance: float):
+def fog_nodes(tree: Any, density: float, radiance: float) -> Any:
     """What swallows and sends light between the camera and what it sees, and is not there for rays to lamps: from the
     camera L becomes L e^(-density d) + radiance (1 - e^(-density d))."""
     add, link = tree.nodes.new, tree.links.new
@@ -379,7 +382,7 @@ def fog_nodes(tree, density: float, radiance: float):
     return both
 
 
-def make_lamp(bpy, scene, lamp: dict, shadows: bool):
+def make_lamp(bpy: Any, scene: Any, lamp: dict, shadows: bool) -> Any:
     """A strength is the radiance of a white surface that faces it, of a point or spot light 1 unit away: an irradiance
     of pi times that, and a power of 4 pi² times that, which Blender sends to all sides, whatever the cone."""
     light = bpy.data.lights.new(lamp["kind"], lamp["kind"].upper())
@@ -407,7 +410,8 @@ def turn_z_to(axis: np.ndarray) -> np.ndarray:
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-def make_camera(bpy, scene, job: dict):
+def make_camera(bpy: Any, scene: Any, job: dict) -> Any:
+    """The scene's camera, with its lens."""
     lens = bpy.data.cameras.new("camera")
     for name, value in job["blender_camera"].items():
         setattr(scene.render if name.startswith("pixel_aspect") else lens, name, value)
@@ -424,7 +428,7 @@ def make_camera(bpy, scene, job: dict):
     return camera
 
 
-def adjust(scene, settings: dict) -> None:
+def adjust(scene: Any, settings: dict) -> None:
     """Plain radiance in 32-bit floats: no view transform, no denoiser, no clamping, no
     adaptive sampling; a box of one pixel."""
     render = scene.render
@@ -437,12 +441,6 @@ def adjust(scene, settings: dict) -> None:
     render.dither_intensity = 0.0
     if settings["threads"]:
         render.threads_mode, render.threads = "FIXED", settings["threads"]
-    if settings["engine"] == "eevee":
-        render.engine = "BLENDER_EEVEE_NEXT"
-        scene.eevee.taa_render_samples = settings["samples"]
-        scene.eevee.use_shadows = settings["shadows"]
-        render.filter_size = 0.5
-        return
     render.engine = "CYCLES"
     cycles = scene.cycles
     cycles.device = "CPU"

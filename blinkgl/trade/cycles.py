@@ -7,7 +7,7 @@
     cost.wall_s, cost.cpu_s      # per frame
 
 Blender's Python module ``bpy`` (extra [cycles]) is GPL and wants NumPy 1: it is never imported here. The scene is
-written to a folder as plain files (:func:`export`), and ``cycles_worker.py`` renders it in a process of its own
+written to a folder as plain files (:func:`export`), and ``blender/inside/trace.py`` renders it in a process of its own
 (:mod:`blinkgl.blender.process`).
 
 The same picture, as far as two renderers can make it:
@@ -33,8 +33,6 @@ The same picture, as far as two renderers can make it:
 * What stays different: shading normals that point away from the side that is lit are treated more strictly by a path
   tracer (dark terminators on coarse smooth meshes), the picture ends at a far plane (1e8 units), and a path-traced
   frame is noisy: the same seed in every frame keeps the noise of still surfaces still.
-* EEVEE is here for its speed and for unlit pictures: its filter is narrow but not a box, and of
-  its lit pictures nothing is claimed.
 """
 
 from __future__ import annotations
@@ -58,7 +56,7 @@ from blinkgl.scene.types import Material, Scene
 
 KEYS = 17
 """Poses of what moves, from the beginning of an exposure to its end."""
-WORKER = Path(__file__).with_name("cycles_worker.py")
+WORKER = Path(__file__).parents[1] / "blender" / "inside" / "trace.py"
 # OpenCV's camera looks along +z with y down, Blender's along -z with y up.
 CV_FROM_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -68,7 +66,7 @@ class CyclesSettings:
     """samples : paths per pixel.   seed : of all frames.   shadows : of sun and dome; False
     needs bounces=0.   occlusion : of the dome by what stands around, where there are shadows; False needs bounces=0.
     bounces : of diffuse light.
-    engine : "cycles" or "eevee" (bounces and seed do nothing there).   threads : 0 for all.
+    threads : 0 for all.
     lens : of ``images``; None: a pin-hole.   exposure_ns : from each frame's time on; 0: an instant."""
 
     samples: int = 64
@@ -76,7 +74,6 @@ class CyclesSettings:
     shadows: bool = True
     occlusion: bool = True
     bounces: int = 4
-    engine: str = "cycles"
     threads: int = 0
     lens: LensConfig | None = None
     exposure_ns: int = 0
@@ -93,8 +90,6 @@ class CyclesSettings:
                 raise ConfigError(
                     "out of range", where=f"cycles.{name}", value=getattr(self, name), accepted=f"{low} to {high}"
                 )
-        if self.engine not in ("cycles", "eevee"):
-            raise ConfigError("unknown engine", where="cycles.engine", value=self.engine, accepted="cycles or eevee")
         if self.bounces and not (self.shadows and self.occlusion):
             raise ConfigError(
                 "light that passes through everything cannot bounce",
@@ -190,6 +185,8 @@ def export(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings, fold
     Blender's spot lights fade otherwise between the inner and the outer angle.
     """
     all_rigid(scene, "the path tracer")
+    if not isinstance(scene.camera, PinHole):
+        raise BlinkGLError("the path tracer knows no lenses with distortion", where="camera", accepted="a pin-hole")
     times_ns = np.array(list(times_ns), np.int64)
     camera, arrays = scene.camera, {}
     meshes, materials, textures = _Numbered(), _Numbered(), _Numbered()

@@ -1,11 +1,9 @@
-"""The same scene through pyrender: an independent rasteriser to check pictures against and to race.
+"""The same scene through pyrender: an independent rasteriser to check pictures against.
 
-    from blinkgl.tools.peer_pyrender import available, render, measure
     images = render(scene, [t_ns])          # colour, depth and ids of each time
-    result = measure(scene, times_ns)       # {"seconds_per_frame": …} for colour + depth, flat shading
 
 pyrender makes its own OpenGL context through PyOpenGL, which must not meet ours in one process: the scene is written
-to an .npz of plain arrays and drawn by this file run as a program (``peer_pyrender.py JOB.npz RESULT.npz``).
+to an .npz of plain arrays and drawn by this file run as a program (``pyrender_peer.py JOB.npz RESULT.npz``).
 
 What pyrender does, as found by reading and trying version 0.1.45, and what is done about it here:
 
@@ -15,8 +13,7 @@ What pyrender does, as found by reading and trying version 0.1.45, and what is d
 * Every picture is drawn 4x multi-sampled, and the depth that comes back is that of one of the samples, not of the pixel
   centre: wrong by up to 3/8 px on a slant. The SEG flag turns multi-sampling off, so
   depth and ids come from a SEG pass.
-* SEG culls back faces whatever the material says: two-sided surfaces are handed over with every face doubled. When it
-  is timed, which needs no SEG pass, they are double-sided by its own means instead.
+* SEG culls back faces whatever the material says: two-sided surfaces are handed over with every face doubled.
 * Depth is a 24-bit standard depth buffer, linearised in float32. With an infinite far plane its step is
   2^-24 Z / near relative to Z: choose ``near`` close to the nearest thing (``near`` argument) to read depth.
 * Texture row 0 is turned to the bottom on upload, hence v -> 1 - v. Its principal point is measured from the image's
@@ -27,12 +24,10 @@ What pyrender does, as found by reading and trying version 0.1.45, and what is d
 from __future__ import annotations
 
 import importlib.util
-import json
 import os
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -62,17 +57,7 @@ def render(scene: Scene, times_ns, near: float | None = None) -> dict[str, np.nd
     colour ignores the light (compare with unlit scenes). near : near plane for pyrender, default the camera's.
     Raises RuntimeError with pyrender's last words when it fails.
     """
-    return _run(scene, times_ns, near, repeat=0)
-
-
-def measure(scene: Scene, times_ns, repeat: int = 3) -> dict:
-    """Seconds per frame of pyrender's colour + depth, flat shading, read-back included.
-
-    Returns {"peer", "seconds_per_frame" (median over repeats of the mean over times_ns), "frames", "width", "height",
-    "triangles", "renderer"}, ready for JSON. The first round (uploads, shader compilation) is not counted.
-    """
-    result = _run(scene, times_ns, None, repeat)
-    return json.loads(str(result["timing"]))
+    return _run(scene, times_ns, near)
 
 
 def export(scene: Scene, times_ns, near: float | None = None, double: bool = True, **more) -> dict[str, np.ndarray]:
@@ -123,10 +108,10 @@ def _linear_bytes(image: np.ndarray) -> np.ndarray:
     return np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
-def _run(scene: Scene, times_ns, near, repeat: int) -> dict[str, np.ndarray]:
+def _run(scene: Scene, times_ns, near) -> dict[str, np.ndarray]:
     with tempfile.TemporaryDirectory(prefix="blinkgl-peer-") as folder:
         job, answer = Path(folder) / "job.npz", Path(folder) / "answer.npz"
-        np.savez(job, **export(scene, times_ns, near, double=repeat == 0, repeat=np.array(repeat)))
+        np.savez(job, **export(scene, times_ns, near))
         # PYGLET_HEADLESS: pyrender imports its viewer, which otherwise wants all of X11 where there is some of it.
         environment = {"PYOPENGL_PLATFORM": "egl", "PYGLET_HEADLESS": "1", **os.environ}
         command = [sys.executable, str(Path(__file__).resolve()), str(job), str(answer)]
@@ -153,7 +138,7 @@ def _main(job_path: str, answer_path: str) -> None:
     world = pyrender.Scene(bg_color=background)
     nodes = [world.add(pyrender.Mesh([_primitive(pyrender, job, k)])) for k in range(len(job["ids"]))]
     camera = pyrender.IntrinsicsCamera(fx, fy, cx, cy, znear=near)
-    camera._zfar = None  # noqa: SLF001 - infinite: its matrix and its read-back know it, only its setter does not
+    camera._zfar = None
     eye = world.add(camera)
     # 24 bits of id in three 8-bit colour channels
     codes = {node: [int(i) >> shift & 255 for shift in (16, 8, 0)] for node, i in zip(nodes, job["ids"])}
@@ -165,18 +150,14 @@ def _main(job_path: str, answer_path: str) -> None:
         world.set_pose(eye, job["camera_poses"][n])
 
     frames = len(job["camera_poses"])
-    answer = {}
-    if int(job["repeat"]):
-        answer["timing"] = np.array(json.dumps(_time(pyrender, renderer, world, place, frames, job)))
-    else:
-        colour, depth, ids = [], [], []
-        for n in range(frames):
-            place(n)
-            colour.append(renderer.render(world, pyrender.RenderFlags.FLAT)[0])
-            code, distance = renderer.render(world, pyrender.RenderFlags.SEG, codes)
-            depth.append(distance)
-            ids.append(code.astype(np.uint32) @ np.array([65536, 256, 1], np.uint32))
-        answer.update(colour=np.array(colour), depth=np.array(depth), ids=np.array(ids))
+    colour, depth, ids = [], [], []
+    for n in range(frames):
+        place(n)
+        colour.append(renderer.render(world, pyrender.RenderFlags.FLAT)[0])
+        code, distance = renderer.render(world, pyrender.RenderFlags.SEG, codes)
+        depth.append(distance)
+        ids.append(code.astype(np.uint32) @ np.array([65536, 256, 1], np.uint32))
+    answer = {"colour": np.array(colour), "depth": np.array(depth), "ids": np.array(ids)}
     renderer.delete()
     np.savez(answer_path, **answer)
 
@@ -193,27 +174,6 @@ def _primitive(pyrender, job, k):
         positions=job[f"vertices{k}"], indices=job[f"faces{k}"], material=paint, mode=4,
         texcoord_0=job[f"uvs{k}"] if texture is not None else None,
     )  # fmt: skip
-
-
-def _time(pyrender, renderer, world, place, frames, job) -> dict:
-    from OpenGL.GL import GL_RENDERER, glGetString
-
-    rounds = []
-    for _ in range(1 + int(job["repeat"])):
-        started = time.perf_counter()
-        for n in range(frames):
-            place(n)
-            renderer.render(world, pyrender.RenderFlags.FLAT)
-        rounds.append((time.perf_counter() - started) / frames)
-    return {
-        "peer": f"pyrender {pyrender.__version__}, flat colour + depth",
-        "seconds_per_frame": float(np.median(rounds[1:])),
-        "frames": frames,
-        "width": int(job["size"][0]),
-        "height": int(job["size"][1]),
-        "triangles": int(sum(len(job[f"faces{k}"]) for k in range(len(job["ids"])))),
-        "renderer": glGetString(GL_RENDERER).decode(),
-    }
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""The Blender side of ``peer_gltf.py``: plays a glTF file as Blender's own importer understands it.
+"""The Blender side of ``played.py``: plays a glTF file as Blender's own importer understands it.
 
     python gltf_worker.py FOLDER        FOLDER/job.json in; FOLDER/played.npz out
 
-job.json: file (absolute path), times (s), fps, and, for silhouettes, camera {size, parameters (peer_cycles.
-blender_camera), pose 4x4 in Blender's camera axes, near}, else null. played.npz: "mesh:NAME" (T, V, 3) float64,
+job.json: file (absolute path), times (s), fps, and, for silhouettes, camera {size, parameters (blinkgl.trade.
+cycles.blender_camera), pose 4x4 in Blender's camera axes, near}, else null. played.npz: "mesh:NAME" (T, V, 3) float64,
 vertices in Blender's world (z up) at each time; "masks" (T, H, W) bool, where the camera sees something.
 
 A program of its own that needs nothing but numpy and ``bpy``, and imports nothing of BlinkGL. Standard output carries

@@ -1,31 +1,26 @@
-"""Light and materials beside a path tracer: the same scene in Blender's Cycles (extra [cycles], see ``peer_cycles.py``)
-at path depth 1, each effect by itself.
-
-    python -m blinkgl.tools.peer_light [--samples 256] [--only WORD …] [--panoramas FOLDER] [--pictures FOLDER]
+"""Light and materials beside a path tracer: scenes of one effect each, and the same in Blender's Cycles (extra
+[cycles], ``blinkgl/trade/cycles.py``) at path depth 1.
 
 Diffuse scenes: floor, ball, box, open sheet. Metal: five balls of five roughnesses, graded by themselves. Of each the
 relative difference of colours, (theirs - ours) / (theirs + 0.01), over pixels off silhouettes and, of hard shadows,
-farther than two texels from their edges: median of what is there, and 95 % quantile. Of a frame camera's defocus and
-motion blur every pixel is graded that they change by more than 2 %.
+farther than two texels from their edges. Of a frame camera's defocus and motion blur every pixel is graded that they
+change by more than 2 %.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import PinHole
 from blinkgl.config.images import ImagesConfig
 from blinkgl.config.sequence import RenderConfig
-from blinkgl.gl import create_context
 from blinkgl.imaging import FrameCamera
 from blinkgl.imaging.response import decode
 from blinkgl.render import reference
@@ -36,10 +31,9 @@ from blinkgl.scene.motion.trajectories import look_rotation
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Fog, Gloss, Lamp, Light, Map, Mask, Material, Mesh, Part, Scene, SceneObject, Texture
 from blinkgl.scene.worlds.sky import panorama_light
-from blinkgl.srgb import to_srgb8
-from blinkgl.tools.peer_cycles import CyclesSettings, colours
 from blinkgl.tools.shader_debugger.lamps import near_an_edge
 from blinkgl.tools.shader_debugger.session import DebugRenderer
+from blinkgl.trade.cycles import CyclesSettings, colours
 
 EXPOSURE_US = 20_000
 ROUGHNESSES = (0.1, 0.25, 0.45, 0.7, 1.0)
@@ -233,36 +227,3 @@ def compared(
 def relative(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
     """(H, W) difference of two (H, W, 3), of theirs."""
     return np.abs(theirs - ours).mean(axis=2) / (theirs.mean(axis=2) + 0.01)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--samples", type=int, default=256)
-    parser.add_argument("--only", nargs="*", default=[""], help="cases that have one of these words in their names")
-    parser.add_argument("--panoramas", type=Path, help="folder of .hdr files")
-    parser.add_argument("--pictures", type=Path, help="folder for ours and theirs, side by side")
-    options = parser.parse_args()
-    if options.pictures is not None:
-        options.pictures.mkdir(parents=True, exist_ok=True)
-    print(f"{'effect':34} {'pixels':>7} {'median':>8} {'95 %':>8}")
-    with create_context() as gl:
-        for case in cases(options.panoramas):
-            if not any(word in case.name for word in options.only):
-                continue
-            ours, theirs, graded, true = compared(gl, case, options.samples)
-            error = relative(ours, theirs)
-            rows = [(case.name, graded)]
-            if case.name.startswith("metal"):
-                rows = [(f"{case.name}, {r:g}", graded & (true.instance == k + 1)) for k, r in enumerate(ROUGHNESSES)]
-                rows = [(name, on) for name, on in rows if on.any()]
-            for name, on in rows:
-                median, most = (100 * np.quantile(error[on], q) for q in (0.5, 0.95))
-                print(f"{name:34} {on.sum():7} {median:7.2f}% {most:7.2f}%", flush=True)
-            if options.pictures is not None:
-                both = np.concatenate([ours, theirs], axis=1)[..., ::-1]
-                file = options.pictures / f"{case.name.replace(', ', '-').replace(' ', '-')}.png"
-                cv2.imwrite(str(file), cv2.resize(to_srgb8(both), None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,15 +1,12 @@
 """Blender's own importer of glTF beside BlinkGL's: where each vertex of a skinned, morphed, animated file is at given
 times, and which pixels a camera sees it in (by Cycles).
 
-    python -m blinkgl.tools.peer_gltf FILE --out played.npz [--times 20]
-
 Needs the extra [cycles] (:mod:`blinkgl.blender.process`). Between two key frames Blender blends quaternions linearly,
 the standard asks for the arc: compare at :func:`key_times`.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 from dataclasses import dataclass
@@ -20,9 +17,8 @@ import numpy as np
 from blinkgl.blender.process import Blender, how_it_ended, interpreter
 from blinkgl.camera import PinHole
 from blinkgl.errors import BlinkGLError
-from blinkgl.io.atomic import atomic_file
 from blinkgl.scene.importing import gltf
-from blinkgl.tools.peer_cycles import CV_FROM_BLENDER, blender_camera
+from blinkgl.trade.cycles import CV_FROM_BLENDER, blender_camera
 
 WORKER = Path(__file__).with_name("gltf_worker.py")
 
@@ -77,19 +73,3 @@ def play(path: Path, times: np.ndarray, camera: PinHole | None = None, T_world_c
             arrays = {key: stored[key] for key in stored.files}
     masks = arrays.pop("masks")
     return Played({key.partition(":")[2]: places for key, places in arrays.items()}, masks)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("file", type=Path)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--times", type=int, default=20)
-    options = parser.parse_args()
-    times = key_times(options.file, options.times)
-    played = play(options.file, times)
-    with atomic_file(options.out) as temporary, open(temporary, "wb") as file:
-        np.savez(file, times=times, **played.positions)
-
-
-if __name__ == "__main__":
-    main()

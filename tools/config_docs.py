@@ -19,9 +19,11 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from blinkgl.config.base import is_model, members, tag_of
+from blinkgl.config.primitives import PRIMITIVES
 from blinkgl.config.rig import SECTIONS, RigSensorConfig
 from blinkgl.config.sequence import SequenceConfig
-from blinkgl.scene.geometry.primitives import BUILDERS, PARAMETERS, parameters
+from blinkgl.scene.geometry import BUILDERS
+from blinkgl.scene.geometry.primitives import PARAMETERS, parameters
 from eflow.config import TrainConfig
 
 HEADER = """# Every key of the YAML
@@ -67,7 +69,8 @@ def _primitives() -> str:
         ),
         "| kind | parameters and defaults | what it is |\n|---|---|---|\n",
     ]
-    for kind, build in BUILDERS.items():
+    for kind in PRIMITIVES:
+        build = BUILDERS[kind]
         values = ", ".join(
             f"`{name}: {list(value) if isinstance(value, tuple) else value}`"
             for name, value in parameters(kind).items()

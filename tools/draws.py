@@ -23,13 +23,15 @@ import numpy as np
 from blinkgl.config.base import validate
 from blinkgl.config.camera import CameraConfig
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
+from blinkgl.config.primitives import kinds
 from blinkgl.config.readout import ReadoutConfig
-from blinkgl.config.scene import PRIMITIVE_KINDS, TEXTURE_KINDS, RandomSceneConfig
+from blinkgl.config.scene import TEXTURE_KINDS, RandomSceneConfig
 from blinkgl.events import Events, make_emulator
 from blinkgl.events.readout import Readout
 from blinkgl.scene.build import build_scene
+from blinkgl.scene.geometry import BUILDERS
 from blinkgl.scene.geometry.meshes import make_mesh
-from blinkgl.scene.geometry.primitives import BUILDERS, random_primitive
+from blinkgl.scene.geometry.random_primitives import random_primitive
 from blinkgl.scene.surfaces.coats import bunting, clothes, scales
 from blinkgl.scene.surfaces.textures import procedural_texture
 from blinkgl.scene.types import Scene
@@ -165,9 +167,7 @@ def coats() -> dict[str, Any]:
 
 
 def bodies() -> dict[str, Any]:
-    return {
-        f"{kind} {index}": told_mesh(random_primitive(kind, index)) for kind in PRIMITIVE_KINDS for index in range(3)
-    }
+    return {f"{kind} {index}": told_mesh(random_primitive(kind, index)) for kind in kinds("pool") for index in range(3)}
 
 
 def living() -> dict[str, Any]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from blinkgl.config.primitives import PRIMITIVES
 from blinkgl.errors import ConfigError
 from blinkgl.labels import files, grading
 from blinkgl.labels.files import Form
@@ -20,11 +21,10 @@ if TYPE_CHECKING:
 
 Categories = tuple[tuple[str, int], ...]
 """Pattern -> number, in order."""
-_KINDS = (
-    "sky", "ground", "wall", "cuboid", "cylinder", "sphere", "icosphere", "cone", "torus", "capsule", "prism",
-    "pyramid", "figure", "flag", "fish", "grid", "die",
-)  # fmt: skip
-BY_NAME: Categories = (*((kind, k) for k, kind in enumerate(_KINDS, 1)), ("*", 255))
+_CATEGORIES = {"sky": 1, "ground": 2, "wall": 3} | {
+    name: kind.category for name, kind in PRIMITIVES.items() if kind.category is not None
+}
+BY_NAME: Categories = (*sorted(_CATEGORIES.items(), key=lambda row: row[1]), ("*", 255))
 """``semantics: true``: sky 1, ground 2, wall 3, shapes from 4 on, 255 for other names. Data sets hold these numbers:
 new kinds come at the end."""
 

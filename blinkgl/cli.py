@@ -20,8 +20,8 @@ import typer
 from blinkgl import __version__
 from blinkgl.errors import BlinkGLError
 from blinkgl.machine.interrupts import interruptible
+from blinkgl.shader_debugger.cli import app as shader_app
 from blinkgl.show.terminal import never_fail_to_print
-from blinkgl.tools.shader_debugger.cli import app as shader_app
 
 app = typer.Typer(name="blinkgl", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 app.add_typer(shader_app)

@@ -87,8 +87,9 @@ def test_data_flows_one_way():
 
 FILLED_IN_LATER = set(
     """
-    Collected Comparison Cost Displacement Document DrawItem Example Explanation Level Measured Omissions Outcome Parameter
-    Pool RenderStats SequenceReport RecordingSide SimulationReport StreamStats Totals Verification _Body
+    BufferReport Collected Comparison Cost Displacement Document DrawItem Draws Example Explanation Finding Level
+    Measured Omissions Outcome Parameter Pool RenderStats Result SequenceReport RecordingSide SimulationReport
+    StreamStats Totals Verification _Arriving _Body
 """.split()
 )
 """Records that are written to while they are made. All others are values: who holds one may count on it."""

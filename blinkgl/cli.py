@@ -16,7 +16,7 @@ import typer
 
 from blinkgl import __version__
 from blinkgl.machine.command_line import run_app
-from blinkgl.tools.shader_debugger.cli import app as shader_app
+from blinkgl.shader_debugger.cli import app as shader_app
 
 app = typer.Typer(name="blinkgl", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 app.add_typer(shader_app)

@@ -61,7 +61,7 @@ FLOORS = (
     "dataset",
     "layouts online report",
     "trade front eflow",
-    "show",
+    "show shader_debugger",
     "cli __main__ tools",
 )
 """From the ground up. ``import blinkgl`` itself fetches its names when they are first used."""
@@ -116,8 +116,9 @@ def test_imports_lead_down():
 
 FILLED_IN_LATER = set(
     """
-    Collected Comparison Cost Displacement Document DrawItem Example Explanation Level Measured Omissions Outcome
-    Parameter Pool RenderStats SequenceReport RecordingSide SimulationReport StreamStats Totals Verification _Body
+    BufferReport Collected Comparison Cost Displacement Document DrawItem Draws Example Explanation Finding Level
+    Measured Omissions Outcome Parameter Pool RenderStats Result SequenceReport RecordingSide SimulationReport
+    StreamStats Totals Verification _Arriving _Body
 """.split()
 )
 """Records that are written to while they are made. All others are values: who holds one may count on it."""

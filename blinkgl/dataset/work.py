@@ -246,11 +246,11 @@ def _source_hash() -> str:
     tests while the code is being worked on)."""
     if build := os.environ.get("BLINKGL_BUILD"):
         return build
-    found = hashlib.sha256()
+    found, apart = hashlib.sha256(), {"configs", "tools", "report", "shader_debugger"}  # what makes no sequence
     for package in ("blinkgl", "blinkgl.shaders"):
         root = resources.files(package)
         for path in sorted(Path(str(root)).rglob("*")):
-            if path.suffix in (".py", ".glsl") and not {"configs", "tools", "report"} & set(path.parts):
+            if path.suffix in (".py", ".glsl") and not apart & set(path.parts):
                 found.update(path.name.encode() + b"\0" + path.read_bytes())
     return found.hexdigest()[:12]
 

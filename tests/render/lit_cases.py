@@ -31,8 +31,8 @@ from blinkgl.scene.motion.trajectories import look_rotation
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Fog, Gloss, Lamp, Light, Map, Mask, Material, Mesh, Part, Scene, SceneObject, Texture
 from blinkgl.scene.worlds.sky import panorama_light
-from blinkgl.tools.shader_debugger.lamps import near_an_edge
-from blinkgl.tools.shader_debugger.session import DebugRenderer
+from blinkgl.shader_debugger.lamps import near_an_edge
+from blinkgl.shader_debugger.session import DebugRenderer
 from blinkgl.trade.cycles import CyclesSettings, colours
 
 EXPOSURE_US = 20_000

@@ -73,7 +73,7 @@ def test_texts_tables_titles_and_bars_keep_their_brackets(capsys):
 def test_there_is_no_other_console():
     """Whatever is printed for people goes through blinkgl.machine.terminal; benchmarks, which
     print their own words alone, need not."""
-    for folder in ("blinkgl", "eflow", "tools/shader_debugger"):
+    for folder in ("blinkgl", "eflow", "blinkgl/shader_debugger"):
         for path in (ROOT / folder).rglob("*.py"):
             if path != ROOT / "blinkgl/machine/terminal.py":
                 text = path.read_text(encoding="utf-8")

@@ -24,8 +24,8 @@ from blinkgl.scene.geometry.primitives import grid
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Material, Part, Scene, SceneObject, Texture
-from blinkgl.tools.shader_debugger import compare, mipmaps, moments, probe, session, silhouettes
-from blinkgl.tools.shader_debugger.session import DebugRenderer, When, moment, open_renderer, open_subject
+from blinkgl.shader_debugger import compare, mipmaps, moments, probe, session, silhouettes
+from blinkgl.shader_debugger.session import DebugRenderer, When, moment, open_renderer, open_subject
 from debugger_scene import HEIGHT, LOOKUP_MISTAKES, MISTAKES, WIDTH, edit, with_stale_pose
 
 DEMO = str(Path(__file__).parents[2] / "configs/demo.yaml")

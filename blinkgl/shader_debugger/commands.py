@@ -9,8 +9,8 @@ import numpy as np
 
 from blinkgl.errors import OutputError
 from blinkgl.io.atomic import atomic_file, output_errors
-from blinkgl.tools.shader_debugger.compare import Comparison, Report, parse_tolerances
-from blinkgl.tools.shader_debugger.moments import (
+from blinkgl.shader_debugger.compare import BufferReport, Comparison, parse_tolerances
+from blinkgl.shader_debugger.moments import (
     MAPS,
     PASSES,
     GpuMoment,
@@ -20,10 +20,10 @@ from blinkgl.tools.shader_debugger.moments import (
     lookup_of,
     open_reference,
 )
-from blinkgl.tools.shader_debugger.probe import as_text, probe
-from blinkgl.tools.shader_debugger.session import Subject, When, check_pixel, open_renderer
-from blinkgl.tools.shader_debugger.silhouettes import EDGED, edged_of
-from blinkgl.tools.shader_debugger.verdict import as_text as verdict_text, verdict
+from blinkgl.shader_debugger.probe import as_text, probe
+from blinkgl.shader_debugger.session import Subject, When, check_pixel, open_renderer
+from blinkgl.shader_debugger.silhouettes import EDGED, edged_of
+from blinkgl.shader_debugger.verdict import as_text as verdict_text, verdict
 
 
 def write_passes(
@@ -34,7 +34,7 @@ def write_passes(
 
     Anti-aliased as the configuration says: these are the arrays that generation uses. Raises BlinkGLError."""
     from blinkgl.io import pictures
-    from blinkgl.tools.shader_debugger import picture
+    from blinkgl.shader_debugger import picture
 
     there = buffers_of(subject.scene)
     names = [check_pass(name, there) for name in names] if names else list(there)
@@ -101,11 +101,11 @@ def run_diff(
     tolerances: list[str],
     shaders: str | None = None,
     out: str | None = None,
-) -> tuple[dict, list[Report]]:
+) -> tuple[dict, list[BufferReport]]:
     """Compares the named buffers (default: all that can be); with ``out`` also writes
     diff.png and NAME_error.npy there.
     Returns what :func:`verdict.verdict` says, and the reports."""
-    from blinkgl.tools.shader_debugger.compare import QUANTITIES
+    from blinkgl.shader_debugger.compare import QUANTITIES
 
     if names:
         there = buffers_of(subject.scene, edged_of(subject.config))
@@ -119,7 +119,7 @@ def run_diff(
         reports = [comparison.report(name, limits.get(name)) for name in names]
         found = verdict(comparison, reports)
     if out is not None:
-        from blinkgl.tools.shader_debugger import picture
+        from blinkgl.shader_debugger import picture
 
         folder = _folder(out)
         for report in reports:
@@ -134,7 +134,8 @@ def run_diff(
     return found, reports
 
 
-def diff_json(found: dict, reports: list[Report]) -> str:
+def diff_json(found: dict, reports: list[BufferReport]) -> str:
+    """What ``diff --json`` prints."""
     return json.dumps(_finite(found | {"buffers": [r.summary() for r in reports]}))
 
 
@@ -149,7 +150,7 @@ def _finite(value):
     return value
 
 
-def diff_text(found: dict, reports: list[Report]) -> str:
+def diff_text(found: dict, reports: list[BufferReport]) -> str:
     """The verdict, the table, then histogram, suspicions and the worst pixel of each object of each buffer that failed,
     or of a single one."""
     lines = [*verdict_text(found), ""] if not found["passed"] else []

@@ -8,16 +8,17 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import moderngl
 
 from blinkgl.errors import ConfigError
 from blinkgl.gl import create_context
 from blinkgl.gl.shader import GEOMETRY, STAGES, ShaderError, ShaderSource, expand, link, stages_of
-from blinkgl.tools.shader_debugger.diagnostics import Diagnostic, diagnose
-from blinkgl.tools.shader_debugger.preprocess import active_lines
-from blinkgl.tools.shader_debugger.session import EditedFolder, files_of, open_folder
-from blinkgl.tools.shader_debugger.variants import lookups, variants
+from blinkgl.shader_debugger.diagnostics import Diagnostic, diagnose
+from blinkgl.shader_debugger.preprocess import active_lines
+from blinkgl.shader_debugger.session import EditedFolder, files_of, open_folder
+from blinkgl.shader_debugger.variants import lookups, variants
 
 _DECLARATION = re.compile(
     r"^\s*(?:layout\s*\([^)]*\)\s*)?(?:(?:flat|smooth|noperspective|centroid|invariant|highp|mediump|lowp)\s+)*"
@@ -77,7 +78,7 @@ def check(files: list[str], shaders: str | None = None, backend: str = "auto", d
     return result
 
 
-def check_program(ctx: moderngl.Context, folder, name: str, result: Result) -> None:
+def check_program(ctx: moderngl.Context, folder: Any, name: str, result: Result) -> None:
     """Adds every variant of one program to ``result``."""
     wanted = variants(name)
     wanted = [{}] if wanted is None else wanted + lookups(name)  # [{}]: somebody's own program, as it stands
@@ -198,6 +199,7 @@ def _includes(folder, program: str, include: str) -> bool:
 
 
 def as_text(result: Result) -> str:
+    """The check in lines for a person."""
     total = sum(result.programs.values())
     lines = []
     for found in result.errors:

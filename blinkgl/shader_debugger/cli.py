@@ -32,13 +32,13 @@ DIFFERENT = 1  # exit status of `diff` over the tolerance, and of `check` with a
 
 
 def _subject(config, seed, sequence, overrides):
-    from blinkgl.tools.shader_debugger.session import open_subject
+    from blinkgl.shader_debugger.session import open_subject
 
     return open_subject(config, seed=seed, sequence=sequence, overrides=overrides or [])
 
 
 def _when(subject, time, step):
-    from blinkgl.tools.shader_debugger.session import moment
+    from blinkgl.shader_debugger.session import moment
 
     return moment(subject, time, step)
 
@@ -56,7 +56,7 @@ def passes(
     names: Annotated[list[str] | None, typer.Option("--pass", help="Only this buffer; may be repeated.")] = None,
 ) -> None:
     """Write every buffer of one moment as a labelled PNG and .npy, and a contact sheet."""
-    from blinkgl.tools.shader_debugger.commands import write_passes
+    from blinkgl.shader_debugger.commands import write_passes
 
     subject = _subject(config, seed, sequence, overrides)
     paths = write_passes(subject, _when(subject, time, step), out, names, shaders)
@@ -77,7 +77,7 @@ def probe(
 ) -> None:
     """Print every buffer at a pixel beside the float64 reference, where the point is, and why
     it is invalid or occluded."""
-    from blinkgl.tools.shader_debugger.commands import run_probe
+    from blinkgl.shader_debugger.commands import run_probe
 
     subject = _subject(config, seed, sequence, overrides)
     typer.echo(run_probe(subject, _when(subject, time, step), pixel, shaders, json))
@@ -105,7 +105,7 @@ def diff(
     json: Json = False,
 ) -> None:
     """Compare whole images with the float64 reference. Exit status 1 when a buffer is over its tolerance."""
-    from blinkgl.tools.shader_debugger import commands
+    from blinkgl.shader_debugger import commands
 
     subject = _subject(config, seed, sequence, overrides)
     found, reports = commands.run_diff(subject, _when(subject, time, step), names, tolerance or [], shaders, out)
@@ -126,7 +126,7 @@ def check(
 ) -> None:
     """Compile every program in every variant any configuration can ask for; list what is
     unused. Exit status 1 on an error."""
-    from blinkgl.tools.shader_debugger import check as checking
+    from blinkgl.shader_debugger import check as checking
 
     result = checking.check(files or [], shaders, backend, device)
     typer.echo(_json.dumps(result.as_dict()) if json else checking.as_text(result))
@@ -146,7 +146,7 @@ def show(
     shaders: Shaders = None,
 ) -> None:
     """Print a program's source as the compiler gets it, includes and defines written out."""
-    from blinkgl.tools.shader_debugger.check import show_source
+    from blinkgl.shader_debugger.check import show_source
 
     typer.echo(show_source(program, define or [], stage, active, numbers, shaders), nl=False)
 
@@ -166,7 +166,7 @@ def time(
 ) -> None:
     """GPU time of each pass and program variant, split into vertex and fragment work, with
     draws, triangles and overdraw."""
-    from blinkgl.tools.shader_debugger import timing
+    from blinkgl.shader_debugger import timing
 
     subject = _subject(config, seed, sequence, overrides)
     result = timing.measure(subject, _when(subject, at, None), shaders, repeat)
@@ -189,7 +189,7 @@ def serve(
 ) -> None:
     """A local page: passes, scrubbing, probe by click, differences, and shaders that
     reload when saved. Ctrl-C ends it."""
-    from blinkgl.tools.shader_debugger.server import serve as run_server
+    from blinkgl.shader_debugger.server import serve as run_server
 
     subject = _subject(config, seed, sequence, overrides)
     run_server(subject, _when(subject, time, step), shaders, host, port, step)

@@ -18,9 +18,9 @@ from blinkgl.labels import LABELS, LabelRequest
 from blinkgl.render.painter import Painter
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
-from blinkgl.tools.shader_debugger import check, diagnostics, preprocess, timing, variants
-from blinkgl.tools.shader_debugger.moments import GpuMoment, buffers_of
-from blinkgl.tools.shader_debugger.session import DebugRenderer, moment, open_folder, open_subject
+from blinkgl.shader_debugger import check, diagnostics, preprocess, timing, variants
+from blinkgl.shader_debugger.moments import GpuMoment, buffers_of
+from blinkgl.shader_debugger.session import DebugRenderer, moment, open_folder, open_subject
 from debugger_scene import copy_shaders, edit
 
 PRODUCTION = ("luminance.glsl", "velocity.glsl", "colour.glsl", "label.glsl", "downsample.glsl", "edges.glsl")

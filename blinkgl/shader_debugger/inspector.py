@@ -14,11 +14,11 @@ from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.gl import ShaderLoader
 from blinkgl.gl.shader import ShaderError, expand, stages_of
 from blinkgl.io import pictures
-from blinkgl.tools.shader_debugger import picture
-from blinkgl.tools.shader_debugger.commands import _finite, _meaningful
-from blinkgl.tools.shader_debugger.compare import Comparison
-from blinkgl.tools.shader_debugger.diagnostics import Diagnostic, diagnose
-from blinkgl.tools.shader_debugger.moments import (
+from blinkgl.shader_debugger import picture
+from blinkgl.shader_debugger.commands import _finite, _meaningful
+from blinkgl.shader_debugger.compare import Comparison
+from blinkgl.shader_debugger.diagnostics import Diagnostic, diagnose
+from blinkgl.shader_debugger.moments import (
     PASSES,
     GpuMoment,
     ReferenceMoment,
@@ -26,9 +26,9 @@ from blinkgl.tools.shader_debugger.moments import (
     check_pass,
     open_reference,
 )
-from blinkgl.tools.shader_debugger.probe import _numbers, _surface_text, probe
-from blinkgl.tools.shader_debugger.questions import SOURCES
-from blinkgl.tools.shader_debugger.session import (
+from blinkgl.shader_debugger.probe import _numbers, _surface_text, probe
+from blinkgl.shader_debugger.questions import SOURCES
+from blinkgl.shader_debugger.session import (
     Snapshot,
     Subject,
     When,
@@ -38,8 +38,8 @@ from blinkgl.tools.shader_debugger.session import (
     open_folder,
     open_renderer,
 )
-from blinkgl.tools.shader_debugger.silhouettes import EDGED, edged_of
-from blinkgl.tools.shader_debugger.verdict import verdict
+from blinkgl.shader_debugger.silhouettes import EDGED, edged_of
+from blinkgl.shader_debugger.verdict import verdict
 
 POLL_S = 0.15  # between two looks at the shader files
 KEPT = 6  # moments in memory
@@ -300,7 +300,7 @@ class Worker:
                 answer.set_exception(error)
         self.inspector.close()
 
-    def call(self, function, *arguments) -> Any:
+    def call(self, function: Any, *arguments: Any) -> Any:
         """The result of ``function`` in the render thread; raises what it raised."""
         if self._stop.is_set():
             raise BlinkGLError("the server is stopping")

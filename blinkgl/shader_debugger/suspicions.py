@@ -9,14 +9,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 
 from blinkgl.render import reference
 from blinkgl.render.colour import LUMA
 from blinkgl.scene.shapes.deformer import normals_at
+from blinkgl.shader_debugger.moments import PASSES, lookup_of
 from blinkgl.srgb import srgb_from_linear
-from blinkgl.tools.shader_debugger.moments import PASSES, lookup_of
 
 EXPLAINED = 0.9  # of the pixels that are wrong
 CLOSE = 1e-3  # relative: a candidate need not match to the last bit, other errors may be there, too
@@ -25,7 +26,7 @@ MOST = 3  # suspicions of one buffer, and objects looked at on their own
 FEWEST = 5  # wrong pixels of an object that can carry a suspicion of its own
 
 
-def suspicions(comparison, report) -> list[str]:
+def suspicions(comparison: Any, report: Any) -> list[str]:
     """One line per candidate that fits; best first, at most three.
 
     comparison : of the moment.   report : of one buffer that is over its tolerance."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -17,10 +17,10 @@ from blinkgl.render.colour import LUMA
 from blinkgl.render.passes.shadow import ShadowMap
 from blinkgl.scene.lights import MAX_SHADOWS, shadowing
 from blinkgl.scene.types import Scene
-from blinkgl.tools.shader_debugger.lamps import map_of
-from blinkgl.tools.shader_debugger.mipmaps import mipmapped_albedo
-from blinkgl.tools.shader_debugger.session import LOOKUPS as LOOKUP_PASSES, DebugRenderer, Subject, When
-from blinkgl.tools.shader_debugger.silhouettes import EDGED, edged, twin_of
+from blinkgl.shader_debugger.lamps import map_of
+from blinkgl.shader_debugger.mipmaps import mipmapped_albedo
+from blinkgl.shader_debugger.session import LOOKUPS as LOOKUP_PASSES, DebugRenderer, Subject, When
+from blinkgl.shader_debugger.silhouettes import EDGED, edged, twin_of
 
 _T = TypeVar("_T")
 
@@ -153,7 +153,7 @@ def lookup_of(name: str) -> tuple[str, str]:
     return (pass_name, what) if pass_name in LOOKUP_PASSES and what in LOOKUPS else ("", "")
 
 
-def check_pass(name: str, known=PASSES, where: str = "--pass") -> str:
+def check_pass(name: str, known: Any = PASSES, where: str = "--pass") -> str:
     """``name`` if it is one of ``known``. Raises ConfigError."""
     if name not in known:
         raise ConfigError("unknown pass", where=where, value=name, accepted="one of " + ", ".join(known))

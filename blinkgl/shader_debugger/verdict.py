@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from blinkgl.tools.shader_debugger.compare import QUANTITIES, Comparison, Report
+from blinkgl.shader_debugger.compare import QUANTITIES, BufferReport, Comparison
 
 
-def verdict(comparison: Comparison, reports: list[Report]) -> dict:
+def verdict(comparison: Comparison, reports: list[BufferReport]) -> dict:
     """Plain data (JSON).
 
     passed : every buffer is within its tolerance.
@@ -49,7 +49,7 @@ def verdict(comparison: Comparison, reports: list[Report]) -> dict:
     return {"passed": not failed, "first": first, "objects": list(rows.values())}
 
 
-def _suspicion(report: Report, name: str, names: list[str]) -> str:
+def _suspicion(report: BufferReport, name: str, names: list[str]) -> str:
     """The first that is about this object, or about no object."""
     others = [n for n in names if n != name]
     return next(

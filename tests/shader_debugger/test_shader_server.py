@@ -16,14 +16,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import webdriver
 from PIL import Image
 
-import webdriver
-from blinkgl.tools.shader_debugger import server as server_module
-from blinkgl.tools.shader_debugger.moments import buffers_of
-from blinkgl.tools.shader_debugger.server import LOCAL, MOST_OPEN, MOST_WAITING, THREADS, DebugServer, host_allowed
-from blinkgl.tools.shader_debugger.session import moment, open_subject
-from blinkgl.tools.shader_debugger.silhouettes import edged_of
+from blinkgl.shader_debugger import server as server_module
+from blinkgl.shader_debugger.moments import buffers_of
+from blinkgl.shader_debugger.server import LOCAL, MOST_OPEN, MOST_WAITING, THREADS, DebugServer, host_allowed
+from blinkgl.shader_debugger.session import moment, open_subject
+from blinkgl.shader_debugger.silhouettes import edged_of
 from debugger_scene import HEIGHT, WIDTH, copy_shaders, edit
 
 

@@ -11,8 +11,8 @@ import pytest
 
 from blinkgl.gl import ShaderLoader
 from blinkgl.render.passes import ScenePass
-from blinkgl.tools.shader_debugger import compare, moments, session
-from blinkgl.tools.shader_debugger.session import moment, open_renderer, open_subject
+from blinkgl.shader_debugger import compare, moments, session
+from blinkgl.shader_debugger.session import moment, open_renderer, open_subject
 from debugger_scene import edit
 
 LIT = str(Path(__file__).with_name("lit.yaml"))

@@ -10,7 +10,7 @@ from blinkgl.render.lighting import EXAMPLES
 from blinkgl.render.passes import PASSES, Pass, ScenePass
 from blinkgl.render.resources import MORE, Kind
 from blinkgl.scene.shapes.table import DEFORMERS, define_of
-from blinkgl.tools.shader_debugger.session import LOOKUPS, Inspection
+from blinkgl.shader_debugger.session import LOOKUPS, Inspection
 
 SURFACES = (("TINTED", "EMISSIVE"), ("EMISSIVE", "EMISSION_MAP"), ("GLOSSY",), ("BUMPED",), MORE)
 """What materials are beside a base colour: each of MORE alone, where it can be, and all of them."""

@@ -8,10 +8,10 @@ import numpy as np
 from blinkgl.render import reference
 from blinkgl.render.probe import probe as reference_probe
 from blinkgl.render.renderer import Renderer
-from blinkgl.tools.shader_debugger.compare import QUANTITIES, Comparison
-from blinkgl.tools.shader_debugger.lamps import place_in
-from blinkgl.tools.shader_debugger.moments import MAPS, PASSES, GpuMoment, ReferenceMoment, buffers_of, lookup_of
-from blinkgl.tools.shader_debugger.silhouettes import EDGED
+from blinkgl.shader_debugger.compare import QUANTITIES, Comparison
+from blinkgl.shader_debugger.lamps import place_in
+from blinkgl.shader_debugger.moments import MAPS, PASSES, GpuMoment, ReferenceMoment, buffers_of, lookup_of
+from blinkgl.shader_debugger.silhouettes import EDGED
 
 
 def ulps(gpu: np.ndarray, ref: np.ndarray) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from typing import Any
 
 from blinkgl.gl.shader import ShaderError, ShaderSource, made_includes
 
@@ -38,7 +39,7 @@ class Diagnostic:
         return asdict(self)
 
 
-def diagnose(error: ShaderError, sources: Mapping[str, ShaderSource], folder) -> list[Diagnostic]:
+def diagnose(error: ShaderError, sources: Mapping[str, ShaderSource], folder: Any) -> list[Diagnostic]:
     """Every message behind a ShaderError. ``sources``: by stage, empty when the program could
     not even be put together."""
     found, stage = [], ""
@@ -121,7 +122,7 @@ def _declaration(source: ShaderSource, name: str) -> tuple[str, int, int] | None
     return None
 
 
-def excerpt(folder, file: str, line: int, column: int = 0, around: int = 2) -> str:
+def excerpt(folder: Any, file: str, line: int, column: int = 0, around: int = 2) -> str:
     """Lines around ``line`` of a file in the shader folder, a caret under ``column``."""
     path = folder
     for part in file.split("/"):

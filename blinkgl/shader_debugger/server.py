@@ -27,9 +27,9 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from blinkgl.errors import BlinkGLError, GLError
-from blinkgl.tools.shader_debugger.inspector import Inspector, Worker
-from blinkgl.tools.shader_debugger.questions import ROUTES, read_query
-from blinkgl.tools.shader_debugger.session import Subject, When
+from blinkgl.shader_debugger.inspector import Inspector, Worker
+from blinkgl.shader_debugger.questions import ROUTES, read_query
+from blinkgl.shader_debugger.session import Subject, When
 
 if TYPE_CHECKING:
     from importlib.resources.abc import Traversable

@@ -21,6 +21,7 @@ from __future__ import annotations
 import ctypes
 import time
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,7 @@ from blinkgl.labels import LABELS, asked_for
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.passes import Geometry, Pass
 from blinkgl.scene.types import Scene
-from blinkgl.tools.shader_debugger.session import DebugPainter, DebugRenderer, Subject, When, open_renderer
+from blinkgl.shader_debugger.session import DebugPainter, DebugRenderer, Subject, When, open_renderer
 
 HALF = 2
 
@@ -56,7 +57,7 @@ class Stopwatch:
 
     _TIMESTAMP, _RESULT = 0x8E28, 0x8866
 
-    def __init__(self, gl):
+    def __init__(self, gl: Any):
         uint, pointer = ctypes.c_uint, ctypes.c_void_p
         self._gl = gl
         self._stamp = gl.function("glQueryCounter", None, uint, uint)
@@ -97,7 +98,7 @@ class Stopwatch:
 class TimedPainter(DebugPainter):
     """Counts what is drawn after :meth:`start`; measures it draw by draw when ``each`` is set."""
 
-    def __init__(self, gl, scene, resources, stats):
+    def __init__(self, gl: Any, scene: Scene, resources: Any, stats: Any):
         super().__init__(gl, scene, resources, stats)
         self.watch = Stopwatch(gl)
         self.each, self.result = False, Draws()
@@ -106,11 +107,11 @@ class TimedPainter(DebugPainter):
     def start(self, each: bool) -> None:
         self.each, self.result = each, Draws()
 
-    def programs(self, pass_):
+    def programs(self, pass_: Any) -> Any:
         self._pass = pass_
         return super().programs(pass_)
 
-    def draw(self, uniforms, item):
+    def draw(self, uniforms: Any, item: Any) -> Any:
         triangles = len(item.mesh.faces)
         if self.each:
             self.watch.start()
@@ -130,7 +131,7 @@ class TimedPainter(DebugPainter):
 class TimedRenderer(DebugRenderer):
     """A renderer whose passes are measured: nothing of a frame is read."""
 
-    def __init__(self, gl, scene, config):
+    def __init__(self, gl: Any, scene: Scene, config: Any):
         self.timed: TimedPainter | None = None
         super().__init__(gl, scene, config, painter=self._watched)
 
@@ -142,7 +143,7 @@ class TimedRenderer(DebugRenderer):
         self.timed.watch.release()
         super().release()
 
-    def run(self, call, each: bool) -> Draws:
+    def run(self, call: Any, each: bool) -> Draws:
         """What ``call(self)`` draws; as a whole, or draw by draw."""
         self.timed.start(each)
         if each:
@@ -260,6 +261,7 @@ def _measure_pass(name, call, scale, full: TimedRenderer, half: TimedRenderer, r
 
 
 def as_text(result: dict) -> str:
+    """The timing in lines for a person."""
     lines = [
         (
             f"{result['config']}, sequence {result['sequence']}, t = {result['t_s']:.6g} s, {result['width']} x "

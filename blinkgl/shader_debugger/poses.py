@@ -6,6 +6,8 @@ looked up or shaded later."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from blinkgl.render import reference
@@ -16,7 +18,7 @@ EXPLAINED = 0.05  # of the displacement: what a pose may leave unexplained
 ROUNDING = 0.01  # px; float32 leaves less
 
 
-def displaced(gpu, ref) -> np.ndarray:
+def displaced(gpu: Any, ref: Any) -> np.ndarray:
     """(H, W, 2) px from each pixel's centre to where the point drawn there lies by the true poses; 0 where nothing was
     drawn, inf where that is out of the camera's sight."""
     part = gpu["part"]
@@ -33,7 +35,7 @@ def _project(camera, pose: np.ndarray, local: np.ndarray) -> np.ndarray:
     return camera.project(local @ pose[:3, :3].T + pose[:3, 3])
 
 
-def pose_suspicions(comparison, report) -> list[str]:
+def pose_suspicions(comparison: Any, report: Any) -> list[str]:
     """One line per pose, of the camera or of an object, that explains the pixels that are misplaced."""
     gpu, ref = comparison.gpu, comparison.ref
     scene, now = ref.scene, ref.when.t_ns

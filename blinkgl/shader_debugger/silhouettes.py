@@ -12,10 +12,10 @@ from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.contours import Lines
 from blinkgl.render.passes import Colour, Edged, Luminance, Pass
 from blinkgl.render.passes.edged import SKY
-from blinkgl.tools.edges_twin import filtered
+from blinkgl.shader_debugger.edges_twin import filtered
 
 if TYPE_CHECKING:
-    from blinkgl.tools.shader_debugger.session import DebugRenderer
+    from blinkgl.shader_debugger.session import DebugRenderer
 
 EDGED = ("luminance_edges", "rate_edges", "colour_edges")
 _SAMPLES = samples_of("edges")

@@ -14,13 +14,14 @@ from PIL import Image
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.colour import flow_wheel
 from blinkgl.io.pictures import map_scalar
-from blinkgl.tools.shader_debugger.moments import PASSES, Pass
+from blinkgl.shader_debugger.moments import PASSES, Pass
 
 ERROR_MAP = "inferno"
 INK, PAPER, MUTED = "#1f2933", "#ffffff", "#64748b"
 
 
 def png_bytes(rgb: np.ndarray) -> bytes:
+    """A PNG file of (H, W, 3) uint8."""
     out = io.BytesIO()
     Image.fromarray(rgb).save(out, "PNG", compress_level=1)
     return out.getvalue()

@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -32,9 +33,9 @@ from blinkgl.labels.label import Label, View
 from blinkgl.render import reference
 from blinkgl.scene.lights import is_coloured
 from blinkgl.scene.types import Material
-from blinkgl.tools.shader_debugger.lamps import near_an_edge
-from blinkgl.tools.shader_debugger.mipmaps import mipmapped_albedo
-from blinkgl.tools.shader_debugger.moments import (
+from blinkgl.shader_debugger.lamps import near_an_edge
+from blinkgl.shader_debugger.mipmaps import mipmapped_albedo
+from blinkgl.shader_debugger.moments import (
     MAPS,
     PASSES,
     GpuMoment,
@@ -45,9 +46,9 @@ from blinkgl.tools.shader_debugger.moments import (
     lookup_of,
     luma_of,
 )
-from blinkgl.tools.shader_debugger.poses import displaced, pose_suspicions
-from blinkgl.tools.shader_debugger.silhouettes import EDGED
-from blinkgl.tools.shader_debugger.suspicions import suspicions
+from blinkgl.shader_debugger.poses import displaced, pose_suspicions
+from blinkgl.shader_debugger.silhouettes import EDGED
+from blinkgl.shader_debugger.suspicions import suspicions
 
 WORST = 10  # objects told apart in a report
 NOTHING = "nothing hit"
@@ -120,7 +121,7 @@ _MAPPED = "not graded where a map says how a surface shines, which the reference
 _LEVEL = "drivers may approximate the level (OpenGL 4.6, 8.14.1)"
 _EDGES = "not graded near the edge of a shadow, nor where light grazes: there a map is off by its texels"
 _MAP = "off its silhouettes"
-_FILTERED = "at all pixels, against a float64 twin on the GPU's own unfiltered picture and depths (tools/edges_twin.py)"
+_FILTERED = "at all pixels, against a float64 twin on the GPU's own unfiltered picture and depths (edges_twin.py)"
 _MIPS = "against a CPU twin of mip-mapped sampling; drivers may make mip maps differently, hence the loose tolerance"
 
 
@@ -200,7 +201,7 @@ def parse_tolerances(texts: list[str], names: list[str]) -> dict[str, float]:
 
 
 @dataclass(eq=False)
-class Report:
+class BufferReport:
     """Of one buffer. errors : (H, W) float64, nan where not comparable.   graded, band : (H, W) bool.
     value : the graded statistic.
     objects : of each object (the worst ten, worst first) its graded pixels, those over the tolerance, their median and
@@ -358,7 +359,7 @@ class Comparison:
             raise TypeError(f"label '{name}': `reference` gives {np.shape(ref[name])} and not {np.shape(gpu[name])}")
         return gpu[name], ref[name]
 
-    def twin(self, of: str, **more) -> np.ndarray:
+    def twin(self, of: str, **more: Any) -> np.ndarray:
         """(H, W, 3) float64 albedo that pass ``of`` should have found with its own
         coordinates; 0 where it drew nothing.
         more : as for :meth:`twin_colour`."""
@@ -396,7 +397,7 @@ class Comparison:
         error = QUANTITIES[name].error(g, r, self.gpu, self.ref)
         return np.where(np.isnan(error), np.inf, error)
 
-    def report(self, name: str, tolerance: float | None = None) -> Report:
+    def report(self, name: str, tolerance: float | None = None) -> BufferReport:
         quantity = QUANTITIES[name]
         errors = self.errors(name)
         of_map = name in MAPS
@@ -420,13 +421,15 @@ class Comparison:
             graded &= self.gpu["part"] >= 0
         inside = errors[graded]
         value = (float(inside.mean()) if quantity.statistic == "mean" else float(inside.max())) if inside.size else 0.0
-        report = Report(quantity, self.tolerance(name) if tolerance is None else tolerance, errors, graded, band, value)
+        report = BufferReport(
+            quantity, self.tolerance(name) if tolerance is None else tolerance, errors, graded, band, value
+        )
         report.objects = self._per_object(report)
         if not report.passed and not of_map:
             report.suspicions = pose_suspicions(self, report) if name == "local" else suspicions(self, report)
         return report
 
-    def _per_object(self, report: Report) -> list[dict]:
+    def _per_object(self, report: BufferReport) -> list[dict]:
         name = report.quantity.name
         g, r = self.pair(name)
         owner = np.full(report.errors.shape, len(self.objects) - 1) if name in MAPS else self.owner(name)

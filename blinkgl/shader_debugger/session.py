@@ -8,7 +8,7 @@ import os
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.render.strokes import Strokes
 from blinkgl.scene.build import check_assets, sequence_scene
 from blinkgl.scene.types import Scene
-from blinkgl.tools.shader_debugger.silhouettes import edged_of
+from blinkgl.shader_debugger.silhouettes import edged_of
 
 DEBUG_PROGRAM = "debug.glsl"
 LENT = (DEBUG_PROGRAM, "include/vertex.glsl")
@@ -130,18 +130,18 @@ class EditedFolder:
     def __init__(self, folder: Path, inside: str = ""):
         self.path, self._inside = folder, inside
 
-    def __truediv__(self, name: str):
+    def __truediv__(self, name: str) -> Any:
         inside = f"{self._inside}{name}"
         if name == "include":
             return EditedFolder(self.path, "include/")
         own = self.path / inside
         return shader_folder() / inside if inside in LENT and not own.exists() else own
 
-    def iterdir(self):
+    def iterdir(self) -> Any:
         return self.path.iterdir()
 
 
-def open_folder(shaders: str | None):
+def open_folder(shaders: str | None) -> Any:
     """The folder whose shaders are debugged: ``shaders``, or the shipped ones. Raises
     GLError when it cannot be read."""
     if shaders is None:
@@ -172,7 +172,7 @@ class Snapshot:
         self._files, self.path = files, path
 
     @classmethod
-    def of(cls, folder) -> Snapshot:
+    def of(cls, folder: Any) -> Snapshot:
         root = folder.path if isinstance(folder, EditedFolder) else Path(str(folder))
         files = {}
         places = {path.relative_to(root).as_posix(): path for path in files_of(folder)} | {
@@ -192,7 +192,7 @@ class Snapshot:
     def __truediv__(self, name: str) -> Snapshot:
         return Snapshot(self._files, f"{self.path}/{name}" if self.path else name)
 
-    def iterdir(self):
+    def iterdir(self) -> Any:
         inside = f"{self.path}/" if self.path else ""
         return (
             Snapshot(self._files, path)
@@ -206,7 +206,7 @@ class Snapshot:
         return self._files[self.path].decode(encoding)
 
 
-def files_of(folder) -> list[Path]:
+def files_of(folder: Any) -> list[Path]:
     """Every shader file below ``folder``, for watching and for messages."""
     root = folder.path if isinstance(folder, EditedFolder) else Path(str(folder))
     return sorted([*root.glob("*.glsl"), *(root / "include").rglob("*.glsl")])
@@ -235,11 +235,11 @@ class _DebugStrokes(Strokes):
 class DebugPainter(Painter):
     """Tolerates edited shaders that no longer use a uniform."""
 
-    def __init__(self, gl, scene, resources, stats):
+    def __init__(self, gl: GLContext, scene: Scene, resources: Any, stats: Any):
         super().__init__(gl, scene, resources, stats)
         self.strokes = _DebugStrokes(gl)
 
-    def uniforms(self, program):
+    def uniforms(self, program: Any) -> Any:
         return _Uniforms(super().uniforms(program))
 
 
@@ -255,10 +255,10 @@ class Inspection(ScenePass):
         Output("WINDOW", "RGBA32F"),
     )
 
-    def defines(self, kind):
+    def defines(self, kind: Any) -> Any:
         return {f"OUT_{output.name}": i for i, output in enumerate(self.outputs)}
 
-    def set(self, painter, uniforms, item, shot):
+    def set(self, painter: Any, uniforms: Any, item: Any, shot: Any) -> Any:
         uniforms["part_number"].value = item.part + 1
 
 
@@ -268,25 +268,29 @@ SHOWN = tuple(Output(name, "RGBA32F") for name in ("lookup", "albedo", "mirrored
 
 @dataclass(frozen=True)
 class LuminanceLookup(Luminance):
+    """The luminance pass, which shows its look-ups."""
+
     still: ClassVar[bool] = False
 
     @property
-    def outputs(self):
+    def outputs(self) -> Any:
         return (*super().outputs, *SHOWN)
 
-    def defines(self, kind):
+    def defines(self, kind: Any) -> Any:
         return super().defines(kind) | {"SHOW_LOOKUP": 1}
 
     @classmethod
-    def every_kind(cls):
+    def every_kind(cls) -> Any:
         yield cls()
 
 
 @dataclass(frozen=True)
 class ColourLookup(Colour):
+    """The colour pass, which shows its look-ups."""
+
     outputs: ClassVar[tuple[Output, ...]] = (*Colour.outputs, *SHOWN)
 
-    def defines(self, kind):
+    def defines(self, kind: Any) -> Any:
         return super().defines(kind) | {"SHOW_LOOKUP": 1}
 
 
@@ -310,7 +314,7 @@ class DebugRenderer(Renderer):
 
     edged: tuple[str, ...] = ()
 
-    def __init__(self, gl: GLContext, scene: Scene, config, painter: type[Painter] = DebugPainter):
+    def __init__(self, gl: GLContext, scene: Scene, config: Any, painter: type[Painter] = DebugPainter):
         super().__init__(gl, scene, config, whole=True, painter=painter)
 
     def use_shaders(self, loader: ShaderLoader) -> None:
@@ -382,7 +386,7 @@ class DebugRenderer(Renderer):
 
 
 @contextmanager
-def open_renderer(subject: Subject, shaders: str | None = None, *, as_configured: bool = False):
+def open_renderer(subject: Subject, shaders: str | None = None, *, as_configured: bool = False) -> Any:
     """A :class:`DebugRenderer` of the subject with the shaders of a folder, on the configuration's OpenGL.
 
     as_configured : anti-aliasing as generation does; otherwise one sample at the pixel centre, which is what the

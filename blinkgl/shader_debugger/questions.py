@@ -10,7 +10,7 @@ from urllib.parse import parse_qsl
 
 from blinkgl.errors import ConfigError
 from blinkgl.io.pictures import MAPS
-from blinkgl.tools.shader_debugger.moments import check_pass
+from blinkgl.shader_debugger.moments import check_pass
 
 LONGEST = 2000  # characters of a query
 LARGEST = 1e30  # ends of a colour scale: far above every buffer, and their difference is still a number

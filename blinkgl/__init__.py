@@ -52,6 +52,7 @@ _HOMES = {
         "write_trajectory",
     ),
     "blinkgl.types.events": ("Events",),
+    "blinkgl.tensors": ("TensorEsim", "TensorEvents", "TensorV2e"),
     "blinkgl.sequence.items": ("CameraImage", "EventChunk", "GroundTruth", "Picture"),
     "blinkgl.labels.frames": ("Flow", "LabelFrame"),
     "blinkgl.online.samples": ("StreamSample", "WindowSample"),
@@ -103,6 +104,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see; a test compares it w
     from blinkgl.online.samples import StreamSample, WindowSample
     from blinkgl.online.stream import StreamStats
     from blinkgl.sequence.items import CameraImage, EventChunk, GroundTruth, Picture
+    from blinkgl.tensors import TensorEsim, TensorEvents, TensorV2e
     from blinkgl.types.events import Events
 
 __all__ = [
@@ -140,6 +142,9 @@ __all__ = [
     "Scene",
     "StreamSample",
     "StreamStats",
+    "TensorEsim",
+    "TensorEvents",
+    "TensorV2e",
     "Timeline",
     "Trajectory",
     "V2e",

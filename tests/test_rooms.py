@@ -54,7 +54,7 @@ FLOORS = (
     "errors rng srgb types camera gl machine",
     "config",
     "io events",
-    "labels scene timeline",
+    "labels scene timeline tensors",
     "render sequence_files blender card",
     "imaging recordings",
     "sequence",
@@ -140,7 +140,7 @@ def test_a_record_is_a_value_unless_it_is_filled_in_later():
 
 def test_records_that_hold_arrays_are_compared_by_identity():
     """Else ``==`` of two of them raises (an array has no truth value), and a hash by value does, too."""
-    everything, holders = list(records()), {"ndarray", "ArrayLike"}
+    everything, holders = list(records()), {"ndarray", "ArrayLike", "Tensor"}
     words = lambda thing: [
         set(re.findall(r"\w+", re.sub(r"Callable\[.*", "", str(f.type)))) for f in dataclasses.fields(thing)
     ]

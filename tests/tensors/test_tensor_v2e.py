@@ -1,8 +1,10 @@
 """TensorV2e makes the events of V2e, bit for bit and in their order, noise included."""
 
 import pytest
+import torch
 
 from blinkgl.config.events import V2eConfig
+from blinkgl.errors import EventDataError
 from blinkgl.events.v2e import V2e
 from blinkgl.tensors import TensorV2e
 from same_events import compare
@@ -30,3 +32,10 @@ def test_the_same_events_as_the_numba_kernel(name):
     config = V2eConfig(**OPTIONS[name])
     sizes = ((1, 1, 2), (7, 201, 3), (33, 64, 2))
     assert sum(compare(TensorV2e, V2e, config, *size) for size in sizes) > 2000
+
+
+def test_more_shot_noise_than_it_may_draw_is_refused():
+    emulator = TensorV2e(40, 64, V2eConfig(shot_noise_rate_hz=1e4, max_events_per_step=1000), envs=2)
+    emulator.step(torch.full((2, 40, 64), 0.5), 0)
+    with pytest.raises(EventDataError, match="environment 1, frame 1.*more shot noise"):
+        emulator.step(torch.full((2, 40, 64), 0.5), [1_000, 1_000_000_000])

@@ -551,7 +551,9 @@ def convert(
 
 @app.command("import")
 def import_(
-    source: Annotated[str, typer.Argument(metavar="SCENE", help=".blend, .fbx, .usd/.usda/.usdc/.usdz, .dae or .abc.")],
+    source: Annotated[
+        str, typer.Argument(metavar="SCENE", help=".blend, .fbx, .usd/.usda/.usdc/.usdz, .dae, .abc or .obj.")
+    ],
     out: Annotated[str, typer.Option("--out", "-o", help="The GLB to write.")],
     scene: Annotated[
         str | None, typer.Option("--scene", help="Name of the file's scene (default: the one it was saved in).")
@@ -570,12 +572,8 @@ def import_(
     clips: Annotated[
         bool, typer.Option("--clips", help="An animation per action, not one of the scene as it plays.")
     ] = False,
-    texture_size: Annotated[
-        int, typer.Option("--texture-size", min=16, max=8192, help="Sides of baked pictures, px.")
-    ] = 1024,
-    bake_seconds: Annotated[
-        float, typer.Option("--bake-seconds", min=0, help="After so long no further picture is begun.")
-    ] = 120.0,
+    texture_size: Annotated[int | None, typer.Option("--texture-size", hidden=True)] = None,
+    bake_seconds: Annotated[float | None, typer.Option("--bake-seconds", hidden=True)] = None,
     time_limit: Annotated[
         float, typer.Option("--time-limit", min=1, help="Seconds that Blender may take altogether.")
     ] = 900.0,
@@ -585,8 +583,12 @@ def import_(
 ) -> int:
     """Make a GLB of a scene of Blender's or of a format that Blender reads (extra [cycles]), and say what came and what
     could not."""
+    from blinkgl.errors import ConfigError
     from blinkgl.show import import_ as command
 
+    for option, value in (("--texture-size", texture_size), ("--bake-seconds", bake_seconds)):
+        if value is not None:
+            raise ConfigError("colours are no longer baked", where=option, accepted="colours baked in Blender")
     return command.run(
         source,
         out,
@@ -597,8 +599,6 @@ def import_(
         fps=fps,
         keys_per_frame=keys_per_frame,
         clips=clips,
-        texture_size=texture_size,
-        bake_s=bake_seconds,
         time_limit_s=time_limit,
         overwrite=overwrite,
     )

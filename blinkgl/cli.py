@@ -18,7 +18,7 @@ from typing import Annotated
 import typer
 
 from blinkgl import __version__
-from blinkgl.errors import BlinkGLError
+from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.machine.interrupts import interruptible
 from blinkgl.shader_debugger.cli import app as shader_app
 from blinkgl.show.terminal import never_fail_to_print
@@ -453,20 +453,8 @@ def calibrate(
     still: Annotated[
         bool, typer.Option("--still", help="No frames: a scene that stands still in constant light. Noise alone.")
     ] = False,
-    flicker: Annotated[
-        str | None,
-        typer.Option(
-            metavar="HZ,CONTRAST",
-            help="No frames: an even scene under light that goes as 1 + CONTRAST sin, HZ times a second. Thresholds.",
-        ),
-    ] = None,
-    edge: Annotated[
-        str | None,
-        typer.Option(
-            metavar="CONTRAST[,WIDTH]",
-            help="No frames: straight borders of two tones that move at constant speed; WIDTH in px. Thresholds.",
-        ),
-    ] = None,
+    flicker: Annotated[str | None, typer.Option("--flicker", hidden=True)] = None,
+    edge: Annotated[str | None, typer.Option("--edge", hidden=True)] = None,
     emulator: Annotated[
         str,
         typer.Option("--emulator", "-e", help="esim, v2e or voltmeter; with --still also pixels: noise beside any."),
@@ -492,13 +480,12 @@ def calibrate(
     """Fit an emulator to a camera's own recording: a sensor file, and a page that says how near it comes."""
     from blinkgl.show import calibrate as command
 
+    _gone("no scene is guessed without frames", "--frames or --still", **{"--flicker": flicker, "--edge": edge})
     return command.run(
         recording,
         frames,
         out,
         still=still,
-        flicker=flicker,
-        edge=edge,
         emulator=emulator,
         sensor=sensor,
         overrides=overrides or [],
@@ -583,12 +570,10 @@ def import_(
 ) -> int:
     """Make a GLB of a scene of Blender's or of a format that Blender reads (extra [cycles]), and say what came and what
     could not."""
-    from blinkgl.errors import ConfigError
     from blinkgl.show import import_ as command
 
-    for option, value in (("--texture-size", texture_size), ("--bake-seconds", bake_seconds)):
-        if value is not None:
-            raise ConfigError("colours are no longer baked", where=option, accepted="colours baked in Blender")
+    given = {"--texture-size": texture_size, "--bake-seconds": bake_seconds}
+    _gone("colours are no longer baked", "colours baked in Blender", **given)
     return command.run(
         source,
         out,
@@ -602,6 +587,13 @@ def import_(
         time_limit_s=time_limit,
         overwrite=overwrite,
     )
+
+
+def _gone(problem: str, accepted: str, **options: object) -> None:
+    """Refuses options that earlier versions had."""
+    for option, value in options.items():
+        if value is not None:
+            raise ConfigError(problem, where=option, accepted=accepted)
 
 
 # --- frame ------------------------------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ COPY shaders ./shaders
 COPY configs ./configs
 COPY tools ./tools
 RUN pip install -q --no-cache-dir -c constraints.txt --upgrade pip setuptools wheel && pip install -q --no-cache-dir --no-build-isolation -c constraints.txt ".[physics]"
-RUN mv configs /opt/blinkgl/configs && rm -rf /opt/blinkgl/source/* && cd / && python -m blinkgl.machine.compiling
+RUN mv configs /opt/blinkgl/configs && rm -rf /opt/blinkgl/source/* && cd / && python -m blinkgl.show.compile_kernels
 RUN useradd --create-home blinkgl && install -d -o blinkgl /work
 USER blinkgl
 WORKDIR /work

@@ -95,7 +95,7 @@ setup: .venv/.installed-dev opengl
 
 # Once per machine instead of in somebody's first run; where it fails, the first run compiles.
 .venv/.kernels: .venv/.installed-core $(wildcard blinkgl/events/*.py) | opengl
-	-@.venv/bin/python -m blinkgl.machine.compiling
+	-@.venv/bin/python -m blinkgl.show.compile_kernels
 	@touch $@
 
 # No stamp: it takes half a second, and system packages come and go without make seeing it.

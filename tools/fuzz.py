@@ -35,13 +35,13 @@ import trimesh
 
 from blinkgl.config.sequence import load_run
 from blinkgl.errors import BlinkGLError
-from blinkgl.events.types import Events
 from blinkgl.io.flo import read_flo, write_flo
 from blinkgl.io.flow_png import read_flow_png, write_flow_png
 from blinkgl.io.formats import open_events, write_events
 from blinkgl.io.frames import open_frames
 from blinkgl.io.pfm import write_pfm
 from blinkgl.scene.importing.mesh_files import load_asset
+from blinkgl.types.events import Events
 
 HEIGHT, WIDTH = 24, 32
 CPU_S, WALL_S, MEMORY_MB = 10, 60.0, 2048

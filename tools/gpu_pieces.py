@@ -33,8 +33,8 @@ from blinkgl.events import Esim
 from blinkgl.events.table import emulator_of
 from blinkgl.gl import GLContext, create_context, egl_devices
 from blinkgl.labels import LABELS, LabelRequest
-from blinkgl.machine import doctor
 from blinkgl.render.renderer import Renderer
+from blinkgl.show import checks as doctor
 from blinkgl.timeline.reductions import OfArrays
 from blinkgl.tools import bench_accuracy
 from blinkgl.tools.bench import pace, probe_scene

@@ -33,9 +33,9 @@ from typing import Any
 import numpy as np
 
 from blinkgl.errors import BlinkGLError
-from blinkgl.events.types import Events
 from blinkgl.io.formats import open_events
-from blinkgl.show.terminal import plain_console, say
+from blinkgl.machine.terminal import plain_console, say
+from blinkgl.types.events import Events
 from eflow.checkpoint import load_model
 from eflow.data.window import Window
 from eflow.infer import LIKELY_PX, MethodPredictor, Predictor, StreamWindow, read_truth

@@ -21,8 +21,8 @@ from blinkgl.card.v2e import FEW_SHOTS, SIZES, CardV2e, V2eRoom, V2eStages
 from blinkgl.config.events import V2eConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events.emulator import BLOCK
-from blinkgl.events.types import Events
 from blinkgl.events.v2e import V2e
+from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
     from blinkgl.gl import GLContext

@@ -20,9 +20,9 @@ from blinkgl.card.v2e import CardV2e
 from blinkgl.errors import EventDataError, GLError
 from blinkgl.events.emulator import Emulator
 from blinkgl.events.esim import Esim
-from blinkgl.events.types import Events
 from blinkgl.events.v2e import V2e
 from blinkgl.gl import create_context
+from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
     from blinkgl.gl import GLContext

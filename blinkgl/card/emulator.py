@@ -21,7 +21,7 @@ from blinkgl.card.proof import rounding as rounding_of
 from blinkgl.errors import EventDataError
 from blinkgl.events.emulator import BLOCK, Emulator
 from blinkgl.events.packing import unpacked
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
     from blinkgl.gl import GLContext

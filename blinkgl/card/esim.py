@@ -28,7 +28,7 @@ from blinkgl.errors import EventDataError
 from blinkgl.events.arith import Q_ONE, log_q25
 from blinkgl.events.emulator import BLOCK, INTENSITY_LIMIT_BITS
 from blinkgl.events.esim import Esim
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
     from blinkgl.gl import GLContext

@@ -19,7 +19,7 @@ from blinkgl.errors import EventDataError
 from blinkgl.events.emulator import BLOCK, INTENSITY_LIMIT_BITS
 from blinkgl.events.packing import MAX_CAUSE_ROWS
 from blinkgl.events.table import emulator_of
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
     from typing_extensions import Self

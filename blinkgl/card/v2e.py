@@ -25,8 +25,8 @@ from blinkgl.card.memory import refuse_too_large
 from blinkgl.card.room import Buffers
 from blinkgl.config.events import V2eConfig
 from blinkgl.events.emulator import BLOCK, INTENSITY_LIMIT_BITS
-from blinkgl.events.types import Events
 from blinkgl.events.v2e import V2e
+from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
     import moderngl

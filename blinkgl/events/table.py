@@ -69,7 +69,7 @@ def emulator_of(config: EmulatorConfig) -> type[Emulator]:
     """The class that a configuration is of. Raises TypeError for one that is not in the table."""
     for emulator in EMULATORS.values():
         if type(config) is emulator.Config:
-            return emulator.kind_for(config)
+            return emulator
     raise TypeError(f"no emulator for {type(config).__name__}")
 
 

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from blinkgl.errors import ConfigError, EventDataError
-from blinkgl.events.types import Events
 from blinkgl.front import arguments as check
 from blinkgl.front.sections import EmulatorSettings, events_tree
 from blinkgl.io import flow as flow_files, formats, trajectories
 from blinkgl.io.formats import EventFile
+from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
     from blinkgl.recordings.calibration import Calibration

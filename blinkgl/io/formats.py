@@ -25,10 +25,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from blinkgl.errors import AssetError, OutputError
-from blinkgl.events.types import Events
 from blinkgl.io.atomic import atomic_file
 from blinkgl.io.columns import check_events, check_size
 from blinkgl.io.davis import CameraFrame, ImuSamples
+from blinkgl.types.events import Events
 
 ENDINGS = {
     ".h5": "dsec",
@@ -82,7 +82,7 @@ class EventFile:
         """All events from the beginning, in pieces, memory flat (npz, npy: held whole).
 
         Raises, naming event and value, EventDataError: times that run backwards, an event outside height and width
-        where those are known, or that :class:`~blinkgl.events.types.Events` cannot hold;
+        where those are known, or that :class:`~blinkgl.types.events.Events` cannot hold;
         AssetError when the file is damaged."""
         last, count = None, 0
         for events in self._reader.chunks():

@@ -20,7 +20,6 @@ from blinkgl.errors import EventDataError
 from blinkgl.events import emulator_of
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.truth import Surfaces, SurfaceTruth
-from blinkgl.events.types import Events
 from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging import FrameCamera
 from blinkgl.labels import LABELS, Label, LabelRequest, asked_for
@@ -38,10 +37,10 @@ from blinkgl.sequence.items import GroundTruth, Item, Picture
 from blinkgl.sequence.simulate import Simulation
 from blinkgl.timeline import Timeline, make_timeline
 from blinkgl.timeline.reductions import OfArrays, Reductions
+from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
     from blinkgl.card.tiles import Tiles
-    from blinkgl.sequence.helper import Hand
 
 SURFACES = LabelRequest("ids", "depth", "velocity")
 """Labels that say what made an event."""
@@ -124,7 +123,7 @@ class RenderedSequence(Simulation):
     scene : as it was built.   renderer : what draws it, at its level of detail.
     sensor : what is recorded, and through which camera. A scene that was made already is
     recorded as the configuration says.   number : of the sensor on its rig, by which noise differs.
-    atlas, hand : see :func:`~blinkgl.sequence.simulate.simulate_sequence`."""
+    atlas : see :func:`~blinkgl.sequence.simulate.simulate_sequence`."""
 
     def __init__(
         self,
@@ -141,9 +140,8 @@ class RenderedSequence(Simulation):
         window_ns: tuple[int, int] | None,
         number: int = 0,
         atlas: Tiles | None = None,
-        hand: Hand | None = None,
     ):
-        self.number, self._hand = number, hand
+        self.number = number
         clock = StageClock()
         scene = scene or (renderer.scene if renderer is not None else None)
         if scene is None:
@@ -208,10 +206,7 @@ class RenderedSequence(Simulation):
         """Of the event pass."""
         rates, tells = self.camera.emulator.needs_rate, self.camera.tells
         textures = self.camera.takes_textures(self.renderer.gl)
-        if self._hand is None or textures or self.timeline.looks_at_frames:
-            return drawn(self.renderer, self.timeline, rates, tells, textures)
-        shown = partial(surfaces_at, self.renderer) if tells else None
-        return self._hand.drawn(self.renderer, self.number, self.timeline, rates, shown)
+        return drawn(self.renderer, self.timeline, rates, tells, textures)
 
     def _in_order(self) -> Iterator[Item]:
         yield from super()._in_order()
@@ -266,8 +261,7 @@ class RenderedSequence(Simulation):
     def seconds(self) -> dict[str, float]:
         stats, (render_s, readback_s) = self.renderer.stats, self._before
         images = {} if self.frame_camera is None else {"images": self.frame_camera.seconds}
-        waited_s = 0.0 if self._hand is None else self._hand.waited_s.get(self.number, 0.0)
-        drawing = {"render": stats.render_s - render_s + waited_s, "read-back": stats.readback_s - readback_s}
+        drawing = {"render": stats.render_s - render_s, "read-back": stats.readback_s - readback_s}
         return {**self.clock.seconds, **images, **drawing}
 
     def poses(self) -> dict[str, np.ndarray]:

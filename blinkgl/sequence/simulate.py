@@ -28,7 +28,6 @@ from blinkgl.camera import CameraModel
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.events.camera import EventCamera
-from blinkgl.events.types import Events, count_causes, named_causes
 from blinkgl.gl import GLContext
 from blinkgl.imaging import FrameCamera
 from blinkgl.render.renderer import Renderer
@@ -38,10 +37,10 @@ from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.inertial import Inertial
 from blinkgl.sequence.items import CameraImage, EventChunk, GroundTruth, Item, Picture
 from blinkgl.timeline import Ticks, Timeline
+from blinkgl.types.events import Events, count_causes, named_causes
 
 if TYPE_CHECKING:
     from blinkgl.card.tiles import Tiles
-    from blinkgl.sequence.helper import Hand
 
 
 def simulate_sequence(
@@ -57,7 +56,6 @@ def simulate_sequence(
     renderer: Renderer | None = None,
     window_ns: tuple[int, int] | None = None,
     atlas: Tiles | None = None,
-    hand: Hand | None = None,
 ) -> Simulation:
     """Sequence ``index`` of a run, ready to be iterated over: :class:`EventChunk`, :class:`GroundTruth`,
     :class:`CameraImage` and :class:`Picture` in time order.
@@ -73,7 +71,6 @@ def simulate_sequence(
     what is drawn, not of recorded frames.)
     atlas : the batch that its events are made in, of the context ``gl``; see
     :func:`~blinkgl.sequence.side_by_side.side_by_side`.
-    hand : of another process, which draws frames of this sequence, too (:mod:`blinkgl.sequence.helper`).
     Raises BlinkGLError for anything the user or the machine caused, here or while iterating."""
     if pictures_hz is not None and not events:
         raise ConfigError(
@@ -104,14 +101,13 @@ def simulate_sequence(
             renderer=renderer,
             window_ns=window_ns,
             atlas=atlas,
-            hand=hand,
             **wanted,
         )
-    if scene is not None or renderer is not None or window_ns is not None or atlas is not None or hand is not None:
+    if scene is not None or renderer is not None or window_ns is not None or atlas is not None:
         raise ConfigError(
             "nothing is drawn of recorded frames",
             where="frames",
-            accepted="no scene, renderer, window_ns, atlas or hand",
+            accepted="no scene, renderer, window_ns or atlas",
         )
     return RecordedSequence(config, index, base=base, **wanted)
 

@@ -120,7 +120,7 @@ _SHADING = "against the GPU's own albedo times its own light, and what it adds"
 _MAPPED = "not graded where a map says how a surface shines, which the reference has without mip maps"
 _LEVEL = "drivers may approximate the level (OpenGL 4.6, 8.14.1)"
 _EDGES = "not graded near the edge of a shadow, nor where light grazes: there a map is off by its texels"
-_MAP = "off its silhouettes; with what throws its shadow out of the picture, too"
+_MAP = "off its silhouettes"
 _FILTERED = "at all pixels, against a float64 twin on the GPU's own unfiltered picture and depths (edges_twin.py)"
 _MIPS = "against a CPU twin of mip-mapped sampling; drivers may make mip maps differently, hence the loose tolerance"
 

@@ -13,7 +13,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from blinkgl.camera.drawing import seen_through
-from blinkgl.config.lod import LodConfig
 from blinkgl.config.sequence import NS_PER_S, SequenceConfig, load_run
 from blinkgl.errors import ConfigError, GLError
 from blinkgl.gl import GLContext, ShaderLoader, create_context
@@ -25,7 +24,6 @@ from blinkgl.render.passes.shadow import ShadowMap
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.strokes import Strokes
 from blinkgl.scene.build import check_assets, sequence_scene
-from blinkgl.scene.geometry.lod import at_level_of_detail
 from blinkgl.scene.types import Scene
 from blinkgl.shader_debugger.silhouettes import edged_of
 
@@ -82,9 +80,6 @@ def open_subject(
     check_assets(one.scene, template.base, one.output.split)
     scene = sequence_scene(one, index, template.base)
     scene = scene.with_camera(seen_through(scene.camera))
-    # Here, and not in each renderer: the rays of the reference have to meet the triangles that are drawn.
-    scene = at_level_of_detail(scene, one.render.lod)
-    one = one.model_copy(update={"render": one.render.model_copy(update={"lod": LodConfig()})})
     return Subject(str(config), one, index, scene)
 
 
@@ -301,13 +296,10 @@ class ColourLookup(Colour):
 
 @dataclass(frozen=True)
 class WholeShadowMap(ShadowMap):
-    """With all that casts, also what throws its shadow out of the picture."""
+    """Drawn anew, whatever stood still since the last one."""
 
     def stands_still(self, whole: bool) -> bool:
         return False
-
-    def items(self, moment: Any) -> Any:
-        return [item for item in moment.visible if item.casts]
 
 
 LOOKUPS = {"luminance": LuminanceLookup(), "colour": ColourLookup()}

@@ -10,7 +10,7 @@ from typing import Any
 from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn
 
 from blinkgl.config.reader import to_short_yaml
-from blinkgl.show.terminal import plain_column, plain_console, say
+from blinkgl.machine.terminal import plain_column, plain_console, say
 
 _LONGER_SIDE = 640  # px: an event camera's, not a film's
 

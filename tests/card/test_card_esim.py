@@ -11,8 +11,8 @@ from blinkgl.card.room import Room
 from blinkgl.config.events import EsimConfig
 from blinkgl.errors import EventDataError, GLError
 from blinkgl.events import Esim
-from blinkgl.events.reference import ReferenceEsim
 from tests.events.clips import assert_same, random_clip, run
+from tests.events.reference import ReferenceEsim
 
 VARIANTS = {
     "plain": dict(threshold_sigma=0.0),

@@ -10,10 +10,10 @@ from blinkgl.card.kernels import Rounding
 from blinkgl.config.events import V2eConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events import V2e
-from blinkgl.events.reference import ReferenceV2e
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 from tests.card.test_frames_on_card import textures
 from tests.events.clips import assert_same, random_clip, run
+from tests.events.reference import ReferenceV2e
 
 CLEAN = dict(preset="clean")
 NOISE = dict(shot_noise_rate_hz=100.0, leak_rate_hz=20.0, hot_pixel_fraction=0.02, causes=True)

@@ -103,8 +103,8 @@ def config_of(folder, **changes):
 def test_files_are_the_same_and_the_manifest_says_which(gl, tmp_path, monkeypatch, emulator):
     from blinkgl.dataset.generate import generate_sequence
     from blinkgl.dataset.verify import verify_dataset
-    from blinkgl.io.sequence_dir import read_manifest
     from blinkgl.render.canvas import Frame
+    from blinkgl.sequence_files.sequence_dir import read_manifest
 
     viewed, view = [], Frame.view
     monkeypatch.setattr(Frame, "view", lambda frame, name="": viewed.append(frame) or view(frame, name))

@@ -10,7 +10,7 @@ from blinkgl.card.sinks import ONE
 from blinkgl.config.events import EsimConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events import Esim
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 from tests.card.test_frames_on_card import textures
 from tests.events.clips import assert_same, random_clip, run
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import AssetError, EventDataError
-from blinkgl.events.types import Events
 from blinkgl.io.text import TextReader, TextWriter
+from blinkgl.types.events import Events
 
 
 def read(path, text: str) -> Events:

@@ -12,7 +12,7 @@ from blinkgl import cli
 from blinkgl.card.tensors import Way
 from blinkgl.errors import EventDataError
 from blinkgl.gl import context as context_module, osmesa
-from blinkgl.machine import doctor
+from blinkgl.show import checks as doctor
 from blinkgl.show.doctor import show
 
 

@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter
 from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.records import HereOrInside, parse, read_text, shown
-from blinkgl.io.sequence_dir import MANIFEST, is_rig_folder, read_manifest
+from blinkgl.sequence_files.sequence_dir import MANIFEST, is_rig_folder, read_manifest
 
 INDEX = "index.jsonl"
 _PART = 20_000

@@ -21,13 +21,11 @@ from blinkgl.events.philox import (
     Stream,
     normal2,
     normal2_and_uniform,
-    normal_and_uniform,
     pixel_counters,
     rough_normal,
     uniform2,
 )
-from blinkgl.events.types import Events
-from blinkgl.events.v2e_authors import noise_share, noise_size
+from blinkgl.types.events import Events
 
 
 def sorted_events(rows: list[tuple[int, int, int, int, int]], causes: bool) -> Events:
@@ -371,76 +369,6 @@ class ReferenceV2e:
         return rows
 
 
-class ReferenceV2eAuthors:
-    """The published program, as the docstring of :mod:`blinkgl.events.v2e_authors` says it: all pixels at once, one
-    round of events after the other."""
-
-    def __init__(self, height: int, width: int, config: V2eConfig, seed: int = 0):
-        self.height, self.width, self.config, self.seed = height, width, config, np.uint64(seed)
-        self.pixels = height * width
-        law = ReferenceV2e(height, width, config, seed)
-        self.on, self.off, self.leak, self.leaks, self.hums = law.on, law.off, law.leak, law.leaks, law.hums
-        self.kind = np.float64 if config.cutoff_hz else np.float32
-        self.leaked, self.hum, self.noise_then = (np.zeros(self.pixels, k) for k in (np.float32, float, float))
-        self.last = np.full(self.pixels, -(2.0**60))
-        self.hot = v2e.draw_hot(height, width, config, self.seed)
-        self.t_ns: int | None = None
-        self.frame = 0
-
-    def step(self, luminance: np.ndarray, t_ns: int) -> Events:
-        c, pixels = self.config, pixel_counters(self.height, self.width)
-        intensity = (as_luminance(luminance) * np.float32(c.full_scale)).ravel().astype(float)
-        x = np.array([i * math.log(20.0) / 20 if i <= 20 else math.log(i) for i in intensity])
-        x = (np.rint(x * 1e8) / 1e8).astype(np.float32)
-        if self.t_ns is None:
-            self.signal, self.reference, self.t_ns, self.frame = x.astype(self.kind), x.astype(self.kind), t_ns, 1
-            return Events.empty()
-        dt_ns, dt, level = t_ns - self.t_ns, (t_ns - self.t_ns) * 1e-9, (intensity + 20) / 275
-        share = np.minimum(2 * np.pi * c.cutoff_hz * dt_ns * 1e-9 * level, 1) if c.cutoff_hz else 1.0
-        self.signal = ((1 - share) * self.signal + share * x).astype(self.kind)
-        hum, turn = normal2(self.seed, pixels, np.uint64(Stream.NOISE), np.uint64(self.frame))
-        if self.hums:
-            off = c.contrast_threshold_off or c.contrast_threshold
-            size = noise_size(c.shot_noise_rate_hz, c.cutoff_hz, dt, c.contrast_threshold, off, c.threshold_sigma)
-            share = noise_share(c.cutoff_hz, dt)
-            self.hum = (1 - share) * self.hum + share * size * hum
-        if self.leaks:
-            fallen = (dt * self.leak.astype(float) * (1 - c.leak_jitter * turn)).astype(np.float32)
-            self.reference, self.leaked = self.reference - fallen, self.leaked + fallen
-        difference = self.signal + self.hum - self.reference
-        counts = np.where(difference > 0, difference // self.on, -(-difference // self.off)).astype(int)
-        most = max(int(np.abs(counts).max()), 1)
-        up, size = counts > 0, np.where(counts > 0, self.on, self.off)
-        sign = np.where(up, 1.0, -1.0)
-        by_leak, by_noise = sign * self.leaked, sign * (self.hum - self.noise_then)
-        cause = np.argmax([np.abs(counts) * size - by_leak - by_noise, by_leak, by_noise], axis=0)
-        cause[(cause == 1) & (self.hot == 1)] = 3
-        rows, moved = [[] for _ in range(self.pixels)], np.zeros(self.pixels, int)
-        for k in range(1, most + 1):
-            after = dt_ns if k == most else int(dt_ns * (k / most))
-            fires = np.abs(counts) >= k
-            if c.refractory_us and round(c.refractory_us * 1000) > dt_ns / most:
-                fires &= self.t_ns + after - self.last > round(c.refractory_us * 1000)
-                self.last[fires] = self.t_ns + after
-            moved += fires
-            for i in np.flatnonzero(fires):
-                rows[i].append(((self.t_ns + after) // 1000, *divmod(i, self.width), int(up[i]), cause[i]))
-        self.reference = (self.reference + sign * moved * size).astype(self.kind)
-        if c.shot_noise_rate_hz and not self.hums:
-            u, _ = uniform2(self.seed, pixels, np.uint64(Stream.SHOT), np.uint64(self.frame))
-            chance = 0.5 * c.shot_noise_rate_hz * dt_ns * 1e-9 * (1 - 0.75 * level)
-            nominal = c.contrast_threshold, c.contrast_threshold_off or c.contrast_threshold
-            lights = u > 1 - chance * (nominal[0] / self.on), u < chance * (nominal[1] / self.off)
-            for p, here in ((0, lights[1]), (1, lights[0])):
-                self.reference[here] = self.signal[here]
-                moved += here
-                for i in np.flatnonzero(here):
-                    rows[i].append((t_ns // 1000, *divmod(i, self.width), p, 2))
-        self.leaked[moved > 0], self.noise_then[moved > 0] = 0, self.hum[moved > 0]
-        self.t_ns, self.frame = t_ns, self.frame + 1
-        return sorted_events([row for of_one in rows for row in of_one], c.causes)
-
-
 class ReferenceVoltmeter:
     """Lin et al. 2022, sections 3 and 4, as the docstring of :mod:`blinkgl.events.voltmeter` says it."""
 
@@ -457,7 +385,7 @@ class ReferenceVoltmeter:
         c, f = self.config, np.float32
         intensity = (as_luminance(luminance) * f(c.full_scale)).ravel()
         rows = []
-        if self.t_ns is None and c.start == "stationary" and c.compat == "none":
+        if self.t_ns is None and c.start == "stationary":
             self.v, left_us = voltmeter.start_voltage(intensity, c, self.seed)
             self.release = [t_ns + int(us * 1e3) if us else None for us in left_us]
             v = np.where([r is None for r in self.release], self.v, voltmeter.IN_DEAD_TIME)
@@ -481,9 +409,7 @@ class ReferenceVoltmeter:
             by_light = self.parts[:, 0] + f(c.k1) * (intensity - self.intensity) / (mean + f(c.k2))
             after = np.stack([by_light, self.parts[:, 1] + (f(c.k4 * dt) + f(c.k5 * dt) * mean)], axis=1)
             for i in range(len(self.v)):
-                if c.compat == "authors":
-                    v_end[i] = self.pixel_of_authors(i, np.float64(intensity[i]), dt, t_ns, rows)
-                elif near[i] or self.release[i] is not None:
+                if near[i] or self.release[i] is not None:
                     v_end[i], unspent[i] = self.pixel(i, np.float64(intensity[i]), dt, t_ns, rows)
                 else:
                     continue
@@ -568,28 +494,3 @@ class ReferenceVoltmeter:
             if whole:
                 break
         return int(v * voltmeter.V_ONE), np.float32(variance)
-
-    def pixel_of_authors(self, i: int, after: np.float64, dt: float, t_ns: int, rows: list) -> int:
-        """:meth:`pixel` of ``compat: authors``."""
-        v, t = np.float64(self.v[i] / voltmeter.V_ONE), 0.0
-        if self.release[i] is not None:
-            if self.release[i] > t_ns:
-                return voltmeter.IN_DEAD_TIME
-            v, t, self.release[i] = np.float64(0), max(self.release[i] - self.t_ns, 0) * 1e-3, None
-        mu, sigma = self.rates(i, after, dt, t)
-        draw = self.frame << 20
-        while True:
-            normal, which = normal_and_uniform(self.seed, np.uint64(i), np.uint64(Stream.DIFFUSION), np.uint64(draw))
-            side, _ = uniform2(self.seed, np.uint64(i), np.uint64(Stream.DIFFUSION), np.uint64(draw + 1))
-            draw += 2
-            up = side < voltmeter.on_first(1.0 - v, 1.0 + v, mu, sigma)
-            distance = 1.0 - v if up else 1.0 + v
-            hit = voltmeter.hitting_time(distance, mu, sigma, normal, which)
-            if not hit < dt - t:
-                moved = distance * (dt - t) / hit
-                v = v + moved if up else v - moved
-                return int(np.clip(v, -voltmeter.NEAREST, voltmeter.NEAREST) * voltmeter.V_ONE)
-            resumed = self.fire(i, up, t + hit, t_ns, rows)
-            if resumed is None:
-                return voltmeter.IN_DEAD_TIME
-            v, t = np.float64(0), resumed

@@ -2,7 +2,7 @@
 
     <sequence>/
       rig.yaml                       sensors, what they record, where they are (T_rig_sensor), pairs
-      left/  right/                  sequences of their own, each with its manifest (blinkgl.io.sequence_dir)
+      left/  right/                  sequences of their own, each with its manifest (sequence_dir.py)
       imu0/imu/                      a sensor that is an inertial unit and no camera (blinkgl.io.imu)
       config.yaml  manifest.json  preview.mp4
 
@@ -21,7 +21,7 @@ import numpy as np
 from blinkgl.config.reader import read_table, to_yaml
 from blinkgl.config.rig import RigSensorConfig, baseline_of
 from blinkgl.io.atomic import output_errors
-from blinkgl.io.sequence_dir import MANIFEST, RIG, SequenceWriter, digest_of, read_manifest
+from blinkgl.sequence_files.sequence_dir import MANIFEST, RIG, SequenceWriter, digest_of, read_manifest
 
 
 class RigWriter(SequenceWriter):

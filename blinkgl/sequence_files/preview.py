@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from blinkgl.events.types import Events
 from blinkgl.io.colour import count_events, event_colour, flow_colour, flow_wheel
 from blinkgl.io.overlays import Curves, TrackLines, with_tracks
 from blinkgl.io.video import VideoWriter
 from blinkgl.srgb import to_srgb8, tone_mapped
 from blinkgl.timeline.sampling import Ticks
+from blinkgl.types.events import Events
 
 Self = TypeVar("Self", bound="_Streamed")
 _BAR = 30

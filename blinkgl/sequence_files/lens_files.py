@@ -11,11 +11,11 @@ import numpy as np
 
 from blinkgl.camera import CameraModel
 from blinkgl.camera.rectified import rectify_map
-from blinkgl.io.camchain import Calibrated, cam_to_cam_yaml, camchain_yaml, read_camchain
+from blinkgl.config.camchain import Calibrated, cam_to_cam_yaml, camchain_yaml, read_camchain
 from blinkgl.io.dsec import read_rectify_map, write_rectify_map
 
 if TYPE_CHECKING:
-    from blinkgl.io.sequence_dir import SequenceWriter
+    from blinkgl.sequence_files.sequence_dir import SequenceWriter
 
 RECTIFY_MAP, CAM_TO_CAM, CAMCHAIN = "rectify_map.h5", "cam_to_cam.yaml", "camchain.yaml"
 FILES = RECTIFY_MAP, CAM_TO_CAM, CAMCHAIN

@@ -40,7 +40,6 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 from blinkgl.config.imu import ImuConfig
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.errors import AssetError, BlinkGLError, OutputError
-from blinkgl.events.types import Events
 from blinkgl.io import imu as imu_files
 from blinkgl.io.atomic import fsync, output_errors, refuse_existing, remove_stale, temporary_beside
 from blinkgl.io.dsec import DsecEventWriter
@@ -57,11 +56,12 @@ from blinkgl.io.frame_camera import (
 from blinkgl.io.hdf5 import blosc_dataset, write_rows
 from blinkgl.io.records import InsidePath, entries_below, open_regular, parse, read_text, shown
 from blinkgl.labels import Form, Label, label_of
+from blinkgl.types.events import Events
 
 Self = TypeVar("Self", bound="SequenceWriter")
 MANIFEST = "manifest.json"
 RIG = "rig.yaml"
-"""In the folder of a sequence of several sensors (:mod:`blinkgl.io.rig_dir`)."""
+"""In the folder of a sequence of several sensors (:mod:`blinkgl.sequence_files.rig_dir`)."""
 _LARGEST = 2**62
 _IN_FLIGHT = 8
 """Labels waiting for the encoder thread: bounds memory at a few tens of MB."""
@@ -420,7 +420,7 @@ class Manifest(BaseModel):
 
 
 class RigManifest(BaseModel):
-    """The same of a rig's sequence (:mod:`blinkgl.io.rig_dir`), whose ``files`` are those of all sensors."""
+    """The same of a rig's sequence (rig_dir.py), whose ``files`` are those of all sensors."""
 
     model_config = ConfigDict(strict=True, extra="allow")
     format: Literal["blinkgl-rig"]

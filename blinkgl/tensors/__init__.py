@@ -1,0 +1,22 @@
+"""ESIM and V2E in torch: events as tensors, of many environments at once, on the device that the frames lie on.
+
+In:    linear luminance, (environments, H, W) float32 on one device; an emulator's configuration; seeds
+Out:   TensorEvents on that device, bit for bit those of the numba kernels, and grids made of them
+Start: batch.py (frames in, events out), then esim.py
+
+Every operation is an eager one of torch's, which IEEE 754 rounds the same way on every device; :mod:`~.arith` writes
+the functions of :mod:`blinkgl.events.arith` in the same sums and products. So the same frames and seed make the same
+events on a processor and on a card, without a proof for each card. (``torch.compile`` may contract a product and a sum
+into one rounding; do not compile these functions where the bits matter.)
+
+torch is imported when this room is, and by nothing below it. Nothing here is differentiable: an event is a decision.
+"""
+
+from __future__ import annotations
+
+from blinkgl.tensors.batch import TensorEvents
+from blinkgl.tensors.esim import TensorEsim
+from blinkgl.tensors.grids import event_counts, latest_times, time_surface, voxel_grid
+from blinkgl.tensors.v2e import TensorV2e
+
+__all__ = ["TensorEsim", "TensorEvents", "TensorV2e", "event_counts", "latest_times", "time_surface", "voxel_grid"]

@@ -1,0 +1,322 @@
+"""What the emulators on tensors share: frames and times in, checks, the order of events, reset, saving.
+
+A step has two halves. The first looks at every pixel: it computes the signal and how far it lies beyond the pixel's
+levels, into memory of its own. Then the host reads a few numbers in one transfer: whether every intensity can be used,
+how many pixels fire, how many events they have. Only after that does the second half work on the pixels that fire and
+change the state, so a frame that is refused leaves every environment as it was.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from blinkgl.errors import EventDataError
+from blinkgl.events.arith import LOG_MAX_INPUT
+from blinkgl.events.emulator import INTENSITY_LIMIT_BITS, MAX_SIDE
+from blinkgl.events.packing import MAX_INTERVAL_NS
+from blinkgl.tensors.philox import words_of
+from blinkgl.types.events import Events
+
+_RADIX_BITS = 16
+_CHUNK = {"cpu": 2**18}
+"""Pixels that the first half takes in one go: on a processor they stay in the second-level cache; elsewhere 2^24 keep
+the scratch memory small beside the state of many environments."""
+
+
+@dataclass(frozen=True, eq=False)
+class TensorEvents:
+    """Events of one step of all environments, on their device, sorted by environment, then time, then raster order.
+
+    env, x, y : (N,) int32, environment, pixel column, pixel row.
+    t : (N,) int64 microseconds.   p : (N,) uint8, 1 brighter (ON), 0 darker (OFF).
+    cause : (N,) uint8 of :class:`~blinkgl.types.events.Cause`, or None without ``config.causes``.
+    starts : (environments + 1,) int64, where each environment's events begin, and the end.
+    shape : (environments, H, W)."""
+
+    env: Tensor
+    x: Tensor
+    y: Tensor
+    t: Tensor
+    p: Tensor
+    cause: Tensor | None
+    starts: Tensor
+    shape: tuple[int, int, int]
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def numpy(self) -> list[Events]:
+        """The events of each environment in this process's memory (one transfer)."""
+        starts = self.starts.tolist()
+        x, y = (one.cpu().numpy().astype(np.uint16) for one in (self.x, self.y))
+        t, p = self.t.cpu().numpy(), self.p.cpu().numpy()
+        cause = None if self.cause is None else self.cause.cpu().numpy()
+        parts = [slice(a, b) for a, b in pairwise(starts)]
+        return [Events(x[s], y[s], t[s], p[s], None if cause is None else cause[s]) for s in parts]
+
+
+@dataclass(frozen=True, eq=False)
+class Interval:
+    """One step's times. An integer where all environments have the same, else (environments,) int64 on the device.
+
+    t0_ns, dt_ns : start and length.   base_us : the start's microsecond.   fresh : environments whose first frame this
+    is; their intervals have a length of 1 and no events.   start_ns, end_ns : (environments,) int64 on the host."""
+
+    t0_ns: Any
+    dt_ns: Any
+    base_us: Any
+    fresh: tuple[int, ...]
+    start_ns: np.ndarray
+    end_ns: np.ndarray
+
+    @property
+    def longest_ns(self) -> int:
+        """The longest interval."""
+        return max(int((self.end_ns - self.start_ns).max()), 1)
+
+    @property
+    def lengths_ns(self) -> list[int]:
+        """Of each environment."""
+        return np.maximum(self.end_ns - self.start_ns, 1).tolist()
+
+    def of(self, value: Any, env: Tensor) -> Any:
+        """``value``, one of the times, for elements of these environments."""
+        return value[env] if isinstance(value, Tensor) else value
+
+
+class Found(NamedTuple):
+    """Events that are not in their order yet, (N,) int64.
+
+    word : pixel number over all environments, and the polarity in the lowest bit.
+    after_us : microseconds after the environment's base."""
+
+    word: Tensor
+    after_us: Tensor
+
+
+def stable_order(keys: Sequence[tuple[Tensor, int]]) -> Tensor:
+    """Indices that sort by the keys, the first one first; equal elements keep their order.
+
+    keys : (N,) int64 >= 0, with the number of bits that they take."""
+    order: Any = None
+    for key, bits in reversed(keys):
+        if key.device.type != "cpu":
+            fresh = torch.sort(key if order is None else key[order], stable=True).indices
+            order = fresh if order is None else order[fresh]
+            continue
+        # NumPy sorts 16-bit keys by counting, which takes a tenth of a comparison sort's time. From the lowest digit
+        # up, every pass keeps the order of equal digits.
+        whole = key.numpy()
+        for low in range(0, bits, _RADIX_BITS):
+            digit = (whole >> low).astype(np.uint16)
+            fresh = np.argsort(digit if order is None else digit[order], kind="stable")
+            order = fresh if order is None else order[fresh]
+    if order is None:
+        return torch.arange(len(keys[0][0]), device=keys[0][0].device)
+    return order if isinstance(order, Tensor) else torch.from_numpy(order)
+
+
+def places(flags: Tensor) -> Tensor:
+    """Indices of the elements >= 0 of a flat int32 or float32 tensor, ascending; the host learns how many there are."""
+    if flags.device.type == "cpu":  # NumPy's comparison and search take a quarter of torch's time
+        return torch.from_numpy(np.flatnonzero(flags.numpy() >= 0))
+    return torch.nonzero(flags >= 0).view(-1)
+
+
+class Batch(ABC):
+    """Emulators of ``envs`` environments of one size and configuration; environment k draws from ``seed + k``.
+
+    device : torch's.   Raises EventDataError: a size or a number of environments that does not fit."""
+
+    _state: tuple[str, ...] = ()
+    """Names of the tensors that make up the state, besides times."""
+
+    @property
+    def _host_is_near(self) -> bool:
+        """Whether a look at a number costs nothing, because the host is the device."""
+        return self.device.type == "cpu"
+
+    def __init__(self, height: int, width: int, envs: int, device: Any, seed: int):
+        if not (1 <= height < MAX_SIDE and 1 <= width < MAX_SIDE and envs >= 1 and envs * height * width < 2**31):
+            raise EventDataError(
+                "frame size or number of environments out of range",
+                value=(envs, height, width),
+                accepted=f"sides of 1 to {MAX_SIDE - 1}, fewer than 2^31 pixels in all",
+            )
+        self.height, self.width, self.envs = int(height), int(width), int(envs)
+        self.device = torch.empty(0, device=device).device  # with its number, as tensors say it
+        self.seed = int(seed) & (2**64 - 1)
+        self.seeds = tuple((self.seed + k) & (2**64 - 1) for k in range(self.envs))
+        """Of each environment: that of the single emulator that it equals."""
+        self._pixels = self.height * self.width
+        self._keys = torch.tensor([words_of(s) for s in self.seeds], dtype=torch.int64, device=self.device)
+        self._clock = np.zeros((self.envs, 4), np.int64)  # started, t_ns, frames, start of the leak clock (V2E)
+        self.saturated = torch.zeros(self.envs, dtype=torch.int64, device=self.device)
+        """(environments,) events cut by ``max_events_per_step`` so far."""
+
+    # -- for users -----------------------------------------------------------------------------------------------
+    @torch.no_grad()
+    def step(self, frames: Tensor, t_ns: int | Sequence[int] | np.ndarray | Tensor) -> TensorEvents:
+        """The events of every environment since its last frame; none for an environment's first frame.
+
+        frames : (environments, H, W) float32 linear luminance on :attr:`device`, finite, 0 to 2^30.
+        t_ns : of these frames, an integer for all environments or (environments,) of them on the host, increasing in
+        each environment by at most 17 minutes.
+        Raises EventDataError that names the environment, and the pixel where it is an intensity; no environment has
+        then changed. Gradients do not flow through events: frames are detached."""
+        flat = self._checked(frames)
+        interval = self._interval(t_ns)
+        events = self._advance(flat, interval)
+        self._clock[:, 0], self._clock[:, 1] = 1, interval.end_ns
+        self._clock[:, 2] += 1
+        return events
+
+    def reset(self, mask: Any = None) -> None:
+        """The environments of ``mask`` ((environments,) bool; None: all) begin anew with their next frame, at any time.
+
+        What is frozen in a sensor (thresholds, leaks, seeds) stays. A mask on a card is brought to the host."""
+        mask = np.ones(self.envs, bool) if mask is None else torch.as_tensor(mask).cpu().numpy()
+        if mask.shape != (self.envs,) or mask.dtype != bool:
+            raise EventDataError(
+                "not a mask of environments",
+                where="mask",
+                value=(mask.dtype, mask.shape),
+                accepted=f"({self.envs},) bool",
+            )
+        self._clock[mask] = 0
+        for k in np.flatnonzero(mask):
+            self._forget(int(k))
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Everything the future depends on besides configuration and seed: copies of tensors."""
+        state = {name: getattr(self, name).clone() for name in (*self._state, "saturated")}
+        return {"clock": torch.from_numpy(self._clock.copy()), **state}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Restore :meth:`state_dict`'s result into one of the same size, configuration, seed and environments.
+
+        Raises EventDataError: it is of another; nothing has then changed."""
+        mine = {"clock": torch.from_numpy(self._clock), **{k: getattr(self, k) for k in (*self._state, "saturated")}}
+        fits = set(state) == set(mine) and all(
+            state[k].shape == v.shape and state[k].dtype == v.dtype for k, v in mine.items()
+        )
+        if not fits:
+            raise EventDataError("saved state is of other emulators", value=sorted(state), accepted=", ".join(mine))
+        for name, tensor in mine.items():
+            tensor.copy_(state[name])
+
+    # -- checks --------------------------------------------------------------------------------------------------
+    def _checked(self, frames: Tensor) -> Tensor:
+        """(environments * H * W,) of the frames. What needs a look at the numbers comes with the first half."""
+        wanted = (self.envs, self.height, self.width)
+        if not isinstance(frames, Tensor) or tuple(frames.shape) != wanted or frames.dtype != torch.float32:
+            value = (str(frames.dtype), tuple(frames.shape)) if hasattr(frames, "dtype") else type(frames).__name__
+            raise EventDataError("not frames of luminance", where="frames", value=value, accepted=f"float32 {wanted}")
+        if frames.device != self.device:
+            raise EventDataError(
+                "frames on another device", where="frames", value=str(frames.device), accepted=str(self.device)
+            )
+        return frames.detach().reshape(-1)
+
+    def _interval(self, t_ns: Any) -> Interval:
+        """Of the step to ``t_ns``. Raises EventDataError naming the first environment whose time cannot be."""
+        try:
+            times = np.asarray(t_ns.cpu() if isinstance(t_ns, Tensor) else t_ns)
+            if times.dtype.kind not in "iu" or times.shape not in ((), (self.envs,)):
+                raise ValueError
+            times = np.broadcast_to(times.astype(np.int64), (self.envs,)).copy()
+        except (TypeError, ValueError, OverflowError):
+            accepted = f"whole nanoseconds, one or {self.envs}"
+            raise EventDataError("not time stamps", where="t_ns", value=t_ns, accepted=accepted) from None
+        started, before = self._clock[:, 0] == 1, np.where(self._clock[:, 0] == 1, self._clock[:, 1], times)
+        late = np.where(started, times <= before, False) | (np.abs(times) >= 2**61)
+        wrong = np.flatnonzero(late | (times - before > MAX_INTERVAL_NS))
+        if len(wrong):
+            k = int(wrong[0])
+            raise EventDataError(
+                "time stamps must increase, by at most 17 minutes",
+                where=f"environment {k}, frame {self._clock[k, 2]}",
+                value=f"{times[k]} ns",
+                accepted=f"more than {before[k]} ns" if started[k] else "less than 2^61 ns",
+            )
+        length = np.where(started, times - before, 1)  # no division by an interval that does not exist
+
+        def given(values: np.ndarray) -> Any:
+            alike = (values == values[0]).all()
+            return int(values[0]) if alike else torch.from_numpy(values.copy()).to(self.device, non_blocking=True)
+
+        fresh = tuple(int(k) for k in np.flatnonzero(~started))
+        return Interval(given(before), given(length), given(before // 1000), fresh, before, times)
+
+    def _refuse(self, flat: Tensor, lowest: int, highest: int) -> None:
+        """Raises EventDataError for intensities whose bits, read as integers, reach from ``lowest`` to ``highest``.
+
+        Negative numbers have negative bits; infinities and NaN lie above the largest number, so two extremes of a
+        frame check all of it. Only -0.0 looks wrong and is not."""
+        if lowest >= 0 and highest <= int(INTENSITY_LIMIT_BITS):
+            return
+        bad = torch.nonzero(~((flat >= 0) & (flat <= LOG_MAX_INPUT))).view(-1)
+        if len(bad):
+            k, pixel = divmod(int(bad[0]), self._pixels)
+            y, x = divmod(pixel, self.width)
+            error = EventDataError(
+                f"intensity at pixel x={x}, y={y} cannot be used",
+                where=f"environment {k}, frame {self._clock[k, 2]}",
+                value=float(flat[bad[0]]),
+                accepted=f"a finite value from 0 to {LOG_MAX_INPUT:.3g}",
+            )
+            error.pixel = (x, y)
+            raise error
+
+    def _chunks(self) -> list[slice]:
+        """The flat pixels, in pieces."""
+        size, total = _CHUNK.get(self.device.type, 2**24), self.envs * self._pixels
+        return [slice(a, min(a + size, total)) for a in range(0, total, size)]
+
+    # -- events --------------------------------------------------------------------------------------------------
+    def _env_of(self, flat: Tensor) -> Tensor:
+        """Environments of flat pixel numbers."""
+        return torch.div(flat, self._pixels, rounding_mode="trunc") if self.envs > 1 else torch.zeros_like(flat)
+
+    def _events(self, interval: Interval, found: Found, cause: Tensor | None, waves: bool) -> TensorEvents:
+        """Columns in their order, from events that lie pixel by pixel, or wave by wave with each wave in raster order.
+
+        waves : events of one pixel are not beside each other yet."""
+        env = self._env_of(found.word >> 1) if self.envs > 1 else None
+        keys = [(found.after_us, (interval.longest_ns // 1000 + 1).bit_length())]
+        if env is not None:
+            keys.insert(0, (env, (self.envs - 1).bit_length()))
+        if waves:  # raster order among equal times; the sort itself keeps a pixel's events in the order they came
+            keys.append((found.word >> 1, (self.envs * self._pixels - 1).bit_length()))
+        order = stable_order(keys)
+        word, after = found.word.index_select(0, order), found.after_us.index_select(0, order)
+        env, pixel = torch.zeros_like(word) if env is None else env.index_select(0, order), word >> 1
+        if self.envs > 1:
+            pixel -= env * self._pixels
+        y = torch.div(pixel, self.width, rounding_mode="trunc")
+        return TensorEvents(
+            env=env.to(torch.int32),
+            x=(pixel - y * self.width).to(torch.int32),
+            y=y.to(torch.int32),
+            t=after + interval.of(interval.base_us, env),
+            p=(word & 1).to(torch.uint8),
+            cause=None if cause is None else cause.index_select(0, order).to(torch.uint8),
+            starts=torch.searchsorted(env, torch.arange(self.envs + 1, device=self.device)),
+            shape=(self.envs, self.height, self.width),
+        )
+
+    @abstractmethod
+    def _advance(self, flat: Tensor, interval: Interval) -> TensorEvents:
+        """The events of a step; changes nothing where it raises."""
+
+    @abstractmethod
+    def _forget(self, k: int) -> None:
+        """Environment k waits for its first frame."""

@@ -1,0 +1,42 @@
+"""Functions and draws on tensors have the bits of those that the numba kernels use."""
+
+import numpy as np
+import pytest
+import torch
+
+from blinkgl.events import arith, philox
+from blinkgl.tensors import arith as ours, philox as draws
+
+RNG = np.random.default_rng(0)
+WIDE32 = np.exp(RNG.uniform(-20, 20, 100_003)).astype(np.float32)
+WIDE64 = np.exp(RNG.uniform(-40, 40, 100_003))
+
+
+def same(a: torch.Tensor, b: np.ndarray) -> bool:
+    return a.numpy().dtype == b.dtype and np.array_equal(a.numpy(), b)
+
+
+def test_elementary_functions():
+    v, w = torch.from_numpy(WIDE32), torch.from_numpy(WIDE64)
+    out = torch.empty(len(v), dtype=torch.int32)
+    ours.log_q25_(v.clone(), out, torch.empty_like(v), torch.empty_like(v))
+    assert same(out, arith.log_q25(WIDE32))
+    assert same(ours.log_f32(v), arith.log_f32(WIDE32)) and same(ours.log_f64(w), arith.log_f64(WIDE64))
+    falls = np.minimum(WIDE32, 90)
+    assert same(ours.exp_f32(-torch.from_numpy(falls)), arith.exp_f32(-falls))
+    assert same(ours.fall_f64(w), arith.fall_f64(WIDE64))
+    assert same(ours.sqrt(v), np.sqrt(WIDE32)) and same(ours.sqrt(w), np.sqrt(WIDE64))
+    turns = RNG.random(100_003)
+    for a, b in zip(ours.cos_sin_turn(torch.from_numpy(turns)), arith.cos_sin_turn(turns)):
+        assert same(a + 0.0, b + 0.0)  # of zeros only the sign may differ
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2**63 + 12_345, 2**64 - 1])
+def test_draws(seed):
+    pixel, index = np.arange(10_001, dtype=np.uint64), np.uint64(2**40 + 7)
+    key, tensor, number = draws.words_of(seed), torch.arange(10_001), 2**40 + 7
+    for name in ("uniform2", "normal2", "rough_normal"):
+        theirs = getattr(philox, name)(np.uint64(seed), pixel, np.uint64(3), index)
+        made = getattr(draws, name)(key, tensor, 3, number)
+        for a, b in zip(*((x if isinstance(x, tuple) else (x,)) for x in (made, theirs))):
+            assert same(a, b), name

@@ -3,7 +3,7 @@
     python -m blinkgl.tools.bench_card [--quick] [--traffic] [--only v2e] [--batches]
 
 Processor time of numba's kernel, the card's, the card's given frames that lie there already, and that one with the sort
-and the read-back one frame late that graphics cards have: in turns, frame by frame, on `bench_events`' clips and on a
+and the read-back one frame late that graphics cards have: in turns, frame by frame, on the benchmark's clips and on a
 still picture; the events of all are compared. On OpenGL that the processor draws, this is the price of the detour; for
 a graphics card there is ``gpu_suite``. ``--batches``: 1, 4 and 8 small sequences at once, as tiles of a kernel, with a
 kernel each, and by numba, instead. ``--traffic``: no measurement, but a table computed from the sizes of the

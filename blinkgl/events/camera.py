@@ -17,7 +17,6 @@ import numpy as np
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import EventDataError
-from blinkgl.events.filters import make_filter
 from blinkgl.events.pixels import Latency, PixelNoise
 from blinkgl.events.readout import Readout
 from blinkgl.events.table import make_emulator
@@ -74,7 +73,7 @@ class EventCamera:
     ):
         self._truth = truth
         self.emulator = made or make_emulator(config, height, width, seed, reconstruction, gl)
-        self._pixels, self._latency, self._readout, self._filters = None, None, None, ()
+        self._pixels, self._latency, self._readout = None, None, None
         self._luminance: np.ndarray | None = None
         if readout is not None:
             if readout.pixels is not None:
@@ -82,7 +81,6 @@ class EventCamera:
             if readout.latency is not None:
                 self._latency = Latency(readout.latency, height, width, seed)
             self._readout = Readout(readout)
-            self._filters = tuple(make_filter(one, height, width) for one in readout.filters)
 
     def release(self) -> None:
         """Lets go of what lies on a card. Harmless when repeated."""
@@ -124,11 +122,6 @@ class EventCamera:
         """Events under way to the outside: on the bus, or not known yet for their latency."""
         return sum(stage.late for stage in (self._latency, self._readout) if stage is not None)
 
-    @property
-    def filtered(self) -> int | None:
-        """Events that the filters on the camera have dropped so far; None without filters."""
-        return sum(stage.dropped for stage in self._filters) if self._filters else None
-
     def step(self, frame: EventFrame) -> Events:
         """The events that are out by :attr:`done_ns` and were not before. Raises EventDataError as ``Emulator.step``;
         ``t_ns`` is then the frame's."""
@@ -160,10 +153,7 @@ class EventCamera:
             if self.emulator.lags:  # for flush, which has no frame
                 self._luminance = luminance.copy()
             events = self._latency.step(events, self.emulator.decoded(luminance), until_us)
-        events = self._readout.step(events, until_us)
-        for stage in self._filters:
-            events = stage.step(events)
-        return events
+        return self._readout.step(events, until_us)
 
 
 def emulate(

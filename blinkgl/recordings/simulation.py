@@ -55,8 +55,6 @@ class SimulationReport:
     """events that found the queue of the sensor's read-out full"""
     late: int = 0
     """events that were still on the read-out's bus when the last frame came"""
-    filtered: int = 0
-    """events that the filters on the camera dropped"""
     causes: dict[str, int] = field(default_factory=dict)
     """events by what caused them, "signal", "leak", "shot" and "hot"; empty unless ``causes`` of the emulator is set"""
     displacement: between.Displacement | None = None
@@ -225,7 +223,6 @@ def stepped(
         report.events += len(events)
         report.on += int(np.count_nonzero(events.p))
         report.saturated, report.lost, report.late = camera.saturated, camera.dropped, camera.late
-        report.filtered = camera.filtered or 0
         if camera.emulator.causes:
             by_cause += count_causes(events)
             report.causes = named_causes(by_cause)

@@ -116,14 +116,7 @@ _SENSOR = {
     "height": 16,
     "emulators": {"esim": {"contrast_threshold": 0.25}, "v2e": {"cutoff_hz": 100}, "voltmeter": {"k1": 4}},
     "readout": {
-        "filters": [
-            {"kind": "trail", "keep": "first", "threshold_us": 5},
-            {"kind": "trail", "keep": "second", "threshold_us": 50_000},
-            {"kind": "trail", "keep": "not_first", "threshold_us": 50_000},
-            {"kind": "rate", "events_per_second": 1e7},
-            {"kind": "flicker", "mode": "stop"},
-            {"kind": "flicker", "mode": "pass", "block": 64},
-        ]
+        "clock_us": 5,
     },
 }
 FEATURES: dict[str, dict[str, dict[str, Any]]] = {
@@ -182,22 +175,11 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "unsaid": NOTHING,
         "ample": {"readout": {"events_per_second": 1e9}},
         "slow": {"readout": {"events_per_second": 1e3, "row_ns": 50, "queue_events": 4}},
-        "filters": {
-            "readout": {
-                "filters": [
-                    {"kind": "trail", "keep": "first", "threshold_us": 10},
-                    {"kind": "trail", "keep": "not_first"},
-                    {"kind": "rate", "events_per_second": 1e6},
-                    {"kind": "flicker", "start": 2, "stop_below": 1, "mode": "stop"},
-                ],
-                "clock_us": 10,
-            }
-        },
+        "clock": {"readout": {"clock_us": 10}},
         "pixels": {
             "readout": {
                 "pixels": {"dead_fraction": 0.1, "hot_fraction": 0.02, "hot_rate_hz": 500, "rate_hz": 5},
                 "latency": {"fixed_us": 100, "dark_us": 2000, "jitter_us": 20},
-                "filters": [{"kind": "trail", "keep": "second"}, {"kind": "flicker", "mode": "pass", "block": 256}],
             }
         },
     },

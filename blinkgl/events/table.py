@@ -83,13 +83,15 @@ def make_emulator(
 ) -> Emulator:
     """The emulator a config asks for; ``reconstruction``: its path between frames, see :class:`Emulator`.
 
-    gl : context that draws the frames, on whose card it may be (``events.device``); None: none."""
+    gl : context that draws the frames, on whose card it may be (``events.device``); None: none.
+    Raises EventDataError: ``events.device: cuda`` for what torch does not make, or without a card."""
     kind, device = emulator_of(config), getattr(config, "device", "cpu")
-    if device == "cpu" or (device == "auto" and gl is None):
+    # torch takes seconds to import, so nobody loads it who has no card.
+    if device == "cpu" or (device == "auto" and (gl is None or gl.is_software)):
         return kind(height, width, config, seed, reconstruction)
-    from blinkgl.card.choice import emulator_on  # above this room; nobody loads it who does not ask for a card
+    from blinkgl.tensors.emulator import emulator_on  # above this room
 
-    return emulator_on(kind, config, height, width, seed, reconstruction, gl)
+    return emulator_on(kind, config, height, width, seed, reconstruction)
 
 
 def _checked(emulator: Any) -> str:

@@ -153,18 +153,15 @@ def _run(frames, config, gamma, interpolate, factor, max_px, seed, readout, repo
     if first is None:
         raise EventDataError("events need at least two frames", value="0 frames")
     camera = EventCamera(config, readout, *first[0].shape[:2], seed)
-    try:
-        yield from stepped(
-            itertools.chain([first], frames),
-            camera,
-            gamma=gamma,
-            interpolate=interpolate,
-            factor=factor,
-            max_px=max_px,
-            report=report,
-        )
-    finally:
-        camera.release()
+    yield from stepped(
+        itertools.chain([first], frames),
+        camera,
+        gamma=gamma,
+        interpolate=interpolate,
+        factor=factor,
+        max_px=max_px,
+        report=report,
+    )
 
 
 def stepped(

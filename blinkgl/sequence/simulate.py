@@ -40,7 +40,6 @@ from blinkgl.sequence.items import CameraImage, EventChunk, GroundTruth, Item, P
 from blinkgl.timeline import Ticks, Timeline
 
 if TYPE_CHECKING:
-    from blinkgl.card.tiles import Tiles
     from blinkgl.sequence.helper import Hand
 
 
@@ -56,7 +55,6 @@ def simulate_sequence(
     scene: Scene | None = None,
     renderer: Renderer | None = None,
     window_ns: tuple[int, int] | None = None,
-    atlas: Tiles | None = None,
     hand: Hand | None = None,
 ) -> Simulation:
     """Sequence ``index`` of a run, ready to be iterated over: :class:`EventChunk`, :class:`GroundTruth`,
@@ -71,8 +69,6 @@ def simulate_sequence(
     released at the end; its scene is drawn.
     window_ns : first and last time, ns, instead of all of the sequence. (These three: of
     what is drawn, not of recorded frames.)
-    atlas : the batch that its events are made in, of the context ``gl``; see
-    :func:`~blinkgl.sequence.side_by_side.side_by_side`.
     hand : of another process, which draws frames of this sequence, too (:mod:`blinkgl.sequence.helper`).
     Raises BlinkGLError for anything the user or the machine caused, here or while iterating."""
     if pictures_hz is not None and not events:
@@ -103,15 +99,14 @@ def simulate_sequence(
             scene=scene,
             renderer=renderer,
             window_ns=window_ns,
-            atlas=atlas,
             hand=hand,
             **wanted,
         )
-    if scene is not None or renderer is not None or window_ns is not None or atlas is not None or hand is not None:
+    if scene is not None or renderer is not None or window_ns is not None or hand is not None:
         raise ConfigError(
             "nothing is drawn of recorded frames",
             where="frames",
-            accepted="no scene, renderer, window_ns, atlas or hand",
+            accepted="no scene, renderer, window_ns or hand",
         )
     return RecordedSequence(config, index, base=base, **wanted)
 
@@ -189,8 +184,6 @@ class Simulation(ABC):
 
     def close(self) -> None:
         """Lets go of OpenGL. Harmless when repeated."""
-        if self.camera is not None:
-            self.camera.release()
         self._stack.close()
 
     def __iter__(self) -> Iterator[Item]:

@@ -186,7 +186,7 @@ def test_more_events_than_a_step_may_emit():
     "values, message",
     [
         ({"second_cutoff_hz": 30.0}, "the authors' program has no second low-pass"),
-        ({"device": "gl"}, "compat: authors is made on the processor alone"),
+        ({"device": "cuda"}, "compat: authors is made on the processor alone"),
     ],
 )
 def test_refusals(values, message):

@@ -1,4 +1,4 @@
-"""GLSL: one file per program, those that draw nothing in compute/, what they share in include/.
+"""GLSL: one file per program, what they share in include/.
 
 In:    vertex streams and uniforms of ``blinkgl.render``.
 Out:   pixels of one pass.

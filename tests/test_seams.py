@@ -284,9 +284,7 @@ def test_nothing_else_asks_which_kind_an_emulator_is():
     assert found.pop("config/sequence.py") == {"EsimConfig"}, "the default of `events:`"
     assert set(found) == {
         "config/events.py",
-        "card/atlas_v2e.py",
-        "card/esim.py",
-        "card/v2e.py",
+        *(f"tensors/{name}.py" for name in ("esim", "v2e")),
         *(f"events/{name}.py" for name in ("esim", "v2e", "v2e_model", "voltmeter")),
     }
 

@@ -53,6 +53,8 @@ ORDER = (
     "video_to_events",
     "events_over_frame",
     "event_tensors",
+    "tensor_environments",
+    "tensor_gym",
     "dataset_from_yaml",
     "torch_dataloader",
     "online_windows",

@@ -34,12 +34,13 @@ _CAUSES = Field(
     description="Mark every event by what caused it (`Events.cause`; `events/cause` in HDF5, `cause` in .npz): "
     "0 signal, 1 leak, 2 shot noise, 3 hot pixel. The events are the same.",
 )
-Device = Literal["auto", "cpu", "gl"]
+Device = Literal["auto", "cpu", "cuda"]
 _DEVICE: Any = Field(
     "auto",
-    description="Where events are made: by the processor, or by compute shaders of the OpenGL that draws the "
-    "frames (straight lines between frames alone). The events are the same. `auto`: `gl` where a graphics card "
-    "draws them and can do it, else `cpu`, and so wherever OpenGL is drawn by the processor.",
+    description="Where events are made: `cpu`, by compiled loops; `cuda`, by torch on a card, which takes frames that "
+    "the same card has drawn without moving them (straight lines between frames alone). The events are the same. "
+    "`auto`: `cuda` where a card draws the frames, torch has a card and a short trial gives the same events; else "
+    "`cpu`.",
 )
 _THRESHOLD = dict(ge=0.001, le=10.0)
 

@@ -312,9 +312,9 @@ class SequenceConfig(Config):
 
     @rule("timeline.reconstruction", "events.device", "?frames")
     def _the_card_follows(path: str, device: str | None, frames: bool):
-        if device == "gl" and path != "linear" and not frames:
+        if device == "cuda" and path != "linear" and not frames:
             raise Refused(
-                "the card follows straight lines between frames alone",
+                "events on a card follow straight lines between frames alone",
                 where="timeline.reconstruction",
                 value=path,
                 accepted="linear, or events.device: auto or cpu",

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -24,10 +24,7 @@ from blinkgl.events.truth import Surfaces, SurfaceTruth
 from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
-    import moderngl
-
     from blinkgl.events.emulator import Emulator
-    from blinkgl.gl import GLContext
 
 _NOTHING = nullcontext()
 
@@ -36,13 +33,13 @@ class EventFrame(NamedTuple):
     """What an emulator is given of one moment; valid until the next one is asked for, so
     that a source may reuse its arrays.
 
-    luminance : (H, W) float32, linear, or uint8 codes; a texture of the card's, where the camera
-    :attr:`~EventCamera.takes_textures`.   rate : (H, W) float32, d(luminance)/dt per second, or None.
+    luminance : (H, W) float32, linear, or uint8 codes; or a tensor on the camera's
+    :attr:`~EventCamera.tensor_device`.   rate : (H, W) float32, d(luminance)/dt per second, or None.
     rows : (y0, y1): outside these rows the frame is the one before; None: it may differ anywhere.
     As of ``Emulator.step``. surfaces : what the pixels show, of a camera that says what made its events."""
 
     t_ns: int
-    luminance: np.ndarray | moderngl.Texture
+    luminance: Any
     rate: np.ndarray | None = None
     rows: tuple[int, int] | None = None
     surfaces: Surfaces | None = None
@@ -51,12 +48,11 @@ class EventFrame(NamedTuple):
 class EventCamera:
     """``events:`` and ``readout:`` of a configuration: frames in, the events that leave the sensor out.
 
-    Events go from the emulator through the pixels' defects, their latency, the bus with its clock, and the filters, as
+    Events go from the emulator through the pixels' defects, their latency, the bus with its clock, as
     far as the configuration has them. readout : None: none of it.   seed : of the draws.
     reconstruction : the path between frames, see :class:`Emulator`.   emulator : the :class:`Emulator` itself.
     truth : says what made each event, of frames that come with their ``surfaces``; None: nobody asks.
-    gl : context that draws the frames, on whose card the emulator may be; None: none.
-    made : the emulator, made already of that configuration, such as a tile of a batch.
+    make : of the emulator: that on the processor, or on the device that is asked for (``tensors/choice.py``).
     Raises EventDataError: size, or a path that the emulator cannot follow."""
 
     def __init__(
@@ -68,11 +64,10 @@ class EventCamera:
         seed: int,
         reconstruction: str = "linear",
         truth: SurfaceTruth | None = None,
-        gl: GLContext | None = None,
-        made: Emulator | None = None,
+        make: Callable[..., Emulator] = make_emulator,
     ):
         self._truth = truth
-        self.emulator = made or make_emulator(config, height, width, seed, reconstruction, gl)
+        self.emulator = make(config, height, width, seed, reconstruction)
         self._pixels, self._latency, self._readout = None, None, None
         self._luminance: np.ndarray | None = None
         if readout is not None:
@@ -82,20 +77,16 @@ class EventCamera:
                 self._latency = Latency(readout.latency, height, width, seed)
             self._readout = Readout(readout)
 
-    def release(self) -> None:
-        """Lets go of what lies on a card. Harmless when repeated."""
-        self.emulator.release()
-
     @property
     def tells(self) -> bool:
         """Whether events say what made them, so that frames have to come with their ``surfaces``."""
         return self._truth is not None
 
-    def takes_textures(self, gl: GLContext) -> bool:
-        """Whether frames that ``gl`` draws may stay on its card: the emulator takes them, and nothing else of the
-        camera looks at them."""
-        mine = self.emulator.takes_textures and getattr(self.emulator, "gl", None) is gl
-        return mine and self._latency is None and self._truth is None
+    @property
+    def tensor_device(self) -> Any:
+        """The torch device of which it takes frames as tensors; None: arrays alone, because the emulator does or
+        because something else of the camera looks at them."""
+        return self.emulator.tensor_device if self._latency is None and self._truth is None else None
 
     @property
     def frames(self) -> int:

@@ -67,9 +67,9 @@ class Emulator(ABC):
     Config: ClassVar[type[EmulatorConfig]]
     """Its configuration: name, keys, the paths between frames that it can follow, and what a sensor sets."""
     device: ClassVar[str] = "cpu"
-    """Where events are made: "cpu" or "gl"."""
-    takes_textures: ClassVar[bool] = False
-    """Whether ``step`` takes a frame that lies on the card, too."""
+    """Where events are made: "cpu" or "cuda"."""
+    tensor_device: Any = None
+    """The torch device of which ``step`` takes frames as tensors, too; None: it takes arrays alone."""
     _still_pixels_sleep = False
     """Whether a pixel whose luminance does not change has no events and no changing state."""
     _state: tuple[str, ...] = ()
@@ -220,9 +220,6 @@ class Emulator(ABC):
                 accepted=f"({self.height}, {self.width}) float32",
             )
         return _flat(rate)
-
-    def release(self) -> None:  # noqa: B027 - on the processor there is nothing to let go of
-        """Lets go of what lies on a card. Harmless when repeated."""
 
     def flush(self) -> Events:
         """Events that are still held back; call it after the last frame. Empty for everything but ``pchip``, which then

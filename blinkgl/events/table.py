@@ -25,7 +25,7 @@ from blinkgl.events.emulator import Emulator
 from blinkgl.events.response import Response
 
 if TYPE_CHECKING:
-    from blinkgl.gl import GLContext
+    pass
 
 EMULATORS: dict[str, type[Emulator]] = {}
 """By ``Config``'s key ``emulator``."""
@@ -74,22 +74,11 @@ def emulator_of(config: EmulatorConfig) -> type[Emulator]:
 
 
 def make_emulator(
-    config: EmulatorConfig,
-    height: int,
-    width: int,
-    seed: int = 0,
-    reconstruction: str = "linear",
-    gl: GLContext | None = None,
+    config: EmulatorConfig, height: int, width: int, seed: int = 0, reconstruction: str = "linear"
 ) -> Emulator:
-    """The emulator a config asks for; ``reconstruction``: its path between frames, see :class:`Emulator`.
-
-    gl : context that draws the frames, on whose card it may be (``events.device``); None: none."""
-    kind, device = emulator_of(config), getattr(config, "device", "cpu")
-    if device == "cpu" or (device == "auto" and gl is None):
-        return kind(height, width, config, seed, reconstruction)
-    from blinkgl.card.choice import emulator_on  # above this room; nobody loads it who does not ask for a card
-
-    return emulator_on(kind, config, height, width, seed, reconstruction, gl)
+    """The emulator a config asks for, on the processor; ``reconstruction``: its path between frames, see
+    :class:`Emulator`. Raises EventDataError: a size or a path that it cannot follow."""
+    return emulator_of(config)(height, width, config, seed, reconstruction)
 
 
 def _checked(emulator: Any) -> str:

@@ -79,7 +79,6 @@ class GLContext:
         _thread.current = weakref.ref(self)
         self.shaders = ShaderLoader(self.ctx)
         self.idle = self.ctx.framebuffer(self.ctx.renderbuffer((1, 1)))  # bound when a target in use is released
-        self._first: weakref.WeakSet[Any] = weakref.WeakSet()
         self.lost = False
         """Whether :meth:`check` has found that it draws no more."""
         self._checks = 0
@@ -109,11 +108,6 @@ class GLContext:
         """The program of ``shaders/<name>``; compiled once per (name, defines). See :class:`ShaderLoader`."""
         _refuse_after_fork()
         return self.shaders.program(name, defines)
-
-    def kernel(self, name: str, defines: Mapping[str, Any] | None = None) -> moderngl.ComputeShader:
-        """The compute program of ``shaders/<name>``, as :meth:`program`."""
-        _refuse_after_fork()
-        return self.shaders.kernel(name, defines)
 
     def framebuffer(
         self, width: int, height: int, colour: tuple[str, ...] = ("RGBA8",), depth: bool | str = True
@@ -180,17 +174,11 @@ class GLContext:
     def released(self) -> bool:
         return self._raw is None
 
-    def ends_first(self, thing: Any) -> None:
-        """``thing.release()`` is called before the context goes: other drivers (CUDA) hold on to what is in it."""
-        self._first.add(thing)
-
     def release(self) -> None:
         """Free the context and everything in it. Harmless when repeated."""
         if self._raw is not None and _forked():  # the parent's, who goes on with it
             self._raw = None
         if self._raw is not None:
-            for thing in list(self._first):
-                thing.release()
             with self.borrowed():
                 self.shaders.clear()
                 self.ctx.release()

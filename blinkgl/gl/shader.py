@@ -29,7 +29,6 @@ STAGES = ("vertex", "fragment")
 """Of a program that draws."""
 GEOMETRY = "geometry"
 """The stage between them, of variants that define ``GEOMETRY_STAGE``."""
-COMPUTE = "compute"
 DEFAULT_VERSION = "#version 430 core"
 
 MADE: list[Callable[[], Mapping[str, str]]] = []
@@ -47,7 +46,7 @@ _MESSAGES = (
     re.compile(r"\d+\((?P<line>\d+)\) : (?P<kind>error|warning) (?P<text>.*)"),
     re.compile(r"(?P<kind>ERROR|WARNING): \d+:(?P<line>\d+): (?P<text>.*)"),
 )
-_STAGE_HEADER = re.compile(r"(vertex|geometry|fragment|compute)_shader$")
+_STAGE_HEADER = re.compile(r"(vertex|geometry|fragment)_shader$")
 
 
 def stages_of(defines: Mapping[str, Any] | None) -> tuple[str, ...]:
@@ -95,13 +94,13 @@ def expand(
     """Source of one stage with includes and defines written out.
 
     name    : file in ``folder`` (default: the shipped shaders), or an absolute path; includes are always the folder's.
-            stage: "vertex", "geometry", "fragment" or "compute".
+            stage: "vertex", "geometry" or "fragment".
     defines : NAME -> number, True (1), text as it stands, or False/None (left undefined).
 
     Raises ShaderError for a missing file, an include cycle, or a define that is no GLSL identifier.
     """
-    if stage not in (*STAGES, GEOMETRY, COMPUTE):
-        raise ValueError(f"stage must be one of {(*STAGES, GEOMETRY, COMPUTE)}, not {stage!r}")
+    if stage not in (*STAGES, GEOMETRY):
+        raise ValueError(f"stage must be one of {(*STAGES, GEOMETRY)}, not {stage!r}")
     folder = shader_folder() if folder is None else folder
     body = _Expansion(folder)
     body.file(name, Path(name) if Path(name).is_absolute() else folder / name, chain=())
@@ -267,7 +266,6 @@ class ShaderLoader:
         self.ctx = ctx
         self.folder = shader_folder() if folder is None else folder
         self._programs: dict[tuple[str, tuple[tuple[str, str], ...]], moderngl.Program] = {}
-        self._kernels: dict[tuple[str, tuple[tuple[str, str], ...]], moderngl.ComputeShader] = {}
         self._made: dict[
             tuple[str, tuple[tuple[str, str], ...]], dict[str, str]
         ] = {}  # includes of a program that are no files
@@ -279,17 +277,6 @@ class ShaderLoader:
         if key not in self._programs or not self._made.get(key, {}).items() <= made_includes().items():
             self._programs[key] = self._compile(name, defines)
         return self._programs[key]
-
-    def kernel(self, name: str, defines: Mapping[str, Any] | None = None) -> moderngl.ComputeShader:
-        """The compute program of file ``name`` with ``defines``; compiled when first asked for. Raises ShaderError."""
-        key = (name, normalised(defines))
-        if key not in self._kernels:
-            source = expand(name, COMPUTE, defines, self.folder)
-            try:
-                self._kernels[key] = self.ctx.compute_shader(source.text)
-            except moderngl.Error as error:
-                raise translate(str(error), {COMPUTE: source}) from None
-        return self._kernels[key]
 
     @property
     def compiled(self) -> tuple[tuple[str, tuple[tuple[str, str], ...]], ...]:
@@ -306,10 +293,9 @@ class ShaderLoader:
 
     def clear(self) -> None:
         """Release every program; the next call of :meth:`program` reads its file again (live reload)."""
-        for program in (*self._programs.values(), *self._kernels.values()):
+        for program in self._programs.values():
             program.release()
         self._programs.clear()
-        self._kernels.clear()
 
 
 def translate(log: str, sources: Mapping[str, ShaderSource]) -> ShaderError:

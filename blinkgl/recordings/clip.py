@@ -81,10 +81,7 @@ class Clip:
         end_ns = int(self.clock_us[stop]) * 1000
         shown = (EventFrame(t, luminance) for t, luminance in self.frames if t <= end_ns)
         camera = EventCamera(config, readout, *self.size, seed)
-        try:
-            chunks = [events for _, events in emulate(shown, camera)]
-        finally:
-            camera.release()
+        chunks = [events for _, events in emulate(shown, camera)]
         events = Events.concatenate(chunks).window(int(self.edges_us[0]), int(self.edges_us[stop]))
         return events.part(self.used[events.y, events.x])
 

@@ -29,6 +29,7 @@ from blinkgl.errors import ConfigError, EventDataError, OutputError
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.io.frames import open_frames
 from blinkgl.srgb import linear_from_srgb
+from blinkgl.tensors.choice import make_on_device
 from blinkgl.timeline import interpolate as between
 from blinkgl.types.events import Events, count_causes, named_causes
 
@@ -150,19 +151,16 @@ def _run(frames, config, gamma, interpolate, factor, max_px, seed, readout, repo
     first = next(frames, None)
     if first is None:
         raise EventDataError("events need at least two frames", value="0 frames")
-    camera = EventCamera(config, readout, *first[0].shape[:2], seed)
-    try:
-        yield from stepped(
-            itertools.chain([first], frames),
-            camera,
-            gamma=gamma,
-            interpolate=interpolate,
-            factor=factor,
-            max_px=max_px,
-            report=report,
-        )
-    finally:
-        camera.release()
+    camera = EventCamera(config, readout, *first[0].shape[:2], seed, make=make_on_device)
+    yield from stepped(
+        itertools.chain([first], frames),
+        camera,
+        gamma=gamma,
+        interpolate=interpolate,
+        factor=factor,
+        max_px=max_px,
+        report=report,
+    )
 
 
 def stepped(

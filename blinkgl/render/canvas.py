@@ -6,7 +6,7 @@ over by the pass's next frame; whoever reads a frame after that is told so.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from blinkgl.errors import GLError
 from blinkgl.gl.framebuffer import checked_array
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.rectangles import Rectangle, merged
+from blinkgl.render.tensors import TextureReader
 
 if TYPE_CHECKING:
     import moderngl
@@ -63,7 +64,7 @@ class Frame:
         return self._canvas.target
 
     def texture(self, output: str = "") -> moderngl.Texture:
-        """Of an output of the pass (default: its first), or :data:`DEPTH_BUFFER`, for another pass or a compute shader.
+        """Of an output of the pass (default: its first), or :data:`DEPTH_BUFFER`, for another pass.
         As the program wrote it: all components of its format."""
         if output == DEPTH_BUFFER:
             if not isinstance(self._canvas.pass_.depth, str):
@@ -88,6 +89,21 @@ class Frame:
         and only what has changed is transferred. To be copied by whoever wants to keep it."""
         self._check()
         return self._canvas.view(name, self)
+
+    def tensor(self, device: Any = "cuda", name: str = "") -> Any:
+        """A picture as a torch tensor of the caller's own, (H, W) or (H, W, C), dtype of its format.
+
+        device : torch's. On the card that draws it, the picture does not leave it where CUDA can share it; see
+        :mod:`blinkgl.render.tensors`, and :meth:`transfer` for the way it takes.
+        Raises GLError: no torch, no such device, no such output."""
+        self._check()
+        return self._canvas.tensor(device, name)
+
+    def transfer(self, device: Any = "cuda", name: str = "") -> str:
+        """How :meth:`tensor` gets there: "interop", "pinned" or "plain", with why no shorter way where there is one."""
+        self._check()
+        reader = self._canvas.reader(device, name)
+        return f"{reader.way}: {reader.why}" if reader.why else reader.way
 
     def changed_since(self, before: Frame | None) -> list[Rectangle] | None:
         """Rectangles outside of which this frame equals ``before``; None: it may differ anywhere, since nothing is
@@ -131,6 +147,7 @@ class Canvas:
         self._held: dict[
             int, tuple[int, dict[str, np.ndarray]]
         ] = {}  # attachment -> number of the frame held, and its pictures
+        self._readers: dict[tuple[int, str], TextureReader] = {}  # by attachment and device
         self._used: dict[str, Frame] = {}  # inputs of the last frame
 
     def make_target(self, width: int, height: int) -> Target:
@@ -194,6 +211,29 @@ class Canvas:
         seen.flags.writeable = False
         return seen
 
+    def reader(self, device: Any, name: str) -> TextureReader:
+        """What reads a picture's attachment into tensors of a device; made when it is first asked for."""
+        i, _ = self._place(name)
+        if (i, str(device)) not in self._readers:
+            self.painter.gl.resume()
+            self.painter.finish()
+            self._readers[i, str(device)] = TextureReader(self.painter.gl, self.target, i, device)
+        return self._readers[i, str(device)]
+
+    def tensor(self, device: Any, name: str) -> Any:
+        """A tensor of the caller's own."""
+        i, component = self._place(name)
+        reader = self.reader(device, name)
+        self.painter.finish()
+        started = working_clock()
+        picture = reader.read()
+        if component is not None:
+            picture = picture[..., component].contiguous()
+        elif self.outputs[i].components:
+            picture = picture[..., : self.outputs[i].components]
+        self.painter.stats.readback_s += working_clock() - started
+        return picture
+
     def _update(self, i: int, pictures: dict[str, np.ndarray], stale: list[Rectangle] | None) -> dict[str, np.ndarray]:
         """The pictures of attachment ``i`` as they are now, where they were right but for ``stale``."""
         self.painter.finish()
@@ -237,4 +277,7 @@ class Canvas:
 
     def release(self) -> None:
         self.number = -1
+        for reader in self._readers.values():
+            reader.release()
+        self._readers.clear()
         self.target.release()

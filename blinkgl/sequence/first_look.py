@@ -81,11 +81,8 @@ def first_look(
 
     def grid(times: list[int], frames: list[np.ndarray], every: int) -> tuple[np.ndarray, int]:
         sensor = EventCamera(noiseless, None, height, width, _SEED)
-        try:
-            chunks = emulate(map(EventFrame, times[::every], frames[::every]), sensor)
-            events = masked(Events.concatenate([chunk for _, chunk in chunks]), mask)
-        finally:
-            sensor.release()
+        chunks = emulate(map(EventFrame, times[::every], frames[::every]), sensor)
+        events = masked(Events.concatenate([chunk for _, chunk in chunks]), mask)
         return voxel_grid(events, times[0] // 1000, times[-1] // 1000 + 1, height, width, BINS), len(events)
 
     off, off_of_twice, norm, count = 0.0, 0.0, 0.0, 0

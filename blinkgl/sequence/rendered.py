@@ -3,11 +3,11 @@ emulator; ground truth at label times."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -35,36 +35,32 @@ from blinkgl.sequence.first_look import first_look
 from blinkgl.sequence.inertial import Inertial, measured
 from blinkgl.sequence.items import GroundTruth, Item, Picture
 from blinkgl.sequence.simulate import Simulation
+from blinkgl.tensors.choice import make_on_device
 from blinkgl.timeline import Timeline, make_timeline
-from blinkgl.timeline.reductions import OfArrays, Reductions
 from blinkgl.types.events import Events
-
-if TYPE_CHECKING:
-    from blinkgl.card.tiles import Tiles
 
 SURFACES = LabelRequest("ids", "depth", "velocity")
 """Labels that say what made an event."""
 
 
 def drawn(
-    renderer: Renderer, times: Iterable[int], rates: bool = False, surfaces: bool = False, textures: bool = False
+    renderer: Renderer, times: Iterable[int], rates: bool = False, surfaces: bool = False, device: Any = None
 ) -> Iterator[EventFrame]:
     """The frames of the event pass at ``times``, ns; a :class:`Timeline` is told every one.
-    rates : with d(luminance)/dt.   surfaces : with what every pixel shows.   textures : as they lie on the card, where
-    the timeline does not look at them; without rates then."""
+    rates : with d(luminance)/dt.   surfaces : with what every pixel shows.   device : torch's, on which frames are
+    tensors, where the timeline does not look at them; without rates then."""
     observe, frame = times.observe if isinstance(times, Timeline) else None, None
-    textures = textures and not rates and not (isinstance(times, Timeline) and times.looks_at_frames)
+    tensors = device is not None and not rates and not (isinstance(times, Timeline) and times.looks_at_frames)
     for t_ns in times:
         before, frame = frame, renderer.luminance(t_ns, rate=rates)
-        if textures:
-            shown = surfaces_at(renderer, t_ns) if surfaces else None
-            yield EventFrame(t_ns, frame.texture(), None, frame.rows_changed_since(before), shown)
+        rows = frame.rows_changed_since(before)
+        if tensors:
+            yield EventFrame(t_ns, frame.tensor(device), None, rows, surfaces_at(renderer, t_ns) if surfaces else None)
             continue
         luminance, rate = frame.view(), frame.view("rate") if rates else None
         if observe is not None:
             observe(t_ns, luminance, rate)
-        shown = surfaces_at(renderer, t_ns) if surfaces else None
-        yield EventFrame(t_ns, luminance, rate, frame.rows_changed_since(before), shown)
+        yield EventFrame(t_ns, luminance, rate, rows, surfaces_at(renderer, t_ns) if surfaces else None)
 
 
 def _truth_of(sensor: Sensor, config: SequenceConfig) -> SurfaceTruth | None:
@@ -79,15 +75,13 @@ def timeline_of(
     scene: Scene,
     renderer: Renderer,
     span_ns: tuple[int, int],
-    reductions: Callable[[], Reductions] = OfArrays,
 ) -> Timeline:
     """What decides the times of a sensor's frames, after a first look where one is asked for.   scene : of one sensor,
-    as it was built.   renderer : of it.   span_ns : first and last time, ns.   reductions : makes who reduces its small
-    pictures."""
+    as it was built.   renderer : of it.   span_ns : first and last time, ns."""
     emulator, dynamics = recording(scene, config).sensors[0].emulator, scene.dynamics
     stops = dynamics.impacts_ns if dynamics is not None else ()
     response = emulator_of(emulator).response(emulator)
-    made = partial(make_timeline, pictures=renderer, response=response, stops_ns=stops, reductions=reductions)
+    made = partial(make_timeline, pictures=renderer, response=response, stops_ns=stops)
     asked, (t0_ns, t1_ns) = config.timeline, span_ns
     timeline = made(asked, t0_ns, t1_ns)
     if not isinstance(asked, DisplacementTimeline) or not asked.first_look:
@@ -99,18 +93,6 @@ def timeline_of(
     return timeline
 
 
-def _reductions(gl: GLContext, device: str, stack: ExitStack) -> Reductions:
-    """Who reduces the timeline's small pictures, where ``events.device`` says. What it holds goes with the stack."""
-    if device == "cpu" or (device == "auto" and gl.is_software):
-        return OfArrays()
-    from blinkgl.card.reductions import reductions_on  # nobody loads it who does not ask for a card
-
-    made = reductions_on(gl, device)
-    if not isinstance(made, OfArrays):
-        stack.callback(made.release)
-    return made
-
-
 def surfaces_at(renderer: Renderer, t_ns: int) -> Surfaces:
     """What every pixel's centre shows at t_ns."""
     seen = renderer.labels(t_ns, SURFACES)
@@ -120,10 +102,9 @@ def surfaces_at(renderer: Renderer, t_ns: int) -> Surfaces:
 class RenderedSequence(Simulation):
     """See :func:`~blinkgl.sequence.simulate.simulate_sequence`.
 
-    scene : as it was built.   renderer : what draws it, at its level of detail.
+    scene : as it was built.   renderer : what draws it.
     sensor : what is recorded, and through which camera. A scene that was made already is
-    recorded as the configuration says.   number : of the sensor on its rig, by which noise differs.
-    atlas : see :func:`~blinkgl.sequence.simulate.simulate_sequence`."""
+    recorded as the configuration says.   number : of the sensor on its rig, by which noise differs."""
 
     def __init__(
         self,
@@ -139,7 +120,6 @@ class RenderedSequence(Simulation):
         renderer: Renderer | None,
         window_ns: tuple[int, int] | None,
         number: int = 0,
-        atlas: Tiles | None = None,
     ):
         self.number = number
         clock = StageClock()
@@ -173,11 +153,9 @@ class RenderedSequence(Simulation):
                     seed,
                     path,
                     _truth_of(self.sensor, config),
-                    renderer.gl,
-                    None if atlas is None else atlas.emulator(emulator, seed, path, size),
+                    partial(make_on_device, gl=renderer.gl),
                 )
-                reductions = partial(_reductions, renderer.gl, getattr(emulator, "device", "auto"), stack)
-                self.timeline = timeline_of(config, scene, renderer, span_ns, reductions)
+                self.timeline = timeline_of(config, scene, renderer, span_ns)
             if labels and config.images is not None:
                 seed = kernel_seed(config.seed, index, Role.IMAGES, number)
                 self.frame_camera = FrameCamera(renderer, config.images, seed, span_ns)
@@ -205,8 +183,7 @@ class RenderedSequence(Simulation):
     def _frames(self) -> Iterator[EventFrame]:
         """Of the event pass."""
         rates, tells = self.camera.emulator.needs_rate, self.camera.tells
-        textures = self.camera.takes_textures(self.renderer.gl)
-        return drawn(self.renderer, self.timeline, rates, tells, textures)
+        return drawn(self.renderer, self.timeline, rates, tells, self.camera.tensor_device)
 
     def _in_order(self) -> Iterator[Item]:
         yield from super()._in_order()

@@ -20,7 +20,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -39,9 +39,6 @@ from blinkgl.sequence.items import CameraImage, EventChunk, GroundTruth, Item, P
 from blinkgl.timeline import Ticks, Timeline
 from blinkgl.types.events import Events, count_causes, named_causes
 
-if TYPE_CHECKING:
-    from blinkgl.card.tiles import Tiles
-
 
 def simulate_sequence(
     config: SequenceConfig,
@@ -55,7 +52,6 @@ def simulate_sequence(
     scene: Scene | None = None,
     renderer: Renderer | None = None,
     window_ns: tuple[int, int] | None = None,
-    atlas: Tiles | None = None,
 ) -> Simulation:
     """Sequence ``index`` of a run, ready to be iterated over: :class:`EventChunk`, :class:`GroundTruth`,
     :class:`CameraImage` and :class:`Picture` in time order.
@@ -69,8 +65,6 @@ def simulate_sequence(
     released at the end; its scene is drawn.
     window_ns : first and last time, ns, instead of all of the sequence. (These three: of
     what is drawn, not of recorded frames.)
-    atlas : the batch that its events are made in, of the context ``gl``; see
-    :func:`~blinkgl.sequence.side_by_side.side_by_side`.
     Raises BlinkGLError for anything the user or the machine caused, here or while iterating."""
     if pictures_hz is not None and not events:
         raise ConfigError(
@@ -100,14 +94,13 @@ def simulate_sequence(
             scene=scene,
             renderer=renderer,
             window_ns=window_ns,
-            atlas=atlas,
             **wanted,
         )
-    if scene is not None or renderer is not None or window_ns is not None or atlas is not None:
+    if scene is not None or renderer is not None or window_ns is not None:
         raise ConfigError(
             "nothing is drawn of recorded frames",
             where="frames",
-            accepted="no scene, renderer, window_ns or atlas",
+            accepted="no scene, renderer or window_ns",
         )
     return RecordedSequence(config, index, base=base, **wanted)
 
@@ -185,8 +178,6 @@ class Simulation(ABC):
 
     def close(self) -> None:
         """Lets go of OpenGL. Harmless when repeated."""
-        if self.camera is not None:
-            self.camera.release()
         self._stack.close()
 
     def __iter__(self) -> Iterator[Item]:

@@ -135,43 +135,32 @@ def _opengl(backend: str, device: int) -> Iterator[Check]:
         for name in ("R32F", "RG32F", "RGBA32F", "R32UI", "R16F", "RGBA8"):
             yield _try(section, f"{name} target", lambda name=name: _draw_exactly(gl, name), driver)
         yield _try(section, "32F depth, reversed-Z", lambda: _draw_depth(gl), driver)
-        yield _optional(_try(section, "compute shaders", lambda: _make_events(gl), driver))
         yield _to_torch(gl, section)
         timer = _try(section, "timer queries", lambda: _time_a_draw(gl), "")
         yield _optional(timer)
 
 
-def _make_events(gl) -> str:
-    """A short clip's events by the card and by the processor."""
-    from blinkgl.card.choice import same_events
-    from blinkgl.card.proof import rounding
-    from blinkgl.events import Esim, V2e
-
-    if not all(same_events(gl, kind=kind) for kind in (Esim, V2e)):
-        raise RuntimeError("other events than the processor's; events.device: auto stays on the processor")
-    soft = [name.split("_")[1] + "s" for name, wanted in rounding(gl)._asdict().items() if wanted]
-    how = f"{' and '.join(soft)} in whole numbers: the card rounds otherwise" if soft else "arithmetic in hardware"
-    limit = gl.ctx.info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"] / 2**20
-    return f"ESIM's and V2E's events bit for bit, {how}; buffers up to {limit:.0f} MiB"
-
-
 def _to_torch(gl, section: str) -> Check:
-    """How tensors go from this context to torch; on the card only after a pattern was written and read."""
-    name = "tensors for torch"
+    """How frames go from this context to torch; on a card after one was drawn, copied and compared."""
+    name = "frames for torch"
     if gl.is_software:  # torch takes seconds to import
-        return Check(section, name, "info", "in the processor's memory, where they are made")
-    from blinkgl.card.tensors import way_here
+        return Check(section, name, "info", "in the processor's memory, where they are drawn")
+    from blinkgl.render.tensors import TextureReader
 
     try:
-        way = way_here(gl)
+        with gl.framebuffer(8, 8, ("R32F",), depth=False) as target:
+            target.clear(0.25)
+            reader = TextureReader(gl, target, 0, "cuda")
+            reader.read()
+            way, why = reader.way, reader.why
+            reader.release()
     except BlinkGLError as error:
         return Check(section, name, "absent", error.problem, install("torch"))
     except Exception as error:  # noqa: BLE001 - a broken torch; the line has to appear
         return Check(section, name, "absent", " ".join(f"{type(error).__name__}: {error}".split())[:200])
-    if way.way == "interop":
-        return Check(section, name, "ok", "they stay on the card: CUDA reads what OpenGL writes")
-    lacks = "cuda-bindings" in way.why
-    return Check(section, name, "absent", f"over the bus, {way}", install("cuda-bindings") if lacks else "")
+    if way == "interop":
+        return Check(section, name, "ok", "they stay on the card: CUDA reads what OpenGL draws")
+    return Check(section, name, "absent", f"over the bus: {why}", install("cuda-bindings") if "bindings" in why else "")
 
 
 _TRIANGLE = """#version 430 core

@@ -1,8 +1,4 @@
-"""What a timeline needs of a small picture: a percentile and the largest of what moves in it, two numbers.
-
-They are found where the picture is: of arrays here, of textures in :mod:`blinkgl.card.reductions`, the same to the last
-bit, so that frames come at the same times.
-"""
+"""What a timeline needs of a small picture: a percentile and the largest of what moves in it, two numbers."""
 
 from __future__ import annotations
 
@@ -12,21 +8,16 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 import numpy as np
 
 if TYPE_CHECKING:
-    import moderngl
-
     from blinkgl.events.response import Response
 
 SLOWEST = np.float32(2.0**-40)
-"""What moves (px/s) or changes (per second) by less than these 1e-12 stands still. The squares of what does not are no
-subnormal numbers, which cards may take for zero."""
+"""What moves (px/s) or changes (per second) by less than these 1e-12 stands still."""
 
 
 class Drawn(Protocol):
     """What has been drawn, wherever it is."""
 
     def read(self) -> np.ndarray: ...
-
-    def texture(self) -> moderngl.Texture: ...
 
 
 class Ranked(NamedTuple):
@@ -40,25 +31,15 @@ class Ranked(NamedTuple):
 STILL = Ranked(0, 0.0, 0.0)
 
 
-class Reductions(Protocol):
-    """How small pictures become :class:`Ranked`."""
-
-    def speeds(self, drawn: Drawn, percent: float) -> Ranked:
-        """Of the lengths of (h, w, 2) float32 vectors."""
-
-    def changes(self, drawn: Drawn, response: Response, percent: float) -> Ranked:
-        """Of |d(signal)/dt|, per second, of (h, w, 2) float32 luminances and their rates."""
+def speeds(drawn: Drawn, percent: float) -> Ranked:
+    """Of the lengths of (h, w, 2) float32 vectors."""
+    return ranked(np.linalg.norm(drawn.read(), axis=-1), percent)
 
 
-class OfArrays:
-    """Of pictures that are read back."""
-
-    def speeds(self, drawn: Drawn, percent: float) -> Ranked:
-        return ranked(np.linalg.norm(drawn.read(), axis=-1), percent)
-
-    def changes(self, drawn: Drawn, response: Response, percent: float) -> Ranked:
-        picture = drawn.read()
-        return ranked(np.abs(response.change(picture[..., 0], picture[..., 1])), percent)
+def changes(drawn: Drawn, response: Response, percent: float) -> Ranked:
+    """Of |d(signal)/dt|, per second, of (h, w, 2) float32 luminances and their rates."""
+    picture = drawn.read()
+    return ranked(np.abs(response.change(picture[..., 0], picture[..., 1])), percent)
 
 
 def ranked(values: np.ndarray, percent: float) -> Ranked:

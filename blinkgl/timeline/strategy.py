@@ -9,7 +9,7 @@ timeline.info()                                  # what was achieved, for the ma
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,7 +17,7 @@ import numpy as np
 from blinkgl.config.timeline import TimelineConfig
 from blinkgl.events.response import Response
 from blinkgl.timeline.budget import TimeError, contraharmonic_mean
-from blinkgl.timeline.reductions import Drawn, OfArrays, Reductions
+from blinkgl.timeline.reductions import Drawn, changes, speeds
 from blinkgl.timeline.sampling import bounded_times, uniform_times
 
 
@@ -37,8 +37,6 @@ class Timeline:
 
     looks_at_frames = False
     """Whether :meth:`observe` looks at what it is given: frames may stay on the card where not."""
-    ranks = False
-    """Whether all that it wants of small pictures is :attr:`reductions`'."""
 
     def __init__(
         self,
@@ -51,8 +49,6 @@ class Timeline:
     ):
         self.config, self.t0_ns, self.t1_ns, self.pictures, self.response = config, t0_ns, t1_ns, pictures, response
         self.stops_ns = stops_ns
-        self.reductions: Reductions = OfArrays()
-        """Who finds percentiles in small pictures; the frames' times are the same, whoever does."""
         self.looks = 0
         """Small pictures asked for so far."""
         self.seen: dict[str, Any] = {}
@@ -91,11 +87,9 @@ class Uniform(Timeline):
 class Displacement(Timeline):
     """Steps in which pixels move ``max_px``, by the image velocity of those that move."""
 
-    ranks = True
-
     def pace(self, t_ns: int) -> float:
         c = self.config
-        seen = self.reductions.speeds(self.pictures.velocity_of_movers(t_ns, c.sample_every), c.percentile)
+        seen = speeds(self.pictures.velocity_of_movers(t_ns, c.sample_every), c.percentile)
         pace = seen.percentile / c.max_px
         return pace if c.max_px_peak is None else max(pace, seen.largest / c.max_px_peak)
 
@@ -103,11 +97,9 @@ class Displacement(Timeline):
 class Brightness(Timeline):
     """Steps in which the emulator's signal changes by a fraction of its threshold."""
 
-    ranks = True
-
     def pace(self, t_ns: int) -> float:
         c = self.config
-        seen = self.reductions.changes(self.pictures.brightness(t_ns, c.sample_every), self.response, c.percentile)
+        seen = changes(self.pictures.brightness(t_ns, c.sample_every), self.response, c.percentile)
         return seen.percentile / (c.max_fraction_of_threshold * self.response.threshold)
 
 
@@ -171,11 +163,7 @@ def make_timeline(
     pictures: SmallPictures,
     response: Response,
     stops_ns: Sequence[int] = (),
-    reductions: Callable[[], Reductions] = OfArrays,
 ) -> Timeline:
     """Of any ``timeline:`` configuration.   stops_ns : increasing; times of impacts, that
-    adaptive kinds do not step over.   reductions : makes who finds percentiles, where the kind wants some."""
-    timeline = _KINDS[config.kind](config, t0_ns, t1_ns, pictures, response, stops_ns)
-    if timeline.ranks:
-        timeline.reductions = reductions()
-    return timeline
+    adaptive kinds do not step over."""
+    return _KINDS[config.kind](config, t0_ns, t1_ns, pictures, response, stops_ns)

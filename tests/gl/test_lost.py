@@ -10,8 +10,8 @@ from blinkgl.dataset.executor import Inline
 from blinkgl.dataset.run import run_dataset
 from blinkgl.errors import GLError, may_pass
 from blinkgl.gl import GLContext, create_context
-from tests.card.test_choice import TINY
 from tests.dataset.runs import tree
+from tests.tiny_recipe import TINY
 
 
 class Gone:

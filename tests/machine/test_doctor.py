@@ -9,8 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from blinkgl import cli
-from blinkgl.card.tensors import Way
-from blinkgl.errors import EventDataError
+from blinkgl.errors import GLError
 from blinkgl.gl import context as context_module, osmesa
 from blinkgl.show import checks as doctor
 from blinkgl.show.doctor import show
@@ -115,35 +114,26 @@ def test_shown_text_is_plain_when_piped(report, capsys):
 
 
 @pytest.mark.parametrize(
-    ("way", "status", "value", "remedy"),
+    ("answer", "status", "value", "remedy"),
     [
-        (Way("interop"), "ok", "they stay on the card: CUDA reads what OpenGL writes", ""),
-        (
-            Way("pinned", "no cuda-bindings"),
-            "absent",
-            "over the bus, pinned: no cuda-bindings",
-            "cuda-bindings",
-        ),
-        (
-            Way("pageable", "torch sees no CUDA device"),
-            "absent",
-            "over the bus, pageable: torch sees no CUDA device",
-            "",
-        ),
-        (EventDataError("tensors need torch"), "absent", "tensors need torch", "torch"),
+        (("interop", ""), "ok", "they stay on the card: CUDA reads what OpenGL draws", ""),
+        (("pinned", "no cuda-bindings"), "absent", "over the bus: no cuda-bindings", "cuda-bindings"),
+        (("pinned", "cuInit: error 999"), "absent", "over the bus: cuInit: error 999", ""),
+        (GLError("tensors need torch"), "absent", "tensors need torch", "torch"),
         (OSError("libcudart"), "absent", "OSError: libcudart", ""),
     ],
 )
-def test_how_tensors_go_to_torch(monkeypatch, way, status, value, remedy):
+def test_how_frames_go_to_torch(gl, monkeypatch, answer, status, value, remedy):
     """Of a card's context; there is none here."""
 
-    def answer(gl):
-        if isinstance(way, Exception):
-            raise way
-        return way
+    def reader(*_):
+        if isinstance(answer, Exception):
+            raise answer
+        return SimpleNamespace(way=answer[0], why=answer[1], read=lambda: None, release=lambda: None)
 
-    monkeypatch.setattr("blinkgl.card.tensors.way_here", answer)
-    check = doctor._to_torch(SimpleNamespace(is_software=False), "OpenGL")
+    monkeypatch.setattr("blinkgl.render.tensors.TextureReader", reader)
+    card = SimpleNamespace(is_software=False, framebuffer=gl.framebuffer)
+    check = doctor._to_torch(card, "OpenGL")
     assert (check.status, check.value) == (status, value)
     assert remedy in check.remedy and bool(check.remedy) == bool(remedy)
     assert doctor._to_torch(SimpleNamespace(is_software=True), "OpenGL").status == "info"

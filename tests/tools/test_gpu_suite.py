@@ -1,8 +1,7 @@
-"""The suite for machines with a card: what was measured is kept, what cannot be is said, the wheels are all listed."""
+"""The suite for machines with a card runs whole on the processor; the wheels that it needs are all listed."""
 
 from __future__ import annotations
 
-import argparse
 import configparser
 import json
 import re
@@ -11,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from blinkgl.tools import gpu_pieces, gpu_suite
-from blinkgl.tools.gpu_suite import LEFT, Rows, kept, main, stamp_of
+from blinkgl.config.events import EsimConfig
+from blinkgl.events import Esim
+from blinkgl.tools import gpu_suite
 
 ROOT = Path(__file__).parents[2]
-STAMP = {"build": "tests", "small": True}
 
 
 def names_of(text: str) -> set[str]:
@@ -32,83 +31,57 @@ def test_the_list_of_wheels_is_whole():
     assert wanted <= names_of("\n".join(carried)) | there and not names_of("\n".join(carried)) & there
     pinned = {line.split(";")[0].strip() for line in (ROOT / "constraints.txt").read_text().splitlines()}
     assert set(carried) <= pinned
-    assert "torch>=2.6" in config["options.extras_require"]["learn"].split()
 
 
-def test_rows_are_kept_as_far_as_they_are_whole(tmp_path):
-    file = tmp_path / "piece.jsonl"
-    rows = Rows(file, STAMP)
-    rows.add("a", fps=np.float64(2.5), same=np.True_)
-    rows.add("b", fps=3)
-    file.write_text(file.read_text() + '{"key": "c", "fp')  # killed here
-    again = Rows(file, STAMP)
-    assert again.rows == [{"key": "a", "fps": 2.5, "same": True}, {"key": "b", "fps": 3}]
-    assert "b" in again and "c" not in again
-    again.add("c", fps=4)
-    assert [row["key"] for row in kept(file, STAMP)] == ["a", "b", "c"]
-    assert kept(file, {**STAMP, "small": False}) == kept(tmp_path / "none.jsonl", STAMP) == []
+def test_every_piece_runs_here(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(gpu_suite, "DENSITIES", (0.1,))
+    monkeypatch.setattr(gpu_suite, "SIZES", ((1, 1, 2), (3, 7, 4), (16, 20, 3)))
+    status = gpu_suite.main(["--out", str(tmp_path), "--small", "--device", "cpu", "--events", "1000"])
+    report = json.loads((tmp_path / "gpu_suite.json").read_text())
+    states = {piece["state"] for piece in report["pieces"].values()}
+    assert status == 0 and states == {"done"} and list(report["pieces"]) == list(gpu_suite.PIECES)
+    rows = {name: {row[""]: row for row in piece["rows"]} for name, piece in report["pieces"].items()}
+    assert rows["events"]["all, 1 turns"]["events, all the same"] > 10_000
+    assert set(rows["events"]) > set(gpu_suite.VARIANTS)
+    assert len(rows["kernel"]) == 3 and all(row["Mev/s"] > 0 for row in rows["kernel"].values())
+    assert all(row["frames go by"].startswith("plain") for row in rows["end_to_end"].values())
+    page = (tmp_path / "gpu_suite.md").read_text()
+    assert "| OpenGL: renderer | info |" in page and page in capsys.readouterr().out
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("suite")
+def test_what_fails_is_said_and_the_others_go_on(tmp_path, monkeypatch):
+    def broken(options):
+        """Breaks."""
+        yield {"": "one row"}
+        if options:
+            raise ValueError("no such thing")
 
+    def slow(options):
+        """Goes on and on."""
+        while True:
+            yield {"": "another"}
 
-def test_one_command_again_and_again(folder, monkeypatch, capfd):
-    """Minutes that are too few; then all; then nothing is measured twice."""
-    command = ["--out", str(folder), "--small", "--only", "doctor"]
-    monkeypatch.setattr(gpu_suite, "LEAST_S", 0.0)
-    assert main([*command, "--minutes", "0.0002"]) == LEFT
-    report = json.loads((folder / "gpu_suite.json").read_text())
-    assert report["pieces"]["doctor"]["state"] == "begun" and "minutes were over" in report["pieces"]["doctor"]["said"]
-    assert main(command) == 0
-    report = json.loads((folder / "gpu_suite.json").read_text())
-    doctor = report["pieces"]["doctor"]
-    assert doctor["state"] == "done" and report["stamp"] == stamp_of(True)
-    assert any(row["key"] == "OpenGL: compute shaders" and row["status"] == "ok" for row in doctor["rows"])
-    assert "| OpenGL: renderer | info |" in (folder / "gpu_suite.md").read_text()
-    monkeypatch.setattr(gpu_suite, "_run", None)
-    assert "left: doctor; the same command again goes on" in capfd.readouterr().out
-    assert main(command) == 0 and "left:" not in capfd.readouterr().out
-
-
-def test_what_a_machine_cannot_do_is_said_and_the_rest_goes_on(folder):
-    assert main(["--out", str(folder), "--small", "--only", "kernel", "--backend", "egl", "--device", "97"]) == 0
-    piece = json.loads((folder / "gpu_suite.json").read_text())["pieces"]["kernel"]
-    assert piece["state"] == "absent" and "nothing draws here: gl.device: no such EGL device" in piece["said"]
-
-
-def test_no_such_piece(capsys):
+    monkeypatch.setattr(gpu_suite, "PIECES", {"broken": broken, "slow": slow})
+    assert gpu_suite.main(["--out", str(tmp_path), "--minutes", "0.003", "--device", "cpu"]) == 1
+    pieces = json.loads((tmp_path / "gpu_suite.json").read_text())["pieces"]
+    assert pieces["broken"]["said"] == "ValueError: no such thing" and len(pieces["broken"]["rows"]) == 1
+    assert pieces["slow"]["state"] == "cut" and pieces["slow"]["rows"]
     with pytest.raises(SystemExit):
-        main(["--only", "doctor,kernels"])
-    assert "no piece is called that (got 'kernels'); expected doctor, frames" in capsys.readouterr().err
+        gpu_suite.main(["--only", "nothing"])
 
 
-def test_density_of_the_clips():
-    for density in (0.0, 0.07, 1.0):
-        clip = gpu_pieces.noise(48, 64, density, 6)
-        emulator = gpu_pieces.Esim(48, 64, gpu_pieces.Events.VARIANTS["plain"])
-        counts = [len(emulator.step(frame, k * 10**6)) for k, frame in enumerate(clip)][1:]
-        assert np.mean(counts) / (48 * 64) == pytest.approx(density, rel=0.1)
+@pytest.mark.parametrize("density", gpu_suite.DENSITIES)
+def test_clips_have_the_events_that_are_asked_for(density):
+    clip, emulator = gpu_suite.noise(48, 64, density, 6), Esim(48, 64, EsimConfig(threshold_sigma=0.0))
+    counts = [len(emulator.step(frame, k * 1_000_000)) for k, frame in enumerate(clip)]
+    assert np.allclose(counts[2:], density * 48 * 64, rtol=0.25)
 
 
-@pytest.mark.slow
-def test_rows_of_card_and_processor(gl, tmp_path):
-    """What is compared, beside something that differs."""
-    found = gpu_pieces.Events.compared(gl, gpu_pieces.EsimConfig(), 24, 16, 0.3)
-    assert found["numba"] == found["card"] > 100 and found["steps_that_differ"] == 0 and found["same_state"]
-    tensors = gpu_pieces.Tensors.measured(gl, 24, 16, 5, "pageable", 0.01)
-    assert tensors["same"] and tensors["way"] == "pageable" and tensors["samples_per_s"] > 0
-    with gpu_pieces.create_context() as other:
-        apart = gpu_pieces.Frames.apart(gl, other, 24, 16, "edges")
-    assert apart["largest"] == apart["beyond"] == 0.0 and "llvmpipe" in apart["beside"]
-    rows = Rows(tmp_path / "kernel.jsonl", STAMP)
-    options = argparse.Namespace(small=True, backend="auto", device=0)
-    gpu_pieces.SMALL, before = {"24x16": (24, 16)}, gpu_pieces.SMALL
-    try:
-        gpu_pieces.Kernel.run(rows, options)
-    finally:
-        gpu_pieces.SMALL = before
-    assert len(rows.rows) == 16 and all(row["stay_steps_per_s"] > 0 for row in rows.rows)
-    seen = {row["key"].split()[2]: row["events_per_step"] / (24 * 16) for row in rows.rows if "plain" in row["key"]}
-    assert seen["0"] == 0 and seen["0.31"] == pytest.approx(0.31, rel=0.3) and seen["5"] == pytest.approx(5, rel=0.1)
+def test_a_difference_is_found(monkeypatch):
+    def other(self, height, width, config, seed):
+        Esim.__init__(self, height, width, config, seed + 1)
+
+    kind = type("Other", (Esim,), {"__init__": other})
+    monkeypatch.setattr(gpu_suite, "emulator_of", lambda config: kind)
+    with pytest.raises(AssertionError, match="environment 0, step 1: . differs"):
+        gpu_suite.compared(EsimConfig(), 8, 8, 1, "cpu", 0)

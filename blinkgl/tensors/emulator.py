@@ -1,0 +1,168 @@
+"""``events.device: cuda``: ESIM and V2E on a card behind the interface that every other emulator has.
+
+A batch of one environment makes the events; checks, saving and restoring stay those of the emulator on the processor,
+so a state that was saved by one goes on in the other, and files are the same.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from blinkgl.errors import EventDataError
+from blinkgl.events.emulator import Emulator
+from blinkgl.events.esim import Esim
+from blinkgl.events.v2e import V2e
+from blinkgl.tensors.batch import Batch
+from blinkgl.tensors.esim import TensorEsim
+from blinkgl.tensors.v2e import TensorV2e
+from blinkgl.types.events import Events
+
+DEVICE = "cuda"
+"""What ``events.device: cuda`` means to torch; tests, which have no card, say "cpu"."""
+_trials: dict[tuple[str, str], bool] = {}
+
+
+class _OnDevice(Emulator):
+    """What a class mixes in before the emulator whose events it makes."""
+
+    device = "cuda"
+    _batch_kind: ClassVar[Any]
+
+    def __init__(self, height: int, width: int, config: Any = None, seed: int = 0, device: Any = DEVICE):
+        super().__init__(height, width, config, seed)  # type: ignore[bad-argument-type]
+        self._batch: Batch = self._batch_kind(height, width, self.config, device=device, seed=seed)
+        self.tensor_device = self._batch.device
+
+    def step(self, luminance: Any, t_ns: int, rows: Any = None, rate: Any = None) -> Events:
+        if not isinstance(luminance, Tensor):
+            return super().step(luminance, t_ns, rows, rate)
+        # A frame that lies on the device: the batch checks it there.
+        t_ns = self._checked_time(t_ns)
+        events = self._made(luminance[None] if luminance.ndim == 2 else luminance, t_ns)
+        self.t_ns, self._rows_before = t_ns, None
+        self.frames += 1
+        return events
+
+    def _made(self, frames: Tensor, t_ns: int) -> Events:
+        try:
+            events = self._batch.step(frames, t_ns).numpy()[0]
+        except EventDataError as error:  # there is one environment, and nobody has numbered it
+            where = (error.where or "").replace("environment 0, ", "") or None
+            alone = EventDataError(error.problem, where=where, value=error.value, accepted=error.accepted)
+            alone.pixel = error.pixel
+            raise alone from None
+        self.saturated = int(self._batch.saturated[0])
+        return events if len(events) else Events.empty()
+
+    def _of_array(self, frame: np.ndarray, t_ns: int) -> Events:
+        light = np.ascontiguousarray(self.decoded(frame)).reshape(1, self.height, self.width)
+        return self._made(torch.from_numpy(light).to(self._batch.device), t_ns)
+
+    def _start(self, frame: np.ndarray, t_ns: int, rate: Any) -> Events:
+        return self._of_array(frame, t_ns)
+
+    def _advance(self, frame: np.ndarray, t_ns: int, rate: Any) -> Events:
+        return self._of_array(frame, t_ns)
+
+    def decoded(self, frame: Any) -> Any:
+        """As :meth:`Emulator.decoded`; of a tensor, the tensor."""
+        return frame if isinstance(frame, Tensor) else super().decoded(frame)
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """That of the emulator on the processor."""
+        there = self._batch.state_dict()
+        epoch = {"_epoch_ns": there["clock"][:, 3]}
+        if "_intensity" in there:
+            epoch["_brightest"] = there["_intensity"].amax()[None].to(torch.float64)
+        for name, values in {**there, **epoch}.items():
+            if name in self._state:
+                mine = getattr(self, name)
+                mine[...] = values.cpu().numpy().reshape(mine.shape)
+        return super().state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        super().load_state_dict(state)
+        there = self._batch.state_dict()
+        epoch = int(getattr(self, "_epoch_ns", [0])[0])
+        clock = [self.t_ns is not None, self.t_ns or 0, self.frames, epoch]
+        there["clock"] = torch.tensor([clock], dtype=torch.int64)
+        there["saturated"] = torch.tensor([self.saturated])
+        for name in there:
+            if name in self._state:
+                there[name] = torch.from_numpy(np.array(getattr(self, name)).reshape(-1))
+        self._batch.load_state_dict(there)
+
+
+class DeviceEsim(_OnDevice, Esim):
+    """:class:`~blinkgl.events.esim.Esim` on a torch device."""
+
+    _batch_kind = TensorEsim
+
+
+class DeviceV2e(_OnDevice, V2e):
+    """:class:`~blinkgl.events.v2e.V2e` on a torch device."""
+
+    _batch_kind = TensorV2e
+
+
+KINDS: dict[Any, type[_OnDevice]] = {Esim: DeviceEsim, V2e: DeviceV2e}
+"""The classes for a device, by those for the processor."""
+
+
+def emulator_on(kind: Any, config: Any, height: int, width: int, seed: int, reconstruction: str) -> Emulator:
+    """The emulator ``kind`` on :data:`DEVICE`; for ``events.device: auto`` that on the processor where it does not go.
+
+    Raises EventDataError, naming the key, where the card is asked for and cannot do it."""
+    problem = _problem(kind, config, reconstruction, DEVICE)
+    if problem is None:
+        return KINDS[kind](height, width, config, seed, DEVICE)
+    if config.device == "auto":
+        return kind(height, width, config, seed, reconstruction)
+    raise problem
+
+
+def _problem(kind: Any, config: Any, reconstruction: str, device: Any) -> EventDataError | None:
+    """Why this device does not make these events; None: it does."""
+    if kind not in KINDS:
+        return EventDataError(
+            "not made on tensors", where="events.device", value=config.device, accepted="cpu, or auto"
+        )
+    if reconstruction != "linear":
+        return EventDataError(
+            "events on a card follow straight lines between frames alone",
+            where="timeline.reconstruction",
+            value=reconstruction,
+            accepted="linear, or events.device: cpu",
+        )
+    if torch.device(device).type == "cuda" and not torch.cuda.is_available():
+        return EventDataError(
+            "torch sees no CUDA card", where="events.device", value=config.device, accepted="cpu, or auto"
+        )
+    if not same_events(kind, config, device):
+        return EventDataError(
+            "the card's events of a trial are not the processor's",
+            where="events.device",
+            value=config.device,
+            accepted="cpu, or another driver",
+        )
+    return None
+
+
+def same_events(kind: Any, config: Any, device: Any) -> bool:
+    """Whether a short clip, 32 x 64 pixels and three intervals, has the same events on a device as on the processor.
+    Asked once per configuration, device and process."""
+    key = (str(device), config.model_dump_json())
+    if key not in _trials:
+        rng = np.random.default_rng(1)
+        clip = np.exp(rng.normal(-1, 0.5, (4, 32, 64))).astype(np.float32)
+        both = KINDS[kind](32, 64, config, 1, device), kind(32, 64, config, 1)
+        steps = [[one.step(frame, 1_000_003 * k) for k, frame in enumerate(clip)] for one in both]
+        ours, theirs = (Events.concatenate(chunks) for chunks in steps)
+        _trials[key] = ours.columns == theirs.columns and all(
+            np.array_equal(getattr(ours, name), getattr(theirs, name)) for name in theirs.columns
+        )
+    return _trials[key]

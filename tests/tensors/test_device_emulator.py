@@ -1,0 +1,146 @@
+"""``events.device: cuda``: who makes the events, what is refused, and that files are the same. Without a card, torch's
+processor stands for it."""
+
+from __future__ import annotations
+
+import hashlib
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+import blinkgl
+from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
+from blinkgl.config.sequence import load_run
+from blinkgl.dataset.generate import generate_sequence
+from blinkgl.dataset.verify import verify_dataset
+from blinkgl.errors import ConfigError, EventDataError
+from blinkgl.events import Esim
+from blinkgl.events.v2e import V2e
+from blinkgl.sequence_files.sequence_dir import read_manifest
+from blinkgl.tensors import emulator as devices
+from blinkgl.tensors.choice import make_on_device
+from same_events import assert_same
+from tests.tiny_recipe import TINY
+
+CARD, SOFTWARE = SimpleNamespace(is_software=False), SimpleNamespace(is_software=True)
+
+
+@pytest.fixture
+def card(monkeypatch):
+    monkeypatch.setattr(devices, "DEVICE", "cpu")
+
+
+def made(gl, reconstruction="linear", config=EsimConfig, **values):
+    return make_on_device(config(**values), 16, 24, 1, reconstruction, gl).device
+
+
+def test_auto_takes_a_card_that_can_do_it(card, monkeypatch):
+    assert made(SOFTWARE) == "cpu" == made(None) == made(CARD, device="cpu") == made(CARD, "pchip")
+    assert made(CARD) == "cuda" == made(None, device="cuda") == made(CARD, config=V2eConfig)
+    assert made(CARD, config=VoltmeterConfig) == "cpu"
+    monkeypatch.setattr(devices, "_trials", {})
+    monkeypatch.setattr(devices, "same_events", lambda *_: False)
+    assert made(CARD) == "cpu"
+    with pytest.raises(EventDataError, match=r"^events\.device: the card's events of a trial"):
+        made(CARD, device="cuda")
+
+
+def test_what_is_refused(card, tmp_path):
+    with pytest.raises(EventDataError, match=r"^timeline\.reconstruction.*linear, or events\.device: cpu"):
+        made(CARD, "pchip", device="cuda")
+    with pytest.raises(ConfigError, match=r"device.*'gl'.*cuda"):
+        blinkgl.Esim(4, 4, device="gl")
+    path = tmp_path / "run.yaml"
+    path.write_text(yaml.safe_dump({**TINY, "events": {"device": "cuda"}, "timeline": {"reconstruction": "hermite"}}))
+    with pytest.raises(ConfigError, match=r"timeline\.reconstruction.*straight lines"):
+        load_run(path)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a card")
+def test_without_a_card_it_is_said():
+    assert made(CARD) == "cpu"
+    with pytest.raises(EventDataError, match=r"^events\.device: torch sees no CUDA card.*cpu, or auto"):
+        made(None, device="cuda")
+
+
+@pytest.mark.parametrize(
+    ("kind", "config"),
+    [
+        (Esim, EsimConfig(threshold_jitter=0.03, refractory_us=200)),
+        (V2e, V2eConfig(leak_rate_hz=5, shot_noise_rate_hz=20, causes=True)),
+        (V2e, V2eConfig(preset="noisy", photoreceptor_noise=True)),
+    ],
+    ids=["esim", "v2e", "v2e, noise"],
+)
+def test_a_state_goes_on_with_the_other_device(card, kind, config):
+    rng = np.random.default_rng(0)
+    clip = np.exp(rng.normal(-1, 0.6, (8, 16, 24))).astype(np.float32)
+    theirs, ours = kind(16, 24, config, 1), devices.KINDS[kind](16, 24, config, 1, "cpu")
+    for k, frame in enumerate(clip):
+        if k == 4:
+            states = ours.state_dict(), theirs.state_dict()
+            assert states[0].keys() == states[1].keys()
+            assert all(np.array_equal(states[0][name], states[1][name]) for name in states[1])
+            theirs, ours = kind(16, 24, config, 1), devices.KINDS[kind](16, 24, config, 1, "cpu")
+            ours.load_state_dict(states[1])
+            theirs.load_state_dict(states[0])
+        given = torch.from_numpy(frame) if k % 2 else frame
+        assert_same(ours.step(given, 1_000_000 * k), theirs.step(frame, 1_000_000 * k), k)
+    codes = (clip[0] * 200).clip(0, 255).astype(np.uint8)
+    assert_same(ours.step(codes, 10**10), theirs.step(codes, 10**10), "codes")
+
+
+def test_a_bad_frame_is_said_in_the_same_words(card):
+    both = Esim(4, 6), devices.DeviceEsim(4, 6, device="cpu")
+    said = []
+    for one in both:
+        one.step(np.full((4, 6), 0.5, np.float32), 0)
+        bad = np.full((4, 6), 0.5, np.float32)
+        bad[1, 2] = np.inf
+        with pytest.raises(EventDataError) as raised:
+            one.step(bad if one is both[0] else torch.from_numpy(bad), 1000)
+        said.append((str(raised.value), raised.value.pixel))
+        assert len(one.step(np.ones((4, 6), np.float32), 1000)) > 0
+    assert said[0] == said[1]
+
+
+@pytest.mark.parametrize("events", [{}, {"emulator": "v2e", "preset": "noisy", "causes": True}], ids=["esim", "v2e"])
+def test_files_are_the_same_and_the_manifest_says_which(card, gl, tmp_path, monkeypatch, events):
+    from blinkgl.render.canvas import Frame
+
+    tensors, tensor = [], Frame.tensor
+    monkeypatch.setattr(Frame, "tensor", lambda frame, *given: tensors.append(frame) or tensor(frame, *given))
+    sums, said = {}, {}
+    for device in ("cpu", "cuda"):
+        recipe = tmp_path / f"{device}.yaml"
+        recipe.write_text(yaml.safe_dump({**TINY, "events": {**events, "device": device}}))
+        path = generate_sequence(load_run(recipe).sequence(0), 0, tmp_path / device, gl).path
+        said[device] = read_manifest(path)["events_device"]
+        files = (p for p in path.rglob("*") if p.is_file() and p.name not in ("manifest.json", "config.yaml"))
+        sums[device] = {p.relative_to(path).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+    assert said == {"cpu": "cpu", "cuda": "cuda"} and tensors
+    assert sums["cpu"] == sums["cuda"] and "events.h5" in sums["cpu"]
+    if not events:
+        result = verify_dataset(tmp_path / "cuda", deep=1)
+        assert result.clean and len(result.deep) == 1
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"timeline": {"kind": "budget", "max_time_error_px": 0.2}},  # a timeline that looks at the frames
+        {"readout": {"latency": {"dark_us": 500}}},  # as slow as pixels are bright
+    ],
+    ids=["budget", "latency"],
+)
+def test_who_looks_at_frames_gets_arrays(card, gl, tmp_path, changes):
+    sums = []
+    for device in ("cpu", "cuda"):
+        recipe = tmp_path / f"{device}.yaml"
+        recipe.write_text(yaml.safe_dump({**TINY, **changes, "events": {"device": device}}))
+        path = generate_sequence(load_run(recipe).sequence(0), 0, tmp_path / device, gl).path
+        sums.append(hashlib.sha256((path / "events.h5").read_bytes()).hexdigest())
+    assert sums[0] == sums[1]

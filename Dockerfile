@@ -6,7 +6,7 @@
 #   docker build --target nvidia -t blinkgl:nvidia .
 #   docker run --rm --gpus all -v "$PWD/out:/work/out" blinkgl:nvidia doctor
 #
-# Its steps are checked in a bare Debian without Docker: python -m blinkgl.tools.recipe --root FOLDER (docs/install.md).
+# tests/test_packaging.py compares what it installs with tools/setup.sh.
 
 FROM debian:bookworm-slim AS cpu
 ENV DEBIAN_FRONTEND=noninteractive PIP_DISABLE_PIP_VERSION_CHECK=1 PATH=/opt/blinkgl/venv/bin:$PATH
@@ -20,7 +20,7 @@ COPY shaders ./shaders
 COPY configs ./configs
 COPY tools ./tools
 RUN pip install -q --no-cache-dir -c constraints.txt --upgrade pip setuptools wheel && pip install -q --no-cache-dir --no-build-isolation -c constraints.txt ".[physics]"
-RUN mv configs /opt/blinkgl/configs && rm -rf /opt/blinkgl/source/* && cd / && python -m blinkgl.machine.compiling
+RUN mv configs /opt/blinkgl/configs && rm -rf /opt/blinkgl/source/* && cd / && python -m blinkgl.show.compile_kernels
 RUN useradd --create-home blinkgl && install -d -o blinkgl /work
 USER blinkgl
 WORKDIR /work

@@ -2,13 +2,14 @@
 # make test    install into .venv, check OpenGL, run the tests
 # make lint    ruff, formatting, types; what the tests last covered      make format  rewrite what the formatter would; make coverage
 # make docs    install into .venv, build the documentation into out/site
-# make slow    the tests that take long       make bench   the benchmarks
-# make fuzz    damaged files and strange configurations (an hour)      make mutate   are there tests that notice a wrong line?
+# make slow    the tests that take long       make bench WHAT=events   a benchmark
+# make fuzz    damaged files (minutes)
 # make clean   remove what was built (not .venv, not out/)
 #
 # PYTHON=python3.12 chooses the interpreter .venv is made with, JOBS=4 the number of test processes.
 
 JOBS ?= auto
+WHAT ?= generate
 PIP = .venv/bin/python -m pip --disable-pip-version-check
 # setuptools warns about every editable install beside a folder of the same name; that is the layout wanted here.
 INSTALL = PYTHONWARNINGS=ignore $(PIP) install --quiet --no-build-isolation -c constraints.txt
@@ -16,7 +17,7 @@ COVERED = if [ -f .coverage ]; then .venv/bin/python -m coverage report --sort=c
 	else echo "coverage: not measured here yet (make coverage)"; fi
 INPUTS = setup.cfg pyproject.toml constraints.txt tools/setup.sh Makefile
 
-.PHONY: demo test lint format coverage docs slow bench fuzz mutate doctor setup opengl clean
+.PHONY: demo test lint format coverage docs slow bench fuzz doctor setup opengl clean
 .DELETE_ON_ERROR:
 
 demo: .venv/.kernels opengl
@@ -50,15 +51,10 @@ slow: .venv/.installed-dev opengl
 	.venv/bin/python -m pytest -q -m slow
 
 bench: .venv/.installed-dev opengl
-	@for program in tools/bench_*.py; do echo "== $$program"; .venv/bin/python $$program || exit 1; done
+	.venv/bin/python -m blinkgl.tools.bench $(WHAT)
 
-fuzz: .venv/.installed-dev opengl
-	.venv/bin/python -m blinkgl.tools.fuzz_files --mutants 1000 --out out/fuzz/files --json out/fuzz/files.json
-	.venv/bin/python -m blinkgl.tools.fuzz_configs --count 10000 --runs 300 --out out/fuzz/configs --json out/fuzz/configs.json
-
-mutate: .venv/.installed-dev opengl
-	.venv/bin/python -m blinkgl.tools.mutate --map
-	.venv/bin/python -m blinkgl.tools.mutate --count 200 --seed 1 --out out/mutants.json
+fuzz: .venv/.installed-dev
+	.venv/bin/python -m blinkgl.tools.fuzz --mutants 1000
 
 doctor: .venv/.installed-core
 	.venv/bin/blinkgl doctor
@@ -99,7 +95,7 @@ setup: .venv/.installed-dev opengl
 
 # Once per machine instead of in somebody's first run; where it fails, the first run compiles.
 .venv/.kernels: .venv/.installed-core $(wildcard blinkgl/events/*.py) | opengl
-	-@.venv/bin/python -m blinkgl.machine.compiling
+	-@.venv/bin/python -m blinkgl.show.compile_kernels
 	@touch $@
 
 # No stamp: it takes half a second, and system packages come and go without make seeing it.

@@ -11,7 +11,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 _HOMES = {
     "blinkgl.front.scenes": (
@@ -51,7 +51,7 @@ _HOMES = {
         "write_flow",
         "write_trajectory",
     ),
-    "blinkgl.events.types": ("Events",),
+    "blinkgl.types.events": ("Events",),
     "blinkgl.tensors": ("TensorEsim", "TensorEvents", "TensorV2e"),
     "blinkgl.sequence.items": ("CameraImage", "EventChunk", "GroundTruth", "Picture"),
     "blinkgl.labels.frames": ("Flow", "LabelFrame"),
@@ -63,7 +63,6 @@ _HOME = {name: module for module, names in _HOMES.items() for name in names}
 
 if TYPE_CHECKING:  # what a type checker and an editor see; a test compares it with the table
     from blinkgl.errors import AssetError, BlinkGLError, ConfigError, EventDataError, GLError, OutputError
-    from blinkgl.events.types import Events
     from blinkgl.front.drawing import Renderer, render_frame
     from blinkgl.front.files import (
         calibrate,
@@ -106,6 +105,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see; a test compares it w
     from blinkgl.online.stream import StreamStats
     from blinkgl.sequence.items import CameraImage, EventChunk, GroundTruth, Picture
     from blinkgl.tensors import TensorEsim, TensorEvents, TensorV2e
+    from blinkgl.types.events import Events
 
 __all__ = [
     "Animation",

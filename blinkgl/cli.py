@@ -9,19 +9,14 @@ at once.
 
 from __future__ import annotations
 
-import errno
-import os
 import sys
-import traceback
 from typing import Annotated
 
 import typer
 
 from blinkgl import __version__
-from blinkgl.errors import BlinkGLError
-from blinkgl.machine.interrupts import interruptible
-from blinkgl.show.terminal import never_fail_to_print
-from blinkgl.tools.shader_debugger.cli import app as shader_app
+from blinkgl.machine.command_line import run_app
+from blinkgl.shader_debugger.cli import app as shader_app
 
 app = typer.Typer(name="blinkgl", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 app.add_typer(shader_app)
@@ -609,99 +604,7 @@ def import_(
 
 def run(arguments: list[str]) -> int:
     """Run one command line (without the program name); returns the exit status and raises nothing a user can cause."""
-    never_fail_to_print()
-    debug = "--debug" in arguments
-    arguments = [a for a in arguments if a != "--debug"] or ["--help"]
-    try:
-        # Not standalone: typer then hands errors up instead of printing its own boxes.
-        with interruptible():
-            status = app(arguments, prog_name="blinkgl", standalone_mode=False)
-        return status if isinstance(status, int) else 0
-    except (KeyboardInterrupt, typer.Abort):
-        print("interrupted", file=sys.stderr)
-        return 130
-    except BrokenPipeError:  # `blinkgl … | head`: nobody reads any more, which is no error of ours
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
-    except Exception as error:  # noqa: BLE001 - nothing leaves without a line for the user
-        line = _user_line(error)
-        if debug or line is None:
-            traceback.print_exc()
-        if line is None:
-            print("this is a bug in BlinkGL; please report the lines above and the command", file=sys.stderr)
-            return 1
-        print(f"error: {line}", file=sys.stderr)
-        if isinstance(error, BlinkGLError):
-            if getattr(error, "detail", ""):  # a shader's messages with the source around them
-                print(f"\n{error.detail}", file=sys.stderr)
-            return error.exit_status
-        return BlinkGLError.exit_status
-
-
-OUT_OF_MEMORY = (
-    "out of memory; use a smaller image, fewer workers or shorter sequences, or raise the limit on the process "
-    "('ulimit -v' shows it)"
-)
-_MACHINE_ERRNOS = {
-    errno.ENOSPC,
-    errno.EDQUOT,
-    errno.EACCES,
-    errno.EPERM,
-    errno.EROFS,
-    errno.EIO,
-    errno.ENAMETOOLONG,
-    errno.EMFILE,
-    errno.ENFILE,
-    errno.EFBIG,
-}
-
-
-def _user_line(error: Exception) -> str | None:
-    """The line for an error that the user or the machine caused; None for a bug."""
-    if isinstance(error, BlinkGLError):
-        return str(error)
-    # typer's usage errors; their class moved between versions.
-    if hasattr(error, "format_message") and hasattr(error, "exit_code"):
-        context = getattr(error, "ctx", None)
-        command = context.command_path if context is not None else "blinkgl"
-        message = " ".join(error.format_message().split()).rstrip(".")
-        return f"{message}; see '{command} --help'"
-    if is_out_of_memory(error):
-        asked = " ".join(str(error).split())
-        return OUT_OF_MEMORY + (f" ({asked[:120]})" if asked else "")
-    if isinstance(error, OSError):
-        code = error.errno
-        if code is None and "No space left" in str(error):  # h5py keeps the number inside its text
-            code = errno.ENOSPC
-        if code in _MACHINE_ERRNOS:
-            return f"{error.filename}: {os.strerror(code).lower()}" if error.filename else os.strerror(code).lower()
-    return None
-
-
-def is_out_of_memory(error: BaseException | None) -> bool:
-    """MemoryError (NumPy's too), ENOMEM, and what C++ libraries make of it: OpenCV, LLVM,
-    torch and HDF5 say it in words only."""
-    seen: set[int] = set()
-    while error is not None and id(error) not in seen:
-        seen.add(id(error))
-        if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
-            return True
-        text = str(error).lower()
-        if any(
-            words in text
-            for words in (
-                "cannot allocate memory",
-                "can't allocate memory",
-                "insufficient memory",
-                "bad_alloc",
-                "out of memory",
-                "unable to allocate",
-                "failed to map segment",
-            )
-        ):
-            return True
-        error = error.__cause__ or error.__context__
-    return False
+    return run_app(app, arguments, "blinkgl", "BlinkGL")
 
 
 def main() -> None:

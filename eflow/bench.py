@@ -21,7 +21,7 @@ from eflow.models import NETWORKS, SIZES, build_model, model_config
 PRESETS: dict[str, dict] = {
     name if size == "base" else f"{name}-{size}": {"name": name, "size": size} for name in NETWORKS for size in SIZES
 } | {"eflowformer-twins": {"name": "eflowformer", "layers": 2, "attention": "twins"}}
-"""Names that ``eflow bench`` and ``compare_networks`` take: every network in every size."""
+"""Names that ``eflow bench`` takes: every network in every size."""
 
 
 def preset(name: str):

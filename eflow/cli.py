@@ -5,18 +5,16 @@ from __future__ import annotations
 import importlib.util
 import signal
 import sys
-import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from blinkgl import __version__
-from blinkgl.cli import _user_line
 from blinkgl.errors import BlinkGLError, ConfigError
+from blinkgl.machine.command_line import run_app
 from blinkgl.machine.extras import EXTRAS, install
 from blinkgl.machine.interrupts import interruptible
-from blinkgl.show.terminal import never_fail_to_print
 from eflow.methods.table import METHODS, make_method
 
 if TYPE_CHECKING:
@@ -139,7 +137,7 @@ def render(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
     """Render windows of a recipe into a folder that several trainings can share. Ctrl-C keeps what is there by then."""
-    from blinkgl.io.sequence_dir import refuse_existing
+    from blinkgl.sequence_files.sequence_dir import refuse_existing
     from eflow.data.online import open_online
     from eflow.data.pool import render_pool
     from eflow.progress import Counting
@@ -205,7 +203,7 @@ def evaluate(
     device: Device = "auto",
 ) -> None:
     """Score a network or a method on a data set, beside zero flow and what knows the global motion."""
-    from blinkgl.show.terminal import plain_console
+    from blinkgl.machine.terminal import plain_console
     from eflow.data.sources import open_source
     from eflow.evaluate import evaluate as score, show
 
@@ -288,7 +286,7 @@ def predict(
 
     import numpy as np
 
-    from blinkgl.events.types import Events
+    from blinkgl.types.events import Events
     from eflow import infer
     from eflow.confidence import disagreement
     from eflow.doubts import doubts
@@ -402,7 +400,7 @@ def submit(
     device: Device = "auto",
 ) -> None:
     """Write a benchmark's submission file; it is checked before it gets its name."""
-    from blinkgl.show.terminal import plain_console
+    from blinkgl.machine.terminal import plain_console
     from eflow.submit import submit_blinkflow, submit_dsec
 
     _one_of("--benchmark", benchmark, ("dsec", "blinkflow"))
@@ -521,7 +519,7 @@ def bench(
     """Milliseconds, GMACs and peak memory per model and resolution; each measured in a process of its own."""
     from rich.table import Table
 
-    from blinkgl.show.terminal import plain_console
+    from blinkgl.machine.terminal import plain_console
     from eflow import bench as benchmark
     from eflow.evaluate import write_json
 
@@ -658,30 +656,7 @@ def _size(text: str | None) -> tuple[int, int] | None:
 
 def run(arguments: list[str]) -> int:
     """Run one command line (without the program name); returns the exit status and raises nothing a user can cause."""
-    never_fail_to_print()
-    debug = "--debug" in arguments
-    arguments = [a for a in arguments if a != "--debug"] or ["--help"]
-    try:
-        with interruptible():
-            status = app(arguments, prog_name="eflow", standalone_mode=False)
-        return status if isinstance(status, int) else 0
-    except (KeyboardInterrupt, typer.Abort):
-        print("interrupted", file=sys.stderr)
-        return 130
-    except ModuleNotFoundError as error:
-        if error.name not in ("torch", "safetensors", "tensorboard"):
-            raise
-        print(f"error: {error.name} is not installed; run {install(*EXTRAS['learn'][0])}", file=sys.stderr)
-        return BlinkGLError.exit_status
-    except Exception as error:  # noqa: BLE001 - nothing leaves without a line for the user
-        line = _user_line(error)
-        if debug or line is None:
-            traceback.print_exc()
-        if line is None:
-            print("this is a bug in eflow; please report the lines above and the command", file=sys.stderr)
-            return 1
-        print(f"error: {line}", file=sys.stderr)
-        return BlinkGLError.exit_status
+    return run_app(app, arguments, "eflow", "eflow")
 
 
 def main() -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 
 SLOWEST, FASTEST = 1e-3, 1e4
 """Events per second and pixel that cameras give: a dark still scene has 0.05; a dead time of 100 µs allows 10,000."""

@@ -16,8 +16,8 @@ from rich.table import Table
 
 from blinkgl.errors import AssetError
 from blinkgl.io.atomic import atomic_file, output_errors
-from blinkgl.io.sequence_dir import refuse_existing
-from blinkgl.show.terminal import plain_console
+from blinkgl.machine.terminal import plain_console
+from blinkgl.sequence_files.sequence_dir import refuse_existing
 from eflow.confidence import SHARES, area, disagreement, sparsification
 from eflow.data.dataset import FlowDataset, collate
 from eflow.data.sources import Source

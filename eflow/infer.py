@@ -14,13 +14,13 @@ import torch
 import torch.nn.functional as F
 
 from blinkgl.errors import AssetError, EventDataError
-from blinkgl.events.types import Events
 from blinkgl.io.atomic import output_errors, remove_stale, temporary_beside
 from blinkgl.io.flo import encode_flo
 from blinkgl.io.flow_png import write_flow_png
 from blinkgl.io.formats import EventFile, open_events
 from blinkgl.io.images import encode_npy
-from blinkgl.io.sequence_dir import refuse_existing
+from blinkgl.sequence_files.sequence_dir import refuse_existing
+from blinkgl.types.events import Events
 from eflow.data.representation import VoxelGrid
 from eflow.data.window import Window
 from eflow.methods import Method

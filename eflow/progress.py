@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 
 from rich.progress import BarColumn, Progress
 
-from blinkgl.show.terminal import plain_column, plain_console
+from blinkgl.machine.terminal import plain_column, plain_console
 
 T = TypeVar("T")
 _QUIET_S = 10.0

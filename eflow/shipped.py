@@ -24,7 +24,7 @@ from blinkgl.config.base import Config, validate
 from blinkgl.config.reader import read_table, to_yaml
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.io.atomic import atomic_folder, output_errors
-from blinkgl.io.sequence_dir import refuse_existing
+from blinkgl.sequence_files.sequence_dir import refuse_existing
 from eflow.methods.table import METHODS
 
 FOLDER = Path(__file__).parent / "weights"

@@ -34,7 +34,7 @@ from blinkgl.config.reader import to_yaml
 from blinkgl.config.recipe import derived_seed
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 from blinkgl.io.atomic import atomic_file, output_errors
-from blinkgl.io.sequence_dir import refuse_existing
+from blinkgl.sequence_files.sequence_dir import refuse_existing
 from eflow import checkpoint as ckpt
 from eflow.allocator import keep_memory
 from eflow.config import OptimConfig, SourceConfig, TrainConfig

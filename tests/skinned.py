@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from blinkgl.scene.geometry.primitives import BUILDERS
+from blinkgl.scene.geometry import BUILDERS
 from blinkgl.scene.shapes.skeleton import Locals, Skeleton
 from blinkgl.scene.shapes.skin import Skin
 

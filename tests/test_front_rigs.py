@@ -10,7 +10,7 @@ from blinkgl import Camera, Mesh, Rig, RigSensor, Timeline, record_rig, simulate
 from blinkgl.errors import ConfigError
 from blinkgl.io.frame_camera import read_exposures
 from blinkgl.io.imu import read_imu
-from blinkgl.io.rig_dir import read_rig
+from blinkgl.sequence_files.rig_dir import read_rig
 from tests.test_front import box_scene
 
 TURNED = np.array([[0.0, 0, 1, 0.02], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])

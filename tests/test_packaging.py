@@ -254,7 +254,8 @@ def test_citation():
     for work in told["references"]:
         assert {"type", "title", "authors", "year"} <= set(work) and isinstance(work["year"], int)
         assert work["type"] in ("conference-paper", "article")
-    assert told["version"] == blinkgl.__version__
+    released = blinkgl.__version__.endswith(".dev0") or told["version"] == blinkgl.__version__
+    assert released, "between two releases the one before is cited"
     changes = (REPOSITORY / "CHANGELOG.md").read_text(encoding="utf-8")
     assert f"## {told['version']} ({told['date-released']})" in changes, "a release is dated once"
 
@@ -267,53 +268,36 @@ def test_changes_are_of_known_kinds():
     assert kinds and odd == [], f"a fragment is called NAME.KIND.md, KIND one of {kinds}"
 
 
+def docker_stages(text: str) -> dict[str, list[tuple[str, str]]]:
+    """Stage of a Dockerfile -> its instructions, (word, text)."""
+    stages: dict[str, list[tuple[str, str]]] = {}
+    for line in re.sub(r"^\s*#.*\n", "", text, flags=re.M).replace("\\\n", " ").splitlines():
+        word, _, rest = line.strip().partition(" ")
+        if word == "FROM":
+            stages[rest.split()[-1]] = steps = []
+        if word:
+            steps.append((word, rest))
+    return stages
+
+
 def test_the_container_installs_what_setup_sh_asks_for():
     """The Dockerfile, without Docker: it copies what a build reads, and installs the
     packages that tools/setup.sh would."""
-    from blinkgl.tools.recipe import stage
-
-    image, cpu = stage((REPOSITORY / "Dockerfile").read_text(encoding="utf-8"), "cpu")
-    assert image == "debian:bookworm-slim"
-    copied = {name for step in cpu if step.instruction == "COPY" for name in step.text.split()[:-1]}
+    stages = docker_stages((REPOSITORY / "Dockerfile").read_text(encoding="utf-8"))
+    assert stages["cpu"][0][1].startswith("debian:bookworm-slim ")
+    cpu = stages["cpu"][1:]
+    copied = {name for word, text in cpu if word == "COPY" for name in text.split()[:-1]}
     assert copied == {*PACKAGES, "setup.cfg", "pyproject.toml", "constraints.txt", "README.md", "LICENSE"}
     ignored = (REPOSITORY / ".dockerignore").read_text(encoding="utf-8").split()
     assert {line[1:] for line in ignored if line.startswith("!")} == copied
     setup = (REPOSITORY / "tools/setup.sh").read_text(encoding="utf-8")
     wanted = set(re.search(r'packages="([^$"]+)"', setup)[1].split()) | {"python3-venv", "libosmesa6"}
-    installed = {
-        word
-        for step in cpu
-        if step.instruction == "RUN" and "apt-get install" in step.text
-        for word in step.text.split()
-    }
+    installed = {name for word, text in cpu if word == "RUN" and "apt-get install" in text for name in text.split()}
     assert wanted <= installed
     shipped = [file.read_text(encoding="utf-8") for file in (REPOSITORY / "configs").rglob("*.yaml")]
     assert any("\n  physics:" in text for text in shipped)  # so what they need is there, too
-    assert any("pip install" in step.text and '".[physics]"' in step.text for step in cpu)
-    nvidia = stage((REPOSITORY / "Dockerfile").read_text(encoding="utf-8"), "nvidia")[1]
-    assert nvidia[: len(cpu)] == cpu and any("graphics" in step.text for step in nvidia if step.instruction == "ENV")
-    assert [step.text for step in nvidia if step.instruction == "USER"][-1] == "blinkgl"
-
-
-def test_the_recipe_copies_and_sets_as_docker_does(tmp_path):
-    from blinkgl.tools.recipe import State, Step, copy, stage, steps
-
-    recipe = "# a\nFROM x:1 AS a\nENV A=1 B=$A:2\nRUN one \\\n  two\nFROM a AS b\nUSER me\n"
-    assert stage(recipe, "b") == ("x:1", [Step("ENV", "A=1 B=$A:2"), Step("RUN", "one    two"), Step("USER", "me")])
-    with pytest.raises(ValueError, match="ADD"):
-        steps("FROM x\nADD y z\n")
-    state = State()
-    for step in (Step("ENV", "A=1"), Step("ENV", "B=$A:2"), Step("WORKDIR", "/src"), Step("ENTRYPOINT", '["run"]')):
-        state.set(step)
-    assert (state.environment["B"], state.folder, state.command) == ("1:2", "/src", ["run"])
-    context, root = tmp_path / "context", tmp_path / "root"
-    (context / "d/e").mkdir(parents=True)
-    for name in ("f", "d/g", "d/e/h"):
-        (context / name).write_text(name)
-    copy(context, root, state, "f ./")
-    copy(context, root, state, "d /there")
-    assert sorted(p.relative_to(root).as_posix() for p in root.rglob("*") if p.is_file()) == [
-        "src/f",
-        "there/e/h",
-        "there/g",
-    ]
+    assert any("pip install" in text and '".[physics]"' in text for _, text in cpu)
+    base, *nvidia = stages["nvidia"]
+    assert base == ("FROM", "cpu AS nvidia")
+    assert any("graphics" in text for word, text in nvidia if word == "ENV")
+    assert [text for word, text in nvidia if word == "USER"][-1] == "blinkgl"

@@ -50,45 +50,74 @@ def test_every_room_is_on_the_map():
         assert f"`blinkgl.{room}`" in pages, f"docs/rooms.md says nothing of {room}"
 
 
-def _room(module: str) -> str:
-    """The files at the top of scene/ and config/ are looked at one by one: scene/types.py comes before the rooms inside
-    and scene/build.py after them, config/labels.py before the table of labels and config/sequence.py after it."""
-    parts = module.split(".")
-    return ".".join(parts[:3] if parts[1] in ("scene", "config") else parts[:2])
+FLOORS = (
+    "errors rng srgb types camera gl machine",
+    "config",
+    "io events",
+    "labels scene timeline tensors",
+    "render sequence_files blender",
+    "imaging recordings",
+    "sequence",
+    "dataset",
+    "layouts online report",
+    "trade front eflow",
+    "show shader_debugger",
+    "cli __main__ tools",
+)
+"""From the ground up. ``import blinkgl`` itself fetches its names when they are first used."""
 
 
-def test_data_flows_one_way():
-    """What is imported when a module is imported never leads back to the room it came from. (``blinkgl.tools`` reads
-    what it likes; the front door fetches its names when they are first used.)"""
-    arrows: dict[str, set[str]] = {}
-    for path in sorted((ROOT / "blinkgl").rglob("*.py")):
-        module = path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".").removesuffix(".__init__")
-        if module in ("blinkgl", "blinkgl.cli", "blinkgl.__main__"):
+def rooms_imported(path: Path) -> set[str]:
+    """Rooms that a module imports, at its top or inside a function; not those for annotations alone."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    hidden = {
+        id(inner)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
+        for inner in ast.walk(node)
+    }
+    names = set()
+    for node in ast.walk(tree):
+        if id(node) in hidden:
             continue
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("blinkgl."):
-                names = [f"{node.module}.{name.name}" for name in node.names]
-                there = {
-                    _room(
-                        n
-                        if (ROOT / (n.replace(".", "/") + ".py")).is_file() or (ROOT / n.replace(".", "/")).is_dir()
-                        else node.module
-                    )
-                    for n in names
-                }
-                arrows.setdefault(_room(module), set()).update(there - {_room(module)})
+        if isinstance(node, ast.Import):
+            names |= {name.name for name in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names |= {f"{node.module}.{name.name}" for name in node.names}
+    known = set(" ".join(FLOORS).split())
+    rooms = {name.split(".")[1] if name.startswith("blinkgl.") else name.split(".")[0] for name in names}
+    return rooms & known
+
+
+def room_of(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return parts[1] if parts[0] == "blinkgl" else parts[0]
+
+
+def test_imports_lead_down():
+    """Of every module, wherever the import stands: to the same floor or further down, and never in a circle."""
+    floor = {room: k for k, rooms in enumerate(FLOORS) for room in rooms.split()}
+    arrows: dict[str, set[str]] = {room: set() for room in floor}
+    upwards = []
+    for folder in ("blinkgl", "eflow", "tools"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            room = room_of(path)
+            if room == "__init__":
+                continue
+            there = rooms_imported(path) - {room}
+            arrows[room] |= there
+            upwards += [f"{path.relative_to(ROOT)} imports {other}" for other in there if floor[other] > floor[room]]
+    assert not upwards, "\n".join(upwards)
     graphlib.TopologicalSorter(arrows).prepare()  # raises CycleError, which names the circle
-    assert not arrows["blinkgl.events"] & {"blinkgl.scene", "blinkgl.gl", "blinkgl.render"} and not arrows[
-        "blinkgl.io"
-    ] & {"blinkgl.render", "blinkgl.gl"}
 
 
 # --- records ----------------------------------------------------------------------------------------------------------
 
 FILLED_IN_LATER = set(
     """
-    Collected Comparison Displacement Document DrawItem Example Explanation Level Measured Omissions Outcome Parameter
-    Pool RenderStats SequenceReport RecordingSide SimulationReport StreamStats Totals Verification _Body
+    BufferReport Collected Comparison Cost Displacement Document DrawItem Draws Example Explanation Finding Level
+    Measured Omissions Outcome Parameter Pool RenderStats Result SequenceReport RecordingSide SimulationReport
+    StreamStats Totals Verification _Arriving _Body
 """.split()
 )
 """Records that are written to while they are made. All others are values: who holds one may count on it."""

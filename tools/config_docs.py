@@ -19,9 +19,11 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from blinkgl.config.base import is_model, members, tag_of
+from blinkgl.config.primitives import PRIMITIVES
 from blinkgl.config.rig import SECTIONS, RigSensorConfig
 from blinkgl.config.sequence import SequenceConfig
-from blinkgl.scene.geometry.primitives import BUILDERS, PARAMETERS, parameters
+from blinkgl.scene.geometry import BUILDERS
+from blinkgl.scene.geometry.primitives import PARAMETERS, parameters
 from eflow.config import TrainConfig
 
 HEADER = """# Every key of the YAML
@@ -53,7 +55,7 @@ keys are refused with the nearest known one. Paths start from the YAML file's fo
 
 def page() -> str:
     """The whole page of ``blinkgl generate``'s YAML as Markdown."""
-    return HEADER + "".join(_section(SequenceConfig, "", set())) + _primitives()
+    return HEADER + "".join(_Page().section(SequenceConfig, "")) + _primitives()
 
 
 def _primitives() -> str:
@@ -67,7 +69,8 @@ def _primitives() -> str:
         ),
         "| kind | parameters and defaults | what it is |\n|---|---|---|\n",
     ]
-    for kind, build in BUILDERS.items():
+    for kind in PRIMITIVES:
+        build = BUILDERS[kind]
         values = ", ".join(
             f"`{name}: {list(value) if isinstance(value, tuple) else value}`"
             for name, value in parameters(kind).items()
@@ -80,34 +83,64 @@ def _primitives() -> str:
 
 def eflow_page() -> str:
     """The whole page of ``eflow train``'s YAML as Markdown."""
-    return EFLOW_HEADER + "".join(_section(TrainConfig, "", set()))
+    return EFLOW_HEADER + "".join(_Page().section(TrainConfig, ""))
 
 
-def _section(model: type[BaseModel], path: str, done: set, note: str = "") -> list[str]:
-    title = f"`{path}`{note}" if path else "Top level"
-    about = " ".join((model.__doc__ or "").split()).replace("``", "`")
-    rows, below = [], []
-    for name, info in model.model_fields.items():
-        inner = f"{path}.{name}" if path else name
+class _Page:
+    """Makes the sections. A model is described where it first stands, and so is a key that another section has, too:
+    later places name the section."""
+
+    def __init__(self) -> None:
+        self.described: dict[type[BaseModel], str] = {}
+        self.said: dict[str, str] = {}
+
+    def section(self, model: type[BaseModel], path: str, note: str = "") -> list[str]:
+        """Return the lines of a model's section, and of those below it that are new."""
+        title = f"`{path}`{note}" if path else "Top level"
+        self.described[model] = title
+        rows: dict[str, str] = {}
+        below: list[tuple[type[BaseModel], str, str]] = []
+        for name, info in model.model_fields.items():
+            inner = f"{path}.{name}" if path else name
+            # a sensor's sections are those of a single camera, and have been described
+            children = [] if model is RigSensorConfig and name in SECTIONS else _models(info.annotation)
+            known = [self.described[child] for child in children if child in self.described]
+            rows[name] = self._row(name, info, known[0] if known and len(children) == 1 else None)
+            place = inner + (".<name>" if _is_dict(info.annotation) else "[]" if _is_list(info.annotation) else "")
+            for child in children:
+                tag = tag_of(child) if len(children) > 1 else None
+                below.append((child, place, f" with `{tag[0]}: {tag[1]}`" if tag else ""))
+        about = " ".join((model.__doc__ or "").split()).replace("``", "`")
+        lines = [f"\n## {title}\n\n{about}\n", *self._shown(title, rows)]
+        for child, place, suffix in below:
+            if child not in self.described:
+                lines += self.section(child, place, suffix)
+        return lines
+
+    @staticmethod
+    def _row(name: str, info: FieldInfo, known: str | None) -> str:
         meaning = (info.description or _about(info)).replace("``", "`").replace("|", "\\|")
-        rows.append(f"| `{name}` | {_type(info)} | {_default(info)} | {meaning} |\n")
-        # a sensor's sections are those of a single camera, and have been described
-        children = [] if model is RigSensorConfig and name in SECTIONS else _models(info.annotation)
-        tagged = [c for c in children if tag_of(c)]
-        for child in children:
-            suffix = f" with `{tag_of(child)[0]}: {tag_of(child)[1]}`" if child in tagged and len(children) > 1 else ""
-            marker = (child, inner)
-            if marker not in done:
-                done.add(marker)
-                below += _section(
-                    child,
-                    inner
-                    + ("." + "<name>" if _is_dict(info.annotation) else "[]" if _is_list(info.annotation) else ""),
-                    done,
-                    suffix,
-                )
-    head = f"\n## {title}\n\n{about}\n\n| key | type | default | meaning |\n|---|---|---|---|\n"
-    return [head, *rows, *below]
+        default = _default(info)
+        if known is not None:
+            default = default.replace("see below", f"see {known}")
+            meaning += f"; keys: {known}" if "see" not in default else ""
+        return f"| `{name}` | {_type(info)} | {default} | {meaning} |\n"
+
+    def _shown(self, title: str, rows: dict[str, str]) -> list[str]:
+        """Return the table of the rows that no other section has; a sentence names the others."""
+        elsewhere: dict[str, list[str]] = {}
+        for name, row in rows.items():
+            if row in self.said:
+                elsewhere.setdefault(self.said[row], []).append(name)
+        # One key alone is quicker read than looked up.
+        elsewhere = {place: names for place, names in elsewhere.items() if len(names) > 1}
+        left_out = {name for names in elsewhere.values() for name in names}
+        for row in rows.values():
+            self.said.setdefault(row, title)
+        sentences = [f"As in {place}: {', '.join(f'`{n}`' for n in names)}." for place, names in elsewhere.items()]
+        shown = [row for name, row in rows.items() if name not in left_out]
+        head = ["\n| key | type | default | meaning |\n|---|---|---|---|\n"] if shown else []
+        return ["\n" + " ".join(sentences) + "\n"] * bool(sentences) + head + shown
 
 
 def _about(info: FieldInfo) -> str:

@@ -1,7 +1,7 @@
 """Reads BlinkGL's docstrings for the documentation site: a Griffe extension, named in mkdocs.yml.
 
 The docstrings are written to be read in the source. Two habits in them mean nothing to Markdown and are translated:
-``:class:`~blinkgl.events.types.Events```, which becomes code, and the lines that explain arguments,
+``:class:`~blinkgl.types.events.Events```, which becomes code, and the lines that explain arguments,
 
     width, height : px.   fov : horizontal field of view, degrees,
     default 60.

@@ -23,15 +23,15 @@ import numpy as np
 from blinkgl.config.base import validate
 from blinkgl.config.camera import CameraConfig
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
-from blinkgl.config.lod import LodConfig
+from blinkgl.config.primitives import kinds
 from blinkgl.config.readout import ReadoutConfig
-from blinkgl.config.scene import PRIMITIVE_KINDS, TEXTURE_KINDS, RandomSceneConfig
+from blinkgl.config.scene import TEXTURE_KINDS, RandomSceneConfig
 from blinkgl.events import Events, make_emulator
 from blinkgl.events.readout import Readout
 from blinkgl.scene.build import build_scene
-from blinkgl.scene.geometry.lod import at_level_of_detail
+from blinkgl.scene.geometry import BUILDERS
 from blinkgl.scene.geometry.meshes import make_mesh
-from blinkgl.scene.geometry.primitives import BUILDERS, random_primitive
+from blinkgl.scene.geometry.random_primitives import random_primitive
 from blinkgl.scene.surfaces.coats import bunting, clothes, scales
 from blinkgl.scene.surfaces.textures import procedural_texture
 from blinkgl.scene.types import Scene
@@ -167,9 +167,7 @@ def coats() -> dict[str, Any]:
 
 
 def bodies() -> dict[str, Any]:
-    return {
-        f"{kind} {index}": told_mesh(random_primitive(kind, index)) for kind in PRIMITIVE_KINDS for index in range(3)
-    }
+    return {f"{kind} {index}": told_mesh(random_primitive(kind, index)) for kind in kinds("pool") for index in range(3)}
 
 
 def living() -> dict[str, Any]:
@@ -238,15 +236,6 @@ def world(keys: dict[str, Any]) -> RandomSceneConfig:
     )
 
 
-def coarse() -> dict[str, Any]:
-    """The default world at a level of detail."""
-    scene = build_scene(world(WORLDS["default"]), CameraConfig(width=96, height=72), 0, END_NS, seed=3)
-    return {
-        thing.name: [n for part in thing.parts for n in told_mesh(part.mesh)]
-        for thing in at_level_of_detail(scene, LodConfig(enabled=True)).objects
-    }
-
-
 def clip(frames: int = 6, height: int = 37, width: int = 45) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(frames, times ns, rates) of a random walk of 8-bit codes, looked up in a table that
     is exact on every machine."""
@@ -282,7 +271,7 @@ def events() -> dict[str, Any]:
     return said
 
 
-PARTS = (textures, coats, bodies, living, shapes, worlds, coarse, events)
+PARTS = (textures, coats, bodies, living, shapes, worlds, events)
 
 
 def drawn(parts=PARTS) -> dict[str, Any]:

@@ -1,139 +1,184 @@
-"""What a dozen small configurations write, as SHA-256 sums: did a change change anything?
+"""Compare what BlinkGL writes with the sums that the repository keeps: did a change change anything?
 
-    python -m blinkgl.tools.fingerprint --out before.json        # at one commit
-    python -m blinkgl.tools.fingerprint --against before.json    # at another, on the same machine
+    python -m blinkgl.tools.fingerprint            # against the kept sums; status 1 where bytes differ
+    python -m blinkgl.tools.fingerprint --keep                # write the sums of this platform anew
+    python -m blinkgl.tools.fingerprint --only wave,v2e       # some cases
 
-The second exits with status 1 where bytes differ.
-
-All timelines, emulators, anti-aliasing settings, reconstructions, labels, sensors, level of detail, a still camera,
-converted frames and ``simulate`` take part. Sums of two machines differ (processor, driver, versions are in the
-manifests), so none are kept in the repository.
+``tests/fingerprint/cases.yaml`` has the cases: small pictures of every feature that a user was promised. The sums lie
+beside it, one file for each platform (:func:`platform_name`): rasterisers and NumPy versions round differently.
+A sum covers the names and bytes of the files in one folder. ``manifest.json`` and ``config.yaml`` are left
+out: they name versions and every key of the configuration, so that a removed key would change every case.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import hashlib
 import json
+import re
+import shutil
 import sys
 import tempfile
+from collections.abc import Callable
+from importlib import resources
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 
-from blinkgl.config.reader import to_yaml
-from blinkgl.config.sequence import LabelsConfig, load_run
+from blinkgl.config.reader import read_table, to_yaml
+from blinkgl.config.recipe import merge
+from blinkgl.config.sequence import load_run
 from blinkgl.dataset.generate import generate_run
 from blinkgl.events.table import EMULATORS
-from blinkgl.machine.bench import machine_line
+from blinkgl.gl import create_context
+from blinkgl.io.formats import convert
+from blinkgl.layouts.export import export_layout
+from blinkgl.layouts.table import LAYOUTS
+from blinkgl.recordings.simulation import file_to_events
 
-BASE = {
-    "seed": 5,
-    "camera": {"width": 96, "height": 72},
-    "time": {"duration": 0.1, "label_rate": 20},
-    "scene": {
-        "kind": "random",
-        "objects": {"count": 4, "distance": [1.5, 5]},
-        "pool": {"urdfs": False},
-        "textures": {"variants": 12, "photographs": False, "max_size": 128},
-    },
-    "labels": {
-        "flow": ["forward", "backward"],
-        **{
-            name: True
-            for name, info in LabelsConfig.model_fields.items()
-            if info.annotation is bool and name != "disparity"  # which needs another eye
-        },
-    },
-}
-STILL = "scene.camera_motion={speed: 0, rotation_rate: 0}"
-CASES: dict[str, list[str]] = {
-    "default": [],
-    "no_quality": ["quality=null"],
-    "uniform": ["timeline={kind: uniform, fps: 400}", "labels.float_flow=[npy, flo, h5]"],
-    "peak": ["timeline={kind: displacement, max_px: 1, percentile: 90, max_px_peak: 3}"],
-    "brightness": ["timeline={kind: brightness, max_fraction_of_threshold: 2}", "render.antialiasing=taps4"],
-    "budget": ["timeline={kind: budget, max_time_error_us: 300}", "render.antialiasing=msaa4"],
-    "pchip": ["timeline={kind: uniform, fps: 300, reconstruction: pchip}", "render.antialiasing=ssaa2"],
-    "hermite": ["timeline={kind: displacement, max_px: 1.5, reconstruction: hermite}", "render.antialiasing=ssaa4"],
-    "v2e": ["events={emulator: v2e, preset: noisy}", "render.mip_bias=-1"],
-    "v2e_clean": ["events={emulator: v2e, preset: clean}", "render.anisotropy=4"],
-    "voltmeter": ["events={emulator: voltmeter, preset: DVS346}"],
-    "sensor": ["sensor=davis346", "camera.width=96", "camera.height=72", "readout.events_per_second=200000"],
-    "fast": ["quality=fast"],
-    "balanced": ["quality=balanced", "scene.ground=null"],
-    "lod": ["render.lod={enabled: true}"],
-    "still": [STILL, "render.antialiasing=ssaa2"],
-    "still_hermite": [STILL, "timeline={kind: uniform, fps: 200, reconstruction: hermite}"],
-    "esim_noisy": [
-        "events={emulator: esim, contrast_threshold: {uniform: [0.1, 0.3]}, threshold_sigma: 0.05, refractory_us: 300}"
-    ],
-}
+HERE = Path(__file__).resolve().parents[1] / "tests" / "fingerprint"
+NOT_DATA = re.compile(r"(^|/)(manifest\.json|config\.yaml|rig\.yaml|README\.md|\.run/.*)$")
+
+
+def platform_name() -> str:
+    """Return the name of what decides the last bits: rasteriser, its version, NumPy's version."""
+    with create_context() as gl:
+        drawn_by = f"{gl.renderer} {gl.version}"
+    words = re.sub(r"[^A-Za-z0-9.]+", "-", f"{drawn_by} numpy-{np.__version__}")
+    return words.strip("-")
 
 
 def sums(folder: Path) -> dict[str, str]:
-    """Path below the folder -> SHA-256 of the file."""
-    return {
-        p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest()
-        for p in sorted(folder.rglob("*"))
-        if p.is_file()
-    }
+    """Return a SHA-256 sum (its first 16 digits) for each folder below ``folder`` that directly holds data files."""
+    found: dict[str, Any] = {}
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if path.is_file() and not NOT_DATA.search(name):
+            whole = found.setdefault(path.relative_to(folder).parent.as_posix(), hashlib.sha256())
+            whole.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
+    return {name: whole.hexdigest()[:16] for name, whole in found.items()}
 
 
-def sequence(overrides: list[str], scratch: Path) -> dict[str, str]:
-    """One rendered sequence of BASE with overrides."""
-    recipe = scratch / "recipe.yaml"
-    recipe.write_text(to_yaml(BASE))
-    for _ in generate_run(load_run(recipe, overrides), scratch / "out"):
-        pass
-    return sums(scratch / "out")
+@functools.cache
+def table() -> dict[str, Any]:
+    """Return what cases.yaml says."""
+    return read_table(HERE / "cases.yaml")
 
 
-def frames(scratch: Path) -> dict[str, str]:
-    """A folder of frames, converted by ``generate`` and by ``simulate`` with each emulator."""
-    import cv2
-
-    from blinkgl.recordings.simulation import file_to_events
-
-    folder = scratch / "clip" / "image_left"
-    folder.mkdir(parents=True)
-    y, x = np.mgrid[:48, :64].astype(np.float64)
+def assets(folder: Path) -> None:
+    """Write the files that cases name: a clip, pictures, a panorama, a trajectory, a skinned mesh that morphs."""
+    clip = folder / "clip" / "image_left"
+    clip.mkdir(parents=True)
+    y, x = np.mgrid[:36, :48].astype(np.float64)
     for k in range(12):
         picture = 128 + 90 * np.sin((x + 1.3 * k) / 5) * np.cos((y - 0.4 * k) / 7)
-        cv2.imwrite(str(folder / f"{k:06d}.png"), np.round(picture).astype(np.uint8))
+        cv2.imwrite(str(clip / f"{k:06d}.png"), np.round(picture).astype(np.uint8))
+    waves = np.stack([128 + 60 * np.sin(x / 3), 128 + 60 * np.cos(y / 4), np.full_like(x, 230)], axis=-1)
+    cv2.imwrite(str(folder / "bumps.png"), np.round(waves[..., ::-1]).astype(np.uint8))
+    cv2.imwrite(str(folder / "mask.png"), np.where((x // 8 + y // 8) % 3 == 0, 0, 255).astype(np.uint8))
+    sky = np.repeat((1 + np.sin(x / 3) * np.cos(y / 3))[:24, :, None], 3, axis=2)
+    cv2.imwrite(str(folder / "sky.hdr"), sky.astype(np.float32))
+    poses = [f"{t / 10} {-3 + t / 40} {t / 20} 1 -0.5 0.5 -0.5 0.5" for t in range(-2, 5)]
+    (folder / "path.txt").write_text("\n".join(poses) + "\n", encoding="utf-8")
+    shutil.copy(HERE / "arm.glb", folder)
+    (folder / "configs").mkdir()
+    shutil.copytree(str(resources.files("blinkgl.configs") / "scenes"), folder / "configs" / "scenes")
+
+
+def generated(name: str, scratch: Path) -> Path:
+    """Generate the case ``name`` and return the folder of the data set."""
+    recipe = scratch / "recipe.yaml"
+    case, base = table()["cases"][name], table()["base"]
+    if "from" in case.get("scene", {}):  # a whole scene: nothing of the base's is laid over it
+        base = {key: value for key, value in base.items() if key != "scene"}
+    recipe.write_text(to_yaml(merge(base, case)), encoding="utf-8")
+    for _ in generate_run(load_run(recipe), scratch / "out"):
+        pass
+    return scratch / "out"
+
+
+def simulated(scratch: Path) -> Path:
+    """Turn a folder of frames into events with each emulator, and the events into other formats."""
+    out = scratch / "out"
     for emulator in EMULATORS:
-        file_to_events(folder, scratch / "out" / f"{emulator}.npz", fps=100, emulator=emulator, seed=3)
-    return sums(scratch / "out")
+        file_to_events(scratch / "clip" / "image_left", out / f"{emulator}.npz", fps=100, emulator=emulator, seed=3)
+    for name in ("a.h5", "b.txt", "c.raw", "d.npy"):
+        convert(out / "esim.npz", out / "formats" / name)
+    return out
+
+
+def exported(scratch: Path) -> Path:
+    """Export a rig and a single camera in the layouts that take them."""
+    for case in ("labels", "stereo"):
+        inner = scratch / case
+        inner.mkdir()
+        assets(inner)
+        data = generated(case, inner)
+        for layout in LAYOUTS:
+            try:
+                export_layout(data, scratch / "out" / case / layout, layout)
+            except Exception as error:  # noqa: BLE001 - what a layout refuses is part of the fingerprint
+                refused = scratch / "out" / case / f"{layout}.refused"
+                refused.parent.mkdir(parents=True, exist_ok=True)
+                refused.write_text(type(error).__name__, encoding="utf-8")
+    return scratch / "out"
+
+
+OTHERS: dict[str, Callable[[Path], Path]] = {"simulate": simulated, "export": exported}
+
+
+def names() -> list[str]:
+    """Return the names of all cases."""
+    return [*table()["cases"], *OTHERS]
+
+
+def fingerprint(name: str) -> dict[str, str]:
+    """Return the sums of one case, by folder of its output."""
+    with tempfile.TemporaryDirectory() as folder:
+        scratch = Path(folder)
+        assets(scratch)
+        return sums(OTHERS[name](scratch) if name in OTHERS else generated(name, scratch))
+
+
+def kept(platform: str) -> dict[str, dict[str, str]] | None:
+    """Return the sums that the repository keeps of a platform, or None."""
+    try:
+        return json.loads((HERE / "sums" / f"{platform}.json").read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+
+
+def differences(name: str, before: dict[str, str], after: dict[str, str]) -> list[str]:
+    """Return one line for each folder whose sum differs."""
+    return [f"{name}/{path}" for path in sorted(before.keys() | after) if before.get(path) != after.get(path)]
 
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, help="where the sums go")
-    parser.add_argument("--against", type=Path, help="sums of another commit")
+    parser.add_argument("--keep", action="store_true", help="write the sums of this platform instead of comparing")
     parser.add_argument("--only", default="", help="names of cases, with commas between")
-    parser.add_argument("--keep", type=Path, help="a folder that keeps what was written")
     options = parser.parse_args(arguments)
-    wanted = options.only.split(",") if options.only else [*CASES, "frames"]
-    made: dict[str, dict[str, str]] = {}
+    wanted = options.only.split(",") if options.only else names()
+    platform = platform_name()
+    before = kept(platform)
+    made = {}
     for name in wanted:
-        with tempfile.TemporaryDirectory() as scratch:
-            folder = options.keep / name if options.keep else Path(scratch)
-            folder.mkdir(parents=True, exist_ok=True)
-            made[name] = frames(folder) if name == "frames" else sequence(CASES[name], folder)
-        print(f"{name}: {len(made[name])} files", flush=True)
-    if options.out:
-        options.out.write_text(json.dumps({"machine": machine_line(), "cases": made}, indent=1))
-    if not options.against:
+        made[name] = fingerprint(name)
+        changed = differences(name, before.get(name, {}), made[name]) if before else []
+        print(f"{name}: {len(made[name])} folders", *changed, sep="\n  differs: ", flush=True)
+    if options.keep:
+        file = HERE / "sums" / f"{platform}.json"
+        file.parent.mkdir(exist_ok=True)
+        known = before if before and options.only else {}
+        file.write_text(json.dumps({**known, **made}, indent=1) + "\n", encoding="utf-8")
         return 0
-    before = json.loads(options.against.read_text())["cases"]
-    different = [
-        f"{case}/{path}"
-        for case in wanted
-        for path in sorted(made[case].keys() | before.get(case, {}).keys())
-        if made[case].get(path) != before.get(case, {}).get(path)
-    ]
-    print(f"{sum(map(len, made.values()))} files, {len(different)} differ", *different, sep="\n  ")
-    return 1 if different else 0
+    if before is None:
+        print(f"no sums are kept for {platform}; --keep writes them")
+        return 1
+    return int(any(differences(name, before.get(name, {}), made[name]) for name in wanted))
 
 
 if __name__ == "__main__":

@@ -33,21 +33,44 @@ from typing import Any
 import numpy as np
 
 from blinkgl.errors import BlinkGLError
-from blinkgl.events.types import Events
-from blinkgl.show.terminal import plain_console, say
-from blinkgl.tools.data_statistics import TEST, read, recordings
+from blinkgl.io.formats import open_events
+from blinkgl.machine.terminal import plain_console, say
+from blinkgl.types.events import Events
 from eflow.checkpoint import load_model
 from eflow.data.window import Window
 from eflow.infer import LIKELY_PX, MethodPredictor, Predictor, StreamWindow, read_truth
 from eflow.methods.iwe import flow_warp_loss
 from eflow.methods.table import METHODS, make_method
 
+TEST = "ecd_rotation"
+"""Folder of the bursts whose flow is known: the networks are judged by them and not tuned on them."""
 MOVES = 1.1
 """FWL of the affine field from which on a window is said to move."""
 LONGEST_MS = 120.0
 MIDDLE = (260, 346)
 """Height and width, px, that are looked at of a large sensor."""
 Answer = Callable[[StreamWindow], np.ndarray]
+
+
+def read(path: Path) -> tuple[Events, int, int]:
+    """Events, height and width of a recording; evbench's .mat too (y and polarity turned over). Raises BlinkGLError."""
+    if path.suffix != ".mat":
+        with open_events(path) as file:
+            sized = file.sized()
+            return sized.read(), sized.height, sized.width
+    from scipy.io import loadmat
+
+    table = {k: v.ravel() for k, v in loadmat(path).items() if k in ("ts", "x", "y", "pol")}
+    t = table["ts"].astype(np.int64)
+    columns = table["x"].astype(np.uint16), (179 - table["y"].astype(np.int64)).astype(np.uint16), t
+    return Events(*columns, (1 - (table["pol"] > 0)).astype(np.uint8)), 180, 190
+
+
+def recordings(root: Path) -> list[Path]:
+    """Every file below ``root`` that is one, by folder."""
+    endings = (".aedat4", ".aedat", ".raw", ".mat")
+    text = ("events.txt", "events_chunk.txt")
+    return sorted(p for p in root.rglob("*") if p.suffix in endings or p.name in text)
 
 
 def looked_at(path: Path) -> tuple[Events, int, int]:

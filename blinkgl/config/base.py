@@ -29,7 +29,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Annotated, Any, ClassVar, Generic, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import annotated_types
 from pydantic import (
@@ -93,18 +93,30 @@ def remembering() -> Iterator[None]:
         _known.reset(token)
 
 
+class Removed(NamedTuple):
+    """A key that earlier versions had. Every ``config.yaml`` that they wrote has it, so it is read where its value
+    means what happens without it, and refused where it does not.
+
+    instead : what to write, in a sentence's end.   is_off : whether a value means what happens now."""
+
+    instead: str
+    is_off: Callable[[Any], bool]
+
+
 class Config(BaseModel):
     """Frozen; unknown keys, NaN and infinity are refused. Numbers written as strings ("1e-4") are converted,
     because YAML 1.1 reads ``1e-4`` as a string.
 
     presets : values that the key ``preset`` of a model gives to those of its other keys that are not given.
-    instead : keys that are given in the place of another, which then is null where it is not given itself."""
+    instead : keys that are given in the place of another, which then is null where it is not given itself.
+    removed : keys of earlier versions; see :class:`Removed`."""
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True, ignored_types=(Rule,)
     )
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     instead: ClassVar[Mapping[str, str]] = {}
+    removed: ClassVar[Mapping[str, Removed]] = {}
     rules: ClassVar[tuple[Rule, ...]] = ()
 
     @classmethod
@@ -133,10 +145,21 @@ class Config(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _fill_preset(cls, data: Any) -> Any:
+        if isinstance(data, dict) and not cls.removed.keys().isdisjoint(data):
+            data = {key: value for key, value in data.items() if not cls._is_removed(key, value)}
         if cls.presets and isinstance(data, dict):
             name = data.get("preset", cls.model_fields["preset"].default)
             data = {**(cls.presets.get(name, {}) if isinstance(name, str) else {}), **cls._left_out(data), **data}
         return cls.completed(data) if isinstance(data, dict) else data
+
+    @classmethod
+    def _is_removed(cls, key: str, value: Any) -> bool:
+        """Return whether a key of an earlier version may be ignored. Raises Refused where its value would matter."""
+        if key not in cls.removed:
+            return False
+        if not cls.removed[key].is_off(value):
+            raise Refused("this key was removed", where=key, value=value, accepted=cls.removed[key].instead)
+        return True
 
     @classmethod
     def _left_out(cls, data: dict[str, Any]) -> dict[str, None]:

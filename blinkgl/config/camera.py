@@ -159,7 +159,7 @@ def with_calibrations(tree: dict[str, Any], base: Path) -> dict[str, Any]:
 
 def calibrated(camera: dict[str, Any], base: Path) -> dict[str, Any]:
     """A ``camera:`` table with the keys of its calibration in that one's place. Raises ConfigError."""
-    from blinkgl.io.camchain import read_camchain
+    from blinkgl.config.camchain import read_camchain
 
     own = {key: value for key, value in camera.items() if key not in ("calibration", "calibration_name")}
     given, name = camera["calibration"], camera.get("calibration_name")

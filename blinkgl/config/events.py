@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import Field
 
-from blinkgl.config.base import Family, Members, Refused, rule
+from blinkgl.config.base import Family, Members, Refused, Removed, rule
 
 if TYPE_CHECKING:
     from blinkgl.config.sensor import SensorConfig
@@ -247,12 +247,21 @@ V2E_PRESETS = {
 }
 
 
+_NO_COMPAT = {
+    "compat": Removed(
+        "the key left out; docs/concepts.md says how near these events are to those of the authors' programs",
+        lambda value: value == "none",
+    )
+}
+
+
 class V2eConfig(_TwoThresholds, EmulatorConfig):
     """V2E (Hu, Liu, Delbruck, CVPRW 2021): finite bandwidth, mismatch, leak, shot noise, refractory period."""
 
     reconstructions = ("linear",)
     presets = V2E_PRESETS
     fitted = _V2E_FITTED
+    removed = _NO_COMPAT
     emulator: Literal["v2e"] = "v2e"
     preset: Literal["default", "clean", "noisy"] = Field(
         "default", description="v2e's command-line defaults, or its `clean` and `noisy` parameter sets."
@@ -334,12 +343,6 @@ class V2eConfig(_TwoThresholds, EmulatorConfig):
         "often as down. `zero`: every pixel has just fired, as v2e starts. Without leak the first and the last are "
         "the same.",
     )
-    compat: Literal["none", "authors"] = Field(
-        "none",
-        description="`authors`: as their program computes it, frame by frame, where numbers made with v2e have to be "
-        "made again (the law; its random numbers are others). Events then lie at fractions of a frame, and noise and "
-        "dead time depend on the frame rate; `start` is `zero` whatever it says.",
-    )
     hot_pixel_fraction: float = Field(0.0, ge=0, le=1, description="Share of pixels that fire by themselves.")
     hot_pixel_rate_hz: float = Field(100.0, ge=0, le=1e5, description="Mean rate of a hot pixel, Hz, ON.")
     max_events_per_step: int = _MAX_EVENTS
@@ -354,23 +357,6 @@ class V2eConfig(_TwoThresholds, EmulatorConfig):
                 where="second_cutoff_hz",
                 value=second_cutoff_hz,
                 accepted="0, or a cutoff_hz > 0 beside it",
-            )
-
-    @rule("second_cutoff_hz", "compat")
-    def _theirs_has_one_low_pass(second_cutoff_hz, compat):
-        if second_cutoff_hz and compat == "authors":
-            raise Refused(
-                "the authors' program has no second low-pass",
-                where="second_cutoff_hz",
-                value=second_cutoff_hz,
-                accepted="0, or compat: none",
-            )
-
-    @rule("compat", "device")
-    def _theirs_has_no_kernel_for_the_card(compat, device):
-        if compat == "authors" and device == "cuda":
-            raise Refused(
-                "compat: authors is made on the processor alone", where="device", value=device, accepted="cpu, or auto"
             )
 
     @rule("photoreceptor_noise", "cutoff_hz")
@@ -401,6 +387,7 @@ class VoltmeterConfig(EmulatorConfig):
     reconstructions = ("linear",)
     presets = VOLTMETER_PRESETS
     fitted = _VOLTMETER_FITTED
+    removed = _NO_COMPAT
     one_threshold = True
     emulator: Literal["voltmeter"] = "voltmeter"
     preset: Literal["DVS346", "DVS240"] = Field(
@@ -427,11 +414,6 @@ class VoltmeterConfig(EmulatorConfig):
         "stationary",
         description="V at the first frame: as of a scene that has stood still for long, or 0 everywhere (as in the "
         "authors' program: the first leak events of a flat image then come together).",
-    )
-    compat: Literal["none", "authors"] = Field(
-        "none",
-        description="`authors`: draw as their program does, where numbers made with it have to be made again. V then "
-        "starts at 0, and its noise depends on the frame rate.",
     )
     max_events_per_step: int = _MAX_EVENTS
     causes: bool = _CAUSES

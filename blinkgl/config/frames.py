@@ -21,7 +21,7 @@ def _limit(default: float | None, most: float, what: str) -> float | None:
 class QualifyConfig(Config):
     """Which frames are near enough to each other to be interpolated. A pair of frames with a measure beyond its limit
     does not qualify, and with too many such pairs the sequence does not. `blinkgl qualify` prints the measures;
-    [what was measured](results.md#interpolated-frames) says how the limits were chosen."""
+    the limits were chosen on rendered scenes whose in-between frames are known."""
 
     displacement: float | None = _limit(
         17.0, 1e4, "99th percentile of the given flow (without one, of the interpolation's own), px"

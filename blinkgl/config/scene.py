@@ -18,13 +18,10 @@ from blinkgl.config.deform import AnimationConfig, DeformConfig, RandomDeformCon
 from blinkgl.config.materials import TEXTURE_KINDS, MaterialConfig, Radiance, TextureKind
 from blinkgl.config.physics import BodyConfig, PhysicsConfig, RandomPhysicsConfig
 from blinkgl.config.places import Matrix, check_rigid
+from blinkgl.config.primitives import PRIMITIVES, kinds
 from blinkgl.config.trajectory import CameraMotion, ObjectMotion
 
-PRIMITIVE_KINDS = ("cuboid", "cylinder", "sphere", "icosphere", "cone", "torus", "capsule", "prism", "pyramid")
-
-PrimitiveKind = Literal["cuboid", "cylinder", "sphere", "icosphere", "cone", "torus", "capsule", "prism", "pyramid"]
-LIVING_KINDS = ("figure", "flag", "fish")
-LivingKind = Literal["figure", "flag", "fish"]
+POOLED, ALL_PRIMITIVES = kinds("pool", "living"), tuple(PRIMITIVES)
 
 
 def _ordered(value: tuple[float, float]) -> tuple[float, float]:
@@ -124,7 +121,7 @@ class PoolConfig(Config):
     """Where the random world's objects come from."""
 
     primitives: Annotated[
-        Literal["all"] | tuple[PrimitiveKind | LivingKind, ...], _one_of(("all",), PRIMITIVE_KINDS + LIVING_KINDS)
+        Literal["all"] | tuple[Literal[POOLED], ...], _one_of(("all",), POOLED)  # type: ignore[invalid-literal]
     ] = Field(
         "all",
         description="'all', which are the rigid ones, or a list of kinds; [] for none. A figure walks, runs, dances or "
@@ -593,7 +590,7 @@ class WayConfig(Config):
 class MeshConfig(Config):
     """A primitive with its parameters, or a file."""
 
-    primitive: Literal[PrimitiveKind, "grid", "die", LivingKind] | None = Field(None, description="kind of primitive")
+    primitive: Literal[ALL_PRIMITIVES] | None = Field(None, description="kind of primitive")  # type: ignore[invalid-literal]
     parameters: dict[str, Annotated[int | float | Vector3 | str, BeforeValidator(_parameter)]] = Field(
         {},
         description="the primitive's sizes, numbers of faces, and what it does: see [primitives](#primitives)",

@@ -13,11 +13,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, Field
 
-from blinkgl.config.base import Config, Refused, remembering, rule, validate, validate_field
+from blinkgl.config.base import Config, Refused, Removed, remembering, rule, validate, validate_field
 from blinkgl.config.camera import CameraConfig, camera_radius, with_calibrations
 from blinkgl.config.corners import Fill, corners, corners_of, sites
 from blinkgl.config.draw import draw, is_distribution
@@ -27,7 +27,6 @@ from blinkgl.config.gl import GLConfig
 from blinkgl.config.images import ImagesConfig, check_images, readout_us
 from blinkgl.config.imu import ImuConfig, check_imu
 from blinkgl.config.labels import LabelsConfig, fill_causes
-from blinkgl.config.lod import LodConfig
 from blinkgl.config.quality import DEFAULT, Quality, fill_quality, with_default
 from blinkgl.config.reader import parse_yaml, read_table
 from blinkgl.config.readout import ReadoutConfig, drain_us
@@ -45,7 +44,6 @@ from blinkgl.config.sensor import Sensor, fill_sensor, spelled_out
 from blinkgl.config.timeline import DisplacementTimeline, TimelineConfig
 from blinkgl.config.tracks import TracksConfig, check_tracks
 from blinkgl.errors import ConfigError
-from blinkgl.labels import LABELS  # noqa: F401 - whose rows bring the keys of `labels:`
 
 if TYPE_CHECKING:
     from blinkgl.config.recipe import Group
@@ -149,7 +147,12 @@ class RenderConfig(Config):
         le=8,
         description="added to the mip level that is looked up, log2: -1 is sharper by 2, and aliases more",
     )
-    lod: LodConfig = Field(LodConfig(), description="level of detail of meshes")
+    removed: ClassVar = {
+        "lod": Removed(
+            "meshes that are as fine as you want them drawn",
+            lambda value: isinstance(value, dict) and value.get("enabled", False) is False,
+        )
+    }
 
 
 class PreviewConfig(Config):

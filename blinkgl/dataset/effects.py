@@ -56,7 +56,7 @@ def _panorama(light: Light) -> float:
     return PANORAMA[is_coloured(light), light.finer is not None]
 
 
-# `python -m blinkgl.tools.bench_light`, --changes, --materials: docs/results.md has commands and date.
+# Measured at 348eebef by its tools/bench_light.py (--changes, --materials), 2026-11-22.
 _MEASURED: tuple[tuple[str, str, Callable[[Scene], bool], tuple[float, float, float, float, float]], ...] = (
     ("coloured light", "scene.light.*_color", lambda s: is_coloured(s.light), (1.23, 6.0, 6.6, 12.3, 0.0)),
     ("further lights", "scene.light.lights, scene.lights", _further, (1.21, 3.3, 3.1, 3.8, 0.0)),

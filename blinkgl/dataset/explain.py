@@ -225,8 +225,7 @@ def _describe(scene: Scene, renderer: Renderer, config: SequenceConfig) -> dict[
         + f"; {moving} move",
         **_living(scene),
         "camera": f"{scene.camera.summary}, " + ("still" if scene.camera_path.is_static else "moving"),
-        "triangles": f"{renderer.triangles:,}"
-        + (" (level of detail: see notes)" if renderer.config.lod.enabled else ""),
+        "triangles": f"{renderer.triangles:,}",
         "textures": f"{len(textures)}, {pixels / 1e6:.1f} Mpx",
         "light": f"{_shining(scene.light)} on {lit} of {len(parts)} parts, the others unlit"
         if lit
@@ -491,8 +490,6 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
             "super-sampling of event frames",
             "render.antialiasing: msaa4 (edges are filtered; textures by mip-maps alone)",
         )
-    if not config.render.lod.enabled:
-        add("level of detail", "render.lod.enabled: false (every mesh as it is)")
     if config.render.antialiasing == "taps4":
         add(
             "anti-aliasing of silhouettes",

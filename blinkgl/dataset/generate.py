@@ -5,9 +5,8 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -20,15 +19,12 @@ from blinkgl.dataset.report import Progress, SequenceReport, config_yaml, losses
 from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging.metering import decibels
 from blinkgl.io.frame_camera import ExposureLine
-from blinkgl.io.lens_files import write_lens
-from blinkgl.io.sequence_dir import SequenceWriter, refuse_existing
 from blinkgl.io.tracks import TRACKS
 from blinkgl.labels import LABELS
 from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Item, Picture, Simulation, simulate_sequence
 from blinkgl.sequence.clock import StageClock
-
-if TYPE_CHECKING:
-    from blinkgl.sequence.helper import Hand, Helper
+from blinkgl.sequence_files.lens_files import write_lens
+from blinkgl.sequence_files.sequence_dir import SequenceWriter, refuse_existing
 
 
 def generate_run(
@@ -62,23 +58,20 @@ def generate_sequence(
     *,
     base: Path = Path("."),
     progress: Progress | None = None,
-    helper: Helper | None = None,
 ) -> SequenceReport:
     """Generates one sequence directory, whole or not at all: what happens in the sequence, written down.
 
     gl : context to draw with; not looked at (None) for a sequence that is converted from frames.
     base : folder that relative paths in the configuration start from.
-    helper : another process, which draws frames, too.
     Raises BlinkGLError for anything the user or the machine caused."""
     if config.sensors is not None:
         from blinkgl.dataset.rig import generate_rig  # which writes each of its sensors as is done here
 
-        return generate_rig(config, index, out, gl, base=base, progress=progress, helper=helper)
+        return generate_rig(config, index, out, gl, base=base, progress=progress)
     report = SequenceReport(index, Path(out) / sequence_name(config.output, index))
     pictures_hz = config.preview.rate if config.preview.enabled else None
     with (
-        hand_of(helper, config, index, base, gl) as hand,
-        simulate_sequence(config, index, gl, base=base, pictures_hz=pictures_hz, hand=hand) as sequence,
+        simulate_sequence(config, index, gl, base=base, pictures_hz=pictures_hz) as sequence,
         writer_of(sequence, report.path, config_yaml(sequence.config, index)) as writer,
     ):
         span_ns = sequence.t1_ns - sequence.t0_ns
@@ -94,15 +87,6 @@ def generate_sequence(
         flushing = StageClock()  # leaving the block waits for the writers' threads and syncs the files
     report.finish(sequence, flushing.total)
     return report
-
-
-def hand_of(
-    helper: Helper | None, config: SequenceConfig, index: int, base: Path, gl: GLContext | None
-) -> AbstractContextManager[Hand | None]:
-    """What the helper does for a sequence; of nothing that a card draws, which both would wait for."""
-    if helper is None or gl is None or not gl.is_software or config.frames is not None:
-        return nullcontext()
-    return helper.sequence(config, config_yaml(config, index), index, base, gl)
 
 
 def writer_of(sequence: Simulation, path: Path, config_text: str) -> SequenceWriter:

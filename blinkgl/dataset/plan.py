@@ -18,9 +18,10 @@ from typing import Any, overload
 from blinkgl.config.base import validate
 from blinkgl.config.corners import sites
 from blinkgl.config.draw import is_distribution, options
+from blinkgl.config.primitives import kinds
 from blinkgl.config.reader import to_yaml
 from blinkgl.config.recipe import Group, all_groups
-from blinkgl.config.scene import LIVING_KINDS, ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig
+from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig
 from blinkgl.config.sequence import OutputConfig, RunTemplate, SequenceConfig
 from blinkgl.errors import AssetError, ConfigError, OutputError
 from blinkgl.scene.build import check_assets, panorama_of
@@ -231,7 +232,7 @@ def _asset_corners(template: RunTemplate) -> Iterator[SequenceConfig]:
     yield from template.corners_of(*world)
     for name, mesh in meshes.items():
         kind, given = (mesh.get(key) if isinstance(mesh, dict) else None for key in ("primitive", "parameters"))
-        if isinstance(kind, str) and kind in LIVING_KINDS and isinstance(given, dict) and not is_distribution(given):
+        if isinstance(kind, str) and kind in kinds("living") and isinstance(given, dict) and not is_distribution(given):
             for key, value in given.items():
                 path = ("scene", "meshes", name, "parameters", key)
                 for one in options(path, value) if is_distribution(value) else ():

@@ -10,11 +10,11 @@ import numpy as np
 
 from blinkgl.config.sequence import PreviewConfig
 from blinkgl.io.overlays import Curves, TrackLines
-from blinkgl.io.preview import Panels, RigPreviewWriter
-from blinkgl.io.sequence_dir import SequenceWriter
 from blinkgl.labels import LABELS, Label
 from blinkgl.sequence import EventChunk, Item, Picture, Simulation
 from blinkgl.sequence.inertial import Inertial
+from blinkgl.sequence_files.preview import Panels, RigPreviewWriter
+from blinkgl.sequence_files.sequence_dir import SequenceWriter
 
 
 class PreviewRecorder:

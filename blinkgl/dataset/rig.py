@@ -4,21 +4,17 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from blinkgl.config.sequence import SequenceConfig
-from blinkgl.dataset.generate import hand_of, made_by, write_end, write_item, writer_of
+from blinkgl.dataset.generate import made_by, write_end, write_item, writer_of
 from blinkgl.dataset.plan import sequence_name
 from blinkgl.dataset.preview import PreviewRecorder
 from blinkgl.dataset.report import Progress, SequenceReport, config_yaml
 from blinkgl.gl import GLContext
-from blinkgl.io.rig_dir import RigWriter
 from blinkgl.sequence import EventChunk
 from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.rig import RigSequence, simulate_rig
-
-if TYPE_CHECKING:
-    from blinkgl.sequence.helper import Helper
+from blinkgl.sequence_files.rig_dir import RigWriter
 
 
 def generate_rig(
@@ -29,15 +25,13 @@ def generate_rig(
     *,
     base: Path = Path("."),
     progress: Progress | None = None,
-    helper: Helper | None = None,
 ) -> SequenceReport:
     """As :func:`blinkgl.dataset.generate.generate_sequence`, of a configuration with ``sensors``."""
     report = SequenceReport(index, Path(out) / sequence_name(config.output, index))
     text = config_yaml(config, index)
     pictures_hz = config.preview.rate if config.preview.enabled else None
     with (
-        hand_of(helper, config, index, base, gl) as hand,
-        simulate_rig(config, index, gl, base=base, pictures_hz=pictures_hz, hand=hand) as rig,
+        simulate_rig(config, index, gl, base=base, pictures_hz=pictures_hz) as rig,
         RigWriter(report.path, config.sensors or (), config_yaml=text, t_offset_us=rig.t0_ns // 1000) as writer,
     ):
         span_ns = rig.t1_ns - rig.t0_ns

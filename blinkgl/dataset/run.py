@@ -23,8 +23,8 @@ from blinkgl.dataset.report import Totals
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.work import Job, Message, environment_differences, report_of
 from blinkgl.errors import BlinkGLError, ConfigError, OutputError
-from blinkgl.io.index import write_index
 from blinkgl.machine.interrupts import interruptible
+from blinkgl.sequence_files.index import write_index
 
 ATTEMPTS = 3
 """A sequence is set aside after so many failures that could have passed, or one that could not

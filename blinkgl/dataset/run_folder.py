@@ -30,7 +30,7 @@ from blinkgl.dataset.work import RUN_FOLDER, Message, SequenceLog
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.atomic import atomic_file, output_errors, remove_stale
 from blinkgl.io.records import parse, read_text
-from blinkgl.io.sequence_dir import verify_sequence
+from blinkgl.sequence_files.sequence_dir import verify_sequence
 
 FORMAT = "blinkgl-run"
 _FORSAKEN_S = 3600.0

@@ -29,15 +29,15 @@ from typing import Any
 import numpy as np
 
 from blinkgl.errors import AssetError, OutputError
-from blinkgl.events.types import TOLD, Events
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.event_labels import EVENT_LABELS, with_truth
 from blinkgl.io.frame_camera import EXPOSURES, ExposureLine, picture_file, read_exposures
 from blinkgl.io.images import NpzReader, numpy_errors
-from blinkgl.io.index import sequence_folders
-from blinkgl.io.sequence_dir import read_manifest, verify_sequence
 from blinkgl.labels import LABELS
+from blinkgl.sequence_files.index import sequence_folders
+from blinkgl.sequence_files.sequence_dir import read_manifest, verify_sequence
+from blinkgl.types.events import TOLD, Events
 
 _FLOW = LABELS["flow_forward"]
 """What makes a sample: without it there is none."""

@@ -37,9 +37,7 @@ from blinkgl.dataset.generate import generate_sequence
 from blinkgl.dataset.plan import Plan, digest
 from blinkgl.dataset.report import SequenceReport
 from blinkgl.errors import BlinkGLError, ConfigError, OutputError, may_pass
-from blinkgl.events.threads import thread_count
 from blinkgl.gl import GLContext, create_context
-from blinkgl.sequence.helper import Helper
 
 Message = dict[str, Any]
 RUN_FOLDER = ".run"
@@ -95,16 +93,12 @@ def thread_environment(workers: int, cores: int, given: Mapping[str, str] = os.e
 
 
 class Maker:
-    """Makes the job's sequences in this process. Use as a context manager; ``open`` before ``make``.
-
-    helper : another process that draws frames, too, where this one has more than a core to itself: it may be as many
-    threads as :func:`thread_environment` has given its kernels."""
+    """Makes the job's sequences in this process. Use as a context manager; ``open`` before ``make``."""
 
     def __init__(self, job: Work, device: int | None = None):
         self.job, self.device = job, device
         self.plan = job.plan()
         self.gl: GLContext | None = None
-        self.helper: Helper | None = None
 
     @classmethod
     def of(cls, job: Mapping[str, Any], device: int | None) -> Maker:
@@ -124,8 +118,6 @@ class Maker:
             device = rendered[0].device if self.device is None else self.device
             self._context = partial(create_context, rendered[0].backend, device)
             self.gl = self._context()
-            if (cores := thread_count()) > 1:
-                self.helper = Helper(Path(self.job.out) / RUN_FOLDER / "logs" / "helper.log", cores=cores // 2)
         return {
             "kind": "hello",
             "pid": os.getpid(),
@@ -145,7 +137,7 @@ class Maker:
         task = self.plan.tasks[number]
         log = SequenceLog(self.job.out, task.name)
         log.write(f"attempt {attempt}, pid {os.getpid()} on {platform.node()}")
-        last, cpu = 0.0, self._cpu_s()
+        last, cpu = 0.0, time.process_time()
 
         def progress(report: SequenceReport, fraction: float) -> None:
             nonlocal last
@@ -173,7 +165,6 @@ class Maker:
                 self.gl,
                 base=Path(self.job.base),
                 progress=progress,
-                helper=self.helper,
             )
         except (KeyboardInterrupt, SystemExit):
             log.write("interrupted")
@@ -192,21 +183,15 @@ class Maker:
             "kind": "done",
             "task": number,
             "bytes": size,
-            "cpu_s": self._cpu_s() - cpu,
+            "cpu_s": time.process_time() - cpu,
             "peak_rss_kib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
             "report": {**asdict(report), "path": str(report.path)},
         }
-
-    def _cpu_s(self) -> float:
-        return time.process_time() + (0.0 if self.helper is None else self.helper.cpu_s)
 
     def __enter__(self) -> Maker:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self.helper is not None:
-            self.helper.close()
-            self.helper = None
         if self.gl is not None:
             self.gl.release()
             self.gl = None
@@ -261,11 +246,11 @@ def _source_hash() -> str:
     tests while the code is being worked on)."""
     if build := os.environ.get("BLINKGL_BUILD"):
         return build
-    found = hashlib.sha256()
+    found, apart = hashlib.sha256(), {"configs", "tools", "report", "shader_debugger"}  # what makes no sequence
     for package in ("blinkgl", "blinkgl.shaders"):
         root = resources.files(package)
         for path in sorted(Path(str(root)).rglob("*")):
-            if path.suffix in (".py", ".glsl") and not {"configs", "tools", "report"} & set(path.parts):
+            if path.suffix in (".py", ".glsl") and not apart & set(path.parts):
                 found.update(path.name.encode() + b"\0" + path.read_bytes())
     return found.hexdigest()[:12]
 

@@ -1,7 +1,7 @@
 """Event emulators. They know nothing of scenes or OpenGL.
 
 In:    frames (linear luminance, float32) and times (int64 ns).
-Out:   :class:`~blinkgl.events.types.Events`, columnar, in order of time.
+Out:   :class:`~blinkgl.types.events.Events`, columnar, in order of time.
 Start: esim.py, the simplest; emulator.py is the contract, table.py names them all.
 """
 
@@ -10,9 +10,9 @@ from __future__ import annotations
 from blinkgl.events.emulator import Emulator
 from blinkgl.events.esim import Esim
 from blinkgl.events.table import emulator_of, make_emulator, register
-from blinkgl.events.types import Events
 from blinkgl.events.v2e import V2e
 from blinkgl.events.voltmeter import DvsVoltmeter
+from blinkgl.types.events import Events
 
 __all__ = ["DvsVoltmeter", "Emulator", "Esim", "Events", "V2e", "emulator_of", "make_emulator", "register"]
 

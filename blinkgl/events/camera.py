@@ -22,7 +22,7 @@ from blinkgl.events.pixels import Latency, PixelNoise
 from blinkgl.events.readout import Readout
 from blinkgl.events.table import make_emulator
 from blinkgl.events.truth import Surfaces, SurfaceTruth
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
     from blinkgl.gl import GLContext

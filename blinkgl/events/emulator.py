@@ -14,7 +14,7 @@ from blinkgl.events.arith import LOG_MAX_INPUT
 from blinkgl.events.packing import MAX_CAUSE_ROWS, MAX_INTERVAL_NS, PackedBuffer
 from blinkgl.events.response import Response
 from blinkgl.events.threads import run, thread_count
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 
 BLOCK = 1024
 """Pixels a kernel takes in one go: everything about them stays in the first cache levels. Threads get whole blocks."""
@@ -74,11 +74,6 @@ class Emulator(ABC):
     """Whether a pixel whose luminance does not change has no events and no changing state."""
     _state: tuple[str, ...] = ()
     """Names of the array attributes that make up the state; ``None`` entries are features that are off."""
-
-    @classmethod
-    def kind_for(cls, config: Any) -> type[Emulator]:
-        """The class that makes the events of this configuration: this one, unless a key asks for another program."""
-        return cls
 
     @classmethod
     @abstractmethod

@@ -14,7 +14,7 @@ returns exactly passes exactly the same levels.
 
 How it is fast: the logarithm and the comparison with both levels are branch-free loops over blocks that stay in
 the first-level cache; the pixels that fire are then picked out of the block's flags, eight at a time, without branches
-on the data. :mod:`blinkgl.events.reference` is the slow twin.
+on the data. ``tests/events/reference.py`` is the slow twin.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from blinkgl.events.packing import JIT, T_SHIFT
 from blinkgl.events.philox import Stream, normal2, pixel_counters
 from blinkgl.events.response import Response, smallest_threshold
 from blinkgl.events.threads import take_part
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 
 _I0, _FAR_BELOW = np.int32(0), np.int32(-(2**31))
 _U1000 = np.uint64(1000)

@@ -16,7 +16,7 @@ from blinkgl.config.base import Config
 from blinkgl.config.readout import FlickerFilter, RateFilter, TrailFilter
 from blinkgl.errors import EventDataError
 from blinkgl.events.packing import JIT
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 
 _LONG_AGO = -(2**62)
 

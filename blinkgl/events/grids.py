@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 
 
 def voxel_grid(events: Events, t0_us: int, t1_us: int, height: int, width: int, bins: int) -> np.ndarray:

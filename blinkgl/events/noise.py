@@ -10,7 +10,7 @@ ladder with a rung at the noise's mean is the quietest. Thresholds for ON and OF
 once they are spread, move the ladder a little with every pair of events: a pixel is on a ladder for the longer, the
 quieter it is, and its rate in the end is the harmonic mean over where the ladder may stand. That is the rate of the
 table, and pixels start on ladders as they are found then (:func:`start_places`). It was solved for as the stationary
-state of Markov chains, without throwing dice (``tools/noise_rates.py``).
+state of Markov chains, without throwing dice (by ``tools/noise_rates.py`` of 348eebef).
 
 With a dead time the reference is taken anew wherever the noise is at its end, and pixels leave their ladder. A dead
 time shorter than a frame lets them find the loud ones, where noise goes to and fro over one level (three times the
@@ -144,7 +144,7 @@ _DEAD = np.array(
 IN_SECONDS = 0.5
 """Part of a factor above 1 (of its logarithm) that a clip of seconds sees: pixels leave the ladders that they begin on
 by events, and those of the quiet ones are rare. Chosen on clips of 2 s at 5 Hz; the best of 0, 1/4, 1/2 and 1 on other
-clips, too, where thresholds are spread, not where they are equal (``python -m blinkgl.tools.noise_rates --judge``)."""
+clips, too, where thresholds are spread, not where they are equal."""
 
 
 _DEAD_Q = 1 / DEAD_SIZES**2

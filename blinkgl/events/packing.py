@@ -15,7 +15,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from blinkgl.events.threads import run, take_part
-from blinkgl.events.types import Cause, Events
+from blinkgl.types.events import Cause, Events
 
 T_SHIFT = 33
 CAUSE_SHIFT = 31
@@ -32,7 +32,7 @@ JIT = dict(nogil=True, cache=True, error_model="numpy", boundscheck=False)
 
 @register_jitable
 def cause_of(light: float, leak: float, noise: float) -> int:
-    """The :class:`~blinkgl.events.types.Cause` of a crossing: the largest part, all in its direction."""
+    """The :class:`~blinkgl.types.events.Cause` of a crossing: the largest part, all in its direction."""
     if light >= leak and light >= noise:
         return _SIGNAL
     return _LEAK if leak >= noise else _SHOT

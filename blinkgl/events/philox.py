@@ -91,15 +91,6 @@ def rough_normal(seed: int, pixel: int, stream: int, index: int) -> float:
 
 
 @register_jitable
-def normal_and_uniform(seed: int, pixel: int, stream: int, index: int) -> tuple[float, float]:
-    """A standard normal (angle of 32 bits) and an independent uniform (32 bits) from one block."""
-    w0, w1, w2, w3 = philox4x32(pixel & _MASK32, stream, index & _MASK32, index >> _S32, seed & _MASK32, seed >> _S32)
-    u = (_D(((w1 << _S32) | w0) >> _S11) + _HALF) * _ULP53
-    c, _ = cos_sin_turn((_D(w2) + _HALF) * _ULP32)
-    return np.sqrt(_MINUS2 * log_f64(u)) * c, (_D(w3) + _HALF) * _ULP32
-
-
-@register_jitable
 def normal2_and_uniform(seed: int, pixel: int, stream: int, index: int) -> tuple[float, float, float]:
     """Two independent standard normals (angle of 32 bits) and an independent uniform (32 bits) from one block."""
     w0, w1, w2, w3 = philox4x32(pixel & _MASK32, stream, index & _MASK32, index >> _S32, seed & _MASK32, seed >> _S32)

@@ -16,7 +16,7 @@ from blinkgl.errors import EventDataError
 from blinkgl.events.arith import exp_f64, log_f64
 from blinkgl.events.packing import JIT
 from blinkgl.events.philox import Stream, normal2, pixel_counters, uniform2
-from blinkgl.events.types import OPTIONAL, Cause, Events
+from blinkgl.types.events import OPTIONAL, Cause, Events
 
 _BATCH, _MOST_HZ, _LONGEST_BEFORE_S = 1024, 1e6, 5.0
 _DEFECT, _OWN, _LATE = np.uint64(Stream.DEFECT), np.uint64(Stream.OWN_NOISE), np.uint64(Stream.LATENCY)

@@ -22,7 +22,7 @@ import numpy as np
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events.packing import JIT
-from blinkgl.events.types import OPTIONAL, Events
+from blinkgl.types.events import OPTIONAL, Events
 
 _PS_PER_US = 1_000_000
 

@@ -15,6 +15,7 @@ docs/extending.md has the whole of one. What configuration needs is in ``Config`
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from blinkgl.config.base import tag_of, validate
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
 
 EMULATORS: dict[str, type[Emulator]] = {}
 """By ``Config``'s key ``emulator``."""
+DEVICES = {"cuda": "blinkgl.tensors.emulator:emulator_on"}
+"""What makes emulators on another device, by ``events.device``: "module:function", loaded when a configuration asks.
+A name and no import, since that room stands above this one."""
 _SOME_SENSORS = (
     SensorConfig(name="unknown", width=4, height=3),
     SensorConfig(
@@ -69,7 +73,7 @@ def emulator_of(config: EmulatorConfig) -> type[Emulator]:
     """The class that a configuration is of. Raises TypeError for one that is not in the table."""
     for emulator in EMULATORS.values():
         if type(config) is emulator.Config:
-            return emulator.kind_for(config)
+            return emulator
     raise TypeError(f"no emulator for {type(config).__name__}")
 
 
@@ -89,9 +93,8 @@ def make_emulator(
     # torch takes seconds to import, so nobody loads it who has no card.
     if device == "cpu" or (device == "auto" and (gl is None or gl.is_software)):
         return kind(height, width, config, seed, reconstruction)
-    from blinkgl.tensors.emulator import emulator_on  # above this room
-
-    return emulator_on(kind, config, height, width, seed, reconstruction)
+    module, _, maker = DEVICES["cuda"].partition(":")
+    return getattr(import_module(module), maker)(kind, config, height, width, seed, reconstruction)
 
 
 def _checked(emulator: Any) -> str:

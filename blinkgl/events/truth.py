@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blinkgl.events.types import TRUTH, Events
+from blinkgl.types.events import TRUTH, Events
 
 _JUMP = 0.05
 """Relative change of depth from frame to frame beyond which one instance shows another surface of itself."""
@@ -64,7 +64,7 @@ class SurfaceTruth:
         self._seen = [*self._seen[-2:], (t_ns, surfaces)]
 
     def of(self, events: Events, done_ns: int) -> np.ndarray:
-        """(N,) of :data:`~blinkgl.events.types.TRUTH` of events of the interval that ends at the frame of done_ns."""
+        """(N,) of :data:`~blinkgl.types.events.TRUTH` of events of the interval that ends at the frame of done_ns."""
         truth = np.empty(len(events), TRUTH)
         at = next(k for k, (t_ns, _) in enumerate(self._seen) if t_ns == done_ns)
         (before_ns, before), (after_ns, after) = self._seen[max(at - 1, 0)], self._seen[at]

@@ -38,7 +38,6 @@ from blinkgl.events.packing import JIT, T_SHIFT
 from blinkgl.events.philox import Stream
 from blinkgl.events.response import Response, smallest_threshold
 from blinkgl.events.threads import take_part
-from blinkgl.events.types import Events
 from blinkgl.events.v2e_blocks import (
     DRAWS,
     add_scaled_block,
@@ -65,6 +64,7 @@ from blinkgl.events.v2e_model import (
     shot_tables,
 )
 from blinkgl.events.v2e_waves import FLOATS, INTS, emit_waves
+from blinkgl.types.events import Events
 
 _F = np.float32
 _ZERO, _HALF, _JOINT = _F(0), _F(0.5), _F(20.0)
@@ -316,8 +316,6 @@ class V2e(Emulator):
     bytes per pixel, 8 more with shot noise."""
 
     Config = V2eConfig
-    compat: ClassVar[str] = "none"
-    """The ``config.compat`` that this class does."""
     _state: ClassVar[tuple[str, ...]] = (
         "_intensity",
         "_x",
@@ -336,14 +334,6 @@ class V2e(Emulator):
         "_before_second",
         "_second_lag",
     )
-
-    @classmethod
-    def kind_for(cls, config: V2eConfig) -> type[Emulator]:
-        if config.compat == cls.compat:
-            return cls
-        from blinkgl.events.v2e_authors import V2eAuthors  # which is made of this one
-
-        return V2eAuthors
 
     @classmethod
     def response(cls, config: V2eConfig) -> Response:
@@ -366,13 +356,6 @@ class V2e(Emulator):
     ):
         super().__init__(height, width, seed, reconstruction)
         self.config = config = config or V2eConfig()
-        if config.compat != self.compat:
-            raise EventDataError(
-                f"{type(self).__name__} does not do this, see make_emulator",
-                where="compat",
-                value=config.compat,
-                accepted=self.compat,
-            )
         pixels = self.height * self.width
         frame = lambda wanted=True: np.zeros(pixels if wanted else 0, np.float32)
         on, off = config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold

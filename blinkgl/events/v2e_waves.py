@@ -22,8 +22,8 @@ from numba.extending import register_jitable
 from blinkgl.events.arith import fall_f64, select
 from blinkgl.events.packing import CAUSE_SHIFT, JIT, T_SHIFT, cause_of
 from blinkgl.events.philox import Stream, rough_normal
-from blinkgl.events.types import Cause
 from blinkgl.events.v2e_model import signal_at
+from blinkgl.types.events import Cause
 
 _U = np.uint64
 _U0, _U1, _U1000 = _U(0), _U(1), _U(1000)

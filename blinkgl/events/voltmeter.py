@@ -23,11 +23,6 @@ That equation is followed exactly, so that noise is the same at any frame rate:
 * V starts at the stationary law of a still scene (:func:`start_voltage`), not at 0 everywhere, where all pixels of a
   flat image would have their first leak event together.
 
-``compat: authors`` is the published program instead: V starts at 0; every pixel draws, in every interval, which
-threshold comes first (:func:`on_first`) and the inverse Gaussian time to it as if there were no other; where that is
-beyond the interval's end the pixel moves towards that threshold by the share of the time that has passed. The
-variance of such a move is of the order of dt^2 instead of dt: noise then falls with the frame rate.
-
 V is kept in 2^-29, fine enough for a leak of one event an hour at any frame rate.
 """
 
@@ -44,10 +39,10 @@ from blinkgl.events.arith import exp_f64, select
 from blinkgl.events.blocks import compact_flags, copy_block, lookup_block, scale_block
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
 from blinkgl.events.packing import CAUSE_SHIFT, JIT, T_SHIFT, cause_of
-from blinkgl.events.philox import Stream, normal2_and_uniform, normal_and_uniform, uniform2
+from blinkgl.events.philox import Stream, normal2_and_uniform, uniform2
 from blinkgl.events.response import Response
 from blinkgl.events.threads import take_part
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 
 _F = np.float32
 _ZERO, _HALF, _ONE, _I0 = _F(0.0), _F(0.5), _F(1.0), np.int32(0)
@@ -109,27 +104,6 @@ def in_reach(v: float, drift: float, noise: float) -> bool:
 def one_minus_exp(x: float) -> float:
     """1 - e^-x for x >= 0, to 1e-11 relative."""
     return select(x < 1e-4, x * (1.0 - x * (0.5 - x * (1.0 / 6.0))), 1.0 - exp_f64(-x))
-
-
-@register_jitable
-def on_first(to_on: float, to_off: float, mu: float, sigma: float) -> float:
-    """P(+threshold before -threshold) for drift mu and diffusion sigma, at distances to_on and to_off > 0.
-
-    (e^{2 mu b/s^2} - 1)/(e^{2 mu b/s^2} - e^{-2 mu a/s^2}) (Lin et al. 2022, eq. 9), arranged so that nothing
-    overflows and small drifts do not cancel; b/(a + b) without drift.
-    """
-    variance = sigma * sigma
-    if variance == 0.0:
-        return 1.0 if mu > 0 else 0.0
-    rate = 2.0 * abs(mu) / variance
-    span = rate * (to_on + to_off)
-    if span < 1e-12:
-        return to_off / (to_on + to_off)
-    if rate * to_off > 40.0 and (mu > 0 or rate * to_on > 60.0):
-        return 1.0 if mu > 0 else 0.0  # to within 1e-17
-    if mu > 0:
-        return one_minus_exp(rate * to_off) / one_minus_exp(span)
-    return one_minus_exp(rate * to_off) * exp_f64(-rate * to_on) / one_minus_exp(span)
 
 
 @register_jitable
@@ -268,7 +242,6 @@ class Interval(NamedTuple):
     step: int
     refractory_ns: int
     bound_per_pixel: int
-    authors: bool
 
 
 @numba.njit(**JIT)
@@ -421,76 +394,6 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
 
 
 @numba.njit(**JIT)
-def _emit_block_authors(active, count, first, now, v_end, light_end, leak_end, p, v, cap, packed, begin):
-    """:func:`_emit_block` of ``compat: authors``; every pixel is listed."""
-    out, cut = begin, 0
-    dt_us = v.dt_ns * 1e-3
-    start_ns = v.t0_ns - 1000 * v.base_us
-    y = first // v.width
-    row_end = (y + 1) * v.width
-    for j in range(count):
-        i = np.int64(active[j])
-        while i >= row_end:
-            y += 1
-            row_end += v.width
-        pixel = (y << 17) | ((i - row_end + v.width) << 1)
-        mu, leak_rate, sigma = rates(np.float64(p.intensity[i]), np.float64(now[i - first]), dt_us, v)
-        voltage, t_us = p.v[i] / V_ONE, 0.0
-        if p.release.size and p.release[i] != NEVER_NS:
-            if p.release[i] > v.t0_ns + v.dt_ns:
-                v_end[i - first] = IN_DEAD_TIME
-                if p.by_light.size:
-                    light_end[i - first] = leak_end[i - first] = _ZERO
-                continue
-            t_us, voltage = max(p.release[i] - v.t0_ns, 0) * 1e-3, 0.0
-            p.release[i] = NEVER_NS
-        since_us, light, leak = t_us, 0.0, 0.0
-        if p.by_light.size:
-            light, leak = np.float64(p.by_light[i]), np.float64(p.by_leak[i])
-        emitted, dead = 0, False
-        draw = np.uint64(v.step) << _U20
-        last = draw + _MAX_DRAWS
-        while True:
-            normal, which = normal_and_uniform(v.seed, np.uint64(i), _DIFFUSION, draw)
-            side, _ = uniform2(v.seed, np.uint64(i), _DIFFUSION, draw + _U1)
-            draw += _U2
-            left_us = dt_us - t_us
-            up = side < on_first(1.0 - voltage, 1.0 + voltage, mu, sigma)
-            distance = 1.0 - voltage if up else 1.0 + voltage
-            after_us = hitting_time(distance, mu, sigma, normal, which)
-            if not after_us < left_us:
-                share = distance * left_us / after_us  # 0 where it is never reached
-                voltage = max(min(voltage + (share if up else -share), NEAREST), -NEAREST)
-                break
-            t_us += after_us
-            voltage = 0.0
-            event_ns = min(np.int64(t_us * 1e3), v.dt_ns)
-            if emitted == cap or draw >= last:
-                cut += 1 + np.int64((dt_us - t_us) * max(abs(mu), sigma * sigma))
-                break
-            word = pixel | np.int64(up)
-            if p.by_light.size:
-                word |= cause_at(1 if up else -1, t_us - since_us, light, leak, mu, leak_rate) << CAUSE_SHIFT
-            packed[out] = (np.int64(np.uint64(start_ns + event_ns) // _U1000) << T_SHIFT) | word
-            out += 1
-            emitted += 1
-            if p.release.size:
-                release_ns = event_ns + v.refractory_ns
-                if release_ns > v.dt_ns:
-                    p.release[i] = v.t0_ns + release_ns
-                    dead = True
-                    break
-                t_us = release_ns * 1e-3
-            since_us, light, leak = t_us, 0.0, 0.0
-        v_end[i - first] = IN_DEAD_TIME if dead else np.int32(voltage * V_ONE)
-        if p.by_light.size:
-            rest_us = 0.0 if dead else dt_us - since_us
-            light_end[i - first] = np.float32(0.0 if dead else light + (mu - leak_rate) * rest_us)
-            leak_end[i - first] = np.float32(0.0 if dead else leak + leak_rate * rest_us)
-    return out, cut
-
-
-@numba.njit(**JIT)
 def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p, v):
     """Band kernel, see :meth:`Emulator._run`."""
     cut, pixels = 0, p.v.size
@@ -509,8 +412,6 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
         else:
             scale_block(frame[s:e], v.scale, now[:n])
         most = _sense_block(p.intensity[s:e], now[:n], p.v[s:e], p.unspent[s:e], v, v_end, unspent_end, flags)
-        if v.authors:
-            flags[:n] = 1
         if p.by_light.size:
             _share_block(p.intensity[s:e], now[:n], p.by_light[s:e], p.by_leak[s:e], v, light_end[:n], leak_end[:n])
         most = np.float64(min(most, _MAX_BOUND))
@@ -522,19 +423,13 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
                 cap = max(1, share // count)
             if filled + count * cap > packed.size:
                 return block, filled, cut
-            if v.authors:
-                filled, cut_here = _emit_block_authors(
-                    active, count, s, now, v_end, light_end, leak_end, p, v, cap, packed, filled
-                )
-            else:
-                filled, cut_here = _emit_block(
-                    active, count, s, now, v_end, unspent_end, light_end, leak_end, p, v, cap, packed, filled
-                )
+            filled, cut_here = _emit_block(
+                active, count, s, now, v_end, unspent_end, light_end, leak_end, p, v, cap, packed, filled
+            )
             cut += cut_here
         copy_block(now[:n], p.intensity[s:e])
         copy_block(v_end[:n], p.v[s:e])
-        if not v.authors:
-            copy_block(unspent_end[:n], p.unspent[s:e])
+        copy_block(unspent_end[:n], p.unspent[s:e])
         if p.by_light.size:
             copy_block(light_end[:n], p.by_light[s:e])
             copy_block(leak_end[:n], p.by_leak[s:e])
@@ -583,7 +478,6 @@ class DvsVoltmeter(Emulator):
         pixels = self.height * self.width
         self._intensity, self._v = np.zeros(pixels, np.float32), np.zeros(pixels, np.int32)
         self._unspent = np.zeros(pixels, np.float32)
-        self._authors = config.compat == "authors"
         self._by_light, self._by_leak = (np.zeros(pixels if config.causes else 0, np.float32) for _ in range(2))
         self._refractory_ns = round(config.refractory_us * 1000)
         self._release = np.full(pixels if self._refractory_ns else 0, NEVER_NS, np.int64)
@@ -595,7 +489,7 @@ class DvsVoltmeter(Emulator):
 
     def _start(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
         self._intensity[...] = self._table[frame] if frame.dtype == np.uint8 else frame * self._scale
-        if self.config.start == "stationary" and not self._authors:
+        if self.config.start == "stationary":
             self._v[...], left_us = start_voltage(self._intensity, self.config, self.seed)
             dead = np.flatnonzero(left_us)
             self._v[dead] = IN_DEAD_TIME
@@ -623,7 +517,6 @@ class DvsVoltmeter(Emulator):
             self.frames,
             self._refractory_ns,
             dt_ns // self._refractory_ns + 2 if self._refractory_ns else 2**31,
-            self._authors,
         )
         source = (NO_FRAME, frame) if frame.dtype == np.uint8 else (frame, NO_CODES)
         return self._run(_bands, (*source, self._table, pixels, interval), base_us, t_ns // 1000 - base_us)

@@ -9,7 +9,6 @@ import numpy as np
 
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
-from blinkgl.events.types import Events
 from blinkgl.front import arguments as check
 from blinkgl.front.runs import (
     MAX_INDEX,
@@ -24,6 +23,7 @@ from blinkgl.render.tracks import Tracks
 from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Item, Simulation, simulate as core
 from blinkgl.sequence.inertial import Inertial
 from blinkgl.srgb import to_srgb8
+from blinkgl.types.events import Events
 
 
 def simulate_sequence(

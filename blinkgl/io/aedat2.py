@@ -21,8 +21,8 @@ import numba
 import numpy as np
 
 from blinkgl.errors import AssetError
-from blinkgl.events.types import Events
 from blinkgl.io.davis import CameraFrame, G, ImuSamples
+from blinkgl.types.events import Events
 
 MAGIC = b"#!AER-DAT"
 SIZES = {

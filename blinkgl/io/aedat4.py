@@ -17,12 +17,12 @@ from typing import NoReturn
 import numpy as np
 
 from blinkgl.errors import AssetError, BlinkGLError, EventDataError, OutputError
-from blinkgl.events.types import Events
 from blinkgl.io import aedat4_decode
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import check_events, check_size, events_of, refuse_causes
 from blinkgl.io.davis import CameraFrame, ImuSamples
 from blinkgl.machine.extras import install
+from blinkgl.types.events import Events
 
 MAGIC = b"#!AER-DAT4"
 

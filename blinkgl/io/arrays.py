@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.errors import AssetError
-from blinkgl.events.types import Events
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import check_events, check_size, events_of, microseconds
 from blinkgl.io.images import NpzReader, numpy_errors, read_npy
+from blinkgl.types.events import Events
 
 DTYPE = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1")])
 _NAMES = {

@@ -1,4 +1,4 @@
-"""Boxes of objects (:class:`blinkgl.labels.boxes.Boxes`): ``boxes/000000.npz``, all arrays by name, and
+"""Boxes of objects (:class:`blinkgl.types.boxes.Boxes`): ``boxes/000000.npz``, all arrays by name, and
 ``boxes_kitti/000000.txt``, a line per object that is seen, in the fields of KITTI's labels:
 
     type truncated occluded alpha left top right bottom height width length x y z rotation_y
@@ -21,7 +21,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError
 from blinkgl.io.images import NpzReader, numpy_errors
-from blinkgl.labels.boxes import SHAPES, Boxes
+from blinkgl.types.boxes import SHAPES, Boxes
 
 _PARTLY, _LARGELY = 0.05, 0.5
 

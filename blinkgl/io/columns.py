@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError, OutputError
-from blinkgl.events.types import Cause, Events
+from blinkgl.types.events import Cause, Events
 
 MAX_SIDE = 65536
 _MAX_TIME = 1 << 62
@@ -32,7 +32,7 @@ def events_of(
     """Columns of any integer, boolean or float type as :class:`Events`; ``offset`` (µs) is added to the times.
 
     t : µs. p : 0 or 1, with ``signed`` also -1, which becomes 0. cause : 0 to 3, see
-    :class:`~blinkgl.events.types.Cause`, where the file has them. first : index of the
+    :class:`~blinkgl.types.events.Cause`, where the file has them. first : index of the
     first of these events in the file.
     Raises EventDataError, naming event and value, for what Events cannot hold: coordinates outside uint16 or between
     pixels, NaN, times beyond int64, another polarity. AssetError: a column that is no 1-D array of

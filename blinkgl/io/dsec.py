@@ -2,7 +2,7 @@
 
 Layout: ``events/{x,y}`` u2, ``events/p`` u1, ``events/t`` u4 µs relative to the scalar ``t_offset`` (i8 µs on the
 image clock), ``ms_to_idx`` u8 with ``ms_to_idx[ms]`` = smallest index whose t >= 1000·ms. Blosc-zstd with bit
-shuffle, as the published files. ``events/cause`` u1 besides, of :class:`~blinkgl.events.types.Cause`, where events have
+shuffle, as the published files. ``events/cause`` u1 besides, of :class:`~blinkgl.types.events.Cause`, where events have
 causes; readers of DSEC's files do not look at it.
 """
 
@@ -21,10 +21,10 @@ import hdf5plugin
 import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
-from blinkgl.events.types import Events
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import MAX_SIDE, check_events, check_size, events_of
 from blinkgl.io.hdf5 import blosc_dataset, dataset, hdf5_errors, open_hdf5, write_rows
+from blinkgl.types.events import Events
 
 BLOCK = 1 << 17
 """Events per HDF5 chunk and per write."""

@@ -3,7 +3,7 @@
 instance  (N,)   u2   instance id of the surface, 0: nothing
 depth     (N,)   f4   along the optical axis, world units; inf: nothing
 velocity  (N, 2) f4   px/s, +x right, +y down
-cause     (N,)   u1   blinkgl.events.types.Cause, where the emulator says it
+cause     (N,)   u1   blinkgl.types.events.Cause, where the emulator says it
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import h5py
 import numpy as np
 
 from blinkgl.errors import AssetError
-from blinkgl.events.types import TOLD, TRUTH, Events
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.hdf5 import blosc_dataset, dataset, hdf5_errors, open_hdf5, write_rows
+from blinkgl.types.events import TOLD, TRUTH, Events
 
 EVENT_LABELS = "event_labels.h5"
 BLOCK = 1 << 17
@@ -117,7 +117,7 @@ class EventLabelsReader:
         return dataset(self._file, name, self.path, shape=(None, *shape), kinds="f" if kind.kind == "f" else "iu")
 
     def read(self, start: int = 0, stop: int | None = None) -> tuple[np.ndarray, np.ndarray | None]:
-        """Of the events number ``start`` to ``stop`` (None: the last): (N,) of :data:`~blinkgl.events.types.TRUTH`, and
+        """Of the events number ``start`` to ``stop`` (None: the last): (N,) of :data:`~blinkgl.types.events.TRUTH`, and
         their causes (N,) uint8, None where the file has none. Raises AssetError: damaged."""
         rows = slice(*slice(start, stop).indices(self.count)[:2])
         with hdf5_errors(self.path):

@@ -18,9 +18,9 @@ import numba
 import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
-from blinkgl.events.types import Events
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import check_events, check_size, refuse_causes
+from blinkgl.types.events import Events
 
 _WORD = {"evt2": np.dtype("<u4"), "evt3": np.dtype("<u2")}
 _MAX_SIDE = 2048

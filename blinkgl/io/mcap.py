@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError, OutputError
-from blinkgl.events.types import Events
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import check_events, check_size, events_of, refuse_causes
+from blinkgl.types.events import Events
 
 TOPIC = "/event_camera/events"
 SCHEMA = "event_camera_msgs/msg/EventPacket"

@@ -9,9 +9,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from blinkgl.events.types import Events
 from blinkgl.io.columns import events_of, microseconds
 from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
+from blinkgl.types.events import Events
 
 DATASET = "davis/left/events"
 

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from blinkgl.io.pictures import id_colours
-from blinkgl.labels.boxes import Boxes
+from blinkgl.types.boxes import Boxes
 
 _FROM_PX = 160
 """Pictures less wide than this have no room for words."""

@@ -17,11 +17,11 @@ import h5py
 import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
-from blinkgl.events.types import Events
 from blinkgl.io import ecf
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import check_events, check_size, events_of, refuse_causes
 from blinkgl.io.hdf5 import hdf5_errors, joined, open_hdf5
+from blinkgl.types.events import Events
 
 DATASET = "CD/events"
 EVENT = np.dtype({"names": ["x", "y", "p", "t"], "formats": ["<u2", "<u2", "<i2", "<i8"], "offsets": [0, 2, 4, 8]})

@@ -20,7 +20,7 @@ _SHARE = 0.95
 class Depth(Label):
     """(H, W) float32 world units along the optical axis; inf: nothing hit."""
 
-    name, about = "depth", "float32 .npy, world units along the optical axis"
+    name = "depth"
     unit, kind = "world units", "depth"
     shard = "depth.npy"
     buffer = "R32F"

@@ -22,10 +22,6 @@ class Disparity(Label):
     nothing is hit, and everywhere where a sensor has no other eye. Hidden points have theirs, too."""
 
     name = "disparity"
-    about = (
-        "float32 .npy, px: x in the left eye less x in the right of a stereo pair, 0 where nothing is hit "
-        "(docs/rigs.md)"
-    )
     unit, kind = "px", "scalar"
     needs = ("depth",)
     shard = "disparity.npy"

@@ -2,73 +2,19 @@
 
 from __future__ import annotations
 
-import math
 import os
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field
 
-from blinkgl.config.base import Refused
 from blinkgl.labels import grading
 from blinkgl.labels.files import Form
 from blinkgl.labels.frames import Flow
-from blinkgl.labels.label import Drawn, Key, Label, Towards, View
+from blinkgl.labels.label import Drawn, Label, Towards, View
 
 if TYPE_CHECKING:
     from blinkgl.config.labels import LabelsConfig
     from blinkgl.render.passes import Shot
-
-_ACCEPTED = (
-    "forward, backward, or an interval in s: a number or a fraction such as 1/100, from 1e-6 to 4300, negative: back"
-)
-
-
-def _where_to(value: Any) -> str | float:
-    """An entry of ``labels.flow``: a direction, or seconds, which may be written as a fraction. Raises Refused."""
-    if isinstance(value, str) and value in ("forward", "backward"):
-        return value
-    # No Fraction: that of "1e999999999" is a number of as many digits, and takes hours.
-    top, slash, bottom = value.partition("/") if isinstance(value, str) else (value, "", "1")
-    try:
-        seconds = math.nan if isinstance(value, bool) else float(top) / float(bottom if slash else 1)
-    except (ValueError, TypeError, ZeroDivisionError, OverflowError):
-        seconds = math.nan
-    if not 1e-6 <= abs(seconds) <= 4300:
-        raise Refused("no direction, and no interval", value=value, accepted=_ACCEPTED)
-    return seconds
-
-
-def _each_once(flow: tuple[str | float, ...]) -> tuple[str | float, ...]:
-    """Raises Refused for an interval that is there twice."""
-    known: set[int] = set()
-    for one in (one for one in flow if isinstance(one, float)):
-        if round(one * 1e6) in known:
-            raise Refused("an interval twice", value=one, accepted="each once")
-        known.add(round(one * 1e6))
-    return flow
-
-
-FLOW_KEY = Key(
-    Annotated[
-        tuple[Annotated[Literal["forward", "backward"] | float, BeforeValidator(_where_to)], ...],
-        AfterValidator(_each_once),
-    ],
-    Field(
-        ("forward",),
-        max_length=1000,
-        description="optical flow: forward to the next label and backward to the one before, DSEC 16-bit PNG; numbers "
-        "are intervals of one's own, s, from each label's time on (`0.01`, `1/30`; negative: back), float32 .h5 "
-        "(docs/over_time.md)",
-    ),
-    "depth",
-)
-_KEYS = {
-    "flow": FLOW_KEY,
-    "float_flow": Key(
-        tuple[Literal["npy", "flo", "h5"], ...], Field((), description="float32 flow besides the PNG"), "depth"
-    ),
-}
 
 
 def seconds_of(labels: LabelsConfig) -> tuple[float, ...]:
@@ -91,10 +37,9 @@ class FlowTo(Label):
     def __init__(self, towards: Towards):
         self.varyings = ("local", towards)
         self.towards, self.name, self.title = towards, f"flow_{towards}", f"{towards} flow"
-        self.about, self.off = f"optical flow {towards}", "not in labels.flow"
+        self.off = "not in labels.flow"
         self.stamps, self.shard = f"flow/{towards}_timestamps.txt", "flow.png" if towards == "forward" else "back.png"
 
-    keys = property(lambda self: _KEYS)
     said = property(lambda self: "flow" if self.towards == "forward" else self.name)
 
     def asked(self, labels: LabelsConfig) -> bool:
@@ -107,9 +52,7 @@ class FlowTo(Label):
         return {f"difference_{self.towards}": (shot.ends[self.towards].mvp - shot.moment.mvp)[:, [0, 1, 3]]}
 
     def finish(self, drawn: Drawn) -> Flow:
-        from blinkgl.render.occlusion import flow_and_reach
-
-        return Flow(*flow_and_reach(drawn.raw(self.name)))
+        return drawn.flow(self.name)
 
     def wrong(self, value: Flow, height: int, width: int) -> str | None:
         shapes = np.shape(value.flow), np.shape(value.valid)

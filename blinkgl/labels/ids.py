@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 class Ids(Label):
     """(H, W) uint32 instance ids; 0: nothing hit."""
 
-    name, about = "ids", "instance ids, 16-bit PNG"
+    name = "ids"
     title, unit, kind = "instance ids", "0: nothing hit", "ids"
     shard = "ids.png"
     buffer, dtype = "R32UI", np.uint32

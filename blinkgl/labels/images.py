@@ -10,8 +10,7 @@ from blinkgl.labels.label import Label, View
 class Images(Label):
     """(H, W, 3) float32 linear radiance, anti-aliased as ``render.image_antialiasing`` says."""
 
-    name, about = "images", "sRGB PNG of the colour pass"
-    title, unit, kind, default = "images", "linear radiance", "light", True
+    name, title, unit, kind = "images", "images", "linear radiance", "light"
     anti_aliased, at_last = True, True
     channels, dtype = None, None
     stamps, shard = "images/timestamps.txt", "image.png"

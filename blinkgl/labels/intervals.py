@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from blinkgl.labels.files import Form
-from blinkgl.labels.flow import FLOW_KEY, FlowTo, seconds_of
+from blinkgl.labels.flow import FlowTo, seconds_of
 from blinkgl.labels.frames import Flow, ending_within
-from blinkgl.labels.label import Drawn, Key, Label
-from blinkgl.labels.occlusion import OCCLUSION_KEY
+from blinkgl.labels.label import Drawn, Label
 
 if TYPE_CHECKING:
     from blinkgl.config.labels import LabelsConfig
@@ -105,15 +104,10 @@ class FlowIntervals(_OverIntervals):
     """:class:`Flows`: what ``flow_forward`` would be, did it lead from the label's time to each of the others."""
 
     name, title, unit = "flow_intervals", "flow over intervals", "px"
-    about = "flow over every interval among labels.flow, float32, .h5 (docs/over_time.md)"
     each = ("flow_forward",)
     shard = "flow_intervals.h5"
     stamps = "flow/intervals_timestamps.txt"
     arrays, made = {"flow": ((2,), np.float32), "valid": ((), bool)}, Flows
-
-    @property
-    def keys(self) -> dict[str, Key]:
-        return {"flow": FLOW_KEY}
 
     def asked(self, labels: LabelsConfig) -> bool:
         return bool(seconds_of(labels))
@@ -139,19 +133,14 @@ class OcclusionIntervals(_OverIntervals):
     """:class:`Occlusions`: what ``occlusion_forward`` would be at the end of each interval."""
 
     name, title, unit = "occlusion_intervals", "occlusion over intervals", ""
-    about = "masks of pixels hidden at the end of every interval among labels.flow, .h5"
     off = "labels.occlusion: false, or no interval in labels.flow"
     each = ("flow_forward", "occlusion_forward")
     arrays, made = {"occluded": ((), bool)}, Occlusions
 
-    @property
-    def keys(self) -> dict[str, Key]:
-        return {"occlusion": OCCLUSION_KEY}
-
     said = property(lambda self: "occlusion")
 
     def asked(self, labels: LabelsConfig) -> bool:
-        return bool(seconds_of(labels)) and labels.occlusion  # type: ignore[missing-attribute]
+        return bool(seconds_of(labels)) and labels.occlusion
 
     def ask(self, tree: dict[str, Any]) -> None:
         tree["occlusion"] = True

@@ -12,17 +12,17 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
-from pydantic import Field
 
 from blinkgl.labels import files, grading
 from blinkgl.labels.files import Form
 
 if TYPE_CHECKING:
     from blinkgl.config.labels import LabelsConfig
-    from blinkgl.labels.frames import LabelFrame
+    from blinkgl.labels.frames import Flow, LabelFrame
     from blinkgl.render.passes import Shot
     from blinkgl.render.reference import ReferenceFrame
     from blinkgl.scene.types import Scene
+    from blinkgl.types.boxes import Boxes
 
 Towards = Literal["forward", "backward"]
 
@@ -48,16 +48,6 @@ BUFFERS = {
 VARYINGS = ("local", "normal", "rate", "forward", "backward")
 _NUMBERS = {"f": "real", "u": "whole", "i": "whole", "b": "truth"}
 KINDS = ("scalar", "depth", "signed", "ids", "mask", "light", "unit", "motion")
-
-
-@dataclass(frozen=True)
-class Key:
-    """A key of ``labels:``: its type, and default and description as pydantic has them.
-    before : key that it stands in front of."""
-
-    annotation: Any
-    info: Any
-    before: str | None = None
 
 
 @dataclass(frozen=True)
@@ -92,7 +82,9 @@ class Drawn(Protocol):
     categories : pattern of names and number of the category, in order.
     t_ns : the time.   leading : of a label that says ``each``, interval in ns -> frame of those labels, leading so far.
     raw(name) : (H, W[, C]) buffer of a label, its own or one of ``needs``.   value(name) : what that label made of its.
-    there(name) : buffer of a label among its ``there``, at the time that this label leads to."""
+    there(name) : buffer of a label among its ``there``, at the time that this label leads to.
+    flow(name) : the flow in a label's buffer.   occlusion(flow) : (H, W) bool, where the points of that flow's label
+    are hidden at its end; needs "ids", and "depth" and "ids" there.   boxes() : of the objects; needs "ids"."""
 
     scene: Scene
     t_ns: int
@@ -106,15 +98,22 @@ class Drawn(Protocol):
 
     def there(self, name: str) -> np.ndarray: ...
 
+    def flow(self, name: str) -> Flow: ...
+
+    def occlusion(self, flow: str) -> np.ndarray: ...
+
+    def boxes(self) -> Boxes: ...
+
 
 class Label:
-    """One kind of ground truth. ``name``, ``about``, ``reference`` and ``tolerance`` have to be said; a label of the
+    """One kind of ground truth. ``name``, ``reference`` and ``tolerance`` have to be said; a label of the
     shader says ``buffer``, and ``glsl``.
 
     What it is called
-        name : key of ``labels:`` (unless it says other ``keys``), folder, attribute of a
+        name : key of ``labels:`` (unless ``asked`` looks at another), folder, attribute of a
         :class:`~blinkgl.labels.LabelFrame`.
-        about : what it is and how it is written, for the page of keys.   default : written when nothing is said.
+        about : what it is and how it is written, for the page of keys; of a label that ``config/labels.py`` has no key
+        of.
         title, unit : for tables.   kind : how a picture shows it, one of KINDS.
         off : what ``explain`` says of it when it is not asked for.
 
@@ -146,11 +145,10 @@ class Label:
         tolerance, judged_in, error … : as of :class:`View`."""
 
     name: str
-    about: str
+    about: str = ""
     title: str = ""
     unit: str = ""
     kind: str = "scalar"
-    default: bool = False
     off: str = ""
 
     buffer: str | None = None
@@ -179,11 +177,6 @@ class Label:
         return self.title or self.name
 
     # ---- configuration -------------------------------------------------------------------------------------------
-
-    @property
-    def keys(self) -> Mapping[str, Key]:
-        """Its keys of ``labels:``. Several labels may share one: then it is the same object."""
-        return {self.name: Key(bool, Field(self.default, description=self.about))}
 
     def asked(self, labels: LabelsConfig) -> bool:
         """Whether ``labels:`` asks for it."""

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 class Normals(Label):
     """(H, W, 3) float32 unit, camera axes (OpenCV), facing the camera; 0 where nothing is hit."""
 
-    name, about = "normals", "unit normals in camera axes, float32 .npy"
+    name = "normals"
     unit, kind = "camera axes", "unit"
     shard = "normals.npy"
     buffer, varyings, channels = "RGBA32F", ("normal",), 3

@@ -5,18 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import Field
 
 from blinkgl.labels import files, grading
 from blinkgl.labels.files import Form
-from blinkgl.labels.label import Drawn, Key, Label, Towards, View
+from blinkgl.labels.label import Drawn, Label, Towards, View
 
 if TYPE_CHECKING:
     from blinkgl.config.labels import LabelsConfig
-
-OCCLUSION_KEY = Key(
-    bool, Field(True, description="masks of pixels that are not visible at the flow's other end"), "depth"
-)
 
 
 class OcclusionAt(Label):
@@ -27,15 +22,10 @@ class OcclusionAt(Label):
     dtype = bool
 
     def __init__(self, towards: Towards):
-        self.towards, self.name, self.about = (
-            towards,
-            f"occlusion_{towards}",
-            f"masks of pixels hidden at the end of {towards} flow",
-        )
+        self.towards, self.name = towards, f"occlusion_{towards}"
         self.needs, self.there = (f"flow_{towards}", "ids"), ("depth", "ids")
         self.shard = "occlusion.png" if towards == "forward" else None
 
-    keys = property(lambda self: {"occlusion": OCCLUSION_KEY})
     said = property(lambda self: "occlusion")
 
     def asked(self, labels: LabelsConfig) -> bool:
@@ -45,20 +35,7 @@ class OcclusionAt(Label):
         tree["occlusion"] = True
 
     def finish(self, drawn: Drawn) -> np.ndarray:
-        from blinkgl.render.occlusion import occlusion_mask
-
-        flow = drawn.value(f"flow_{self.towards}")
-        z_there = drawn.raw(f"flow_{self.towards}")[..., 2]
-        return occlusion_mask(
-            drawn.scene,
-            drawn.end_ns,
-            flow.flow,
-            z_there,
-            flow.valid,
-            drawn.raw("ids"),
-            drawn.there("depth"),
-            drawn.there("ids"),
-        )
+        return drawn.occlusion(f"flow_{self.towards}")
 
     @property
     def forms(self) -> tuple[Form, ...]:

@@ -25,10 +25,6 @@ class SceneFlow(Label):
     T_cam'_cam (X + s) in that camera's axes."""
 
     name, title = "scene_flow", "scene flow"
-    about = (
-        "3-D motion of the surface to the next label, world units in the camera's axes at the label's time, 0 for what "
-        "stands still, float32 .npy"
-    )
     unit, kind = "world units", "scalar"
     towards = "forward"
     stamps, shard = "scene_flow/timestamps.txt", "scene_flow.npy"
@@ -57,8 +53,4 @@ class SceneFlow(Label):
         )
 
     def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
-        from blinkgl.render.reference import moved_in_space
-
-        assert frame.forward is not None
-        moved = moved_in_space(scene, frame.hits(), frame.forward.t_ns).reshape(*frame.hit.shape, 3)
-        return np.where(frame.hit[..., None], moved, 0.0)
+        return frame.scene_flow(scene)

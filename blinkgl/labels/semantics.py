@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import re
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import BeforeValidator, Field
 
-from blinkgl.config.base import Refused
+from blinkgl.config.primitives import PRIMITIVES
 from blinkgl.errors import ConfigError
 from blinkgl.labels import files, grading
 from blinkgl.labels.files import Form
-from blinkgl.labels.label import Drawn, Key, Label, View
+from blinkgl.labels.label import Drawn, Label, View
 
 if TYPE_CHECKING:
     from blinkgl.config.labels import LabelsConfig
@@ -22,45 +21,17 @@ if TYPE_CHECKING:
 
 Categories = tuple[tuple[str, int], ...]
 """Pattern -> number, in order."""
-_KINDS = (
-    "sky", "ground", "wall", "cuboid", "cylinder", "sphere", "icosphere", "cone", "torus", "capsule", "prism",
-    "pyramid", "figure", "flag", "fish", "grid", "die",
-)  # fmt: skip
-BY_NAME: Categories = (*((kind, k) for k, kind in enumerate(_KINDS, 1)), ("*", 255))
+_CATEGORIES = {"sky": 1, "ground": 2, "wall": 3} | {
+    name: kind.category for name, kind in PRIMITIVES.items() if kind.category is not None
+}
+BY_NAME: Categories = (*sorted(_CATEGORIES.items(), key=lambda row: row[1]), ("*", 255))
 """``semantics: true``: sky 1, ground 2, wall 3, shapes from 4 on, 255 for other names. Data sets hold these numbers:
 new kinds come at the end."""
 
 
-def _a_table(value: Any) -> Any:
-    """One message for what is neither of the two, instead of one for each."""
-    if isinstance(value, bool):
-        return value
-    if not isinstance(value, dict):
-        raise Refused(
-            "no table of patterns", value=value, accepted="a table such as {'chair*': 7, '*': 0}, or true or false"
-        )
-    for pattern, number in value.items():
-        if not isinstance(pattern, str) or not 1 <= len(pattern) <= 200:
-            raise Refused("not a pattern of names", value=pattern, accepted="text of 1 to 200 characters")
-        if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number <= 65535:
-            raise Refused(f"no number of a category for '{pattern}'", value=number, accepted="0 to 65535")
-    return value
-
-
-SEMANTICS_KEY = Key(
-    Annotated[bool | dict[str, int], BeforeValidator(_a_table)],
-    Field(
-        False,
-        description='category of what is seen, 16-bit PNG: a table of patterns, `{"wall-*": 1, "chair*": 7, "*": 0}`, '
-        "the first that fits an object's name, its meshes' or its category counts, 0 where none does; true: by kind of "
-        "shape, sky 1, ground 2, wall 3, cuboid 4 … (docs/boxes.md)",
-    ),
-)
-
-
 def categories_of(labels: LabelsConfig) -> Categories:
     """The table that ``labels:`` asks for; that by kinds where it says none."""
-    asked = labels.semantics  # type: ignore[missing-attribute]
+    asked = labels.semantics
     return tuple(asked.items()) if isinstance(asked, dict) and asked else BY_NAME
 
 
@@ -87,14 +58,9 @@ class Semantics(Label):
     """(H, W) uint16 category of the object that is seen; 0: nothing hit, or no pattern fits its name."""
 
     name = "semantics"
-    about = "category of what is seen, by names or a table of patterns, 16-bit PNG"
     unit, kind = "0: nothing, or no category", "ids"
     needs, dtype = ("ids",), np.uint16
     shard = "semantics.png"
-
-    @property
-    def keys(self) -> dict[str, Key]:
-        return {"semantics": SEMANTICS_KEY}
 
     def categories(self, labels: LabelsConfig) -> Categories:
         return categories_of(labels)

@@ -9,16 +9,19 @@ import re
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
+from pydantic import Field
+
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.labels.files import Form
-from blinkgl.labels.label import BUFFERS, KINDS, VARYINGS, Key, Label
+from blinkgl.labels.label import BUFFERS, KINDS, VARYINGS, Label
 
 if TYPE_CHECKING:
     from blinkgl.labels.frames import LabelRequest
 
 LABELS: dict[str, Label] = {}
 """By ``name``, in the order in which they were registered, which is that of everything that lists labels."""
-_KEYS: dict[str, Key] = {}
+_KEYS: set[str] = set()
+"""Keys of ``labels:`` that were added for a label."""
 
 
 def register(label: Label) -> Label:
@@ -26,30 +29,27 @@ def register(label: Label) -> Label:
 
     Raises TypeError naming the label and the part that is missing or of the wrong kind, or that another has its name;
     nothing is then registered."""
-    keys = _checked(label)
-    added: list[str] = []
-    try:
-        for name, key in keys.items():
-            if _KEYS.get(name) is not key:
-                LabelsConfig.add_key(name, key.annotation, key.info, key.before)
-                added.append(name)
-    except TypeError as error:
-        for name in added:
-            LabelsConfig.remove_key(name)
-        raise TypeError(f"label '{label.name}': `keys`: {error}") from None
-    _KEYS.update(keys)
+    _checked(label)
+    if _has_own_key(label) and label.name not in LabelsConfig.model_fields:
+        try:
+            LabelsConfig.add_key(label.name, bool, Field(False, description=label.about))
+        except TypeError as error:
+            raise TypeError(f"label '{label.name}': `name`: {error}") from None
+        _KEYS.add(label.name)
     LABELS[label.name] = label
     return label
 
 
 def unregister(name: str) -> None:
     """Takes the label of this name out again, and the keys that no other has. Raises KeyError where there is none."""
-    gone = LABELS.pop(name)
-    left = {key for label in LABELS.values() for key in label.keys}
-    for key in gone.keys:
-        if key not in left:
-            LabelsConfig.remove_key(key)
-            del _KEYS[key]
+    del LABELS[name]
+    if name in _KEYS:
+        LabelsConfig.remove_key(name)
+        _KEYS.remove(name)
+
+
+def _has_own_key(label: Label) -> bool:
+    return type(label).asked is Label.asked
 
 
 def label_of(name: str) -> Label:
@@ -69,8 +69,8 @@ def asked_for(labels: LabelsConfig) -> LabelRequest:
     return LabelRequest(*asked, intervals_ns=sorted(intervals), categories=categories)
 
 
-def _checked(label: Any) -> dict[str, Key]:
-    """The label's keys. Raises TypeError as :func:`register`."""
+def _checked(label: Any) -> None:
+    """Raises TypeError as :func:`register`."""
     if not isinstance(label, Label):
         raise TypeError(
             f"{label!r} is not a Label"
@@ -91,7 +91,9 @@ def _checked(label: Any) -> dict[str, Key]:
     )
     called = f"'{name}'"
     unless(name not in LABELS, "name", "is taken: there is such a label already")
-    unless(bool(getattr(label, "about", "")), "about", "is missing")
+    if _has_own_key(label):
+        unless(name not in LabelsConfig.settings, "name", "is taken: `labels:` has such a key for something else")
+        unless(name in LabelsConfig.model_fields or bool(label.about), "about", "is missing")
     unless(label.kind in KINDS, "kind", f"is {label.kind!r} and none of {', '.join(KINDS)}")
 
     unless(
@@ -159,10 +161,3 @@ def _checked(label: Any) -> dict[str, Key]:
             "tolerance",
             f"is {tolerance!r} and not a number >= 0",
         )
-    keys = label.keys
-    unless(
-        isinstance(keys, dict) and keys and all(isinstance(key, Key) for key in keys.values()),
-        "keys",
-        f"is {keys!r} and not a table of Keys",
-    )
-    return keys

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class Velocity(Label):
     """(H, W, 2) float32 px/s at the label's time; 0 where nothing is hit."""
 
-    name, about = "velocity", "instantaneous image velocity, px/s, float32 .npy"
+    name = "velocity"
     title, unit, kind = "velocity label", "px/s", "motion"
     shard = "velocity.npy"
     buffer, varyings, channels = "RG32F", ("local", "rate"), 2

@@ -10,10 +10,10 @@ from blinkgl.config.sequence import SequenceConfig, load_run
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.atomic import atomic_file, output_errors
-from blinkgl.io.sequence_dir import MANIFEST
 from blinkgl.layouts.source import Source, sources_of
 from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.exporting import glb
+from blinkgl.sequence_files.sequence_dir import MANIFEST
 
 RATE_HZ, SHAPES_HZ = 120, 30
 """Poses, and shapes that change, are sampled so often, and at the labels' times."""

@@ -21,7 +21,7 @@ import numpy as np
 
 from blinkgl.camera import CameraModel, PinHole
 from blinkgl.camera.rectified import rectify_map
-from blinkgl.io.camchain import Calibrated, cam_to_cam_yaml
+from blinkgl.config.camchain import Calibrated, cam_to_cam_yaml
 from blinkgl.io.dsec import identity_rectify_map, write_rectify_map
 from blinkgl.io.flow_png import encode_png
 from blinkgl.layouts.files import copy, write_bytes, write_lines

@@ -12,20 +12,20 @@ import cv2
 import numpy as np
 
 from blinkgl.camera import CameraModel, PinHole
+from blinkgl.config.camchain import read_camchain
 from blinkgl.config.reader import read_table
 from blinkgl.errors import AssetError
-from blinkgl.events.types import Events
-from blinkgl.io.camchain import read_camchain
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.images import NpzReader, numpy_errors, read_image
 from blinkgl.io.imu import H5 as IMU
-from blinkgl.io.index import made_folders
-from blinkgl.io.lens_files import CAM_TO_CAM
 from blinkgl.io.records import read_text
-from blinkgl.io.rig_dir import read_rig
-from blinkgl.io.sequence_dir import is_rig_folder, read_manifest, verify_sequence
 from blinkgl.labels import LABELS, Form
 from blinkgl.labels.intervals import Flows
+from blinkgl.sequence_files.index import made_folders
+from blinkgl.sequence_files.lens_files import CAM_TO_CAM
+from blinkgl.sequence_files.rig_dir import read_rig
+from blinkgl.sequence_files.sequence_dir import is_rig_folder, read_manifest, verify_sequence
+from blinkgl.types.events import Events
 
 
 @dataclass(frozen=True)

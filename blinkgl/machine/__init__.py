@@ -1,7 +1,7 @@
-"""The machine that BlinkGL runs on.
+"""What every room may ask of the machine that BlinkGL runs on.
 
 In:    nothing.
-Out:   what it can do, what is missing and the command that mends it, how long kernels have compiled.
-Start: doctor.py (``examine``); cpu.py, extras.py, compiling.py, bench.py and interrupts.py answer one question each,
-for every other room.
+Out:   processor, optional parts, how long kernels have compiled, interrupts, how a command line ends.
+Start: command_line.py (``run_app``); cpu.py, extras.py, compiling.py, bench.py, interrupts.py, terminal.py answer one
+question each.
 """

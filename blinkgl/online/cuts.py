@@ -9,11 +9,11 @@ from typing import cast
 import numpy as np
 
 from blinkgl.errors import ConfigError
-from blinkgl.events.types import Events
 from blinkgl.labels.frames import Flow
 from blinkgl.online.job import StreamJob
 from blinkgl.online.samples import StreamSample, WindowSample
 from blinkgl.sequence import Simulation
+from blinkgl.types.events import Events
 
 _LEAST_PX = 0.3  # shorter flow counts as so long where density is asked for
 _CANDIDATES = 6  # places drawn for each sample that is wanted

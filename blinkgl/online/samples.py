@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 
 _COLUMNS = ("x", "y", "t", "p")
 

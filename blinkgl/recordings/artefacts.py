@@ -1,7 +1,7 @@
 """How far two frames are apart for an interpolation: what is measured before recorded frames become events.
 
 Pure functions of frames (H, W) float32 linear light and flows (H, W, 2) px, +x right, +y down; one number each. Which
-numbers are too large is configuration (``frames.qualify``), and was chosen by ``tools/validate_interpolation.py``.
+numbers are too large is configuration (``frames.qualify``), chosen by ``tools/validate_interpolation.py`` of 348eebef.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import median_filter
 
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 
 BIN_US = 250
 AROUND_MS = 5.0

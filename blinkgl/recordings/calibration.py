@@ -19,7 +19,6 @@ from scipy.stats import qmc
 
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.errors import AssetError, ConfigError, EventDataError
-from blinkgl.events.types import Events
 from blinkgl.recordings.clip import (
     Clip,
     clip_of_frames,
@@ -31,6 +30,7 @@ from blinkgl.recordings.clip import (
 from blinkgl.recordings.simulation import INTERPOLATIONS, emulator_config
 from blinkgl.recordings.statistics import Sums, Target, interval_distance, sums, target
 from blinkgl.recordings.stimulus import Stimulus
+from blinkgl.types.events import Events
 
 LEAST_EVENTS = 2000
 TRIED = 64

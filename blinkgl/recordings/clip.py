@@ -17,13 +17,13 @@ from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.sensor import ReadoutConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
-from blinkgl.events.types import Events
 from blinkgl.io.formats import open_events
 from blinkgl.io.frames import RECORDING, open_frames
 from blinkgl.recordings.bursts import frame_bursts, inside_any
 from blinkgl.recordings.comparison import BLUR_PX, LOG_OFFSET
 from blinkgl.recordings.simulation import Decoder
 from blinkgl.timeline.interpolate import Displacement, motion
+from blinkgl.types.events import Events
 
 TILE_PX = 32
 MOST_PIXEL_STEPS = 3_000_000

@@ -17,9 +17,9 @@ import numba
 import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
-from blinkgl.events.types import Events
 from blinkgl.io.formats import ENDINGS, EventFile, open_events
 from blinkgl.io.images import NpzReader, npy_header, numpy_errors
+from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
     from blinkgl.recordings.judge import Judgement

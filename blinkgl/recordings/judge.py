@@ -11,7 +11,7 @@ import numba
 import numpy as np
 
 from blinkgl.errors import EventDataError
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 
 SIDE_PX = 16
 WINDOWS = 16

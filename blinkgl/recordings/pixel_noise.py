@@ -22,8 +22,8 @@ from scipy.stats import binom, ks_2samp, poisson
 from blinkgl.config.readout import PixelsConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events.pixels import PixelNoise
-from blinkgl.events.types import Events
 from blinkgl.recordings.clip import read_recording
+from blinkgl.types.events import Events
 
 LEAST_EVENTS = 500
 """Of a half: fewer say nothing of a spread over pixels."""

@@ -27,10 +27,10 @@ from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import ConfigError, EventDataError, OutputError
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
-from blinkgl.events.types import Events, count_causes, named_causes
 from blinkgl.io.frames import open_frames
 from blinkgl.srgb import linear_from_srgb
 from blinkgl.timeline import interpolate as between
+from blinkgl.types.events import Events, count_causes, named_causes
 
 INTERPOLATIONS = ("linear", "cubic", "motion")
 _LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
@@ -247,7 +247,7 @@ def file_to_events(
     """
     from blinkgl.io.atomic import atomic_file
     from blinkgl.io.formats import WITH_CAUSES, event_writer, output_format
-    from blinkgl.io.preview import PreviewWriter
+    from blinkgl.sequence_files.preview import PreviewWriter
 
     kind = output_format(target)
     if getattr(emulator_config(options.get("emulator", EmulatorConfig.members.default)), "causes", False):

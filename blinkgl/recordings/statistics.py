@@ -13,10 +13,10 @@ import cv2
 import numba
 import numpy as np
 
-from blinkgl.events.types import Events
 from blinkgl.recordings.bursts import inside_any
 from blinkgl.recordings.clip import TILE_PX, Clip
 from blinkgl.recordings.comparison import BLUR_PX
+from blinkgl.types.events import Events
 
 GROUPS = 16
 """Of tiles of pixels, for the jackknife."""

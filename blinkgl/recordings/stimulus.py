@@ -13,9 +13,9 @@ import numpy as np
 from scipy.special import ndtr
 
 from blinkgl.errors import EventDataError
-from blinkgl.events.types import Events
 from blinkgl.recordings.clip import MOST_PIXEL_STEPS, STILL, Clip, Tiles
 from blinkgl.recordings.comparison import LOG_OFFSET
+from blinkgl.types.events import Events
 
 MIDDLE = 0.4
 """Luminance between the darkest and the brightest."""

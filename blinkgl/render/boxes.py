@@ -1,4 +1,4 @@
-"""Boxes of objects (:class:`blinkgl.labels.boxes.Boxes`) from their vertices in float64 and a picture of ids.
+"""Boxes of objects (:class:`blinkgl.types.boxes.Boxes`) from their vertices in float64 and a picture of ids.
 
 What of an object is before the near plane is cut there, and its corners are projected: of a pin-hole camera the box of
 those is that of the whole, since a triangle's picture is a triangle. Through a lens its edges bend, by less than the
@@ -11,11 +11,11 @@ import numba as nb
 import numpy as np
 
 from blinkgl.camera import CameraModel
-from blinkgl.labels.boxes import Boxes, empty
 from blinkgl.labels.semantics import Categories, category_of, class_of
 from blinkgl.render.matrices import cam_from_obj
 from blinkgl.render.reference import vertices_at
 from blinkgl.scene.types import Scene, SceneObject
+from blinkgl.types.boxes import Boxes, no_boxes
 
 
 def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -> Boxes:
@@ -67,7 +67,7 @@ def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -
                 "truncated": 1.0 - float(np.prod(inside[1] - inside[0]) / area) if area > 0 else 0.0,
             }
         )
-    made = empty()
+    made = no_boxes()
     if rows:
         made = {
             name: np.array([row[name] for row in rows], None if none.dtype.kind == "U" else none.dtype)

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from blinkgl.labels import LABELS, Label, LabelFrame, LabelRequest
+from blinkgl.labels import LABELS, Flow, Label, LabelFrame, LabelRequest
 from blinkgl.machine.compiling import working_clock
+from blinkgl.render.boxes import boxes_of
 from blinkgl.render.moment import Moment, View
+from blinkgl.render.occlusion import flow_and_reach, occlusion_mask
 from blinkgl.render.passes import Geometry
 
 if TYPE_CHECKING:
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     from blinkgl.render.canvas import Frame
     from blinkgl.render.renderer import Renderer
     from blinkgl.scene.types import Scene
+    from blinkgl.types.boxes import Boxes
 
 KEPT = 3
 """Times whose buffers are kept for others: neighbouring labels look at the same moments."""
@@ -136,6 +139,18 @@ class _Drawn:
 
     def there(self, name: str) -> np.ndarray:
         return self._allowed(self._there, name, self._label.there, "there")
+
+    def flow(self, name: str) -> Flow:
+        return Flow(*flow_and_reach(self.raw(name)))
+
+    def occlusion(self, flow: str) -> np.ndarray:
+        assert self.end_ns is not None
+        value, z_there = self.value(flow), self.raw(flow)[..., 2]
+        there = self.there("depth"), self.there("ids")
+        return occlusion_mask(self.scene, self.end_ns, value.flow, z_there, value.valid, self.raw("ids"), *there)
+
+    def boxes(self) -> Boxes:
+        return boxes_of(self.scene, self.t_ns, self.raw("ids"), self.categories)
 
     def _allowed(self, buffers: dict[str, np.ndarray], name: str, known: tuple[str, ...], part: str) -> np.ndarray:
         if name not in known or name not in buffers:

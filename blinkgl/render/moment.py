@@ -9,14 +9,13 @@ Computed once, shared by all passes.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from blinkgl.camera.drawing import seen_through
 from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate, inverse_depth_bits
-from blinkgl.render.umbras import Solids
 
 if TYPE_CHECKING:
     from blinkgl.camera import CameraModel
@@ -69,10 +68,7 @@ class Moment:
     """All objects of a scene at t_ns. What nobody asks for is not computed; what somebody did is not computed again.
 
     T_world_cam : (4, 4) float64.   T_world_obj, T_cam_obj : (n, 4, 4) float64, a row per object of the scene.
-    view : :class:`View` of the camera.   Arrays per item have a row per part that is drawn, ``DrawItem.number``.
-    looker : of a lamp's: whose picture its shadows are for; those that are not seen there need not be drawn."""
-
-    looker: Moment | None = None
+    view : :class:`View` of the camera.   Arrays per item have a row per part that is drawn, ``DrawItem.number``."""
 
     def __init__(self, t_ns: int, view: View, T_world_cam: np.ndarray, T_world_obj: np.ndarray, stage: Stage):
         self.t_ns, self.view, self.T_world_cam, self.T_world_obj, self._stage = (
@@ -82,18 +78,6 @@ class Moment:
             T_world_obj,
             stage,
         )
-
-    @property
-    def stage(self) -> Stage:
-        """What of the scene is the same at all times."""
-        return self._stage
-
-    def once(self, key: Hashable, compute: Callable[[], Any]) -> Any:
-        """What ``compute`` gives, by a key of the caller's, computed when first asked for."""
-        kept = self.__dict__.setdefault("_others", {})
-        if key not in kept:
-            kept[key] = compute()
-        return kept[key]
 
     def through(self, view: View) -> Moment:
         """The same instant through another camera at the same place."""
@@ -177,11 +161,6 @@ class Stage:
         self.item_centre = np.array([i.centre for i in items]).reshape(-1, 3)
         self.item_radius = np.array([i.radius for i in items])
         self.item_layer = np.array([i.layer for i in items])
-
-    @_once
-    def solids(self) -> Solids:
-        """Boxes of the items, for shadows."""
-        return Solids(self.items)
 
 
 class Bodies:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +19,6 @@ if TYPE_CHECKING:
     from blinkgl.render.lens import Lens
     from blinkgl.render.moment import Moment
     from blinkgl.render.passes.base import Pass, Shot
-    from blinkgl.render.rectangles import Rectangle
     from blinkgl.render.resources import DrawItem, Kind, SceneResources
     from blinkgl.scene.types import Map, Scene
 
@@ -91,20 +87,6 @@ class Painter:
         ctx.front_face = "cw"  # counter-clockwise meshes in an image whose y points down
         ctx.cull_face = "back"
         self._culling = False
-
-    @contextmanager
-    def only(self, place: Rectangle, shot: Shot) -> Iterator[None]:
-        """Draws into a rectangle of the picture, px, alone, of what may be drawn into."""
-        ctx, camera, (width, height) = self.gl.ctx, shot.moment.view.camera, shot.size
-        across, down = width / camera.width, height / camera.height
-        x, y, w, h = before = ctx.scissor or (0, 0, width, height)
-        x0, y0 = max(x, math.floor(place.x0 * across)), max(y, math.floor(place.y0 * down))
-        x1, y1 = min(x + w, math.ceil(place.x1 * across)), min(y + h, math.ceil(place.y1 * down))
-        ctx.scissor = (x0, y0, max(x1 - x0, 0), max(y1 - y0, 0))
-        try:
-            yield
-        finally:
-            ctx.scissor = None if before == (0, 0, width, height) else before
 
     def programs(self, pass_: Pass) -> Programs:
         programs = self._programs.get(pass_)

@@ -147,6 +147,12 @@ class ReferenceFrame:
         flat = {name: (a := getattr(self, name)).reshape(self.hit.size, *a.shape[2:]) for name in _HIT_IMAGES}
         return Hits(t_ns=self.t_ns, **flat)
 
+    def scene_flow(self, scene: Scene) -> np.ndarray:
+        """(H, W, 3) world units, as :func:`moved_in_space` to the forward flow's time; 0 where nothing is hit."""
+        assert self.forward is not None
+        moved = moved_in_space(scene, self.hits(), self.forward.t_ns).reshape(*self.hit.shape, 3)
+        return np.where(self.hit[..., None], moved, 0.0)
+
 
 def scene_parts(scene: Scene) -> list[tuple[SceneObject, Part]]:
     """Every part with its object, in the order that part indices count."""

@@ -43,7 +43,6 @@ from blinkgl.render.passes import (
 )
 from blinkgl.render.resources import DrawItem, SceneResources
 from blinkgl.render.still import StillCanvas
-from blinkgl.scene.geometry.lod import at_level_of_detail
 from blinkgl.scene.geometry.meshes import without_collapsed_faces
 
 if TYPE_CHECKING:
@@ -60,9 +59,8 @@ class Renderer:
     without triangles that are lines in float32.   width, height : of the image, px.   stats : RenderStats.
     whole : frames are always drawn whole; otherwise a camera that stands still has only what
     moves drawn again, to the same pixels.
-    beside : of the same scene seen by another sensor: meshes, textures, poses and (where they hold all whose shadows
-    both see) shadow maps are then its own, but where levels of detail are asked for, which hang on the camera. It has
-    to be released last.
+    beside : of the same scene seen by another sensor: its meshes, textures, poses and shadow maps serve this one, too.
+    It has to be released last.
     painter : class that issues the draw calls; a subclass may look on."""
 
     def __init__(
@@ -76,10 +74,10 @@ class Renderer:
         painter: type[Painter] = Painter,
     ):
         gl.resume()
-        if beside is not None and not config.lod.enabled:
+        if beside is not None:
             scene = replace(beside.scene, rig=scene.rig)
         else:
-            scene, beside = without_collapsed_faces(at_level_of_detail(scene, config.lod)), None
+            scene = without_collapsed_faces(scene)
         self.gl, self.scene, self.config, self.stats = gl, scene, config, RenderStats()
         self.width, self.height = scene.camera.width, scene.camera.height
         self._samples = samples_of(config.antialiasing)

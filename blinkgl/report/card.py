@@ -15,11 +15,11 @@ import numpy as np
 from blinkgl.config.reader import to_yaml
 from blinkgl.errors import AssetError
 from blinkgl.io.atomic import atomic_file, output_errors
-from blinkgl.io.index import INDEX, write_index
-from blinkgl.io.sequence_dir import read_manifest
 from blinkgl.labels import LABELS
 from blinkgl.report.charts import number, size
 from blinkgl.report.collect import Collected, collect
+from blinkgl.sequence_files.index import INDEX, write_index
+from blinkgl.sequence_files.sequence_dir import read_manifest
 
 CARD, CROISSANT = "README.md", "croissant.json"
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))

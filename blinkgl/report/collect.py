@@ -20,11 +20,11 @@ from blinkgl.io.flow_png import read_flow_png
 from blinkgl.io.frame_camera import EXPOSURES, picture_file, read_codes, read_exposures
 from blinkgl.io.images import read_image
 from blinkgl.io.imu import H5 as IMU_H5, read_imu
-from blinkgl.io.index import entry, sequence_folders
 from blinkgl.io.records import shown
-from blinkgl.io.sequence_dir import read_manifest, verify_sequence
 from blinkgl.io.tracks import TRACKS, read_tracks
 from blinkgl.labels import LABELS
+from blinkgl.sequence_files.index import entry, sequence_folders
+from blinkgl.sequence_files.sequence_dir import read_manifest, verify_sequence
 
 SAMPLED_SEQUENCES, LABELS_EACH, PIXEL_STEP = 150, 3, 8
 MAX_CONFIGS = 5000

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 
 from blinkgl.io.atomic import atomic_file, output_errors
-from blinkgl.io.index import write_index
 from blinkgl.report.charts import histogram, number, size
 from blinkgl.report.collect import Collected, Example, Parameter, collect, task_of
 from blinkgl.report.markup import png, render
+from blinkgl.sequence_files.index import write_index
 
 _MAX_PICTURE_PX = 360
 _MAX_LISTED = 50

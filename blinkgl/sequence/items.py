@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from blinkgl.events.types import Events
 from blinkgl.imaging import CameraImage
 from blinkgl.labels import LabelFrame
+from blinkgl.types.events import Events
 
 
 @dataclass(frozen=True, eq=False)

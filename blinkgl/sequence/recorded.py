@@ -13,7 +13,6 @@ import numpy as np
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.events.camera import EventCamera
-from blinkgl.events.types import Events
 from blinkgl.labels import Flow, LabelFrame, asked_for
 from blinkgl.recordings.simulation import Decoder, stepped, timed
 from blinkgl.rng import Role, kernel_seed
@@ -22,6 +21,7 @@ from blinkgl.sequence.folders import flow_files, folder_of, read_flow_of, read_f
 from blinkgl.sequence.items import GroundTruth, Picture
 from blinkgl.sequence.qualify import verdict
 from blinkgl.sequence.simulate import Simulation
+from blinkgl.types.events import Events
 
 RECORDED = ("images", "flow_forward", "occlusion_forward")
 """Labels that recorded frames may bring."""

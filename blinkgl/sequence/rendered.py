@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from blinkgl.errors import EventDataError
 from blinkgl.events import emulator_of
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.truth import Surfaces, SurfaceTruth
-from blinkgl.events.types import Events
 from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging import FrameCamera
 from blinkgl.labels import LABELS, Label, LabelRequest, asked_for
@@ -37,9 +36,7 @@ from blinkgl.sequence.inertial import Inertial, measured
 from blinkgl.sequence.items import GroundTruth, Item, Picture
 from blinkgl.sequence.simulate import Simulation
 from blinkgl.timeline import Timeline, make_timeline
-
-if TYPE_CHECKING:
-    from blinkgl.sequence.helper import Hand
+from blinkgl.types.events import Events
 
 SURFACES = LabelRequest("ids", "depth", "velocity")
 """Labels that say what made an event."""
@@ -106,8 +103,7 @@ class RenderedSequence(Simulation):
 
     scene : as it was built.   renderer : what draws it, at its level of detail.
     sensor : what is recorded, and through which camera. A scene that was made already is
-    recorded as the configuration says.   number : of the sensor on its rig, by which noise differs.
-    hand : see :func:`~blinkgl.sequence.simulate.simulate_sequence`."""
+    recorded as the configuration says.   number : of the sensor on its rig, by which noise differs."""
 
     def __init__(
         self,
@@ -123,9 +119,8 @@ class RenderedSequence(Simulation):
         renderer: Renderer | None,
         window_ns: tuple[int, int] | None,
         number: int = 0,
-        hand: Hand | None = None,
     ):
-        self.number, self._hand = number, hand
+        self.number = number
         clock = StageClock()
         scene = scene or (renderer.scene if renderer is not None else None)
         if scene is None:
@@ -187,11 +182,7 @@ class RenderedSequence(Simulation):
     def _frames(self) -> Iterator[EventFrame]:
         """Of the event pass."""
         rates, tells = self.camera.emulator.needs_rate, self.camera.tells
-        device = self.camera.tensor_device
-        if self._hand is None or device is not None or self.timeline.looks_at_frames:
-            return drawn(self.renderer, self.timeline, rates, tells, device)
-        shown = partial(surfaces_at, self.renderer) if tells else None
-        return self._hand.drawn(self.renderer, self.number, self.timeline, rates, shown)
+        return drawn(self.renderer, self.timeline, rates, tells, self.camera.tensor_device)
 
     def _in_order(self) -> Iterator[Item]:
         yield from super()._in_order()
@@ -246,8 +237,7 @@ class RenderedSequence(Simulation):
     def seconds(self) -> dict[str, float]:
         stats, (render_s, readback_s) = self.renderer.stats, self._before
         images = {} if self.frame_camera is None else {"images": self.frame_camera.seconds}
-        waited_s = 0.0 if self._hand is None else self._hand.waited_s.get(self.number, 0.0)
-        drawing = {"render": stats.render_s - render_s + waited_s, "read-back": stats.readback_s - readback_s}
+        drawing = {"render": stats.render_s - render_s, "read-back": stats.readback_s - readback_s}
         return {**self.clock.seconds, **images, **drawing}
 
     def poses(self) -> dict[str, np.ndarray]:

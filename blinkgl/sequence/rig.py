@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.gl import GLContext, create_context
@@ -28,9 +28,6 @@ from blinkgl.sequence.items import Item
 from blinkgl.sequence.rendered import RenderedSequence
 from blinkgl.timeline import together
 
-if TYPE_CHECKING:
-    from blinkgl.sequence.helper import Hand
-
 
 def simulate_rig(
     config: SequenceConfig,
@@ -40,11 +37,10 @@ def simulate_rig(
     base: Path = Path("."),
     pictures_hz: float | None = None,
     scene: Scene | None = None,
-    hand: Hand | None = None,
 ) -> RigSequence:
     """Sequence ``index`` of a run whose configuration has ``sensors``; arguments as of
     :func:`~blinkgl.sequence.simulate.simulate_sequence`. Raises BlinkGLError."""
-    return RigSequence(config, index, gl, base=base, pictures_hz=pictures_hz, scene=scene, hand=hand)
+    return RigSequence(config, index, gl, base=base, pictures_hz=pictures_hz, scene=scene)
 
 
 class RigSequence:
@@ -63,7 +59,6 @@ class RigSequence:
         base: Path,
         pictures_hz: float | None,
         scene: Scene | None = None,
-        hand: Hand | None = None,
     ):
         self.config, self.index, self.clock, self.pictures_hz = config, index, StageClock(), pictures_hz
         with self.clock("scene"):
@@ -92,7 +87,6 @@ class RigSequence:
                         renderer=renderers[-1],
                         window_ns=None,
                         number=k,
-                        hand=hand,
                     )
                 )
             timed = [member for member in self.members if member.timeline is not None]

@@ -20,7 +20,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +28,6 @@ from blinkgl.camera import CameraModel
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.events.camera import EventCamera
-from blinkgl.events.types import Events, count_causes, named_causes
 from blinkgl.gl import GLContext
 from blinkgl.imaging import FrameCamera
 from blinkgl.render.renderer import Renderer
@@ -38,9 +37,7 @@ from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.inertial import Inertial
 from blinkgl.sequence.items import CameraImage, EventChunk, GroundTruth, Item, Picture
 from blinkgl.timeline import Ticks, Timeline
-
-if TYPE_CHECKING:
-    from blinkgl.sequence.helper import Hand
+from blinkgl.types.events import Events, count_causes, named_causes
 
 
 def simulate_sequence(
@@ -55,7 +52,6 @@ def simulate_sequence(
     scene: Scene | None = None,
     renderer: Renderer | None = None,
     window_ns: tuple[int, int] | None = None,
-    hand: Hand | None = None,
 ) -> Simulation:
     """Sequence ``index`` of a run, ready to be iterated over: :class:`EventChunk`, :class:`GroundTruth`,
     :class:`CameraImage` and :class:`Picture` in time order.
@@ -69,7 +65,6 @@ def simulate_sequence(
     released at the end; its scene is drawn.
     window_ns : first and last time, ns, instead of all of the sequence. (These three: of
     what is drawn, not of recorded frames.)
-    hand : of another process, which draws frames of this sequence, too (:mod:`blinkgl.sequence.helper`).
     Raises BlinkGLError for anything the user or the machine caused, here or while iterating."""
     if pictures_hz is not None and not events:
         raise ConfigError(
@@ -99,14 +94,13 @@ def simulate_sequence(
             scene=scene,
             renderer=renderer,
             window_ns=window_ns,
-            hand=hand,
             **wanted,
         )
-    if scene is not None or renderer is not None or window_ns is not None or hand is not None:
+    if scene is not None or renderer is not None or window_ns is not None:
         raise ConfigError(
             "nothing is drawn of recorded frames",
             where="frames",
-            accepted="no scene, renderer, window_ns or hand",
+            accepted="no scene, renderer or window_ns",
         )
     return RecordedSequence(config, index, base=base, **wanted)
 

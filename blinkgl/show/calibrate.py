@@ -13,13 +13,13 @@ from rich.table import Table
 from blinkgl.config.reader import to_short_yaml
 from blinkgl.errors import ConfigError, OutputError
 from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.machine.terminal import plain_column, plain_console, say
 from blinkgl.recordings.calibration import calibrate
 from blinkgl.recordings.pixel_noise import fit_pixels
 from blinkgl.recordings.stimulus import WIDEST_PX, Edge, Flicker, Stimulus
 from blinkgl.report import pixel_noise
 from blinkgl.report.calibration import page, parameters, rows
 from blinkgl.show.simulate import emulator_options
-from blinkgl.show.terminal import plain_column, plain_console, say
 
 PIXELS = "pixels"
 """In the place of an emulator's name: the noise of single pixels, which stands beside any emulator."""

@@ -10,8 +10,8 @@ from typing import Any
 from rich.table import Table
 
 from blinkgl.io.atomic import atomic_file
+from blinkgl.machine.terminal import plain_console, say
 from blinkgl.recordings.comparison import BLUR_PX, compare, plot
-from blinkgl.show.terminal import plain_console, say
 
 
 def run(a: str, b: str | None, out: str | None = None, **options: Any) -> int:

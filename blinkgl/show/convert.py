@@ -6,7 +6,7 @@ from typing import Any
 
 from blinkgl.errors import ConfigError
 from blinkgl.io.formats import WITH_CAUSES, convert, output_format
-from blinkgl.show.terminal import plain_console, say
+from blinkgl.machine.terminal import plain_console, say
 
 
 def run(source: str, target: str, *, size: str | None = None, **options: Any) -> int:

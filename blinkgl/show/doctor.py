@@ -6,8 +6,8 @@ from rich.table import Table
 from rich.text import Text
 
 from blinkgl.errors import BlinkGLError
-from blinkgl.machine.doctor import Report, examine
-from blinkgl.show.terminal import plain_console, say
+from blinkgl.machine.terminal import plain_console, say
+from blinkgl.show.checks import Report, examine
 
 _MARKS = {"ok": ("ok", "green"), "missing": ("MISSING", "bold red"), "absent": ("absent", "yellow"), "info": ("", "")}
 

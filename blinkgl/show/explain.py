@@ -9,7 +9,7 @@ from rich.table import Table
 
 from blinkgl.config.sequence import load_run
 from blinkgl.dataset.explain import Explanation, explain
-from blinkgl.show.terminal import plain_console, say
+from blinkgl.machine.terminal import plain_console, say
 
 
 def run(config: str, *, sequence: int | None = None, seed: int | None = None, overrides: Sequence[str] = ()) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from blinkgl.dataset.shards import export_shards
 from blinkgl.errors import ConfigError
 from blinkgl.layouts import export_layout, layout_of
-from blinkgl.show.terminal import plain_console, say
+from blinkgl.machine.terminal import plain_console, say
 
 SHARDS = "webdataset"
 

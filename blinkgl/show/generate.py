@@ -18,7 +18,7 @@ from blinkgl.dataset.report import STAGES, SequenceReport, Totals
 from blinkgl.dataset.run import Outcome, run_dataset
 from blinkgl.dataset.work import Message, report_of
 from blinkgl.machine.compiling import compiling_line
-from blinkgl.show.terminal import causes_line, plain_column, plain_console, say
+from blinkgl.machine.terminal import causes_line, plain_column, plain_console, say
 
 MAX_NOTES = 20
 """Files of which it is said what is not drawn; beyond, that there are more."""

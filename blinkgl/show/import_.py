@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from blinkgl.config.reader import to_short_yaml
-from blinkgl.show.terminal import plain_column, plain_console, say
+from blinkgl.machine.terminal import plain_column, plain_console, say
 
 _SHAPES = ("meshes", "curves, texts, metaballs", "instances", "collection instances")
 _LONGER_SIDE = 640  # px: an event camera's, not a film's

@@ -17,9 +17,9 @@ from blinkgl.config.frames import FramesConfig
 from blinkgl.config.recipe import all_groups
 from blinkgl.config.sequence import RunTemplate, apply_overrides, load_run
 from blinkgl.errors import AssetError, ConfigError, EventDataError
+from blinkgl.machine.terminal import plain_console, say
 from blinkgl.sequence.folders import folder_of
 from blinkgl.sequence.qualify import Verdict, shown, verdict
-from blinkgl.show.terminal import plain_console, say
 
 UNFIT = 1
 """Exit status when a folder does not qualify."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from blinkgl.errors import ConfigError
+from blinkgl.machine.terminal import plain_console, say
 from blinkgl.report import write_report
 from blinkgl.report.card import write_card
-from blinkgl.show.terminal import plain_console, say
 
 
 def run(

@@ -12,7 +12,7 @@ from blinkgl.config.draw import middle
 from blinkgl.config.reader import parse_yaml, read_table
 from blinkgl.config.recipes import with_recipes
 from blinkgl.errors import ConfigError
-from blinkgl.show.terminal import causes_line, plain_column, plain_console, say
+from blinkgl.machine.terminal import causes_line, plain_column, plain_console, say
 
 
 def emulator_options(

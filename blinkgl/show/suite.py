@@ -10,7 +10,7 @@ from rich.table import Table
 
 from blinkgl.errors import ConfigError
 from blinkgl.io.atomic import atomic_file, output_errors
-from blinkgl.show.terminal import plain_console, say
+from blinkgl.machine.terminal import plain_console, say
 from blinkgl.show.trade import check_cost
 from blinkgl.trade.fronts import fronts
 from blinkgl.trade.pareto import excess

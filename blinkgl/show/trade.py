@@ -10,7 +10,7 @@ from rich.table import Table
 
 from blinkgl.config.sequence import load_run
 from blinkgl.errors import ConfigError
-from blinkgl.show.terminal import plain_console, say
+from blinkgl.machine.terminal import plain_console, say
 from blinkgl.trade.measure import QUICK, TRACED_LEVELS, Options
 from blinkgl.trade.run import convergence_line, trade, write
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from blinkgl.dataset.verify import Verification, verify_dataset
 from blinkgl.errors import BlinkGLError
 from blinkgl.io.records import shown
-from blinkgl.show.terminal import plain_console, say
+from blinkgl.machine.terminal import plain_console, say
 
 _MOST_LINES = 20
 

@@ -22,8 +22,8 @@ from blinkgl.errors import EventDataError
 from blinkgl.events.arith import LOG_MAX_INPUT
 from blinkgl.events.emulator import INTENSITY_LIMIT_BITS, MAX_SIDE
 from blinkgl.events.packing import MAX_INTERVAL_NS
-from blinkgl.events.types import Events
 from blinkgl.tensors.philox import words_of
+from blinkgl.types.events import Events
 
 _RADIX_BITS = 16
 _CHUNK = {"cpu": 2**18}
@@ -37,7 +37,7 @@ class TensorEvents:
 
     env, x, y : (N,) int32, environment, pixel column, pixel row.
     t : (N,) int64 microseconds.   p : (N,) uint8, 1 brighter (ON), 0 darker (OFF).
-    cause : (N,) uint8 of :class:`~blinkgl.events.types.Cause`, or None without ``config.causes``.
+    cause : (N,) uint8 of :class:`~blinkgl.types.events.Cause`, or None without ``config.causes``.
     starts : (environments + 1,) int64, where each environment's events begin, and the end.
     shape : (environments, H, W)."""
 

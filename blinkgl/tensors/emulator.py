@@ -15,11 +15,11 @@ from torch import Tensor
 from blinkgl.errors import EventDataError
 from blinkgl.events.emulator import Emulator
 from blinkgl.events.esim import Esim
-from blinkgl.events.types import Events
 from blinkgl.events.v2e import V2e
 from blinkgl.tensors.batch import Batch
 from blinkgl.tensors.esim import TensorEsim
 from blinkgl.tensors.v2e import TensorV2e
+from blinkgl.types.events import Events
 
 DEVICE = "cuda"
 """What ``events.device: cuda`` means to torch; tests, which have no card, say "cpu"."""

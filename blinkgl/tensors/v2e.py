@@ -83,12 +83,12 @@ class TensorV2e(Batch):
     """V2E of ``envs`` environments of one size and configuration on ``device``; used as :class:`TensorEsim`.
 
     Environment k makes the events of ``blinkgl.V2e`` with the seed ``seed + k`` (modulo 2^64), bit for bit and in their
-    order, its noise included, with three limits: ``compat: authors`` is refused, ``max_events_per_step`` cuts nothing,
+    order, its noise included, with two limits: ``max_events_per_step`` cuts nothing,
     and the first frame of an environment goes through the host (0.1 to 1 s at 640x480). A step synchronises with the
     host once for the checks, once a wave of events, and, with shot noise, once for each candidate of the busiest block
     of 1024 pixels.
 
-    Raises EventDataError: a size that does not fit, ``compat: authors``.   Source: Hu, Liu, Delbruck, CVPRW 2021."""
+    Raises EventDataError: a size that does not fit.   Source: Hu, Liu, Delbruck, CVPRW 2021."""
 
     # Of the state and the constants, those that are named below; see V2e and its Pixels.
     _intensity: Tensor
@@ -115,8 +115,6 @@ class TensorV2e(Batch):
     ):
         super().__init__(height, width, envs, device, seed)
         self.config = config = config or V2eConfig()
-        if config.compat != "none":
-            raise EventDataError("not made on tensors", where="compat", value=config.compat, accepted="none")
         if config.causes and height > MAX_CAUSE_ROWS:
             raise EventDataError("too many rows", where="causes", value=height, accepted=f"at most {MAX_CAUSE_ROWS}")
         self._has = Parts(

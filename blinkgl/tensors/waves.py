@@ -17,9 +17,9 @@ from torch import Tensor
 
 from blinkgl.events.packing import CAUSE_SHIFT
 from blinkgl.events.philox import Stream
-from blinkgl.events.types import Cause
 from blinkgl.tensors.arith import fall_f64
 from blinkgl.tensors.philox import rough_normal
+from blinkgl.types.events import Cause
 
 _TURNS = 60  # of the root finder, as in the kernel
 Rows = dict[str, Tensor]

@@ -43,23 +43,20 @@ def bounded_times(
     t0_ns: int,
     t1_ns: int,
     stops_ns: Sequence[int] = (),
-    after_ns: int | None = None,
 ) -> Iterator[int]:
     """Steps so short that ``pace * step <= 1`` at both ends of each step, within [min_step, max_step].
 
     pace : t_ns -> how many steps per second the scene asks for at that time.
     stops_ns : increasing times that no step goes over, such as those of impacts: what turns round inside a step is at
         neither of its ends. One that comes less than min_step after another, or before t1, is left out.
-    after_ns : only the times after this one, which is one of them.
     The step is proposed from the pace at its start (as in Rebecq et al. 2018, section 3.2) and then checked against
     the pace at its end, which the original does not do: something that accelerates inside the step would exceed the
     bound. A rejected step is shortened and tried again; the pace at an accepted end is the next step's start, so a
     pace is asked for once per frame as long as nothing is rejected. The last step ends at t1 exactly, and steps
     before it may be shorter than min_step only there, and before a stop.
     """
-    if after_ns is None:
-        yield t0_ns
-    t = t0_ns if after_ns is None else after_ns
+    yield t0_ns
+    t = t0_ns
     v = pace(t)
     ends = deque(_apart(stops_ns, min_step_ns, t0_ns, t1_ns))
     while t < t1_ns:

@@ -37,8 +37,6 @@ class Timeline:
 
     looks_at_frames = False
     """Whether :meth:`observe` looks at what it is given: frames may stay on the card where not."""
-    repeats = True
-    """Whether its times are the same for everybody who draws the scene, so that another process may decide them."""
 
     def __init__(
         self,
@@ -59,13 +57,9 @@ class Timeline:
         """Of other cameras, whose pace is kept, too (:mod:`blinkgl.timeline.together`)."""
 
     def __iter__(self) -> Iterator[int]:
-        return self.after(None)
-
-    def after(self, t_ns: int | None) -> Iterator[int]:
-        """The times after t_ns, which is one of them; None: all."""
         c = self.config
         least, most = round(c.min_step_us * 1000), round(c.max_step_us * 1000)
-        return bounded_times(self._counted, least, most, self.t0_ns, self.t1_ns, self.stops_ns, t_ns)
+        return bounded_times(self._counted, least, most, self.t0_ns, self.t1_ns, self.stops_ns)
 
     def pace(self, t_ns: int) -> float:
         """Steps per second that the scene asks for at one time."""
@@ -86,8 +80,8 @@ class Timeline:
 class Uniform(Timeline):
     """``fps`` frames a second, whatever happens."""
 
-    def after(self, t_ns: int | None) -> Iterator[int]:
-        return (t for t in uniform_times(self.config.fps, self.t0_ns, self.t1_ns) if t_ns is None or t > t_ns)
+    def __iter__(self) -> Iterator[int]:
+        return uniform_times(self.config.fps, self.t0_ns, self.t1_ns)
 
 
 class Displacement(Timeline):
@@ -113,7 +107,6 @@ class Budget(Timeline):
     """The step whose estimated error is what was asked for: :mod:`blinkgl.timeline.budget`."""
 
     looks_at_frames = True
-    repeats = False
 
     def __init__(self, config: TimelineConfig, *others: Any):
         super().__init__(config, *others)

@@ -15,8 +15,6 @@ class Shared(Timeline):
     """One of several timelines, with the times of all: it observes its own camera's frames and says what was achieved
     there."""
 
-    repeats = False
-
     def __init__(self, own: Timeline, times: Iterator[int]):
         self.own, self._times = own, times
         super().__init__(own.config, own.t0_ns, own.t1_ns, own.pictures, own.response, own.stops_ns)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 
 _MISSED, _EXTRA, _MATCH = np.uint8(0), np.uint8(1), np.uint8(2)
 _JIT = dict(cache=True, nogil=True)

@@ -10,8 +10,8 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from blinkgl.events.grids import masked, voxel_grid
-from blinkgl.events.types import Events
 from blinkgl.trade.matching import match_events
+from blinkgl.types.events import Events
 
 BINS = 15
 """Of a clip's voxel grid."""

@@ -20,13 +20,13 @@ from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.grids import masked
-from blinkgl.events.types import Events
 from blinkgl.gl import GLContext
 from blinkgl.render.cutouts import Cutouts
 from blinkgl.render.rectangles import Rectangle
 from blinkgl.scene.types import Scene
 from blinkgl.timeline.sampling import displacement_times
 from blinkgl.timeline.speed import largest_speed
+from blinkgl.types.events import Events
 
 SAMPLES = RenderConfig(antialiasing="edges", mip_bias=-1.0)
 """How the samples are drawn."""

@@ -44,8 +44,6 @@ OTHERS = {
     "": (),
     "mip bias -0.5": ("render.mip_bias=-0.5",),
     "mip bias -1": ("render.mip_bias=-1",),
-    "lod": ("render.lod.enabled=true",),
-    "lod 0.25 px": ("render.lod={enabled: true, error_px: 0.25}",),
     "anisotropy 4": ("render.anisotropy=4",),
     "textures 256 px": ("scene.textures.max_size=256",),
     "textures 128 px": ("scene.textures.max_size=128",),

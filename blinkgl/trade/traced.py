@@ -1,6 +1,6 @@
 """A path tracer in the reference's place (``blinkgl trade --reference cycles``): errors then contain what rasterising
-leaves out, shadows and inter-reflection, and what it filters differently. Needs the extra [cycles];
-see ``tools/peer_cycles.py``."""
+leaves out, shadows and inter-reflection, and what it filters differently. Needs the extra [cycles]; see
+``cycles.py``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from blinkgl.gl import GLContext
 from blinkgl.render.rectangles import Rectangle
 from blinkgl.scene.types import Scene
-from blinkgl.tools import peer_cycles
+from blinkgl.trade import cycles
 from blinkgl.trade.reference import FineTiles
 
 
@@ -23,8 +23,8 @@ class TracedFrames:
 
     def __init__(self, gl: GLContext, scene: Scene, tiles: tuple[Rectangle, ...], scale: int):
         self._motion = FineTiles(gl, scene, tiles, 1)
-        self.cost = peer_cycles.Cost()
-        self._frames = peer_cycles.source(scene, peer_cycles.CyclesSettings(samples=scale * scale), self.cost)
+        self.cost = cycles.Cost()
+        self._frames = cycles.source(scene, cycles.CyclesSettings(samples=scale * scale), self.cost)
 
     def __enter__(self) -> TracedFrames:
         return self

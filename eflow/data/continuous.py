@@ -12,10 +12,10 @@ import torch
 from torch.utils.data import Dataset
 
 from blinkgl.errors import AssetError, ConfigError
-from blinkgl.io.index import sequence_folders
 from blinkgl.io.intervals import intervals_in
 from blinkgl.io.records import read_text
 from blinkgl.labels import LABELS, label_of
+from blinkgl.sequence_files.index import sequence_folders
 from eflow.data.dataset import FlowDataset
 from eflow.data.representation import Representation
 from eflow.data.sources import Entry, FolderSource, Sequence as Recording

@@ -13,8 +13,8 @@ from torch.utils.data import Dataset
 from blinkgl.errors import AssetError
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.frame_camera import EXPOSURES, ExposureLine, picture_file, read_codes, read_exposures
-from blinkgl.io.index import sequence_folders
-from blinkgl.io.sequence_dir import read_manifest
+from blinkgl.sequence_files.index import sequence_folders
+from blinkgl.sequence_files.sequence_dir import read_manifest
 from eflow.data.representation import Representation
 from eflow.data.window import Window
 

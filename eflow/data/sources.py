@@ -28,8 +28,8 @@ from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flow import read_flow_npy
 from blinkgl.io.flow_png import read_flow_png
 from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
-from blinkgl.io.index import INDEX, read_index
 from blinkgl.labels import LABELS
+from blinkgl.sequence_files.index import INDEX, read_index
 from eflow.data.folders import below
 from eflow.data.pool import ABOUT, PoolSource
 from eflow.data.window import RawSample, Window

@@ -16,10 +16,10 @@ import torch
 from torch.utils.data import Dataset
 
 from blinkgl.errors import AssetError
-from blinkgl.io.index import made_folders
-from blinkgl.io.rig_dir import read_rig
-from blinkgl.io.sequence_dir import is_rig_folder
 from blinkgl.labels import LABELS
+from blinkgl.sequence_files.index import made_folders
+from blinkgl.sequence_files.rig_dir import read_rig
+from blinkgl.sequence_files.sequence_dir import is_rig_folder
 from eflow.data.dataset import FlowDataset
 from eflow.data.representation import Representation
 from eflow.data.sources import FolderSource, Sequence, blinkgl_sequence

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from blinkgl.events.types import Events
 from blinkgl.online.samples import WindowSample
+from blinkgl.types.events import Events
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,5 +1,5 @@
 // What a pass looks up in its texture, for the shader debugger: included by the variant SHOW_LOOKUP alone, which
-// nothing but tools/shader_debugger asks for. Every look-up that follows in the pass's own source is noted with the
+// nothing but blinkgl/shader_debugger asks for. Every look-up that follows in the pass's own source is noted with the
 // coordinates and the level that it really uses, whatever expression the source has in its place.
 
 layout(location = 1) out vec4 shown_lookup; // u, v (times uv_scale), mip level (before clamping), light

@@ -42,7 +42,7 @@ def test_blender_stays_in_its_own_programs():
                 found |= {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom):
                 found.add((node.module or "").split(".")[0])
-        theirs = file.parent == inside or file.name in ("cycles_worker.py", "gltf_worker.py")
+        theirs = file.parent == inside
         assert theirs or not found & {"bpy", "mathutils", "bmesh"}, file
         assert not theirs or not found & {"blinkgl", "tools", "scipy", ""}, file
         if file.parent == inside:

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 from shared_data import shared
 
+import played
 from blinkgl.blender import process
 from blinkgl.camera import PinHole
 from blinkgl.config.sequence import RenderConfig
@@ -17,7 +18,6 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.motion.trajectories import look_rotation
 from blinkgl.scene.worlds.from_file import from_gltf
-from blinkgl.tools import peer_gltf
 from gltf_at import Played
 
 pytestmark = pytest.mark.skipif(bool(process.available()), reason=process.available() or "there")
@@ -37,8 +37,8 @@ def theirs():
     def get(figure: str):
         if figure not in kept:
             path = shared(f"data/assets/characters/mannequin_{figure}.glb")
-            times = peer_gltf.key_times(path, 20)
-            kept[figure] = path, times, peer_gltf.play(path, times)
+            times = played.key_times(path, 20)
+            kept[figure] = path, times, played.play(path, times)
         return kept[figure]
 
     return get
@@ -74,9 +74,9 @@ def drawn(path: Path, times: np.ndarray) -> np.ndarray:
 
 def judged(path: Path, times: np.ndarray) -> np.ndarray:
     """(T, V, 3) straight from the specification."""
-    played = Played(path)
-    nodes = [i for i, node in played.document.nodes.items() if node.mesh is not None]
-    return np.stack([np.concatenate([played.of(i, t) for i in nodes]) for t in times])
+    one = Played(path)
+    nodes = [i for i, node in one.document.nodes.items() if node.mesh is not None]
+    return np.stack([np.concatenate([one.of(i, t) for i in nodes]) for t in times])
 
 
 @pytest.mark.parametrize("who", [judged, drawn])
@@ -95,7 +95,7 @@ def test_silhouettes_are_cycles(theirs, gl):
     """Pixels in which the figure is seen: those that differ touch its outline."""
     path, times, _ = theirs("running")
     some = times[[0, 7, 15]]
-    masks = peer_gltf.play(path, some, CAMERA, POSE).masks
+    masks = played.play(path, some, CAMERA, POSE).masks
     with Renderer(gl, scene_of(path, times), RenderConfig()) as renderer:
         for t, mask in zip(some, masks):
             ours = renderer.labels(round(t * NS), LabelRequest("ids")).ids > 0

@@ -1,6 +1,4 @@
-"""The float64 reference, level of detail and random worlds ask the camera model, whichever it is."""
-
-from dataclasses import replace
+"""The float64 reference and random worlds ask the camera model, whichever it is."""
 
 import numpy as np
 import pytest
@@ -9,7 +7,6 @@ from scipy.spatial.transform import Rotation
 from blinkgl.camera import CAMERA_MODELS
 from blinkgl.config.scene import RandomSceneConfig
 from blinkgl.render import reference
-from blinkgl.scene.geometry.lod import largest_scale
 from blinkgl.scene.geometry.primitives import grid
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.rig import Rig
@@ -44,16 +41,6 @@ def test_the_reference_sees_through_it(camera):
     np.testing.assert_allclose(frame.forward.flow, there - xy, atol=1e-10)
     np.testing.assert_allclose(frame.velocity, camera.jacobian(points) @ [0.3, 0, -0.5], atol=1e-10)
     np.testing.assert_array_equal(frame.forward.occluded, ((there < -0.5) | (there >= [47.5, 35.5])).any(axis=-1))
-
-
-@every
-def test_level_of_detail_asks_it(camera):
-    scene = wall(camera)
-    part = scene.objects[0].parts[0]
-    small = replace(part, mesh=grid(width=0.5, depth=0.5))
-    scale = largest_scale(scene, scene.objects[0], small)
-    points = np.array([0.3, 0, 3.5]) + part.mesh.normals[0] * 0 + small.mesh.vertices
-    assert np.linalg.norm(camera.jacobian(points), ord=2, axis=(1, 2)).max() <= scale < 60
 
 
 @every

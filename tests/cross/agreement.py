@@ -18,16 +18,16 @@ from blinkgl.dataset.explain import Explanation
 from blinkgl.dataset.report import SequenceReport
 from blinkgl.dataset.shards import export_shards
 from blinkgl.dataset.verify import verify_dataset
-from blinkgl.events.types import Events, count_causes, named_causes
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flo import read_flo
 from blinkgl.io.flow_png import read_flow_png
 from blinkgl.io.frame_camera import read_exposures
-from blinkgl.io.index import read_index
-from blinkgl.io.sequence_dir import read_manifest
 from blinkgl.labels import LABELS, asked_for
 from blinkgl.report import write_report
 from blinkgl.report.collect import collect
+from blinkgl.sequence_files.index import read_index
+from blinkgl.sequence_files.sequence_dir import read_manifest
+from blinkgl.types.events import Events, count_causes, named_causes
 
 LEFT_OUT = {label.heading: label.forms[0].folder + "/" for label in LABELS.values()} | {
     "occlusion masks": "occlusion/",
@@ -267,7 +267,6 @@ def of_explanation(told: Explanation, config: SequenceConfig, report: SequenceRe
             f"event frames: explain {told.frames}, made {manifest['frames']}",
         )
     for what, off in (
-        ("level of detail", not config.render.lod.enabled),
         ("anisotropic filtering", config.render.anisotropy == 1),
         ("anti-aliasing of event frames", config.render.antialiasing == "none"),
         ("rates of change in the event frames", config.timeline.reconstruction != "hermite"),

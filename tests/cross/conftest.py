@@ -9,8 +9,6 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scene"))
 
-from blinkgl.config.events import V2eConfig
-from blinkgl.events import make_emulator
 from features import HEIGHT, WIDTH
 from gltf_files import GltfBuilder, arm_file
 
@@ -20,10 +18,6 @@ FRAMES, SHIFT = 5, (1.25, -0.5)
 @pytest.fixture(scope="session")
 def assets(tmp_path_factory) -> Path:
     """Folder that relative paths of the rows start from."""
-    # `make` compiles no program of an emulator that has to be asked for: every process of every executor would.
-    emulator = make_emulator(V2eConfig(compat="authors"), HEIGHT, WIDTH)
-    for k in range(2):
-        emulator.step(np.full((HEIGHT, WIDTH), 0.3 + k, np.float32), k * 10**6)
     folder = tmp_path_factory.mktemp("assets")
     scene_file(folder / "scene.glb")
     (folder / "arm.glb").write_bytes(arm_file(morphs=True).glb())

@@ -144,7 +144,6 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
             "events": {"emulator": "esim", "threshold_jitter": 0.05, "refractory_us": 50, "contrast_threshold_off": 0.3}
         },
         "v2e": {"events": {"emulator": "v2e"}},
-        "v2e, authors": {"events": {"emulator": "v2e", "preset": "noisy", "compat": "authors", "causes": True}},
         "v2e, clean": {"events": {"emulator": "v2e", "preset": "clean", "start": "zero"}},
         "v2e, noisy": {
             "events": {
@@ -158,9 +157,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
             }
         },
         "voltmeter": {"events": {"emulator": "voltmeter"}},
-        "voltmeter, 240": {
-            "events": {"emulator": "voltmeter", "preset": "DVS240", "causes": True, "compat": "authors", "k4": 1e-4}
-        },
+        "voltmeter, 240": {"events": {"emulator": "voltmeter", "preset": "DVS240", "causes": True, "k4": 1e-4}},
     },
     "timeline": {
         "uniform": {"timeline": {"kind": "uniform", "fps": 400}},
@@ -257,7 +254,6 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "sharp": {"render": {"anisotropy": 4, "mip_bias": -1}},
         "drawn": {"render": {"mip_bias": {"uniform": [-1, 0]}}},
     },
-    "level of detail": {"off": NOTHING, "on": {"render": {"lod": {"enabled": True, "edge_px": 4}}}},
     "light": {
         "lit": NOTHING,
         "unlit": {"scene": {"light": {"unlit": True}}},

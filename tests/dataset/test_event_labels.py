@@ -15,8 +15,8 @@ from blinkgl import AssetError, Events, read_events
 from blinkgl.cli import run
 from blinkgl.dataset.shards import export_shards
 from blinkgl.dataset.verify import verify_dataset
-from blinkgl.events.types import TRUTH
 from blinkgl.io.event_labels import BLOCK, EventLabelsReader, EventLabelsWriter
+from blinkgl.types.events import TRUTH
 
 CONFIG = """
 camera: {width: 48, height: 36}

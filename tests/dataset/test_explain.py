@@ -15,10 +15,10 @@ from blinkgl.dataset.effects import effects_of
 from blinkgl.dataset.explain import explain
 from blinkgl.dataset.generate import generate_run
 from blinkgl.errors import ConfigError
+from blinkgl.machine.terminal import plain_console
 from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.types import Light
 from blinkgl.show.explain import show
-from blinkgl.show.terminal import plain_console
 
 SMALL = {
     "camera": {"width": 64, "height": 48},

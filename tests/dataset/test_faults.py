@@ -26,8 +26,9 @@ from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError, EventDataError, GLError, OutputError, may_pass
-from blinkgl.io import atomic, index as index_module
-from blinkgl.io.index import read_index, write_index
+from blinkgl.io import atomic
+from blinkgl.sequence_files import index as index_module
+from blinkgl.sequence_files.index import read_index, write_index
 from runs import RECIPE, recipe_file, start, temporaries, tree
 
 FLY = {"fly": {**RECIPE["groups"]["fly"], "output": {"sequences": 3}}}

@@ -84,7 +84,7 @@ def test_verify_sees_what_is_altered(made, tmp_path):
     from blinkgl.dataset.verify.contents import _check_labels, _check_times
     from blinkgl.dataset.verify.found import guarded
     from blinkgl.dataset.verify.labels import problems_of_asked
-    from blinkgl.io.sequence_dir import read_manifest
+    from blinkgl.sequence_files.sequence_dir import read_manifest
 
     assert verify_dataset(made / "out", deep=1).problems == {}
     folder = tmp_path / "s"

@@ -23,8 +23,8 @@ from blinkgl.dataset import generate as generate_module
 from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.io.dsec import DsecEventReader
-from blinkgl.io.sequence_dir import verify_sequence
 from blinkgl.render.passes import Luminance
+from blinkgl.sequence_files.sequence_dir import verify_sequence
 
 SMALL = {
     "seed": 4,

@@ -10,13 +10,13 @@ import pytest
 
 from blinkgl.camera.rectified import rectified
 from blinkgl.cli import run
+from blinkgl.config.camchain import read_camchain
 from blinkgl.config.reader import to_yaml
 from blinkgl.config.sequence import load_run
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import ConfigError
-from blinkgl.io.camchain import read_camchain
 from blinkgl.io.flow import read_flow
-from blinkgl.io.lens_files import FILES
+from blinkgl.sequence_files.lens_files import FILES
 
 LENS = {"width": 64, "height": 48, "fov": 75, "lens": "radtan", "distortion": [-0.3, 0.1, 1e-3, -2e-3]}
 RUN = {

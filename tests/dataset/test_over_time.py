@@ -15,8 +15,8 @@ from blinkgl.dataset.verify import verify_dataset
 from blinkgl.dataset.verify.contents import _check_tracks, check_imu
 from blinkgl.dataset.verify.found import guarded
 from blinkgl.io.imu import read_imu, read_imu_csv
-from blinkgl.io.sequence_dir import read_manifest
 from blinkgl.io.tracks import read_tracks
+from blinkgl.sequence_files.sequence_dir import read_manifest
 
 CONFIG = """
 camera: {width: 48, height: 36}

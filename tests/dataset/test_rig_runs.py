@@ -19,13 +19,13 @@ from blinkgl.dataset.verify.again import differences
 from blinkgl.errors import ConfigError, OutputError
 from blinkgl.gl import create_context
 from blinkgl.io.imu import read_imu
-from blinkgl.io.index import made_folders, read_index, sequence_folders
-from blinkgl.io.rig_dir import read_rig
-from blinkgl.io.sequence_dir import read_manifest
 from blinkgl.render.reference import render as by_reference
 from blinkgl.scene.build import sequence_scene
 from blinkgl.sequence import simulate_sequence
 from blinkgl.sequence.rig import simulate_rig
+from blinkgl.sequence_files.index import made_folders, read_index, sequence_folders
+from blinkgl.sequence_files.rig_dir import read_rig
+from blinkgl.sequence_files.sequence_dir import read_manifest
 
 WAY = [
     {"time": t, "position": [-2.5, y, 0.3], "look_at": [0, 0.3 * y, 0]} for t, y in ((-0.2, -0.4), (0, 0), (0.4, 0.8))
@@ -249,8 +249,8 @@ def _without_right():
 
 
 def _events(config, base):
-    from blinkgl.events.types import Events
     from blinkgl.sequence import EventChunk
+    from blinkgl.types.events import Events
 
     with create_context() as gl, simulate_rig(config, 0, gl, base=base) as rig:
         return Events.concatenate([i.events for m, i in rig if m.name == "left" and isinstance(i, EventChunk)])

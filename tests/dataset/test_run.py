@@ -18,9 +18,9 @@ from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.dataset.work import thread_environment
 from blinkgl.errors import BlinkGLError, ConfigError, OutputError
-from blinkgl.io.index import read_index
 from blinkgl.scene.geometry import primitives
 from blinkgl.scene.worlds import random_world
+from blinkgl.sequence_files.index import read_index
 from runs import NAMES, RECIPE, alive, children, recipe_file, start, temporaries, tree, wait_for
 
 

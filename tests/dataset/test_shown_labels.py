@@ -72,7 +72,7 @@ def test_written_and_verified(made, tmp_path):
     other = tmp_path / "s"
     shutil.copytree(folder, other)
     from blinkgl.dataset.verify.contents import _check_labels
-    from blinkgl.io.sequence_dir import read_manifest
+    from blinkgl.sequence_files.sequence_dir import read_manifest
 
     form = LABELS["boxes"].forms[0]
     value = form.read(other / "boxes/000000.npz")

@@ -19,7 +19,7 @@ from blinkgl.config.sequence import load_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import between, verify_dataset
 from blinkgl.errors import AssetError
-from blinkgl.io.sequence_dir import digest_of
+from blinkgl.sequence_files.sequence_dir import digest_of
 from runs import NAMES, recipe_file
 
 

@@ -285,7 +285,7 @@ EXPLAINED = {
         (
             {
                 "timeline": {"kind": "uniform", "fps": 100, "reconstruction": "hermite"},
-                "render": {"antialiasing": "ssaa2", "lod": {"enabled": True}},
+                "render": {"antialiasing": "ssaa2"},
             },
             26,
             4,
@@ -315,8 +315,6 @@ def test_what_each_pass_holds_and_how_often_it_is_drawn(tmp_path, changes, frame
     )
     assert told.seconds_per_simulated_second == pytest.approx(told.seconds / 0.25)
     assert told.scene["bodies"].startswith("3 objects") and told.scene["camera"].endswith(", moving")
-    assert told.scene["triangles"].endswith(" (level of detail: see notes)") == (samples == 4)
-    assert ("level of detail" in dict(told.left_out)) == (samples == 1)
     assert PROBES == 12 and told.machine and "velocity pass" in dict(told.left_out)
     assert ("anti-aliasing of event frames" in dict(told.left_out)) == (samples == 1)
     labels = next(p for p in told.passes if p.name == "labels")
@@ -348,8 +346,8 @@ def test_a_sequence_that_is_made(tmp_path, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(work.time, "monotonic", lambda: now[0])
 
-    def make(config, index, out, gl, *, base, progress, helper):
-        assert (index, out, gl, base, helper) == (1, str(tmp_path / "out"), None, tmp_path, None)
+    def make(config, index, out, gl, *, base, progress):
+        assert (index, out, gl, base) == (1, str(tmp_path / "out"), None, tmp_path)
         assert config.output.name == "a"
         report = SequenceReport(index, tmp_path / "seq", 0.5, 10, 1000, 7, 3, {"render": 1.5}, 2.0, omissions=("lamp",))
         for step in (1.0, 0.1, 0.15, 0.16, 0.26):  # news after more than a quarter of a second

@@ -8,11 +8,11 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from blinkgl.events.types import Events
 from blinkgl.io.dsec import DsecEventWriter, identity_rectify_map, write_rectify_map
 from blinkgl.io.flow_png import write_flow_png
-from blinkgl.io.sequence_dir import SequenceWriter
 from blinkgl.labels import Flow
+from blinkgl.sequence_files.sequence_dir import SequenceWriter
+from blinkgl.types.events import Events
 
 SPAN = 100_000
 

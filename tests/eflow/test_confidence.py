@@ -135,7 +135,7 @@ def test_predict_writes_it_with_every_file_of_flow(network, tmp_path, capsys):
 
 
 def test_nothing_is_left_of_a_prediction_that_fails(network, tmp_path, capsys):
-    from blinkgl.events.types import Events
+    from blinkgl.types.events import Events
 
     pieces = [moving_events(64, 80, 0, 2 * SPAN), moving_events(64, 80, 6 * SPAN, 7 * SPAN)]
     write_events(tmp_path / "e.npz", Events.concatenate(pieces), 64, 80)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 from eflow.cli import run
 from eflow.doubts import doubts
 

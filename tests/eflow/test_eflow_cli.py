@@ -416,7 +416,7 @@ def test_a_small_sensor_is_refused_by_name(refined, tmp_path, capsys):
 def test_a_silent_window(network, tmp_path, capsys):
     events = moving_events(64, 64, 0, SPAN)
     late = moving_events(64, 64, 3 * SPAN, 4 * SPAN)
-    from blinkgl.events.types import Events
+    from blinkgl.types.events import Events
 
     write_events(tmp_path / "e.npz", Events.concatenate([events, late]), 64, 64)
     assert run(["predict", network, str(tmp_path / "e.npz")]) == 2

@@ -153,8 +153,8 @@ def test_unlabelled_data_cannot_be_trained_on(tmp_path):
 
 
 def test_windows_without_events(tmp_path):
-    from blinkgl.io.sequence_dir import SequenceWriter
     from blinkgl.labels import Flow
+    from blinkgl.sequence_files.sequence_dir import SequenceWriter
     from flow_data import SPAN, constant_flow, moving_events
 
     with SequenceWriter(tmp_path / "still", 128, 128, config_yaml="") as writer:

@@ -5,7 +5,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from blinkgl.machine import cpu, doctor  # noqa: E402
+from blinkgl.machine import cpu  # noqa: E402
+from blinkgl.show import checks as doctor  # noqa: E402
 from eflow import precision  # noqa: E402
 from eflow.config import load_train_config  # noqa: E402
 from eflow.precision import precision_on  # noqa: E402

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 
 
 def random_clip(seed: int, frames: int = 8, height: int = 37, width: int = 45, contrast: float = 0.5, dtype=np.float32):

@@ -14,9 +14,9 @@ from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import EventDataError, OutputError
 from blinkgl.events import Events, make_emulator
 from blinkgl.events.camera import EventCamera, EventFrame
-from blinkgl.events.types import Cause, count_causes, named_causes
 from blinkgl.io.formats import WITH_CAUSES, WRITABLE, convert, event_writer, open_events, write_events
 from blinkgl.recordings.simulation import SimulationReport, frames_to_events
+from blinkgl.types.events import Cause, count_causes, named_causes
 from tests.events.clips import assert_same, random_clip, run
 
 MS = 10**6
@@ -52,7 +52,6 @@ def shares(config, seconds: float, slope: float = 0.0, side: int = 30) -> dict[s
         (VoltmeterConfig(**{**STILL, "k4": 2e-5}), 0.0, "leak"),
         (VoltmeterConfig(**{**STILL, "k5": 4e-7}), 0.0, "leak"),
         (VoltmeterConfig(**{**STILL, "k6": 6e-3}), 0.0, "shot"),
-        (VoltmeterConfig(**{**STILL, "k4": 2e-5, "compat": "authors"}), 0.0, "leak"),
     ],
 )
 def test_one_term_alone_is_the_cause(config, slope, cause):

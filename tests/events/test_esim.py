@@ -13,8 +13,8 @@ from scipy.optimize import brentq
 from blinkgl.config.events import EsimConfig, V2eConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events import Esim, Events, V2e
-from blinkgl.events.reference import ReferenceEsim
 from tests.events.clips import assert_same, random_clip, run, run_cubic
+from tests.events.reference import ReferenceEsim
 
 PLAIN = dict(threshold_sigma=0.0)
 VARIANTS = {

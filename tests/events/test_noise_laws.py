@@ -1,4 +1,4 @@
-"""Noise is that of the stated equations at any frame rate: distribution tests of ``tools/noise_laws.py``'s cases.
+"""Noise is that of the stated equations at any frame rate: distribution tests of ``noise_laws.py``'s cases.
 
 Every p-value is held to 1e-4, with fixed seeds; there are 120, so an emulator that is right would have failed one
 choice of seeds in 80.
@@ -11,8 +11,8 @@ import pytest
 
 from blinkgl.config.events import V2eConfig, VoltmeterConfig
 from blinkgl.events import DvsVoltmeter, V2e
-from blinkgl.tools.noise_laws import FRAMES, Case, cases, judge, shot_rate, v2e_law, voltmeter_law, watch
 from tests.events.clips import run
+from tests.events.noise_laws import FRAMES, Case, cases, judge, shot_rate, v2e_law, voltmeter_law, watch
 
 SIDE, LEAST_P = 40, 1e-4
 CASES = cases()
@@ -28,47 +28,6 @@ def test_rate_intervals_and_first_event_are_of_the_stated_law(name, frames):
     assert seen.interval_p > LEAST_P, seen.interval_ks
     assert seen.first_p > LEAST_P, seen.first_ks
     assert abs(seen.on - case.law.on) < 6 * np.sqrt(0.25 / seen.events) + 1e-3
-
-
-@pytest.mark.parametrize("fps, spread", [(50.0, 1.0), (500.0, 0.5), (5000.0, 0.2)])
-def test_the_judge_sees_noise_that_depends_on_the_frames(fps, spread):
-    """The authors' way of carrying V on loses diffusion as frames get shorter, and their start is synchronous."""
-    right = CASES["Voltmeter leak and diffusion"]
-    case = right._replace(config=right.config.model_copy(update={"compat": "authors"}))
-    seen = judge(watch(case, fps, SIDE, seed=3), case, SIDE)
-    assert seen.first_p < 1e-12
-    assert seen.interval_cv < spread * 1.3 * seen.cv_law
-    assert fps == 50 or seen.interval_p < 1e-12
-
-
-def test_compat_authors_is_their_algorithm():
-    """Against their recursion in NumPy, all pixels at once: rates, intervals, and V where nothing fired."""
-    config = VoltmeterConfig(compat="authors", k3=0.0, k4=4e-5, k5=0.0, k6=3e-3)
-    side, dt, frames = 60, 2000.0, 150
-    rng, mu, sigma = np.random.default_rng(0), 4e-5, 3e-3
-    v, counts = np.zeros(side**2), np.zeros(side**2)
-    for _ in range(frames):
-        left, todo = np.full(side**2, dt), np.arange(side**2)
-        while todo.size:
-            a, b = 1 - v[todo], 1 + v[todo]
-            r = 2 * mu / sigma**2
-            up = rng.random(todo.size) < (np.exp(r * b) - 1) / (np.exp(r * b) - np.exp(-r * a))
-            distance = np.where(up, a, b)
-            time = rng.wald(distance / mu, (distance / sigma) ** 2)
-            late = time > left[todo]
-            v[todo] = np.where(late, v[todo] + np.where(up, 1, -1) * distance * left[todo] / time, 0.0)
-            counts[todo] += ~late
-            left[todo] -= time
-            todo = todo[~late]
-    emulator = DvsVoltmeter(side, side, config, seed=2)
-    events = run(emulator, [np.full((side, side), 0.4, np.float32)] * (frames + 1), np.arange(frames + 1) * 2_000_000)
-    mine = np.bincount(events.y.astype(int) * side + events.x, minlength=side**2)
-    error = np.hypot(mine.std(), counts.std()) / side
-    assert abs(mine.mean() - counts.mean()) < 4 * error
-    assert abs(mine.std() / counts.std() - 1) < 0.08
-    from scipy import stats
-
-    assert stats.ks_2samp(emulator._v / 2**29, v).pvalue > LEAST_P
 
 
 def test_a_cameras_own_constants_hold_their_jitter():

@@ -15,9 +15,9 @@ from blinkgl.events.camera import EventCamera, EventFrame
 from blinkgl.events.esim import draw_thresholds
 from blinkgl.events.pixels import Latency, PixelNoise
 from blinkgl.events.readout import Readout
-from blinkgl.events.reference import ReferenceEsim, ReferenceV2e
-from blinkgl.events.types import Cause
+from blinkgl.types.events import Cause
 from tests.events.clips import assert_same, run
+from tests.events.reference import ReferenceEsim, ReferenceV2e
 
 H, W = 60, 80
 NOISY = PixelsConfig(hot_fraction=0.02, hot_rate_hz=200.0, hot_spread_decades=0.3, rate_hz=2.0, spread_decades=0.5,

@@ -5,7 +5,7 @@ import pytest
 
 from blinkgl.events import Events
 from blinkgl.events.truth import Surfaces, SurfaceTruth
-from blinkgl.events.types import TRUTH
+from blinkgl.types.events import TRUTH
 
 MS = 1_000_000
 

@@ -14,8 +14,8 @@ from scipy.optimize import brentq
 from blinkgl.config.events import V2eConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events import Events, V2e, v2e_model as v2e
-from blinkgl.events.reference import ReferenceV2e
 from tests.events.clips import assert_same, random_clip, run
+from tests.events.reference import ReferenceV2e
 from tests.events.test_esim import threads  # noqa: F401  (fixture)
 
 MS = 10**6

@@ -272,7 +272,6 @@ def runs(draw, emulators=esim):
                 antialiasing=st.sampled_from(["none", "msaa4", "taps4", "edges", "ssaa2"]),
                 anisotropy=st.sampled_from([1.0, 16.0]),
                 mip_bias=st.sampled_from([-8.0, -0.5, 8.0]),
-                lod=st.sampled_from([{"enabled": True}, {"enabled": True, "edge_px": 100.0}]),
             )
         ),
         "labels": {

@@ -10,11 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import PinHole
-from blinkgl.config.lod import LodConfig
 from blinkgl.config.sequence import RenderConfig, RunTemplate
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.errors import AssetError, EventDataError
-from blinkgl.io.sequence_dir import verify_sequence
 from blinkgl.labels import LABELS, LabelRequest
 from blinkgl.render import renderer as module
 from blinkgl.render.passes import Geometry
@@ -23,6 +21,7 @@ from blinkgl.scene.geometry import primitives
 from blinkgl.scene.geometry.meshes import faces_in_float32
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Light, Material, Part, SceneObject, Texture
+from blinkgl.sequence_files.sequence_dir import verify_sequence
 from tests.extremes.measures import FACING
 from tests.render.render_scenes import LEVEL, cube, drift, mesh, quad, rig, scene, smooth_texture, still, thing
 from tests.shared_data import shared
@@ -230,8 +229,7 @@ def test_models_keep_their_faces():
         assert faces_in_float32(shape).all()
 
 
-@pytest.mark.parametrize("lod", [False, True])
-def test_the_renderer_drops_lines_and_says_so(gl, lod):
+def test_the_renderer_drops_lines_and_says_so(gl):
     ball = primitives.icosphere(subdivisions=4)
     a, b = ball.vertices[ball.faces[0, :2]]
     vertices = np.concatenate([ball.vertices, [(a + b) / 2]])
@@ -246,13 +244,12 @@ def test_the_renderer_drops_lines_and_says_so(gl, lod):
     line = sheet(slivers(np.random.default_rng(0), 1) * 0 + np.array([[0, 0, 0], [1, 1, 1], [2, 2, 2.0]]))
     two = SceneObject("ball", 1, (Part(line, Material()), Part(split, Material())), still((0, 4, 0)))
     world = scene([two, thing("other", 2, split, still((1, 5, 0)))])
-    with Renderer(gl, world, RenderConfig(lod=LodConfig(enabled=lod))) as renderer:
+    with Renderer(gl, world, RenderConfig()) as renderer:
         assert [len(o.parts) for o in renderer.scene.objects] == [1, 1]
-        assert renderer.scene.objects[0].parts[0].mesh is renderer.scene.objects[1].parts[0].mesh or lod
+        assert renderer.scene.objects[0].parts[0].mesh is renderer.scene.objects[1].parts[0].mesh
         assert all(faces_in_float32(p.mesh).all() for o in renderer.scene.objects for p in o.parts)
-        assert "without width in float32" in renderer.scene.log[-1] and (
-            lod or renderer.scene.log[-1].startswith("3 triangles")
-        )
+        said = renderer.scene.log[-1]
+        assert "without width in float32" in said and said.startswith("3 triangles")
         assert set(np.unique(renderer.labels(0, LabelRequest("ids")).ids)) == {0, 1, 2}
     with Renderer(gl, scene([thing("ball", 1, ball, still((0, 4, 0)))]), RenderConfig()) as renderer:
         assert not renderer.scene.log

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, Phase, event, given, settings
 from blinkgl.config.sequence import RunTemplate
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.errors import BlinkGLError
-from blinkgl.io.sequence_dir import verify_sequence
+from blinkgl.sequence_files.sequence_dir import verify_sequence
 from tests.extremes.configurations import esim, runs, v2e, voltmeter
 
 # No explain phase: it re-runs a failing sequence hundreds of times to say which of its values matter.

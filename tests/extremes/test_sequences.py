@@ -14,7 +14,7 @@ from blinkgl.config.sequence import RunTemplate
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.io.flow_png import read_flow_png
-from blinkgl.io.sequence_dir import verify_sequence
+from blinkgl.sequence_files.sequence_dir import verify_sequence
 
 BOX = {
     "kind": "explicit",

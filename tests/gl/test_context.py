@@ -274,7 +274,7 @@ def test_the_environment_of_the_process_is_left_alone():
         from blinkgl.gl import create_context
         with create_context():
             list(blinkgl.simulate([np.full((4, 4), k, np.uint8) for k in range(3)], fps=100))
-        import blinkgl.cli, blinkgl.show.simulate, blinkgl.recordings.comparison, blinkgl.machine.doctor
+        import blinkgl.cli, blinkgl.show.simulate, blinkgl.recordings.comparison, blinkgl.show.checks
         import blinkgl.dataset.explain, blinkgl.dataset.run, blinkgl.trade.run
         assert dict(os.environ) == before, set(os.environ.items()) ^ set(before.items())
     """

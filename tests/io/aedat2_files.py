@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 
 CHIP = "eu.seebetter.ini.chips.davis.DAVIS240C"
 SIZES = {"DAVIS240C": (180, 240), "Davis346B": (260, 346)}

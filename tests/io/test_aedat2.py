@@ -16,10 +16,10 @@ from aedat2_files import (
 )
 from blinkgl.cli import run
 from blinkgl.errors import AssetError, EventDataError, OutputError
-from blinkgl.events.types import Events
 from blinkgl.io.aedat2 import Aedat2Reader
 from blinkgl.io.formats import convert, open_events
 from blinkgl.io.frames import open_frames
+from blinkgl.types.events import Events
 from tests.shared_data import shared
 
 H, W = 180, 240

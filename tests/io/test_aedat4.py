@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import AssetError, EventDataError, OutputError
-from blinkgl.events.types import Events
 from blinkgl.io import aedat4
 from blinkgl.io.aedat4 import Aedat4Reader
 from blinkgl.io.formats import open_events, write_events
+from blinkgl.types.events import Events
 
 LIBRARY = """
 import os

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import AssetError, BlinkGLError, EventDataError
-from blinkgl.events.types import Events
 from blinkgl.io.columns import check_events, events_of, microseconds
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.formats import convert, open_events, write_events
+from blinkgl.types.events import Events
 
 GOOD = {"x": [1, 2, 3], "y": [4, 5, 6], "t": [10, 20, 30], "p": [0, 1, 1]}
 

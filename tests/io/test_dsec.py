@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import AssetError, EventDataError, OutputError
-from blinkgl.events.types import Events
 from blinkgl.io import dsec
 from blinkgl.io.dsec import DsecEventReader, DsecEventWriter
+from blinkgl.types.events import Events
 
 
 def random_events(n: int, duration_us: int, seed: int = 0, t0: int = 0, height: int = 48, width: int = 64) -> Events:

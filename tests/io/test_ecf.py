@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 
 from blinkgl.errors import AssetError, EventDataError
-from blinkgl.events.types import Events
 from blinkgl.io import ecf
 from blinkgl.io.formats import open_events, write_events
 from blinkgl.io.prophesee import EVENT
+from blinkgl.types.events import Events
 
 H, W = 480, 640
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import AssetError, EventDataError
-from blinkgl.events.types import Events
 from blinkgl.io.evt import EvtReader, EvtWriter
+from blinkgl.types.events import Events
 
 WORD = {"evt2": "<u4", "evt3": "<u2"}
 

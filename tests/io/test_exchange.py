@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import AssetError, EventDataError, OutputError
-from blinkgl.events.types import Events
 from blinkgl.io.formats import convert, open_events, write_events
 from blinkgl.io.prophesee import EVENT
+from blinkgl.types.events import Events
 
 H, W = 48, 64
 

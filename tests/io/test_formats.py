@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import AssetError, BlinkGLError, EventDataError, OutputError
-from blinkgl.events.types import Events
 from blinkgl.io.evt import EvtReader, EvtWriter
 from blinkgl.io.formats import convert, event_writer, open_events, write_events
+from blinkgl.types.events import Events
 from tests.shared_data import shared
 
 H, W = 480, 640

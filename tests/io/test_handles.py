@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import BlinkGLError
-from blinkgl.events.types import Events
 from blinkgl.io.dsec import DsecEventReader, DsecEventWriter
 from blinkgl.io.formats import event_writer, open_events, write_events
 from blinkgl.io.frames import open_frames
-from blinkgl.io.sequence_dir import SequenceWriter
 from blinkgl.io.video import VideoReader, VideoWriter
+from blinkgl.sequence_files.sequence_dir import SequenceWriter
+from blinkgl.types.events import Events
 
 FILES = {
     "dsec": "e.h5",

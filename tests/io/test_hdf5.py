@@ -202,7 +202,7 @@ def test_rows_written_here_are_those_of_the_filter(tmp_path):
 _PROGRAM = """
 import hashlib, os, sys
 import numpy as np
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 from blinkgl.io.formats import open_events, write_events
 before = dict(os.environ)
 rng, n = np.random.default_rng(0), 150_000

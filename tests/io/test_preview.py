@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from blinkgl.events.types import Events
-from blinkgl.io import preview as module
 from blinkgl.io.colour import INVALID, count_events, event_colour, flow_colour, flow_wheel
-from blinkgl.io.preview import PreviewWriter
+from blinkgl.sequence_files import preview as module
+from blinkgl.sequence_files.preview import PreviewWriter
 from blinkgl.srgb import to_srgb8
+from blinkgl.types.events import Events
 
 
 class Film:

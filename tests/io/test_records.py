@@ -15,10 +15,11 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 from blinkgl.errors import AssetError, OutputError
-from blinkgl.io import atomic, index
-from blinkgl.io.index import INDEX, read_index, sequence_folders, write_index
+from blinkgl.io import atomic
 from blinkgl.io.records import InsidePath, entries_below, open_regular, parse, read_text, shown
-from blinkgl.io.sequence_dir import Manifest, refuse_existing, verify_sequence
+from blinkgl.sequence_files import index
+from blinkgl.sequence_files.index import INDEX, read_index, sequence_folders, write_index
+from blinkgl.sequence_files.sequence_dir import Manifest, refuse_existing, verify_sequence
 
 # --- text and names ---------------------------------------------------------------------------------------------------
 

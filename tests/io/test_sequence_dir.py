@@ -17,11 +17,11 @@ import pytest
 from blinkgl import srgb
 from blinkgl.config.sequence import LabelsConfig
 from blinkgl.errors import BlinkGLError, OutputError
-from blinkgl.events.types import Events
 from blinkgl.io import flo, images
 from blinkgl.io.atomic import atomic_file, machine_token, remove_stale
-from blinkgl.io.sequence_dir import SequenceWriter, read_manifest, verify_sequence
 from blinkgl.labels import Flow
+from blinkgl.sequence_files.sequence_dir import SequenceWriter, read_manifest, verify_sequence
+from blinkgl.types.events import Events
 
 H, W = 24, 32
 
@@ -216,7 +216,7 @@ def test_full_disk_does_not_upset_interpreter_exit(small_disk):
     code = f"""
 import numpy as np
 from blinkgl.io.dsec import DsecEventWriter
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 from blinkgl.errors import OutputError
 rng = np.random.default_rng(0)
 try:
@@ -236,7 +236,7 @@ except OutputError as error:
 def test_kill_leaves_no_final_name_and_the_next_run_cleans_up(tmp_path):
     code = f"""
 import time, numpy as np
-from blinkgl.io.sequence_dir import SequenceWriter
+from blinkgl.sequence_files.sequence_dir import SequenceWriter
 with SequenceWriter({str(tmp_path / "a")!r}, 24, 32, config_yaml='') as w:
     w.label('depth', 0, np.zeros((24, 32)), 0)
     print('ready', flush=True)

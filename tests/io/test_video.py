@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import AssetError, OutputError
-from blinkgl.events.types import Events
 from blinkgl.io.colour import INVALID, event_colour, flow_colour
-from blinkgl.io.preview import PreviewWriter
 from blinkgl.io.video import VideoReader, VideoWriter
+from blinkgl.sequence_files.preview import PreviewWriter
+from blinkgl.types.events import Events
 
 
 def write_video(path, count=12, height=48, width=64):

@@ -9,8 +9,9 @@ import pytest
 
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.labels import LABELS, Flow, Flows, LabelFrame, LabelRequest, Occlusions, asked_for, grading, label_of
-from blinkgl.labels.boxes import Boxes, empty
 from blinkgl.labels.files import Form
+from blinkgl.render.occlusion import flow_and_reach
+from blinkgl.types.boxes import Boxes, no_boxes
 
 H, W = 4, 5
 
@@ -19,7 +20,7 @@ def whole(name: str):
     """A value that is right, of (H, W) px."""
     label = LABELS[name]
     if name == "boxes":
-        arrays = {key: np.ones((1, *array.shape[1:]), array.dtype) for key, array in empty().items()}
+        arrays = {key: np.ones((1, *array.shape[1:]), array.dtype) for key, array in no_boxes().items()}
         return Boxes(**arrays, resolution=np.array([W, H]))
     if name == "flow_intervals":
         return Flows(0, np.array([1, 2]), np.ones((2, H, W, 2), np.float32), np.ones((2, H, W), bool))
@@ -228,7 +229,11 @@ def test_what_cannot_be_in_a_value(name, number, said):
 
 
 def buffers(**raw):
-    return SimpleNamespace(raw=lambda name: raw[name], value=lambda name: LABELS[name].finish(buffers(**raw)))
+    return SimpleNamespace(
+        raw=lambda name: raw[name],
+        value=lambda name: LABELS[name].finish(buffers(**raw)),
+        flow=lambda name: Flow(*flow_and_reach(raw[name])),
+    )
 
 
 def test_what_the_shader_writes_becomes_the_value():

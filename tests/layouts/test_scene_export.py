@@ -12,7 +12,7 @@ import yaml
 from blinkgl.cli import run
 from blinkgl.config.sequence import load_run
 from blinkgl.dataset.run import run_dataset
-from blinkgl.io.sequence_dir import read_manifest
+from blinkgl.sequence_files.sequence_dir import read_manifest
 
 HEIGHT, WIDTH = 36, 48
 SCENE = {

@@ -11,7 +11,7 @@ import pytest
 from blinkgl import cli
 from blinkgl.errors import GLError
 from blinkgl.gl import context as context_module, osmesa
-from blinkgl.machine import doctor
+from blinkgl.show import checks as doctor
 from blinkgl.show.doctor import show
 
 

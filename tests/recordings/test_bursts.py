@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blinkgl.events.types import Events
 from blinkgl.recordings.bursts import frame_bursts, inside_any
 from blinkgl.recordings.clip import clip_of_frames, read_recording
 from blinkgl.recordings.simulation import emulator_config
 from blinkgl.recordings.statistics import sums
+from blinkgl.types.events import Events
 from tests.recordings.test_calibration import GAP_US, TRUE, H, W, moving, scene
 from tests.shared_data import shared
 

@@ -14,13 +14,13 @@ import yaml
 from blinkgl.cli import run
 from blinkgl.errors import BlinkGLError, ConfigError, EventDataError
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
-from blinkgl.events.types import Events
 from blinkgl.io.formats import write_events
 from blinkgl.recordings.calibration import _Search, calibrate, calibrate_events
 from blinkgl.recordings.clip import Clip, clip_of_frames, clip_of_still, clock_offset
 from blinkgl.recordings.simulation import emulator_config
 from blinkgl.recordings.statistics import numbers, sums, target
 from blinkgl.recordings.stimulus import Edge, Flicker, find_borders
+from blinkgl.types.events import Events
 from tests.shared_data import shared
 
 H, W, GAP_US = 64, 80, 20_000

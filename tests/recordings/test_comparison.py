@@ -12,10 +12,10 @@ import pytest
 
 from blinkgl.cli import run
 from blinkgl.errors import EventDataError
-from blinkgl.events.types import Events
 from blinkgl.io.formats import write_events
 from blinkgl.recordings import comparison
 from blinkgl.recordings.comparison import IEI_EDGES_US, compare, plot
+from blinkgl.types.events import Events
 from tests.shared_data import shared
 
 H, W = 40, 50

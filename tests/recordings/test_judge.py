@@ -7,10 +7,10 @@ import pytest
 
 from blinkgl.cli import run
 from blinkgl.errors import EventDataError
-from blinkgl.events.types import Events
 from blinkgl.io.formats import write_events
 from blinkgl.recordings.comparison import compare
 from blinkgl.recordings.judge import LEAST_PATCHES, area, boosted, judge_halves, patches
+from blinkgl.types.events import Events
 
 H, W = 96, 128
 

@@ -12,9 +12,9 @@ from blinkgl.config.readout import PixelsConfig
 from blinkgl.config.sensor import load_sensor
 from blinkgl.errors import EventDataError
 from blinkgl.events.pixels import PixelNoise
-from blinkgl.events.types import Events
 from blinkgl.io.formats import write_events
 from blinkgl.recordings.pixel_noise import fit_pixels, fit_pixels_of
+from blinkgl.types.events import Events
 
 SIZE = (200, 300)
 KNOWN = PixelsConfig(

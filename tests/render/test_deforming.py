@@ -15,8 +15,8 @@ from blinkgl.config.sequence import RenderConfig
 from blinkgl.labels import LabelRequest
 from blinkgl.render import reference
 from blinkgl.render.renderer import Renderer
+from blinkgl.scene.geometry.living import figure as figure_of
 from blinkgl.scene.geometry.meshes import transform_mesh
-from blinkgl.scene.geometry.primitives import figure as figure_of
 from blinkgl.scene.shapes.skeleton import Locals, Skeleton
 from blinkgl.scene.shapes.skin import Morphs, Skin
 from blinkgl.scene.shapes.table import deformer_of

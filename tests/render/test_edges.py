@@ -18,7 +18,7 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.shapes.closed_forms import Wave
 from blinkgl.scene.types import Light, Material, Texture
-from blinkgl.tools.edges_twin import filtered as filtered_slowly, read_both
+from blinkgl.shader_debugger.edges_twin import filtered as filtered_slowly, read_both
 from render_scenes import (
     LEVEL,
     SECOND,

@@ -284,7 +284,7 @@ def test_a_lens_that_sees_too_much(gl):
 
 
 def test_the_shader_debugger_looks_at_the_flat_picture(tmp_path):
-    from blinkgl.tools.shader_debugger.session import open_subject
+    from blinkgl.shader_debugger.session import open_subject
 
     config = tmp_path / "run.yaml"
     config.write_text(

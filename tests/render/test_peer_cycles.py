@@ -15,6 +15,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from blinkgl.blender import process
+from blinkgl.blender.inside import trace
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.render import reference
@@ -22,8 +23,7 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.scene.lights import lamp_pose
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.types import Lamp, Light, Material, Part, SceneObject
-from blinkgl.tools import cycles_worker
-from blinkgl.tools.peer_cycles import Cost, CyclesSettings, blender_camera, colours, export, frames
+from blinkgl.trade.cycles import Cost, CyclesSettings, blender_camera, colours, export, frames
 from render_scenes import LEVEL, cube, mixed_scene, quad, rig, scene, smooth_texture, sphere, still, thing
 
 TIMES = [300_000_000, 650_000_000]
@@ -108,10 +108,10 @@ def test_rotations_of_the_worker():
         [Rotation.random(50, random_state=1), Rotation.from_rotvec(np.pi * np.eye(3)), Rotation.identity(1)]
     )
     for R in turns.as_matrix():
-        again = Rotation.from_quat(cycles_worker.quaternion(R), scalar_first=True).as_matrix()
+        again = Rotation.from_quat(trace.quaternion(R), scalar_first=True).as_matrix()
         np.testing.assert_allclose(again, R, atol=1e-14)
         axis = R[:, 2]
-        turned = cycles_worker.turn_z_to(axis)
+        turned = trace.turn_z_to(axis)
         np.testing.assert_allclose(turned[:, 2], axis, atol=1e-14)
         np.testing.assert_allclose(turned @ turned.T, np.eye(3), atol=1e-14)
         assert np.linalg.det(turned) > 0
@@ -202,7 +202,6 @@ time.sleep(600)
         ({"samples": 0}, "cycles.samples: out of range"),
         ({"bounces": -1}, "cycles.bounces"),
         ({"shadows": False}, "cycles.bounces: light that passes through"),
-        ({"engine": "luxcore"}, "cycles.engine: unknown engine"),
     ],
 )
 def test_settings_are_checked(wrong, words):

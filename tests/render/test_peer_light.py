@@ -11,8 +11,8 @@ import pytest
 from blinkgl.blender import process
 from blinkgl.config.images import LensConfig
 from blinkgl.scene.types import Fog
-from blinkgl.tools.peer_cycles import KEYS, CyclesSettings, export
-from blinkgl.tools.peer_light import ROUGHNESSES, cases, compared, relative
+from blinkgl.trade.cycles import KEYS, CyclesSettings, export
+from lit_cases import ROUGHNESSES, cases, compared, relative
 from tests.shared_data import shared
 
 NUMBER = len(list(cases(None)))

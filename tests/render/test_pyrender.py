@@ -10,16 +10,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import pyrender_peer
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.labels import LabelRequest
 from blinkgl.render import reference
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Material, Texture
-from blinkgl.tools import peer_pyrender
 from render_scenes import mixed_scene, quad, rig, scene, still, thing
 
-if peer_pyrender.available():
-    pytest.skip(peer_pyrender.available(), allow_module_level=True)
+if pyrender_peer.available():
+    pytest.skip(pyrender_peer.available(), allow_module_level=True)
 
 TIMES = [300_000_000, 650_000_000]
 NEAR = 1.5  # in front of everything: pyrender's 24-bit depth is then good to 2^-24 Z / near
@@ -45,7 +45,7 @@ def world():
 
 @pytest.fixture(scope="module")
 def peer(world):
-    return peer_pyrender.render(world, TIMES, near=NEAR)
+    return pyrender_peer.render(world, TIMES, near=NEAR)
 
 
 @pytest.mark.parametrize("moment", [0, 1])
@@ -77,7 +77,7 @@ def test_flat_colours_are_equal_to_8_bit_rounding(gl):
     sky = base.objects[0]
     plain = replace(sky.parts[0], material=Material(base_color=(0.2, 0.4, 0.6), unlit=True))
     base = replace(base, objects=(replace(sky, parts=(plain,)), *base.objects[1:]))
-    theirs = peer_pyrender.render(base, TIMES[:1])["colour"][0]
+    theirs = pyrender_peer.render(base, TIMES[:1])["colour"][0]
     true = reference.render(base, TIMES[0])
     with Renderer(gl, base, RenderConfig(image_antialiasing="none")) as renderer:
         ours = renderer.colour(TIMES[0]).read()
@@ -93,7 +93,7 @@ def test_picture_is_the_same_way_up(gl):
     paint = Material(texture=texels, uv_scale=(0.75, 1.25), unlit=True, double_sided=True)
     eye = rig(path=still((0.1, 0.2, -2.5)))
     picture = scene([thing("picture", 300, quad(3, 2.5), still(), paint)], eye)
-    theirs = peer_pyrender.render(picture, [0])
+    theirs = pyrender_peer.render(picture, [0])
     with Renderer(gl, picture, RenderConfig(image_antialiasing="none")) as renderer:
         ours = renderer.colour(0).read()
     true = reference.render(picture, 0)
@@ -103,15 +103,9 @@ def test_picture_is_the_same_way_up(gl):
     assert np.abs(theirs["colour"][0] - 255.0 * true.colour).mean() < 0.6
 
 
-def test_measure_reports_seconds_per_frame(world):
-    result = peer_pyrender.measure(world, TIMES, repeat=1)
-    assert result["seconds_per_frame"] > 0 and result["frames"] == 2
-    assert (result["width"], result["height"]) == (160, 120) and result["triangles"] == 12 + 128 + 5120 + 12 + 2
-
-
 def test_failure_is_one_line(world, monkeypatch):
     monkeypatch.setenv("PYOPENGL_PLATFORM", "egl")
     monkeypatch.setenv("EGL_DEVICE_ID", "999")
     with pytest.raises(RuntimeError, match="pyrender failed: .*[Dd]evice") as error:
-        peer_pyrender.render(world, [0])
+        pyrender_peer.render(world, [0])
     assert "\n" not in str(error.value)

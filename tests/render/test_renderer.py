@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from blinkgl.camera import PinHole
-from blinkgl.config.lod import LodConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.gl import create_context
 from blinkgl.labels import LABELS, LabelRequest
@@ -155,24 +154,6 @@ def test_only_what_is_asked_for_is_made(gl):
         assert defines and all(not any(k.startswith("OUT_") and k != "OUT_DEPTH" for k in d) for d in defines)
         frame = renderer.labels(0, LabelRequest("depth"))
         assert frame.ids is None and frame.forward is None and frame.colour is None
-
-
-def test_frames_and_labels_are_drawn_from_the_same_level_of_detail(gl):
-    """A fine ball far away: fewer triangles, and what is bright is exactly what has an id."""
-    ball = primitives.icosphere(subdivisions=4)
-    objects = (SceneObject("ball", 1, (Part(ball, Material(unlit=True)),), still((0.3, 12, 0.2))),)
-    camera = Rig.alone(PinHole(96, 72, 90, 90, 47.5, 35.5), still((0, 0, 0), LEVEL))
-    scene = Scene(objects, camera, 0, SECOND, Light())
-    with (
-        Renderer(gl, scene, PLAIN) as full,
-        Renderer(gl, scene, PLAIN.model_copy(update={"lod": LodConfig(enabled=True)})) as coarse,
-    ):
-        assert coarse.triangles < full.triangles / 4 and full.scene is scene
-        for renderer in (full, coarse):
-            np.testing.assert_array_equal(
-                renderer.luminance(0).read() > 0, renderer.labels(0, LabelRequest("ids")).ids == 1
-            )
-        assert np.abs((coarse.luminance(0).read() > 0).sum() / (full.luminance(0).read() > 0).sum() - 1) < 0.05
 
 
 def test_nothing_hit_is_background(gl):

@@ -12,8 +12,8 @@ from blinkgl.config.sequence import load_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.errors import AssetError
 from blinkgl.io.flow_png import read_flow_png
-from blinkgl.io.index import read_index
 from blinkgl.report.card import write_card
+from blinkgl.sequence_files.index import read_index
 
 RECIPE = {
     "seed": 2,

@@ -6,7 +6,7 @@ import struct
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from blinkgl.scene.geometry.primitives import BUILDERS
+from blinkgl.scene.geometry import BUILDERS
 
 TURNS = [Rotation.from_rotvec([0, 0, a]).as_quat() for a in (0.0, 0.7, 0.0)]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from sources import parsed
 
 ROOT = Path(__file__).parents[2]
-KERNELS_ALONE = {"tools/bench_events.py", "tools/bench_load.py", "tools/draws.py", "tools/noise_laws.py"}
+KERNELS_ALONE = {"tools/bench.py", "tools/draws.py"}
 THE_DOOR = {"blinkgl/front/sensors.py"}  # hands an emulator to a person who steps it
 OWN = {
     "make_emulator": {"blinkgl/events/camera.py", "blinkgl/events/table.py", "blinkgl/events/__init__.py"}

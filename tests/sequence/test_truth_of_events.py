@@ -22,9 +22,9 @@ from blinkgl import (
     write_events,
 )
 from blinkgl.config.sequence import RunTemplate
-from blinkgl.events.types import Cause
 from blinkgl.front.runs import configured
 from blinkgl.sequence import simulate_sequence
+from blinkgl.types.events import Cause
 
 SQUARES = np.where(((np.indices((64, 64)) // 8).sum(0) % 2)[..., None], (230, 200, 60), (40, 60, 110)).astype(np.uint8)
 CAMERA = Camera(72, 48, fov=60, pose=look_at((-3, 0, 0), (0, 0, 0)))

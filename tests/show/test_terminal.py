@@ -9,7 +9,7 @@ import typer
 from rich.table import Table
 
 from blinkgl import cli
-from blinkgl.show.terminal import plain_column, plain_console, say
+from blinkgl.machine.terminal import plain_column, plain_console, say
 
 ROOT = Path(__file__).parents[2]
 
@@ -71,11 +71,11 @@ def test_texts_tables_titles_and_bars_keep_their_brackets(capsys):
 
 
 def test_there_is_no_other_console():
-    """Whatever is printed for people goes through blinkgl.show.terminal; benchmarks, which
+    """Whatever is printed for people goes through blinkgl.machine.terminal; benchmarks, which
     print their own words alone, need not."""
-    for folder in ("blinkgl", "eflow", "tools/shader_debugger"):
+    for folder in ("blinkgl", "eflow", "blinkgl/shader_debugger"):
         for path in (ROOT / folder).rglob("*.py"):
-            if path != ROOT / "blinkgl/show/terminal.py":
+            if path != ROOT / "blinkgl/machine/terminal.py":
                 text = path.read_text(encoding="utf-8")
                 assert not re.search(r"(?<![\w.])(Console|TextColumn)\(|from_markup|rich_markup_mode=(?!None)", text), (
                     path

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from blinkgl.events.types import Events
+from blinkgl.types.events import Events
 
 
 def assert_same(ours: Events, theirs: Events, what: object) -> None:

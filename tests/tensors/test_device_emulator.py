@@ -19,7 +19,7 @@ from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import ConfigError, EventDataError
 from blinkgl.events import Esim, make_emulator
 from blinkgl.events.v2e import V2e
-from blinkgl.io.sequence_dir import read_manifest
+from blinkgl.sequence_files.sequence_dir import read_manifest
 from blinkgl.tensors import emulator as devices
 from same_events import assert_same
 from tests.tiny_recipe import TINY
@@ -39,7 +39,7 @@ def made(gl, reconstruction="linear", config=EsimConfig, **values):
 def test_auto_takes_a_card_that_can_do_it(card, monkeypatch):
     assert made(SOFTWARE) == "cpu" == made(None) == made(CARD, device="cpu") == made(CARD, "pchip")
     assert made(CARD) == "cuda" == made(None, device="cuda") == made(CARD, config=V2eConfig)
-    assert made(CARD, config=VoltmeterConfig) == "cpu" == made(CARD, config=V2eConfig, compat="authors")
+    assert made(CARD, config=VoltmeterConfig) == "cpu"
     monkeypatch.setattr(devices, "_trials", {})
     monkeypatch.setattr(devices, "same_events", lambda *_: False)
     assert made(CARD) == "cpu"
@@ -50,8 +50,6 @@ def test_auto_takes_a_card_that_can_do_it(card, monkeypatch):
 def test_what_is_refused(card, tmp_path):
     with pytest.raises(EventDataError, match=r"^timeline\.reconstruction.*linear, or events\.device: cpu"):
         made(CARD, "pchip", device="cuda")
-    with pytest.raises(ConfigError, match="device: compat: authors"):
-        blinkgl.V2e(4, 4, compat="authors", device="cuda")
     with pytest.raises(ConfigError, match=r"device.*'gl'.*cuda"):
         blinkgl.Esim(4, 4, device="gl")
     path = tmp_path / "run.yaml"

@@ -34,9 +34,7 @@ def test_the_same_events_as_the_numba_kernel(name):
     assert sum(compare(TensorV2e, V2e, config, *size) for size in sizes) > 2000
 
 
-def test_what_it_does_not_do_is_refused():
-    with pytest.raises(EventDataError, match="compat"):
-        TensorV2e(4, 4, V2eConfig(compat="authors"))
+def test_more_shot_noise_than_it_may_draw_is_refused():
     emulator = TensorV2e(40, 64, V2eConfig(shot_noise_rate_hz=1e4, max_events_per_step=1000), envs=2)
     emulator.step(torch.full((2, 40, 64), 0.5), 0)
     with pytest.raises(EventDataError, match="environment 1, frame 1.*more shot noise"):

@@ -8,10 +8,10 @@ import shutil
 from pathlib import Path
 
 import pytest
+from webdriver import Browser, missing
 
 import blinkgl
 from blinkgl.tools import site
-from webdriver import Browser, missing
 
 REPOSITORY = Path(__file__).parents[2]
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from blinkgl.events.grids import voxel_grid
-from blinkgl.events.types import Events
 from blinkgl.trade.matching import match_events
 from blinkgl.trade.metrics import SpeedMaps, event_errors
+from blinkgl.types.events import Events
 
 H, W = 4, 5
 

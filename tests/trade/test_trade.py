@@ -23,8 +23,7 @@ from blinkgl.render.cutouts import lattice, mask_of
 from blinkgl.render.rectangles import Rectangle
 from blinkgl.render.renderer import Renderer
 from blinkgl.show.trade import show
-from blinkgl.tools import peer_cycles
-from blinkgl.trade import run as run_module
+from blinkgl.trade import cycles, run as run_module
 from blinkgl.trade.measure import Bench, Level, Options
 from blinkgl.trade.pareto import pareto_front
 from blinkgl.trade.reference import FineTiles
@@ -279,7 +278,7 @@ def test_a_path_tracer_in_the_references_place(gl, config, monkeypatch, tmp_path
     monkeypatch.setattr(
         run_module, "create_context", lambda *_: nullcontext(gl)
     )  # else theirs is current, not this one
-    monkeypatch.setattr(peer_cycles, "frames", frames)
+    monkeypatch.setattr(cycles, "frames", frames)
     monkeypatch.setattr(process, "available", lambda: "")
     options = replace(OPTIONS, tiles=(1, 1, 64, 48), reference="cycles")
     setting = (Setting("displacement 1 px"),)

@@ -23,9 +23,9 @@ from blinkgl.dataset.verify.found import Known, Verification, guarded
 from blinkgl.dataset.verify.sequence import look
 from blinkgl.dataset.work import RUN_FOLDER
 from blinkgl.errors import AssetError
-from blinkgl.io.index import made_folders, sequence_folders
 from blinkgl.io.records import shown
-from blinkgl.io.sequence_dir import MANIFEST
+from blinkgl.sequence_files.index import made_folders, sequence_folders
+from blinkgl.sequence_files.sequence_dir import MANIFEST
 
 __all__ = ["Verification", "verify_dataset"]
 

@@ -19,8 +19,8 @@ from blinkgl.dataset.verify.found import Known, Verification, guarded
 from blinkgl.errors import BlinkGLError
 from blinkgl.gl import GLContext, create_context
 from blinkgl.io.records import shown
-from blinkgl.io.sequence_dir import MANIFEST, read_manifest
 from blinkgl.labels import LABELS
+from blinkgl.sequence_files.sequence_dir import MANIFEST, read_manifest
 
 _SAME_ANYWHERE = (
     "split",

@@ -11,11 +11,11 @@ from blinkgl.dataset.plan import sequence_name
 from blinkgl.io.event_labels import EVENT_LABELS
 from blinkgl.io.frame_camera import files_of
 from blinkgl.io.imu import FILES as IMU_FILES
-from blinkgl.io.lens_files import FILES as LENS_FILES
 from blinkgl.io.records import shown
-from blinkgl.io.sequence_dir import MANIFEST, RIG
 from blinkgl.io.tracks import TRACKS
 from blinkgl.labels import LABELS, asked_for
+from blinkgl.sequence_files.lens_files import FILES as LENS_FILES
+from blinkgl.sequence_files.sequence_dir import MANIFEST, RIG
 
 
 def said_of(config: SequenceConfig) -> list[tuple[str, Any]]:

@@ -15,9 +15,9 @@ from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.verify.found import Known, Verification, guarded
 from blinkgl.dataset.work import RUN_FOLDER
 from blinkgl.errors import BlinkGLError
-from blinkgl.io.index import INDEX, entry, read_index
 from blinkgl.io.records import open_regular, shown
-from blinkgl.io.sequence_dir import MANIFEST
+from blinkgl.sequence_files.index import INDEX, entry, read_index
+from blinkgl.sequence_files.sequence_dir import MANIFEST
 
 _AT_TOP = {INDEX, "report.html"}
 

@@ -14,7 +14,6 @@ from blinkgl.config.tracks import track_times
 from blinkgl.dataset.verify.asked import distorts, exposures_of
 from blinkgl.dataset.verify.found import guarded
 from blinkgl.dataset.verify.labels import problems_of_asked
-from blinkgl.events.types import Cause
 from blinkgl.io.event_labels import EVENT_LABELS, EventLabelsReader, problem_of as problem_of_truth
 from blinkgl.io.frame_camera import (
     FOLDER as FRAME_CAMERA,
@@ -26,10 +25,11 @@ from blinkgl.io.frame_camera import (
 )
 from blinkgl.io.hdf5 import dataset, open_hdf5
 from blinkgl.io.imu import FILES as IMU_FILES, read_imu, read_imu_csv
-from blinkgl.io.lens_files import problems_of_lens
 from blinkgl.io.records import shown
 from blinkgl.io.tracks import TRACKS, problem_of as problem_of_tracks, read_tracks
 from blinkgl.labels import LABELS, Label
+from blinkgl.sequence_files.lens_files import problems_of_lens
+from blinkgl.types.events import Cause
 
 _BLOCK = 1 << 20
 

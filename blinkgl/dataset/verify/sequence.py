@@ -10,7 +10,7 @@ from blinkgl.dataset.verify.asked import bound, files_of_rig, misnamed, not_aske
 from blinkgl.dataset.verify.contents import check_imu, contents
 from blinkgl.dataset.verify.found import Known, guarded
 from blinkgl.io.records import shown
-from blinkgl.io.sequence_dir import MANIFEST, read_manifest, verify_sequence
+from blinkgl.sequence_files.sequence_dir import MANIFEST, read_manifest, verify_sequence
 
 _REQUIRED = {"duration_us": int, "seed": int, "sequence": int, "split": str, "labels": int}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -13,7 +13,6 @@ from moderngl import LINEAR
 from blinkgl.render.canvas import DEPTH_BUFFER
 from blinkgl.render.passes.base import Input, Output, Pass, ScenePass, Shot
 from blinkgl.render.shadows import Box, boxes, planes_of, scale_of, view_of
-from blinkgl.render.umbras import DRAW, TRIANGLE, Umbra, umbra
 from blinkgl.scene.lights import MAX_SHADOWS, lamps_of
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.types import Lamp
@@ -21,7 +20,6 @@ from blinkgl.scene.types import Lamp
 if TYPE_CHECKING:
     from blinkgl.render.moment import Moment
     from blinkgl.render.painter import Painter, Uniforms
-    from blinkgl.render.rectangles import Rectangle
     from blinkgl.render.resources import DrawItem, Kind
     from blinkgl.scene.types import Scene
 
@@ -33,7 +31,7 @@ FINEST = 1 / 32
 @dataclass(frozen=True)
 class ShadowMap(ScenePass):
     """Depth buffer of what casts a lamp's shadows, (texels, texels), reversed: 0 where nothing does. Drawn
-    again only where something that casts has moved; without what moves and whose shadow is not in the picture.
+    again only where something that casts has moved.
 
     box : of a sun.   soft : whether those who read it look at the depths themselves.
     crowd : whether most of what casts moves, so that all of it is drawn again."""
@@ -66,25 +64,10 @@ class ShadowMap(ScenePass):
         return {"PARALLEL": 1} if self.lamp.kind == "sun" else {}
 
     def seen(self, moment: Moment) -> Moment:
-        seen = moment.from_place(*view_of(self.lamp, self.box, self.texels, self.lamp.path.pose(moment.t_ns)))
-        seen.looker = moment
-        return seen
-
-    def serves(self, drawn: Moment, moment: Moment) -> bool:
-        """Another may see shadows of what was left out."""
-        if drawn.looker is None or drawn.t_ns != moment.t_ns:
-            return False
-        return drawn.looker is moment or self.umbra(moment).throws <= self.umbra(drawn.looker).throws
+        return moment.from_place(*view_of(self.lamp, self.box, self.texels, self.lamp.path.pose(moment.t_ns)))
 
     def items(self, moment: Moment) -> list[DrawItem]:
-        assert moment.looker is not None
-        throws, all_ = self.umbra(moment.looker).throws, not self.stands_still(False)
-        return [i for i in moment.visible if i.casts and (i.number in throws or not (i.moves or all_))]
-
-    def umbra(self, moment: Moment) -> Umbra:
-        """Where in the picture of a moment its shadows can fall."""
-        wide, wider, _, _ = scale_of(self.lamp, self.box, self.texels)
-        return moment.once(self, lambda: umbra(moment, moment.stage.solids, self.lamp, (wide, wider), self.soft))
+        return [item for item in moment.visible if item.casts]
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
         painter.gl.ctx.cull_face = "front"
@@ -116,9 +99,7 @@ def _faces(items: Iterable[DrawItem]) -> int:
 
 
 class Shaded(ScenePass):
-    """A pass that is lit. shadows : maps of the lamps whose shadows it draws, a field of the pass.
-
-    Where no shadow can fall (:mod:`blinkgl.render.umbras`) the same pass without shadows is drawn."""
+    """A pass that is lit. shadows : maps of the lamps whose shadows it draws, a field of the pass."""
 
     lit: ClassVar[bool] = True
     shadows: tuple[ShadowMap, ...]
@@ -126,29 +107,6 @@ class Shaded(ScenePass):
     @property
     def inputs(self) -> tuple[Input, ...]:
         return tuple(Input(name, map_, DEPTH_BUFFER) for name, map_ in zip(_SAMPLERS, self.shadows))
-
-    def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
-        if not self.shadows:
-            super().paint(painter, shot, items)
-            return
-        umbras = [map_.umbra(shot.moment) for map_ in self.shadows]
-        shaded, open_ = painter.programs(self), painter.programs(self.without_shadows())
-        for item in self.items(shot.moment) if items is None else items:
-            places = [place for one in umbras for place in one.places.get(item.number, ())]
-            if places and not _pays(item, places, umbras[0].boxes[item.number]):
-                self.draw_item(painter, shot, item, shaded[item.kind])
-                continue
-            # What is drawn first stays: the depths are the same to the bit, and only what is nearer is drawn over.
-            if places:
-                uniforms = shaded[item.kind]
-                self.dress_item(painter, shot, item, uniforms)
-                for place in places:
-                    with painter.only(place, shot):
-                        painter.draw(uniforms, item)
-            self.draw_item(painter, shot, item, open_[item.kind])
-
-    def without_shadows(self) -> Shaded:
-        return _without_shadows(self)
 
     def bind(self, uniforms: Uniforms, shot: Shot) -> None:
         for unit, (name, map_) in enumerate(zip(_SAMPLERS, self.shadows), 1):
@@ -167,17 +125,6 @@ class Shaded(ScenePass):
             uniforms["shadow_scale"].write(_scales(self.shadows).tobytes())
             if "shadow_plane" in uniforms:
                 uniforms["shadow_plane"].write(planes_of(rows, _scales(self.shadows)).astype(np.float32).tobytes())
-
-
-def _pays(item: DrawItem, places: Sequence[Rectangle], box: Rectangle) -> bool:
-    """Whether to draw an item several times, by programs of their own. box : where it is in the picture."""
-    spared = box.area - sum(place.area for place in places)
-    return len(places) * (DRAW + len(item.mesh.faces) * TRIANGLE) < spared
-
-
-@lru_cache(maxsize=64)
-def _without_shadows(pass_: Shaded) -> Shaded:
-    return replace(pass_, shadows=())  # type: ignore[type-var]  # its kinds are dataclasses
 
 
 _SAMPLERS = tuple(f"shadow_map_{k}" for k in range(MAX_SHADOWS))

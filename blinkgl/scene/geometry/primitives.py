@@ -1,5 +1,4 @@
-"""Primitive bodies with analytic normals and proper texture coordinates, z up: solids, centred on the origin, and
-bodies that move by themselves.
+"""Primitive bodies with analytic normals and proper texture coordinates, z up, centred on the origin.
 
 All but :func:`grid` are closed. Every function takes keyword parameters in the user's units and returns a
 :class:`~blinkgl.scene.types.Mesh` whose ``source_hash`` is a hash of the parameters. Texture coordinates run once round
@@ -13,23 +12,17 @@ import inspect
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import wraps
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from blinkgl.config.deform import FlagConfig
-from blinkgl.config.scene import LIVING_KINDS, PRIMITIVE_KINDS
+from blinkgl.config.primitives import PRIMITIVES
 from blinkgl.errors import AssetError
-from blinkgl.scene.geometry.figure import body_of
-from blinkgl.scene.geometry.meshes import closedness, make_mesh, transform_mesh, weld
-from blinkgl.scene.shapes.closed_forms import Beat, Flag, Waves
+from blinkgl.scene.geometry.meshes import closedness, make_mesh, weld
 from blinkgl.scene.shapes.deformer import Deformer
-from blinkgl.scene.shapes.gait import CLIPS, PARENTS, Proportions, clip_of
-from blinkgl.scene.shapes.skeleton import Skeleton
-from blinkgl.scene.shapes.skin import Skin
+from blinkgl.scene.shapes.gait import CLIPS
 from blinkgl.scene.types import Mesh
 
 PARAMETERS = {
@@ -73,6 +66,8 @@ _RANGES = {"figure.build": _PART, "figure.legs": _PART, "figure.arms": _PART, "f
 _RANGES |= {"fish.deep": (0.6, 1.6), "phase": (0.0, 1.0), "tempo": (0.1, 4.0), "wind": (0.1, 4.0)}
 
 
+BUILDERS: dict[str, Callable[..., Mesh]] = {}
+"""By kind."""
 Surface = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """positions (V, 3), normals (V, 3), uvs (V, 2), faces (F, 3)"""
 
@@ -82,8 +77,11 @@ def parameter_hash(*parts: object) -> str:
     return hashlib.blake2b(repr(parts).encode(), digest_size=16).hexdigest()
 
 
-def _primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Callable[..., Mesh]:
-    """Checks the parameters, builds, and stamps name, hash and closedness."""
+def primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Callable[..., Mesh]:
+    """Makes a builder of a kind in ``config/primitives.py``, which checks the parameters and stamps name, hash and
+    closedness; puts it into :data:`BUILDERS`. Raises TypeError for a name that is not there."""
+    if build.__name__ not in PRIMITIVES:
+        raise TypeError(f"no primitive '{build.__name__}' in config/primitives.py")
     signature = inspect.signature(build)
 
     def checked(**parameters: Any) -> inspect.BoundArguments:
@@ -150,17 +148,18 @@ def _primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Call
         )
 
     made.checked = checked  # type: ignore[attr-defined]
+    BUILDERS[build.__name__] = made
     return made
 
 
-def _join(pieces: Sequence[Surface]) -> Surface:
+def join(pieces: Sequence[Surface]) -> Surface:
     """One body of several (positions, normals, uvs, faces)."""
     offsets = np.cumsum([0] + [len(p[0]) for p in pieces[:-1]])
     positions, normals, uvs = (np.concatenate([p[i] for p in pieces]) for i in range(3))
     return positions, normals, uvs, np.concatenate([p[3] + o for p, o in zip(pieces, offsets)])
 
 
-def _lattice(columns: int, rows: int) -> np.ndarray:
+def lattice(columns: int, rows: int) -> np.ndarray:
     """(2*columns*rows, 3) faces of a vertex lattice numbered row by row (row r+1 above row r), counter-clockwise."""
     c, r = np.meshgrid(np.arange(columns), np.arange(rows))
     i = (r * (columns + 1) + c).ravel()
@@ -175,7 +174,7 @@ def square(origin: ArrayLike, right: ArrayLike, up: ArrayLike, columns: int, row
     positions = origin + s[:, None] * right + t[:, None] * up
     normal = np.cross(right, up)
     normal = normal / np.linalg.norm(normal)
-    return positions, np.broadcast_to(normal, positions.shape), np.stack([s, 1 - t], 1), _lattice(columns, rows)
+    return positions, np.broadcast_to(normal, positions.shape), np.stack([s, 1 - t], 1), lattice(columns, rows)
 
 
 def _revolve(profile: np.ndarray, normals: np.ndarray, v: np.ndarray, segments: int) -> Surface:
@@ -194,7 +193,7 @@ def _revolve(profile: np.ndarray, normals: np.ndarray, v: np.ndarray, segments: 
         axis=2,
     )
     uvs = np.stack(np.broadcast_arrays(angle / (2 * math.pi), v[:, None]), axis=2).reshape(-1, 2).copy()
-    faces = _lattice(segments, len(profile) - 1)
+    faces = lattice(segments, len(profile) - 1)
     pole = np.repeat(np.abs(profile[:, 0]) < 1e-12, segments + 1)
     positions[pole, :2] = 0.0
     uvs[pole, 0] += 0.5 / segments  # a pole's vertex belongs to one segment: its middle
@@ -213,12 +212,12 @@ def _disc(radius: float, z: float, up: bool, segments: int, turn: float = 0.0) -
     return positions, np.broadcast_to([0.0, 0.0, side], positions.shape), uvs, faces if up else faces[:, ::-1]
 
 
-@_primitive
+@primitive
 def cuboid(extents: Sequence[float] = (1.0, 1.0, 1.0), subdivisions: int = 1) -> Surface:
     """Box of edge lengths ``extents``; the texture once on each side."""
     x, y, z = np.array(extents) / 2
     n = subdivisions
-    return _join(
+    return join(
         [
             square((x, -y, -z), (0, 2 * y, 0), (0, 0, 2 * z), n, n),
             square((-x, y, -z), (0, -2 * y, 0), (0, 0, 2 * z), n, n),
@@ -234,7 +233,7 @@ DIE_FACES = 2, 3
 """Rows and columns of a die's texture: 1 2 3 above 4 5 6, a face each."""
 
 
-@_primitive
+@primitive
 def die(size: float = 1.0, rounding: float = 0.12, subdivisions: int = 4) -> Surface:
     """Cube with rounded edges and corners, of ``subdivisions`` cells each (``rounding`` is a part of ``size``, at most
     a half, which is a ball). Its six faces are in one texture, 1 2 3 above 4 5 6, opposite ones 7 together: see
@@ -247,7 +246,7 @@ def die(size: float = 1.0, rounding: float = 0.12, subdivisions: int = 4) -> Sur
     edge = half - radius + radius * turn
     ticks = np.concatenate([-edge[::-1], edge]) if rounding < 0.5 else np.concatenate([-edge[:0:-1], edge])
     across, up = np.meshgrid(ticks, ticks)
-    n, lattice, sides = len(ticks) - 1, _lattice(len(ticks) - 1, len(ticks) - 1), []
+    n, cells, sides = len(ticks) - 1, lattice(len(ticks) - 1, len(ticks) - 1), []
     x, y, z = np.eye(3)
     # Seen from outside: what is out of the face, to its right, up in it.
     faces = ((z, x, y), (x, y, z), (y, -x, z), (-y, x, z), (-x, -y, z), (-z, -x, y))
@@ -257,17 +256,17 @@ def die(size: float = 1.0, rounding: float = 0.12, subdivisions: int = 4) -> Sur
         normals = (cube - core) / np.linalg.norm(cube - core, axis=2, keepdims=True)
         row, column = divmod(number, DIE_FACES[1])
         uvs = np.stack([(column + 0.5 + across / size) / DIE_FACES[1], (row + 0.5 - up / size) / DIE_FACES[0]], axis=2)
-        sides.append((*(a.reshape((n + 1) ** 2, -1) for a in (core + radius * normals, normals, uvs)), lattice))
-    return _join(sides)
+        sides.append((*(a.reshape((n + 1) ** 2, -1) for a in (core + radius * normals, normals, uvs)), cells))
+    return join(sides)
 
 
-@_primitive
+@primitive
 def grid(width: float = 1.0, depth: float = 1.0, subdivisions: int = 1) -> Surface:
     """Rectangle in z = 0 facing +z, ``width`` in x and ``depth`` in y; the texture once on it. Not closed."""
     return square((-width / 2, -depth / 2, 0), (width, 0, 0), (0, depth, 0), subdivisions, subdivisions)
 
 
-@_primitive
+@primitive
 def sphere(radius: float = 0.5, segments: int = 32, rings: int = 16) -> Surface:
     """Sphere by longitude and latitude."""
     latitude = np.linspace(-math.pi / 2, math.pi / 2, rings + 1)
@@ -276,7 +275,7 @@ def sphere(radius: float = 0.5, segments: int = 32, rings: int = 16) -> Surface:
     return _revolve(radius * direction, direction, 1 - np.arange(rings + 1) / rings, segments)
 
 
-@_primitive
+@primitive
 def icosphere(radius: float = 0.5, subdivisions: int = 3) -> Surface:
     """Sphere of 20 * 4**subdivisions nearly equal triangles, box-projected texture."""
     g = (1 + math.sqrt(5)) / 2
@@ -336,16 +335,16 @@ def icosphere(radius: float = 0.5, subdivisions: int = 3) -> Surface:
     return radius * mesh.vertices, mesh.normals, mesh.uvs, mesh.faces
 
 
-@_primitive
+@primitive
 def cylinder(radius: float = 0.5, height: float = 1.0, segments: int = 32, rings: int = 2) -> Surface:
     """Circular cylinder along z."""
     t = np.linspace(0, 1, rings)
     profile = np.stack([np.full(rings, radius), (t - 0.5) * height], axis=1)
     side = _revolve(profile, np.broadcast_to([1.0, 0.0], profile.shape), 1 - t, segments)
-    return _join([side, _disc(radius, height / 2, True, segments), _disc(radius, -height / 2, False, segments)])
+    return join([side, _disc(radius, height / 2, True, segments), _disc(radius, -height / 2, False, segments)])
 
 
-@_primitive
+@primitive
 def cone(radius: float = 0.5, height: float = 1.0, segments: int = 32, rings: int = 4) -> Surface:
     """Circular cone with its tip at z = height/2."""
     t = np.linspace(0, 1, rings)
@@ -359,10 +358,10 @@ def cone(radius: float = 0.5, height: float = 1.0, segments: int = 32, rings: in
     normals[tip] = np.stack(
         [slope[0] * np.cos(angle), slope[0] * np.sin(angle), np.full(segments + 1, slope[1])], axis=1
     )
-    return _join([(positions, normals, uvs, faces), _disc(radius, -height / 2, False, segments)])
+    return join([(positions, normals, uvs, faces), _disc(radius, -height / 2, False, segments)])
 
 
-@_primitive
+@primitive
 def torus(radius: float = 0.35, tube: float = 0.15, segments: int = 32, tube_segments: int = 16) -> Surface:
     """Ring about z: ``radius`` to the middle of a tube of radius ``tube`` (< radius)."""
     if tube >= radius:
@@ -378,7 +377,7 @@ def torus(radius: float = 0.35, tube: float = 0.15, segments: int = 32, tube_seg
     )
 
 
-@_primitive
+@primitive
 def capsule(radius: float = 0.25, height: float = 0.5, segments: int = 32, rings: int = 16) -> Surface:
     """Cylinder of ``height`` between two half spheres; ``rings`` rows of the two together."""
     half = max(rings // 2, 1)
@@ -393,17 +392,17 @@ def capsule(radius: float = 0.25, height: float = 0.5, segments: int = 32, rings
     return _revolve(profile, direction, 1 - length / length[-1], segments)
 
 
-@_primitive
+@primitive
 def prism(sides: int = 6, radius: float = 0.5, height: float = 1.0) -> Surface:
     """Upright prism over a regular polygon of circumradius ``radius``, flat-shaded; the texture once on each side."""
     angle = 2 * math.pi * np.arange(sides + 1) / sides
     rim = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(sides + 1, -height / 2)], axis=1)
     rim[-1] = rim[0]
     walls = [square(rim[i], rim[i + 1] - rim[i], (0, 0, height), 1, 1) for i in range(sides)]
-    return _join([*walls, _disc(radius, height / 2, True, sides), _disc(radius, -height / 2, False, sides)])
+    return join([*walls, _disc(radius, height / 2, True, sides), _disc(radius, -height / 2, False, sides)])
 
 
-@_primitive
+@primitive
 def pyramid(sides: int = 4, radius: float = 0.5, height: float = 1.0) -> Surface:
     """Pyramid over a regular polygon, flat-shaded; each side carries the texture's triangle."""
     angle = 2 * math.pi * np.arange(sides + 1) / sides
@@ -421,179 +420,9 @@ def pyramid(sides: int = 4, radius: float = 0.5, height: float = 1.0) -> Surface
                 np.array([[0, 1, 2]]),
             )
         )
-    return _join([*walls, _disc(radius, -height / 2, False, sides)])
-
-
-@_primitive
-def figure(
-    height: float = 1.75,
-    build: float = 1.0,
-    legs: float = 1.0,
-    arms: float = 1.0,
-    head: float = 1.0,
-    clip: str = "stand",
-    variant: int = 0,
-    tempo: float = 1.0,
-    phase: float = 0.0,
-    coat: int = 0,
-) -> tuple[Surface, Deformer]:
-    """A person on z = 0, looking along x: walks, runs, dances, waves or stands, on the spot (an object's `way` takes it
-    along). The texture is an atlas in which each part of the body has its place, in one scale all over."""
-    if height > 1000:
-        raise AssetError("bad parameter", where="figure.height", value=height, accepted="a number up to 1000")
-    proportions = Proportions(height, build, legs, arms, head)
-    body = body_of(proportions)
-    skeleton = Skeleton(PARENTS, clip_of(clip, proportions, tempo, phase, variant), where="figure")
-    skin = Skin(skeleton, range(len(PARENTS)), body.inverse_bind, body.joints, body.weights, where="figure")
-    return (body.vertices, body.normals, body.uvs, body.faces), skin
-
-
-@_primitive
-def flag(
-    width: float = 1.5,
-    height: float = 1.0,
-    wind: float = 1.0,
-    phase: float = 0.0,
-    subdivisions: int = 40,
-    coat: int = 0,
-) -> tuple[Surface, Deformer]:
-    """Cloth in wind, from its held edge at x = 0 along x, from z = 0 up, waving in y; the texture once on each side,
-    seen through from the other."""
-    thick = 0.004 * min(width, height)
-    rows = max(round(subdivisions * height / width), 1)
-    front = square((0, -thick, 0), (width, 0, 0), (0, 0, height), subdivisions, rows)
-    back = square((width, thick, 0), (-width, 0, 0), (0, 0, height), subdivisions, rows)
-    back[2][:, 0] = 1 - back[2][:, 0]
-    rim = [
-        square((0, thick, 0), (0, -2 * thick, 0), (0, 0, height), 1, rows),
-        square((width, -thick, 0), (0, 2 * thick, 0), (0, 0, height), 1, rows),
-        square((0, thick, 0), (width, 0, 0), (0, -2 * thick, 0), subdivisions, 1),
-        square((0, -thick, height), (width, 0, 0), (0, 2 * thick, 0), subdivisions, 1),
-    ]
-    beat = Beat(0.75 / wind**0.7, -2 * math.pi * phase)
-    config = FlagConfig(amplitude=0.1 * wind**0.3, period=beat.period, phase=360 * phase)
-    low, high = np.array([0, -thick, 0]), np.array([width, thick, height])
-    cloth = Flag.of(config, low, high)
-    cloth.goes = "level"
-    return _join([front, back, *rim]), cloth
-
-
-@_primitive
-def fish(
-    length: float = 0.3, deep: float = 1.0, tempo: float = 1.0, phase: float = 0.0, coat: int = 0
-) -> tuple[Surface, Deformer]:
-    """A fish that swims along x, its nose at x = length / 2: a wave runs down its body, larger towards the tail."""
-    rings, segments = 48, 28
-    s = (1 - np.cos(math.pi * np.arange(rings + 1) / rings)) / 2  # 0 the nose, 1 the end of the tail; finer at both
-    body = np.sqrt(np.clip(s / 0.78, 0, 1)) * np.clip(1 - (s / 0.80) ** 2.2, 0, 1) ** 0.8
-    tail = np.exp(-(((s - 0.97) / 0.085) ** 2)) * (s < 1)
-    fin = np.exp(-(((s - 0.40) / 0.13) ** 4))
-    stalk = 0.022 * (np.sin(math.pi * np.clip(s, 0, 1)) ** 0.3)
-    up = length * deep * (0.235 * body + 0.17 * tail + 0.07 * fin + stalk)
-    under = length * deep * (0.215 * body + 0.17 * tail + 0.05 * np.exp(-(((s - 0.55) / 0.06) ** 2)) + stalk)
-    wide = length * (0.105 * body + 0.010 * np.sin(math.pi * s) ** 0.5)
-    angle = 2 * math.pi * np.arange(segments + 1) / segments
-    # Fins are thin: what is higher than the body itself tapers off.
-    z = np.where(np.cos(angle) > 0, up[:, None], under[:, None]) * np.cos(angle)
-    core = length * deep * (0.225 * body + stalk)[:, None]
-    thin = np.clip((1 - np.clip(np.abs(z) / (core + 1e-9) - 0.25, 0, 1) ** 2), 0.06, 1)
-    y = -wide[:, None] * np.sin(angle) * thin
-    y[:, [0, segments // 2, -1]] = 0
-    notch = 0.10 * length * tail[:, None] * (np.abs(z) / (0.17 * length * deep) - 0.55)
-    x = length * (0.5 - s)[:, None] - notch
-    positions = np.stack([x, y, z], axis=2)
-    positions[[0, -1]] = positions[[0, -1]].mean(axis=1, keepdims=True)
-    faces = _lattice(segments, rings)[:, ::-1]  # rows go to the tail
-    flat = positions.reshape(-1, 3)
-    corners = flat[faces]
-    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    faces, area = (a[np.linalg.norm(area, axis=1) > 1e-12 * length**2] for a in (faces, area))
-    uvs = np.stack(np.broadcast_arrays(angle / (2 * math.pi), s[:, None]), axis=2).reshape(-1, 2)
-    wave = -2 * math.pi / (0.95 * length) * np.array([1.0, 0, 0])
-    frequency = 1.9 * tempo * math.sqrt(0.3 / length)
-    beat = Beat(1 / frequency, -2 * math.pi * phase)
-    swim = Waves(
-        np.array([0, 1.0, 0]),
-        (np.array([-0.9 / length, 0, 0]), 0.55),
-        ((wave, 0.0), (np.zeros(3), 0.0)),
-        (0.085 * length, 0.0),
-        (beat, beat),
-    )
-    swim.goes, swim.speed = "level", 0.7 * 0.95 * length / (beat.period_ns * 1e-9)
-    return (flat, _smooth_normals(flat, faces, area), uvs, faces), swim
-
-
-def _smooth_normals(positions: np.ndarray, faces: np.ndarray, area: np.ndarray) -> np.ndarray:
-    """(V, 3) means of the faces round each point, across seams of the texture, too."""
-    points, welded = weld(positions, faces)
-    total = np.zeros_like(points)
-    np.add.at(total, welded, area[:, None])
-    out = np.zeros_like(positions)
-    out[faces] = total[welded]
-    length = np.linalg.norm(out, axis=1, keepdims=True)
-    return np.where(length > 0, out / np.maximum(length, 1e-300), [0.0, 0.0, 1.0])
-
-
-BUILDERS = {
-    f.__name__: f
-    for f in (cuboid, cylinder, sphere, icosphere, cone, torus, capsule, prism, pyramid, grid, die, figure, flag, fish)
-}
+    return join([*walls, _disc(radius, -height / 2, False, sides)])
 
 
 def parameters(kind: str) -> dict[str, float | int | str | tuple[float, ...]]:
     """Names and defaults of a builder's parameters."""
     return {name: parameter.default for name, parameter in inspect.signature(BUILDERS[kind]).parameters.items()}
-
-
-def random_primitive(kind: str, index: int) -> Mesh:
-    """The ``index``-th body of a kind, about one unit large. No two have the same proportions, so that bodies of
-    different indices may be told apart by a train/test split; ``source_hash`` is of (kind, index)."""
-    rng = np.random.default_rng([(PRIMITIVE_KINDS + LIVING_KINDS).index(kind), index])
-
-    def between(low: float, high: float) -> float:
-        # Log-uniform, and rounded: the last bit of exp differs between platforms.
-        return round(math.exp(rng.uniform(math.log(low), math.log(high))), 6)
-
-    if kind == "cuboid":
-        mesh = cuboid(extents=(between(0.25, 1), between(0.25, 1), between(0.25, 1)), subdivisions=2)
-    elif kind in ("cylinder", "cone"):
-        mesh = BUILDERS[kind](radius=0.5, height=between(0.3, 3))
-    elif kind == "sphere":
-        mesh = transform_mesh(sphere(), np.diag([1, between(0.6, 1), between(0.6, 1)]))
-    elif kind == "icosphere":
-        mesh = transform_mesh(
-            icosphere(subdivisions=int(rng.integers(1, 4))), np.diag([1, between(0.6, 1), between(0.6, 1)])
-        )
-    elif kind == "torus":
-        mesh = torus(tube=between(0.06, 0.25))
-    elif kind == "capsule":
-        mesh = capsule(height=between(0.1, 1.2))
-    elif kind == "prism":
-        mesh = prism(sides=int(rng.integers(3, 9)), height=between(0.3, 3))
-    elif kind == "figure":
-        does = ("walk", "dance", "run", "dance", "walk", "wave")[index % 6]
-        grown, parts = between(1.2, 1.95), [between(0.9, 1.1) for _ in range(3)]
-        mesh = figure(
-            height=grown,
-            build=between(0.8, 1.3),
-            legs=parts[0],
-            arms=parts[1],
-            head=parts[2] * (1.75 / grown) ** 0.5,
-            clip=does,
-            variant=index,
-            tempo=between(0.85, 1.2),
-            phase=round(rng.uniform(), 6),
-            coat=index,
-        )
-    elif kind == "flag":
-        mesh = flag(height=between(0.5, 1.5), wind=between(0.5, 2), phase=round(rng.uniform(), 6), coat=index)
-    elif kind == "fish":
-        mesh = fish(deep=between(0.65, 1.5), tempo=between(0.7, 1.6), phase=round(rng.uniform(), 6), coat=index)
-    else:
-        mesh = pyramid(sides=int(rng.integers(3, 7)), height=between(0.5, 1.6))
-    return replace(mesh, source_hash=random_primitive_hash(kind, index), name=f"{kind}-{index}")
-
-
-def random_primitive_hash(kind: str, index: int) -> str:
-    """``source_hash`` of :func:`random_primitive`, without making it."""
-    return parameter_hash("random primitive", 1, kind, index)

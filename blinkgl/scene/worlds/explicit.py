@@ -16,8 +16,8 @@ from blinkgl.camera import CameraModel
 from blinkgl.config.deform import AnimationConfig, animation_of
 from blinkgl.config.materials import MaterialConfig
 from blinkgl.config.places import rigid_matrix
+from blinkgl.config.primitives import PRIMITIVES
 from blinkgl.config.scene import (
-    LIVING_KINDS,
     ExplicitSceneConfig,
     KeyedMotionConfig,
     MeshConfig,
@@ -26,9 +26,9 @@ from blinkgl.config.scene import (
     object_names,
 )
 from blinkgl.errors import AssetError, ConfigError
+from blinkgl.scene.geometry import BUILDERS
 from blinkgl.scene.geometry.deforming import deforming
 from blinkgl.scene.geometry.meshes import transform_mesh
-from blinkgl.scene.geometry.primitives import BUILDERS
 from blinkgl.scene.geometry.tangents import split_mirrored
 from blinkgl.scene.importing.mesh_files import Asset, load_asset
 from blinkgl.scene.lights import make_light
@@ -217,7 +217,7 @@ def _check_speeds(
 
 def _on_body(given: Any, where: str, base: Path) -> np.ndarray:
     """(4, 4) T_body_sensor, of a matrix or of EuRoC's sensor.yaml."""
-    from blinkgl.io.camchain import read_place_on_body
+    from blinkgl.config.camchain import read_place_on_body
 
     if not isinstance(given, str):
         return rigid_matrix(given)
@@ -263,7 +263,7 @@ def check_primitive(kind: str, parameters: Mapping[str, Any], name: str) -> None
     """Raises ConfigError for what :func:`primitive_mesh` would refuse; of living things, whose parameters have nothing
     to do with each other, without making one."""
     with _parameters_of(name):
-        (BUILDERS[kind].checked if kind in LIVING_KINDS else BUILDERS[kind])(**parameters)
+        (BUILDERS[kind].checked if PRIMITIVES[kind].use == "living" else BUILDERS[kind])(**parameters)
 
 
 @contextmanager

@@ -16,9 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from blinkgl.config.scene import PRIMITIVE_KINDS, TEXTURE_KINDS, PoolConfig, TexturesConfig
+from blinkgl.config.primitives import kinds
+from blinkgl.config.scene import TEXTURE_KINDS, PoolConfig, TexturesConfig
 from blinkgl.errors import AssetError, ConfigError
-from blinkgl.scene.geometry.primitives import random_primitive, random_primitive_hash
+from blinkgl.scene.geometry.random_primitives import random_primitive, random_primitive_hash
 from blinkgl.scene.importing.mesh_files import MESH_SUFFIXES, Asset, dependencies, load_asset
 from blinkgl.scene.reading import MAX_BYTES, contents
 from blinkgl.scene.surfaces.coats import COATS, coat
@@ -165,9 +166,8 @@ def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_t
     """Primitives, mesh folders and pybullet's URDF meshes. Loads :class:`~blinkgl.scene.importing.mesh_files.Asset`
     objects that are centred on their bounding box and have bounding radius 1. Raises ConfigError for
     a folder that is missing or holds no mesh."""
-    kinds = PRIMITIVE_KINDS if config.primitives == "all" else config.primitives
     entries = []
-    for kind in kinds:
+    for kind in kinds("pool") if config.primitives == "all" else config.primitives:
         for index in range(config.variants):
             entries.append(
                 Entry(random_primitive_hash(kind, index), f"{kind}-{index}", "primitives", kind=kind, index=index)

@@ -8,8 +8,9 @@ import pytest
 from blinkgl.errors import AssetError
 from blinkgl.scene.geometry.figure import ATLAS, CHARTS
 from blinkgl.scene.geometry.isosurface import isosurface
+from blinkgl.scene.geometry.living import figure, fish, flag
 from blinkgl.scene.geometry.meshes import closedness, normalise, transform_mesh, uvs_degenerate, weld
-from blinkgl.scene.geometry.primitives import figure, fish, flag, random_primitive
+from blinkgl.scene.geometry.random_primitives import random_primitive
 from blinkgl.scene.shapes.gait import CLIPS, J
 
 MS = 1_000_000

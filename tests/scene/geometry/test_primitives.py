@@ -6,10 +6,11 @@ import math
 import numpy as np
 import pytest
 
-from blinkgl.config.scene import PRIMITIVE_KINDS
+from blinkgl.config.primitives import PRIMITIVES, PrimitiveKind, kinds, seed_of
 from blinkgl.errors import AssetError
 from blinkgl.scene.geometry import primitives as P
 from blinkgl.scene.geometry.meshes import make_mesh
+from blinkgl.scene.geometry.random_primitives import RANDOM, random_primitive
 
 
 def face_vectors(mesh):
@@ -26,7 +27,7 @@ def volume(mesh):
     return np.einsum("ij,ij->i", v[f[:, 0]], np.cross(v[f[:, 1]], v[f[:, 2]])).sum() / 6
 
 
-@pytest.mark.parametrize("kind", PRIMITIVE_KINDS)
+@pytest.mark.parametrize("kind", kinds("pool"))
 def test_closed_outward_unit_normals(kind):
     mesh = P.BUILDERS[kind]()
     assert mesh.closed and volume(mesh) > 0
@@ -104,7 +105,7 @@ def test_analytic_normals_against_angle_weighted_ones(kind):
 
 def test_textures_are_not_mirrored():
     """Seen from outside, u x (-v) points at the viewer: a map with positive determinant everywhere."""
-    for kind in PRIMITIVE_KINDS:
+    for kind in kinds("pool"):
         mesh = P.BUILDERS[kind]()
         uv = mesh.uvs[mesh.faces].astype(float)
         e1, e2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
@@ -256,7 +257,7 @@ def test_flat_sides_carry_the_texture_once_each(kind, sides):
     np.testing.assert_allclose(unit, 0 if kind == "prism" else inside / math.hypot(inside, 3.0), atol=1e-6)
 
 
-@pytest.mark.parametrize("kind", [kind for kind in P.BUILDERS if kind not in P.LIVING_KINDS])
+@pytest.mark.parametrize("kind", [kind for kind in P.BUILDERS if kind not in kinds("living")])
 def test_sizes_when_nothing_is_said(kind):
     """About one unit, standing on nothing: centred on the origin."""
     mesh = P.BUILDERS[kind]()
@@ -285,3 +286,28 @@ def test_numbers_of_faces_have_ends(kind, name, low, high, monkeypatch):
     for value in (low - 1, high + 1, low + 0.5):
         with pytest.raises(AssetError, match=rf"{kind}.{name}: bad parameter"):
             P.BUILDERS[kind](**{name: value})
+
+
+def test_every_kind_is_built_and_every_pooled_one_drawn():
+    assert set(P.BUILDERS) == set(PRIMITIVES)
+    assert set(RANDOM) == set(kinds("pool", "living"))
+    numbers = [kind.category for kind in PRIMITIVES.values()]
+    assert len(set(numbers)) == len(numbers) and min(numbers) > 3, "1 to 3 are sky, ground and wall"
+
+
+def test_another_kind_changes_no_other_shape(monkeypatch):
+    """Random shapes hang on their kind's own seed, wherever it stands in the table."""
+    before = {kind: random_primitive(kind, 3) for kind in RANDOM}
+    monkeypatch.setitem(PRIMITIVES, "brick", PrimitiveKind("pool"))
+    table = {"brick": PRIMITIVES["brick"], **PRIMITIVES}
+    monkeypatch.setattr("blinkgl.config.primitives.PRIMITIVES", table)
+    assert "brick" in kinds("pool") and seed_of("brick") not in {kind.seed for kind in PRIMITIVES.values()}
+    for kind, mesh in before.items():
+        np.testing.assert_array_equal(random_primitive(kind, 3).vertices, mesh.vertices, err_msg=kind)
+
+
+def test_a_builder_of_an_unknown_kind_is_refused():
+    with pytest.raises(TypeError, match="no primitive 'brick' in config/primitives.py"):
+
+        @P.primitive
+        def brick(): ...

@@ -9,7 +9,7 @@ import pytest
 
 from blinkgl.config.deform import BendConfig, BreatheConfig, FlagConfig, TwistConfig, WaveConfig
 from blinkgl.errors import ConfigError
-from blinkgl.scene.geometry.primitives import BUILDERS
+from blinkgl.scene.geometry import BUILDERS
 from blinkgl.scene.motion.collision import resolve_collisions
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.shapes.table import deformer_of

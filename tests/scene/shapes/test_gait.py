@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blinkgl.scene.geometry.primitives import figure, fish
+from blinkgl.scene.geometry.living import figure, fish
 from blinkgl.scene.motion.ways import Way, way_path
 from blinkgl.scene.shapes.gait import CLIPS, JOINTS, PARENTS, J, Proportions, clip_of
 from blinkgl.scene.shapes.skeleton import Skeleton

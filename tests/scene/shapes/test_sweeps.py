@@ -9,7 +9,9 @@ import pytest
 from scipy.spatial import ConvexHull
 from skinned import arm
 
-from blinkgl.scene.geometry.primitives import fish, flag, icosphere, random_primitive
+from blinkgl.scene.geometry.living import fish, flag
+from blinkgl.scene.geometry.primitives import icosphere
+from blinkgl.scene.geometry.random_primitives import random_primitive
 from blinkgl.scene.shapes.deformer import Sweep, filled
 from blinkgl.scene.shapes.skin import Morphs, Skin
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import fit_gloss
 import numpy as np
 import pytest
 
 from blinkgl.scene.surfaces import gloss
-from blinkgl.tools import fit_gloss
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from blinkgl.config.deform import AnimationConfig, ClipConfig
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene
-from blinkgl.scene.geometry.primitives import BUILDERS
+from blinkgl.scene.geometry import BUILDERS
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.mesh_files import load_asset
 from blinkgl.scene.shapes.skin import Skin

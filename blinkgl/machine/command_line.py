@@ -1,0 +1,121 @@
+"""Run a command line so that a user sees one line per error, whatever went wrong."""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+import traceback
+
+import typer
+
+from blinkgl.errors import BlinkGLError
+from blinkgl.machine.extras import EXTRAS, install
+from blinkgl.machine.interrupts import interruptible
+from blinkgl.machine.terminal import never_fail_to_print
+
+
+def run_app(app: typer.Typer, arguments: list[str], program: str, project: str) -> int:
+    """Run ``app`` with ``arguments`` and return the exit status: 2 and one line for an error of the user's or the
+    machine's, 130 when interrupted, 1 and a traceback for a bug.
+
+    program : name of the command.   project : whose bug an unforeseen error is."""
+    never_fail_to_print()
+    debug = "--debug" in arguments
+    arguments = [a for a in arguments if a != "--debug"] or ["--help"]
+    try:
+        # Not standalone: typer then hands errors up instead of printing its own boxes.
+        with interruptible():
+            status = app(arguments, prog_name=program, standalone_mode=False)
+        return status if isinstance(status, int) else 0
+    except (KeyboardInterrupt, typer.Abort):
+        print("interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # `blinkgl … | head`: the reader has gone, which is no error of ours
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except Exception as error:  # noqa: BLE001 - every error leaves as a line for the user
+        return _report(error, debug, project)
+
+
+def _report(error: Exception, debug: bool, project: str) -> int:
+    line = user_line(error)
+    if debug or line is None:
+        traceback.print_exception(error)
+    if line is None:
+        print(f"this is a bug in {project}; please report the lines above and the command", file=sys.stderr)
+        return 1
+    print(f"error: {line}", file=sys.stderr)
+    if not isinstance(error, BlinkGLError):
+        return BlinkGLError.exit_status
+    if getattr(error, "detail", ""):  # a shader's messages with the source around them
+        print(f"\n{error.detail}", file=sys.stderr)
+    return error.exit_status
+
+
+OUT_OF_MEMORY = (
+    "out of memory; use a smaller image, fewer workers or shorter sequences, or raise the limit on the process "
+    "('ulimit -v' shows it)"
+)
+_MACHINE_ERRNOS = {
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EACCES,
+    errno.EPERM,
+    errno.EROFS,
+    errno.EIO,
+    errno.ENAMETOOLONG,
+    errno.EMFILE,
+    errno.ENFILE,
+    errno.EFBIG,
+}
+
+
+def user_line(error: Exception) -> str | None:
+    """Return the line for an error that the user or the machine caused; None for a bug."""
+    if isinstance(error, BlinkGLError):
+        return str(error)
+    # typer's usage errors; their class moved between versions.
+    if hasattr(error, "format_message") and hasattr(error, "exit_code"):
+        context = getattr(error, "ctx", None)
+        command = context.command_path if context is not None else "blinkgl"
+        message = " ".join(error.format_message().split()).rstrip(".")
+        return f"{message}; see '{command} --help'"
+    if isinstance(error, ModuleNotFoundError) and error.name in EXTRAS["learn"][0]:
+        return f"{error.name} is not installed; run {install(*EXTRAS['learn'][0])}"
+    if is_out_of_memory(error):
+        asked = " ".join(str(error).split())
+        return OUT_OF_MEMORY + (f" ({asked[:120]})" if asked else "")
+    if isinstance(error, OSError):
+        code = error.errno
+        if code is None and "No space left" in str(error):  # h5py keeps the number inside its text
+            code = errno.ENOSPC
+        if code in _MACHINE_ERRNOS:
+            return f"{error.filename}: {os.strerror(code).lower()}" if error.filename else os.strerror(code).lower()
+    return None
+
+
+def is_out_of_memory(error: BaseException | None) -> bool:
+    """Return whether memory ran out: MemoryError (NumPy's too), ENOMEM, or the words that OpenCV, LLVM, torch and HDF5
+    say it in."""
+    seen: set[int] = set()
+    while error is not None and id(error) not in seen:
+        seen.add(id(error))
+        if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
+            return True
+        text = str(error).lower()
+        if any(
+            words in text
+            for words in (
+                "cannot allocate memory",
+                "can't allocate memory",
+                "insufficient memory",
+                "bad_alloc",
+                "out of memory",
+                "unable to allocate",
+                "failed to map segment",
+            )
+        ):
+            return True
+        error = error.__cause__ or error.__context__
+    return False

@@ -1,0 +1,128 @@
+"""Primitives that move by themselves: people, cloth in wind, fish."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from blinkgl.config.deform import FlagConfig
+from blinkgl.errors import AssetError
+from blinkgl.scene.geometry.figure import body_of
+from blinkgl.scene.geometry.meshes import weld
+from blinkgl.scene.geometry.primitives import Surface, join, lattice, primitive, square
+from blinkgl.scene.shapes.closed_forms import Beat, Flag, Waves
+from blinkgl.scene.shapes.deformer import Deformer
+from blinkgl.scene.shapes.gait import PARENTS, Proportions, clip_of
+from blinkgl.scene.shapes.skeleton import Skeleton
+from blinkgl.scene.shapes.skin import Skin
+
+
+@primitive
+def figure(
+    height: float = 1.75,
+    build: float = 1.0,
+    legs: float = 1.0,
+    arms: float = 1.0,
+    head: float = 1.0,
+    clip: str = "stand",
+    variant: int = 0,
+    tempo: float = 1.0,
+    phase: float = 0.0,
+    coat: int = 0,
+) -> tuple[Surface, Deformer]:
+    """A person on z = 0, looking along x: walks, runs, dances, waves or stands, on the spot (an object's `way` takes it
+    along). The texture is an atlas in which each part of the body has its place, in one scale all over."""
+    if height > 1000:
+        raise AssetError("bad parameter", where="figure.height", value=height, accepted="a number up to 1000")
+    proportions = Proportions(height, build, legs, arms, head)
+    body = body_of(proportions)
+    skeleton = Skeleton(PARENTS, clip_of(clip, proportions, tempo, phase, variant), where="figure")
+    skin = Skin(skeleton, range(len(PARENTS)), body.inverse_bind, body.joints, body.weights, where="figure")
+    return (body.vertices, body.normals, body.uvs, body.faces), skin
+
+
+@primitive
+def flag(
+    width: float = 1.5,
+    height: float = 1.0,
+    wind: float = 1.0,
+    phase: float = 0.0,
+    subdivisions: int = 40,
+    coat: int = 0,
+) -> tuple[Surface, Deformer]:
+    """Cloth in wind, from its held edge at x = 0 along x, from z = 0 up, waving in y; the texture once on each side,
+    seen through from the other."""
+    thick = 0.004 * min(width, height)
+    rows = max(round(subdivisions * height / width), 1)
+    front = square((0, -thick, 0), (width, 0, 0), (0, 0, height), subdivisions, rows)
+    back = square((width, thick, 0), (-width, 0, 0), (0, 0, height), subdivisions, rows)
+    back[2][:, 0] = 1 - back[2][:, 0]
+    rim = [
+        square((0, thick, 0), (0, -2 * thick, 0), (0, 0, height), 1, rows),
+        square((width, -thick, 0), (0, 2 * thick, 0), (0, 0, height), 1, rows),
+        square((0, thick, 0), (width, 0, 0), (0, -2 * thick, 0), subdivisions, 1),
+        square((0, -thick, height), (width, 0, 0), (0, 2 * thick, 0), subdivisions, 1),
+    ]
+    beat = Beat(0.75 / wind**0.7, -2 * math.pi * phase)
+    config = FlagConfig(amplitude=0.1 * wind**0.3, period=beat.period, phase=360 * phase)
+    low, high = np.array([0, -thick, 0]), np.array([width, thick, height])
+    cloth = Flag.of(config, low, high)
+    cloth.goes = "level"
+    return join([front, back, *rim]), cloth
+
+
+@primitive
+def fish(
+    length: float = 0.3, deep: float = 1.0, tempo: float = 1.0, phase: float = 0.0, coat: int = 0
+) -> tuple[Surface, Deformer]:
+    """A fish that swims along x, its nose at x = length / 2: a wave runs down its body, larger towards the tail."""
+    rings, segments = 48, 28
+    s = (1 - np.cos(math.pi * np.arange(rings + 1) / rings)) / 2  # 0 the nose, 1 the end of the tail; finer at both
+    body = np.sqrt(np.clip(s / 0.78, 0, 1)) * np.clip(1 - (s / 0.80) ** 2.2, 0, 1) ** 0.8
+    tail = np.exp(-(((s - 0.97) / 0.085) ** 2)) * (s < 1)
+    fin = np.exp(-(((s - 0.40) / 0.13) ** 4))
+    stalk = 0.022 * (np.sin(math.pi * np.clip(s, 0, 1)) ** 0.3)
+    up = length * deep * (0.235 * body + 0.17 * tail + 0.07 * fin + stalk)
+    under = length * deep * (0.215 * body + 0.17 * tail + 0.05 * np.exp(-(((s - 0.55) / 0.06) ** 2)) + stalk)
+    wide = length * (0.105 * body + 0.010 * np.sin(math.pi * s) ** 0.5)
+    angle = 2 * math.pi * np.arange(segments + 1) / segments
+    # Fins are thin: what is higher than the body itself tapers off.
+    z = np.where(np.cos(angle) > 0, up[:, None], under[:, None]) * np.cos(angle)
+    core = length * deep * (0.225 * body + stalk)[:, None]
+    thin = np.clip((1 - np.clip(np.abs(z) / (core + 1e-9) - 0.25, 0, 1) ** 2), 0.06, 1)
+    y = -wide[:, None] * np.sin(angle) * thin
+    y[:, [0, segments // 2, -1]] = 0
+    notch = 0.10 * length * tail[:, None] * (np.abs(z) / (0.17 * length * deep) - 0.55)
+    x = length * (0.5 - s)[:, None] - notch
+    positions = np.stack([x, y, z], axis=2)
+    positions[[0, -1]] = positions[[0, -1]].mean(axis=1, keepdims=True)
+    faces = lattice(segments, rings)[:, ::-1]  # rows go to the tail
+    flat = positions.reshape(-1, 3)
+    corners = flat[faces]
+    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    faces, area = (a[np.linalg.norm(area, axis=1) > 1e-12 * length**2] for a in (faces, area))
+    uvs = np.stack(np.broadcast_arrays(angle / (2 * math.pi), s[:, None]), axis=2).reshape(-1, 2)
+    wave = -2 * math.pi / (0.95 * length) * np.array([1.0, 0, 0])
+    frequency = 1.9 * tempo * math.sqrt(0.3 / length)
+    beat = Beat(1 / frequency, -2 * math.pi * phase)
+    swim = Waves(
+        np.array([0, 1.0, 0]),
+        (np.array([-0.9 / length, 0, 0]), 0.55),
+        ((wave, 0.0), (np.zeros(3), 0.0)),
+        (0.085 * length, 0.0),
+        (beat, beat),
+    )
+    swim.goes, swim.speed = "level", 0.7 * 0.95 * length / (beat.period_ns * 1e-9)
+    return (flat, _smooth_normals(flat, faces, area), uvs, faces), swim
+
+
+def _smooth_normals(positions: np.ndarray, faces: np.ndarray, area: np.ndarray) -> np.ndarray:
+    """(V, 3) means of the faces round each point, across seams of the texture, too."""
+    points, welded = weld(positions, faces)
+    total = np.zeros_like(points)
+    np.add.at(total, welded, area[:, None])
+    out = np.zeros_like(positions)
+    out[faces] = total[welded]
+    length = np.linalg.norm(out, axis=1, keepdims=True)
+    return np.where(length > 0, out / np.maximum(length, 1e-300), [0.0, 0.0, 1.0])

@@ -1,0 +1,178 @@
+"""``index.jsonl``: one line per sequence of a data set, for loaders that do not want to search a file system.
+
+    {"path": "train/flying_000000", "split": "train", "name": "flying_000000", "sequence":
+    0, "seed": …, "emulator": "v2e",
+     "events": …, "labels": …, "frames": …, "height": …, "width": …, "t_offset_us": …, "duration_us": …, "bytes": …}
+
+Made from the manifests alone and sorted by path: the same sequences give the same file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import heapq
+import itertools
+import json
+import os
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
+
+from pydantic import BaseModel, ConfigDict, TypeAdapter
+
+from blinkgl.errors import AssetError, BlinkGLError
+from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.records import HereOrInside, parse, read_text, shown
+from blinkgl.sequence_files.sequence_dir import MANIFEST, is_rig_folder, read_manifest
+
+INDEX = "index.jsonl"
+_PART = 20_000
+_KEYS = (
+    "split",
+    "sequence",
+    "seed",
+    "emulator",
+    "events",
+    "labels",
+    "frames",
+    "height",
+    "width",
+    "t_offset_us",
+    "duration_us",
+    "blinkgl",
+)
+
+
+def sequence_folders(root: str | Path) -> Iterator[Path]:
+    """Folders <root>/<split>/<sequence> with a manifest, or ``root`` itself when it is a
+    sequence; of a rig those of its cameras, <root>/<split>/<sequence>/<sensor>. Hidden ones are not looked at."""
+    for folder in made_folders(root):
+        yield from _of_cameras(folder)
+
+
+def _of_cameras(folder: Path) -> Iterator[Path]:
+    """The folder itself, or of a rig those of its cameras."""
+    if is_rig_folder(folder):
+        yield from (manifest.parent for manifest in sorted(folder.glob(f"*/{MANIFEST}")))
+    else:
+        yield folder
+
+
+def made_folders(root: str | Path) -> Iterator[Path]:
+    """The same, but of a rig its own: what a run makes, one a task."""
+    root = Path(root)
+    if (root / MANIFEST).is_file():
+        yield root
+        return
+    for pattern in ("*", "*/*"):
+        for manifest in sorted(root.glob(f"{pattern}/{MANIFEST}")):
+            inside = pattern == "*/*" and is_rig_folder(manifest.parent.parent)
+            if not inside and not any(part.startswith(".") for part in manifest.relative_to(root).parts):
+                yield manifest.parent
+
+
+_SOMETIMES = ("events_by_cause", "sensor")
+"""Keys of manifests that only some have."""
+
+
+def entry(root: Path, folder: Path) -> dict[str, Any]:
+    """A sequence's line. Raises AssetError for a damaged manifest."""
+    manifest = read_manifest(folder)
+    return {
+        "path": folder.relative_to(root).as_posix(),
+        "name": folder.name if "sensor" not in manifest else f"{folder.parent.name}/{folder.name}",
+        **{key: manifest.get(key) for key in _KEYS},
+        **{key: manifest[key] for key in _SOMETIMES if key in manifest},
+        "bytes": sum(file["bytes"] for file in manifest["files"].values()),
+    }
+
+
+def write_index(root: str | Path) -> int:
+    """Writes ``index.jsonl`` of the sequences below ``root`` (damaged ones are left out);
+    returns how many. Raises OutputError.
+
+    Lines are sorted in parts of some thousands, which wait in files without names and are merged:
+    memory does not grow with the data set."""
+    root = Path(root)
+    count = 0
+    with atomic_file(root / INDEX) as path, output_errors(path), contextlib.ExitStack() as stack:
+        parts = [stack.enter_context(part) for part in _sorted_parts(root)]
+        with open(path, "w", encoding="utf-8") as file:
+            for line in heapq.merge(*parts, key=_path_of):
+                file.write(line)
+                count += 1
+    return count
+
+
+def _sorted_parts(root: Path) -> Iterator[IO[str]]:
+    """Open files of sorted lines."""
+    found = _lines(root)
+    while part := sorted(itertools.islice(found, _PART), key=_path_of):
+        file = tempfile.TemporaryFile("w+", encoding="utf-8", dir=root)  # noqa: SIM115 - whoever takes it closes it
+        file.writelines(part)
+        file.seek(0)
+        yield file
+
+
+def _lines(root: Path) -> Iterator[str]:
+    for folder in _unsorted(root):
+        with contextlib.suppress(BlinkGLError):
+            yield json.dumps(entry(root, folder), sort_keys=True) + "\n"
+
+
+def _path_of(line: str) -> str:
+    return json.loads(line)["path"]
+
+
+def _unsorted(root: Path) -> Iterator[Path]:
+    """The same as :func:`sequence_folders`, in no order, and without a list of them all."""
+    if (root / MANIFEST).is_file():
+        yield from _of_cameras(root)
+        return
+    for top in _visible(root):
+        if (top / MANIFEST).is_file():
+            yield from _of_cameras(top)
+            continue
+        for folder in _visible(top):
+            if (folder / MANIFEST).is_file():
+                yield from _of_cameras(folder)
+
+
+def _visible(folder: Path) -> Iterator[Path]:
+    with os.scandir(folder) as entries:
+        for found in entries:
+            if found.is_dir() and not found.name.startswith("."):
+                yield Path(found.path)
+
+
+class _Line(BaseModel):
+    """What a reader relies on; "." is the path of a folder that is a sequence itself."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+    path: HereOrInside
+
+
+_MODEL = TypeAdapter(_Line)
+
+
+def read_index(root: str | Path) -> list[dict[str, Any]]:
+    """The lines of ``index.jsonl``. Raises AssetError: missing, damaged, a path that leaves
+    the data set or is listed twice."""
+    path = Path(root) / INDEX
+    try:
+        entries = [parse(line, _MODEL) for line in read_text(path).splitlines() if line]
+    except FileNotFoundError:
+        raise AssetError("no such file", where=str(path)) from None
+    except ValueError as error:
+        raise AssetError(
+            f"damaged index: {error}", where=str(path), accepted="run 'blinkgl report' to make it anew"
+        ) from None
+    if twice := [name for name, count in Counter(line["path"] for line in entries).items() if count > 1]:
+        raise AssetError(
+            f"damaged index: {shown(twice[0])} is listed twice",
+            where=str(path),
+            accepted="run 'blinkgl report' to make it anew",
+        )
+    return entries

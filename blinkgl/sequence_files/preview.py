@@ -1,0 +1,246 @@
+"""preview.mp4: frames, events and flow colours side by side, with the time; made while the
+sequence is being generated."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from blinkgl.io.colour import count_events, event_colour, flow_colour, flow_wheel
+from blinkgl.io.overlays import Curves, TrackLines, with_tracks
+from blinkgl.io.video import VideoWriter
+from blinkgl.srgb import to_srgb8, tone_mapped
+from blinkgl.timeline.sampling import Ticks
+from blinkgl.types.events import Events
+
+Self = TypeVar("Self", bound="_Streamed")
+_BAR = 30
+_GAP = 4
+_BACK, _TEXT, _DIM = (22, 24, 28), (235, 238, 242), (150, 156, 166)
+_MAX_PANEL_HEIGHT = 360
+_STRIP = 64
+_LEGEND = 27
+
+
+class Panels:
+    """Of one camera: frame, events and flow side by side. Frames are taken at ``rate_hz`` of simulated time and played
+    at ``fps``, i.e. slowed by ``rate_hz / fps``.
+
+    height, width : sensor size, px.   t0_us : start.   flow : False leaves the flow panel out.   label : of the frame.
+    tracks : points that are drawn over the frame, with tails.   curves : of an inertial unit, given the strip's width
+    and height; they stand below.
+    canvas : (h, w, 3) uint8, all as it is shown."""
+
+    def __init__(
+        self,
+        height: int,
+        width: int,
+        *,
+        t0_us: int = 0,
+        flow: bool = True,
+        rate_hz: float = 40,
+        fps: float = 20,
+        label: str = "frame",
+        tracks: TrackLines | None = None,
+        curves: Callable[[int, int], Curves] | None = None,
+    ):
+        self._counts = np.zeros((2, height, width), np.uint16)
+        self._pending = 0
+        self._noise: int | None = None  # of the pending; None: nobody knows
+        factor = min(1.0, _MAX_PANEL_HEIGHT / height)
+        if height < 200:
+            factor = 2.0
+        self._panel = (max(2, round(width * factor / 2) * 2), max(2, round(height * factor / 2) * 2))  # (w, h), even
+        self._ticks, self._t0_us = Ticks(t0_us, rate_hz), t0_us
+        self._slow = rate_hz / fps
+        self._names = [label, "events", "optical flow"][: 3 if flow else 2]
+        w, h = self._panel
+        whole, below = len(self._names) * (w + _GAP) - _GAP, 0 if curves is None else _STRIP
+        self._tracks, self._curves = tracks, None if curves is None else curves(whole, below)
+        self._canvas = np.empty((h + _BAR + below, whole, 3), np.uint8)
+        self._canvas[:] = _BACK
+        self._flow_max, self._brightest = 0.0, 1.0
+        self._has_flow = flow
+        self._font, self._small = ImageFont.load_default(14), ImageFont.load_default(11)
+        if flow:
+            self._panel_view(2)[:] = (32, 34, 38)
+            self._caption(2, "")
+
+    @property
+    def canvas(self) -> np.ndarray:
+        return self._canvas
+
+    def add_events(self, events: Events) -> None:
+        """Collected until the next frame."""
+        count_events(events.x, events.y, events.p, self._counts)
+        self._pending += len(events)
+        if events.cause is not None:
+            self._noise = (self._noise or 0) + int(np.count_nonzero(events.cause))
+
+    def set_flow(self, flow: np.ndarray, valid: np.ndarray | None = None) -> None:
+        """(H, W, 2) px and its valid mask. Full saturation follows the 95th percentile of speed: up at once, down
+        slowly, so that neither a passing object washes out the rest nor the colours flicker."""
+        if not self._has_flow:
+            return
+        speed = np.hypot(flow[::4, ::4, 0], flow[::4, ::4, 1])
+        speed = speed[np.isfinite(speed) & (True if valid is None else valid[::4, ::4])]
+        if speed.size:
+            self._flow_max = max(0.95 * self._flow_max, float(np.percentile(speed, 95)))
+        nearest = lambda a: cv2.resize(a, self._panel, interpolation=cv2.INTER_NEAREST)  # edges stay true
+        shown = None if valid is None else nearest(np.asarray(valid, np.uint8)) > 0
+        self._panel_view(2)[:] = flow_colour(nearest(np.asarray(flow, np.float32)), self._flow_max or None, shown)
+        self._legend()
+        self._caption(2, f"full colour = {self._flow_max:.3g} px")
+
+    def due(self, t_us: int) -> bool:
+        """Whether :meth:`frame` at this time would be shown."""
+        return self._ticks.due(t_us)
+
+    def compose(self, t_us: int, image: np.ndarray, over: Iterable[Callable[[np.ndarray], np.ndarray]] = ()) -> int:
+        """Draws :attr:`canvas`; for how many periods it is shown: those that have passed, 0 where none has.
+        image : (H, W[, 3]) float linear light, whose highlights are compressed where they exceed 1, or uint8 sRGB.
+        over : (h, w, 3) uint8 picture, of the panel's size -> the same with something drawn over it."""
+        if not self.due(t_us):
+            return 0
+        small = self._fit(image)  # first: cheaper, and averages linear light where it is given
+        small = self._toned(small) if small.dtype.kind == "f" else small
+        shown = np.repeat(small[..., None], 3, axis=2) if small.ndim == 2 else small
+        if self._tracks is not None:
+            shown = with_tracks(shown, self._tracks, t_us)
+        for drawn_over in over:
+            shown = drawn_over(shown)
+        self._panel_view(0)[:] = shown
+        if self._curves is not None:
+            self._canvas[-_STRIP:] = self._curves.at(t_us)
+        self._panel_view(1)[:] = self._fit(event_colour(self._counts))
+        self._caption(0, f"{(t_us - self._t0_us) / 1000:.1f} ms   slowed {self._slow:g}x")
+        share = "" if self._noise is None else f"   {100 * self._noise / max(self._pending, 1):.0f} % noise"
+        self._caption(1, f"ON blue, OFF red   {self._pending:,}{share}")
+        self._counts[:] = 0
+        self._pending, self._noise = 0, None if self._noise is None else 0
+        return self._ticks.passed(t_us)
+
+    def _toned(self, image: np.ndarray) -> np.ndarray:
+        """uint8 sRGB in which nothing clips. What counts as the brightest follows the picture's at once when it rises
+        and slowly when it falls, so that a passing light does not make the rest flicker."""
+        self._brightest = max(1.0, 0.95 * self._brightest, float(np.nan_to_num(image, nan=0.0, posinf=0.0).max()))
+        return to_srgb8(tone_mapped(image, self._brightest))
+
+    def _panel_view(self, panel: int) -> np.ndarray:
+        w, h = self._panel
+        left = panel * (w + _GAP)
+        return self._canvas[_BAR : _BAR + h, left : left + w]
+
+    def _fit(self, image: np.ndarray) -> np.ndarray:
+        larger = self._panel[1] > image.shape[0]
+        return cv2.resize(image, self._panel, interpolation=cv2.INTER_NEAREST if larger else cv2.INTER_AREA)
+
+    def _caption(self, panel: int, detail: str) -> None:
+        w = self._panel[0]
+        strip = Image.new("RGB", (w, _BAR), _BACK)
+        draw = ImageDraw.Draw(strip)
+        draw.text((8, _BAR / 2), self._names[panel], fill=_TEXT, font=self._font, anchor="lm")
+        draw.text((w - 8, _BAR / 2), detail, fill=_DIM, font=self._small, anchor="rm")
+        left = panel * (w + _GAP)
+        self._canvas[:_BAR, left : left + w] = np.asarray(strip)
+
+    def _legend(self) -> None:
+        """The colour wheel in the flow panel's lower right corner."""
+        view = self._panel_view(2)
+        size = 2 * _LEGEND + 1
+        if min(view.shape[:2]) < 3 * size:
+            return
+        y, x = np.mgrid[-_LEGEND : _LEGEND + 1, -_LEGEND : _LEGEND + 1]
+        inside = np.clip(_LEGEND + 0.5 - np.hypot(x, y), 0, 1)[..., None]  # one pixel of anti-aliasing
+        wheel = cv2.resize(flow_wheel(), (size, size), interpolation=cv2.INTER_AREA)
+        corner = view[-size - 6 : -6, -size - 6 : -6]
+        ring = np.clip(1.5 - np.abs(np.hypot(x, y) - _LEGEND), 0, 1)[..., None]
+        mixed = corner * (1 - inside) + wheel * inside
+        corner[:] = mixed * (1 - ring) + 60 * ring
+
+
+class _Streamed:
+    """Context manager around a video that is kept when all went well."""
+
+    _video: VideoWriter
+
+    def close(self) -> None:
+        self._video.close()
+
+    def abort(self) -> None:
+        self._video.abort()
+
+    def __enter__(self: Self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self.close() if kind is None else self.abort()
+
+
+class PreviewWriter(Panels, _Streamed):
+    """Streams a side-by-side video of one camera; memory does not grow with the sequence.
+
+        preview.add_events(events)              every chunk
+        preview.set_flow(flow, valid)           whenever a label exists; shown until the next
+        if preview.due(t_us):                   ask first: making the picture may cost something
+            preview.frame(t_us, image)
+
+    path : ending decides the container, .mp4 usually.   The others are those of :class:`Panels`.
+
+    Raises OutputError when the video cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike,
+        height: int,
+        width: int,
+        *,
+        t0_us: int = 0,
+        flow: bool = True,
+        rate_hz: float = 40,
+        fps: float = 20,
+        label: str = "frame",
+    ):
+        super().__init__(height, width, t0_us=t0_us, flow=flow, rate_hz=rate_hz, fps=fps, label=label)
+        self._video = VideoWriter(path, *self._canvas.shape[:2], fps, preset="superfast", crf=22)
+
+    def frame(self, t_us: int, image: np.ndarray) -> None:
+        """Composes and encodes one picture (several times when more than one period has passed), as of
+        :meth:`Panels.compose`."""
+        for _ in range(self.compose(t_us, image)):
+            self._video.write(self._canvas)
+
+
+class RigPreviewWriter(_Streamed):
+    """The same of several cameras, one below the other. panels : of each, of one ``rate_hz`` and ``fps``.
+
+    Raises OutputError when the video cannot be written."""
+
+    def __init__(self, path: str | os.PathLike, panels: Sequence[Panels], fps: float):
+        self.panels = tuple(panels)
+        heights = [one.canvas.shape[0] for one in self.panels]
+        self._canvas = np.empty((sum(heights), max(one.canvas.shape[1] for one in self.panels), 3), np.uint8)
+        self._canvas[:] = _BACK
+        self._tops = np.cumsum([0, *heights[:-1]])
+        height, width = self._canvas.shape[:2]
+        self._video = VideoWriter(path, height, width, fps, preset="superfast", crf=22)
+
+    def frame(
+        self, number: int, t_us: int, image: np.ndarray, over: Iterable[Callable[[np.ndarray], np.ndarray]] = ()
+    ) -> None:
+        """The picture of the camera of this number, as of :meth:`Panels.compose`. When the last one's is there all are
+        encoded."""
+        one, top = self.panels[number], self._tops[number]
+        count = one.compose(t_us, image, over)
+        if count:
+            height, width = one.canvas.shape[:2]
+            self._canvas[top : top + height, :width] = one.canvas
+        if number == len(self.panels) - 1:
+            for _ in range(count):
+                self._video.write(self._canvas)

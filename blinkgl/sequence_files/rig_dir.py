@@ -1,0 +1,103 @@
+"""A sequence of several sensors on disk: a folder like any sequence's, with one below it for each sensor.
+
+    <sequence>/
+      rig.yaml                       sensors, what they record, where they are (T_rig_sensor), pairs
+      left/  right/                  sequences of their own, each with its manifest (sequence_dir.py)
+      imu0/imu/                      a sensor that is an inertial unit and no camera (blinkgl.io.imu)
+      config.yaml  manifest.json  preview.mp4
+
+The manifest has the format "blinkgl-rig" and lists every file below the folder.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from blinkgl.config.reader import read_table, to_yaml
+from blinkgl.config.rig import RigSensorConfig, baseline_of
+from blinkgl.io.atomic import output_errors
+from blinkgl.sequence_files.sequence_dir import MANIFEST, RIG, SequenceWriter, digest_of, read_manifest
+
+
+class RigWriter(SequenceWriter):
+    """Context manager around the folder of a rig's sequence: appears whole or not at all, as a sequence's does.
+
+    sensors : as configured.   The other parameters are those of :class:`SequenceWriter`.
+
+        with RigWriter(final, sensors, config_yaml=…) as rig:
+            with SequenceWriter(rig.folder("left"), …) as left: …
+            rig.adopt("left")
+    """
+
+    kind = "blinkgl-rig"
+
+    def __init__(
+        self, final: str | os.PathLike, sensors: Sequence[RigSensorConfig], *, config_yaml: str, t_offset_us: int = 0
+    ):
+        super().__init__(final, 1, 1, config_yaml=config_yaml, t_offset_us=t_offset_us, events=False)
+        self.sensors = tuple(sensors)
+        self.count = 0
+        """Events of all sensors."""
+
+    def folder(self, name: str) -> Path:
+        """Where the sequence of a sensor is to be written."""
+        return self.path(name)
+
+    def adopt(self, name: str) -> None:
+        """The sequence at :meth:`folder` is whole: its files are listed with their checksums."""
+        folder = self.folder(name)
+        manifest = read_manifest(folder)
+        with output_errors(folder):
+            self._files |= {f"{name}/{file}": known for file, known in manifest["files"].items()}
+            self._files[f"{name}/{MANIFEST}"] = digest_of(folder / MANIFEST)
+        self.count += manifest["events"]
+
+    def _finish(self) -> None:
+        self.text(RIG, rig_yaml(self.sensors))
+        super()._finish()
+
+    def _about(self) -> dict[str, Any]:
+        return {
+            "t_offset_us": self.t_offset_us,
+            "events": self.count,
+            "sensors": [one.name for one in self.sensors],
+            "cameras": [one.name for one in self.sensors if one.sees],
+        }
+
+
+def rig_yaml(sensors: Sequence[RigSensorConfig]) -> str:
+    """``rig.yaml``: what is on the rig, by name. Rounded nowhere."""
+    tables: dict[str, Any] = {}
+    for one in sensors:
+        records = [key for key in ("events", "images", "imu") if getattr(one, key) is not None]
+        about: dict[str, Any] = {"records": records, "T_rig_sensor": one.place.T.tolist()}
+        if one.sees:
+            camera = one.camera.model
+            about |= {
+                "resolution": [camera.width, camera.height],
+                "camera_model": camera.kind,
+                "intrinsics": [float(v) for v in camera.intrinsics],
+                "distortion": [float(v) for v in camera.distortion],
+            }
+        if one.pair is not None:
+            other = next(other for other in sensors if other.name == one.pair)
+            about |= {"pair": one.pair, "baseline": baseline_of(one, other)}
+        tables[one.name] = about
+    return (
+        "# T_rig_sensor: from the sensor's axes to the rig's, both x right, y down, z forward; in world units.\n"
+        "# intrinsics: fx, fy, cx, cy, px; distortion: coefficients of the model. baseline: along the camera's x axis\n"
+        "# to the other eye.\n" + to_yaml({"sensors": tables})
+    )
+
+
+def read_rig(folder: str | os.PathLike) -> dict[str, dict[str, Any]]:
+    """The sensors of a rig's folder, by name, as ``rig.yaml`` has them, ``T_rig_sensor`` as (4, 4) float64.
+
+    Raises AssetError, ConfigError: no such file, or damaged."""
+    tables = read_table(Path(folder) / RIG)["sensors"]
+    return {name: {**one, "T_rig_sensor": np.array(one["T_rig_sensor"], np.float64)} for name, one in tables.items()}

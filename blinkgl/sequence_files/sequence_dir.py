@@ -1,0 +1,512 @@
+"""One generated sequence on disk: written aside, checksummed, synced, renamed; and its verification.
+
+    <sequence>/
+      events.h5                      DSEC layout (blinkgl.io.dsec)
+      event_labels.h5                what made each event, a row per event (blinkgl.io.event_labels)    (on request)
+      images/%06d.png                sRGB frames at label times;        images/timestamps.txt   one µs per line
+      flow/forward/%06d.png          DSEC 16-bit flow;                  flow/forward_timestamps.txt   from_us,to_us
+      flow/forward_npy/%06d.npy      float32 (H, W, 3) = u, v, valid    (as BlinkFlow's; on request)
+      flow/forward_flo/%06d.flo, flow/forward.h5                        (on request)
+      flow/backward…                 the same, from > to
+      flow/intervals/%06d.h5         flow over intervals of one's own; occlusion/intervals/   (on request)
+      occlusion/{forward,backward}/%06d.png   255 where the point is hidden at the other end
+      depth/%06d.npy  velocity/%06d.npy  normals/%06d.npy  ids/%06d.png
+      frame_camera/                  images with exposure and noise (blinkgl.io.frame_camera)   (on request)
+      imu/                           an inertial unit (blinkgl.io.imu)   (on request)
+      tracks.npz                     points on surfaces, followed (blinkgl.io.tracks)   (on request)
+      poses.npz  config.yaml  manifest.json  preview.mp4
+
+Images, flow and all that are labels stand where their rows say (``blinkgl.labels``).
+Float flow stands in folders of its own because DSEC loaders take every file of ``flow/forward`` for a PNG.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import threading
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import h5py
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+
+from blinkgl.config.imu import ImuConfig
+from blinkgl.config.labels import LabelsConfig
+from blinkgl.errors import AssetError, BlinkGLError, OutputError
+from blinkgl.io import imu as imu_files
+from blinkgl.io.atomic import fsync, output_errors, refuse_existing, remove_stale, temporary_beside
+from blinkgl.io.dsec import DsecEventWriter
+from blinkgl.io.event_labels import EVENT_LABELS, EventLabelsWriter
+from blinkgl.io.frame_camera import (
+    EXPOSURES,
+    STAMPS,
+    ExposureLine,
+    encode_codes,
+    exposures_csv,
+    picture_file,
+    stamps_txt,
+)
+from blinkgl.io.hdf5 import blosc_dataset, write_rows
+from blinkgl.io.records import InsidePath, entries_below, open_regular, parse, read_text, shown
+from blinkgl.labels import Form, Label, label_of
+from blinkgl.types.events import Events
+
+Self = TypeVar("Self", bound="SequenceWriter")
+MANIFEST = "manifest.json"
+RIG = "rig.yaml"
+"""In the folder of a sequence of several sensors (:mod:`blinkgl.sequence_files.rig_dir`)."""
+_LARGEST = 2**62
+_IN_FLIGHT = 8
+"""Labels waiting for the encoder thread: bounds memory at a few tens of MB."""
+
+
+class SequenceWriter:
+    """Context manager around one sequence directory. On success everything appears under ``final`` at once; on any
+    exception (Ctrl-C and a full disk included) nothing does and the temporary is removed.
+
+    Encoding and hashing run in one background thread, event compression in another; their errors surface in the next
+    call or on exit. Arrays are copied, so callers may reuse read-back buffers.
+
+    Parameters
+    ----------
+    final : the directory to make. An existing non-empty one is refused.
+    height, width : sensor size, px.
+    config_yaml : resolved configuration, stored as ``config.yaml``.
+    t_offset_us : time of the sequence's start, µs; events before it are refused by the DSEC format.
+    labels : ``labels:``, which says in which forms labels are written; None: each in its first.
+    events : False makes no ``events.h5``.
+    truth : True makes ``event_labels.h5`` beside it, of events that say what made them.
+    codec : of ``events.h5``, "zstd" or "lz4".
+
+    Attributes
+    ----------
+    info : dict written into the manifest beside the checksums (seed, versions, GL renderer, counts). Keep wall-clock
+        times out of it: the same seed shall give the same manifest.
+    t_end_us : set it to the sequence's end, so that ``ms_to_idx`` covers an eventless tail.
+
+    Raises
+    ------
+    OutputError : the directory exists, or cannot be written.
+    """
+
+    kind = "blinkgl-sequence"
+    """``format`` of the manifest."""
+
+    def __init__(
+        self,
+        final: str | os.PathLike,
+        height: int,
+        width: int,
+        *,
+        config_yaml: str,
+        t_offset_us: int = 0,
+        labels: LabelsConfig | None = None,
+        events: bool = True,
+        truth: bool = False,
+        codec: str = "zstd",
+    ):
+        self.final = Path(final)
+        self.height, self.width, self.config_yaml, self.t_offset_us = (
+            int(height),
+            int(width),
+            config_yaml,
+            int(t_offset_us),
+        )
+        self.labels = labels
+        self.info: dict[str, Any] = {}
+        self.t_end_us: int | None = None
+        self.lost: dict[str, int] = {}
+        self._with_events, self._with_truth, self._codec = events, truth, codec
+        self._files: dict[str, dict[str, Any]] = {}
+        self._promised = {name for name, on in (("events.h5", events), (EVENT_LABELS, truth)) if on}
+        self._timestamps: dict[str, list[str]] = {}
+        self._row_files: dict[str, h5py.File] = {}
+        self._exposures: list[ExposureLine] = []
+        self._failure: list[BaseException] = []
+
+    def __enter__(self: Self) -> Self:
+        refuse_existing(self.final)
+        with output_errors(self.final):
+            self.final.parent.mkdir(parents=True, exist_ok=True)
+            remove_stale(self.final.parent)
+            self._tmp = temporary_beside(self.final)
+            self._tmp.mkdir()
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="sequence-writer")
+        self._slots = threading.BoundedSemaphore(_IN_FLIGHT)
+        self._truth: EventLabelsWriter | None = None
+        try:
+            if self._with_truth:
+                self._truth = EventLabelsWriter(self._tmp / EVENT_LABELS)
+            self._events = (
+                DsecEventWriter(self._tmp / "events.h5", self.height, self.width, self.t_offset_us, codec=self._codec)
+                if self._with_events
+                else None
+            )
+        except BaseException:
+            self._discard()
+            raise
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+        if kind is None:
+            try:
+                self._finish()
+                return
+            except BaseException as failure:  # noqa: BLE001 - Ctrl-C while flushing leaves nothing either
+                error = failure
+        self._discard()
+        if isinstance(error, OutputError) and str(self._tmp) in (error.where or ""):
+            # The user knows the final name, not the temporary's.
+            where = error.where.replace(str(self._tmp), str(self.final))
+            raise OutputError(error.problem, where=where, accepted=error.accepted) from error
+        if kind is None:
+            raise error
+
+    # ---- what a sequence consists of -------------------------------------------------------------------------
+
+    def append_events(self, events: Events) -> None:
+        """The next events, in time order (µs on the sequence's clock)."""
+        self._check()
+        self._events.append(events)
+        if self._truth is not None and len(events):
+            self._submit(partial(self._truth.append, events.copy()))
+
+    def label(self, name: str, index: int, value: Any, t_us: int, to_us: int | None = None) -> None:
+        """The ``index``-th value of a label (:mod:`blinkgl.labels`) of ``t_us``; ``to_us``: where it leads, of those
+        that lead to another time. Pixels that a form cannot hold are counted in ``lost`` and the manifest. Raises
+        TypeError: a value of another shape or kind of number."""
+        label = label_of(name)
+        if (wrong := label.wrong(value, self.height, self.width)) is not None:
+            raise TypeError(f"label '{name}': {wrong}")
+        value = label.own(value)
+        if label.stamps is not None and label.towards is None:
+            self._stamp(label.stamps, str(int(t_us)))
+        elif label.stamps is not None:
+            self._stamp(label.stamps, f"{int(t_us)}, {int(to_us)}", "# from_timestamp_us, to_timestamp_us")
+        for form in label.forms[:1] if self.labels is None else label.written(self.labels):
+            if form.rows is None:
+                self._write(form.file(index), partial(self._encoded, label, form, value))
+            else:
+                self._submit(partial(self._append_rows, form, value))
+
+    def poses(self, **arrays: np.ndarray) -> None:
+        """``poses.npz``: named numeric arrays (camera and object poses, times, intrinsics)."""
+        self.arrays("poses.npz", **arrays)
+
+    def arrays(self, name: str, **arrays: np.ndarray) -> None:
+        """Named numeric arrays as ``name``, an .npz file."""
+        arrays = {k: np.array(v) for k, v in arrays.items()}
+        if bad := [k for k, v in arrays.items() if v.dtype.hasobject]:
+            raise TypeError(f"{name}: object arrays would be pickled: {bad}")
+
+        def save(path: Path) -> None:
+            with open(path, "wb") as file:  # NumPy stamps zip members 1980-01-01: the bytes do not depend on the clock
+                np.savez(file, **arrays)
+
+        self.external(name, save)
+
+    def imu(self, config: ImuConfig, measured: Mapping[str, np.ndarray], folder: str = "") -> None:
+        """``imu/``: what an inertial unit measured, the arrays of :class:`~blinkgl.sequence.inertial.Inertial` by
+        name.   folder : that it stands in, of a rig's unit by itself, with a "/" at its end."""
+        noisy, ideal = (
+            tuple(measured[name] for name in names)
+            for names in (("t_ns", "rate", "acceleration"), ("t_ns", "ideal_rate", "ideal_acceleration"))
+        )
+        self.text(folder + imu_files.CSV, imu_files.imu_csv(*noisy))
+        self.text(folder + imu_files.IDEAL, imu_files.imu_csv(*ideal))
+        self._write(folder + imu_files.H5, partial(imu_files.imu_h5, measured))
+        self.text(folder + imu_files.KALIBR, imu_files.kalibr_yaml(config, measured["T_cam_imu"]))
+
+    def image(self, pictures: Mapping[str, np.ndarray], exposure: ExposureLine) -> None:
+        """The next image of the frame camera: codes of "images" and what is written beside it
+        (:mod:`blinkgl.io.frame_camera`), which are not to be changed any more."""
+        for picture, codes in pictures.items():
+            self._write(picture_file(picture, len(self._exposures)), partial(encode_codes, codes))
+        self._exposures.append(exposure)
+
+    def text(self, name: str, content: str) -> None:
+        """A UTF-8 text file at ``name`` inside the sequence."""
+        self._write(name, content.encode)
+
+    def path(self, name: str) -> Path:
+        """Where another writer (the preview's) may put ``name`` before exit; it is checksummed on exit."""
+        path = self._tmp / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def external(self, name: str, save: Callable[[Path], None]) -> None:
+        """Runs ``save(path)`` in the background thread."""
+
+        def task() -> None:
+            path = self.path(name)
+            with output_errors(path):
+                save(path)
+
+        self._promised.add(name)
+        self._submit(task)
+
+    # ---- machinery -------------------------------------------------------------------------------------------
+
+    def _encoded(self, label: Label, form: Form, value: Any) -> bytes:
+        data = form.encode(value)
+        if isinstance(data, tuple):
+            data, lost = data
+            way = label.towards or label.name
+            self.lost[way] = self.lost.get(way, 0) + lost
+        return data
+
+    def _stamp(self, name: str, line: str, header: str | None = None) -> None:
+        self._timestamps.setdefault(name, [header] if header else []).append(line)
+
+    def _write(self, name: str, encode: Callable[[], bytes]) -> None:
+        def task() -> None:
+            data = encode()
+            path = self.path(name)
+            with output_errors(path), open(path, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            self._files[name] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+
+        self._submit(task)
+
+    def _submit(self, task: Callable[[], None]) -> None:
+        self._check()
+        self._slots.acquire()
+        self._pool.submit(task).add_done_callback(self._done)
+
+    def _done(self, future: Future) -> None:
+        self._slots.release()
+        if not future.cancelled() and (error := future.exception()) is not None:
+            self._failure.append(error)
+
+    def _check(self) -> None:
+        if self._failure:
+            raise self._failure[0]
+
+    def _append_rows(self, form: Form, value: Any) -> None:
+        name, rows = form.file(0), form.rows(value)
+        path = self.path(name)
+        with output_errors(path):
+            if name not in self._row_files:
+                self._promised.add(name)
+                file = self._row_files[name] = h5py.File(path, "w", rdcc_nbytes=0)
+                for key, array in rows.items():
+                    blosc_dataset(file, key, (0, *array.shape), array.dtype, (1, *array.shape))
+            file = self._row_files[name]
+            for key, array in rows.items():
+                write_rows(file[key], len(file[key]), array[None])
+
+    def _finish(self) -> None:
+        self._check()
+        for name, lines in self._timestamps.items():
+            self.text(name, "\n".join(lines) + "\n")
+        if self._exposures:
+            self.text(STAMPS, stamps_txt(self._exposures))
+            self.text(EXPOSURES, exposures_csv(self._exposures))
+        self.text("config.yaml", self.config_yaml)
+        if self._events is not None:
+            self._events.close(self.t_end_us)
+        if self._truth is not None:
+            self._submit(self._truth.close)
+        self._pool.shutdown(wait=True)
+        self._check()
+        with output_errors(self.final):
+            for file in self._row_files.values():
+                file.close()
+            self._check_untouched()
+            for path in sorted(self._tmp.rglob("*")):
+                name = path.relative_to(self._tmp).as_posix()
+                if path.is_file() and name not in self._files:
+                    fsync(path)
+                    self._files[name] = digest_of(path)
+            manifest = {
+                "format": self.kind,
+                "format_version": 1,
+                **self._about(),
+                **self.info,
+                "files": self._files,
+            }
+            path = self._tmp / MANIFEST
+            path.write_text(json.dumps(manifest, indent=1, sort_keys=True, default=_plain) + "\n", encoding="utf-8")
+            fsync(path)
+            for folder in sorted({p.parent for p in self._tmp.rglob("*")}, reverse=True):
+                fsync(folder)
+            refuse_existing(self.final)
+            os.rename(self._tmp, self.final)
+            fsync(self.final.parent)
+
+    def _about(self) -> dict[str, Any]:
+        """What a manifest of this kind says of it."""
+        return {
+            "height": self.height,
+            "width": self.width,
+            "t_offset_us": self.t_offset_us,
+            "events": self._events.count if self._events is not None else 0,
+            "flow_pixels_out_of_range": self.lost,
+        }
+
+    def _check_untouched(self) -> None:
+        """OutputError when a file that was written is gone or cut: somebody tidied up under us.
+        Half of it must not pass for the whole."""
+        sizes = {
+            name: path.stat().st_size if (path := self._tmp / name).is_file() else None
+            for name in self._promised | self._files.keys()
+        }
+        for name, size in sorted(sizes.items()):
+            if size is None or size != self._files.get(name, {"bytes": size})["bytes"]:
+                raise OutputError(
+                    f"{name} was deleted or altered while the sequence was being written",
+                    where=str(self.final),
+                    accepted="a folder that nobody else writes to",
+                )
+
+    def _discard(self) -> None:
+        self._pool.shutdown(wait=True, cancel_futures=True)
+        if getattr(self, "_events", None) is not None:
+            self._events.abort()
+        if self._truth is not None:
+            self._truth.abort()
+        for file in self._row_files.values():
+            try:
+                file.close()
+            except Exception:  # noqa: BLE001 - a full disk refuses the flush; the file is deleted anyway
+                pass
+        shutil.rmtree(self._tmp, ignore_errors=True)
+
+
+def is_rig_folder(folder: str | os.PathLike) -> bool:
+    """Whether a folder is the sequence of a rig, with those of its cameras in it."""
+    return (Path(folder) / RIG).is_file()
+
+
+class _File(BaseModel):
+    """A line of the manifest's ``files``."""
+
+    model_config = ConfigDict(strict=True)
+    bytes: int = Field(ge=0, le=_LARGEST)
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+
+
+class Manifest(BaseModel):
+    """What a manifest must look like, wherever it comes from. Further keys are welcome; a
+    key that its maker left out is None."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+    format: Literal["blinkgl-sequence"]
+    format_version: Literal[1]
+    height: int = Field(ge=1, le=65536)
+    width: int = Field(ge=1, le=65536)
+    events: int = Field(ge=0, le=_LARGEST)
+    t_offset_us: int = Field(ge=-_LARGEST, le=_LARGEST)
+    duration_us: int | None = Field(None, ge=0, le=_LARGEST)
+    seed: int | None = Field(None, ge=0, lt=2**63)
+    sequence: int | None = Field(None, ge=0, le=_LARGEST)
+    split: str | None = Field(None, max_length=255)
+    emulator: str | None = Field(None, max_length=255)
+    blinkgl: str | None = Field(None, max_length=255)
+    labels: int | None = Field(None, ge=0, le=_LARGEST)
+    frames: int | None = Field(None, ge=0, le=_LARGEST)
+    opengl: dict[str, str] | None = None
+    versions: dict[str, str] | None = None
+    files: dict[InsidePath, _File]
+
+
+class RigManifest(BaseModel):
+    """The same of a rig's sequence (rig_dir.py), whose ``files`` are those of all sensors."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+    format: Literal["blinkgl-rig"]
+    format_version: Literal[1]
+    events: int = Field(ge=0, le=_LARGEST)
+    t_offset_us: int = Field(ge=-_LARGEST, le=_LARGEST)
+    duration_us: int | None = Field(None, ge=0, le=_LARGEST)
+    seed: int | None = Field(None, ge=0, lt=2**63)
+    sequence: int | None = Field(None, ge=0, le=_LARGEST)
+    split: str | None = Field(None, max_length=255)
+    blinkgl: str | None = Field(None, max_length=255)
+    labels: int | None = Field(None, ge=0, le=_LARGEST)
+    frames: int | None = Field(None, ge=0, le=_LARGEST)
+    opengl: dict[str, str] | None = None
+    versions: dict[str, str] | None = None
+    sensors: list[InsidePath]
+    cameras: list[InsidePath]
+    files: dict[InsidePath, _File]
+
+
+_MODEL, _RIG_MODEL = TypeAdapter(Manifest), TypeAdapter(RigManifest)
+
+
+def verify_sequence(folder: str | os.PathLike, *, checksums: bool = True) -> list[str]:
+    """Problems of a sequence directory against its manifest, one line each; empty when whole.
+
+    Finds missing, foreign, truncated and altered files, and what is no file: links, pipes, devices, empty folders. An
+    unreadable manifest is one problem. ``checksums=False`` reads no contents, and so misses what
+    was altered without changing its length."""
+    folder = Path(folder)
+    try:
+        files = read_manifest(folder)["files"]
+        present = {name: (kind, size) for name, kind, size in entries_below(folder)}
+    except BlinkGLError as error:
+        return [str(error)]
+    except OSError as error:
+        return [f"{shown(error.filename)}: cannot be read: {error.strerror}"]
+    problems = []
+    for name, expected in sorted(files.items()):
+        kind, size = present.get(name, ("", 0))
+        if kind != "file":
+            problems += [f"{shown(name)}: missing"] if not kind else []
+        elif size != expected["bytes"]:
+            problems.append(f"{shown(name)}: {size} bytes, manifest says {expected['bytes']}")
+        elif checksums:
+            try:
+                if digest_of(folder / name)["sha256"] != expected["sha256"]:
+                    problems.append(f"{shown(name)}: checksum differs")
+            except (OSError, BlinkGLError) as error:
+                problems.append(f"{shown(name)}: cannot be read: {getattr(error, 'strerror', error)}")
+    for name, (kind, _) in sorted(present.items()):
+        if kind != "file":
+            problems.append(f"{shown(name)}: a {kind}" if kind[0] != "e" else f"{shown(name)}: an {kind}")
+        elif name not in files and name != MANIFEST:
+            problems.append(f"{shown(name)}: not in the manifest")
+    return problems
+
+
+def read_manifest(folder: str | os.PathLike) -> dict[str, Any]:
+    """The manifest, of the shape :class:`Manifest` describes, or :class:`RigManifest`; AssetError when there is none
+    or it is damaged."""
+    path = Path(folder) / MANIFEST
+    try:
+        text = read_text(path)
+        data = parse(text)
+        rig = isinstance(data, dict) and data.get("format") == "blinkgl-rig"
+        return parse(text, _RIG_MODEL if rig else _MODEL)
+    except FileNotFoundError:
+        raise AssetError("no manifest", where=str(path)) from None
+    except ValueError as error:
+        raise AssetError(f"damaged manifest: {error}", where=str(path)) from None
+
+
+def digest_of(path: Path) -> dict[str, Any]:
+    """A file's line in a manifest."""
+    digest, size = hashlib.sha256(), 0
+    with open(open_regular(path), "rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+            size += len(block)
+    return {"bytes": size, "sha256": digest.hexdigest()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    raise TypeError(f"manifest: {type(value).__name__} is not plain data")

@@ -1,0 +1,263 @@
+"""``blinkgl shader check`` and ``show``: compile everything, say what is wrong where, and
+what is declared for nothing."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import moderngl
+
+from blinkgl.errors import ConfigError
+from blinkgl.gl import create_context
+from blinkgl.gl.shader import GEOMETRY, STAGES, ShaderError, ShaderSource, expand, link, stages_of
+from blinkgl.shader_debugger.diagnostics import Diagnostic, diagnose
+from blinkgl.shader_debugger.preprocess import active_lines
+from blinkgl.shader_debugger.session import EditedFolder, files_of, open_folder
+from blinkgl.shader_debugger.variants import lookups, variants
+
+_DECLARATION = re.compile(
+    r"^\s*(?:layout\s*\([^)]*\)\s*)?(?:(?:flat|smooth|noperspective|centroid|invariant|highp|mediump|lowp)\s+)*"
+    r"(in|out|uniform)\s+(?:(?:highp|mediump|lowp)\s+)?\w+\s+([^;{]+);"
+)
+_NAME = re.compile(r"^\s*(\w+)")
+
+
+@dataclass
+class Finding:
+    """One thing said about some variants of a program. examples : defines of the first of them."""
+
+    diagnostic: Diagnostic
+    program: str
+    count: int = 0
+    example: dict = field(default_factory=dict)
+
+
+@dataclass
+class Result:
+    """renderer : what compiled.   programs : name -> number of variants.   errors, unused : findings, each once."""
+
+    renderer: str = ""
+    seconds: float = 0.0
+    programs: dict[str, int] = field(default_factory=dict)
+    errors: list[Finding] = field(default_factory=list)
+    unused: list[Finding] = field(default_factory=list)
+
+    def as_dict(self) -> dict:
+        def plain(findings):
+            return [
+                f.diagnostic.as_dict() | {"program": f.program, "variants": f.count, "example": f.example}
+                for f in findings
+            ]
+
+        return {
+            "renderer": self.renderer,
+            "seconds": self.seconds,
+            "programs": self.programs,
+            "errors": plain(self.errors),
+            "unused": plain(self.unused),
+        }
+
+
+def check(files: list[str], shaders: str | None = None, backend: str = "auto", device: int = 0) -> Result:
+    """Compiles every variant of every program, or of those that ``files`` belong to.
+
+    Raises ConfigError for a file that is no shader, GLError without OpenGL or without a folder to read."""
+    folder, names = _programs(files, shaders)
+    result = Result()
+    started = time.perf_counter()
+    with create_context(backend, device) as gl:
+        result.renderer = gl.renderer
+        for name in names:
+            check_program(gl.ctx, folder, name, result)
+    result.seconds = time.perf_counter() - started
+    return result
+
+
+def check_program(ctx: moderngl.Context, folder: Any, name: str, result: Result) -> None:
+    """Adds every variant of one program to ``result``."""
+    wanted = variants(name)
+    wanted = [{}] if wanted is None else wanted + lookups(name)  # [{}]: somebody's own program, as it stands
+    result.programs[name] = len(wanted)
+    for defines in wanted:
+        sources: dict[str, ShaderSource] = {}
+        try:
+            for stage in stages_of(defines):
+                sources[stage] = expand(name, stage, defines, folder)
+            program = link(ctx, sources)
+        except ShaderError as error:
+            for diagnostic in dict.fromkeys(diagnose(error, sources, folder)):
+                if diagnostic.kind == "error":
+                    _add(result.errors, diagnostic, name, defines)
+            continue
+        for diagnostic in unused(sources, set(program)):
+            _add(result.unused, diagnostic, name, defines)
+        program.release()
+
+
+def _add(findings: list[Finding], diagnostic: Diagnostic, program: str, defines: dict) -> None:
+    for found in findings:
+        if found.program == program and found.diagnostic == diagnostic:
+            break
+    else:
+        found = Finding(diagnostic, program, 0, dict(defines))
+        findings.append(found)
+    found.count += 1
+
+
+def unused(sources: dict[str, ShaderSource], members: set[str]) -> list[Diagnostic]:
+    """Uniforms and varyings that do nothing in this variant. members : uniforms and
+    attributes the linked program has."""
+    out = []
+    text = {stage: active_lines(source.text) for stage, source in sources.items()}
+    words = {stage: re.findall(r"\w+", "\n".join(line for _, line in lines)) for stage, lines in text.items()}
+    inputs = {name for kind, name, *_ in _declarations(text["fragment"]) if kind == "in"}
+    if GEOMETRY in sources:  # which declares what it hands on by macros
+        inputs |= set(re.findall(r"\w+", sources[GEOMETRY].text))
+    for stage, lines in text.items():
+        for kind, name, number, column in _declarations(lines):
+            mentioned = words[stage].count(name) > 1
+            problem = None
+            if kind == "uniform" and name not in members:
+                problem = (
+                    f"uniform '{name}' is never used"
+                    if not mentioned
+                    else f"uniform '{name}' has no effect on the output"
+                )
+            elif kind == "in" and stage == "fragment" and not mentioned:
+                problem = f"varying '{name}' is never read"
+            elif kind == "in" and stage == "vertex" and name not in members:
+                problem = f"vertex attribute '{name}' is never used"
+            elif kind == "out" and stage == "vertex" and name not in inputs:
+                problem = f"varying '{name}' is written but the fragment stage does not take it"
+            if problem:
+                file, line = sources[stage].locate(number)
+                out.append(Diagnostic(file, line, column, "unused", problem, stage))
+    return out
+
+
+def _declarations(lines: list[tuple[int, str]]):
+    """(kind, name, line number, column) of every in, out and uniform."""
+    for number, line in lines:
+        match = _DECLARATION.match(line)
+        for declarator in match[2].split(",") if match else ():
+            if name := _NAME.match(declarator):
+                column = re.search(rf"\b{name[1]}\b", line[match.start(2) :]).start() + match.start(2) + 1
+                yield match[1], name[1], number, column
+
+
+def _programs(files: list[str], shaders: str | None):
+    """The folder, and the program files to compile."""
+    folder = open_folder(shaders)
+    if files and shaders is None:  # a file of another folder brings its folder along
+        first = Path(files[0]).resolve()
+        home = next((folder.parent for folder in first.parents if folder.name == "include"), first.parent)
+        if first.is_file() and home != Path(str(folder)).resolve():
+            folder = open_folder(str(home))
+    known = files_of(folder)
+    root = folder.path if isinstance(folder, EditedFolder) else Path(str(folder))
+    programs = [path.name for path in known if path.parent == root]
+    if isinstance(folder, EditedFolder) and "debug.glsl" not in programs:
+        programs.append("debug.glsl")
+    if not files:
+        return folder, programs
+    chosen: list[str] = []
+    for text in files:
+        path = next(
+            (
+                p
+                for p in known
+                if p.resolve() == Path(text).resolve() or str(p.relative_to(root)) == text or p.name == text
+            ),
+            None,
+        )
+        if path is None:
+            raise ConfigError(
+                "no such shader",
+                where="check",
+                value=text,
+                accepted="one of " + ", ".join(str(p.relative_to(root)) for p in known),
+            )
+        wanted = (
+            [path.name]
+            if path.parent == root
+            else [name for name in programs if _includes(folder, name, path.relative_to(root).as_posix())]
+        )
+        chosen += [name for name in wanted if name not in chosen]
+    return folder, chosen
+
+
+def _includes(folder, program: str, include: str) -> bool:
+    try:
+        return include in expand(program, "fragment", {}, folder).files
+    except ShaderError:
+        return True  # broken on the way there: compile it and say so
+
+
+def as_text(result: Result) -> str:
+    """The check in lines for a person."""
+    total = sum(result.programs.values())
+    lines = []
+    for found in result.errors:
+        d = found.diagnostic
+        lines += [
+            f"{d.where}: {d.kind}: {d.text}" + (f" [{d.stage} stage]" if d.stage else ""),
+            d.excerpt,
+            (
+                f"         in {found.count} of {result.programs[found.program]} variants of {found.program}, first "
+                f"{_defines(found.example)}"
+            ),
+            "",
+        ]
+    for found in result.unused:
+        d = found.diagnostic
+        lines.append(
+            f"{d.where}: {d.text} in {found.count} of {result.programs[found.program]} variants of {found.program}, "
+            f"first {_defines(found.example)}"
+        )
+    if result.unused:
+        lines.append("")
+    lines += [f"{name:<18} {count:>4} variants" for name, count in result.programs.items()]
+    verdict = (
+        f"{len(result.errors)} error{'s' if len(result.errors) != 1 else ''}"
+        if result.errors
+        else "all compile and link"
+    )
+    lines.append(
+        f"{verdict}, {len(result.unused)} unused; {total} variants in {result.seconds:.1f} s on {result.renderer}"
+    )
+    return "\n".join(lines)
+
+
+def _defines(defines: dict) -> str:
+    return " ".join(f"{key}={value}" for key, value in defines.items()) or "without defines"
+
+
+# ------------------------------------------------------------------------------------------------- show
+
+
+def show_source(program: str, defines: list[str], stage: str, active: bool, numbers: bool, shaders: str | None) -> str:
+    """What ``blinkgl shader show`` prints. Raises ConfigError, ShaderError."""
+    table = {name: value or "1" for name, _, value in (text.partition("=") for text in defines)}
+    if stage not in (*STAGES, GEOMETRY, "both"):
+        raise ConfigError(
+            "unknown stage", where="--stage", value=stage, accepted="vertex, geometry, fragment, or both for all"
+        )
+    folder = open_folder(shaders)
+    out = []
+    for one in stages_of(table) if stage == "both" else (stage,):
+        source = expand(program, one, table, folder)
+        if stage == "both":
+            out.append(f"// ---- {one} stage of {program}\n")
+        keep: Callable[[int], bool] = (
+            {n for n, _ in active_lines(source.text)}.__contains__ if active else (lambda n: True)
+        )
+        for number, line in enumerate(source.text.split("\n")[:-1], 1):
+            if keep(number):
+                file, own = source.locate(number)
+                out.append((f"{f'{file}:{own}' if file else '-':<28} | " if numbers else "") + line + "\n")
+    return "".join(out)

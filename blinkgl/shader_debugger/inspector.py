@@ -1,0 +1,337 @@
+"""What the page asks for, computed in one thread: OpenGL contexts belong to the thread that made them."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections import OrderedDict
+from concurrent.futures import Future, wait
+from typing import Any
+
+import numpy as np
+
+from blinkgl.errors import BlinkGLError, ConfigError
+from blinkgl.gl import ShaderLoader
+from blinkgl.gl.shader import ShaderError, expand, stages_of
+from blinkgl.io import pictures
+from blinkgl.shader_debugger import picture
+from blinkgl.shader_debugger.commands import _finite, _meaningful
+from blinkgl.shader_debugger.compare import Comparison
+from blinkgl.shader_debugger.diagnostics import Diagnostic, diagnose
+from blinkgl.shader_debugger.moments import (
+    PASSES,
+    GpuMoment,
+    ReferenceMoment,
+    buffers_of,
+    check_pass,
+    open_reference,
+)
+from blinkgl.shader_debugger.probe import _numbers, _surface_text, probe
+from blinkgl.shader_debugger.questions import SOURCES
+from blinkgl.shader_debugger.session import (
+    Snapshot,
+    Subject,
+    When,
+    check_pixel,
+    files_of,
+    moment,
+    open_folder,
+    open_renderer,
+)
+from blinkgl.shader_debugger.silhouettes import EDGED, edged_of
+from blinkgl.shader_debugger.verdict import verdict
+
+POLL_S = 0.15  # between two looks at the shader files
+KEPT = 6  # moments in memory
+MOST_ERRORS = 5  # shown at once
+
+
+class _Loader(ShaderLoader):
+    """Remembers what it was asked for last, to find the sources of an error."""
+
+    asked: tuple[str, dict] = ("", {})
+
+    def program(self, name, defines=None):
+        self.asked = (name, dict(defines or {}))
+        return super().program(name, defines)
+
+
+class Inspector:
+    """Buffers, pictures and probes of one subject. Every method but the constructor belongs to the worker's thread."""
+
+    def __init__(self, subject: Subject, when: When, shaders: str | None, step_us: float | None = None):
+        self.subject, self.first, self.step_us = subject, when, step_us
+        self.folder = open_folder(shaders)
+        self._shaders = shaders
+        self.generation = 1
+        self.errors: list[Diagnostic] = []
+        self._gpu: OrderedDict[tuple[int, int], GpuMoment] = OrderedDict()
+        self._reference: OrderedDict[int, ReferenceMoment] = OrderedDict()
+        self._shown = when
+
+    def open(self) -> None:
+        """Makes the context and draws once. Raises GLError."""
+        self._context = open_renderer(self.subject, self._shaders)
+        self.renderer = self._context.__enter__()
+        try:
+            self.renderer.use_shaders(_Loader(self.renderer.gl.ctx, Snapshot.of(self.folder)))
+            self._draw_all(when=self.first)
+        except BaseException as error:
+            self._context.__exit__(type(error), error, None)
+            raise
+
+    def close(self) -> None:
+        self._context.__exit__(None, None, None)
+
+    # ---- moments -----------------------------------------------------------------------------------------------
+
+    def _draw_all(self, when: When) -> GpuMoment:
+        made = GpuMoment(self.renderer, when, self.subject.log_eps)
+        for name in self._buffers():
+            made[name]
+        return made
+
+    def _buffers(self):
+        return buffers_of(self.subject.scene, edged_of(self.subject.config))
+
+    def _array(self, when: When, name: str, source: str) -> np.ndarray:
+        if name in EDGED:  # whose reference is what the twin makes of the GPU's own
+            return self.gpu(when)[name if source == "gpu" else f"{name}_twin"]
+        return (self.gpu(when) if source == "gpu" else self.reference(when))[name]
+
+    def _when(self, seconds: float | None) -> When:
+        self._shown = moment(self.subject, seconds, self.step_us) if seconds is not None else self.first
+        return self._shown
+
+    def gpu(self, when: When) -> GpuMoment:
+        key = (self.generation, when.t_ns)
+        return _kept(self._gpu, key, lambda: GpuMoment(self.renderer, when, self.subject.log_eps))
+
+    def reference(self, when: When) -> ReferenceMoment:
+        return _kept(self._reference, when.t_ns, lambda: open_reference(self.subject, when, self.renderer.maps))
+
+    def _comparison(self, when: When) -> Comparison:
+        gpu, ref = self.gpu(when), self.reference(when)
+        if not hasattr(ref, "comparison") or ref.comparison.gpu is not gpu:
+            ref.comparison = Comparison(gpu, ref)
+        return ref.comparison
+
+    # ---- answers -----------------------------------------------------------------------------------------------
+
+    def state(self) -> dict:
+        """What the page shows around the pictures."""
+        scene, config, gl = self.subject.scene, self.subject.config, self.renderer.gl
+        return {
+            "config": self.subject.path,
+            "sequence": self.subject.index,
+            "seed": config.seed,
+            "renderer": gl.renderer,
+            "width": scene.camera.width,
+            "height": scene.camera.height,
+            "t0": scene.t0_ns * 1e-9,
+            "t1": scene.t1_ns * 1e-9,
+            "t": self.first.t_ns * 1e-9,
+            "labels": [t * 1e-9 for t in config.time.label_times_ns],
+            "interval": config.time.interval_ns * 1e-9,
+            "maps": pictures.MAPS,
+            "folder": str(getattr(self.folder, "path", self.folder)),
+            "passes": [
+                {"name": p.name, "title": p.title, "unit": p.unit, "kind": p.kind, "source": p.source}
+                for p in self._buffers().values()
+            ],
+        }
+
+    def shaders(self) -> dict:
+        return {"generation": self.generation, "errors": [d.as_dict() | {"where": d.where} for d in self.errors]}
+
+    def image(self, q: dict[str, Any]) -> tuple[bytes, dict]:
+        """PNG and legend of one buffer. q : as :func:`questions.read_query` gives it, here and below."""
+        when, name = self._when(q["t"]), check_pass(q["pass"], self._buffers(), "pass")
+        source = self.gpu(when) if q["source"] == "gpu" else self.reference(when)
+        info = PASSES[name]
+        rgb, legend = pictures.picture(
+            info.kind,
+            self._array(when, name, q["source"]),
+            which=q["component"],
+            colours=q["map"],
+            low=q["low"],
+            high=q["high"],
+            hit=_meaningful(source, info),
+        )
+        return picture.png_bytes(rgb), legend | {"unit": info.unit}
+
+    def difference(self, q: dict[str, Any]) -> tuple[bytes, dict]:
+        """PNG and legend of |A - B|, on a logarithmic scale unless q's low is 0."""
+        when = self._when(q["t"])
+        for key in "ab":
+            check_pass(q[key][0], self._buffers(), key)
+        a, b = (np.asarray(self._array(when, name, source), np.float64) for name, source in (q["a"], q["b"]))
+        if a.shape != b.shape:
+            raise ConfigError(
+                "have different numbers of components",
+                where="a, b",
+                value=", ".join(":".join(q[k]) for k in "ab"),
+                accepted="two of the same kind",
+            )
+        which = "length" if q["component"] == "auto" else q["component"]
+        with np.errstate(invalid="ignore"):
+            change = np.where(a == b, 0.0, a - b)
+        values = np.abs(pictures.component(change, which))
+        some = values[np.isfinite(values) & (values > 0)]
+        low, high = (float(v) for v in (np.quantile(some, 0.01), some.max())) if some.size else (1e-12, 1.0)
+        low, high = min(low, 0.999 * high) if q["low"] is None else q["low"], high if q["high"] is None else q["high"]
+        if low > 0:  # logarithmic: one flipped pixel on a silhouette would hide everything else
+            values = np.where(np.isnan(values), values, np.clip(values, low, None))
+        rgb, legend = pictures.picture(
+            "depth", values, which="length", colours=q["map"] or picture.ERROR_MAP, low=low, high=high
+        )
+        return picture.png_bytes(rgb), legend | {"unit": PASSES[q["b"][0]].unit}
+
+    def verdict(self, q: dict[str, Any]) -> dict:
+        """All buffers against the reference: what ``diff`` says first, and its text."""
+        comparison = self._comparison(self._when(q["t"]))
+        reports = [comparison.report(name) for name in comparison.names()]
+        found = verdict(comparison, reports)
+        titles = {name: info.title for name, info in PASSES.items()}
+        return _finite(
+            found
+            | {
+                "titles": titles,
+                "buffers": [r.quantity.name for r in reports if not r.passed],
+                "compared": len(reports),
+            }
+        )
+
+    def probe(self, q: dict[str, Any]) -> dict:
+        """The CLI's probe, with the CLI's text of every number."""
+        when = self._when(q["t"])
+        x, y = check_pixel(self.subject.scene, f"{q['x']},{q['y']}")
+        comparison = self._comparison(when)
+        found = probe(comparison.gpu, comparison.ref, x, y, comparison)
+        for row in found["buffers"]:
+            row |= {f"{side}_text": _numbers(row[side]) for side in SOURCES}
+        for row in found["positions"]:
+            row |= {f"{side}_text": _numbers(row[side]) for side in SOURCES}
+        found["surface_text"] = {side: _surface_text(found["surface"][side]) for side in SOURCES}
+        return _finite(found)
+
+    # ---- reloading ---------------------------------------------------------------------------------------------
+
+    def reload(self) -> None:
+        """Takes the edited shaders when all of them compile and draw; otherwise keeps the old
+        ones and :attr:`errors`."""
+        old = self.renderer.gl.shaders
+        new = _Loader(self.renderer.gl.ctx, Snapshot.of(self.folder))
+        self.renderer.use_shaders(new)
+        try:
+            self._draw_all(self._shown)
+        except ShaderError as error:
+            found = dict.fromkeys(diagnose(error, self._sources(new), new.folder))
+            self.errors = [d for d in found if d.kind == "error"][:MOST_ERRORS]
+        except Exception as error:  # noqa: BLE001 - an edit that compiles but cannot be drawn with: not the tool's end
+            self.errors = [
+                Diagnostic(new.asked[0], 0, 0, "error", f"cannot be drawn with: {type(error).__name__}: {error}")
+            ]
+        else:
+            self.errors = []
+            self.generation += 1
+            old.clear()
+            self._gpu.clear()
+            return
+        self.renderer.use_shaders(old)
+        new.clear()
+
+    def _sources(self, loader: _Loader) -> dict:
+        try:
+            name, defines = loader.asked
+            return {stage: expand(name, stage, defines, loader.folder) for stage in stages_of(defines)}
+        except ShaderError:
+            return {}
+
+    def stamps(self) -> tuple:
+        """Changes whenever a shader file does. Safe in any thread."""
+        out = []
+        for path in files_of(self.folder):
+            try:
+                info = path.stat()
+                out.append((str(path), info.st_mtime_ns, info.st_size, info.st_ino))
+            except OSError:
+                pass
+        return tuple(out)
+
+
+def _kept(cache: OrderedDict, key, make):
+    if key not in cache:
+        cache[key] = make()
+        while len(cache) > KEPT:
+            cache.popitem(last=False)
+    cache.move_to_end(key)
+    return cache[key]
+
+
+class Worker:
+    """Runs an Inspector in its own thread, and watches its files. ``call`` may come from any thread."""
+
+    def __init__(self, inspector: Inspector):
+        self.inspector = inspector
+        self._jobs: queue.Queue = queue.Queue()
+        self._stop = threading.Event()
+        self.changed = threading.Condition()
+        self.version = 1  # counts reloads, good and bad
+        opened: Future = Future()
+        self._thread = threading.Thread(target=self._run, args=(opened,), name="render", daemon=True)
+        self._thread.start()
+        opened.result()  # raises what opening raised
+        self._watcher = threading.Thread(target=self._watch, name="watch", daemon=True)
+        self._watcher.start()
+
+    def _run(self, opened: Future) -> None:
+        try:
+            self.inspector.open()
+        except BaseException as error:  # noqa: BLE001 - raised by whoever waits
+            opened.set_exception(error)
+            return
+        opened.set_result(None)
+        while (job := self._jobs.get()) is not None:
+            function, arguments, answer = job
+            try:
+                answer.set_result(function(*arguments))
+            except BaseException as error:  # noqa: BLE001 - raised by whoever asked
+                answer.set_exception(error)
+        self.inspector.close()
+
+    def call(self, function: Any, *arguments: Any) -> Any:
+        """The result of ``function`` in the render thread; raises what it raised."""
+        if self._stop.is_set():
+            raise BlinkGLError("the server is stopping")
+        answer: Future = Future()
+        self._jobs.put((function, arguments, answer))
+        while not wait((answer,), 1.0).done:
+            if not self._thread.is_alive():
+                raise BlinkGLError("the server is stopping")
+        return answer.result()
+
+    def _watch(self) -> None:
+        seen = last = self.inspector.stamps()
+        while not self._stop.wait(POLL_S):
+            last, stamps = self.inspector.stamps(), last
+            if stamps == last != seen:  # not while an editor is still writing: a file is empty for a moment
+                seen = stamps
+                self.call(self.inspector.reload)
+                with self.changed:
+                    self.version += 1
+                    self.changed.notify_all()
+
+    def wait(self, version: int, timeout: float) -> int:
+        """The version, as soon as it differs from ``version`` or the time is over."""
+        with self.changed:
+            self.changed.wait_for(lambda: self.version != version or self._stop.is_set(), timeout)
+            return self.version
+
+    def close(self) -> None:
+        self._stop.set()
+        with self.changed:
+            self.changed.notify_all()
+        self._watcher.join()
+        self._jobs.put(None)
+        self._thread.join()

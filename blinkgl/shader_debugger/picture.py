@@ -1,0 +1,202 @@
+"""Arrays as pictures: colour maps, labelled PNGs with colour bars, the contact sheet,
+error maps. matplotlib draws with Agg."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.colour import flow_wheel
+from blinkgl.io.pictures import map_scalar
+from blinkgl.shader_debugger.moments import PASSES, Pass
+
+ERROR_MAP = "inferno"
+INK, PAPER, MUTED = "#1f2933", "#ffffff", "#64748b"
+
+
+def png_bytes(rgb: np.ndarray) -> bytes:
+    """A PNG file of (H, W, 3) uint8."""
+    out = io.BytesIO()
+    Image.fromarray(rgb).save(out, "PNG", compress_level=1)
+    return out.getvalue()
+
+
+# ------------------------------------------------------------------------------------------------- figures
+
+
+def _style(axes) -> None:
+    axes.set_xticks([]), axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_color("#cbd5e1"), spine.set_linewidth(0.6)
+
+
+def _disc() -> np.ndarray:
+    """The flow wheel without its corners, RGBA."""
+    wheel = flow_wheel()
+    v, u = np.mgrid[-1 : 1 : len(wheel) * 1j, -1 : 1 : len(wheel) * 1j]
+    return np.dstack([wheel, np.where(np.hypot(u, v) <= 1, 255, 0).astype(np.uint8)])
+
+
+def _legend(figure: Figure, box: tuple[float, float, float, float], legend: dict, size: float) -> None:
+    """Draws the colour bar, or what stands for it, into box (x, y, w, h in figure fractions)."""
+    kind = legend["kind"]
+    if kind == "bar":
+        axes = figure.add_axes(box)
+        low, high = legend["low"], legend["high"]
+        axes.pcolormesh(
+            np.geomspace(low, high, 257) if legend["log"] else np.linspace(low, high, 257),
+            [0, 1],
+            np.linspace(0, 1, 256)[None],
+            cmap=legend["map"],
+            rasterized=True,
+        )
+        axes.set_xlim(low, high), axes.set_yticks([])
+        if legend["log"]:
+            ticks = [float(f"{v:.1g}") for v in np.geomspace(low, high, 5)[1:-1]]
+            axes.set_xscale("log"), axes.set_xticks(ticks, [f"{v:g}" for v in ticks]), axes.minorticks_off()
+        else:
+            axes.locator_params(axis="x", nbins=5)
+        axes.tick_params(axis="x", labelsize=size, colors=MUTED, length=2, pad=1)
+        for spine in axes.spines.values():
+            spine.set_visible(False)
+        return
+    x, y, _, h = box
+    text = {
+        "mask": "white: yes, black: no",
+        "ids": "one colour per number",
+        "unit": "r, g, b = x, y, z; grey is 0",
+        "uv": "r, g = fractional part of u, v",
+        "light": f"sRGB, white = {legend.get('high', 1):.3g}",
+    }.get(kind, "")
+    if kind == "wheel":
+        ratio = figure.get_figheight() / figure.get_figwidth()
+        side = 2.1 * h
+        axes = figure.add_axes((x, y + h - side, side * ratio, side))
+        axes.imshow(_disc()), _style(axes)
+        axes.set_frame_on(False)
+        figure.text(
+            x + side * ratio * 1.25,
+            y + h / 2,
+            f"rim = {legend['high']:.3g}; hue is the direction",
+            fontsize=size,
+            color=MUTED,
+            va="center",
+        )
+        return
+    figure.text(x, y + h / 2, text, fontsize=size, color=MUTED, va="center")
+
+
+def _save(figure: Figure, path: Path, palette: bool = False) -> None:
+    """palette : 256 colours, dithered; a third of the size."""
+    figure.set_dpi(100)
+    figure.set_facecolor(PAPER)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    image = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
+    if palette:
+        # Pillow dithers to given palettes only.
+        image = image.quantize(palette=image.quantize(256), dither=Image.Dither.FLOYDSTEINBERG)
+    with atomic_file(path) as temporary, output_errors(path):
+        image.save(temporary, "PNG", optimize=palette)
+
+
+def save_labelled(path: Path, info: Pass, rgb: np.ndarray, legend: dict, caption: str) -> None:
+    """One buffer: title with unit, the pixels enlarged by a whole factor, colour bar, caption."""
+    height, width = rgb.shape[:2]
+    factor = max(1, round(700 / width))
+    w, h, top, bottom = width * factor, height * factor, 46, 74
+    figure = Figure(figsize=((w + 40) / 100, (h + top + bottom) / 100))
+    W, H = w + 40, h + top + bottom
+    axes = figure.add_axes((20 / W, bottom / H, w / W, h / H))
+    axes.imshow(rgb, interpolation="nearest", aspect="auto"), _style(axes)
+    figure.text(20 / W, 1 - 18 / H, info.title, fontsize=12, color=INK, va="center", weight="bold")
+    figure.text(
+        1 - 20 / W,
+        1 - 18 / H,
+        f"{info.unit}   ·   {info.source}".strip(" ·"),
+        fontsize=8,
+        color=MUTED,
+        va="center",
+        ha="right",
+    )
+    _legend(figure, (20 / W, 44 / H, min(360, w) / W, 14 / H), legend, 8)
+    figure.text(20 / W, 10 / H, caption, fontsize=7, color=MUTED, va="center")
+    _save(figure, path)
+
+
+def save_contact_sheet(path: Path, tiles: list[tuple[Pass, np.ndarray, dict]], caption: str, columns: int = 5) -> None:
+    """All buffers on one page."""
+    height, width = tiles[0][1].shape[:2]
+    w = 232
+    h = round(w * height / width)
+    rows = -(-len(tiles) // columns)
+    gap, head, foot, top = 14, 20, 32, 44
+    W, H = columns * (w + gap) + gap, top + rows * (h + head + foot) + 4
+    figure = Figure(figsize=(W / 100, H / 100))
+    figure.text(gap / W, 1 - 22 / H, caption, fontsize=10, color=INK, va="center", weight="bold")
+    for k, (info, rgb, legend) in enumerate(tiles):
+        x = gap + (k % columns) * (w + gap)
+        y = H - top - (k // columns) * (h + head + foot) - head - h
+        axes = figure.add_axes((x / W, y / H, w / W, h / H))
+        axes.imshow(rgb, interpolation="antialiased", aspect="auto"), _style(axes)
+        figure.text(x / W, (y + h + 9) / H, info.title, fontsize=8.5, color=INK, va="center", weight="bold")
+        figure.text((x + w) / W, (y + h + 9) / H, info.unit, fontsize=7, color=MUTED, va="center", ha="right")
+        _legend(figure, (x / W, (y - 12) / H, w / W, 8 / H), legend, 6)
+    _save(figure, path, palette=True)
+
+
+def save_errors(path: Path, reports: list, caption: str) -> None:
+    """Error map (log scale, silhouette band in grey) and histogram of each compared buffer."""
+    columns = 4
+    height, width = reports[0].errors.shape
+    w, gap, head, below, top = 300, 22, 20, 92, 44
+    h = round(w * height / width)
+    rows = -(-len(reports) // columns)
+    W, H = columns * (w + gap) + gap, top + rows * (h + head + below) + 6
+    figure = Figure(figsize=(W / 100, H / 100))
+    figure.text(gap / W, 1 - 22 / H, caption, fontsize=10, color=INK, va="center", weight="bold")
+    for k, report in enumerate(reports):
+        x = gap + (k % columns) * (w + gap)
+        y = H - top - (k // columns) * (h + head + below) - head - h
+        errors = np.where(report.errors > 0, report.errors, 1e-12)
+        decades = np.log10(np.minimum(errors, 1e12))
+        rgb = map_scalar(np.clip(decades, -9, 2), ERROR_MAP, -9, 2)
+        rgb[~report.graded] = (rgb[~report.graded] * 0.35 + 255 * 0.3).astype(np.uint8)
+        axes = figure.add_axes((x / W, y / H, w / W, h / H))
+        axes.imshow(rgb, interpolation="antialiased", aspect="auto"), _style(axes)
+        verdict, colour = ("ok", "#15803d") if report.passed else ("over tolerance", "#b91c1c")
+        figure.text(
+            x / W,
+            (y + h + 9) / H,
+            PASSES[report.quantity.name].title,
+            fontsize=8.5,
+            color=INK,
+            va="center",
+            weight="bold",
+        )
+        figure.text(
+            (x + w) / W,
+            (y + h + 9) / H,
+            f"{report.quantity.statistic} {report.value:.2g} {report.quantity.unit}: {verdict}",
+            fontsize=7,
+            color=colour,
+            va="center",
+            ha="right",
+        )
+        bars = figure.add_axes((x / W, (y - 62) / H, w / W, 56 / H))
+        inside = np.clip(decades[report.graded], -9, 2)
+        bars.hist(inside, bins=np.linspace(-9, 2, 56), color="#3b6ea5")
+        if report.tolerance > 0:
+            bars.axvline(np.clip(np.log10(report.tolerance), -9, 2), color="#b91c1c", linewidth=1)
+        bars.set_xlim(-9, 2), bars.set_yscale("log"), bars.set_yticks([]), bars.minorticks_off()
+        bars.set_xticks([-9, -6, -3, 0], ["≤1e-9", "1e-6", "1e-3", "1"])
+        bars.tick_params(labelsize=6, colors=MUTED, length=2, pad=1)
+        for spine in bars.spines.values():
+            spine.set_color("#cbd5e1")
+    _save(figure, path, palette=True)

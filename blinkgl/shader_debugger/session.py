@@ -1,0 +1,402 @@
+"""What the debugger looks at: one sequence's scene as a generation run would build it, a time in it, and an OpenGL
+renderer of it whose shaders may be edited while it runs."""
+
+from __future__ import annotations
+
+import math
+import os
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from blinkgl.camera.drawing import seen_through
+from blinkgl.config.sequence import NS_PER_S, SequenceConfig, load_run
+from blinkgl.errors import ConfigError, GLError
+from blinkgl.gl import GLContext, ShaderLoader, create_context
+from blinkgl.gl.shader import ShaderError, expand, shader_folder
+from blinkgl.render.canvas import DEPTH_BUFFER
+from blinkgl.render.painter import Painter
+from blinkgl.render.passes import Colour, Geometry, Luminance, Output, ScenePass
+from blinkgl.render.passes.shadow import ShadowMap
+from blinkgl.render.renderer import Renderer
+from blinkgl.render.strokes import Strokes
+from blinkgl.scene.build import check_assets, sequence_scene
+from blinkgl.scene.types import Scene
+from blinkgl.shader_debugger.silhouettes import edged_of
+
+DEBUG_PROGRAM = "debug.glsl"
+LENT = (DEBUG_PROGRAM, "include/vertex.glsl")
+STEP_FRACTION = 100  # the step of dL/dt is this part of the label interval
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """One sequence. path : its YAML file.   index : its number."""
+
+    path: str
+    config: SequenceConfig
+    index: int
+    scene: Scene
+
+    @property
+    def log_eps(self) -> float:
+        """What the emulator adds to the luminance before the logarithm."""
+        return float(getattr(self.config.events, "log_eps", 1e-3))
+
+
+@dataclass(frozen=True)
+class When:
+    """Times in ns: the moment, the other ends of its flows, and the two times whose difference quotient is dL/dt."""
+
+    t_ns: int
+    forward_ns: int
+    backward_ns: int
+    before_ns: int
+    after_ns: int
+
+    @property
+    def step_s(self) -> float:
+        """Seconds between before and after."""
+        return (self.after_ns - self.before_ns) * 1e-9
+
+    @property
+    def interval_s(self) -> float:
+        return (self.forward_ns - self.t_ns) * 1e-9
+
+
+def open_subject(
+    config: str, *, seed: int | None = None, sequence: int | None = None, overrides: list[str] | tuple = ()
+) -> Subject:
+    """The sequence that ``blinkgl generate CONFIG --seed SEED`` would make under number
+    ``sequence`` (default: its first). Of a lens that distorts it is the flat picture that is drawn for it.
+
+    Raises ConfigError and AssetError."""
+    template = load_run(config, overrides, seed=seed)
+    index = template.sequence(0).output.first_index if sequence is None else sequence
+    one = template.sequence(index)
+    check_assets(one.scene, template.base, one.output.split)
+    scene = sequence_scene(one, index, template.base)
+    scene = scene.with_camera(seen_through(scene.camera))
+    return Subject(str(config), one, index, scene)
+
+
+def moment(subject: Subject, seconds: float | None = None, step_us: float | None = None) -> When:
+    """The times that belong to a moment ``seconds`` on the sequence's clock (default: the first label).
+
+    Flows run one label interval forward and backward; beyond the sequence's ends the poses are held, as everywhere.
+    Raises ConfigError for a time outside the sequence or a step that is not positive."""
+    timing, scene = subject.config.time, subject.scene
+    if seconds is None:
+        t_ns = timing.label_times_ns[0]
+    else:
+        t_ns = round(seconds * NS_PER_S) if math.isfinite(seconds * NS_PER_S) else None
+        if t_ns is None or not scene.t0_ns <= t_ns <= scene.t1_ns:
+            raise ConfigError(
+                "outside the sequence",
+                where="--time",
+                value=seconds,
+                accepted=f"{scene.t0_ns / NS_PER_S:g} to {scene.t1_ns / NS_PER_S:g} s",
+            )
+    if step_us is None:
+        step = max(1000, timing.interval_ns // STEP_FRACTION)
+    elif math.isfinite(step_us * 1000) and step_us * 1000 >= 1:
+        step = round(step_us * 1000)
+    else:
+        raise ConfigError("not a time step", where="--step", value=step_us, accepted="at least 0.001 µs")
+    before, after = max(scene.t0_ns, t_ns - step), min(scene.t1_ns, t_ns + step)
+    return When(t_ns, t_ns + timing.interval_ns, t_ns - timing.interval_ns, before, after)
+
+
+def check_pixel(scene: Scene, text: str) -> tuple[int, int]:
+    """ "X,Y" as two integers inside the image. Raises ConfigError."""
+    width, height = scene.camera.width, scene.camera.height
+    accepted = f"X,Y with 0 <= X < {width} and 0 <= Y < {height}"
+    try:
+        x, y = (int(v) for v in text.split(","))
+    except ValueError:
+        raise ConfigError("not a pixel", where="--pixel", value=text, accepted=accepted) from None
+    if not (0 <= x < width and 0 <= y < height):
+        raise ConfigError("outside the image", where="--pixel", value=text, accepted=accepted)
+    return x, y
+
+
+class EditedFolder:
+    """A user's copy of shaders/, to which :data:`DEBUG_PROGRAM`, and what that includes, is lent
+    when the copy is older than the debugger."""
+
+    def __init__(self, folder: Path, inside: str = ""):
+        self.path, self._inside = folder, inside
+
+    def __truediv__(self, name: str) -> Any:
+        inside = f"{self._inside}{name}"
+        if name == "include":
+            return EditedFolder(self.path, "include/")
+        own = self.path / inside
+        return shader_folder() / inside if inside in LENT and not own.exists() else own
+
+    def iterdir(self) -> Any:
+        return self.path.iterdir()
+
+
+def open_folder(shaders: str | None) -> Any:
+    """The folder whose shaders are debugged: ``shaders``, or the shipped ones. Raises
+    GLError when it cannot be read."""
+    if shaders is None:
+        return shader_folder()
+    folder = Path(shaders)
+    accepted = "a copy of the shaders/ folder"
+    if not folder.is_dir():
+        raise GLError(
+            "no such shader folder" if not folder.exists() else "is not a folder",
+            where="--shaders",
+            value=shaders,
+            accepted=accepted,
+        )
+    if not os.access(folder, os.R_OK | os.X_OK):
+        raise GLError(
+            "shader folder cannot be read", where="--shaders", value=shaders, accepted="a folder with read permission"
+        )
+    if not any(folder.glob("*.glsl")):
+        raise GLError("no shaders in this folder", where="--shaders", value=shaders, accepted=accepted)
+    return EditedFolder(folder)
+
+
+class Snapshot:
+    """The shader folder as it was at one moment. Programs compile when something first asks for them: without it, a
+    variant asked for after a bad edit would be compiled from the bad file."""
+
+    def __init__(self, files: dict[str, bytes], path: str = ""):
+        self._files, self.path = files, path
+
+    @classmethod
+    def of(cls, folder: Any) -> Snapshot:
+        root = folder.path if isinstance(folder, EditedFolder) else Path(str(folder))
+        files = {}
+        places = {path.relative_to(root).as_posix(): path for path in files_of(folder)} | {
+            name: Path(str(folder / name)) for name in LENT
+        }
+        for name, path in places.items():
+            try:
+                files[name] = path.read_bytes()
+            except OSError:
+                pass  # gone or unreadable: missing here, and reported as missing when a program needs it
+        return cls(files)
+
+    @property
+    def name(self) -> str:
+        return self.path.rpartition("/")[2]
+
+    def __truediv__(self, name: str) -> Snapshot:
+        return Snapshot(self._files, f"{self.path}/{name}" if self.path else name)
+
+    def iterdir(self) -> Any:
+        inside = f"{self.path}/" if self.path else ""
+        return (
+            Snapshot(self._files, path)
+            for path in sorted(self._files)
+            if path.startswith(inside) and "/" not in path[len(inside) :]
+        )
+
+    def read_text(self, encoding: str = "utf-8") -> str:
+        if self.path not in self._files:
+            raise FileNotFoundError(self.path)
+        return self._files[self.path].decode(encoding)
+
+
+def files_of(folder: Any) -> list[Path]:
+    """Every shader file below ``folder``, for watching and for messages."""
+    root = folder.path if isinstance(folder, EditedFolder) else Path(str(folder))
+    return sorted([*root.glob("*.glsl"), *(root / "include").rglob("*.glsl")])
+
+
+class _Nothing:
+    """A uniform that the compiler optimised away: takes any value."""
+
+    value = None
+
+    def write(self, data: bytes) -> None:
+        pass
+
+
+class _Uniforms(dict):
+    def __missing__(self, name: str) -> _Nothing:
+        return _Nothing()
+
+
+class _DebugStrokes(Strokes):
+    def program(self, name, defines):
+        uniforms, array = super().program(name, defines)
+        return _Uniforms(uniforms), array
+
+
+class DebugPainter(Painter):
+    """Tolerates edited shaders that no longer use a uniform."""
+
+    def __init__(self, gl: GLContext, scene: Scene, resources: Any, stats: Any):
+        super().__init__(gl, scene, resources, stats)
+        self.strokes = _DebugStrokes(gl)
+
+    def uniforms(self, program: Any) -> Any:
+        return _Uniforms(super().uniforms(program))
+
+
+@dataclass(frozen=True)
+class Inspection(ScenePass):
+    """Which primitive wrote a pixel, and where on it; 0 where nothing is hit. In [..., 3] of LOCAL: number of the part
+    + 1, an index into ``reference.scene_parts``."""
+
+    program: ClassVar[str] = DEBUG_PROGRAM
+    outputs: ClassVar[tuple[Output, ...]] = (
+        Output("TRIANGLE", "R32UI"),
+        Output("LOCAL", "RGBA32F"),
+        Output("WINDOW", "RGBA32F"),
+    )
+
+    def defines(self, kind: Any) -> Any:
+        return {f"OUT_{output.name}": i for i, output in enumerate(self.outputs)}
+
+    def set(self, painter: Any, uniforms: Any, item: Any, shot: Any) -> Any:
+        uniforms["part_number"].value = item.part + 1
+
+
+SHOWN = tuple(Output(name, "RGBA32F") for name in ("lookup", "albedo", "mirrored", "emission", "terms", "light"))
+"""What the variant SHOW_LOOKUP writes beside a pass's own output."""
+
+
+@dataclass(frozen=True)
+class LuminanceLookup(Luminance):
+    """The luminance pass, which shows its look-ups."""
+
+    still: ClassVar[bool] = False
+
+    @property
+    def outputs(self) -> Any:
+        return (*super().outputs, *SHOWN)
+
+    def defines(self, kind: Any) -> Any:
+        return super().defines(kind) | {"SHOW_LOOKUP": 1}
+
+    @classmethod
+    def every_kind(cls) -> Any:
+        yield cls()
+
+
+@dataclass(frozen=True)
+class ColourLookup(Colour):
+    """The colour pass, which shows its look-ups."""
+
+    outputs: ClassVar[tuple[Output, ...]] = (*Colour.outputs, *SHOWN)
+
+    def defines(self, kind: Any) -> Any:
+        return super().defines(kind) | {"SHOW_LOOKUP": 1}
+
+
+@dataclass(frozen=True)
+class WholeShadowMap(ShadowMap):
+    """Drawn anew, whatever stood still since the last one."""
+
+    def stands_still(self, whole: bool) -> bool:
+        return False
+
+
+LOOKUPS = {"luminance": LuminanceLookup(), "colour": ColourLookup()}
+"""Passes that show what they look up. One sample at the pixel's centre, whatever the anti-aliasing."""
+
+
+class DebugRenderer(Renderer):
+    """The production renderer, with passes of its own. Always draws whole frames: what is kept from an earlier frame
+    may be other shaders' work.
+
+    edged : which pictures with filtered silhouettes are shown and compared, see :mod:`silhouettes`."""
+
+    edged: tuple[str, ...] = ()
+
+    def __init__(self, gl: GLContext, scene: Scene, config: Any, painter: type[Painter] = DebugPainter):
+        super().__init__(gl, scene, config, whole=True, painter=painter)
+
+    def use_shaders(self, loader: ShaderLoader) -> None:
+        """Draw with another loader's programs from now on."""
+        self.forget()
+        self.gl.shaders = loader
+
+    def inspect(self, t_ns: int) -> dict[str, np.ndarray]:
+        """The outputs of debug.glsl, see :class:`Inspection`."""
+        frame = self.draw(Inspection(), t_ns)
+        return {name: frame.read(name) for name in frame.names}
+
+    def lookups(self, name: str, t_ns: int) -> dict[str, np.ndarray]:
+        """What the pass "luminance" or "colour" looks up and multiplies, float32, as its own source says it (variant
+        SHOW_LOOKUP): result (H, W[, 3]) as the pass writes it; uv (H, W, 2); level, count (H, W), the number of
+        look-ups; light, and its terms direct, shadow, around (H, W); albedo, mirrored, emission, light_rgb (H, W, 3).
+        One sample at the pixel's centre whatever the anti-aliasing; 0 where nothing is hit.
+
+        Raises ShaderError when the source shows nothing (a copy that is older than the debugger)."""
+        program = LOOKUPS[name].program
+        if "show_lookup(" not in "".join(
+            line
+            for line in expand(program, "fragment", {}, self.gl.shaders.folder).text.splitlines()
+            if not line.startswith("void")
+        ):
+            raise ShaderError(
+                "does not show what it looks up",
+                where=program,
+                accepted='#include "lookup.glsl" and show_lookup(albedo, light, …) under #ifdef SHOW_LOOKUP, as in the '
+                "shipped file",
+            )
+        frame = self.draw(replace(LOOKUPS[name], shadows=self._shadows), t_ns)
+        lookup, albedo, terms = frame.read("lookup"), frame.read("albedo"), frame.read("terms")
+        return {
+            "result": frame.read(name),
+            "uv": lookup[..., :2],
+            "level": lookup[..., 2],
+            "light": lookup[..., 3],
+            "albedo": albedo[..., :3],
+            "count": albedo[..., 3],
+            "direct": terms[..., 0],
+            "shadow": terms[..., 1],
+            "around": terms[..., 2],
+            "mirrored": frame.read("mirrored")[..., :3],
+            "emission": frame.read("emission")[..., :3],
+            "light_rgb": frame.read("light")[..., :3],
+        }
+
+    @property
+    def maps(self) -> tuple[ShadowMap, ...]:
+        """Of the lamps that cast shadows, in the shaders' order."""
+        return self._shadows
+
+    def shadow_map(self, k: int, t_ns: int) -> np.ndarray:
+        """(texels, texels) float32, the depths of map k with all that casts in it, 0 where nothing does."""
+        frame = self.draw(WholeShadowMap(**vars(self.maps[k])), t_ns)
+        depths = np.empty((self.maps[k].texels,) * 2, np.float32)
+        frame.texture(DEPTH_BUFFER).read_into(depths)
+        return depths
+
+    def raw(
+        self, t_ns: int, *names: str, forward_ns: int | None = None, backward_ns: int | None = None
+    ) -> dict[str, np.ndarray]:
+        """Buffers of label.glsl as the shader wrote them, without the masks of ground truth, by
+        the names of their labels: depth, ids …"""
+        ends = {way: t for way, t in (("forward", forward_ns), ("backward", backward_ns)) if t is not None}
+        frame = self.draw(Geometry(names), t_ns, ends)
+        return {name: frame.read(name) for name in names}
+
+
+@contextmanager
+def open_renderer(subject: Subject, shaders: str | None = None, *, as_configured: bool = False) -> Any:
+    """A :class:`DebugRenderer` of the subject with the shaders of a folder, on the configuration's OpenGL.
+
+    as_configured : anti-aliasing as generation does; otherwise one sample at the pixel centre, which is what the
+    reference's rays see.   Raises GLError."""
+    folder = open_folder(shaders)
+    with create_context(subject.config.gl.backend, subject.config.gl.device) as gl:
+        gl.shaders = ShaderLoader(gl.ctx, folder)
+        config = subject.config.render
+        if not as_configured:
+            config = config.model_copy(update={"antialiasing": "none", "image_antialiasing": "none"})
+        with DebugRenderer(gl, subject.scene, config) as renderer:
+            renderer.edged = edged_of(subject.config)
+            yield renderer

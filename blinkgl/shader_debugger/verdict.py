@@ -1,0 +1,84 @@
+"""Where the fault is: the first buffer that is wrong, in the order in which a pass makes them, object by object."""
+
+from __future__ import annotations
+
+from blinkgl.shader_debugger.compare import QUANTITIES, BufferReport, Comparison
+
+
+def verdict(comparison: Comparison, reports: list[BufferReport]) -> dict:
+    """Plain data (JSON).
+
+    passed : every buffer is within its tolerance.
+    first : {buffer, title, source, objects, suspicions} of the first that is not.
+    objects : per object that is over a tolerance, in the order of ``first``: object, first (buffer), x, y (the worst
+    pixel there), over_tolerance and pixels (of that buffer), then (the other buffers that are
+    wrong), suspicion ("" when none fits)."""
+    order = list(QUANTITIES)
+    failed = sorted((r for r in reports if not r.passed), key=lambda r: order.index(r.quantity.name))
+    rows: dict[str, dict] = {}
+    for report in failed:
+        for one in report.objects:
+            if not one["over_tolerance"]:
+                continue
+            name = report.quantity.name
+            row = rows.setdefault(
+                one["object"],
+                {
+                    "object": one["object"],
+                    "first": name,
+                    "x": one["x"],
+                    "y": one["y"],
+                    "pixels": one["pixels"],
+                    "over_tolerance": one["over_tolerance"],
+                    "then": [],
+                    "suspicion": _suspicion(report, one["object"], comparison.objects),
+                },
+            )
+            if row["first"] != name:
+                row["then"].append(name)
+    first = None
+    if failed:
+        top = failed[0].quantity
+        first = {
+            "buffer": top.name,
+            "title": top.title,
+            "source": top.source,
+            "suspicions": failed[0].suspicions,
+            "objects": [row["object"] for row in rows.values() if row["first"] == top.name],
+        }
+    return {"passed": not failed, "first": first, "objects": list(rows.values())}
+
+
+def _suspicion(report: BufferReport, name: str, names: list[str]) -> str:
+    """The first that is about this object, or about no object."""
+    others = [n for n in names if n != name]
+    return next(
+        (
+            text
+            for text in report.suspicions
+            if not text.startswith(tuple(f"{n}{end}" for n in others for end in (":", " is ")))
+        ),
+        "",
+    )
+
+
+def as_text(found: dict) -> list[str]:
+    """Lines."""
+    if found["passed"]:
+        return []
+    first = found["first"]
+    lines = [
+        f"The first that is wrong: {first['title']} ({first['source']})"
+        + (f", on {', '.join(first['objects'])}" if first["objects"] else "")
+    ]
+    lines += [f"  it looks as if: {text}" for text in first["suspicions"]]
+    lines += ["", f"  {'object':<16} {'first wrong':<22} {'over':>7} {'of px':>7}  {'worst at':<12} then also; why"]
+    for row in found["objects"]:
+        place = f"({row['x']}, {row['y']})"
+        more = ", ".join(row["then"]) or "nothing"
+        lines.append(
+            f"  {row['object']:<16} {QUANTITIES[row['first']].title:<22} {row['over_tolerance']:>7} "
+            f"{row['pixels']:>7}  {place:<12} {more}"
+            + (f"; {row['suspicion']}" if row["suspicion"] and row["suspicion"] not in first["suspicions"] else "")
+        )
+    return lines

@@ -1,0 +1,68 @@
+"""Boxes of the objects in a picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Boxes:
+    """N objects of which something would be in the picture, did nothing hide it, in the scene's order.
+
+    instance : (N,) int64, as in ``ids``.   category : (N,) int64, as in ``semantics``.   kind : (N,) text, what the
+    name says it is.
+    visible_box : (N, 4) float64 px, left, top, right, bottom edges of the pixels that show it (the top-left pixel's are
+    -0.5, -0.5, 0.5, 0.5); 0 where none does.   visible_pixels : (N,) int64.
+    amodal_box : (N, 4) float64 px, of all of it before the near plane, whether hidden, in the picture or beside it.
+    cut_box : (N, 4) float64 px, the same, cut at the picture's edges.
+    amodal_pixels : (N,) int64, pixels of the picture that would show it, did nothing hide it.
+    size : (N, 3) float64, of its box in space along that one's axes, world units.
+    T_cam_box, T_world_box : (N, 4, 4) float64, from the box's axes, which are the object's, and its middle, to the
+    camera's and to the world's.   occluded : (N,) float64, share of ``amodal_pixels`` that is hidden.
+    truncated : (N,) float64, share of ``amodal_box`` that is outside the picture.
+    resolution : (2,) int64 width and height of the picture, px."""
+
+    instance: np.ndarray
+    category: np.ndarray
+    kind: np.ndarray
+    visible_box: np.ndarray
+    visible_pixels: np.ndarray
+    amodal_box: np.ndarray
+    cut_box: np.ndarray
+    amodal_pixels: np.ndarray
+    size: np.ndarray
+    T_cam_box: np.ndarray
+    T_world_box: np.ndarray
+    occluded: np.ndarray
+    truncated: np.ndarray
+    resolution: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.instance)
+
+
+SHAPES: dict[str, tuple[tuple[int, ...], str]] = {
+    "instance": ((), "i"),
+    "category": ((), "i"),
+    "kind": ((), "U"),
+    "visible_box": ((4,), "f"),
+    "visible_pixels": ((), "i"),
+    "amodal_box": ((4,), "f"),
+    "cut_box": ((4,), "f"),
+    "amodal_pixels": ((), "i"),
+    "size": ((3,), "f"),
+    "T_cam_box": ((4, 4), "f"),
+    "T_world_box": ((4, 4), "f"),
+    "occluded": ((), "f"),
+    "truncated": ((), "f"),
+}
+"""Array -> its shape behind the objects, NumPy's kind of number."""
+
+
+def no_boxes() -> dict[str, Any]:
+    """Return the arrays of no object, but for ``resolution``."""
+    kinds = {"i": np.int64, "f": np.float64, "U": "U1"}
+    return {name: np.zeros((0, *more), kinds[kind]) for name, (more, kind) in SHAPES.items()}

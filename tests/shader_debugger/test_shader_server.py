@@ -1,0 +1,544 @@
+"""serve: routes and refusals over plain HTTP, live reload, and the page in a real browser."""
+
+from __future__ import annotations
+
+import http.client
+import io
+import json
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import webdriver
+from PIL import Image
+
+from blinkgl.shader_debugger import server as server_module
+from blinkgl.shader_debugger.moments import buffers_of
+from blinkgl.shader_debugger.server import LOCAL, MOST_OPEN, MOST_WAITING, THREADS, DebugServer, host_allowed
+from blinkgl.shader_debugger.session import moment, open_subject
+from blinkgl.shader_debugger.silhouettes import edged_of
+from debugger_scene import HEIGHT, WIDTH, copy_shaders, edit
+
+
+@pytest.fixture(scope="module")
+def served(config, tmp_path_factory):
+    """(server, its folder of shaders)"""
+    folder = copy_shaders(tmp_path_factory.mktemp("served"))
+    subject = open_subject(config)
+    with DebugServer(subject, moment(subject), str(folder)) as server:
+        yield server, folder
+
+
+def buffers(config: str) -> dict:
+    """What the page has of this configuration."""
+    subject = open_subject(config)
+    return buffers_of(subject.scene, edged_of(subject.config))
+
+
+def ask(server, path: str, method: str = "GET", host: str | None = None):
+    """(status, headers, body). Paths go over the wire as they are."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=30)
+    # As it stands, not as http.client likes it.
+    connection._encode_request = lambda request: request.encode("utf-8", "surrogateescape")
+    connection._validate_path = lambda path: None
+    connection.putrequest(method, path, skip_host=True)
+    if host != "":
+        connection.putheader("Host", host or f"127.0.0.1:{server.port}")
+    connection.endheaders()
+    answer = connection.getresponse()
+    body = answer.read()
+    connection.close()
+    return answer.status, answer.headers, body
+
+
+def as_json(server, path: str):
+    status, _, body = ask(server, path)
+    assert status == 200, body
+    return json.loads(body)
+
+
+# ------------------------------------------------------------------------------------------------- routes
+
+
+def test_page_and_state(served, config):
+    server, _ = served
+    for path, kind in (("/", "text/html"), ("/app.js", "text/javascript"), ("/style.css", "text/css")):
+        status, headers, body = ask(server, path)
+        assert status == 200 and headers["Content-Type"].startswith(kind) and len(body) > 500
+        assert "default-src 'none'" in headers["Content-Security-Policy"]
+        text = body.decode()
+        assert "//cdn" not in text and "https://" not in text and "http://" not in text  # works offline
+    state = as_json(server, "/state")
+    assert (state["width"], state["height"], state["generation"], state["errors"]) == (WIDTH, HEIGHT, 1, [])
+    assert [p["name"] for p in state["passes"]] == [*buffers(config)]
+    status, _, body = ask(server, "/", "HEAD")
+    assert status == 200 and body == b""
+
+
+def test_every_buffer_as_a_picture_from_both_sides(served, config):
+    server, _ = served
+    for name in buffers(config):
+        for source in ("gpu", "reference"):
+            status, headers, body = ask(server, f"/image?pass={name}&source={source}&t=0.1")
+            assert status == 200, body
+            assert Image.open(io.BytesIO(body)).size == (WIDTH, HEIGHT)
+            assert json.loads(headers["X-Legend"])["kind"] in ("bar", "wheel", "ids", "mask", "light", "unit", "uv")
+
+
+def test_colours_range_and_component(served):
+    server, _ = served
+    _status, headers, body = ask(server, "/image?pass=flow_forward&component=x&map=gray&low=-10&high=10&t=0.1")
+    legend = json.loads(headers["X-Legend"])
+    assert (legend["low"], legend["high"], legend["map"]) == (-10.0, 10.0, "gray")
+    u = next(row for row in as_json(server, "/probe?t=0.1&x=35&y=40")["buffers"] if row["name"] == "flow_forward")
+    shown = np.asarray(Image.open(io.BytesIO(body)))[40, 35, 0]
+    assert shown == pytest.approx(255 * (u["gpu"][0] + 10) / 20, abs=1.5)
+
+
+def test_difference_of_gpu_and_reference_is_small_and_of_two_passes_is_not(served):
+    server, _ = served
+    _, headers, _ = ask(server, "/difference?a=depth:gpu&b=depth:reference&t=0.2")
+    assert json.loads(headers["X-Legend"])["unit"] == "world units"
+    _, headers, body = ask(server, "/difference?a=flow_forward:gpu&b=flow_backward:gpu&t=0.1")
+    assert json.loads(headers["X-Legend"])["high"] > 5
+    status, _, body = ask(server, "/difference?a=flow_forward:gpu&b=depth:gpu&t=0.1")
+    assert status == 400 and "components" in json.loads(body)["error"]
+
+
+@pytest.mark.parametrize(
+    "path, words",
+    [
+        ("/image?pass=nothing", "unknown pass"),
+        ("/image", "unknown pass"),
+        ("/image?pass=depth&t=99", "outside the sequence"),
+        ("/image?pass=depth&t=x", "not a time"),
+        ("/image?pass=depth&t=inf", "outside the sequence"),
+        ("/image?pass=depth&source=disk", "unknown source"),
+        ("/image?pass=depth&map=../x", "unknown colour map"),
+        ("/image?pass=depth&low=nan", "not a number"),
+        ("/image?pass=velocity&component=w", "no such component"),
+        ("/probe?x=1", "not a pixel"),
+        ("/probe?x=96&y=0", "outside the image"),
+        ("/difference?a=depth", "unknown source"),
+        ("/image?pass=depth&t=1e308", "outside the sequence"),
+        ("/wait?version=²", "not a version"),
+        ("/wait?version=%C2%B2", "not a version"),
+        ("/wait?version=-1", "not a version"),
+        ("/wait?version=" + "9" * 30, "not a version"),
+        ("/probe?x=%C2%B2&y=1", "not a pixel"),
+        ("/probe?x=" + "9" * 1900 + "&y=1", "outside the image"),
+        ("/image?pass=depth&low=-1e308&high=1e308", "not a number"),
+        ("/image?pass=depth&pass=id", "asked twice"),
+        ("/image?pass=depth&size=3", "unknown parameter"),
+        ("/state?a=1", "unknown parameter"),
+        ("/image?pass=" + "x" * 3000, "too long"),
+        ("/verdict?t=-1e400", "outside the sequence"),
+        ("/difference?a=depth:gpu&b=local:gpu", "components"),
+        ("/image?pass=depth&component=..", "no such component"),
+    ],
+)
+def test_bad_questions_get_400_and_one_line(served, path, words):
+    status, headers, body = ask(served[0], path)
+    assert status == 400 and headers["Content-Type"] == "application/json"
+    error = json.loads(body)["error"]
+    assert words in error and "\n" not in error and "Traceback" not in error
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/../setup.cfg",
+        "/..%2fserver.py",
+        "/page/app.js",
+        "/%2e%2e/%2e%2e/etc/passwd",
+        "/app.js/../../cli.py",
+        "//etc/passwd",
+        "/index.html",
+        "/favicon.ico",
+        "/state/",
+        "/STATE",
+        "/shaders/label.glsl",
+        "/app.js%00",
+        "/.git/config",
+        "/proc/self/environ",
+    ],
+)
+def test_unknown_routes_and_traversal_get_404(served, path):
+    status, _, body = ask(served[0], path)
+    assert status == 404 and json.loads(body) == {"error": "no such page"}
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "TRACE"])
+def test_other_methods_are_refused(served, method):
+    assert ask(served[0], "/state", method)[0] == 501
+
+
+def test_foreign_hosts_are_refused(served):
+    server, _ = served
+    for host in (
+        "evil.example",
+        f"evil.example:{server.port}",
+        "127.0.0.1.evil.example",
+        f"127.0.0.1:{server.port + 1}",
+        "",
+        "localhost@evil.example",
+        "0.0.0.0",
+        "169.254.169.254",
+        "[::1",
+        "127.0.0.1/x",
+        "localhost.",
+        "127.1",
+    ):
+        status, _, body = ask(server, "/state", host=host)
+        assert status == 403 and b"passes" not in body, host
+    with socket.create_connection(("127.0.0.1", server.port), timeout=10) as wire:  # two of them, the first one local
+        wire.sendall(b"GET /state HTTP/1.1\r\nHost: localhost\r\nHost: evil.example\r\n\r\n")
+        assert b" 403 " in wire.recv(100)
+    for host in (f"localhost:{server.port}", "127.0.0.1", f"[::1]:{server.port}", "LOCALHOST"):
+        assert ask(server, "/state", host=host)[0] == 200, host
+
+
+def test_hosts_of_other_bindings():
+    assert host_allowed("box.lan:80", "box.lan", 80) and not host_allowed("other.lan:80", "box.lan", 80)
+    assert host_allowed("192.168.1.7:80", "0.0.0.0", 80) and not host_allowed("evil.example:80", "0.0.0.0", 80)
+    assert not host_allowed(None, "127.0.0.1", 80) and not host_allowed("a" * 300, "127.0.0.1", 80)
+    assert all(host_allowed(f"[{n}]" if ":" in n else n, "127.0.0.1", 80) for n in LOCAL)
+
+
+def test_listens_on_the_loopback_alone(served):
+    assert served[0]._server.address[0] == served[0]._server.socket.getsockname()[0] == "127.0.0.1"
+
+
+def test_a_taken_port_is_one_line_and_2(served, shader, config):
+    status, out, err = shader("serve", config, "--port", served[0].port)
+    assert (status, out) == (2, "") and err.startswith("error: serve: cannot listen") and err.count("\n") == 1
+
+
+def test_many_askers_at_once_get_the_same_answer(served):
+    """Requests come in many threads, OpenGL is used in one."""
+    server, _ = served
+    answers: list[bytes] = []
+    threads = [
+        threading.Thread(target=lambda: answers.append(ask(server, "/image?pass=depth&t=0.15")[2])) for _ in range(12)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    assert len(answers) == 12 and len(set(answers)) == 1
+
+
+def test_nonsense_on_the_wire_does_not_stop_it(served):
+    server, _ = served
+    for junk in (
+        b"\x00\xff\xfe garbage\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: " + b"a" * 70_000 + b"\r\n\r\n",
+        b"GET\r\n\r\n",
+        b"",
+    ):
+        with socket.create_connection(("127.0.0.1", server.port), timeout=10) as wire:
+            wire.sendall(junk)
+    assert as_json(server, "/state")["width"] == WIDTH
+
+
+def test_clients_that_say_nothing_hold_no_thread(served):
+    """300 of them, half with half a header: the page is answered meanwhile, and they are let go of."""
+    server, _ = served
+    before = threading.active_count()
+    silent = []
+    try:
+        for k in range(300):
+            wire = socket.create_connection(("127.0.0.1", server.port), timeout=10)
+            silent.append(wire)
+            if k % 2:
+                wire.sendall(b"GET /state HTTP/1.1\r\nHost: ")
+        assert as_json(server, "/state")["width"] == WIDTH
+        assert threading.active_count() <= before + THREADS
+        assert len(server._server._arriving) <= MOST_OPEN
+        assert silent[0].recv(10) == b""  # the oldest gave way
+    finally:
+        for wire in silent:
+            wire.close()
+
+
+def test_a_header_has_a_limit_in_bytes_and_in_time(served, monkeypatch):
+    server, _ = served
+    with socket.create_connection(("127.0.0.1", server.port), timeout=10) as wire:
+        wire.sendall(b"GET /state HTTP/1.1\r\nHost: localhost\r\n")
+        try:
+            while True:  # never ends by itself
+                wire.sendall(b"X-More: " + b"a" * 1000 + b"\r\n")
+        except OSError:
+            pass
+    monkeypatch.setattr(server_module, "HEADER_S", 0.2)
+    with socket.create_connection(("127.0.0.1", server.port), timeout=10) as wire:
+        wire.sendall(b"GET /state HTTP/1.1\r\n")
+        assert wire.recv(100) == b""
+    assert as_json(server, "/state")["width"] == WIDTH
+
+
+def test_pages_that_wait_leave_threads_to_those_that_ask(served):
+    server, _ = served
+    version = as_json(server, "/state")["version"]
+    waiting = [socket.create_connection(("127.0.0.1", server.port), timeout=30) for _ in range(MOST_WAITING + 4)]
+    try:
+        for wire in waiting:
+            wire.sendall(f"GET /wait?version={version} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+        assert as_json(server, "/state")["version"] == version
+        refused, _, _ = select.select(waiting, [], [], 10)
+        assert b" 503 " in refused[0].recv(100)
+    finally:
+        for wire in waiting:
+            wire.close()
+    for _ in range(100):  # those that have left are noticed
+        if server._server.waiting._value == MOST_WAITING:
+            break
+        time.sleep(0.1)
+    assert server._server.waiting._value == MOST_WAITING
+
+
+# ------------------------------------------------------------------------------------------------- reloading
+
+
+def next_version(server, version: int) -> dict:
+    """What the page learns, and within a second of the edit (plus the time this machine takes to draw)."""
+    for _ in range(3):
+        now = as_json(server, f"/wait?version={version}")
+        if now["version"] != version:
+            return now
+    raise AssertionError("the edit was not noticed")
+
+
+def depth_at(server) -> float:
+    row = next(b for b in as_json(server, "/probe?t=0.1&x=35&y=40")["buffers"] if b["name"] == "depth")
+    return row["gpu"]
+
+
+def test_edits_are_taken_errors_keep_the_last_good_program(served):
+    server, folder = served
+    label = folder / "include/labels/depth.glsl"
+    good = label.read_text()
+    state = as_json(server, "/state")
+    before = depth_at(server)
+
+    edit(label, "1.0 / INVERSE_DEPTH", "2.0 / INVERSE_DEPTH")
+    now = next_version(server, state["version"])
+    assert now["errors"] == [] and now["generation"] == state["generation"] + 1
+    assert depth_at(server) == pytest.approx(2 * before, rel=1e-6)
+    occluded = next(b for b in as_json(server, "/probe?t=0.1&x=35&y=40")["buffers"] if b["name"] == "occluded_forward")
+    assert occluded["gpu"] in (True, False)
+
+    edit(label, "2.0 / INVERSE_DEPTH", "2.0 / INVERSE_DEPHT")
+    broken = next_version(server, now["version"])
+    line = next(i for i, text in enumerate(label.read_text().splitlines(), 1) if "INVERSE_DEPHT" in text)
+    error = broken["errors"][0]
+    assert broken["generation"] == now["generation"]
+    assert (
+        error["where"].startswith(f"include/labels/depth.glsl:{line}:")
+        and "INVERSE_DEPHT" in error["text"]
+        and "^" in error["excerpt"]
+    )
+    assert depth_at(server) == pytest.approx(2 * before, rel=1e-6)  # the last good program
+
+    label.write_text(good)
+    mended = next_version(server, broken["version"])
+    assert mended["errors"] == [] and mended["generation"] == now["generation"] + 1
+    assert depth_at(server) == before
+
+
+def test_include_cycle_and_a_vanished_file_while_serving(served):
+    server, folder = served
+    light, good = folder / "include/light.glsl", (folder / "include/light.glsl").read_text()
+    state = as_json(server, "/state")
+    light.write_text(good + "// an edit\n")
+    state = next_version(server, state["version"])
+    light.write_text('#include "light.glsl"\n' + good)
+    broken = next_version(server, state["version"])
+    # variants that nobody had asked the last good shaders for are compiled now, from what they were
+    probed = as_json(server, "/probe?t=0.27&x=50&y=40")
+    assert probed["surface"]["gpu"]["object"] == probed["surface"]["reference"]["object"]
+    assert broken["errors"][0]["where"] == "include/light.glsl:1:1" and "include cycle" in broken["errors"][0]["text"]
+    light.unlink()
+    gone = next_version(server, broken["version"])
+    assert "no such shader file" in gone["errors"][0]["text"]
+    light.write_text(good)
+    assert next_version(server, gone["version"])["errors"] == []
+
+
+def test_an_edit_that_drops_a_uniform_is_drawn(served):
+    """Commenting out what used a uniform is what people do; the renderer still sets it."""
+    server, folder = served
+    label = folder / "include/labels/flow_forward.glsl"
+    good = label.read_text()
+    state = as_json(server, "/state")
+    edit(
+        label,
+        "    vec3 d = difference_forward * vec4(local, 1.0); // d.z is the w row\n"
+        "#ifdef DEFORM\n    d += shape_forward;\n#endif\n"
+        "    return vec4(displacement(d, image_size), 1.0);",
+        "return vec4(1.0, 2.0, 3.0, 1.0);",
+    )
+    now = next_version(server, state["version"])
+    assert now["errors"] == []
+    row = next(b for b in as_json(server, "/probe?t=0.1&x=35&y=40")["buffers"] if b["name"] == "flow_forward")
+    assert row["gpu"] == [1.0, 2.0] and row["ok"] is False
+    label.write_text(good)
+    assert next_version(server, now["version"])["errors"] == []
+
+
+def test_broken_from_the_start_is_one_error(shader, config, tmp_path):
+    folder = copy_shaders(tmp_path)
+    edit(folder / "luminance.glsl", "luminance = albedo;", "luminance = albedo")
+    status, out, err = shader("serve", config, "--shaders", folder, "--port", 0)
+    assert status == 2 and out == "" and err.startswith("error: luminance.glsl:")
+
+
+@pytest.fixture
+def interruptible_children():
+    """Where the suite itself runs in a shell's background SIGINT is ignored, and children would inherit that."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible_children")
+def test_the_command_says_where_and_ends_on_interrupt(config):
+    child = subprocess.Popen(
+        [sys.executable, "-X", "faulthandler", "-m", "blinkgl.cli", "shader", "serve", config, "--port", "0"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        line = child.stdout.readline()
+        assert line.startswith("http://127.0.0.1:") and "Ctrl-C" in line
+        host, port = line.split()[0].removeprefix("http://").rstrip("/").split(":")
+        connection = http.client.HTTPConnection(host, int(port), timeout=30)
+        connection.request("GET", "/state")
+        assert json.load(connection.getresponse())["width"] == WIDTH
+        connection.close()
+        ignored = Path(f"/proc/{child.pid}/status").read_text()
+        child.send_signal(signal.SIGINT)
+        try:
+            _out, err = child.communicate(timeout=30)
+        except subprocess.TimeoutExpired:  # seen twice, never when looked for: where does it stand?
+            child.send_signal(signal.SIGABRT)
+            _out, err = child.communicate(timeout=30)
+            pytest.fail(f"does not end:\n{err}\n{ignored}")
+    finally:
+        child.kill()
+    assert child.returncode == 0 and err == ""
+
+
+# ------------------------------------------------------------------------------------------------- the page
+
+
+@pytest.mark.skipif(webdriver.missing() is not None, reason=webdriver.missing() or "")
+def test_the_page_in_chromium(served, shader, config, tmp_path):
+    """Load, scrub, click, compare with the command line, break a shader, see the error, mend it, see it gone."""
+    server, folder = served
+    with webdriver.Browser(tmp_path) as page:
+        page.open(server.url)
+        page.wait("return document.body.dataset.ready === 'yes'")
+        assert page.run("return document.title") == "BlinkGL shader debugger"
+        assert page.run("return document.querySelector('#pane-a img').naturalWidth") == WIDTH
+        assert page.run("return document.querySelectorAll('#a option').length") == 2 * len(buffers(config))
+
+        picture = (
+            "const c = document.createElement('canvas'), i = document.querySelector(arguments[0]); c.width = "
+            "i.naturalWidth; c.height = i.naturalHeight;const g = c.getContext('2d'); g.drawImage(i, 0, 0); return "
+            "c.toDataURL()"
+        )
+        first = page.run(picture, "#pane-a img")
+        page.choose("#time", "0.3")  # scrub
+        page.wait("return document.body.dataset.shown === '0.3'")
+        assert page.run("return document.querySelector('#seconds').value") == "0.3"
+        assert page.run(picture, "#pane-a img") != first
+
+        page.choose("#a", "depth:gpu")
+        assert page.run("return document.querySelector('#b').value") == "depth:reference"  # B follows
+        page.choose("#view", "difference")
+        page.choose("#map", "turbo")
+        page.wait(
+            "return document.querySelector('#pane-b figcaption b').textContent === '|A − B|' && "
+            "location.hash.includes('map=turbo')"
+        )
+        assert not page.run("return document.querySelector('#pane-b').hidden")
+
+        page.click_at("#pane-a img", (40 + 0.5) / WIDTH, (45 + 0.5) / HEIGHT)
+        page.wait("return document.querySelector('#probe').dataset.pixel")
+        x, y = (int(v) for v in page.run("return document.querySelector('#probe').dataset.pixel").split(","))
+        assert (x, y) == (40, 45)
+        status, out, _ = shader("probe", config, "--shaders", folder, "--time", 0.3, "--pixel", f"{x},{y}")
+        assert status == 0
+        for name, info in buffers(config).items():
+            if name in ("triangle", "local"):  # told below
+                continue
+            line = next(row[3:] for row in out.splitlines() if row[3:].startswith(f"{info.title} "))
+            for side in ("gpu", "reference"):
+                value = page.text(f"#probe [data-{side}={name}]")
+                assert value and f" {value} " in line, (name, side, value, line)
+        assert "GPU drew" in page.text("#probe")
+
+        page.run("document.querySelector('#compare').click()")
+        page.wait("return document.querySelector('#verdict').className === 'good'", timeout=60)
+        assert "all 29 buffers agree" in page.text("#verdict") and page.text("#objects") == ""
+        good = (folder / "luminance.glsl").read_text()
+        edit(
+            folder / "luminance.glsl",
+            "ALBEDO luminance = texture(albedo, uv).CHANNELS;",
+            "ALBEDO luminance = texture(albedo, uv, 1.0).CHANNELS;",
+        )
+        # The verdict was of other shaders.
+        page.wait("return document.querySelector('#verdict').textContent.includes('has changed')")
+        page.run("document.querySelector('#compare').click()")
+        page.wait("return document.querySelector('#verdict').className === 'bad'", timeout=60)
+        assert "level of luminance" in page.text("#verdict") and "a mip bias of +1" in page.text("#verdict")
+        rows = page.run(
+            "return [...document.querySelectorAll('#objects tr')].slice(1).map((tr) => [...tr.children].map((td) => "
+            "td.textContent))"
+        )
+        assert {cells[0] for cells in rows} == {"floor", "ball"} and all(
+            cells[1] == "level of luminance" for cells in rows
+        )
+        page.run("document.querySelector('#objects a').click()")
+        page.wait("return document.querySelector('#probe').dataset.pixel === arguments[0]", rows[0][4].replace(" ", ""))
+        (folder / "luminance.glsl").write_text(good)
+        page.wait("return document.querySelector('#verdict').textContent.includes('has changed')")
+        page.click_at("#pane-a img", (40 + 0.5) / WIDTH, (45 + 0.5) / HEIGHT)
+        page.wait("return document.querySelector('#probe').dataset.pixel === '40,45'")
+
+        good = (folder / "include/motion.glsl").read_text()
+        edit(
+            folder / "include/motion.glsl",
+            "return FRAGMENT_XY / image_size * 2.0 - 1.0;",
+            "return FRAGMENT_XY / imagesize * 2.0 - 1.0;",
+        )
+        started = time.monotonic()
+        error = page.wait("const e = document.querySelector('#errors'); return !e.hidden && e.textContent", timeout=20)
+        noticed = time.monotonic() - started
+        line = next(
+            i
+            for i, text in enumerate((folder / "include/motion.glsl").read_text().splitlines(), 1)
+            if "imagesize" in text
+        )
+        assert f"include/motion.glsl:{line}:" in error and "imagesize" in error and "^" in error
+        assert "last good" in page.text("#reload")
+        page.choose("#time", "0.22")  # the last good shaders draw what they never drew before
+        page.wait("return document.body.dataset.shown === '0.22'")
+        page.choose("#time", "0.3")
+        page.wait("return document.body.dataset.shown === '0.3'")
+        assert page.text("#probe [data-gpu=depth]")
+        print(f"error shown {noticed:.2f} s after the edit")  # noqa: T201
+
+        (folder / "include/motion.glsl").write_text(good)
+        page.wait("return document.querySelector('#errors').hidden", timeout=20)
+        assert "version" in page.text("#reload")
+        assert page.errors() == []

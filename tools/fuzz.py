@@ -1,0 +1,260 @@
+"""Damaged files: each mutant of a small whole file is read, or refused with one line.
+
+    python -m blinkgl.tools.fuzz [NAME …] [--mutants 200] [--seed 0] [--only K] [--keep FILE]
+
+A mutant is read in a process of its own, under a clock and a memory limit. Defects are a traceback, a crash, a message
+of several lines, more than ``CPU_S`` processor seconds or ``MEMORY_MB`` more memory. Each is printed with the command
+that repeats it; FILE keeps the last. The same seed and version make the same mutants. The exit status is 1 when there
+are defects.
+"""
+
+from __future__ import annotations
+
+import argparse
+import faulthandler
+import os
+import re
+import resource
+import select
+import shlex
+import signal
+import struct
+import sys
+import tempfile
+import traceback
+import zlib
+from collections import Counter
+from collections.abc import Callable
+from importlib import resources
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import trimesh
+
+from blinkgl.config.sequence import load_run
+from blinkgl.errors import BlinkGLError
+from blinkgl.io.flo import read_flo, write_flo
+from blinkgl.io.flow_png import read_flow_png, write_flow_png
+from blinkgl.io.formats import open_events, write_events
+from blinkgl.io.frames import open_frames
+from blinkgl.io.pfm import write_pfm
+from blinkgl.scene.importing.mesh_files import load_asset
+from blinkgl.types.events import Events
+
+HEIGHT, WIDTH = 24, 32
+CPU_S, WALL_S, MEMORY_MB = 10, 60.0, 2048
+READ, REFUSED = "read", "refused"
+CONFIG = resources.files("blinkgl.configs") / "demo.yaml"
+
+
+class Format(NamedTuple):
+    """make(path) writes a whole file; read(path) reads it as the commands do."""
+
+    make: Callable[[Path], object]
+    read: Callable[[Path], object]
+
+
+def _events() -> Events:
+    rng = np.random.default_rng(5)
+    columns = (rng.integers(0, size, 400) for size in (WIDTH, HEIGHT, 60_000, 2))
+    x, y, t, p = (column.astype(kind) for column, kind in zip(columns, (np.uint16, np.uint16, np.int64, np.uint8)))
+    return Events(x, y, np.sort(t), p)
+
+
+def _events_as(kind: str | None = None) -> Format:
+    def make(path: Path) -> None:
+        write_events(path, _events(), HEIGHT, WIDTH, format=kind)
+
+    def read(path: Path) -> None:
+        with open_events(path) as file:
+            sized = file.sized()
+            for events in sized.chunks():
+                assert not len(events) or (events.x.max() < sized.width and events.y.max() < sized.height)
+
+    return Format(make, read)
+
+
+def _flow() -> tuple[np.ndarray, np.ndarray]:
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+    return np.dstack([x * 0.25 - 3, y * 0.5 - 6]), (x + y) % 7 > 0
+
+
+def _sound(flow: np.ndarray, valid: np.ndarray) -> None:
+    assert np.isfinite(flow[valid]).all(), "a valid flow that is not finite"
+
+
+def _picture() -> np.ndarray:
+    return np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+
+
+def _write_picture(path: Path) -> None:
+    for file in (path, path.with_stem("1")):
+        if path.suffix == ".pfm":
+            write_pfm(file, _picture().astype(np.float32) / 255)
+        else:
+            cv2.imwrite(str(file), _picture())
+
+
+def _read_frames(path: Path) -> None:
+    """A folder of two frames, or an array of frames."""
+    list(open_frames(path if path.suffix in (".npy", ".npz") else path.parent, fps=100.0))
+
+
+FRAMES = Format(_write_picture, _read_frames)
+MESH = Format(lambda path: trimesh.creation.box().export(path), load_asset)
+FORMATS = {
+    **{name: _events_as() for name in ("e.txt", "e.csv", "e.h5", "e.npz", "e.npy", "e.raw", "e.mcap")},
+    "evt2.raw": _events_as("evt2"),
+    "flow.png": Format(lambda path: write_flow_png(path, *_flow()), lambda path: _sound(*read_flow_png(path))),
+    "flow.flo": Format(lambda path: write_flo(path, *_flow()), lambda path: _sound(*read_flo(path))),
+    **{f"0.{ending}": FRAMES for ending in ("png", "jpg", "tiff", "pfm", "hdr")},
+    "frames.npy": Format(lambda path: np.save(path, np.stack([_picture()] * 2)), _read_frames),
+    **{f"mesh.{ending}": MESH for ending in ("obj", "ply", "stl", "glb")},
+    "run.yaml": Format(lambda path: path.write_text(CONFIG.read_text()), lambda path: load_run(path).sequence(0)),
+}
+
+
+NUMBERS = (0, 1, -1, 127, 255, 256, 32768, 65535, 10**6, 2**31 - 1, 2**31, 2**32 - 1, 2**53, 2**63 - 1, 2**64 - 1)
+TOKENS = (b"", b"-1", b"nan", b"inf", b"1e999", b"9" * 400, b"null", b"[]", b"{}", b"\x00", b"\xff", b"/etc/passwd")
+
+
+def _at(rng: np.random.Generator, data: bytes, width: int = 1) -> int:
+    """A place for ``width`` bytes; half of the time in the first 200 bytes, where headers are."""
+    room = max(len(data) - width + 1, 1)
+    return int(rng.integers(min(room, 200) if rng.random() < 0.5 else room))
+
+
+def flip_bits(rng: np.random.Generator, data: bytes) -> bytes:
+    out = bytearray(data)
+    for _ in range(int(rng.choice([1, 1, 2, 32]))):
+        out[_at(rng, data)] ^= 1 << int(rng.integers(8))
+    return bytes(out)
+
+
+def cut(rng: np.random.Generator, data: bytes) -> bytes:
+    """The file ends early, or a block of it is lost or doubled."""
+    a, b = sorted((_at(rng, data), _at(rng, data)))
+    return (data[:a], data[:a] + data[b:], data[:b] + data[a:])[int(rng.integers(3))]
+
+
+def number(rng: np.random.Generator, data: bytes) -> bytes:
+    """A count, offset or value becomes an extreme one, of any width and byte order."""
+    width, order = int(rng.choice([1, 2, 4, 8])), str(rng.choice(["little", "big"]))
+    at, value = _at(rng, data, width), NUMBERS[int(rng.integers(len(NUMBERS)))]
+    new = (value % (1 << 8 * width)).to_bytes(width, order)
+    if width >= 4 and rng.random() < 0.3:
+        new = struct.pack("<f" if width == 4 else "<d", float(rng.choice([np.nan, np.inf, -np.inf, -1.0, 1e30])))
+    return data[:at] + new + data[at + width :]
+
+
+def word(rng: np.random.Generator, data: bytes) -> bytes:
+    """A word or number of a text is lost, or becomes another."""
+    found = list(re.finditer(rb"[A-Za-z_]+|[-+]?\d[\d.eE+-]*|[:,{}\[\]]", data))
+    if not found:
+        return flip_bits(rng, data)
+    spot, other = (found[int(rng.integers(len(found)))] for _ in range(2))
+    new = other[0] if rng.random() < 0.3 else TOKENS[int(rng.integers(len(TOKENS)))]
+    return data[: spot.start()] + new + data[spot.end() :]
+
+
+MUTATORS = (flip_bits, cut, number, number, word, word)
+
+
+def mutant(name: str, whole: bytes, seed: int, index: int) -> bytes:
+    """Mutant ``index`` of a format's whole file."""
+    rng = np.random.default_rng([seed, zlib.crc32(name.encode()), index])
+    return MUTATORS[int(rng.integers(len(MUTATORS)))](rng, whole)
+
+
+def judge(read: Callable[[Path], object], path: Path) -> str:
+    """READ, REFUSED, or what is wrong, in one line."""
+    try:
+        read(path)
+    except (BlinkGLError, PermissionError, MemoryError) as error:
+        text = str(error)
+        return REFUSED if "\n" not in text and text.isprintable() else f"several lines: {text!r}"
+    except BaseException as error:  # noqa: BLE001 - SystemExit is a defect, too
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        return f"{type(error).__name__} at {Path(last.filename).name}:{last.lineno}: {' '.join(str(error).split())}"
+    return READ
+
+
+def in_a_process(read: Callable[[Path], object], path: Path) -> str:
+    """:func:`judge` in a child that may die or hang."""
+    receiver, sender = os.pipe()
+    sys.stdout.flush()
+    pid = os.fork()
+    if pid == 0:
+        _limit()
+        os.write(sender, judge(read, path).encode("utf-8", "replace")[:4000])
+        os._exit(0)
+    os.close(sender)
+    answered = bool(select.select([receiver], [], [], WALL_S)[0])
+    text = os.read(receiver, 4096).decode() if answered else ""
+    os.close(receiver)
+    if not answered:
+        os.kill(pid, signal.SIGKILL)
+    _, status = os.waitpid(pid, 0)
+    if text:
+        return text
+    killed = not answered or (os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU)
+    return "hangs" if killed else f"the process ends with status {os.waitstatus_to_exitcode(status)}"
+
+
+def _limit() -> None:
+    """Of the child: silence, and no more than so much time and memory."""
+    faulthandler.disable()
+    null = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        os.dup2(null, stream)
+    size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (size + (MEMORY_MB << 20),) * 2)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    resource.setrlimit(resource.RLIMIT_CPU, (int(used.ru_utime + used.ru_stime) + 1 + CPU_S, resource.RLIM_INFINITY))
+
+
+def fuzz(name: str, indices: range | list[int], seed: int, keep: Path | None) -> Counter:
+    """How many mutants of one format were read, refused or, by what is wrong, neither."""
+    outcomes: Counter = Counter()
+    with tempfile.TemporaryDirectory(prefix="blinkgl-fuzz-") as folder:
+        path = Path(folder) / name
+        format_ = FORMATS[name]
+        format_.make(path)
+        whole = path.read_bytes()
+        if (first := judge(format_.read, path)) != READ:  # it also compiles what the children need
+            raise RuntimeError(f"{name}: the whole file is not read: {first}")
+        for index in indices:
+            path.write_bytes(mutant(name, whole, seed, index))
+            outcome = in_a_process(format_.read, path)
+            outcomes[outcome] += 1
+            if outcome not in (READ, REFUSED):
+                again = f"python -m blinkgl.tools.fuzz {shlex.quote(name)} --seed {seed} --only {index}"
+                print(f"{outcome}\n    {again}", flush=True)
+                if keep is not None:
+                    keep.write_bytes(path.read_bytes())
+    return outcomes
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(FORMATS)}; default: all")
+    parser.add_argument("--mutants", type=int, default=200, help="of each format")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", type=int, help="this mutant alone")
+    parser.add_argument("--keep", type=Path, help="file for the last mutant that shows a defect")
+    options = parser.parse_args(arguments)
+    indices = range(options.mutants) if options.only is None else [options.only]
+    defects = 0
+    for name in options.names or FORMATS:
+        outcomes = fuzz(name, indices, options.seed, options.keep)
+        wrong = outcomes.total() - outcomes[READ] - outcomes[REFUSED]
+        defects += wrong
+        print(f"{name:14} {outcomes[READ]:5} read {outcomes[REFUSED]:5} refused {wrong:5} defects", flush=True)
+    return 1 if defects else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

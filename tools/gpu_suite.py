@@ -43,7 +43,7 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.show import checks as doctor
 from blinkgl.tensors import TensorEsim, TensorV2e, voxel_grid
 from blinkgl.tools import bench_accuracy
-from blinkgl.tools.bench_generate import probe_scene
+from blinkgl.tools.bench import probe_scene
 
 Row = dict[str, Any]
 STEP_NS = 1_000_003
@@ -74,7 +74,7 @@ VARIANTS = {
 
 def doctor_piece(options: Namespace) -> Iterator[Row]:
     """What the machine has."""
-    for check in doctor.examine(options.backend, options.egl_device).checks:
+    for check in checks.examine(options.backend, options.egl_device).checks:
         line = asdict(check)
         yield {"": f"{line.pop('section')}: {line.pop('name')}", **line}
 
@@ -151,8 +151,6 @@ def kernel_piece(options: Namespace) -> Iterator[Row]:
     """Speed and memory of the event kernel, frames on the device, in turns with numba on one core."""
     height, width = (48, 64) if options.small else (480, 640)
     config = EsimConfig()
-    numba.set_num_threads(1)
-    torch.set_num_threads(1)  # last: numba's start changes it
     for density, envs in itertools.product(DENSITIES, (1, 16, 256)):
         clip = noise(height, width, density)
         frames = torch.from_numpy(clip).to(options.device)[:, None].expand(2, envs, height, width).contiguous()
@@ -293,6 +291,7 @@ def measured(name: str, options: Namespace, deadline: float) -> dict[str, Any]:
     try:
         for row in PIECES[name](options):
             rows.append(row)
+            print(f"  {next(iter(row.values()))}", flush=True)
             if time.monotonic() > deadline:
                 state, said = "cut", "the time was over"
                 break
@@ -327,6 +326,8 @@ def main(arguments: list[str] | None = None) -> int:
     """See the module. 0: everything is measured, or cannot be here; 1: something failed."""
     options = parsed(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
+    numba.set_num_threads(1)
+    torch.set_num_threads(1)  # after numba, whose start changes it; more threads wait for each other, spinning
     name_of_card = torch.cuda.get_device_name(options.device) if options.device.startswith("cuda") else "no card"
     report: dict[str, Any] = {"machine": bench.machine_line(), "device": f"torch on {options.device} ({name_of_card})"}
     report["pieces"], deadline = {}, time.monotonic() + 60 * options.minutes

@@ -40,7 +40,7 @@ from blinkgl.gl import create_context
 from blinkgl.io.atomic import atomic_file
 from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
-from blinkgl.show import checks as doctor
+from blinkgl.show import checks
 from blinkgl.tensors import TensorEsim, TensorV2e, voxel_grid
 from blinkgl.tools import bench_accuracy
 from blinkgl.tools.bench import probe_scene

@@ -15,7 +15,6 @@ docs/extending.md has the whole of one. What configuration needs is in ``Config`
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from blinkgl.config.base import tag_of, validate
@@ -30,9 +29,6 @@ if TYPE_CHECKING:
 
 EMULATORS: dict[str, type[Emulator]] = {}
 """By ``Config``'s key ``emulator``."""
-DEVICES = {"cuda": "blinkgl.tensors.emulator:emulator_on"}
-"""What makes emulators on another device, by ``events.device``: "module:function", loaded when a configuration asks.
-A name and no import, since that room stands above this one."""
 _SOME_SENSORS = (
     SensorConfig(name="unknown", width=4, height=3),
     SensorConfig(

@@ -254,7 +254,8 @@ def test_citation():
     for work in told["references"]:
         assert {"type", "title", "authors", "year"} <= set(work) and isinstance(work["year"], int)
         assert work["type"] in ("conference-paper", "article")
-    assert told["version"] == blinkgl.__version__
+    released = blinkgl.__version__.endswith(".dev0") or told["version"] == blinkgl.__version__
+    assert released, "between two releases the one before is cited"
     changes = (REPOSITORY / "CHANGELOG.md").read_text(encoding="utf-8")
     assert f"## {told['version']} ({told['date-released']})" in changes, "a release is dated once"
 

@@ -25,9 +25,9 @@ _SIDE = 65535
 
 def open_events(path: str | os.PathLike) -> EventFile:
     """An event file for reading in pieces: ``with open_events(path) as file: for events in file.chunks(): …``;
-    ``height``, ``width`` in px, None where the file does not say (``file.sized()`` finds out), times in µs. Endings:
-    .h5 .hdf5 .raw .aedat4 .aedat .txt .csv .npz .npy. Of .aedat4 and .aedat also ``file.frames()``, the camera's own
-    frames, and ``file.imu()``, its inertial unit (docs/formats.md).
+    ``height``, ``width`` in px, None where the file does not say (``file.sized()`` finds out), times in µs.
+    Formats and endings: docs/formats.md. Of .aedat4 and .aedat also ``file.frames()``, the camera's own frames, and
+    ``file.imu()``, its inertial unit.
 
     Raises AssetError: missing, unknown ending, or not what the ending says."""
     return formats.open_events(check.path(path, "path"))
@@ -61,8 +61,7 @@ def write_events(
     """Writes events, or chunks in order, of a sensor of height x width px; the file appears
     whole or not at all. Returns how many.
 
-    path : its ending names the format, or ``format``: dsec, evt3, evt2, aedat4, text, csv,
-    npz, npy.   t_offset_us : DSEC's, µs.
+    path : its ending names the format, or ``format`` does (docs/formats.md).   t_offset_us : DSEC's, µs.
     time_unit : of text and CSV, "s" or "us". Raises OutputError, EventDataError, ConfigError."""
     path, height, width = (
         check.path(path, "path"),

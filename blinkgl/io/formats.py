@@ -1,24 +1,15 @@
 """Every event format by one door: :func:`open_events`, :func:`event_writer`, :func:`write_events`, :func:`convert`.
 
-| format | ending | read | write |
-|---|---|---|---|
-| dsec (also BlinkFlow's h5) | .h5 .hdf5 | x | x |
-| mvsec | .hdf5 .h5 | x | |
-| prophesee (ECF) | .hdf5 .h5 | x | x (by name) |
-| mcap (extra [exchange]) | .mcap | x | x |
-| evt3, evt2 | .raw | x | x (.raw is EVT3; EVT2 by name) |
-| aedat4 (extra [formats]) | .aedat4 | x | x |
-| aedat2 (jAER, DAVIS cameras) | .aedat | x | |
-| text, csv | .txt .csv | x | x |
-| npz, npy | .npz .npy | x | x |
+:data:`FORMATS` says what there is; docs/formats.md what each file holds.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -30,21 +21,70 @@ from blinkgl.io.columns import check_events, check_size
 from blinkgl.io.davis import CameraFrame, ImuSamples
 from blinkgl.types.events import Events
 
-ENDINGS = {
-    ".h5": "dsec",
-    ".hdf5": "dsec",
-    ".raw": "evt3",
-    ".aedat4": "aedat4",
-    ".aedat": "aedat2",
-    ".mcap": "mcap",
-    ".txt": "text",
-    ".csv": "csv",
-    ".npz": "npz",
-    ".npy": "npy",
+
+@dataclass(frozen=True)
+class EventFormat:
+    """One event format.
+
+    endings : of its files.   module : of ``blinkgl.io``, imported when a file of it is opened or written.
+    reader : class that is made of a path.   writer : class that is made of (path, height, width) and ``fixed``; "": the
+    format is only read.   dataset : of an HDF5 file, by which files with one ending are told apart; "":
+    the format of those that have no other's.   takes : options of :func:`event_writer` that the writer has.
+    causes : it has a place for what caused each event."""
+
+    name: str
+    endings: tuple[str, ...]
+    module: str
+    reader: str
+    writer: str = ""
+    dataset: str = ""
+    fixed: Mapping[str, Any] = field(default_factory=dict)
+    takes: tuple[str, ...] = ()
+    causes: bool = False
+
+    def open(self, path: Path) -> Any:
+        """Return a reader of the file. Raises AssetError: not what the ending says."""
+        return getattr(import_module(f"blinkgl.io.{self.module}"), self.reader)(path)
+
+    def create(self, path: Path, height: int, width: int, options: Mapping[str, Any]) -> EventWriter:
+        """Return a writer of the file. options : those that it takes are used."""
+        given = {name: options[name] for name in self.takes}
+        return getattr(import_module(f"blinkgl.io.{self.module}"), self.writer)(
+            path, height, width, **self.fixed, **given
+        )
+
+
+HDF5 = (".h5", ".hdf5")
+FORMATS = {
+    one.name: one
+    for one in (
+        EventFormat("dsec", HDF5, "dsec", "DsecEventReader", "DsecEventWriter", takes=("t_offset_us",), causes=True),
+        EventFormat("mvsec", HDF5, "mvsec", "MvsecReader", dataset="davis/left/events"),
+        EventFormat("prophesee", HDF5, "prophesee", "PropheseeReader", "PropheseeWriter", dataset="CD/events"),
+        EventFormat("evt3", (".raw",), "evt", "EvtReader", "EvtWriter", fixed={"version": "evt3"}),
+        EventFormat("evt2", (".raw",), "evt", "EvtReader", "EvtWriter", fixed={"version": "evt2"}),
+        EventFormat("aedat4", (".aedat4",), "aedat4", "Aedat4Reader", "Aedat4Writer"),
+        EventFormat("aedat2", (".aedat",), "aedat2", "Aedat2Reader"),
+        EventFormat("mcap", (".mcap",), "mcap", "McapReader", "McapWriter"),
+        EventFormat(
+            "text", (".txt",), "text", "TextReader", "TextWriter", fixed={"separator": " "}, takes=("time_unit",)
+        ),
+        EventFormat(
+            "csv", (".csv",), "text", "TextReader", "TextWriter", fixed={"separator": ","}, takes=("time_unit",)
+        ),
+        EventFormat("npz", (".npz",), "arrays", "ArrayReader", "ArrayWriter", causes=True),
+        EventFormat("npy", (".npy",), "arrays", "ArrayReader", "ArrayWriter", causes=True),
+    )
 }
-WITH_CAUSES = ("dsec", "npz", "npy")
+"""By name. Of formats that share an ending the first is written unless another is named."""
+ENDINGS: dict[str, str] = {}
+"""Ending -> the format that is written by it."""
+for _one in FORMATS.values():
+    for _ending in _one.endings:
+        ENDINGS.setdefault(_ending, _one.name)
+WITH_CAUSES = tuple(name for name, one in FORMATS.items() if one.causes)
 """Formats with a place for what caused each event; the others refuse events that have causes."""
-WRITABLE = ("dsec", "evt3", "evt2", "aedat4", "mcap", "prophesee", "text", "csv", "npz", "npy")
+WRITABLE = tuple(name for name, one in FORMATS.items() if one.writer)
 SENSORS = ((180, 240), (240, 304), (260, 346), (320, 320), (480, 640), (720, 1280), (1080, 1920))
 """(height, width) of event cameras, smallest first: the guess for files that do not say."""
 
@@ -147,40 +187,10 @@ def open_events(path: str | os.PathLike) -> EventFile:
         raise AssetError("unknown event file ending", where=str(path), value=path.suffix, accepted=", ".join(ENDINGS))
     if not path.is_file():
         raise AssetError("no such file", where=str(path))
-    if kind == "dsec":
-        from blinkgl.io.dsec import DsecEventReader
-        from blinkgl.io.hdf5 import hdf5_errors, open_hdf5
-        from blinkgl.io.mvsec import DATASET as MVSEC, MvsecReader
-        from blinkgl.io.prophesee import DATASET as PROPHESEE, PropheseeReader
-
-        with open_hdf5(path) as file, hdf5_errors(path):
-            kind = "mvsec" if MVSEC in file else "prophesee" if PROPHESEE in file else "dsec"
-        reader = {"mvsec": MvsecReader, "prophesee": PropheseeReader, "dsec": DsecEventReader}[kind](path)
-    elif kind == "evt3":
-        from blinkgl.io.evt import EvtReader
-
-        reader = EvtReader(path)
-        kind = reader.version
-    elif kind == "aedat4":
-        from blinkgl.io.aedat4 import Aedat4Reader
-
-        reader = Aedat4Reader(path)
-    elif kind == "mcap":
-        from blinkgl.io.mcap import McapReader
-
-        reader = McapReader(path)
-    elif kind == "aedat2":
-        from blinkgl.io.aedat2 import Aedat2Reader
-
-        reader = Aedat2Reader(path)
-    elif kind in ("text", "csv"):
-        from blinkgl.io.text import TextReader
-
-        reader = TextReader(path)
-    else:
-        from blinkgl.io.arrays import ArrayReader
-
-        reader = ArrayReader(path)
+    if path.suffix.lower() in HDF5:
+        kind = _held(path)
+    reader = FORMATS[kind].open(path)
+    kind = getattr(reader, "version", kind)  # of a .raw file, which says whether it is EVT2 or EVT3
     return EventFile(path, kind, reader.height, reader.width, getattr(reader, "t_offset_us", 0), reader)
 
 
@@ -197,42 +207,24 @@ def output_format(path: str | os.PathLike, format: str | None = None) -> str:
     return kind
 
 
+def _held(path: Path) -> str:
+    """Return the name of the format that an HDF5 file holds, by its datasets."""
+    from blinkgl.io.hdf5 import hdf5_errors, open_hdf5
+
+    with open_hdf5(path) as file, hdf5_errors(path):
+        return next((name for name, one in FORMATS.items() if one.dataset and one.dataset in file), "dsec")
+
+
 def _writer(path: Path, kind: str, height: int, width: int, t_offset_us: int, time_unit: str) -> EventWriter:
     check_size(height, width, str(path))
-    if time_unit != "s" and kind not in ("text", "csv"):
+    if time_unit != "s" and "time_unit" not in FORMATS[kind].takes:
         raise OutputError(
             f"{kind} has a unit of time of its own",
             where=str(path),
             value=time_unit,
             accepted="a unit with .txt and .csv only",
         )
-    if kind == "dsec":
-        from blinkgl.io.dsec import DsecEventWriter
-
-        return DsecEventWriter(path, height, width, t_offset_us)
-    if kind in ("evt2", "evt3"):
-        from blinkgl.io.evt import EvtWriter
-
-        return EvtWriter(path, height, width, kind)
-    if kind == "aedat4":
-        from blinkgl.io.aedat4 import Aedat4Writer
-
-        return Aedat4Writer(path, height, width)
-    if kind == "mcap":
-        from blinkgl.io.mcap import McapWriter
-
-        return McapWriter(path, height, width)
-    if kind == "prophesee":
-        from blinkgl.io.prophesee import PropheseeWriter
-
-        return PropheseeWriter(path, height, width)
-    if kind in ("text", "csv"):
-        from blinkgl.io.text import TextWriter
-
-        return TextWriter(path, height, width, "," if kind == "csv" else " ", unit=time_unit)
-    from blinkgl.io.arrays import ArrayWriter
-
-    return ArrayWriter(path, height, width)
+    return FORMATS[kind].create(path, height, width, {"t_offset_us": t_offset_us, "time_unit": time_unit})
 
 
 @contextlib.contextmanager

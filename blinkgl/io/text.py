@@ -124,14 +124,14 @@ class TextReader:
 
 
 class TextWriter:
-    """``t x y p``. ``separator`` "," makes a CSV: it begins with a line that names the columns. unit : "s" writes
+    """``t x y p``. ``separator`` "," makes a CSV: it begins with a line that names the columns. time_unit : "s" writes
     seconds with six decimals, "us" integer µs; the CSV is then what faery writes and reads, with
     the sensor's size in its first line."""
 
-    def __init__(self, path: str | os.PathLike, height: int, width: int, separator: str = " ", *, unit: str = "s"):
-        if unit not in ("s", "us"):
-            raise EventDataError("unit of time", where=str(path), value=unit, accepted="s or us")
-        self.path, self._separator, self._micro = Path(path), ord(separator), unit == "us"
+    def __init__(self, path: str | os.PathLike, height: int, width: int, separator: str = " ", *, time_unit: str = "s"):
+        if time_unit not in ("s", "us"):
+            raise EventDataError("unit of time", where=str(path), value=time_unit, accepted="s or us")
+        self.path, self._separator, self._micro = Path(path), ord(separator), time_unit == "us"
         self._size, self._count, self._last = (height, width), 0, None
         with output_errors(path):
             self._file = open(path, "wb")  # noqa: SIM115 - closed by close/abort

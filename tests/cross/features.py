@@ -184,14 +184,10 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         },
     },
     "anti-aliasing": {
-        name: {"render": {"antialiasing": name}}
-        for name in ("none", "msaa4", "taps4", "edges", "edges2", "ssaa2", "ssaa4")
+        name: {"render": {"antialiasing": name}} for name in ("none", "taps4", "edges", "edges2", "ssaa2", "ssaa4")
     },
     "images": {
-        **{
-            name: {"render": {"image_antialiasing": name}}
-            for name in ("none", "msaa4", "edges", "edges2", "ssaa2", "ssaa4")
-        },
+        **{name: {"render": {"image_antialiasing": name}} for name in ("none", "edges", "edges2", "ssaa2", "ssaa4")},
         "no images": {"labels": {"images": False}},
     },
     "frame camera": {
@@ -343,12 +339,9 @@ REFUSED: dict[tuple[Kind, Kind], str] = {
 """Pairs that make no sense, and the line that says so. Recorded frames have neither a timeline nor a time: there those
 are no contradiction."""
 
-TOO_SLOW: set[tuple[Kind, Kind]] = {
-    (one, ("textures", "sharp")) for one in (("anti-aliasing", "msaa4"), ("images", "msaa4"))
-} | {(("source", one), ("textures", "sharp")) for one in ("random", "still camera")}
+TOO_SLOW: set[tuple[Kind, Kind]] = {(("source", one), ("textures", "sharp")) for one in ("random", "still camera")}
 """Pairs that are accepted and left out of the rows: llvmpipe takes seconds for a picture of 32 x 24 px with anisotropy
-where a ground ends at the horizon, and with multi-sampling of any triangle (the footprint of a pixel beside its edge is
-endless, and it adds up every texel of it)."""
+where a ground ends at the horizon (the footprint of a pixel there is endless, and it adds up every texel of it)."""
 
 ELSEWHERE = {
     "scene": "tests/scene: what a scene is made of; here only where it comes from, whether it is lit, whether the "

@@ -205,7 +205,7 @@ def test_what_is_written_is_what_python_would_print(tmp_path, separator, unit):
         t,
         np.array([0, 1, 1, 0, 1, 0, 1], np.uint8),
     )
-    writer = TextWriter(tmp_path / "e.txt", 720, 1280, separator, unit=unit)
+    writer = TextWriter(tmp_path / "e.txt", 720, 1280, separator, time_unit=unit)
     writer.append(Events.empty())
     writer.append(events)
     writer.close()
@@ -222,7 +222,7 @@ def test_what_is_written_is_what_python_would_print(tmp_path, separator, unit):
 
 def test_the_writer_refuses(tmp_path):
     with pytest.raises(EventDataError, match="unit of time .got 'ms'.; expected s or us"):
-        TextWriter(tmp_path / "e.txt", 10, 10, unit="ms")
+        TextWriter(tmp_path / "e.txt", 10, 10, time_unit="ms")
     writer = TextWriter(tmp_path / "e.txt", 10, 10)
     one = lambda t, x=0, y=0: Events(
         np.array([x], np.uint16), np.array([y], np.uint16), np.array([t]), np.ones(1, np.uint8)

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from blinkgl.config.base import Config, Refused, one_of, rule, validate
 from blinkgl.config.reader import read_table
-from blinkgl.config.sequence import apply_overrides
+from blinkgl.config.run import apply_overrides
 from eflow import shipped
 
 

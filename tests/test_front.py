@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 import blinkgl
-from blinkgl.config.sequence import RunTemplate
+from blinkgl.config.run import RunTemplate
 from blinkgl.dataset.run import run_dataset
 from blinkgl.errors import BlinkGLError
 from blinkgl.io.dsec import DsecEventReader

@@ -60,7 +60,7 @@ def source(tmp_path_factory):
 
 FRAME = """
 import sys
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.gl import create_context
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import sequence_scene

@@ -21,7 +21,8 @@ from sources import parsed
 import blinkgl
 from blinkgl.cli import run
 from blinkgl.config.events import EmulatorConfig, EsimConfig
-from blinkgl.config.sequence import LabelsConfig, RunTemplate, SequenceConfig, load_run
+from blinkgl.config.run import RunTemplate, load_run
+from blinkgl.config.sequence import LabelsConfig, SequenceConfig
 from blinkgl.dataset.explain import explain
 from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.verify import verify_dataset
@@ -638,7 +639,7 @@ def test_the_page_shows_this_toy_label():
 def test_reading_a_yaml_needs_neither_opengl_nor_a_compiler(tmp_path):
     (tmp_path / "a.yaml").write_text(yaml.safe_dump({"labels": {"depth": True, "flow": ["backward"]}}))
     code = (
-        "import sys; from blinkgl.config.sequence import load_run; "
+        "import sys; from blinkgl.config.run import load_run; "
         "print(load_run(sys.argv[1]).sequence(0).labels.depth);assert not {'moderngl', 'numba', 'cv2', 'h5py', "
         "'blinkgl.gl', 'blinkgl.render'} & set(sys.modules), sorted(sys.modules)"
     )

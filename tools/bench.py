@@ -96,7 +96,7 @@ def events(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
 
 def generate(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
     """Whole sequences: a simulated second of the configuration, and wall time of each stage."""
-    from blinkgl.config.sequence import load_run
+    from blinkgl.config.run import load_run
     from blinkgl.dataset.generate import generate_run
 
     def row() -> dict[str, float]:
@@ -109,7 +109,7 @@ def generate(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
 
 def scene_of(options: argparse.Namespace) -> tuple[Any, Scene]:
     """The first sequence of the configuration, and its scene."""
-    from blinkgl.config.sequence import load_run
+    from blinkgl.config.run import load_run
     from blinkgl.scene.build import sequence_scene
 
     path = config_of(options)

@@ -17,7 +17,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.gl import create_context
 from blinkgl.labels import LabelRequest
 from blinkgl.machine import bench

@@ -30,7 +30,7 @@ import numpy as np
 
 from blinkgl.config.reader import read_table, to_yaml
 from blinkgl.config.recipe import merge
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset.generate import generate_run
 from blinkgl.events.table import EMULATORS
 from blinkgl.gl import create_context

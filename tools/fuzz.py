@@ -33,7 +33,7 @@ import cv2
 import numpy as np
 import trimesh
 
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.errors import BlinkGLError
 from blinkgl.io.flo import read_flo, write_flo
 from blinkgl.io.flow_png import read_flow_png, write_flow_png

@@ -33,7 +33,8 @@ import numpy as np
 import torch
 
 from blinkgl.config.events import EsimConfig, V2eConfig
-from blinkgl.config.sequence import RenderConfig, load_run
+from blinkgl.config.run import load_run
+from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import BlinkGLError
 from blinkgl.events.table import emulator_of
 from blinkgl.gl import create_context

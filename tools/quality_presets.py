@@ -20,7 +20,7 @@ from pathlib import Path
 
 from blinkgl.config.quality import QUALITIES
 from blinkgl.config.reader import to_yaml
-from blinkgl.config.sequence import RunTemplate, apply_overrides
+from blinkgl.config.run import RunTemplate, apply_overrides
 from blinkgl.trade.pareto import excess
 from blinkgl.trade.settings import suite_design
 

@@ -8,7 +8,7 @@ from typing import Literal
 from pydantic import Field
 
 from blinkgl.config.base import Config, Refused, rule
-from blinkgl.config.scene import Paths
+from blinkgl.config.values import Paths
 
 MAX_SPAN_S = (2**32 - 1) * 1e-6
 """Longest recording of one event file, s: DSEC counts its microseconds in 32 bits."""

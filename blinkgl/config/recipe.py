@@ -13,7 +13,7 @@
         enabled: false                        # described, but not made until somebody turns it on
         ...
 
-``scene: {from: FILE, …}`` is the scene of another YAML file (:func:`~blinkgl.config.sequence.load_run` puts it in its
+``scene: {from: FILE, …}`` is the scene of another YAML file (:func:`~blinkgl.config.run.load_run` puts it in its
 place when the recipe is read).
 
 A group is the common part with the group's own keys laid over it. Each group has a seed of its own, derived from the
@@ -30,7 +30,8 @@ from typing import Any
 
 from blinkgl.config.base import validate_field
 from blinkgl.config.draw import is_distribution
-from blinkgl.config.sequence import RunTemplate, SequenceConfig
+from blinkgl.config.run import RunTemplate
+from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 
 _TAGS = ("kind", "emulator")

@@ -32,9 +32,9 @@ from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.places import Matrix, check_rigid, rigid_matrix
 from blinkgl.config.reader import parse_yaml
 from blinkgl.config.readout import ReadoutConfig
-from blinkgl.config.scene import Position, Vector3
 from blinkgl.config.sensor import Sensor
 from blinkgl.config.tracks import TracksConfig
+from blinkgl.config.values import Position, Vector3
 from blinkgl.errors import ConfigError
 
 SECTIONS = ("camera", "sensor", "events", "readout", "labels", "images", "imu", "tracks")

@@ -7,46 +7,32 @@ read (:mod:`blinkgl.config.corners`).
 
 from __future__ import annotations
 
-import copy
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from blinkgl.config.base import Config, Refused, Removed, remembering, rule, validate, validate_field
-from blinkgl.config.camera import CameraConfig, camera_radius, with_calibrations
-from blinkgl.config.corners import Fill, corners, corners_of, sites
-from blinkgl.config.draw import draw, is_distribution
+from blinkgl.config.base import Config, Refused, Removed, rule
+from blinkgl.config.camera import CameraConfig, camera_radius
 from blinkgl.config.events import EmulatorConfig, EsimConfig, followers
 from blinkgl.config.frames import MAX_SPAN_S, FramesConfig
 from blinkgl.config.gl import GLConfig
 from blinkgl.config.images import ImagesConfig, check_images, readout_us
 from blinkgl.config.imu import ImuConfig, check_imu
-from blinkgl.config.labels import LabelsConfig, fill_causes
-from blinkgl.config.quality import DEFAULT, Quality, fill_quality, with_default
-from blinkgl.config.reader import parse_yaml, read_table
+from blinkgl.config.labels import LabelsConfig
+from blinkgl.config.quality import DEFAULT, Quality
 from blinkgl.config.readout import ReadoutConfig, drain_us
-from blinkgl.config.recipes import with_recipes
 from blinkgl.config.rig import (
     SECTIONS,
     RigSensorConfig,
-    check_pairs,
-    is_rig,
-    spelled_out as with_whole_sensors,
-    with_sections,
 )
 from blinkgl.config.scene import RandomSceneConfig, SceneConfig
-from blinkgl.config.sensor import Sensor, fill_sensor, spelled_out
+from blinkgl.config.sensor import Sensor
 from blinkgl.config.timeline import DisplacementTimeline, TimelineConfig
 from blinkgl.config.tracks import TracksConfig, check_tracks
-from blinkgl.errors import ConfigError
 
 if TYPE_CHECKING:
-    from blinkgl.config.recipe import Group
+    pass
 
 NS_PER_S = 1_000_000_000
 MAX_LABELS = 1_000_000
@@ -421,220 +407,3 @@ class SequenceConfig(Config):
                 accepted=f"at least {least:.4g} m (scene.camera_clearance, or the distance of the near "
                 "plane's corners: camera.near and camera.fov)",
             )
-
-
-FILLS = (
-    Fill(
-        ("quality", "timeline.kind", "events.emulator", "frames", "timeline.reconstruction"),
-        ("timeline", "render"),
-        fill_quality,
-    ),
-    Fill(
-        ("sensor", "events.emulator"),
-        ("camera.width", "camera.height", "events", "readout"),
-        fill_sensor,
-        (("events", "sensor.emulators.*"), ("events", "sensor"), ("camera", "sensor"), ("readout", "sensor.readout")),
-    ),
-    Fill(("labels.events", "events.emulator"), ("events.causes",), fill_causes),
-    Fill(("images",), ("labels.images",), lambda images: {} if images is None else {"labels": {"images": False}}),
-)
-_OF_THE_RUN = ("seed", "output", "gl")
-
-
-@dataclass(frozen=True)
-class RunTemplate:
-    """A run before its per-sequence parameters are drawn.
-
-    tree : plain data as read, overrides applied.   base : folder that relative paths in it start from.
-    """
-
-    tree: dict[str, Any]
-    base: Path
-
-    def sequence(self, index: int) -> SequenceConfig:
-        """The validated configuration of sequence ``index`` (>= 0). Raises ConfigError, also where the file describes
-        several groups of sequences (:mod:`blinkgl.config.recipe` takes those apart)."""
-        if "groups" in self.tree:
-            raise ConfigError("the recipe has groups; only a group has numbered sequences", where="groups")
-        return _validated(draw(self.tree, self.seed, index))
-
-    @property
-    def seed(self) -> int:
-        """The run's seed as every sequence has it. Raises ConfigError."""
-        return validate_field(SequenceConfig, "seed", self.tree.get("seed", 0))
-
-    def check(self) -> SequenceConfig:
-        """Validates what stands for all that can be drawn, in every group; returns the first. Raises ConfigError before
-        any work starts."""
-        return self._first
-
-    @cached_property
-    def groups(self) -> tuple[Group, ...]:
-        """As of :func:`blinkgl.config.recipe.all_groups`."""
-        from blinkgl.config.recipe import split
-
-        return split(self)
-
-    @cached_property
-    def _first(self) -> SequenceConfig:  # kept: a large recipe stands for thousands of configurations
-        if "groups" in self.tree:
-            return self.groups[0].template.check()
-        if is_distribution(self.tree):
-            raise ConfigError(
-                "the whole file cannot be drawn", where=next(iter(self.tree)), accepted="distributions of single keys"
-            )
-        for key in _OF_THE_RUN:
-            if key in self.tree and sites(self.tree[key]):
-                raise ConfigError(
-                    "belongs to the whole run and cannot be drawn",
-                    where=key,
-                    value=self.tree[key],
-                    accepted="plain values",
-                )
-        first = None
-        with remembering():
-            for tree in corners(SequenceConfig, with_default(self.tree), FILLS):
-                config = _validated(tree)
-                first = config if first is None else first
-        assert first is not None
-        return first
-
-    def corners_of(self, *keys: str) -> Iterator[SequenceConfig]:
-        """Configurations with every combination that can be drawn of the choices and ends at or below ``keys``."""
-        for tree in corners_of(keys, SequenceConfig, with_default(self.tree), FILLS):
-            yield _validated(tree)
-
-
-def _validated(tree: dict[str, Any]) -> SequenceConfig:
-    """SequenceConfig of plain data, with the values of a named quality and sensor filled in
-    where the tree says nothing."""
-    tree = with_default(tree)
-    if is_rig(tree):
-        return _validated_rig(tree)
-    for fill in FILLS:
-        tree = fill(tree)
-    config = validate(SequenceConfig, tree)
-    if config.labels.disparity:  # type: ignore[missing-attribute]
-        raise ConfigError(
-            "a single camera has no other eye",
-            where="labels.disparity",
-            accepted="false, or rig: stereo, or sensors with a `pair` (docs/rigs.md)",
-        )
-    return config
-
-
-def _validated_rig(tree: dict[str, Any]) -> SequenceConfig:
-    """The same of a rig: each sensor is validated as the single camera that it would be, by the same rules."""
-    tree = with_whole_sensors(tree, FILLS)
-    for fill in FILLS:
-        tree = fill(tree)
-    config = validate(SequenceConfig, tree)
-    common = {key: value for key, value in tree.items() if key not in ("rig", "sensors", *SECTIONS)}
-    for k, one in enumerate(tree["sensors"]):
-        own = {key: one[key] for key in SECTIONS if one.get(key) is not None}
-        try:
-            validate(SequenceConfig, {**common, **own})
-        except ConfigError as error:
-            inside = (error.where or "").split(".")[0] in SECTIONS
-            where = f"sensors.{k}.{error.where}" if inside else error.where
-            raise ConfigError(
-                error.problem if inside else f"{error.problem} (of sensor '{one.get('name')}')",
-                where=where,
-                value=error.value,
-                accepted=error.accepted,
-            ) from None
-    check_pairs(config.sensors or ())
-    return config
-
-
-def load_run(path: str | Path, overrides: Sequence[str] = (), *, seed: int | None = None) -> RunTemplate:
-    """Reads a YAML file and the files that its scenes come from, applies ``a.b=c`` overrides (c is YAML) and an
-    optional seed, checks all that can be drawn.
-
-    Raises ConfigError: missing or unreadable file, bad YAML (with line and column), unknown key, bad value."""
-    base = Path(path).parent
-    tree = with_calibrations(apply_overrides(_with_scenes(read_table(path), base), overrides), base)
-    tree = with_recipes(with_sensors(tree, base))
-    if seed is not None:
-        tree["seed"] = seed
-    if "seed" in tree and not is_distribution(tree["seed"]):  # which check() refuses
-        tree["seed"] = validate_field(SequenceConfig, "seed", tree["seed"])
-    template = RunTemplate(tree, base)
-    template.check()
-    return template
-
-
-def _with_scenes(tree: dict[str, Any], base: Path) -> dict[str, Any]:
-    """``scene: {from: FILE, …}``, at the top and in groups, becomes the scene of that file with the other keys laid
-    over it; the tree then says all by itself, wherever it is read next. Raises ConfigError."""
-    from blinkgl.config.recipe import merge
-
-    groups = tree.get("groups")
-    named = [("groups." + str(name), group) for name, group in groups.items()] if isinstance(groups, dict) else []
-    for where, table in (("", tree), *named):
-        own = table.get("scene") if isinstance(table, dict) else None
-        if not isinstance(own, dict) or "from" not in own:
-            continue
-        where, own = f"{where}.scene.from".lstrip("."), dict(own)
-        given = own.pop("from")
-        if not isinstance(given, str):
-            raise ConfigError("not a file", where=where, value=given, accepted="a YAML file with a scene")
-        scene = read_table(base / given).get("scene")
-        if not isinstance(scene, dict) or "from" in scene:
-            raise ConfigError(
-                "the file has no scene of its own", where=where, value=given, accepted="a file with a table scene"
-            )
-        table["scene"] = merge(scene, own)
-    return tree
-
-
-def with_sensors(tree: dict[str, Any], base: Path) -> dict[str, Any]:
-    """``tree`` with sensors' files, at the top and in groups, read from ``base`` and spelled out.
-    Raises ConfigError."""
-    tree, groups = dict(tree), tree.get("groups")
-    if isinstance(groups, dict):
-        tree["groups"] = {
-            name: with_sensors(group, base) if isinstance(group, dict) and "groups" not in group else group
-            for name, group in groups.items()
-        }
-    if "sensor" in tree:
-        tree["sensor"] = spelled_out(tree["sensor"], base)
-    return with_sections(
-        tree, lambda one: {**one, "sensor": spelled_out(one["sensor"], base)} if "sensor" in one else one
-    )
-
-
-def apply_overrides(tree: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
-    """Copy of ``tree`` with ``--set`` options applied; tables on the way are made when absent."""
-    tree = copy.deepcopy(tree)
-    for option in overrides:
-        dotted, equals, text = option.partition("=")
-        keys = dotted.strip().split(".")
-        if not equals or not all(keys):
-            raise ConfigError("not an override", where="--set", value=option, accepted="path.to.key=value")
-        value = parse_yaml(text, f"--set {dotted}")
-        node: Any = tree
-        for depth, key in enumerate(keys):
-            last = depth == len(keys) - 1
-            if isinstance(node, list):
-                if not key.isdigit() or int(key) >= len(node):
-                    raise ConfigError(
-                        "no such list entry",
-                        where="--set " + ".".join(keys[: depth + 1]),
-                        value=key,
-                        accepted=f"0 … {len(node) - 1}",
-                    )
-                key = int(key)
-            elif not isinstance(node, dict):
-                raise ConfigError(
-                    "is a plain value and has no keys", where="--set " + ".".join(keys[:depth]), value=node
-                )
-            if last:
-                node[key] = value
-            elif isinstance(node, dict):
-                if node.get(key) is None:
-                    node[key] = {}
-                node = node[key]
-            else:
-                node = node[key]
-    return tree

@@ -20,7 +20,8 @@ import numpy as np
 
 from blinkgl.config.images import ImagesConfig
 from blinkgl.config.imu import imu_count
-from blinkgl.config.sequence import RunTemplate, SequenceConfig
+from blinkgl.config.run import RunTemplate
+from blinkgl.config.sequence import SequenceConfig
 from blinkgl.config.tracks import TracksConfig, track_times
 from blinkgl.dataset.choices import quality_in_words
 from blinkgl.dataset.effects import Effect, effects_of

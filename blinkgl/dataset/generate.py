@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 
 import blinkgl
-from blinkgl.config.sequence import RunTemplate, SequenceConfig
+from blinkgl.config.run import RunTemplate
+from blinkgl.config.sequence import SequenceConfig
 from blinkgl.dataset.plan import Plan, check_output, sequence_name
 from blinkgl.dataset.preview import PreviewRecorder
 from blinkgl.dataset.report import Progress, SequenceReport, config_yaml, losses

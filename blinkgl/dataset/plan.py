@@ -21,8 +21,9 @@ from blinkgl.config.draw import is_distribution, options
 from blinkgl.config.primitives import kinds
 from blinkgl.config.reader import to_yaml
 from blinkgl.config.recipe import Group, all_groups
+from blinkgl.config.run import RunTemplate
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig
-from blinkgl.config.sequence import OutputConfig, RunTemplate, SequenceConfig
+from blinkgl.config.sequence import OutputConfig, SequenceConfig
 from blinkgl.errors import AssetError, ConfigError, OutputError
 from blinkgl.scene.build import check_assets, panorama_of
 from blinkgl.scene.importing.mesh_files import dependencies

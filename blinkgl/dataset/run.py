@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from blinkgl.config.sequence import RunTemplate
+from blinkgl.config.run import RunTemplate
 from blinkgl.dataset.executor import Executor, Inline, StartError
 from blinkgl.dataset.plan import Plan, check_output, digest
 from blinkgl.dataset.report import Totals

@@ -32,7 +32,7 @@ from typing import Any, ClassVar, Protocol
 
 from blinkgl import __version__
 from blinkgl.config.reader import parse_yaml
-from blinkgl.config.sequence import RunTemplate
+from blinkgl.config.run import RunTemplate
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.dataset.plan import Plan, digest
 from blinkgl.dataset.report import SequenceReport

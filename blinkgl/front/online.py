@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
-from blinkgl.config.sequence import RunTemplate
+from blinkgl.config.run import RunTemplate
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.front.runs import load

@@ -11,7 +11,8 @@ from blinkgl.config.base import validate_field
 from blinkgl.config.draw import middle
 from blinkgl.config.recipe import merge
 from blinkgl.config.recipes import with_recipes
-from blinkgl.config.sequence import RunTemplate, SequenceConfig, load_run, with_sensors
+from blinkgl.config.run import RunTemplate, load_run, with_sensors
+from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.front.rigs import Rig, rig_of

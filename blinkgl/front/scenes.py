@@ -23,17 +23,13 @@ from numpy.typing import ArrayLike
 from blinkgl.config.base import Config, validate
 from blinkgl.config.camera import CameraConfig, calibrated
 from blinkgl.config.deform import AnimationConfig
+from blinkgl.config.lights import LightConfig
 from blinkgl.config.materials import MaterialConfig
 from blinkgl.config.physics import BodyConfig, PhysicsConfig
-from blinkgl.config.scene import (
-    ExplicitSceneConfig,
-    KeyedMotionConfig,
-    LightConfig,
-    MeshConfig,
-    ObjectConfig,
-    PoseConfig,
-)
-from blinkgl.config.sequence import RunTemplate, SequenceConfig
+from blinkgl.config.poses import KeyedMotionConfig, PoseConfig
+from blinkgl.config.run import RunTemplate
+from blinkgl.config.scene import ExplicitSceneConfig, MeshConfig, ObjectConfig
+from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.scene import types as data

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from blinkgl.config.sequence import SequenceConfig, load_run
+from blinkgl.config.run import load_run
+from blinkgl.config.sequence import SequenceConfig
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.atomic import atomic_file, output_errors

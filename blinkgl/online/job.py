@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 from blinkgl.config.reader import parse_yaml
 from blinkgl.config.recipe import Group, derived_seed
-from blinkgl.config.sequence import RunTemplate
+from blinkgl.config.run import RunTemplate
 from blinkgl.dataset.plan import Plan
 from blinkgl.errors import ConfigError
 

@@ -27,7 +27,7 @@ from typing import Any, cast
 import numpy as np
 
 from blinkgl.config.reader import to_yaml
-from blinkgl.config.sequence import RunTemplate
+from blinkgl.config.run import RunTemplate
 from blinkgl.dataset.executor import Executor, Inline, Local, several_cards
 from blinkgl.dataset.work import Message
 from blinkgl.errors import BlinkGLError, ConfigError, EventDataError

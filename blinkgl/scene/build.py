@@ -8,15 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.config.camera import CameraConfig, camera_radius
+from blinkgl.config.lights import LightConfig
+from blinkgl.config.poses import TrajectoryConfig
 from blinkgl.config.rig import RigSensorConfig, baseline_of
-from blinkgl.config.scene import (
-    ExplicitSceneConfig,
-    FileSceneConfig,
-    LightConfig,
-    RandomSceneConfig,
-    SceneConfig,
-    TrajectoryConfig,
-)
+from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig, SceneConfig
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.scene.rig import Rig, Sensor

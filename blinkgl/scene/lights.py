@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from blinkgl.config.scene import (
+from blinkgl.config.lights import (
     LightConfig,
     PointLampConfig,
     RandomLightsConfig,

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, runtime_checkab
 import numpy as np
 
 from blinkgl.camera import CameraModel
-from blinkgl.config.scene import LightConfig
+from blinkgl.config.lights import LightConfig
 
 if TYPE_CHECKING:
     from blinkgl.scene.rig import Rig, Sensor

@@ -13,7 +13,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from blinkgl.camera.drawing import seen_through
-from blinkgl.config.sequence import NS_PER_S, SequenceConfig, load_run
+from blinkgl.config.run import load_run
+from blinkgl.config.sequence import NS_PER_S, SequenceConfig
 from blinkgl.errors import ConfigError, GLError
 from blinkgl.gl import GLContext, ShaderLoader, create_context
 from blinkgl.gl.shader import ShaderError, expand, shader_folder

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.config.events import EmulatorConfig
-from blinkgl.config.sequence import RunTemplate
+from blinkgl.config.run import RunTemplate
 from blinkgl.dataset.generate import generate_run
 from blinkgl.errors import GLError
 from blinkgl.events.table import EMULATORS

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rich.console import Console
 from rich.table import Table
 
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset.explain import Explanation, explain
 from blinkgl.machine.terminal import plain_console, say
 

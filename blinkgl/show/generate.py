@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TimeElapsedColumn
 from rich.table import Table
 
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset.executor import Executor
 from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.report import STAGES, SequenceReport, Totals

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from blinkgl.config.frames import FramesConfig
 from blinkgl.config.recipe import all_groups
-from blinkgl.config.sequence import RunTemplate, apply_overrides, load_run
+from blinkgl.config.run import RunTemplate, apply_overrides, load_run
 from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.machine.terminal import plain_console, say
 from blinkgl.sequence.folders import folder_of

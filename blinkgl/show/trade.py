@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.errors import ConfigError
 from blinkgl.machine.terminal import plain_console, say
 from blinkgl.trade.measure import QUICK, TRACED_LEVELS, Options

@@ -15,7 +15,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from blinkgl.config.sequence import RunTemplate, SequenceConfig, apply_overrides
+from blinkgl.config.run import RunTemplate, apply_overrides
+from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.events import Events, emulator_of
 from blinkgl.events.grids import masked

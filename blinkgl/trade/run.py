@@ -10,8 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from blinkgl.config.run import RunTemplate
 from blinkgl.config.scene import RandomSceneConfig
-from blinkgl.config.sequence import RunTemplate
 from blinkgl.errors import ConfigError
 from blinkgl.events import emulator_of
 from blinkgl.gl import create_context

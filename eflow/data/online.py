@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.errors import ConfigError
 from blinkgl.online.job import MIX, StreamJob, stream_seed
 from blinkgl.online.stream import SampleStream

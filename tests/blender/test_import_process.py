@@ -157,7 +157,7 @@ def test_the_table_and_the_recipe(blend, tmp_path, fake, monkeypatch, capsys):
     assert "\n  1 meshes\nnote: no [hair]: 'B'\n" in out
     recipe = out.split("to play it:\n")[1]
     (tmp_path / "play.yaml").write_text(recipe)
-    from blinkgl.config.sequence import load_run
+    from blinkgl.config.run import load_run
 
     config = load_run(tmp_path / "play.yaml").sequence(0)
     assert (config.camera.width, config.camera.height) == (640, 360) and config.scene.camera == "Eye"

@@ -11,7 +11,7 @@ from blinkgl.camera.drawing import DENSITY, seen_through
 from blinkgl.config.base import validate
 from blinkgl.config.camchain import Calibrated, cam_to_cam_yaml, camchain_yaml, read_camchain
 from blinkgl.config.camera import CameraConfig, camera_keys
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.errors import ConfigError
 
 RADTAN = {"width": 120, "height": 90, "fx": 95.0, "fy": 99.0, "cx": 60.5, "cy": 43.0, "lens": "radtan"}

@@ -10,7 +10,8 @@ from pydantic import Field, model_validator
 from blinkgl.config.base import Config, Refused, Rule, remembering, rule, validate
 from blinkgl.config.corners import Fill, corners, placed_rules, sites
 from blinkgl.config.recipe import all_groups
-from blinkgl.config.sequence import FILLS, RunTemplate, SequenceConfig, load_run
+from blinkgl.config.run import FILLS, RunTemplate, load_run
+from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 
 # Sound at all low and at all high ends, or at each single one; refused by a combination.

@@ -4,7 +4,8 @@ import pytest
 import yaml
 
 from blinkgl.config.images import ImagesConfig
-from blinkgl.config.sequence import RunTemplate, SequenceConfig, load_run
+from blinkgl.config.run import RunTemplate, load_run
+from blinkgl.config.sequence import SequenceConfig
 from blinkgl.dataset.report import config_yaml
 from blinkgl.errors import ConfigError
 

@@ -10,8 +10,9 @@ from pydantic_core import ErrorDetails
 
 from blinkgl.config import base
 from blinkgl.config.base import PROBLEMS, members, validate
+from blinkgl.config.run import load_run
 from blinkgl.config.sensor import SensorConfig
-from blinkgl.config.sequence import SequenceConfig, load_run
+from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from eflow.config import TrainConfig
 

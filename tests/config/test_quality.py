@@ -6,7 +6,8 @@ import pytest
 import yaml
 
 from blinkgl.config.quality import DEFAULT, QUALITIES, fill_quality, load_quality
-from blinkgl.config.sequence import RenderConfig, RunTemplate, load_run
+from blinkgl.config.run import RunTemplate, load_run
+from blinkgl.config.sequence import RenderConfig
 from blinkgl.config.timeline import DisplacementTimeline
 from blinkgl.dataset.report import config_yaml
 from blinkgl.errors import ConfigError

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from blinkgl.config.reader import MAX_DEPTH, MAX_VALUES, parse_yaml, read_table, read_yaml, to_yaml
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]

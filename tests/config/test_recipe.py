@@ -9,7 +9,7 @@ import yaml
 
 from blinkgl.config.draw import draw
 from blinkgl.config.recipe import all_groups, merge
-from blinkgl.config.sequence import RunTemplate, load_run
+from blinkgl.config.run import RunTemplate, load_run
 from blinkgl.dataset.plan import Plan
 from blinkgl.errors import ConfigError
 

@@ -11,7 +11,7 @@ from blinkgl.config.base import validate
 from blinkgl.config.draw import draw, middle, options
 from blinkgl.config.events import EsimConfig, V2eConfig
 from blinkgl.config.recipes import load_recipe, recipe_names
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.errors import ConfigError
 from blinkgl.show.simulate import emulator_options
 

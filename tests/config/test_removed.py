@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from blinkgl.config.reader import read_table, to_yaml
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.errors import ConfigError
 
 OLD = Path(__file__).parents[1] / "golden" / "config_0.1.0.yaml"

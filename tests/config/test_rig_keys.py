@@ -11,7 +11,8 @@ from blinkgl.config.base import validate
 from blinkgl.config.reader import parse_yaml
 from blinkgl.config.recipes import load_recipe, recipe_names
 from blinkgl.config.rig import PlaceConfig, rig_names
-from blinkgl.config.sequence import RunTemplate, SequenceConfig, load_run
+from blinkgl.config.run import RunTemplate, load_run
+from blinkgl.config.sequence import SequenceConfig
 from blinkgl.dataset.report import config_yaml
 from blinkgl.errors import ConfigError
 

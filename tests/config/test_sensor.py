@@ -7,8 +7,8 @@ import math
 import pytest
 
 from blinkgl.config.draw import middle
+from blinkgl.config.run import RunTemplate, load_run
 from blinkgl.config.sensor import load_sensor
-from blinkgl.config.sequence import RunTemplate, load_run
 from blinkgl.errors import ConfigError
 
 UNITS = """

@@ -9,7 +9,8 @@ from blinkgl.camera import PinHole
 from blinkgl.config.camera import CameraConfig
 from blinkgl.config.quality import DEFAULT
 from blinkgl.config.recipe import all_groups
-from blinkgl.config.sequence import SequenceConfig, TimeConfig, load_run
+from blinkgl.config.run import load_run
+from blinkgl.config.sequence import SequenceConfig, TimeConfig
 from blinkgl.errors import ConfigError
 
 

@@ -14,7 +14,8 @@ import yaml
 
 from agreement import of_data_set, of_explanation
 from blinkgl.cli import run
-from blinkgl.config.sequence import SequenceConfig, load_run
+from blinkgl.config.run import load_run
+from blinkgl.config.sequence import SequenceConfig
 from blinkgl.dataset.executor import Local
 from blinkgl.dataset.explain import explain
 from blinkgl.dataset.generate import generate_run

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from blinkgl.cli import run
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset.cluster import RayCluster, _egl_device, _first_line
 from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.run import run_dataset

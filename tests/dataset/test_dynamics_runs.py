@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from blinkgl.cli import run
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset.executor import Inline, Local
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import verify_dataset

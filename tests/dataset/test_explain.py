@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset.effects import effects_of
 from blinkgl.dataset.explain import explain
 from blinkgl.dataset.generate import generate_run

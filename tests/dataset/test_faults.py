@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from blinkgl.cli import run
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset import executor as executor_module, run_folder as run_folder_module, work
 from blinkgl.dataset.executor import Inline, Local
 from blinkgl.dataset.generate import generate_run

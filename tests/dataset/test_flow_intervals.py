@@ -13,7 +13,7 @@ from blinkgl import Renderer, load, record
 from blinkgl.cli import run
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.reader import to_yaml
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset.explain import explain
 from blinkgl.dataset.shards import sample
 from blinkgl.dataset.verify import verify_dataset

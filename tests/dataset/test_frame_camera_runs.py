@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import blinkgl
-from blinkgl.config.sequence import RunTemplate
+from blinkgl.config.run import RunTemplate
 from blinkgl.dataset.executor import Local
 from blinkgl.dataset.explain import explain
 from blinkgl.dataset.generate import generate_run

@@ -18,7 +18,7 @@ import yaml
 from shared_data import shared
 
 from blinkgl.cli import run
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset import generate as generate_module
 from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.verify import verify_dataset

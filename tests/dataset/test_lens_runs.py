@@ -12,7 +12,7 @@ from blinkgl.camera.rectified import rectified
 from blinkgl.cli import run
 from blinkgl.config.camchain import read_camchain
 from blinkgl.config.reader import to_yaml
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import ConfigError
 from blinkgl.io.flow import read_flow

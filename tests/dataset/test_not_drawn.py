@@ -6,7 +6,7 @@ import pytest
 import yaml
 from rich.console import Console
 
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset.executor import Local
 from blinkgl.dataset.explain import explain
 from blinkgl.show.generate import MAX_NOTES, Display, run

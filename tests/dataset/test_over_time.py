@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from blinkgl.cli import run
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset.explain import explain
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.dataset.verify.contents import _check_tracks, check_imu

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from blinkgl.cli import run
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset import shards
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.shards import export_shards

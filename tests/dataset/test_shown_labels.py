@@ -13,7 +13,7 @@ import pytest
 from blinkgl import ConfigError, Renderer, load
 from blinkgl.cli import run
 from blinkgl.config.reader import to_yaml
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset.shards import sample
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.io.boxes import read_boxes

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from blinkgl.cli import run
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import between, verify_dataset
 from blinkgl.errors import AssetError

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 import yaml
 
-from blinkgl.config.sequence import PreviewConfig, load_run
+from blinkgl.config.run import load_run
+from blinkgl.config.sequence import PreviewConfig
 from blinkgl.dataset import preview as preview_module, sockets, work
 from blinkgl.dataset.explain import PROBES, explain
 from blinkgl.dataset.plan import Plan, check_output

@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("torch")
 
 from blinkgl.config.recipe import all_groups
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from eflow.cli import run
 from eflow.config import load_train_config
 from eflow.models import NETWORKS, model_config

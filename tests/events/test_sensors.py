@@ -12,8 +12,8 @@ from shared_data import shared
 
 from blinkgl.config.events import V2eConfig
 from blinkgl.config.readout import ReadoutConfig
+from blinkgl.config.run import load_run
 from blinkgl.config.sensor import SensorConfig, load_sensor, sensor_names, sensor_table
-from blinkgl.config.sequence import load_run
 from blinkgl.errors import ConfigError
 from blinkgl.events import Events, make_emulator
 from blinkgl.events.camera import EventCamera, EventFrame

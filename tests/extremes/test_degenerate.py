@@ -10,7 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import PinHole
-from blinkgl.config.sequence import RenderConfig, RunTemplate
+from blinkgl.config.run import RunTemplate
+from blinkgl.config.sequence import RenderConfig
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.labels import LABELS, LabelRequest

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, event, given, settings
 
-from blinkgl.config.sequence import RunTemplate
+from blinkgl.config.run import RunTemplate
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.errors import BlinkGLError
 from blinkgl.sequence_files.sequence_dir import verify_sequence

@@ -10,7 +10,7 @@ import hdf5plugin  # noqa: F401  (registers the Blosc filter for h5py)
 import numpy as np
 import pytest
 
-from blinkgl.config.sequence import RunTemplate
+from blinkgl.config.run import RunTemplate
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.io.flow_png import read_flow_png

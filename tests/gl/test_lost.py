@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import yaml
 
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset.executor import Inline
 from blinkgl.dataset.run import run_dataset
 from blinkgl.errors import GLError, may_pass

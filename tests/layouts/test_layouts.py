@@ -11,7 +11,7 @@ import yaml
 
 from blinkgl import read_events
 from blinkgl.cli import run
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.errors import AssetError, ConfigError, OutputError
 from blinkgl.io.flow import read_flow_npy

@@ -10,7 +10,7 @@ import trimesh
 import yaml
 
 from blinkgl.cli import run
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.sequence_files.sequence_dir import read_manifest
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import blinkgl
-from blinkgl.config.sequence import RenderConfig, RunTemplate
+from blinkgl.config.run import RunTemplate
+from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import ConfigError
 from blinkgl.labels import LabelRequest
 from blinkgl.render import reference

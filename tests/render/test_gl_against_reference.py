@@ -16,7 +16,8 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from shared_data import shared
 
-from blinkgl.config.sequence import RenderConfig, load_run
+from blinkgl.config.run import load_run
+from blinkgl.config.sequence import RenderConfig
 from blinkgl.gl.shader import ShaderLoader, shader_folder
 from blinkgl.labels import LabelRequest
 from blinkgl.render import reference

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from blinkgl.cli import run
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.errors import AssetError
 from blinkgl.io.flow_png import read_flow_png

@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from blinkgl.cli import run
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.report import markup
 from blinkgl.report.charts import histogram, number, size

@@ -8,7 +8,8 @@ import pytest
 
 from blinkgl.config.base import validate
 from blinkgl.config.camera import CameraConfig
-from blinkgl.config.scene import ExplicitSceneConfig, LightConfig, RandomLightsConfig, RandomSceneConfig
+from blinkgl.config.lights import LightConfig, RandomLightsConfig
+from blinkgl.config.scene import ExplicitSceneConfig, RandomSceneConfig
 from blinkgl.errors import ConfigError
 from blinkgl.rng import Role, generator
 from blinkgl.scene.build import build_scene

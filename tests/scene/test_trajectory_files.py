@@ -16,7 +16,7 @@ from blinkgl import (
     record,
     write_trajectory,
 )
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.front.runs import configured
 from blinkgl.scene.build import check_assets, sequence_scene
 from blinkgl.scene.motion.paths import smoothed

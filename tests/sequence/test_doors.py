@@ -12,7 +12,7 @@ import yaml
 
 import blinkgl
 from blinkgl import EventChunk, Events, GroundTruth, Picture
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset import explain as explain_module
 from blinkgl.dataset.explain import explain
 from blinkgl.dataset.generate import generate_run

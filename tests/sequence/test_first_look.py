@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import yaml
 
-from blinkgl.config.sequence import RenderConfig, load_run
+from blinkgl.config.run import load_run
+from blinkgl.config.sequence import RenderConfig
 from blinkgl.dataset.generate import generate_run
 from blinkgl.events import Events, emulator_of
 from blinkgl.events.camera import EventCamera, EventFrame, emulate

@@ -14,7 +14,7 @@ import yaml
 
 from blinkgl.cli import run
 from blinkgl.config.frames import FramesConfig, QualifyConfig
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset.explain import explain
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import verify_dataset

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.sequence import EventChunk, GroundTruth, Picture, simulate_sequence
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset.generate import generate_run
 from blinkgl.errors import ConfigError
 from blinkgl.events import Events

@@ -21,7 +21,7 @@ from blinkgl import (
     render_frame,
     write_events,
 )
-from blinkgl.config.sequence import RunTemplate
+from blinkgl.config.run import RunTemplate
 from blinkgl.front.runs import configured
 from blinkgl.sequence import simulate_sequence
 from blinkgl.types.events import Cause

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
-from blinkgl.config.sequence import RenderConfig, load_run
+from blinkgl.config.run import load_run
+from blinkgl.config.sequence import RenderConfig
 from blinkgl.gl.shader import ShaderError, ShaderLoader, expand, normalised, shader_folder, stages_of
 from blinkgl.labels import LABELS, LabelRequest
 from blinkgl.render.painter import Painter
@@ -153,7 +154,7 @@ def recorded(name, stage, defines=None, folder=None):
     seen[f"{{name}} {{stage}} {{shader.normalised(defines)}}"] = name, stage, dict(defines or {{}}), digest
     return source
 shader.expand = recorded
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset.generate import generate_run
 template = load_run({config!r}, ["camera.width=32", "camera.height=24", "time.duration=0.1"])
 list(generate_run(template, {str(tmp_path / "out")!r}, 1))

@@ -13,7 +13,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import PinHole
-from blinkgl.config.sequence import RenderConfig, load_run
+from blinkgl.config.run import load_run
+from blinkgl.config.sequence import RenderConfig
 from blinkgl.gl import ShaderLoader, create_context
 from blinkgl.labels import LabelRequest
 from blinkgl.render import reference

@@ -13,7 +13,7 @@ import yaml
 
 import blinkgl
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import ConfigError, EventDataError

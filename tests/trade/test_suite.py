@@ -13,7 +13,8 @@ from rich.console import Console
 
 from blinkgl.cli import run
 from blinkgl.config.quality import QUALITIES
-from blinkgl.config.sequence import RenderConfig, load_run
+from blinkgl.config.run import load_run
+from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import ConfigError
 from blinkgl.render.rectangles import Rectangle
 from blinkgl.scene.build import sequence_scene

@@ -16,7 +16,8 @@ from rich.console import Console
 from blinkgl.blender import process
 from blinkgl.cli import run
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
-from blinkgl.config.sequence import RenderConfig, load_run
+from blinkgl.config.run import load_run
+from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import ConfigError
 from blinkgl.events.table import EMULATORS
 from blinkgl.render.cutouts import lattice, mask_of

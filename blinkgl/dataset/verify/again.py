@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from blinkgl.config.sequence import load_run
+from blinkgl.config.run import load_run
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.verify.between import comparable, first_difference, made_with

@@ -9,7 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from blinkgl.config.sequence import RunTemplate, SequenceConfig, load_run
+from blinkgl.config.run import RunTemplate, load_run
+from blinkgl.config.sequence import SequenceConfig
 from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.verify.found import Known, Verification, guarded

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from blinkgl.config.sequence import SequenceConfig, load_run
+from blinkgl.config.run import load_run
+from blinkgl.config.sequence import SequenceConfig
 from blinkgl.dataset.verify.asked import bound, files_of_rig, misnamed, not_asked_for, said_of, times_of, unlike
 from blinkgl.dataset.verify.contents import check_imu, contents
 from blinkgl.dataset.verify.found import Known, guarded

@@ -16,15 +16,9 @@ from blinkgl.camera import CameraModel
 from blinkgl.config.deform import AnimationConfig, animation_of
 from blinkgl.config.materials import MaterialConfig
 from blinkgl.config.places import rigid_matrix
+from blinkgl.config.poses import KeyedMotionConfig, PoseConfig, TrajectoryConfig
 from blinkgl.config.primitives import PRIMITIVES
-from blinkgl.config.scene import (
-    ExplicitSceneConfig,
-    KeyedMotionConfig,
-    MeshConfig,
-    PoseConfig,
-    TrajectoryConfig,
-    object_names,
-)
+from blinkgl.config.scene import ExplicitSceneConfig, MeshConfig, object_names
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.geometry import BUILDERS
 from blinkgl.scene.geometry.deforming import deforming

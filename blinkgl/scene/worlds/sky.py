@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from blinkgl.config.scene import EnvironmentConfig
+from blinkgl.config.lights import EnvironmentConfig
 from blinkgl.errors import ConfigError
 from blinkgl.scene.geometry.primitives import parameter_hash, square
 from blinkgl.scene.lights import lit_by

@@ -9,8 +9,8 @@ import pytest
 
 from blinkgl.config.base import validate
 from blinkgl.config.camera import CameraConfig
+from blinkgl.config.run import load_run
 from blinkgl.config.scene import ExplicitSceneConfig, RandomSceneConfig
-from blinkgl.config.sequence import load_run
 from blinkgl.errors import ConfigError
 from blinkgl.scene.build import build_scene, sequence_scene
 

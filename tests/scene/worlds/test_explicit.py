@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.config.base import validate
 from blinkgl.config.camera import CameraConfig
-from blinkgl.config.scene import ExplicitSceneConfig, PoseConfig
+from blinkgl.config.poses import PoseConfig
+from blinkgl.config.scene import ExplicitSceneConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.worlds.explicit import pose_matrix

@@ -7,9 +7,9 @@ import pytest
 
 from blinkgl.config.base import validate
 from blinkgl.config.camera import CameraConfig
+from blinkgl.config.lights import LightConfig
 from blinkgl.config.scene import (
     ExplicitSceneConfig,
-    LightConfig,
     ObjectsConfig,
     PoolConfig,
     RandomSceneConfig,

@@ -1,0 +1,163 @@
+"""Where bodies and cameras are: poses, key frames, trajectories of files, ways."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Literal
+
+from pydantic import Field
+
+from blinkgl.config.base import Config, Refused, rule
+from blinkgl.config.places import Matrix, check_rigid
+from blinkgl.config.values import (
+    Fraction,
+    Position,
+    Vector3,
+)
+
+
+class PoseConfig(Config):
+    """Position, and at most one way to say the orientation."""
+
+    position: Position = Field((0.0, 0.0, 0.0), description="m")
+    quaternion: tuple[float, float, float, float] | None = Field(
+        None, description="[w, x, y, z], need not be normalised"
+    )
+    euler: Vector3 | None = Field(None, description="degrees about the fixed x, y, z axes, applied in this order")
+    look_at: Position | None = Field(
+        None, description="point that the camera's z axis, or an object's x axis, is turned to"
+    )
+
+    @rule("quaternion", "euler", "look_at")
+    def _one_orientation(quaternion, euler, look_at):
+        given = [k for k, v in (("quaternion", quaternion), ("euler", euler), ("look_at", look_at)) if v is not None]
+        if len(given) > 1:
+            raise Refused("only one of quaternion, euler, look_at may be given, not " + " and ".join(given))
+
+    @rule("quaternion")
+    def _some_rotation(quaternion: tuple[float, ...] | None):
+        if quaternion is not None and sum(q * q for q in quaternion) < 1e-12:
+            raise Refused("a quaternion must not be zero", where="quaternion", value=list(quaternion))
+
+    @rule("look_at", "position")
+    def _some_direction(look_at, position):
+        if look_at is not None and max(abs(a - b) for a, b in zip(look_at, position)) < 1e-9:
+            raise Refused("must differ from the position", where="look_at", value=list(look_at))
+
+
+class KeyframeConfig(PoseConfig):
+    """A pose at a time."""
+
+    time: float = Field(
+        ge=-1e7, le=1e7, description="s on the sequence's clock (the first label is at time.start + 1 / label_rate)"
+    )
+
+
+class TrajectoryConfig(Config):
+    """Poses of a file, and a C2 spline through them. They are T_world_body: of a camera with OpenCV's axes, of an
+    object with its own. The file has to cover the sequence."""
+
+    file: str = Field(description="TUM: t x y z qx qy qz qw; or EuRoC's CSV: t, x, y, z, qw, qx, qy, qz")
+    form: Literal["auto", "tum", "euroc"] = Field("auto", description="auto: EuRoC's where lines have commas")
+    start: float | None = Field(
+        None,
+        ge=-1e10,
+        le=1e10,
+        description="s on the file's clock that are 0 s on the sequence's; null: the first pose is at time.start",
+    )
+    smooth: float = Field(
+        0.0,
+        ge=0,
+        le=60,
+        description="each pose becomes the mean of those within so many s before and after, weighed by a triangle; 0: "
+        "the spline passes them all",
+    )
+    speed_limit: float = Field(
+        100.0,
+        gt=0,
+        le=1e9,
+        description="world units/s from one pose to the next: what is faster is taken for a jump, or for poses in mm, "
+        "and refused",
+    )
+    turn_limit: float = Field(7200.0, gt=0, le=1e9, description="degrees/s from one pose to the next, likewise")
+    T_body_sensor: str | Matrix | None = Field(
+        None,
+        description="where this camera or object is on the body whose poses the file has, from its axes to the body's: "
+        "EuRoC's sensor.yaml, whose T_BS that is, or four rows of four; null: it is that body",
+    )
+
+    @rule("T_body_sensor")
+    def _a_place(place):
+        if place is not None and not isinstance(place, str):
+            check_rigid(place, "T_body_sensor")
+
+
+class KeyedMotionConfig(PoseConfig):
+    """A fixed pose, key frames, or a trajectory from a file; before the first and after the last the pose is held.
+    From one key frame to the next a body turns the shortest way (for ``spline``: near it), so ``euler`` may change
+    by less than 180 degrees per step; whole turns need key frames in between."""
+
+    keyframes: tuple[KeyframeConfig, ...] = Field((), description="two or more poses with increasing times")
+    interpolation: Literal["spline", "linear"] = Field(
+        "spline", description="between key frames: C2 spline, or straight lines and slerp"
+    )
+
+    trajectory: TrajectoryConfig | None = Field(None, description="poses of a file, in place of a pose or key frames")
+
+    @rule("?trajectory", "#keyframes", "position", "quaternion", "euler", "look_at")
+    def _one_source(trajectory, keyframes, position, *orientation):
+        if trajectory and (keyframes or any(position) or any(o is not None for o in orientation)):
+            raise Refused("give a trajectory, a fixed pose or keyframes, not several of them", where="trajectory")
+
+    @rule("keyframes.*.time")
+    def _in_order(times: tuple[float, ...]):
+        if len(times) == 1:
+            raise Refused("one key frame is no motion; give two or more, or a fixed pose", where="keyframes")
+        for k, (before, after) in enumerate(itertools.pairwise(times)):
+            if after - before < 1e-6:
+                raise Refused(
+                    "the key frames' times must increase by at least 1e-6 s",
+                    where=f"keyframes.{k + 1}.time",
+                    value=after,
+                )
+
+    @rule("#keyframes", "position", "quaternion", "euler", "look_at")
+    def _pose_or_keyframes(keyframes, position, *orientation):
+        if keyframes and (any(position) or any(o is not None for o in orientation)):
+            raise Refused("give a fixed pose or keyframes, not both")
+
+    @rule("keyframes.*.euler", "keyframes.*.quaternion", "keyframes.*.look_at")
+    def _shortest_turns(eulers: tuple, quaternions: tuple, look_ats: tuple):
+        # Between poses the body turns the shortest way: half a turn has no shortest way, and more would go back.
+        otherwise = [q is not None or at is not None for q, at in zip(quaternions, look_ats)]
+        for k in range(len(eulers) - 1):
+            if otherwise[k] or otherwise[k + 1]:
+                continue
+            steps = [abs(v - u) for u, v in zip(eulers[k] or (0, 0, 0), eulers[k + 1] or (0, 0, 0))]
+            if max(steps) >= 180:
+                raise Refused(
+                    f"euler changes by {max(steps):g} degrees about {'xyz'[steps.index(max(steps))]} from key frame "
+                    f"{k} to {k + 1}; it must be less than 180 (add key frames in between)"
+                )
+
+
+class WayConfig(Config):
+    """A curve that a body follows at one speed, its x axis ahead; beyond an open end it goes straight on."""
+
+    points: tuple[Position, ...] = Field(description="two or more places, m; the curve is smooth and passes them all")
+    speed: float | None = Field(
+        None,
+        gt=0,
+        le=1e4,
+        description="m/s; null: as fast as a figure's steps or a fish's strokes take it, so that feet do not slide; "
+        "1 for other bodies",
+    )
+    closed: bool = Field(False, description="from the last point back to the first, and on")
+    level: bool = Field(True, description="its z axis stays up; false: its x axis goes up and down with the way")
+    start: Fraction = Field(0.0, description="share of the way that lies behind it at time 0")
+
+    @rule("#points", "closed")
+    def _a_way(points, closed):
+        least, given = (3 if closed else 2), len([*points])
+        if given < least:
+            raise Refused(f"a way needs {least} points or more", where="points", value=given)

@@ -1,0 +1,100 @@
+"""Kinds of values that many keys take: ranges, vectors, colours."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BeforeValidator, Field
+
+from blinkgl.config.materials import Radiance
+
+
+def _ordered(value: tuple[float, float]) -> tuple[float, float]:
+    if value[0] > value[1]:
+        raise ValueError("the range must be [smallest, largest]")
+    return value
+
+
+def _as_pair(value: Any) -> Any:
+    return (value, value) if isinstance(value, (int, float)) and not isinstance(value, bool) else value
+
+
+def _as_list(value: Any) -> Any:
+    return (value,) if isinstance(value, str) else value
+
+
+def word_or_list(words: tuple, kinds: tuple[str, ...] = ()):
+    """Refuses what is neither one of ``words`` nor a list of ``kinds``: pydantic would name
+    the union's first member only."""
+
+    def check(value: Any) -> Any:
+        listed = isinstance(value, (list, tuple)) and kinds
+        if not (
+            any(value is w or (isinstance(w, str) and value == w) for w in words)
+            or (listed and all(v in kinds for v in value))
+        ):
+            said = ", ".join(str(w).lower() for w in words)
+            raise ValueError(f"must be {said}" + (" or a list of " + ", ".join(kinds) if kinds else ""))
+        return value
+
+    return BeforeValidator(check)
+
+
+def number_or_three(value: Any) -> Any:
+    """Return a number, or a list of three. Raises ValueError."""
+    items = value if isinstance(value, (list, tuple)) else [value]
+    try:
+        ok = (
+            len(items) in ((3,) if items is value else (1,))
+            and not any(isinstance(v, bool) for v in items)
+            and [float(v) for v in items]
+        )
+    except (TypeError, ValueError):
+        ok = False
+    if not ok:
+        raise ValueError("must be a number or a list of three")
+    return value
+
+
+def parameter_value(value: Any) -> Any:
+    """A word is not looked at before the primitive sees it; YAML 1.1 reads 1e-1 as text, too."""
+    if isinstance(value, str):
+        try:
+            return float(value)
+        except ValueError:
+            return value
+    return number_or_three(value)
+
+
+def greater_than_zero(value: Any) -> Any:
+    """Return a number or a tuple of them, each in (0, 1e9]. Raises ValueError."""
+    values = value if isinstance(value, tuple) else (value,)
+    if min(values) <= 0 or max(values) > 1e9:
+        raise ValueError("must be greater than 0 and at most 1e9")
+    return value
+
+
+Positive = Annotated[float, Field(gt=0, le=1e9)]
+
+
+Fraction = Annotated[float, Field(ge=0, le=1)]
+
+
+PositiveRange = Annotated[tuple[Positive, Positive], BeforeValidator(_as_pair), AfterValidator(_ordered)]
+
+
+Paths = Annotated[tuple[str, ...], BeforeValidator(_as_list)]
+
+
+Vector3 = tuple[float, float, float]
+
+
+# At 1e9 units float64 still tells 1e-7 units apart; beyond, a unit was mistaken, and float32 matrices would overflow in
+# the end.
+Coordinate = Annotated[float, Field(ge=-1e9, le=1e9)]
+
+
+Position = tuple[Coordinate, Coordinate, Coordinate]
+
+
+Color = tuple[Radiance, Radiance, Radiance]

@@ -14,22 +14,9 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.2.0.dev0"
 
 _HOMES = {
-    "blinkgl.front.scenes": (
-        "Animation",
-        "Body",
-        "Camera",
-        "Deform",
-        "Keyframes",
-        "Light",
-        "Material",
-        "Mesh",
-        "Pose",
-        "Primitive",
-        "Scene",
-        "Trajectory",
-        "Way",
-        "look_at",
-    ),
+    "blinkgl.front.poses": ("Keyframes", "Pose", "Trajectory", "look_at"),
+    "blinkgl.front.surfaces": ("Light", "Material"),
+    "blinkgl.front.scenes": ("Animation", "Body", "Camera", "Deform", "Mesh", "Primitive", "Scene", "Way"),
     "blinkgl.front.rigs": ("Rig", "RigSensor"),
     "blinkgl.front.rig_sequences": ("RigRecording", "record_rig", "simulate_rig"),
     "blinkgl.front.runs": ("Timeline", "generate", "load", "verify"),
@@ -79,27 +66,14 @@ if TYPE_CHECKING:  # what a type checker and an editor see; a test compares it w
         write_trajectory,
     )
     from blinkgl.front.online import OnlineSequences
+    from blinkgl.front.poses import Keyframes, Pose, Trajectory, look_at
     from blinkgl.front.rig_sequences import RigRecording, record_rig, simulate_rig
     from blinkgl.front.rigs import Rig, RigSensor
     from blinkgl.front.runs import Timeline, generate, load, verify
-    from blinkgl.front.scenes import (
-        Animation,
-        Body,
-        Camera,
-        Deform,
-        Keyframes,
-        Light,
-        Material,
-        Mesh,
-        Pose,
-        Primitive,
-        Scene,
-        Trajectory,
-        Way,
-        look_at,
-    )
+    from blinkgl.front.scenes import Animation, Body, Camera, Deform, Mesh, Primitive, Scene, Way
     from blinkgl.front.sensors import DvsVoltmeter, Esim, V2e, load_sensor
     from blinkgl.front.sequences import Recording, record, simulate_sequence
+    from blinkgl.front.surfaces import Light, Material
     from blinkgl.labels.frames import Flow, LabelFrame
     from blinkgl.online.samples import StreamSample, WindowSample
     from blinkgl.online.stream import StreamStats

@@ -628,7 +628,7 @@ def _rendered(recipe: str, window_ms: str | None, limit: int | None):
 
 def _windows_of(recipe: str, window_ms: str | None, **how) -> SourceConfig:
     """The online source of a recipe, as a command line asks for it."""
-    from blinkgl.config.base import validate
+    from blinkgl.config.problems import validate
     from eflow.config import SourceConfig
 
     tree: dict = {"recipe": recipe, "online": True, **how}

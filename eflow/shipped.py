@@ -20,7 +20,8 @@ from typing import Literal
 from pydantic import Field
 
 from blinkgl import __version__
-from blinkgl.config.base import Config, validate
+from blinkgl.config.base import Config
+from blinkgl.config.problems import validate
 from blinkgl.config.reader import read_table, to_yaml
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.io.atomic import atomic_folder, output_errors

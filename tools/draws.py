@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from blinkgl.config.base import validate
 from blinkgl.config.camera import CameraConfig
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.config.primitives import kinds
+from blinkgl.config.problems import validate
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.config.scene import TEXTURE_KINDS, RandomSceneConfig
 from blinkgl.events import Events, make_emulator

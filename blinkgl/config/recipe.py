@@ -28,8 +28,8 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
-from blinkgl.config.base import validate_field
 from blinkgl.config.draw import is_distribution
+from blinkgl.config.problems import validate_field
 from blinkgl.config.run import RunTemplate
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError

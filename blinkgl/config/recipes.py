@@ -15,8 +15,9 @@ from typing import Any
 
 from pydantic import Field
 
-from blinkgl.config.base import Config, validate
+from blinkgl.config.base import Config
 from blinkgl.config.draw import is_distribution
+from blinkgl.config.problems import validate
 from blinkgl.config.reader import parse_yaml
 from blinkgl.config.rig import with_sections
 from blinkgl.errors import ConfigError

@@ -9,11 +9,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from blinkgl.config.base import remembering, validate, validate_field
+from blinkgl.config.base import remembering
 from blinkgl.config.camera import with_calibrations
 from blinkgl.config.corners import Fill, corners, corners_of, sites
 from blinkgl.config.draw import draw, is_distribution
 from blinkgl.config.labels import fill_causes
+from blinkgl.config.problems import validate, validate_field
 from blinkgl.config.quality import fill_quality, with_default
 from blinkgl.config.reader import parse_yaml, read_table
 from blinkgl.config.recipes import with_recipes

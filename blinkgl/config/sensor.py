@@ -30,10 +30,11 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Discriminator, Field, Tag
 
-from blinkgl.config.base import Config, Refused, rule, validate
+from blinkgl.config.base import Config, Refused, rule
 from blinkgl.config.corners import corners
 from blinkgl.config.draw import draw, is_distribution, middle
 from blinkgl.config.events import EmulatorConfig
+from blinkgl.config.problems import validate
 from blinkgl.config.reader import parse_yaml, read_table
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import ConfigError

@@ -23,7 +23,7 @@ def _as_list(value: Any) -> Any:
     return (value,) if isinstance(value, str) else value
 
 
-def word_or_list(words: tuple, kinds: tuple[str, ...] = ()):
+def word_or_list(words: tuple, kinds: tuple[str, ...] = ()) -> BeforeValidator:
     """Refuses what is neither one of ``words`` nor a list of ``kinds``: pydantic would name
     the union's first member only."""
 

@@ -15,10 +15,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, overload
 
-from blinkgl.config.base import validate
 from blinkgl.config.corners import sites
 from blinkgl.config.draw import is_distribution, options
 from blinkgl.config.primitives import kinds
+from blinkgl.config.problems import validate
 from blinkgl.config.reader import to_yaml
 from blinkgl.config.recipe import Group, all_groups
 from blinkgl.config.run import RunTemplate

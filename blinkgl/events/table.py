@@ -17,8 +17,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from blinkgl.config.base import tag_of, validate
+from blinkgl.config.base import tag_of
 from blinkgl.config.events import EmulatorConfig
+from blinkgl.config.problems import validate
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.config.sensor import SensorConfig
 from blinkgl.events.emulator import Emulator

@@ -8,8 +8,8 @@ from contextlib import ExitStack
 
 import numpy as np
 
-from blinkgl.config.base import validate
 from blinkgl.config.labels import LabelsConfig
+from blinkgl.config.problems import validate
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.front.runs import MAX_INDEX, Source, configured, scene_of

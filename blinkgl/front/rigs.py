@@ -24,7 +24,8 @@ from blinkgl.config.readout import ReadoutConfig
 from blinkgl.config.rig import PlaceConfig, RigSensorConfig, spelled_out
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
-from blinkgl.front.scenes import Camera, Piece, Vector
+from blinkgl.front.poses import Piece, Vector
+from blinkgl.front.scenes import Camera
 from blinkgl.front.sections import (
     EmulatorSettings,
     ImageSettings,

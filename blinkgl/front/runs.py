@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from blinkgl.config.base import validate_field
 from blinkgl.config.draw import middle
+from blinkgl.config.problems import validate_field
 from blinkgl.config.recipe import merge
 from blinkgl.config.recipes import with_recipes
 from blinkgl.config.run import RunTemplate, load_run, with_sensors

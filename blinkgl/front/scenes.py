@@ -13,143 +13,29 @@ piece is made, and names the argument.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from blinkgl.config.base import Config, validate
 from blinkgl.config.camera import CameraConfig, calibrated
 from blinkgl.config.deform import AnimationConfig
-from blinkgl.config.lights import LightConfig
-from blinkgl.config.materials import MaterialConfig
 from blinkgl.config.physics import BodyConfig, PhysicsConfig
-from blinkgl.config.poses import KeyedMotionConfig, PoseConfig
+from blinkgl.config.problems import validate
 from blinkgl.config.run import RunTemplate
 from blinkgl.config.scene import ExplicitSceneConfig, MeshConfig, ObjectConfig
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.front import arguments as check
+from blinkgl.front.poses import Keyframes, Piece, Pose, Trajectory, Vector, motion_tree
+from blinkgl.front.surfaces import Light, Material
 from blinkgl.scene import types as data
 from blinkgl.scene.geometry.meshes import make_mesh
 from blinkgl.scene.surfaces.coats import COATS
 from blinkgl.scene.surfaces.images import content_hash
 from blinkgl.scene.worlds.explicit import InMemory, explicit_scene, primitive_mesh
-
-Vector = Sequence[float] | np.ndarray
-
-
-class Piece:
-    """A value that is checked when it is made. ``tree``: itself as plain data, as the YAML has it."""
-
-    tree: dict[str, Any]
-
-    def _checked(self, model: type[Config], tree: dict[str, Any], **renamed: str) -> dict[str, Any]:
-        """``tree`` as it is, when the model takes it. renamed : what keys of the model are
-        called as arguments; "": by their own keys."""
-        try:
-            validate(model, tree)
-        except ConfigError as error:
-            first, *rest = (error.where or "config").split(".")
-            at = [step for step in (renamed.get(first, first), *rest) if step not in ("", "config")]
-            raise ConfigError(
-                error.problem, where=".".join([type(self).__name__, *at]), value=error.value, accepted=error.accepted
-            ) from None
-        return tree
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({', '.join(f'{k}={v!r}' for k, v in self.tree.items())})"
-
-
-class Pose(Piece):
-    """Where a body or a camera is, and at most one way to say how it is turned.
-
-    position : (3,) m.   euler : (3,) degrees about the world's x, then y, then z.   quaternion : (4,) w, x, y, z.
-    look_at : (3,) m, the point that a camera's z axis, or a body's x axis, is turned to. At
-    rest a camera looks along +x with z up.
-    Raises ConfigError."""
-
-    def __init__(
-        self,
-        position: Vector = (0.0, 0.0, 0.0),
-        *,
-        euler: Vector | None = None,
-        quaternion: Vector | None = None,
-        look_at: Vector | None = None,
-    ):
-        self.tree = self._checked(
-            PoseConfig, check.given(position=position, euler=euler, quaternion=quaternion, look_at=look_at)
-        )
-
-
-def look_at(position: Vector, target: Vector) -> Pose:
-    """A :class:`Pose` at ``position`` (3,) m, turned to the point ``target`` (3,) m; a camera's
-    horizon is level. Raises ConfigError."""
-    return Pose(position, look_at=target)
-
-
-class Keyframes(Piece):
-    """A motion through poses: ``Keyframes({0.0: Pose(…), 1.5: Pose(…)})``, held before
-    the first time and after the last.
-
-    poses : time in s -> :class:`Pose`, two or more; from one to the next less than half a turn.
-    interpolation : "spline" (twice continuously differentiable) or "linear" (straight lines and slerp).
-    Raises ConfigError."""
-
-    def __init__(self, poses: Mapping[float, Pose], interpolation: Literal["spline", "linear"] = "spline"):
-        check.one_of(poses, "Keyframes.poses", Mapping, "a table of times and poses")
-        for time, pose in poses.items():
-            check.number(time, "Keyframes.poses")
-            check.one_of(pose, f"Keyframes.poses[{time}]", Pose, "a Pose, as look_at makes one")
-        frames = [{"time": check.plain(time), **poses[time].tree} for time in sorted(poses)]
-        if not frames:
-            raise ConfigError("too few entries", where="Keyframes.poses", value=poses, accepted="two or more poses")
-        self.tree = self._checked(
-            KeyedMotionConfig, {"keyframes": frames, "interpolation": check.plain(interpolation)}, keyframes="poses"
-        )
-
-
-class Trajectory(Piece):
-    """A motion from a file, TUM's or EuRoC's, by a spline: ``Camera(pose=Trajectory("flight.txt"))``.
-
-    file : path.   form : "tum", "euroc"; "auto": EuRoC's where lines have commas.   start : s on the file's clock that
-    are 0 s on the scene's; None: its first pose is where the sequence begins.   smooth : s, each pose becomes the mean
-    of those within it.   speed_limit : units/s, turn_limit : degrees/s, beyond which poses are refused.
-    T_body_sensor : where the camera or body that follows it is on the body whose poses these are: (4, 4), or the path
-    of EuRoC's sensor.yaml, whose T_BS that is; None: it is that body.
-    Raises ConfigError; a file that does not cover the sequence is found when the scene is built."""
-
-    def __init__(
-        self,
-        file: str | os.PathLike,
-        *,
-        form: Literal["auto", "tum", "euroc"] = "auto",
-        start: float | None = None,
-        smooth: float = 0.0,
-        speed_limit: float = 100.0,
-        turn_limit: float = 7200.0,
-        T_body_sensor: ArrayLike | str | os.PathLike | None = None,
-    ):
-        tree = check.given(file=os.fspath(check.path(file, "file").absolute()), form=form, start=start, smooth=smooth)
-        tree |= check.given(speed_limit=speed_limit, turn_limit=turn_limit)
-        if isinstance(T_body_sensor, (str, os.PathLike)):
-            tree["T_body_sensor"] = os.fspath(check.path(T_body_sensor, "T_body_sensor").absolute())
-        elif T_body_sensor is not None:
-            place = check.array(T_body_sensor, "Trajectory.T_body_sensor", (4, 4), "a file, or an array (4, 4)")
-            tree["T_body_sensor"] = check.plain(place)
-        self.tree = self._checked(KeyedMotionConfig, {"trajectory": tree}, trajectory="")
-
-
-def _motion(pose: Pose | Keyframes | Trajectory | Vector, where: str, others: str = "") -> dict[str, Any]:
-    """A position alone is a pose. others : what else may be given, for the message."""
-    if isinstance(pose, (Pose, Keyframes, Trajectory)):
-        return pose.tree
-    check.one_of(
-        pose, where, (list, tuple, np.ndarray), f"a Pose, Keyframes, Trajectory, {others}or a position of three numbers"
-    )
-    return Pose(pose).tree
 
 
 class Camera(Piece):
@@ -192,163 +78,7 @@ class Camera(Piece):
             source = {"calibration": os.fspath(calibration), "calibration_name": calibration_name}
             given = calibrated(given | source, Path.cwd())
         self.tree = self._checked(CameraConfig, given)
-        self.motion = _motion(pose, "Camera.pose")
-
-
-class Light(Piece):
-    """A sun and a sky: a white surface with normal n has radiance sun * max(0, n . s) + sky * (0.5 + 0.5 n_z); and
-    lights beside them.
-
-    elevation, azimuth : of the sun, degrees above the horizon and from +x towards +y (default 60, 40).
-    sun_color, sky_color : (3,) linear factors, white by default.
-    lights : tables as under ``light.lights`` of the YAML: ``{"kind": "point", "position": (0, 0, 2), "strength": 3}``,
-    ``{"kind": "spot", "position": …, "look_at": …, "angle": 40}``, ``{"kind": "sun", "elevation": 20}``.
-    environment : a panorama in the place of sun and sky, as ``light.environment``: ``{"map": "park.hdr"}``.
-    shadows : "off", "hard" or "soft".   sun_size : degrees, softens.   shadow_size : texels a side of a shadow map.
-    unlit : radiance = albedo everywhere.
-    Raises ConfigError; a panorama that is missing is found when the scene is built."""
-
-    def __init__(
-        self,
-        sun: float = 0.9,
-        sky: float = 0.6,
-        *,
-        elevation: float | None = None,
-        azimuth: float | None = None,
-        sun_color: Vector | None = None,
-        sky_color: Vector | None = None,
-        lights: Sequence[Mapping[str, Any]] = (),
-        environment: Mapping[str, Any] | None = None,
-        shadows: Literal["off", "hard", "soft"] = "off",
-        sun_size: float = 0.53,
-        shadow_size: int = 1024,
-        unlit: bool = False,
-    ):
-        check.one_of(lights, "Light.lights", (list, tuple), "a list of tables")
-        tree = check.given(
-            sun=sun,
-            sky=sky,
-            sun_elevation=elevation,
-            sun_azimuth=azimuth,
-            sun_color=sun_color,
-            sky_color=sky_color,
-            shadows=shadows,
-            sun_size=sun_size,
-            shadow_size=shadow_size,
-            unlit=unlit,
-        )
-        if environment is not None:
-            tree["environment"] = check.given(**check.one_of(environment, "Light.environment", Mapping, "a table"))
-        if lights:
-            for k, one in enumerate(lights):
-                check.one_of(one, f"Light.lights[{k}]", Mapping, "a table")
-            tree["lights"] = [check.given(**one) for one in lights]
-        self.tree = self._checked(LightConfig, tree, sun_elevation="elevation", sun_azimuth="azimuth")
-
-
-class Material(Piece):
-    """A surface: ``color`` times at most one texture, matt or with a gloss, and light of its own.
-
-    image : an image file (sRGB; .hdr is linear), or an array: (h, w, 3) uint8 sRGB, or
-    float, linear light; row 0 is the top.
-    color : (3,) linear factor.   procedural, seed : kind and number of a made-up texture, such as "bricks".
-    photograph : one that scikit-image brings, such as "astronaut".   uv_scale : (2,) repeats.
-    max_size : px, longer sides of a file are reduced.
-    unlit : radiance = albedo, whatever the light.   double_sided : draw back faces.
-    metallic, roughness : 0 to 1; 0 and 1 are matt; times ``metallic_roughness_map``, its blue and its green.
-    emission : (3,) linear radiance of its own; times ``emission_map``, sRGB.
-    normal_map : x to the right in the picture, y up, z outwards, 0 to 255 for -1 to 1; ``normal_scale`` times its x, y.
-    mask : what is there: holes where it is below ``cutoff`` (0 to 1).
-    Maps are files, or arrays (h, w, 3) uint8, of the mask (h, w) uint8.
-    Raises ConfigError; a missing file is found when the scene is built."""
-
-    def __init__(
-        self,
-        image: str | os.PathLike | np.ndarray | None = None,
-        *,
-        color: Vector = (1.0, 1.0, 1.0),
-        procedural: str | None = None,
-        seed: int = 0,
-        photograph: str | None = None,
-        uv_scale: Vector = (1.0, 1.0),
-        max_size: int = 2048,
-        unlit: bool = False,
-        double_sided: bool = False,
-        metallic: float = 0.0,
-        roughness: float = 1.0,
-        emission: Vector = (0.0, 0.0, 0.0),
-        metallic_roughness_map: str | os.PathLike | np.ndarray | None = None,
-        normal_map: str | os.PathLike | np.ndarray | None = None,
-        normal_scale: float = 1.0,
-        emission_map: str | os.PathLike | np.ndarray | None = None,
-        mask: str | os.PathLike | np.ndarray | None = None,
-        cutoff: float = 0.5,
-    ):
-        given = {
-            "metallic_roughness_map": metallic_roughness_map,
-            "normal_map": normal_map,
-            "emission_map": emission_map,
-            "mask": mask,
-        }
-        self.maps = {key: _map(map_, key) for key, map_ in given.items() if map_ is not None and not _is_file(map_)}
-        files = {key: map_ if _is_file(map_) or map_ is None else f"<{key}>" for key, map_ in given.items()}
-        self.image: data.Texture | None = None
-        if image is not None and not isinstance(image, (str, os.PathLike)):
-            self.image, image = _texture(image), None
-            if procedural is not None or photograph is not None:
-                raise ConfigError("only one of image, procedural, photograph may be given", where="Material.image")
-        tree = check.given(
-            texture=image,
-            procedural=procedural,
-            seed=seed,
-            photograph=photograph,
-            max_size=max_size,
-            color=color,
-            uv_scale=uv_scale,
-            unlit=unlit,
-            double_sided=double_sided,
-            metallic=metallic,
-            roughness=roughness,
-            emission=emission,
-            normal_scale=normal_scale,
-            cutoff=cutoff,
-            **files,
-        )
-        self.tree = self._checked(MaterialConfig, tree, texture="image")
-
-
-def _is_file(given: Any) -> bool:
-    return isinstance(given, (str, os.PathLike))
-
-
-def _map(given: Any, key: str) -> np.ndarray:
-    """(h, w, 3) uint8, of a mask (h, w)."""
-    shape = (None, None) if key == "mask" else (None, None, 3)
-    accepted = f"a file, or an array ({'h, w' if key == 'mask' else 'h, w, 3'}), uint8"
-    where = f"Material.{key}"
-    numbers = check.array(given, where, shape, accepted)
-    if not numbers.size or max(numbers.shape) > 16384:
-        raise ConfigError("size out of range", where=where, value=numbers.shape, accepted="1 to 16384 rows and columns")
-    if numbers.dtype != np.uint8:
-        raise ConfigError("pixels cannot be used", where=where, value=str(numbers.dtype), accepted=accepted)
-    return np.array(numbers, order="C")
-
-
-def _texture(image: Any) -> data.Texture:
-    accepted = "a file, or an array (h, w, 3), uint8 sRGB or float linear light >= 0"
-    pixels = check.array(image, "Material.image", (None, None, 3), accepted)
-    if not pixels.size or max(pixels.shape) > 16384:
-        raise ConfigError(
-            "size out of range", where="Material.image", value=pixels.shape, accepted="1 to 16384 rows and columns"
-        )
-    if pixels.dtype != np.uint8:
-        if pixels.dtype.kind != "f" or not (np.isfinite(pixels).all() and pixels.min() >= 0):
-            raise ConfigError(
-                "pixels cannot be used", where="Material.image", value=str(pixels.dtype), accepted=accepted
-            )
-        pixels = pixels.astype(np.float32)
-    pixels = np.array(pixels, order="C")  # a copy: the scene is a value
-    return data.Texture(pixels, "image", content_hash(str((pixels.dtype, pixels.shape)).encode(), pixels.tobytes()))
+        self.motion = motion_tree(pose, "Camera.pose")
 
 
 class Body(Piece):
@@ -477,7 +207,7 @@ class _Object(Piece):
     ) -> dict[str, Any]:
         kind = type(self).__name__
         self.material = None if material is None else check.one_of(material, f"{kind}.material", Material, "a Material")
-        motion = {"way": pose.tree} if isinstance(pose, Way) else _motion(pose, f"{kind}.pose", "Way, ")
+        motion = {"way": pose.tree} if isinstance(pose, Way) else motion_tree(pose, f"{kind}.pose", "Way, ")
         tree = {"mesh": "mesh", **check.given(name=name, scale=scale, category=category), **motion}
         if body is not None:
             tree["physics"] = check.one_of(body, f"{kind}.body", Body, "a Body").tree

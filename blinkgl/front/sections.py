@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from blinkgl.config.base import Config, validate_field
+from blinkgl.config.base import Config
+from blinkgl.config.problems import validate_field
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check

@@ -22,8 +22,8 @@ import numba
 import numpy as np
 from numpy.typing import DTypeLike
 
-from blinkgl.config.base import validate
 from blinkgl.config.events import EmulatorConfig
+from blinkgl.config.problems import validate
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import ConfigError, EventDataError, OutputError
 from blinkgl.events.camera import EventCamera, EventFrame, emulate

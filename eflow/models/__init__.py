@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from blinkgl.config.base import Config, tag_of, validate
+from blinkgl.config.base import Config, tag_of
+from blinkgl.config.problems import validate
 from eflow.config import ModelConfig
 from eflow.models.contract import FlowModel, FlowPrediction, parameters_of
 from eflow.models.eflowformer import EFlowFormer

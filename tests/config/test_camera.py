@@ -8,9 +8,9 @@ import pytest
 import blinkgl
 from blinkgl.camera import Equidistant, PinHole, Radtan
 from blinkgl.camera.drawing import DENSITY, seen_through
-from blinkgl.config.base import validate
 from blinkgl.config.camchain import Calibrated, cam_to_cam_yaml, camchain_yaml, read_camchain
 from blinkgl.config.camera import CameraConfig, camera_keys
+from blinkgl.config.problems import validate
 from blinkgl.config.run import load_run
 from blinkgl.errors import ConfigError
 

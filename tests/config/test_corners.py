@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 from pydantic import Field, model_validator
 
-from blinkgl.config.base import Config, Refused, Rule, remembering, rule, validate
+from blinkgl.config.base import Config, Refused, Rule, remembering, rule
 from blinkgl.config.corners import Fill, corners, placed_rules, sites
+from blinkgl.config.problems import validate
 from blinkgl.config.recipe import all_groups
 from blinkgl.config.run import FILLS, RunTemplate, load_run
 from blinkgl.config.sequence import SequenceConfig

@@ -9,7 +9,8 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from blinkgl.config import base
-from blinkgl.config.base import PROBLEMS, members, validate
+from blinkgl.config.base import members
+from blinkgl.config.problems import PROBLEMS, validate
 from blinkgl.config.run import load_run
 from blinkgl.config.sensor import SensorConfig
 from blinkgl.config.sequence import SequenceConfig

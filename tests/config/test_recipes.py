@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from blinkgl.config.base import validate
 from blinkgl.config.draw import draw, middle, options
 from blinkgl.config.events import EsimConfig, V2eConfig
+from blinkgl.config.problems import validate
 from blinkgl.config.recipes import load_recipe, recipe_names
 from blinkgl.config.run import load_run
 from blinkgl.errors import ConfigError

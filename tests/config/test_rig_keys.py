@@ -7,7 +7,7 @@ from importlib import resources
 import numpy as np
 import pytest
 
-from blinkgl.config.base import validate
+from blinkgl.config.problems import validate
 from blinkgl.config.reader import parse_yaml
 from blinkgl.config.recipes import load_recipe, recipe_names
 from blinkgl.config.rig import PlaceConfig, rig_names

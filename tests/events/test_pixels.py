@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from blinkgl.config.base import validate
 from blinkgl.config.events import EsimConfig, V2eConfig
+from blinkgl.config.problems import validate
 from blinkgl.config.readout import LatencyConfig, PixelsConfig, ReadoutConfig
 from blinkgl.errors import ConfigError
 from blinkgl.events import Events, make_emulator

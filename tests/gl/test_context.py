@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from blinkgl.config.base import validate
 from blinkgl.config.gl import GLConfig
+from blinkgl.config.problems import validate
 from blinkgl.errors import ConfigError, GLError
 from blinkgl.gl import context as context_module, create_context, egl_devices, osmesa
 

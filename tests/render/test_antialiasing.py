@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from blinkgl.camera import PinHole
-from blinkgl.config.base import validate
+from blinkgl.config.problems import validate
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import ConfigError, GLError
 from blinkgl.labels import LabelRequest

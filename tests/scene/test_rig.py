@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import PinHole
-from blinkgl.config.base import validate
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.labels import LabelsConfig
+from blinkgl.config.problems import validate
 from blinkgl.config.sequence import RenderConfig, SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.labels import LabelRequest

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from blinkgl.config.base import validate
 from blinkgl.config.camera import CameraConfig
 from blinkgl.config.lights import LightConfig, RandomLightsConfig
+from blinkgl.config.problems import validate
 from blinkgl.config.scene import ExplicitSceneConfig, RandomSceneConfig
 from blinkgl.errors import ConfigError
 from blinkgl.rng import Role, generator

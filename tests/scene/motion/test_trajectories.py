@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from blinkgl.config.base import validate
+from blinkgl.config.problems import validate
 from blinkgl.config.trajectory import CameraMotion, ObjectMotion
 from blinkgl.errors import ConfigError
 from blinkgl.scene.motion.paths import PausedPath, SplinePath, StaticPath

@@ -124,7 +124,7 @@ def test_two_bodies_keep_clear_of_all_that_a_third_sweeps():
 
 
 def test_a_configuration_is_refused_in_words():
-    from blinkgl.config.base import validate
+    from blinkgl.config.problems import validate
     from blinkgl.config.scene import ObjectConfig
 
     for data, said in (

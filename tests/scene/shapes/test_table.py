@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from blinkgl.cli import run
-from blinkgl.config.base import validate
 from blinkgl.config.deform import DeformConfig
+from blinkgl.config.problems import validate
 from blinkgl.config.scene import ObjectConfig
 from blinkgl.errors import ConfigError
 from blinkgl.scene.shapes.deformer import Deformer

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from blinkgl.config.base import validate
 from blinkgl.config.camera import CameraConfig
+from blinkgl.config.problems import validate
 from blinkgl.config.run import load_run
 from blinkgl.config.scene import ExplicitSceneConfig, RandomSceneConfig
 from blinkgl.errors import ConfigError

@@ -6,9 +6,9 @@ import trimesh
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from blinkgl.config.base import validate
 from blinkgl.config.camera import CameraConfig
 from blinkgl.config.poses import PoseConfig
+from blinkgl.config.problems import validate
 from blinkgl.config.scene import ExplicitSceneConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene

@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blinkgl.config.base import validate
 from blinkgl.config.camera import CameraConfig, camera_radius
 from blinkgl.config.physics import RandomPhysicsConfig
+from blinkgl.config.problems import validate
 from blinkgl.config.scene import ExplicitSceneConfig, ObjectsConfig, PoolConfig, RandomSceneConfig, TexturesConfig
 from blinkgl.errors import ConfigError
 from blinkgl.scene.build import build_scene

@@ -8,9 +8,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from shared_data import shared
 
-from blinkgl.config.base import validate
 from blinkgl.config.camera import CameraConfig
 from blinkgl.config.deform import AnimationConfig, ClipConfig
+from blinkgl.config.problems import validate
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene

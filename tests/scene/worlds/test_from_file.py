@@ -9,8 +9,8 @@ import trimesh
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from blinkgl.config.base import validate
 from blinkgl.config.camera import CameraConfig
+from blinkgl.config.problems import validate
 from blinkgl.config.scene import FileSceneConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene

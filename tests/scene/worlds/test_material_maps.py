@@ -8,7 +8,7 @@ import pytest
 
 import blinkgl
 from blinkgl import ConfigError
-from blinkgl.config.base import validate
+from blinkgl.config.problems import validate
 from blinkgl.config.scene import ExplicitSceneConfig
 from blinkgl.dataset.plan import _hash_scene_files
 from blinkgl.errors import BlinkGLError

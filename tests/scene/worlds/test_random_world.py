@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from blinkgl.config.base import validate
 from blinkgl.config.camera import CameraConfig
 from blinkgl.config.lights import LightConfig
+from blinkgl.config.problems import validate
 from blinkgl.config.scene import (
     ExplicitSceneConfig,
     ObjectsConfig,

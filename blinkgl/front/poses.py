@@ -1,0 +1,129 @@
+"""Where bodies and cameras are, in Python: the pieces of a motion."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from blinkgl.config.base import Config
+from blinkgl.config.poses import KeyedMotionConfig, PoseConfig
+from blinkgl.config.problems import validate
+from blinkgl.errors import ConfigError
+from blinkgl.front import arguments as check
+
+Vector = Sequence[float] | np.ndarray
+
+
+class Piece:
+    """A value that is checked when it is made. ``tree``: itself as plain data, as the YAML has it."""
+
+    tree: dict[str, Any]
+
+    def _checked(self, model: type[Config], tree: dict[str, Any], **renamed: str) -> dict[str, Any]:
+        """``tree`` as it is, when the model takes it. renamed : what keys of the model are
+        called as arguments; "": by their own keys."""
+        try:
+            validate(model, tree)
+        except ConfigError as error:
+            first, *rest = (error.where or "config").split(".")
+            at = [step for step in (renamed.get(first, first), *rest) if step not in ("", "config")]
+            raise ConfigError(
+                error.problem, where=".".join([type(self).__name__, *at]), value=error.value, accepted=error.accepted
+            ) from None
+        return tree
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(f'{k}={v!r}' for k, v in self.tree.items())})"
+
+
+class Pose(Piece):
+    """Where a body or a camera is, and at most one way to say how it is turned.
+
+    position : (3,) m.   euler : (3,) degrees about the world's x, then y, then z.   quaternion : (4,) w, x, y, z.
+    look_at : (3,) m, the point that a camera's z axis, or a body's x axis, is turned to. At
+    rest a camera looks along +x with z up.
+    Raises ConfigError."""
+
+    def __init__(
+        self,
+        position: Vector = (0.0, 0.0, 0.0),
+        *,
+        euler: Vector | None = None,
+        quaternion: Vector | None = None,
+        look_at: Vector | None = None,
+    ):
+        self.tree = self._checked(
+            PoseConfig, check.given(position=position, euler=euler, quaternion=quaternion, look_at=look_at)
+        )
+
+
+def look_at(position: Vector, target: Vector) -> Pose:
+    """A :class:`Pose` at ``position`` (3,) m, turned to the point ``target`` (3,) m; a camera's
+    horizon is level. Raises ConfigError."""
+    return Pose(position, look_at=target)
+
+
+class Keyframes(Piece):
+    """A motion through poses: ``Keyframes({0.0: Pose(…), 1.5: Pose(…)})``, held before
+    the first time and after the last.
+
+    poses : time in s -> :class:`Pose`, two or more; from one to the next less than half a turn.
+    interpolation : "spline" (twice continuously differentiable) or "linear" (straight lines and slerp).
+    Raises ConfigError."""
+
+    def __init__(self, poses: Mapping[float, Pose], interpolation: Literal["spline", "linear"] = "spline"):
+        check.one_of(poses, "Keyframes.poses", Mapping, "a table of times and poses")
+        for time, pose in poses.items():
+            check.number(time, "Keyframes.poses")
+            check.one_of(pose, f"Keyframes.poses[{time}]", Pose, "a Pose, as look_at makes one")
+        frames = [{"time": check.plain(time), **poses[time].tree} for time in sorted(poses)]
+        if not frames:
+            raise ConfigError("too few entries", where="Keyframes.poses", value=poses, accepted="two or more poses")
+        self.tree = self._checked(
+            KeyedMotionConfig, {"keyframes": frames, "interpolation": check.plain(interpolation)}, keyframes="poses"
+        )
+
+
+class Trajectory(Piece):
+    """A motion from a file, TUM's or EuRoC's, by a spline: ``Camera(pose=Trajectory("flight.txt"))``.
+
+    file : path.   form : "tum", "euroc"; "auto": EuRoC's where lines have commas.   start : s on the file's clock that
+    are 0 s on the scene's; None: its first pose is where the sequence begins.   smooth : s, each pose becomes the mean
+    of those within it.   speed_limit : units/s, turn_limit : degrees/s, beyond which poses are refused.
+    T_body_sensor : where the camera or body that follows it is on the body whose poses these are: (4, 4), or the path
+    of EuRoC's sensor.yaml, whose T_BS that is; None: it is that body.
+    Raises ConfigError; a file that does not cover the sequence is found when the scene is built."""
+
+    def __init__(
+        self,
+        file: str | os.PathLike,
+        *,
+        form: Literal["auto", "tum", "euroc"] = "auto",
+        start: float | None = None,
+        smooth: float = 0.0,
+        speed_limit: float = 100.0,
+        turn_limit: float = 7200.0,
+        T_body_sensor: ArrayLike | str | os.PathLike | None = None,
+    ):
+        tree = check.given(file=os.fspath(check.path(file, "file").absolute()), form=form, start=start, smooth=smooth)
+        tree |= check.given(speed_limit=speed_limit, turn_limit=turn_limit)
+        if isinstance(T_body_sensor, (str, os.PathLike)):
+            tree["T_body_sensor"] = os.fspath(check.path(T_body_sensor, "T_body_sensor").absolute())
+        elif T_body_sensor is not None:
+            place = check.array(T_body_sensor, "Trajectory.T_body_sensor", (4, 4), "a file, or an array (4, 4)")
+            tree["T_body_sensor"] = check.plain(place)
+        self.tree = self._checked(KeyedMotionConfig, {"trajectory": tree}, trajectory="")
+
+
+def motion_tree(pose: Pose | Keyframes | Trajectory | Vector, where: str, others: str = "") -> dict[str, Any]:
+    """A position alone is a pose. others : what else may be given, for the message."""
+    if isinstance(pose, (Pose, Keyframes, Trajectory)):
+        return pose.tree
+    check.one_of(
+        pose, where, (list, tuple, np.ndarray), f"a Pose, Keyframes, Trajectory, {others}or a position of three numbers"
+    )
+    return Pose(pose).tree

@@ -1,0 +1,173 @@
+"""Light and materials in Python."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from blinkgl.config.lights import LightConfig
+from blinkgl.config.materials import MaterialConfig
+from blinkgl.errors import ConfigError
+from blinkgl.front import arguments as check
+from blinkgl.front.poses import Piece, Vector
+from blinkgl.scene import types as data
+from blinkgl.scene.surfaces.images import content_hash
+
+
+class Light(Piece):
+    """A sun and a sky: a white surface with normal n has radiance sun * max(0, n . s) + sky * (0.5 + 0.5 n_z); and
+    lights beside them.
+
+    elevation, azimuth : of the sun, degrees above the horizon and from +x towards +y (default 60, 40).
+    sun_color, sky_color : (3,) linear factors, white by default.
+    lights : tables as under ``light.lights`` of the YAML: ``{"kind": "point", "position": (0, 0, 2), "strength": 3}``,
+    ``{"kind": "spot", "position": …, "look_at": …, "angle": 40}``, ``{"kind": "sun", "elevation": 20}``.
+    environment : a panorama in the place of sun and sky, as ``light.environment``: ``{"map": "park.hdr"}``.
+    shadows : "off", "hard" or "soft".   sun_size : degrees, softens.   shadow_size : texels a side of a shadow map.
+    unlit : radiance = albedo everywhere.
+    Raises ConfigError; a panorama that is missing is found when the scene is built."""
+
+    def __init__(
+        self,
+        sun: float = 0.9,
+        sky: float = 0.6,
+        *,
+        elevation: float | None = None,
+        azimuth: float | None = None,
+        sun_color: Vector | None = None,
+        sky_color: Vector | None = None,
+        lights: Sequence[Mapping[str, Any]] = (),
+        environment: Mapping[str, Any] | None = None,
+        shadows: Literal["off", "hard", "soft"] = "off",
+        sun_size: float = 0.53,
+        shadow_size: int = 1024,
+        unlit: bool = False,
+    ):
+        check.one_of(lights, "Light.lights", (list, tuple), "a list of tables")
+        tree = check.given(
+            sun=sun,
+            sky=sky,
+            sun_elevation=elevation,
+            sun_azimuth=azimuth,
+            sun_color=sun_color,
+            sky_color=sky_color,
+            shadows=shadows,
+            sun_size=sun_size,
+            shadow_size=shadow_size,
+            unlit=unlit,
+        )
+        if environment is not None:
+            tree["environment"] = check.given(**check.one_of(environment, "Light.environment", Mapping, "a table"))
+        if lights:
+            for k, one in enumerate(lights):
+                check.one_of(one, f"Light.lights[{k}]", Mapping, "a table")
+            tree["lights"] = [check.given(**one) for one in lights]
+        self.tree = self._checked(LightConfig, tree, sun_elevation="elevation", sun_azimuth="azimuth")
+
+
+class Material(Piece):
+    """A surface: ``color`` times at most one texture, matt or with a gloss, and light of its own.
+
+    image : an image file (sRGB; .hdr is linear), or an array: (h, w, 3) uint8 sRGB, or
+    float, linear light; row 0 is the top.
+    color : (3,) linear factor.   procedural, seed : kind and number of a made-up texture, such as "bricks".
+    photograph : one that scikit-image brings, such as "astronaut".   uv_scale : (2,) repeats.
+    max_size : px, longer sides of a file are reduced.
+    unlit : radiance = albedo, whatever the light.   double_sided : draw back faces.
+    metallic, roughness : 0 to 1; 0 and 1 are matt; times ``metallic_roughness_map``, its blue and its green.
+    emission : (3,) linear radiance of its own; times ``emission_map``, sRGB.
+    normal_map : x to the right in the picture, y up, z outwards, 0 to 255 for -1 to 1; ``normal_scale`` times its x, y.
+    mask : what is there: holes where it is below ``cutoff`` (0 to 1).
+    Maps are files, or arrays (h, w, 3) uint8, of the mask (h, w) uint8.
+    Raises ConfigError; a missing file is found when the scene is built."""
+
+    def __init__(
+        self,
+        image: str | os.PathLike | np.ndarray | None = None,
+        *,
+        color: Vector = (1.0, 1.0, 1.0),
+        procedural: str | None = None,
+        seed: int = 0,
+        photograph: str | None = None,
+        uv_scale: Vector = (1.0, 1.0),
+        max_size: int = 2048,
+        unlit: bool = False,
+        double_sided: bool = False,
+        metallic: float = 0.0,
+        roughness: float = 1.0,
+        emission: Vector = (0.0, 0.0, 0.0),
+        metallic_roughness_map: str | os.PathLike | np.ndarray | None = None,
+        normal_map: str | os.PathLike | np.ndarray | None = None,
+        normal_scale: float = 1.0,
+        emission_map: str | os.PathLike | np.ndarray | None = None,
+        mask: str | os.PathLike | np.ndarray | None = None,
+        cutoff: float = 0.5,
+    ):
+        given = {
+            "metallic_roughness_map": metallic_roughness_map,
+            "normal_map": normal_map,
+            "emission_map": emission_map,
+            "mask": mask,
+        }
+        self.maps = {key: _map(map_, key) for key, map_ in given.items() if map_ is not None and not _is_file(map_)}
+        files = {key: map_ if _is_file(map_) or map_ is None else f"<{key}>" for key, map_ in given.items()}
+        self.image: data.Texture | None = None
+        if image is not None and not isinstance(image, (str, os.PathLike)):
+            self.image, image = _texture(image), None
+            if procedural is not None or photograph is not None:
+                raise ConfigError("only one of image, procedural, photograph may be given", where="Material.image")
+        tree = check.given(
+            texture=image,
+            procedural=procedural,
+            seed=seed,
+            photograph=photograph,
+            max_size=max_size,
+            color=color,
+            uv_scale=uv_scale,
+            unlit=unlit,
+            double_sided=double_sided,
+            metallic=metallic,
+            roughness=roughness,
+            emission=emission,
+            normal_scale=normal_scale,
+            cutoff=cutoff,
+            **files,
+        )
+        self.tree = self._checked(MaterialConfig, tree, texture="image")
+
+
+def _is_file(given: Any) -> bool:
+    return isinstance(given, (str, os.PathLike))
+
+
+def _map(given: Any, key: str) -> np.ndarray:
+    """(h, w, 3) uint8, of a mask (h, w)."""
+    shape = (None, None) if key == "mask" else (None, None, 3)
+    accepted = f"a file, or an array ({'h, w' if key == 'mask' else 'h, w, 3'}), uint8"
+    where = f"Material.{key}"
+    numbers = check.array(given, where, shape, accepted)
+    if not numbers.size or max(numbers.shape) > 16384:
+        raise ConfigError("size out of range", where=where, value=numbers.shape, accepted="1 to 16384 rows and columns")
+    if numbers.dtype != np.uint8:
+        raise ConfigError("pixels cannot be used", where=where, value=str(numbers.dtype), accepted=accepted)
+    return np.array(numbers, order="C")
+
+
+def _texture(image: Any) -> data.Texture:
+    accepted = "a file, or an array (h, w, 3), uint8 sRGB or float linear light >= 0"
+    pixels = check.array(image, "Material.image", (None, None, 3), accepted)
+    if not pixels.size or max(pixels.shape) > 16384:
+        raise ConfigError(
+            "size out of range", where="Material.image", value=pixels.shape, accepted="1 to 16384 rows and columns"
+        )
+    if pixels.dtype != np.uint8:
+        if pixels.dtype.kind != "f" or not (np.isfinite(pixels).all() and pixels.min() >= 0):
+            raise ConfigError(
+                "pixels cannot be used", where="Material.image", value=str(pixels.dtype), accepted=accepted
+            )
+        pixels = pixels.astype(np.float32)
+    pixels = np.array(pixels, order="C")  # a copy: the scene is a value
+    return data.Texture(pixels, "image", content_hash(str((pixels.dtype, pixels.shape)).encode(), pixels.tobytes()))

@@ -138,12 +138,12 @@ def compared(config: Any, height: int, width: int, envs: int, device: str, seed:
     return total
 
 
-def noise(height: int, width: int, density: float, frames: int = 2) -> np.ndarray:
+def noise(height: int, width: int, density: float, frames: int) -> np.ndarray:
     """(frames, H, W) float32 with ``density`` events a pixel and frame at thresholds of 0.2: pixels drawn by lot go
     there and back again, over the same levels each time, from the second frame on."""
     rng, levels = np.random.default_rng(1), max(1, int(np.ceil(density)))
     moving = rng.choice((-1.0, 1.0), (height, width)) * (rng.random((height, width)) < density / levels)
-    places = np.where(np.arange(frames) % 2 == 1, levels + 0.5, -0.2)  # in thresholds, a little beyond the levels
+    places = np.where(np.arange(frames) % 2 == 1, levels + 0.5, -0.5)  # in thresholds, beyond the levels by its spread
     return np.exp(0.2 * places[:, None, None] * moving - 1.0).astype(np.float32)
 
 
@@ -154,7 +154,7 @@ def kernel_piece(options: Namespace) -> Iterator[Row]:
     for density, envs in itertools.product(DENSITIES, (1, 16, 256)):
         if options.device == "cpu" and density * envs * height * width > 3e7:
             continue  # a step would take a processor minutes and more than 10 GB
-        clip = noise(height, width, density)
+        clip = noise(height, width, density, 3)[1:]  # there and back again, for ever
         frames = torch.from_numpy(clip).to(options.device)[:, None].expand(2, envs, height, width).contiguous()
         batch = TensorEsim(height, width, config, envs=envs, device=options.device)
         single = emulator_of(config)(height, width, config)

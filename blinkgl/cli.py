@@ -15,6 +15,7 @@ from typing import Annotated
 import typer
 
 from blinkgl import __version__
+from blinkgl.errors import ConfigError
 from blinkgl.machine.command_line import run_app
 from blinkgl.shader_debugger.cli import app as shader_app
 
@@ -448,20 +449,8 @@ def calibrate(
     still: Annotated[
         bool, typer.Option("--still", help="No frames: a scene that stands still in constant light. Noise alone.")
     ] = False,
-    flicker: Annotated[
-        str | None,
-        typer.Option(
-            metavar="HZ,CONTRAST",
-            help="No frames: an even scene under light that goes as 1 + CONTRAST sin, HZ times a second. Thresholds.",
-        ),
-    ] = None,
-    edge: Annotated[
-        str | None,
-        typer.Option(
-            metavar="CONTRAST[,WIDTH]",
-            help="No frames: straight borders of two tones that move at constant speed; WIDTH in px. Thresholds.",
-        ),
-    ] = None,
+    flicker: Annotated[str | None, typer.Option("--flicker", hidden=True)] = None,
+    edge: Annotated[str | None, typer.Option("--edge", hidden=True)] = None,
     emulator: Annotated[
         str,
         typer.Option("--emulator", "-e", help="esim, v2e or voltmeter; with --still also pixels: noise beside any."),
@@ -487,13 +476,12 @@ def calibrate(
     """Fit an emulator to a camera's own recording: a sensor file, and a page that says how near it comes."""
     from blinkgl.show import calibrate as command
 
+    _gone("no scene is guessed without frames", "--frames or --still", **{"--flicker": flicker, "--edge": edge})
     return command.run(
         recording,
         frames,
         out,
         still=still,
-        flicker=flicker,
-        edge=edge,
         emulator=emulator,
         sensor=sensor,
         overrides=overrides or [],
@@ -546,7 +534,9 @@ def convert(
 
 @app.command("import")
 def import_(
-    source: Annotated[str, typer.Argument(metavar="SCENE", help=".blend, .fbx, .usd/.usda/.usdc/.usdz, .dae or .abc.")],
+    source: Annotated[
+        str, typer.Argument(metavar="SCENE", help=".blend, .fbx, .usd/.usda/.usdc/.usdz, .dae, .abc or .obj.")
+    ],
     out: Annotated[str, typer.Option("--out", "-o", help="The GLB to write.")],
     scene: Annotated[
         str | None, typer.Option("--scene", help="Name of the file's scene (default: the one it was saved in).")
@@ -565,12 +555,8 @@ def import_(
     clips: Annotated[
         bool, typer.Option("--clips", help="An animation per action, not one of the scene as it plays.")
     ] = False,
-    texture_size: Annotated[
-        int, typer.Option("--texture-size", min=16, max=8192, help="Sides of baked pictures, px.")
-    ] = 1024,
-    bake_seconds: Annotated[
-        float, typer.Option("--bake-seconds", min=0, help="After so long no further picture is begun.")
-    ] = 120.0,
+    texture_size: Annotated[int | None, typer.Option("--texture-size", hidden=True)] = None,
+    bake_seconds: Annotated[float | None, typer.Option("--bake-seconds", hidden=True)] = None,
     time_limit: Annotated[
         float, typer.Option("--time-limit", min=1, help="Seconds that Blender may take altogether.")
     ] = 900.0,
@@ -582,6 +568,8 @@ def import_(
     could not."""
     from blinkgl.show import import_ as command
 
+    given = {"--texture-size": texture_size, "--bake-seconds": bake_seconds}
+    _gone("colours are no longer baked", "colours baked in Blender", **given)
     return command.run(
         source,
         out,
@@ -592,11 +580,16 @@ def import_(
         fps=fps,
         keys_per_frame=keys_per_frame,
         clips=clips,
-        texture_size=texture_size,
-        bake_s=bake_seconds,
         time_limit_s=time_limit,
         overwrite=overwrite,
     )
+
+
+def _gone(problem: str, accepted: str, **options: object) -> None:
+    """Refuses options that earlier versions had."""
+    for option, value in options.items():
+        if value is not None:
+            raise ConfigError(problem, where=option, accepted=accepted)
 
 
 # --- frame ------------------------------------------------------------------------------------------------------------

@@ -1,10 +1,10 @@
 """Scenes of Blender and of the formats it reads, as a GLB.
 
     came = import_scene("shop.blend", "shop.glb")
-    came.rows                                       # what came and what could not
+    came.counts, came.left_out                      # what came, and what could not
 
-Blender opens the file in a process of its own (:mod:`blinkgl.blender.process`), applies modifiers, bakes what glTF
-cannot say and exports; the GLB is read back by BlinkGL's own importer before it gets its name.
+Blender opens the file in a process of its own (:mod:`blinkgl.blender.process`) and exports it by its own exporter of
+glTF, modifiers applied; the GLB is read back by BlinkGL's own importer before it gets its name.
 """
 
 from __future__ import annotations
@@ -28,35 +28,26 @@ from blinkgl.scene.importing import gltf
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.worlds.from_file import from_gltf
 
-PROGRAM = Path(__file__).with_name("inside")
-ENDINGS = (".blend", ".fbx", ".usd", ".usda", ".usdc", ".usdz", ".dae", ".abc")
+PROGRAM = Path(__file__).with_name("inside") / "convert.py"
+ENDINGS = (".blend", ".fbx", ".usd", ".usda", ".usdc", ".usdz", ".dae", ".abc", ".obj")
 _MOST_FACES = 1 << 31
 _FRAME = 1_048_574  # Blender's own limit of frame numbers
-
-
-@dataclass(frozen=True)
-class Row:
-    """kind : of things in the file.   found : how many there are.   came : how many are in the GLB, in whatever form.
-    notes : how they came, and which did not and why."""
-
-    kind: str
-    found: int
-    came: int
-    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Imported:
     """What an import brought.
 
-    blender : version.   rows : what came and what could not.   cameras : names; camera : the scene's own, None without.
+    blender : version.   counts : of what is in the GLB (meshes, triangles …).   left_out : what is not, a line each.
+    cameras : names; camera : the scene's own, None without.
     size : (width, height) px of its render.   frames : (first, last) of the file.   fps : of the file.
     duration_s : of the animation.   omissions : what BlinkGL does not draw of the GLB, a line each.
     """
 
     path: Path
     blender: str
-    rows: tuple[Row, ...]
+    counts: dict[str, int]
+    left_out: tuple[str, ...]
     cameras: tuple[str, ...]
     camera: str | None
     size: tuple[int, int]
@@ -69,11 +60,6 @@ class Imported:
         """All of it as plain data, for JSON."""
         return {**asdict(self), "path": str(self.path)}
 
-    @property
-    def left_out(self) -> tuple[Row, ...]:
-        """Rows of which something is missing."""
-        return tuple(row for row in self.rows if row.came < row.found)
-
 
 def import_scene(
     source: str | os.PathLike[str],
@@ -84,8 +70,6 @@ def import_scene(
     fps: float | None = None,
     keys_per_frame: int = 1,
     clips: bool = False,
-    texture_size: int = 1024,
-    bake_s: float = 120.0,
     time_limit_s: float = 900.0,
     overwrite: bool = False,
     progress: Callable[[str], None] | None = None,
@@ -96,12 +80,11 @@ def import_scene(
     fps : frames per second; None: the file's, 24 where its format does not say (USD, Collada, Alembic).
     keys_per_frame : key frames written per frame; between them glTF goes straight.
     clips : an animation per action instead of one of the scene as it plays.
-    texture_size : px of a side of a baked picture.   bake_s : seconds after which none is begun any more.
     time_limit_s : seconds that Blender may take altogether.   progress : told what it does.
     Raises AssetError (the file), ConfigError (an option), OutputError, BlinkGLError (no Blender, or it crashed).
     """
     source, out = Path(source), Path(out)
-    _check_options(source, out, frames, fps, keys_per_frame, texture_size, bake_s, time_limit_s)
+    _check_options(source, out, frames, fps, keys_per_frame, time_limit_s)
     with atomic_file(out, overwrite=overwrite) as temporary:
         with output_errors(temporary):
             temporary.touch()  # now, not after minutes
@@ -115,7 +98,6 @@ def import_scene(
                 "fps": fps,
                 "keys_per_frame": keys_per_frame,
                 "clips": clips,
-                "bake": {"size": texture_size, "seconds": bake_s},
             }
             (folder / "job.json").write_text(json.dumps(job))
             report = _run(folder, source, time_limit_s, progress or (lambda doing: None))
@@ -125,7 +107,8 @@ def import_scene(
     return Imported(
         out,
         report["blender"],
-        tuple(Row(r["kind"], r["found"], r["came"], tuple(r["notes"])) for r in report["rows"]),
+        report["counts"],
+        tuple(report["left_out"]),
         tuple(report["cameras"]),
         report["camera"],
         (report["size"][0], report["size"][1]),
@@ -136,7 +119,7 @@ def import_scene(
     )
 
 
-def _check_options(source: Path, out: Path, frames, fps, keys_per_frame, texture_size, bake_s, time_limit_s) -> None:
+def _check_options(source: Path, out: Path, frames, fps, keys_per_frame, time_limit_s) -> None:
     if source.suffix.lower() not in ENDINGS:
         accepted = ", ".join(ENDINGS)
         if source.suffix.lower() in (".glb", ".gltf"):
@@ -156,8 +139,6 @@ def _check_options(source: Path, out: Path, frames, fps, keys_per_frame, texture
     for option, value, low, high in (
         ("--fps", 24.0 if fps is None else fps, 1, 10_000),
         ("--keys-per-frame", keys_per_frame, 1, 64),
-        ("--texture-size", texture_size, 16, 8192),
-        ("--bake-seconds", bake_s, 0, 1e6),
         ("--time-limit", time_limit_s, 1, 1e6),
     ):
         if not low <= value <= high:
@@ -192,7 +173,5 @@ def _read_back(path: Path, out: Path) -> tuple[str, ...]:
             path, PinHole.centred(32, 32, 32.0), 0, 1, camera_path=still, max_faces=_MOST_FACES, max_texture=16384
         )
     except BlinkGLError as error:
-        raise AssetError(
-            f"what Blender wrote cannot be read ({error.problem})", where=str(out), accepted="see the table's notes"
-        ) from error
+        raise AssetError(f"what Blender wrote cannot be read ({error.problem})", where=str(out)) from error
     return tuple(line.replace(path.name, out.name) for line in scene.omissions)

@@ -1,13 +1,13 @@
 """What stands between the pixels of a sensor and the outside: pixels that are broken or noisy by themselves, latency,
-the bus and its clock, filters on the camera. In this order; what is not said is not there."""
+the bus and its clock. In this order; what is not said is not there."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar
 
 from pydantic import Field
 
-from blinkgl.config.base import Config, Refused, one_of, rule
+from blinkgl.config.base import Config, Refused, Removed, rule
 
 
 class PixelsConfig(Config):
@@ -68,77 +68,11 @@ class LatencyConfig(Config):
         return self.fixed_us + self.dark_us + 6.0 * self.jitter_us
 
 
-class TrailFilter(Config):
-    """Of every burst, a pixel's events of one polarity each at most `threshold_us` after the one before: the first
-    alone (`first`), the second alone (`second`: STC_CUT_TRAIL), or all but the first (`not_first`: STC_KEEP_TRAIL).
-    Definitions: `I_EventTrailFilterModule` of Prophesee's HAL (OpenEB 5.1)."""
-
-    kind: Literal["trail"] = "trail"
-    keep: Literal["first", "second", "not_first"] = Field("first", description="Which events of a burst pass.")
-    threshold_us: float = Field(
-        10_000.0,
-        ge=1,
-        le=1e9,
-        description="Longest time between two events of a burst; an IMX636 takes 1,000 to 100,000.",
-    )
-
-
-class RateFilter(Config):
-    """Event-rate control: at most `events_per_second * period_us` events in every period (`I_ErcModule` of Prophesee's
-    HAL). After a period that had more, events pass at even distances, by how many that one had."""
-
-    kind: Literal["rate"] = "rate"
-    events_per_second: float = Field(20e6, ge=1, le=1e12, description="Most that pass; the default is a Gen4.1's.")
-    period_us: int = Field(200, ge=1, le=10_000_000, description="Count period; the default is a Gen4.1's.")
-
-    @property
-    def limit(self) -> int:
-        """Events a period."""
-        return int(self.events_per_second * self.period_us / 1e6 + 1e-9)
-
-    @rule("events_per_second", "period_us")
-    def _lets_something_pass(rate: float, period: int):
-        if rate * period < 1e6:
-            raise Refused(
-                "not one event a period would pass",
-                where="period_us",
-                value=period,
-                accepted=f"at least {1e6 / rate:.0f} at this rate",
-            )
-
-
-class FlickerFilter(Config):
-    """Anti-flicker: in a square of `block` x `block` pixels, bursts begin where ON follows OFF. After `start` bursts at
-    distances from 1/`high_hz` to 1/`low_hz` its events are dropped (`stop`), or only then passed (`pass`), until fewer
-    than `stop_below` are left: a distance that is too short takes one back, a pause that is too long all. Band, block
-    and thresholds are those of `I_AntiFlickerModule` of Prophesee's HAL and of its manual of event signal processing,
-    which do not say what a burst is."""
-
-    kind: Literal["flicker"] = "flicker"
-    low_hz: float = Field(50.0, gt=0, le=1e5, description="Lowest frequency of the band; a Gen4.1's default.")
-    high_hz: float = Field(520.0, gt=0, le=1e5, description="Highest frequency of the band; a Gen4.1's default.")
-    mode: Literal["stop", "pass"] = Field("stop", description="Drop what flickers in the band, or pass only that.")
-    start: int = Field(6, ge=1, le=250, description="Bursts in the band after which a block counts as flickering.")
-    stop_below: int = Field(4, ge=1, le=250, description="It stops to where fewer are left.")
-    block: int = Field(4, ge=1, le=256, description="Side of the square, px.")
-
-    @rule("low_hz", "high_hz")
-    def _a_band(low: float, high: float):
-        if low >= high:
-            raise Refused("not a band", where="low_hz", value=low, accepted=f"less than high_hz = {high:g}")
-
-    @rule("start", "stop_below")
-    def _it_can_start(start: int, stop: int):
-        if stop > start:
-            raise Refused("would stop at once", where="stop_below", value=stop, accepted=f"at most start = {start}")
-
-
-FilterConfig = one_of("kind", TrailFilter, RateFilter, FlickerFilter)
-
-
 class ReadoutConfig(Config):
-    """The bus between pixels and time stamps; see :mod:`blinkgl.events.readout`. Before it pixels and latency, behind
-    it filters: :mod:`blinkgl.events.pixels`, :mod:`blinkgl.events.filters`."""
+    """The bus between pixels and time stamps; see :mod:`blinkgl.events.readout`. Before it pixels and latency:
+    :mod:`blinkgl.events.pixels`."""
+
+    removed: ClassVar = {"filters": Removed("events filtered after they were written", lambda value: not value)}
 
     events_per_second: float | None = Field(
         None,
@@ -163,7 +97,6 @@ class ReadoutConfig(Config):
     )
     pixels: PixelsConfig | None = Field(None, description="Dead, hot and noisy pixels; null: none.")
     latency: LatencyConfig | None = Field(None, description="How late a pixel's events are; null: not at all.")
-    filters: tuple[FilterConfig, ...] = Field((), description="Filters on the camera, in order.")
 
     @rule("events_per_second", "row_ns", "queue_events")
     def _queue_empties(rate: float | None, row_ns: float, queue: int):

@@ -86,7 +86,7 @@ class SensorConfig(Config):
         "over the values above.",
     )
     readout: ReadoutConfig | None = Field(
-        None, description="What is behind the pixels: their defects and latency, the bus, its clock, filters."
+        None, description="What is behind the pixels: their defects and latency, the bus and its clock."
     )
     sources: dict[str, str] = Field(
         {},

@@ -485,11 +485,6 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
             "anti-aliasing of event frames",
             "render.antialiasing: none (mip-maps filter textures; edges are not filtered)",
         )
-    elif config.render.antialiasing == "msaa4":
-        add(
-            "super-sampling of event frames",
-            "render.antialiasing: msaa4 (edges are filtered; textures by mip-maps alone)",
-        )
     if config.render.antialiasing == "taps4":
         add(
             "anti-aliasing of silhouettes",

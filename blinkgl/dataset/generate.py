@@ -167,7 +167,7 @@ def manifest_info(sequence: Simulation) -> dict:
         "labels": sequence.labels,
         # between whole microseconds, as every time in the files
         "duration_us": sequence.t1_ns // 1000 - sequence.t0_ns // 1000,
-        **losses(*sequence.losses, sequence.filtered),
+        **losses(*sequence.losses),
         **({"events_by_cause": sequence.causes} if sequence.causes else {}),
         **sequence.facts(),
     }

@@ -64,13 +64,12 @@ class SequenceReport:
         self.total_s, self.compile_s = sequence.clock.total, sequence.clock.compile_s
 
 
-def losses(saturated: int, dropped: int, late: int, filtered: int | None = None) -> dict[str, int]:
+def losses(saturated: int, dropped: int, late: int) -> dict[str, int]:
     """The manifest's figures of events that were made and are not in the file; see docs/formats.md."""
     return {
         "events_cut_by_max_events_per_step": saturated,
         "events_lost_in_readout": dropped,
         "events_late_in_readout": late,
-        **({} if filtered is None else {"events_filtered": filtered}),
     }
 
 

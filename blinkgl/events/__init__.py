@@ -7,6 +7,9 @@ Start: esim.py, the simplest; emulator.py is the contract, table.py names them a
 
 from __future__ import annotations
 
+from importlib import import_module
+
+from blinkgl.config.events import EmulatorConfig
 from blinkgl.events.emulator import Emulator
 from blinkgl.events.esim import Esim
 from blinkgl.events.table import emulator_of, make_emulator, register
@@ -16,5 +19,6 @@ from blinkgl.types.events import Events
 
 __all__ = ["DvsVoltmeter", "Emulator", "Esim", "Events", "V2e", "emulator_of", "make_emulator", "register"]
 
-for _emulator in (Esim, V2e, DvsVoltmeter):
-    register(_emulator)
+# Every kind that a configuration may name has a module of that name, which registers its class.
+for _kind in tuple(EmulatorConfig.members.models):
+    import_module(f"blinkgl.events.{_kind}")

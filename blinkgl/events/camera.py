@@ -17,7 +17,6 @@ import numpy as np
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import EventDataError
-from blinkgl.events.filters import make_filter
 from blinkgl.events.pixels import Latency, PixelNoise
 from blinkgl.events.readout import Readout
 from blinkgl.events.table import make_emulator
@@ -25,7 +24,7 @@ from blinkgl.events.truth import Surfaces, SurfaceTruth
 from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
-    from blinkgl.gl import GLContext
+    from blinkgl.events.emulator import Emulator
 
 _NOTHING = nullcontext()
 
@@ -49,11 +48,11 @@ class EventFrame(NamedTuple):
 class EventCamera:
     """``events:`` and ``readout:`` of a configuration: frames in, the events that leave the sensor out.
 
-    Events go from the emulator through the pixels' defects, their latency, the bus with its clock, and the filters, as
+    Events go from the emulator through the pixels' defects, their latency, the bus with its clock, as
     far as the configuration has them. readout : None: none of it.   seed : of the draws.
     reconstruction : the path between frames, see :class:`Emulator`.   emulator : the :class:`Emulator` itself.
     truth : says what made each event, of frames that come with their ``surfaces``; None: nobody asks.
-    gl : context that draws the frames, on whose card the emulator may be; None: none.
+    make : of the emulator: that on the processor, or on the device that is asked for (``tensors/choice.py``).
     Raises EventDataError: size, or a path that the emulator cannot follow."""
 
     def __init__(
@@ -65,11 +64,11 @@ class EventCamera:
         seed: int,
         reconstruction: str = "linear",
         truth: SurfaceTruth | None = None,
-        gl: GLContext | None = None,
+        make: Callable[..., Emulator] = make_emulator,
     ):
         self._truth = truth
-        self.emulator = make_emulator(config, height, width, seed, reconstruction, gl)
-        self._pixels, self._latency, self._readout, self._filters = None, None, None, ()
+        self.emulator = make(config, height, width, seed, reconstruction)
+        self._pixels, self._latency, self._readout = None, None, None
         self._luminance: np.ndarray | None = None
         if readout is not None:
             if readout.pixels is not None:
@@ -77,7 +76,6 @@ class EventCamera:
             if readout.latency is not None:
                 self._latency = Latency(readout.latency, height, width, seed)
             self._readout = Readout(readout)
-            self._filters = tuple(make_filter(one, height, width) for one in readout.filters)
 
     @property
     def tells(self) -> bool:
@@ -115,11 +113,6 @@ class EventCamera:
         """Events under way to the outside: on the bus, or not known yet for their latency."""
         return sum(stage.late for stage in (self._latency, self._readout) if stage is not None)
 
-    @property
-    def filtered(self) -> int | None:
-        """Events that the filters on the camera have dropped so far; None without filters."""
-        return sum(stage.dropped for stage in self._filters) if self._filters else None
-
     def step(self, frame: EventFrame) -> Events:
         """The events that are out by :attr:`done_ns` and were not before. Raises EventDataError as ``Emulator.step``;
         ``t_ns`` is then the frame's."""
@@ -151,10 +144,7 @@ class EventCamera:
             if self.emulator.lags:  # for flush, which has no frame
                 self._luminance = luminance.copy()
             events = self._latency.step(events, self.emulator.decoded(luminance), until_us)
-        events = self._readout.step(events, until_us)
-        for stage in self._filters:
-            events = stage.step(events)
-        return events
+        return self._readout.step(events, until_us)
 
 
 def emulate(

@@ -33,6 +33,7 @@ from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, NO_LOG,
 from blinkgl.events.packing import JIT, T_SHIFT
 from blinkgl.events.philox import Stream, normal2, pixel_counters
 from blinkgl.events.response import Response, smallest_threshold
+from blinkgl.events.table import register
 from blinkgl.events.threads import take_part
 from blinkgl.types.events import Events
 
@@ -325,6 +326,7 @@ def draw_thresholds(
     return clip(on, a), clip(off, b)
 
 
+@register
 class Esim(Emulator):
     """See the module and :class:`~blinkgl.events.emulator.Emulator`. State: 12 bytes per pixel; spread thresholds
     (constant) and the refractory period add 8 each, jitter and the slopes of ``hermite``

@@ -15,7 +15,6 @@ docs/extending.md has the whole of one. What configuration needs is in ``Config`
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from blinkgl.config.base import tag_of, validate
@@ -26,13 +25,10 @@ from blinkgl.events.emulator import Emulator
 from blinkgl.events.response import Response
 
 if TYPE_CHECKING:
-    from blinkgl.gl import GLContext
+    pass
 
 EMULATORS: dict[str, type[Emulator]] = {}
 """By ``Config``'s key ``emulator``."""
-DEVICES = {"cuda": "blinkgl.tensors.emulator:emulator_on"}
-"""What makes emulators on another device, by ``events.device``: "module:function", loaded when a configuration asks.
-A name and no import, since that room stands above this one."""
 _SOME_SENSORS = (
     SensorConfig(name="unknown", width=4, height=3),
     SensorConfig(
@@ -78,23 +74,11 @@ def emulator_of(config: EmulatorConfig) -> type[Emulator]:
 
 
 def make_emulator(
-    config: EmulatorConfig,
-    height: int,
-    width: int,
-    seed: int = 0,
-    reconstruction: str = "linear",
-    gl: GLContext | None = None,
+    config: EmulatorConfig, height: int, width: int, seed: int = 0, reconstruction: str = "linear"
 ) -> Emulator:
-    """The emulator a config asks for; ``reconstruction``: its path between frames, see :class:`Emulator`.
-
-    gl : context that draws the frames, on whose card it may be (``events.device``); None: none.
-    Raises EventDataError: ``events.device: cuda`` for what torch does not make, or without a card."""
-    kind, device = emulator_of(config), getattr(config, "device", "cpu")
-    # torch takes seconds to import, so nobody loads it who has no card.
-    if device == "cpu" or (device == "auto" and (gl is None or gl.is_software)):
-        return kind(height, width, config, seed, reconstruction)
-    module, _, maker = DEVICES["cuda"].partition(":")
-    return getattr(import_module(module), maker)(kind, config, height, width, seed, reconstruction)
+    """The emulator a config asks for, on the processor; ``reconstruction``: its path between frames, see
+    :class:`Emulator`. Raises EventDataError: a size or a path that it cannot follow."""
+    return emulator_of(config)(height, width, config, seed, reconstruction)
 
 
 def _checked(emulator: Any) -> str:

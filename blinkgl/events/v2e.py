@@ -37,6 +37,7 @@ from blinkgl.events.noise import noise_table
 from blinkgl.events.packing import JIT, T_SHIFT
 from blinkgl.events.philox import Stream
 from blinkgl.events.response import Response, smallest_threshold
+from blinkgl.events.table import register
 from blinkgl.events.threads import take_part
 from blinkgl.events.v2e_blocks import (
     DRAWS,
@@ -308,6 +309,7 @@ _TAIL = 4.0
 """Time constants of the low-pass after which a step, e^4 times the threshold at most, is over."""
 
 
+@register
 class V2e(Emulator):
     """See the module and :class:`~blinkgl.events.emulator.Emulator`. Luminance 1.0 is ``config.full_scale`` DN.
 

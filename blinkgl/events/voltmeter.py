@@ -41,6 +41,7 @@ from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulato
 from blinkgl.events.packing import CAUSE_SHIFT, JIT, T_SHIFT, cause_of
 from blinkgl.events.philox import Stream, normal2_and_uniform, uniform2
 from blinkgl.events.response import Response
+from blinkgl.events.table import register
 from blinkgl.events.threads import take_part
 from blinkgl.types.events import Events
 
@@ -448,6 +449,7 @@ def _bands(taken, start, edges, progress, share, packed, frame, codes, table, p,
         b = take_part(taken, start)
 
 
+@register
 class DvsVoltmeter(Emulator):
     """See the module and :class:`~blinkgl.events.emulator.Emulator`. Luminance 1.0 is ``config.full_scale`` DN.
 

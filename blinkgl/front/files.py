@@ -208,8 +208,6 @@ def calibrate(
     emulator: EmulatorSettings = "esim",
     fixed: Iterable[str] = (),
     still: bool = False,
-    flicker: tuple[float, float] | None = None,
-    edge: float | tuple[float, float] | None = None,
     fps: float | None = None,
     timestamps: str | os.PathLike | None = None,
     gamma: str | float = "linear",
@@ -225,36 +223,17 @@ def calibrate(
 
     recording : event file.   frames : what the camera saw, of its size (default: the recording's own).   emulator : a
     name, or a mapping where the fit begins.   fixed : its keys that stay as they are there.   still : a scene that
-    stands still in constant light, without frames: noise alone.   flicker : (Hz, contrast) of light that goes as
-    1 + contrast sin on an even scene, without frames: thresholds.   edge : contrast, or (contrast, width in px), of
-    straight borders of two tones that move at constant speed, likewise.   fps : of the frames, Hz.   timestamps : file
+    stands still in constant light, without frames: noise alone.   fps : of the frames, Hz.   timestamps : file
     of the frames' times.   gamma : of their codes, "linear", "srgb" or an exponent.   interpolate : between them,
     "motion" or "linear".   max_px : of "motion", px.   frame_delay_ms : added to their times, ms; None: found.
     starts : of the search.   Raises AssetError, EventDataError, ConfigError."""
     from blinkgl.recordings import calibration
-    from blinkgl.recordings.stimulus import WIDEST_PX, Edge, Flicker, Stimulus
 
     listed = isinstance(fixed, Iterable) and not isinstance(fixed, str)
     given = tuple(fixed) if listed else (None,)
     keys = tuple(key for key in given if isinstance(key, str))
     if len(keys) != len(given):
         raise ConfigError("not names of keys", where="fixed", value=fixed, accepted="a list of texts")
-    stimulus: Stimulus | None = None
-    if flicker is not None and edge is not None:
-        raise ConfigError("two scenes at once", where="edge", accepted="one of flicker, edge")
-    if edge is not None:
-        pair = isinstance(edge, tuple)
-        contrast, width = check.array(edge, "edge", (2,), "(contrast, px)").tolist() if pair else (edge, None)
-        stimulus = Edge(
-            check.number(contrast, "edge[0]" if pair else "edge", above=0, most=0.999),
-            None if width is None else check.number(width, "edge[1]", above=0, most=WIDEST_PX),
-        )
-    if flicker is not None:
-        hz, contrast = check.array(flicker, "flicker", (2,), "(Hz, contrast)").tolist()
-        stimulus = Flicker(
-            check.number(hz, "flicker[0]", least=0.01, most=1e4),
-            check.number(contrast, "flicker[1]", above=0, most=0.999),
-        )
     delay = None if frame_delay_ms is None else check.number(frame_delay_ms, "frame_delay_ms", least=-1e6, most=1e6)
     return calibration.calibrate(
         check.path(recording, "recording"),
@@ -262,7 +241,6 @@ def calibrate(
         emulator=events_tree(emulator),
         fixed=keys,
         still=bool(still),
-        stimulus=stimulus,
         fps=_fps(fps),
         timestamps=None if timestamps is None else check.path(timestamps, "timestamps"),
         gamma=gamma,

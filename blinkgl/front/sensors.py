@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from blinkgl.config.sensor import SensorConfig, load_sensor as _load_sensor
-from blinkgl.events import Emulator, make_emulator
+from blinkgl.events import Emulator
 from blinkgl.events.emulator import MAX_SIDE
 from blinkgl.front import arguments as check
 from blinkgl.recordings.simulation import emulator_config
+from blinkgl.tensors.choice import make_on_device
 
 _STEP = """
 
@@ -28,7 +29,7 @@ def _made(
     height, width = check.whole(height, "height", 1, MAX_SIDE - 1), check.whole(width, "width", 1, MAX_SIDE - 1)
     defaults = load_sensor(sensor).values(kind) if sensor is not None else {}
     config = emulator_config({"emulator": kind, **defaults, **check.plain(values)})
-    return make_emulator(config, height, width, check.seed(seed), reconstruction)
+    return make_on_device(config, height, width, check.seed(seed), reconstruction)
 
 
 def Esim(

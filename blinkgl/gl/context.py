@@ -110,10 +110,10 @@ class GLContext:
         return self.shaders.program(name, defines)
 
     def framebuffer(
-        self, width: int, height: int, colour: tuple[str, ...] = ("RGBA8",), depth: bool | str = True, samples: int = 0
+        self, width: int, height: int, colour: tuple[str, ...] = ("RGBA8",), depth: bool | str = True
     ) -> Target:
         """A new render target; see :class:`~blinkgl.gl.framebuffer.Target`."""
-        return Target(self, width, height, colour, depth, samples)
+        return Target(self, width, height, colour, depth)
 
     def make_current(self) -> None:
         """Make this context the current one again, after another context was used in the same thread.

@@ -19,12 +19,12 @@ from blinkgl.errors import GLError
 if TYPE_CHECKING:
     from blinkgl.gl.context import GLContext
 
+_READ_FRAMEBUFFER, _DRAW_FRAMEBUFFER, _COLOR_BIT, _NEAREST = 0x8CA8, 0x8CA9, 0x4000, 0x2600
+_COLOR_ATTACHMENT0 = 0x8CE0
 _TEXTURE_2D, _RENDERBUFFER, _TEXTURE0 = 0x0DE1, 0x8D41, 0x84C0
 _DEPTH_COMPONENT, _DEPTH_COMPONENT32F, _FLOAT = 0x1902, 0x8CAC, 0x1406
 _TEXTURES = {"texture": _DEPTH_COMPONENT32F, "texture of 16 bits": 0x81A5}  # GL_DEPTH_COMPONENT16
 _COLOR, _DEPTH = 0x1800, 0x1801
-_READ_FRAMEBUFFER, _DRAW_FRAMEBUFFER, _COLOR_BIT, _NEAREST = 0x8CA8, 0x8CA9, 0x4000, 0x2600
-_COLOR_ATTACHMENT0 = 0x8CE0
 
 
 class PixelFormat(NamedTuple):
@@ -63,22 +63,17 @@ class Target:
     """A framebuffer of ``width`` x ``height`` px with colour textures and depth.
 
     colour : one key of :data:`FORMATS` per attachment, ``layout(location = i)`` in the fragment shader.
-    samples: 0, or coverage samples per pixel: then colour and depth are multi-sampled
-    renderbuffers, which can be drawn to
-             and resolved (:meth:`resolve_into`), not read or sampled.
     depth  : True: 32F renderbuffer; "texture": 32F texture that a later pass can sample
     (``.depth.use(unit)``, ``sampler2D``); "texture of 16 bits": that, in steps of 1/65535;
              False: none. Clear it to 0 and test with ``ctx.depth_func = ">"`` (reversed-Z).
 
-    fbo    : moderngl.Framebuffer.   colour: its textures, filtered NEAREST (renderbuffers when multi-sampled).   depth:
+    fbo    : moderngl.Framebuffer.   colour: its textures, filtered NEAREST.   depth:
            renderbuffer, texture or None.
 
-    Raises GLError for unknown formats, sizes or samples beyond the driver's limit.
+    Raises GLError for unknown formats, sizes beyond the driver's limit.
     """
 
-    def __init__(
-        self, gl: GLContext, width: int, height: int, colour: Sequence[str], depth: bool | str = True, samples: int = 0
-    ):
+    def __init__(self, gl: GLContext, width: int, height: int, colour: Sequence[str], depth: bool | str = True):
         limit = gl.ctx.info["GL_MAX_TEXTURE_SIZE"]
         if not (1 <= width <= limit and 1 <= height <= limit):
             raise GLError(
@@ -95,15 +90,9 @@ class Target:
         unknown = [name for name in colour if name not in FORMATS]
         if unknown:
             raise GLError("unknown pixel format", value=unknown[0], accepted="one of " + ", ".join(FORMATS))
-        if samples > gl.ctx.max_samples:
-            raise GLError("too many samples per pixel", value=samples, accepted=f"at most {gl.ctx.max_samples}")
-        if samples and depth in _TEXTURES:
-            raise GLError("a multi-sampled target's depth cannot be a texture", accepted="True or False")
-        self.gl, self.width, self.height, self.samples = gl, width, height, samples
+        self.gl, self.width, self.height = gl, width, height
         self.formats = tuple(FORMATS[name] for name in colour)
-        self.colour: tuple[moderngl.Texture | moderngl.Renderbuffer, ...] = tuple(
-            self._texture(f) for f in self.formats
-        )
+        self.colour: tuple[moderngl.Texture, ...] = tuple(self._texture(f) for f in self.formats)
         self.depth = self._depth(depth)
         self.fbo = gl.ctx.framebuffer(list(self.colour), self.depth)
         self._bind = gl.function("glBindFramebuffer", None, ctypes.c_uint, ctypes.c_uint)
@@ -114,11 +103,7 @@ class Target:
         self._clear_int = gl.function("glClearBufferiv", None, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
         self._cleared: tuple[tuple, list[Callable[[], object]]] = (), []  # to what values, and the calls that do it
 
-    def _texture(self, pixel: PixelFormat) -> moderngl.Texture | moderngl.Renderbuffer:
-        if self.samples:
-            return self.gl.ctx.renderbuffer(
-                (self.width, self.height), pixel.components, samples=self.samples, dtype=pixel.gl
-            )
+    def _texture(self, pixel: PixelFormat) -> moderngl.Texture:
         texture = self.gl.ctx.texture((self.width, self.height), pixel.components, dtype=pixel.gl)
         texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
         texture.repeat_x = texture.repeat_y = False
@@ -144,10 +129,10 @@ class Target:
             depth.repeat_x = depth.repeat_y = False
             return depth
         if kind is True:
-            depth = gl.ctx.depth_renderbuffer(size, samples=self.samples)
+            depth = gl.ctx.depth_renderbuffer(size)
             gl.function("glBindRenderbuffer", None, uint, uint)(_RENDERBUFFER, depth.glo)
-            gl.function("glRenderbufferStorageMultisample", None, uint, integer, uint, integer, integer)(
-                _RENDERBUFFER, self.samples, _DEPTH_COMPONENT32F, *size
+            gl.function("glRenderbufferStorage", None, uint, uint, integer, integer)(
+                _RENDERBUFFER, _DEPTH_COMPONENT32F, *size
             )
             return depth
         raise GLError("unknown kind of depth", value=kind, accepted="True, False, 'texture' or 'texture of 16 bits'")
@@ -182,9 +167,9 @@ class Target:
         if self.depth is not None:
             yield partial(self._clear_float, _DEPTH, 0, ctypes.byref(ctypes.c_float(depth)))
 
-    def resolve_into(self, other: Target) -> None:
-        """Writes the mean of each pixel's samples into ``other``, a target of the same size and formats that is not
-        multi-sampled. The first attachment only; honours the scissor."""
+    def copy_into(self, other: Target) -> None:
+        """Copies the first attachment into that of ``other``, a target of the same size and formats; honours the
+        scissor."""
         self._bind(_READ_FRAMEBUFFER, self.fbo.glo)
         self._read_buffer(_COLOR_ATTACHMENT0)  # which reading anything else, the depth say, has changed
         self._bind(_DRAW_FRAMEBUFFER, other.fbo.glo)

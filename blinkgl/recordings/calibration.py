@@ -29,7 +29,6 @@ from blinkgl.recordings.clip import (
 )
 from blinkgl.recordings.simulation import INTERPOLATIONS, emulator_config
 from blinkgl.recordings.statistics import Sums, Target, interval_distance, sums, target
-from blinkgl.recordings.stimulus import Stimulus
 from blinkgl.types.events import Events
 
 LEAST_EVENTS = 2000
@@ -136,7 +135,6 @@ def calibrate(
     emulator: str | EmulatorConfig | dict = EmulatorConfig.members.default,
     fixed: Iterable[str] = (),
     still: bool = False,
-    stimulus: Stimulus | None = None,
     fps: float | None = None,
     timestamps: str | os.PathLike | None = None,
     gamma: str | float = "linear",
@@ -151,8 +149,7 @@ def calibrate(
 
     frames : what the camera saw, of its size and at the middle of the exposures
     (:func:`~blinkgl.io.frames.open_frames`; default: the recording's own).   still : a scene that stands still in
-    constant light, without frames: noise alone.   stimulus : a scene that was made so, without frames
-    (:mod:`~blinkgl.recordings.stimulus`).
+    constant light, without frames: noise alone.
     emulator : a name, or where the fit begins; ``fixed``: keys that stay as they are there.
     gamma, interpolate, max_px : as of ``simulate``.   frame_delay_ms : added to the frames' times; None: found.
     starts : of the search.   progress : called with (what is being done, fraction).
@@ -164,18 +161,12 @@ def calibrate(
     _keys(base, fixed)
     if still and frames is not None:
         raise ConfigError("a still scene needs no frames", where="--still", accepted="either of the two")
-    if stimulus is not None and (still or frames is not None):
-        raise ConfigError(
-            "a scene that is known needs no frames, and does not stand still",
-            where=stimulus.option,
-            accepted=f"one of {stimulus.option}, --still, --frames",
-        )
     if progress:
         progress("reading", 0.0)
     events, size = read_recording(recording, least=LEAST_EVENTS)
     options = dict(name=os.fspath(recording), emulator=base, fixed=fixed, starts=starts, seed=seed, progress=progress)
-    if still or stimulus is not None:
-        return calibrate_events(events, size, None, stimulus=stimulus, **options)
+    if still:
+        return calibrate_events(events, size, None, **options)
     frames = _own_frames(recording) if frames is None else frames
     given, exposures = timed_frames(frames, fps=fps, timestamps=timestamps)
     return calibrate_events(
@@ -197,7 +188,6 @@ def calibrate_events(
     size: tuple[int, int],
     frames: Sequence[tuple[np.ndarray, int, str]] | None,
     *,
-    stimulus: Stimulus | None = None,
     name: str = "events",
     frames_name: str = "frames",
     exposures: bool = False,
@@ -212,7 +202,7 @@ def calibrate_events(
     progress: Callable[[str, float], None] | None = None,
 ) -> Calibration:
     """:func:`calibrate` of what was read already. size : (height, width) of the sensor.   frames : (array, t_ns, name);
-    None: a still scene, or that of ``stimulus``.   exposures : whether their times are known to be the
+    None: a still scene.   exposures : whether their times are known to be the
     middles of exposures."""
     base = emulator_config(emulator)
     keys = _keys(base, fixed)
@@ -223,15 +213,7 @@ def calibrate_events(
     say = progress or (lambda *_: None)
     start, untold = None, {}
     warnings: list[str] = []
-    if stimulus is not None:
-        clip = stimulus.clip(events, size, where=name, seed=seed)
-        first = _Search(clip, base, (clip.intervals + 1) // 2, seed, lambda done: say("stimulus", done))
-        keys = first.responding(keys)
-        start, untold = first.roughly(keys, starts), first.untold
-        rough = first.config(keys, start)
-        clip = stimulus.settled(events, size, clip, lambda one: one.simulate(rough, seed), seed=seed)
-        notes = [stimulus.said(clip)]
-    elif frames is None:
+    if frames is None:
         clip = clip_of_still(events, size)
         notes = [
             "A still scene of middle brightness was assumed: what depends on light, or its change, is not in it.",
@@ -351,8 +333,7 @@ def _own_frames(recording: str | os.PathLike) -> str | os.PathLike:
     raise EventDataError(
         "the recording has no frames, and without them nobody knows what the camera saw",
         where=os.fspath(recording),
-        accepted="--frames, --still for a scene that stands still, --flicker for an even one under such light, or "
-        "--edge for straight borders that move",
+        accepted="--frames, or --still for a scene that stands still",
     )
 
 

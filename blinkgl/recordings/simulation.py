@@ -29,6 +29,7 @@ from blinkgl.errors import ConfigError, EventDataError, OutputError
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.io.frames import open_frames
 from blinkgl.srgb import linear_from_srgb
+from blinkgl.tensors.choice import make_on_device
 from blinkgl.timeline import interpolate as between
 from blinkgl.types.events import Events, count_causes, named_causes
 
@@ -55,8 +56,6 @@ class SimulationReport:
     """events that found the queue of the sensor's read-out full"""
     late: int = 0
     """events that were still on the read-out's bus when the last frame came"""
-    filtered: int = 0
-    """events that the filters on the camera dropped"""
     causes: dict[str, int] = field(default_factory=dict)
     """events by what caused them, "signal", "leak", "shot" and "hot"; empty unless ``causes`` of the emulator is set"""
     displacement: between.Displacement | None = None
@@ -152,7 +151,7 @@ def _run(frames, config, gamma, interpolate, factor, max_px, seed, readout, repo
     first = next(frames, None)
     if first is None:
         raise EventDataError("events need at least two frames", value="0 frames")
-    camera = EventCamera(config, readout, *first[0].shape[:2], seed)
+    camera = EventCamera(config, readout, *first[0].shape[:2], seed, make=make_on_device)
     yield from stepped(
         itertools.chain([first], frames),
         camera,
@@ -222,7 +221,6 @@ def stepped(
         report.events += len(events)
         report.on += int(np.count_nonzero(events.p))
         report.saturated, report.lost, report.late = camera.saturated, camera.dropped, camera.late
-        report.filtered = camera.filtered or 0
         if camera.emulator.causes:
             by_cause += count_causes(events)
             report.causes = named_causes(by_cause)

@@ -12,8 +12,6 @@ class Samples(NamedTuple):
 
     grid  : the image is drawn grid x grid times finer and averaged (super-sampling:
     everything is evaluated grid² times).
-    multi : coverage samples per drawn pixel (multi-sampling: silhouettes are filtered, the shader runs once per pixel
-            and triangle); 0: one, at the pixel's centre.
     taps  : 1, or 4: texture lookups of a drawn pixel, spread over the pixel, each one mip level finer. The texture is
             super-sampled, the light and the silhouettes are not. Event frames only: colour
             is not worth a shader variant.
@@ -22,14 +20,13 @@ class Samples(NamedTuple):
             are four, then lie along the way in which a surface is foreshortened."""
 
     grid: int = 1
-    multi: int = 0
     taps: int = 1
     edges: bool = False
 
     @property
     def stored(self) -> int:
         """Samples kept in memory per pixel of the image."""
-        return self.grid**2 * max(1, self.multi)
+        return self.grid**2
 
     @property
     def shared(self) -> bool:
@@ -39,7 +36,6 @@ class Samples(NamedTuple):
 
 ANTIALIASING = {
     "none": Samples(),
-    "msaa4": Samples(multi=4),
     "taps4": Samples(taps=4),
     "edges": Samples(taps=4, edges=True),
     "edges2": Samples(grid=2, taps=4, edges=True),

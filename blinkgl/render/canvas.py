@@ -156,7 +156,6 @@ class Canvas:
             *pass_.size(width, height),
             colour=tuple(o.format for o in self.outputs),
             depth=pass_.depth,
-            samples=pass_.samples.multi,
         )
 
     def draw(self, shot: Shot) -> Frame:

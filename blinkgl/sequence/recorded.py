@@ -21,6 +21,7 @@ from blinkgl.sequence.folders import flow_files, folder_of, read_flow_of, read_f
 from blinkgl.sequence.items import GroundTruth, Picture
 from blinkgl.sequence.qualify import verdict
 from blinkgl.sequence.simulate import Simulation
+from blinkgl.tensors.choice import make_on_device
 from blinkgl.types.events import Events
 
 RECORDED = ("images", "flow_forward", "occlusion_forward")
@@ -58,7 +59,13 @@ class RecordedSequence(Simulation):
             update={"frames": frames.model_copy(update={"folders": (os.path.relpath(self.folder, base),)})}
         )
         camera = (
-            EventCamera(config.events, config.readout, *size, kernel_seed(config.seed, index, Role.EVENTS))
+            EventCamera(
+                config.events,
+                config.readout,
+                *size,
+                kernel_seed(config.seed, index, Role.EVENTS),
+                make=make_on_device,
+            )
             if events
             else None
         )

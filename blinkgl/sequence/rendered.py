@@ -35,6 +35,7 @@ from blinkgl.sequence.first_look import first_look
 from blinkgl.sequence.inertial import Inertial, measured
 from blinkgl.sequence.items import GroundTruth, Item, Picture
 from blinkgl.sequence.simulate import Simulation
+from blinkgl.tensors.choice import make_on_device
 from blinkgl.timeline import Timeline, make_timeline
 from blinkgl.types.events import Events
 
@@ -101,7 +102,7 @@ def surfaces_at(renderer: Renderer, t_ns: int) -> Surfaces:
 class RenderedSequence(Simulation):
     """See :func:`~blinkgl.sequence.simulate.simulate_sequence`.
 
-    scene : as it was built.   renderer : what draws it, at its level of detail.
+    scene : as it was built.   renderer : what draws it.
     sensor : what is recorded, and through which camera. A scene that was made already is
     recorded as the configuration says.   number : of the sensor on its rig, by which noise differs."""
 
@@ -152,7 +153,7 @@ class RenderedSequence(Simulation):
                     seed,
                     path,
                     _truth_of(self.sensor, config),
-                    renderer.gl,
+                    partial(make_on_device, gl=renderer.gl),
                 )
                 self.timeline = timeline_of(config, scene, renderer, span_ns)
             if labels and config.images is not None:

@@ -252,11 +252,6 @@ class Simulation(ABC):
         return (0, 0, 0) if self.camera is None else (self.camera.saturated, self.camera.dropped, self.camera.late)
 
     @property
-    def filtered(self) -> int | None:
-        """Events so far that the filters on the camera have dropped; None without filters."""
-        return None if self.camera is None else self.camera.filtered
-
-    @property
     def tells(self) -> bool:
         """Whether its events say what made them (``labels.events``)."""
         return self.camera is not None and self.camera.tells

@@ -1,43 +1,30 @@
 """Which lines of an expanded shader the preprocessor leaves alive: #if, #ifdef, #elif, #else, #define of plain values.
 
 Function-like macros are not expanded: lines are kept or dropped whole, which is all that listing declarations needs.
-The driver's own preprocessor remains the one that compiles. Conditions are those of GLSL 4.60, section 3.3: the
-operators of C on 32-bit integers, in a time that grows with the length of the text alone, whatever it says."""
+The driver's own preprocessor remains the one that compiles. Conditions are of names, decimal numbers, ``defined``,
+brackets, + - *, comparisons, ! && and ||; one of anything else counts as false.
+"""
 
 from __future__ import annotations
 
+import ast
+import operator
 import re
 from functools import lru_cache
 
 _DIRECTIVE = re.compile(r"^\s*#\s*(\w+)\s*(.*?)\s*$")
-_TOKEN = re.compile(
-    r"\s*(?:(?P<number>\d\w*)|(?P<name>[A-Za-z_]\w*)|(?P<operator><<|>>|<=|>=|==|!=|&&|\|\||[-+*/%<>&^|!~()]))"
-)
-_PRECEDENCE = {
-    op: level
-    for level, ops in enumerate(
-        (
-            ("||",),
-            ("&&",),
-            ("|",),
-            ("^",),
-            ("&",),
-            ("==", "!="),
-            ("<", ">", "<=", ">="),
-            ("<<", ">>"),
-            ("+", "-"),
-            ("*", "/", "%"),
-        )
-    )
-    for op in ops
-}
-MOST_TOKENS = 10_000  # of one condition with its macros written out
-DEEPEST = 100  # parentheses and signs inside each other
-
-
-class ConditionError(ValueError):
-    """An #if expression that GLSL's preprocessor does not take."""
-
+_DEFINED = re.compile(r"\bdefined\b\s*(?:\(\s*([A-Za-z_]\w*)\s*\)|([A-Za-z_]\w*))")
+_NAME = re.compile(r"\b[A-Za-z_]\w*\b")
+_READABLE = re.compile(r"[\d\s()+*<>=!&|-]*")
+_BINARY = {
+    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Eq: operator.eq, ast.NotEq: operator.ne,
+    ast.Lt: operator.lt, ast.LtE: operator.le, ast.Gt: operator.gt, ast.GtE: operator.ge,
+}  # fmt: skip
+_UNARY = {ast.UAdd: operator.pos, ast.USub: operator.neg, ast.Invert: operator.not_}
+LONGEST = 500
+"""Characters of a condition with its macros written out."""
+DEEPEST = 10
+"""Macros inside each other."""
 
 _COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
 
@@ -110,168 +97,32 @@ def active_lines(text: str, defines: bool = False) -> list[tuple[int, str]]:
 
 def evaluate(expression: str, macros: dict[str, str]) -> bool:
     """Truth of an #if expression; an undefined name is 0, and an expression that cannot be read is false."""
+    text = _DEFINED.sub(lambda match: str(int((match[1] or match[2]) in macros)), expression)
+    for _ in range(DEEPEST):
+        text = _NAME.sub(lambda match: f"({macros[match[0]]})" if match[0] in macros else "0", text)
+        if len(text) > LONGEST:
+            return False
+    if not _READABLE.fullmatch(text):
+        return False
+    # Python's ~ binds as tightly as C's !.
+    python = re.sub(r"!(?!=)", "~", text).replace("&&", " and ").replace("||", " or ").strip()
     try:
-        return value(expression, macros) != 0
-    except ConditionError:
+        return bool(_value(ast.parse(python, mode="eval").body))
+    except (SyntaxError, KeyError, ValueError, RecursionError, MemoryError):
         return False
 
 
-def value(expression: str, macros: dict[str, str]) -> int:
-    """The 32-bit integer that an #if expression stands for, names that are not ``macros`` being 0.
-
-    A macro's own name is not expanded again inside its expansion (C++98 16.3.4, which GLSL
-    follows). Raises ConditionError."""
-    return _Reader(_expanded(expression, macros)).all()
-
-
-def _tokens(text: str) -> list[str]:
-    out, position, text = [], 0, text.rstrip()
-    while position < len(text):
-        match = _TOKEN.match(text, position)
-        if not match:
-            raise ConditionError(f"not of a condition: {text[position : position + 20].strip()!r}")
-        out.append(match[match.lastgroup])
-        position = match.end()
-        if len(out) > MOST_TOKENS:
-            raise ConditionError("too long")
-    return out
-
-
-def _expanded(expression: str, macros: dict[str, str]) -> list[str]:
-    """Tokens with ``defined`` answered and macros written out."""
-    out: list[str] = []
-    # Each entry: a token, and the macros it came out of, as a linked list.
-    todo: list[tuple[str, tuple | None]] = [(token, None) for token in reversed(_tokens(expression))]
-    steps = 0
-    while todo:
-        token, inside = todo.pop()
-        steps += 1
-        if steps > MOST_TOKENS:
-            raise ConditionError("too long when its macros are written out")
-        if token == "defined":
-            bracket = bool(todo) and todo[-1][0] == "("
-            if bracket:
-                todo.pop()
-            name = todo.pop()[0] if todo else ""
-            if not re.match(r"[A-Za-z_]", name) or (bracket and not (todo and todo.pop()[0] == ")")):
-                raise ConditionError("defined wants a name")
-            out.append("1" if name in macros else "0")
-        elif token in macros and not _came_from(token, inside):
-            body = _tokens(macros[token])
-            if not body:
-                raise ConditionError(f"{token} is defined as nothing")
-            todo += [(t, (token, inside)) for t in reversed(body)]
-        else:
-            out.append(token)
-    return out
-
-
-def _came_from(token: str, inside: tuple | None) -> bool:
-    while inside is not None:
-        if inside[0] == token:
-            return True
-        inside = inside[1]
-    return False
-
-
-def _wrapped(number: int) -> int:
-    """As a signed integer of 32 bits."""
-    return (number + 2**31) % 2**32 - 2**31
-
-
-class _Reader:
-    """Precedence climbing over tokens. && and || do not judge what they need not (1 || 1 / 0)."""
-
-    def __init__(self, tokens: list[str]):
-        self.tokens, self.at, self.depth = tokens, 0, 0
-
-    def all(self) -> int:
-        result = self.binary(0, True)
-        if self.at != len(self.tokens):
-            raise ConditionError(f"unexpected {self.tokens[self.at]!r}")
-        return result
-
-    def next(self) -> str:
-        if self.at >= len(self.tokens):
-            raise ConditionError("ends too early")
-        self.at += 1
-        return self.tokens[self.at - 1]
-
-    def binary(self, lowest: int, needed: bool) -> int:
-        left = self.unary(needed)
-        while self.at < len(self.tokens) and _PRECEDENCE.get(self.tokens[self.at], -1) >= lowest:
-            operator = self.next()
-            matters = needed and not ((operator == "&&" and left == 0) or (operator == "||" and left != 0))
-            right = self.binary(_PRECEDENCE[operator] + 1, matters)
-            left = _apply(operator, left, right, matters)
-        return left
-
-    def unary(self, needed: bool) -> int:
-        self.depth += 1
-        if self.depth > DEEPEST:
-            raise ConditionError("nested too deeply")
-        try:
-            token = self.next()
-            if token == "(":
-                result = self.binary(0, needed)
-                if self.next() != ")":
-                    raise ConditionError("a bracket is not closed")
-                return result
-            if token in ("+", "-", "!", "~"):
-                operand = self.unary(needed)
-                return {"+": operand, "-": _wrapped(-operand), "!": int(operand == 0), "~": ~operand}[token]
-            return _number(token)
-        finally:
-            self.depth -= 1
-
-
-def _number(token: str) -> int:
-    """Of 0x1F, 017, 42u; 0 of a name."""
-    if not token[0].isdigit():
-        if re.match(r"[A-Za-z_]", token):
-            return 0
-        raise ConditionError(f"unexpected {token!r}")
-    digits = token[:-1] if token[-1] in "uU" else token
-    for pattern, base in ((r"0[xX][0-9a-fA-F]+", 16), (r"0[0-7]*", 8), (r"[1-9][0-9]*", 10)):
-        if re.fullmatch(pattern, digits):
-            if len(digits) > 40:  # before int(), which takes time and refuses thousands of digits
-                raise ConditionError("a number of more than 32 bits")
-            number = int(digits, base)
-            if number >= 2**32:
-                raise ConditionError("a number of more than 32 bits")
-            return _wrapped(number)
-    raise ConditionError(f"not an integer: {token!r}")
-
-
-def _apply(operator: str, a: int, b: int, matters: bool) -> int:
-    if operator == "&&":
-        return int(a != 0 and b != 0)
-    if operator == "||":
-        return int(a != 0 or b != 0)
-    if operator in ("/", "%"):
-        if b == 0:
-            if matters:
-                raise ConditionError("division by zero")
-            return 0
-        quotient = abs(a) // abs(b) * (1 if (a < 0) == (b < 0) else -1)  # C rounds towards zero
-        return _wrapped(quotient if operator == "/" else a - quotient * b)
-    if operator in ("<<", ">>"):
-        b &= 31  # GLSL leaves shifts by more undefined; this is what processors do
-    return _wrapped(
-        {
-            "|": lambda: a | b,
-            "^": lambda: a ^ b,
-            "&": lambda: a & b,
-            "==": lambda: int(a == b),
-            "!=": lambda: int(a != b),
-            "<": lambda: int(a < b),
-            ">": lambda: int(a > b),
-            "<=": lambda: int(a <= b),
-            ">=": lambda: int(a >= b),
-            "<<": lambda: a << b,
-            ">>": lambda: a >> b,
-            "+": lambda: a + b,
-            "-": lambda: a - b,
-            "*": lambda: a * b,
-        }[operator]()
-    )
+def _value(node: ast.expr) -> int:
+    """What an expression stands for. Raises KeyError for what is none of a condition."""
+    match node:
+        case ast.Constant(value=int(value)):
+            return value
+        case ast.BoolOp(op=ast.And(), values=parts):
+            return all(map(_value, parts))
+        case ast.BoolOp(values=parts):
+            return any(map(_value, parts))
+        case ast.UnaryOp(op=op, operand=operand):
+            return _UNARY[type(op)](_value(operand))
+        case ast.BinOp(left=left, op=op, right=right) | ast.Compare(left=left, ops=[op], comparators=[right]):
+            return _BINARY[type(op)](_value(left), _value(right))
+    raise KeyError(type(node).__name__)

@@ -16,7 +16,6 @@ from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.machine.terminal import plain_column, plain_console, say
 from blinkgl.recordings.calibration import calibrate
 from blinkgl.recordings.pixel_noise import fit_pixels
-from blinkgl.recordings.stimulus import WIDEST_PX, Edge, Flicker, Stimulus
 from blinkgl.report import pixel_noise
 from blinkgl.report.calibration import page, parameters, rows
 from blinkgl.show.simulate import emulator_options
@@ -31,8 +30,6 @@ def run(
     out: str,
     *,
     emulator: str,
-    flicker: str | None = None,
-    edge: str | None = None,
     sensor: str | None = None,
     overrides: Sequence[str] = (),
     overwrite: bool = False,
@@ -48,9 +45,8 @@ def run(
     for path in (target, beside):
         if path.exists() and not overwrite:  # before the work, not after it
             raise OutputError("output file exists", where=str(path), accepted="a new name, or --overwrite")
-    stimulus = _stimulus(flicker, edge)
     if emulator == PIXELS:
-        return _pixels(recording, frames, target, stimulus, sensor, overrides, overwrite, quiet, options)
+        return _pixels(recording, frames, target, sensor, overrides, overwrite, quiet, options)
     base = emulator_options(emulator, None, overrides, sensor)["emulator"]
     fixed = [item.partition("=")[0].strip() for item in overrides]
     console = plain_console(quiet=quiet)
@@ -63,7 +59,6 @@ def run(
             frames,
             emulator=base,
             fixed=fixed,
-            stimulus=stimulus,
             progress=progress,
             **options,
         )
@@ -93,7 +88,6 @@ def _pixels(
     recording: str,
     frames: str | None,
     target: Path,
-    stimulus: Stimulus | None,
     sensor: str | None,
     overrides: Sequence[str],
     overwrite: bool,
@@ -101,7 +95,7 @@ def _pixels(
     options: dict[str, Any],
 ) -> int:
     """The noise of single pixels in the place of an emulator."""
-    if not options["still"] or frames is not None or stimulus is not None:
+    if not options["still"] or frames is not None:
         raise ConfigError(
             "the noise of single pixels shows where nothing moves", where="--emulator", value=PIXELS, accepted="--still"
         )
@@ -149,42 +143,3 @@ def _write(target: Path, sensor: str, page_: str, overwrite: bool) -> None:
         with output_errors(target):
             html.write_text(page_, encoding="utf-8")
             file.write_text(sensor, encoding="utf-8")
-
-
-def _stimulus(flicker: str | None, edge: str | None) -> Stimulus | None:
-    if flicker is not None and edge is not None:
-        raise ConfigError("two scenes at once", where="--edge", accepted="one of --flicker, --edge")
-    return _edge(edge) if edge is not None else None if flicker is None else _flicker(flicker)
-
-
-def _edge(text: str) -> Edge:
-    contrast, comma, width = text.partition(",")
-    try:
-        found = Edge(float(contrast), float(width) if comma else None)
-    except ValueError:
-        found = Edge(0.0)
-    if not (0 < found.contrast < 1 and (found.width_px is None or 0 < found.width_px <= WIDEST_PX)):
-        raise ConfigError(
-            "not a contrast, or a contrast and a width",
-            where="--edge",
-            value=text,
-            accepted="CONTRAST[,WIDTH]: (bright - dark)/(bright + dark) between 0 and 1; a border's blur, one standard "
-            f"deviation, at most {WIDEST_PX:g} px",
-        )
-    return found
-
-
-def _flicker(text: str) -> Flicker:
-    hz, comma, contrast = text.partition(",")
-    try:
-        found = Flicker(float(hz), float(contrast))
-    except ValueError:
-        found = Flicker(0.0, 0.0)
-    if not (comma and 0.01 <= found.hz <= 1e4 and 0 < found.contrast < 1):
-        raise ConfigError(
-            "not a frequency and a contrast",
-            where="--flicker",
-            value=text,
-            accepted="HZ,CONTRAST: 0.01 to 10,000 Hz, and (brightest - darkest)/(brightest + darkest) between 0 and 1",
-        )
-    return found

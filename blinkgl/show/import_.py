@@ -8,13 +8,10 @@ import os
 from typing import Any
 
 from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn
-from rich.table import Table
-from rich.text import Text
 
 from blinkgl.config.reader import to_short_yaml
 from blinkgl.machine.terminal import plain_column, plain_console, say
 
-_SHAPES = ("meshes", "curves, texts, metaballs", "instances", "collection instances")
 _LONGER_SIDE = 640  # px: an event camera's, not a film's
 
 
@@ -38,18 +35,9 @@ def run(source: str, target: str, *, as_json: bool = False, quiet: bool = False,
         return 0
     size = os.path.getsize(target)
     say(console, f"{target}: {size / 1e6:.1f} MB, from {os.path.basename(source)} by Blender {came.blender}")
-    table = Table(box=None, pad_edge=False)
-    for name, justify in (("", "left"), ("in the file", "right"), ("came", "right"), ("how", "left")):
-        table.add_column(name, justify=justify)
-    for row in came.rows:
-        whole = row.came >= row.found
-        table.add_row(
-            row.kind,
-            str(row.found) if row.found else "",
-            Text(str(row.came) if row.found else "", style="" if whole else "bold yellow"),
-            "\n".join(row.notes),
-        )
-    console.print(table)
+    say(console, "  " + ", ".join(f"{count:,} {kind}" for kind, count in came.counts.items() if count))
+    for line in came.left_out:
+        say(console, f"note: {line}")
     for line in came.omissions:
         say(console, f"note: {line}")
     say(console, "to play it:")
@@ -60,7 +48,7 @@ def run(source: str, target: str, *, as_json: bool = False, quiet: bool = False,
 
 def _recipe(target: str, came: Any) -> str:
     """The YAML that plays what was imported, as far as the file decides it."""
-    if not any(row.came for row in came.rows if row.kind in _SHAPES):
+    if not came.counts["meshes"]:
         return f"scene.objects: {{mesh: …, animation: {{file: {target}}}}}    (a clip, for a figure with these joints)"
     scene: dict[str, Any] = {"kind": "file", "path": target}
     if came.cameras:

@@ -100,8 +100,6 @@ def run(
         say(console, f"{report.lost:,} events were lost in the sensor's read-out")
     if report.late:
         say(console, f"{report.late:,} events had not left the sensor's read-out when the frames ended")
-    if report.filtered:
-        say(console, f"{report.filtered:,} events were dropped by the filters on the camera")
     if report.saturated:
         say(console, f"warning: {report.saturated:,} events were cut by max_events_per_step")
     return 0

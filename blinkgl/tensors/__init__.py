@@ -9,14 +9,26 @@ the functions of :mod:`blinkgl.events.arith` in the same sums and products. So t
 events on a processor and on a card, without a proof for each card. (``torch.compile`` may contract a product and a sum
 into one rounding; do not compile these functions where the bits matter.)
 
-torch is imported when this room is, and by nothing below it. Nothing here is differentiable: an event is a decision.
+torch takes seconds to import, so names are loaded when they are first used. Nothing here is differentiable: an event
+is a decision.
 """
 
 from __future__ import annotations
 
-from blinkgl.tensors.batch import TensorEvents
-from blinkgl.tensors.esim import TensorEsim
-from blinkgl.tensors.grids import event_counts, latest_times, time_surface, voxel_grid
-from blinkgl.tensors.v2e import TensorV2e
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from blinkgl.tensors.batch import TensorEvents
+    from blinkgl.tensors.esim import TensorEsim
+    from blinkgl.tensors.grids import event_counts, latest_times, time_surface, voxel_grid
+    from blinkgl.tensors.v2e import TensorV2e
 
 __all__ = ["TensorEsim", "TensorEvents", "TensorV2e", "event_counts", "latest_times", "time_surface", "voxel_grid"]
+_HOMES = {"TensorEsim": "esim", "TensorEvents": "batch", "TensorV2e": "v2e"}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES.get(name, 'grids')}"), name)

@@ -9,7 +9,6 @@ import numpy as np
 
 COLOURS = {
     "none": "#d9552f",
-    "msaa4": "#e0a526",
     "taps4": "#8a5fc0",
     "edges": "#b0307a",
     "edges2": "#6b4a2b",

@@ -38,7 +38,7 @@ RECONSTRUCTIONS = {
     "hermite": ("timeline.reconstruction=hermite",),
 }
 ANTIALIASINGS = {
-    name: (f"render.antialiasing={name}",) for name in ("none", "msaa4", "taps4", "edges", "edges2", "ssaa2", "ssaa4")
+    name: (f"render.antialiasing={name}",) for name in ("none", "taps4", "edges", "edges2", "ssaa2", "ssaa4")
 }
 OTHERS = {
     "": (),
@@ -91,7 +91,7 @@ def design(quick: bool, random_scene: bool = True) -> tuple[Setting, ...]:
     if quick:
         points = [Setting(s, antialiasing=a) for s in displacement(2, 1, 0.5) for a in ("none", "ssaa2")]
         points += [Setting(s, r, "ssaa2") for s in displacement(2, 1) for r in curves]
-        points += [Setting(displacement(1)[0], antialiasing=a) for a in ("msaa4", "taps4", "edges", "edges2", "ssaa4")]
+        points += [Setting(displacement(1)[0], antialiasing=a) for a in ("taps4", "edges", "edges2", "ssaa4")]
         points += [Setting(s, antialiasing="ssaa2") for s in uniform(100, 400)]
         points += [Setting(s, "pchip", "ssaa2") for s in extra[1::3]]
         points += [Setting(displacement(1)[0], antialiasing=a, other=sharper[0]) for a in ("none", "ssaa2")]

@@ -48,9 +48,8 @@ job = json.loads((folder / "job.json").read_text())
 glb = {triangle()!r}
 Path({str(tmp_path / "who")!r}).write_text(f"{{os.getpid()}} {{folder}}")
 def say(**words): print(json.dumps(words), flush=True)
-ROW = dict(kind="meshes", found=2, came=1, notes=["'B' has no [faces]"])
-REPORT = dict(blender="4.5.15", rows=[ROW], cameras=["Eye"], camera="Eye",
-     size=[1920, 1080], first=1, last=49, fps=24.0, duration_s=2.0)
+REPORT = dict(blender="4.5.15", counts=dict(meshes=1, lights=0), left_out=["no [hair]: 'B'"],
+     cameras=["Eye"], camera="Eye", size=[1920, 1080], first=1, last=49, fps=24.0, duration_s=2.0)
 """
         path.write_text(head + code)
         path.chmod(path.stat().st_mode | stat.S_IXUSR)

@@ -32,9 +32,9 @@ def test_what_is_said_wins(tmp_path):
     preset = load_quality("balanced")
     assert preset["timeline"]["kind"] == "displacement", "or choose another timeline below"
     config = sequence(
-        tmp_path, {"quality": "balanced", "timeline": {"max_px": 0.3}, "render": {"antialiasing": "msaa4"}}
+        tmp_path, {"quality": "balanced", "timeline": {"max_px": 0.3}, "render": {"antialiasing": "ssaa4"}}
     )
-    assert (config.timeline.max_px, config.render.antialiasing) == (0.3, "msaa4")
+    assert (config.timeline.max_px, config.render.antialiasing) == (0.3, "ssaa4")
     assert config.timeline.min_step_us == preset["timeline"].get("min_step_us", 200.0)
     config = sequence(tmp_path, {"quality": "balanced"}, "timeline={kind: uniform, fps: 77}")
     assert (config.timeline.kind, config.timeline.fps) == ("uniform", 77)

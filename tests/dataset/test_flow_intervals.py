@@ -131,30 +131,6 @@ def test_explain_python_and_shards(made):
     assert labels[3].flow_intervals.flow.shape == (0, 36, 48, 2) and labels[0].forward is None
 
 
-def test_torch_reads_those_that_lead_over_all(made):
-    torch = pytest.importorskip("torch")
-    from eflow.data.continuous import ContinuousDataset
-    from eflow.data.representation import VoxelGrid
-
-    data, grid = ContinuousDataset(made / "out", VoxelGrid(bins=3)), VoxelGrid(bins=3)
-    assert len(data) == 3 and data.intervals_ns == ASKED
-    one, folder = data[1], folder_of(made)
-    _, _, there = read_intervals(folder / "flow/intervals/000001.h5", ("flow", "valid"))
-    assert np.array_equal(one["flow"].numpy(), there["flow"].transpose(0, 3, 1, 2))
-    assert np.array_equal(one["valid"].numpy(), there["valid"]) and one["occluded"].shape == (4, 36, 48)
-    assert torch.allclose(one["times"], torch.tensor([-0.02, 0.01, 0.05, 0.1]))
-    few = ContinuousDataset(folder, grid, intervals=[0.05, 0.01])
-    assert len(few) == 4 and few[0]["flow"].shape == (2, 2, 36, 48) and few[0]["new"].shape == (3, 36, 48)
-    batch = next(iter(torch.utils.data.DataLoader(few, batch_size=4)))
-    assert batch["flow"].shape == (4, 2, 2, 36, 48)
-    with pytest.raises(ConfigError, match="no label's flow leads over all of them"):
-        ContinuousDataset(folder, grid, intervals=[0.03])
-    with pytest.raises(ConfigError, match="no interval"):
-        ContinuousDataset(folder, grid, intervals=[])
-    with pytest.raises(AssetError, match="no flow over intervals"):
-        ContinuousDataset(made, grid)
-
-
 @pytest.mark.parametrize(
     "flow, said",
     [

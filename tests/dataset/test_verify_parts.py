@@ -434,7 +434,7 @@ def test_what_makes_two_seeds_differ(key):
     assert not between._noisy(of(**{key: 0.0})) and not between._noisy(of())
 
 
-@pytest.mark.parametrize(("key", "differ"), [("pixels", True), ("latency", True), ("filters", False)])
+@pytest.mark.parametrize(("key", "differ"), [("pixels", True), ("latency", True), ("clock", False)])
 def test_a_read_out_may_make_two_seeds_differ(key, differ):
     readout = SimpleNamespace(**{"pixels": None, "latency": None, key: object()})
     assert between._noisy(SimpleNamespace(events=SimpleNamespace(), readout=readout, sensors=None)) is differ

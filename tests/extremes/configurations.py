@@ -269,7 +269,7 @@ def runs(draw, emulators=esim):
         "events": {**draw(emulators), "max_events_per_step": draw(most)},
         "render": draw(
             some(
-                antialiasing=st.sampled_from(["none", "msaa4", "taps4", "edges", "ssaa2"]),
+                antialiasing=st.sampled_from(["none", "taps4", "edges", "ssaa2"]),
                 anisotropy=st.sampled_from([1.0, 16.0]),
                 mip_bias=st.sampled_from([-8.0, -0.5, 8.0]),
             )

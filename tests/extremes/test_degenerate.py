@@ -106,7 +106,7 @@ def raw_buffers(renderer) -> dict[str, np.ndarray]:
     }
 
 
-@pytest.mark.parametrize("antialiasing", ["none", "taps4", "edges", "msaa4", "ssaa2"])
+@pytest.mark.parametrize("antialiasing", ["none", "taps4", "edges", "ssaa2"])
 @pytest.mark.parametrize("textured", [True, False])
 @pytest.mark.parametrize("lines_drawn", [True, False])
 def test_every_pass_of_a_nasty_mesh_is_finite(gl, monkeypatch, antialiasing, textured, lines_drawn):

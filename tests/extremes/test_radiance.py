@@ -29,7 +29,7 @@ def bars(**keys):
     ]
 
 
-@pytest.mark.parametrize("antialiasing", ["none", "msaa4", "ssaa4"])
+@pytest.mark.parametrize("antialiasing", ["none", "ssaa4"])
 def test_radiance_of_twenty_one_decades(gl, promise, antialiasing):
     """Float32 targets keep 2^-24 of any radiance; the luma weights' sum and the box filter round a few times more."""
     world = scene(bars(unlit=True), rig(90, 24, 80.0))

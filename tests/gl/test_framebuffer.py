@@ -160,7 +160,7 @@ def test_what_was_read_before_does_not_change_what_is_copied(gl):
     for read in (one.read_depth, lambda: one.read(1)):
         other.clear((0.0,))
         read()
-        one.resolve_into(other)
+        one.copy_into(other)
         assert (other.read() == 0.25).all()
 
 

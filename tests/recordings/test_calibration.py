@@ -13,13 +13,11 @@ import yaml
 
 from blinkgl.cli import run
 from blinkgl.errors import BlinkGLError, ConfigError, EventDataError
-from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.io.formats import write_events
 from blinkgl.recordings.calibration import _Search, calibrate, calibrate_events
 from blinkgl.recordings.clip import Clip, clip_of_frames, clip_of_still, clock_offset
 from blinkgl.recordings.simulation import emulator_config
 from blinkgl.recordings.statistics import numbers, sums, target
-from blinkgl.recordings.stimulus import Edge, Flicker, find_borders
 from blinkgl.types.events import Events
 from tests.shared_data import shared
 
@@ -232,128 +230,12 @@ def test_noise_of_a_still_scene_comes_back(tmp_path):
     }
 
 
-def flickering(hz: float = 20.0, contrast: float = 0.6, seconds: float = 0.6, size=(32, 40), **emulator) -> Events:
-    """An even scene under such light, drawn here for itself, darkest at 3 ms."""
-    camera = EventCamera(emulator_config({"emulator": "esim", **TRUE, **emulator}), None, *size, 5)
-    t = np.arange(0, seconds, 1 / (hz * 200))
-    light = 0.4 * (1 - contrast * np.cos(2 * np.pi * hz * (t - 3e-3)))
-    shown = (EventFrame(round(1e9 * a), np.full(size, v, np.float32)) for a, v in zip(t, light))
-    return Events.concatenate([events for _, events in emulate(shown, camera)])
-
-
-def test_the_frequency_of_flickering_light_is_found():
-    clip = Flicker(20.0, 0.6).clip(flickering(hz=20.1), (32, 40))
-    assert clip.facts["flicker_hz"] == pytest.approx(20.1, abs=0.06) and clip.intervals == 22
-
-
-@pytest.mark.slow
-def test_thresholds_of_flickering_light(tmp_path):
-    events = flickering(hz=20.1)
-    write_events(tmp_path / "lamp.npz", events, 32, 40)
-    fixed = {key: TRUE[key] for key in ("log_eps", "refractory_us")}
-    result = calibrate(
-        tmp_path / "lamp.npz",
-        stimulus=Flicker(20.0, 0.6),
-        emulator={"emulator": "esim", **fixed},
-        fixed=fixed,
-        starts=1,
-    )
-    assert result.clip.facts["flicker_hz"] == pytest.approx(20.1, abs=0.06)
-    light = np.array([frame[0, 0] for _, frame in result.clip.frames])
-    darkest = np.array([t for t, _ in result.clip.frames])[light < light.min() * 1.001] * 1e-9
-    assert np.abs((darkest - 3e-3) * 20.1 - np.round((darkest - 3e-3) * 20.1)).max() < 0.04, "periods"
-    for key, within in (("contrast_threshold", 0.02), ("contrast_threshold_off", 0.02), ("threshold_sigma", 0.15)):
-        assert result.values[key] == pytest.approx(TRUE[key], rel=within), key
-    assert result.judged[1].rate_ratio == pytest.approx(1, abs=0.02)
-
-
-@pytest.mark.parametrize(
-    "options, said",
-    [
-        (["--flicker", "31,0.6"], "do not go up and down with the light"),
-        (["--flicker", "20"], "not a frequency and a contrast"),
-        (["--flicker", "20,1.5"], "not a frequency and a contrast"),
-        (["--flicker", "20,0.6", "--still"], "--flicker: a scene that is known needs no frames"),
-        (["--flicker", "4,0.6"], "too few periods|do not go up"),
-    ],
-)
-def test_flicker_that_is_not(tmp_path, capsys, options, said):
-    write_events(tmp_path / "lamp.npz", flickering(), 32, 40)
-    assert run(["calibrate", str(tmp_path / "lamp.npz"), "--out", str(tmp_path / "out.yaml"), *options]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and re.search(said, error), error
-    assert [p.name for p in tmp_path.iterdir()] == ["lamp.npz"]
-
-
-def bordered(size=(32, 40), px_per_s=300.0, angle=0.4, contrast=0.6, blur_px=0.9, seed: int = 5, **emulator) -> Events:
-    """After anything else a bright sheet goes by, a dark one, a bright bar and a dark sheet, drawn here for itself,
-    as a row of tones that is blurred; the events from when the first border has left the picture."""
-    camera = EventCamera(emulator_config({"emulator": "esim", **TRUE, **emulator}), None, *size, seed)
-    place = np.arange(-320, 100, 0.05)
-    tone = 1 + contrast * np.select([place < -140, place < -120, place < -90, place < -10], [-1, 1, -1, 1], -1)
-    kernel = np.exp(-(np.arange(-120, 121) ** 2) / (2 * (20 * blur_px) ** 2))
-    tone = 0.4 * np.convolve(np.pad(tone, 120, "edge"), kernel / kernel.sum(), "valid")
-    y, x = np.indices(size)
-    along = np.cos(angle) * x + np.sin(angle) * y
-    gone = np.ptp(along) + 20
-    at = np.arange(0, 150 + 1.2 * np.ptp(along), 0.1)
-    look = lambda px: np.interp(along - along.min() - px, place, tone).astype(np.float32)
-    anything = np.random.default_rng(seed).uniform(0.1, 0.9, size).astype(np.float32)
-    shown = (EventFrame(round(1e9 * px / px_per_s), look(px) if px else anything) for px in at)
-    events = Events.concatenate([events for _, events in emulate(shown, camera)])
-    return events.window(round(1e6 * gone / px_per_s), 2**60)
-
-
-@pytest.mark.parametrize("angle, px_per_s", [(0.4, 300.0), (-2.0, 30.0), (np.pi / 2, 5000.0)])
-def test_borders_that_move_are_found(angle, px_per_s):
-    events = bordered(angle=angle, px_per_s=px_per_s, refractory_us=10.0)
-    found = find_borders(events)
-    assert found.rises.tolist() == [False, True, False]
-    assert 1e6 / found.us_per_px == pytest.approx(px_per_s, rel=2e-3)
-    turned = np.arctan2(*found.slowness[::-1]) - angle
-    assert abs((turned + np.pi) % (2 * np.pi) - np.pi) < 2e-3 and found.explained > 0.99
-    again = Edge(0.6).clip(events, (32, 40))
-    assert again.facts["width_px"] == pytest.approx(0.9, rel=0.25), "by the law of a noise-free pixel alone"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(5))
-def test_thresholds_of_borders_that_move(tmp_path, seed):
-    write_events(tmp_path / "edge.npz", bordered(size=(48, 64), seed=seed, angle=0.3 + 1.1 * seed), 48, 64)
-    fixed = {key: TRUE[key] for key in ("log_eps", "refractory_us")}
-    result = calibrate(
-        tmp_path / "edge.npz", stimulus=Edge(0.6), emulator={"emulator": "esim", **fixed}, fixed=fixed, starts=1
-    )
-    for key, within in (("contrast_threshold", 0.05), ("contrast_threshold_off", 0.02), ("threshold_sigma", 0.4)):
-        assert result.values[key] == pytest.approx(TRUE[key], rel=within), key
-    assert result.clip.facts["width_px"] == pytest.approx(0.9, rel=0.05)
-    assert result.judged[1].rate_ratio == pytest.approx(1, abs=0.03)
-
-
-@pytest.mark.parametrize(
-    "options, said",
-    [
-        (["--edge", "0.6"], "not those of straight borders"),
-        (["--edge", "1.6"], "not a contrast"),
-        (["--edge", "0.6,30"], "not a contrast.*at most 8 px"),
-        (["--edge", "0.6,wide"], "not a contrast"),
-        (["--edge", "0.6", "--still"], "--edge: a scene that is known needs no frames"),
-        (["--edge", "0.6", "--flicker", "20,0.6"], "two scenes at once"),
-    ],
-)
-def test_borders_that_are_none(tmp_path, capsys, options, said):
-    """Flickering light, which has no place."""
-    write_events(tmp_path / "lamp.npz", flickering(), 32, 40)
-    assert run(["calibrate", str(tmp_path / "lamp.npz"), "--out", str(tmp_path / "out.yaml"), *options]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and re.search(said, error), error
-    assert [p.name for p in tmp_path.iterdir()] == ["lamp.npz"]
-
-
-def test_borders_of_three_tones_are_refused():
-    events = bordered()
-    with pytest.raises(EventDataError, match="two borders in a row"):
-        find_borders(Events(events.x, events.y, events.t, np.ones_like(events.p)))
+@pytest.mark.parametrize("option", ["--flicker", "--edge"])
+def test_scenes_without_frames_are_refused(tmp_path, capsys, option):
+    path = still_recording(tmp_path)
+    assert run(["calibrate", str(path), "--out", str(tmp_path / "out.yaml"), option, "20,0.6"]) == 2
+    line = f"error: {option}: no scene is guessed without frames; expected --frames or --still\n"
+    assert capsys.readouterr().err == line
 
 
 FIVE = range(5)

@@ -33,7 +33,7 @@ def full_redraw(gl, world, config=PLAIN):
     return Renderer(gl, world, config, whole=True)
 
 
-@pytest.mark.parametrize("antialiasing", ["none", "msaa4", "edges", "edges2", "ssaa2"])
+@pytest.mark.parametrize("antialiasing", ["none", "edges", "edges2", "ssaa2"])
 def test_identical_to_the_full_redraw(gl, antialiasing):
     config = RenderConfig(antialiasing=antialiasing)
     world = mixed_scene(camera_moves=False)
@@ -122,7 +122,7 @@ def test_other_passes_in_between_do_not_disturb(gl):
             quick.colour(t).view()
 
 
-@pytest.mark.parametrize("antialiasing", ["none", "msaa4", "edges", "edges2", "ssaa2"])
+@pytest.mark.parametrize("antialiasing", ["none", "edges", "edges2", "ssaa2"])
 @pytest.mark.parametrize("seed", range(3))
 def test_any_order_of_kinds_and_of_looking(gl, seed, antialiasing):
     """Frames with and without rates, at times that go back and forth, viewed, read, or not looked at at all; drawn
@@ -195,7 +195,7 @@ def test_another_camera_takes_nothing_from_the_first(gl):
         np.testing.assert_array_equal(a.occluded, b.occluded)
 
 
-@pytest.mark.parametrize("antialiasing", ["none", "msaa4", "edges"])
+@pytest.mark.parametrize("antialiasing", ["none", "edges"])
 def test_changes_are_where_they_are_said_to_be(gl, antialiasing):
     world = mixed_scene(camera_moves=False)
     with Renderer(gl, world, PLAIN.model_copy(update={"antialiasing": antialiasing})) as renderer:

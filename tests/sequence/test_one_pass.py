@@ -11,6 +11,7 @@ KERNELS_ALONE = {"tools/bench.py", "tools/draws.py"}
 THE_DOOR = {"blinkgl/front/sensors.py"}  # hands an emulator to a person who steps it
 OWN = {
     "make_emulator": {"blinkgl/events/camera.py", "blinkgl/events/table.py", "blinkgl/events/__init__.py"}
+    | {"blinkgl/tensors/choice.py"}
     | KERNELS_ALONE
     | THE_DOOR,
     "Readout": {"blinkgl/events/camera.py", "tools/draws.py"},

@@ -17,10 +17,11 @@ from blinkgl.config.sequence import load_run
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import ConfigError, EventDataError
-from blinkgl.events import Esim, make_emulator
+from blinkgl.events import Esim
 from blinkgl.events.v2e import V2e
 from blinkgl.sequence_files.sequence_dir import read_manifest
 from blinkgl.tensors import emulator as devices
+from blinkgl.tensors.choice import make_on_device
 from same_events import assert_same
 from tests.tiny_recipe import TINY
 
@@ -33,7 +34,7 @@ def card(monkeypatch):
 
 
 def made(gl, reconstruction="linear", config=EsimConfig, **values):
-    return make_emulator(config(**values), 16, 24, 1, reconstruction, gl).device
+    return make_on_device(config(**values), 16, 24, 1, reconstruction, gl).device
 
 
 def test_auto_takes_a_card_that_can_do_it(card, monkeypatch):

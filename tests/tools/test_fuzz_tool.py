@@ -40,7 +40,7 @@ def _lines(_):
     [
         (lambda _: None, fuzz.READ),
         (_refuse, fuzz.REFUSED),
-        (_bug, "ZeroDivisionError at test_fuzz.py"),
+        (_bug, "ZeroDivisionError at test_fuzz_tool.py"),
         (_lines, "several lines"),
         (lambda _: os.kill(os.getpid(), signal.SIGSEGV), "the process ends with status -11"),
         (lambda _: os._exit(0), "the process ends with status 0"),

@@ -186,14 +186,14 @@ def test_design():
     for quick in (True, False):
         settings = design(quick)
         assert len(set(settings)) == len(settings) and len({s.name for s in settings}) == len(settings)
-        assert {s.antialiasing for s in settings} == {"none", "msaa4", "taps4", "edges", "edges2", "ssaa2", "ssaa4"}
+        assert {s.antialiasing for s in settings} == {"none", "taps4", "edges", "edges2", "ssaa2", "ssaa4"}
     assert len(design(True)) < 30 < len(design(False))
     assert not any("textures" in s.other for s in design(False, random_scene=False))
 
 
 def test_only_and_skip():
     settings = design(False)
-    assert {s.antialiasing for s in chosen(settings, ["ssaa2", "taps4"], ["MSAA"])} == {"ssaa2", "taps4"}
+    assert {s.antialiasing for s in chosen(settings, ["ssaa2", "taps4"], ["SSAA4"])} == {"ssaa2", "taps4"}
     assert not any(s.size for s in chosen(settings, [], ["half size"]))
 
 

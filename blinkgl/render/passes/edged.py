@@ -70,7 +70,7 @@ class Edged(Pass):
         return {"LIGHT": light, "OF": "rgba"[:channels], "FLOOR": f"{light}({floor})"}
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
-        shot.inputs["picture"].target.resolve_into(shot.target)
+        shot.inputs["picture"].target.copy_into(shot.target)
         moment, strokes = shot.moment, painter.strokes
         drawn = [item for item in (moment.visible if items is None else items) if item.layer != SKY]
         strokes.upload(moment, drawn, *shot.size)

@@ -14,7 +14,7 @@ from blinkgl.labels import LABELS
 from blinkgl.render.lens import steps_of
 from blinkgl.render.passes.base import Input, Output, Pass, ScreenPass, Shot
 from blinkgl.render.passes.colour import Colour
-from blinkgl.render.passes.edged import Edged, filtered
+from blinkgl.render.passes.edged import Edged
 from blinkgl.render.passes.geometry import Geometry
 from blinkgl.render.passes.velocity import Velocity
 from blinkgl.render.rectangles import Rectangle, merged
@@ -89,8 +89,6 @@ class Gather(ScreenPass):
 
 
 def one_value(pass_: Pass) -> Pass:
-    """``pass_``, with the samples of each of its pixels resolved and its edges filtered, but not the mean of a finer
+    """``pass_``, with its edges filtered, but not the mean of a finer
     grid: a gathering pass is a mean over that anyway."""
-    if pass_.samples.edges:
-        return Edged(pass_)
-    return filtered(pass_) if pass_.samples.multi else pass_
+    return Edged(pass_) if pass_.samples.edges else pass_

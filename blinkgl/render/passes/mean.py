@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from blinkgl.render.antialiasing import Samples
-from blinkgl.render.passes.base import Input, Output, Pass, ScreenPass, Shot
+from blinkgl.render.passes.base import Input, Output, Pass, ScreenPass
 
 if TYPE_CHECKING:
-    from blinkgl.render.painter import Painter
-    from blinkgl.render.resources import DrawItem, Kind
+    from blinkgl.render.resources import Kind
 
 
 @dataclass(frozen=True)
@@ -36,12 +35,6 @@ class Mean(ScreenPass):
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
         return {"FACTOR": self.of.samples.grid}
-
-    def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
-        if self.of.samples.multi:
-            shot.inputs["fine"].target.resolve_into(shot.target)
-        else:
-            super().paint(painter, shot)
 
     @classmethod
     def every_kind(cls) -> Iterator[Pass]:

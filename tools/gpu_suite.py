@@ -2,7 +2,7 @@
 
     python -m blinkgl.tools.gpu_suite [--out FOLDER] [--small] [--device cuda] [--only events,kernel]
 
-FOLDER then has ``gpu_suite.json`` and ``gpu_suite.md``; both are written after every piece. A piece that this machine
+FOLDER then has ``gpu_suite.json`` and ``gpu_suite.md``; both are written after every row. A piece that this machine
 cannot do says so in a line, and the others go on. Without a card everything runs on the processor: ``--small`` is the
 rehearsal of a minute. Pieces:
 
@@ -139,12 +139,12 @@ def compared(config: Any, height: int, width: int, envs: int, device: str, seed:
     return total
 
 
-def noise(height: int, width: int, density: float, frames: int = 2) -> np.ndarray:
+def noise(height: int, width: int, density: float, frames: int) -> np.ndarray:
     """(frames, H, W) float32 with ``density`` events a pixel and frame at thresholds of 0.2: pixels drawn by lot go
     there and back again, over the same levels each time, from the second frame on."""
     rng, levels = np.random.default_rng(1), max(1, int(np.ceil(density)))
     moving = rng.choice((-1.0, 1.0), (height, width)) * (rng.random((height, width)) < density / levels)
-    places = np.where(np.arange(frames) % 2 == 1, levels + 0.5, -0.2)  # in thresholds, a little beyond the levels
+    places = np.where(np.arange(frames) % 2 == 1, levels + 0.5, -0.5)  # in thresholds, beyond the levels by its spread
     return np.exp(0.2 * places[:, None, None] * moving - 1.0).astype(np.float32)
 
 
@@ -153,7 +153,9 @@ def kernel_piece(options: Namespace) -> Iterator[Row]:
     height, width = (48, 64) if options.small else (480, 640)
     config = EsimConfig()
     for density, envs in itertools.product(DENSITIES, (1, 16, 256)):
-        clip = noise(height, width, density)
+        if options.device == "cpu" and density * envs * height * width > 3e7:
+            continue  # a step would take a processor minutes and more than 10 GB
+        clip = noise(height, width, density, 3)[1:]  # there and back again, for ever
         frames = torch.from_numpy(clip).to(options.device)[:, None].expand(2, envs, height, width).contiguous()
         batch = TensorEsim(height, width, config, envs=envs, device=options.device)
         single = emulator_of(config)(height, width, config)
@@ -286,13 +288,15 @@ def write(out: Path, report: dict[str, Any]) -> None:
             part.write_text(content + "\n", encoding="utf-8")
 
 
-def measured(name: str, options: Namespace, deadline: float) -> dict[str, Any]:
-    """One piece: its rows as far as the time reaches, and what became of it."""
-    began, rows, state, said = time.monotonic(), [], "done", ""
+def measured(name: str, options: Namespace, deadline: float, report: dict[str, Any]) -> dict[str, Any]:
+    """One piece, put into the report and written row by row, as far as the time reaches; what became of it."""
+    began, piece = time.monotonic(), {"state": "begun", "said": "", "seconds": 0.0, "rows": []}
+    report["pieces"][name], state, said = piece, "done", ""
     try:
         for row in PIECES[name](options):
-            rows.append(row)
+            piece["rows"].append(row)
             print(f"  {next(iter(row.values()))}", flush=True)
+            write(options.out, report)
             if time.monotonic() > deadline:
                 state, said = "cut", "the time was over"
                 break
@@ -300,7 +304,9 @@ def measured(name: str, options: Namespace, deadline: float) -> dict[str, Any]:
         state, said = "absent", str(error)
     except Exception as error:  # noqa: BLE001 - the other pieces go on
         state, said = "failed", f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
-    return {"state": state, "said": said, "seconds": time.monotonic() - began, "rows": rows}
+    piece |= {"state": state, "said": said, "seconds": time.monotonic() - began}
+    write(options.out, report)
+    return piece
 
 
 def parsed(arguments: list[str] | None) -> Namespace:
@@ -334,9 +340,8 @@ def main(arguments: list[str] | None = None) -> int:
     report["pieces"], deadline = {}, time.monotonic() + 60 * options.minutes
     for name in options.only:
         print(f"{name} …", flush=True)
-        piece = report["pieces"][name] = measured(name, options, deadline)
+        piece = measured(name, options, deadline, report)
         print(f"{name}: {piece['state']}, {len(piece['rows'])} rows, {piece['seconds']:.0f} s {piece['said']}")
-        write(options.out, report)
     print((options.out / "gpu_suite.md").read_text(encoding="utf-8"))
     return int(any(piece["state"] == "failed" for piece in report["pieces"].values()))
 

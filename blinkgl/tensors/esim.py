@@ -63,6 +63,14 @@ def crossing_ns(part: Tensor, whole: Tensor, dt_ns: Any, longest_ns: int) -> Ten
     return (quotient << 20) + torch.div((rest << 20) + part * low, whole, rounding_mode="trunc")
 
 
+def _known(flags: Tensor, size: int) -> Tensor:
+    """Indices of the ``size`` set flags, without asking the device how many there are."""
+    try:
+        return torch.nonzero_static(flags, size=size).view(-1)
+    except (NotImplementedError, RuntimeError):  # early versions of torch have it on processors alone
+        return torch.nonzero(flags).view(-1)
+
+
 class TensorEsim(Batch):
     """ESIM of ``envs`` environments of one size and configuration on ``device``.
 
@@ -198,7 +206,7 @@ class TensorEsim(Batch):
         numbers = (extremes[:, 0].amin(), extremes[:, 1].amax(), active.sum(), levels.sum(), levels.amax())
         looked = torch.stack([one.to(torch.int64) for one in (*numbers, self._beyond.amax())]).tolist()
         self._refuse(flat, looked[0], looked[1])
-        firing = self._gathered(torch.nonzero_static(active, size=looked[2]).view(-1))
+        firing = self._gathered(_known(active, looked[2]))
         counts = levels.index_select(0, firing.flat).to(torch.int64)
         return firing, counts, Sizes(*looked[3:])
 

@@ -39,3 +39,14 @@ def test_more_shot_noise_than_it_may_draw_is_refused():
     emulator.step(torch.full((2, 40, 64), 0.5), 0)
     with pytest.raises(EventDataError, match="environment 1, frame 1.*more shot noise"):
         emulator.step(torch.full((2, 40, 64), 0.5), [1_000, 1_000_000_000])
+
+
+def test_a_bad_intensity_is_named_and_nothing_changes():
+    emulator = TensorV2e(4, 6, V2eConfig(**_NOISY), envs=2)
+    emulator.step(torch.full((2, 4, 6), 0.5), 0)
+    before, frames = emulator.state_dict(), torch.full((2, 4, 6), 0.9)
+    frames[1, 3, 2] = float("nan")
+    with pytest.raises(EventDataError, match=r"environment 1, frame 1.*x=2, y=3"):
+        emulator.step(frames, 10**9)
+    after = emulator.state_dict()
+    assert all(torch.equal(before[name], after[name]) for name in before)

@@ -43,7 +43,9 @@ def test_every_piece_runs_here(tmp_path, capsys, monkeypatch):
     rows = {name: {row[""]: row for row in piece["rows"]} for name, piece in report["pieces"].items()}
     assert rows["events"]["all, 1 turns"]["events, all the same"] > 10_000
     assert set(rows["events"]) > set(gpu_suite.VARIANTS)
-    assert len(rows["kernel"]) == 3 and all(row["Mev/s"] > 0 for row in rows["kernel"].values())
+    assert len(rows["kernel"]) == 3
+    for row in rows["kernel"].values():  # the events that the row's name says, over and over
+        assert np.isclose(1e6 * row["Mev/s"] / row["frames/s"], 0.1 * 48 * 64, rtol=0.25)
     assert all(row["frames go by"].startswith("plain") for row in rows["end_to_end"].values())
     page = (tmp_path / "gpu_suite.md").read_text()
     assert "| OpenGL: renderer | info |" in page and page in capsys.readouterr().out

@@ -59,6 +59,19 @@ def test_what_is_refused(card, tmp_path):
         load_run(path)
 
 
+def test_a_step_that_the_processor_would_cut_is_refused(card):
+    """Else files of a card would hold events that those of the processor do not."""
+    config = V2eConfig(preset="clean", device="cuda", contrast_threshold=0.01, max_events_per_step=1000)
+    on_card, frames = make_on_device(config, 16, 24, 1), [np.full((16, 24), v, np.float32) for v in (0.1, 0.9)]
+    on_card.step(frames[0], 0)
+    with pytest.raises(EventDataError, match=r"events\.max_events_per_step.*a higher limit, or events\.device: cpu"):
+        on_card.step(frames[1], 10**6)
+    kernel = make_on_device(config.model_copy(update={"device": "cpu"}), 16, 24, 1)
+    kernel.step(frames[0], 0)
+    kernel.step(frames[1], 10**6)
+    assert kernel.saturated > 0
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a card")
 def test_without_a_card_it_is_said():
     assert made(CARD) == "cpu"

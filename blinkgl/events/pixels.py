@@ -18,6 +18,8 @@ from blinkgl.events.packing import JIT
 from blinkgl.events.philox import Stream, normal2, pixel_counters, uniform2
 from blinkgl.types.events import OPTIONAL, Cause, Events
 
+# Events drawn at once; the highest rate, one event per microsecond; the longest time before the
+# recording.
 _BATCH, _MOST_HZ, _LONGEST_BEFORE_S = 1024, 1e6, 5.0
 _DEFECT, _OWN, _LATE = np.uint64(Stream.DEFECT), np.uint64(Stream.OWN_NOISE), np.uint64(Stream.LATENCY)
 
@@ -43,15 +45,20 @@ class PixelNoise:
         self.config, self._width, self._causes = config, width, causes
         self._seed = np.uint64(int(seed) & (2**64 - 1))
         pixels = pixel_counters(height, width)
+        # Draws 0 and 1 of the stream: uniforms for what a pixel is, normals for how much.
         which, other = uniform2(self._seed, pixels, _DEFECT, np.uint64(0))
         spread, prefers = normal2(self._seed, pixels, _DEFECT, np.uint64(1))
         self.hot = which < config.hot_fraction
         self.dead = other < config.dead_fraction
+        # Log-normal rates: a median and a spread in decades.
         median = np.where(self.hot, config.hot_rate_hz, config.rate_hz)
         decades = np.where(self.hot, config.hot_spread_decades, config.spread_decades)
         rates = np.minimum(median * exp_f64(np.log(10.0) * decades * spread), _MOST_HZ)
         self.rates = np.where(self.dead, 0.0, rates)
+        # Running sums, in which a uniform finds its pixel. Answers come on top of the drawn events,
+        # which are therefore as many fewer.
         self._sums = np.cumsum(self.rates / (1.0 + np.where(self.hot, 0.0, config.answered)))
+        # The odds of ON against OFF are log-normal over the hot pixels.
         off = (1.0 - config.hot_on_share) * exp_f64(-config.hot_on_spread * prefers)
         self.on_shares = np.where(self.hot, config.hot_on_share / (config.hot_on_share + off), config.on_share)
         self._decades = np.log(10.0) * config.answer_spread_decades
@@ -60,22 +67,28 @@ class PixelNoise:
         self._before_ns = round(1e9 * before_s) if config.answered else 0
         self._from_us = 0
         self._last = np.full(height * width, -(2**62), np.int64) if config.refractory_us else None
-        self._batch = 0  # next to be drawn
-        self._t_ns: int | None = None  # where the last batch ended
-        self._drawn = Events.empty()  # and not given yet
+        # Next to be drawn.
+        self._batch = 0
+        # Where the last batch ended.
+        self._t_ns: int | None = None
+        # And not given yet.
+        self._drawn = Events.empty()
 
     def step(self, events: Events, until_us: int) -> Events:
         """``events`` without those of dead pixels, with the noise up to ``until_us`` (that microsecond included); of
         one microsecond the noise comes last. The first step says when the noise begins."""
         if self.dead.any() and len(events):
             events = events.part(~self.dead[events.y.astype(np.int64) * self._width + events.x])
+        # No pixel fires by itself.
         if not (self._sums.size and self._sums[-1] > 0):
             return events
         if self._t_ns is None:
+            # Noise begins early enough for its late answers to fall into the recording.
             self._t_ns, self._from_us = 1000 * until_us - self._before_ns, until_us
             return events
         while self._t_ns // 1000 <= until_us:
             drawn = Events.concatenate([self._drawn, self._more()])
+            # Answers are late, so those of one batch may come after the next batch has begun.
             self._drawn = drawn.part(np.argsort(drawn.t, kind="stable")) if self._before_ns else drawn
         count = int(np.searchsorted(self._drawn.t, until_us, side="right"))
         own, self._drawn = self._drawn.part(slice(count)), self._drawn.part(slice(count, None))
@@ -94,9 +107,12 @@ class PixelNoise:
         proportion to their rates."""
         index = np.uint64(self._batch * _BATCH) + np.arange(_BATCH, dtype=np.uint64)
         self._batch += 1
+        # Draw 0 of an event: the time to it and its pixel; draw 1: polarity and whether it is answered;
+        # draw 2: how late.
         wait, pick = uniform2(self._seed, index, _OWN, np.uint64(0))
         polarity, answers = uniform2(self._seed, index, _OWN, np.uint64(1))
         total = self._sums[-1]
+        # Exponential waiting times, ns.
         gaps = np.minimum(-log_f64(wait) * (1e9 / total), 2.0**55).astype(np.int64)
         t_ns = self._t_ns + np.cumsum(gaps)
         self._t_ns = int(t_ns[-1])
@@ -112,11 +128,13 @@ class PixelNoise:
         if not self._before_ns:
             return own
         late, _ = normal2(self._seed, index, _OWN, np.uint64(2))
+        # Log-normal around ``answer_ms``. An answer has the other polarity.
         wait_ns = 1e6 * self.config.answer_ms * exp_f64(self._decades * late)
         chosen = (answers < self.config.answered) & ~self.hot[pixel]
         answer = own.part(chosen)
         at_us = (t_ns[chosen] + np.minimum(wait_ns[chosen], 2.0**55).astype(np.int64)) // 1000
         both = Events.concatenate([own, replace(answer, t=at_us, p=1 - answer.p)])
+        # What lies before the recording was only drawn for its answers.
         return both.part(both.t > self._from_us)
 
     def state_dict(self) -> dict[str, np.ndarray]:
@@ -135,7 +153,8 @@ class PixelNoise:
 @numba.njit(**JIT)
 def _delay(pixel, t_us, delay, last, out):
     for i in range(t_us.size):
-        out[i] = max(t_us[i] + np.int64(delay[i]), last[pixel[i]])  # no event overtakes another of its pixel
+        # No event overtakes another of its pixel.
+        out[i] = max(t_us[i] + np.int64(delay[i]), last[pixel[i]])
         last[pixel[i]] = out[i]
 
 
@@ -162,6 +181,7 @@ class Latency:
             c = self.config
             pixel = events.y.astype(np.int64) * self._width + events.x
             intensity = luminance.reshape(-1)[pixel].astype(np.float64) * c.full_scale
+            # A constant part, and one that falls with the photocurrent; +1 keeps it finite in the dark.
             delay = c.fixed_us + c.dark_us / (intensity + 1.0)
             if c.jitter_us:
                 index = np.uint64(self._count) + np.arange(len(events), dtype=np.uint64)
@@ -171,6 +191,7 @@ class Latency:
             t = np.empty(len(events), np.int64)
             _delay(pixel, events.t, np.maximum(delay, 0.0), self._last, t)
             self._held = Events.concatenate([self._held, replace(events, t=t)])
+            # Delays differ between pixels: events that are held back may be overtaken.
             self._held = self._held.part(np.argsort(self._held.t, kind="stable"))
         count = int(np.searchsorted(self._held.t, until_us, side="right"))
         known, self._held = self._held.part(slice(count)), self._held.part(slice(count, None)).copy()

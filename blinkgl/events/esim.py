@@ -427,8 +427,7 @@ class Esim(Emulator):
                 np.zeros(4, np.int64),
                 np.zeros((4, 2), np.int64),
             )
-            # Number of the frame up to which events have been returned.
-            self._passed = np.zeros(1, np.int64)
+            self._passed = np.zeros(1, np.int64)  # number of the frame up to which events have been returned
         else:
             self._log = np.zeros(pixels, np.int32)
         self._slope = np.zeros(pixels if self.needs_rate else 0, np.float32)

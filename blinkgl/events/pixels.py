@@ -67,12 +67,9 @@ class PixelNoise:
         self._before_ns = round(1e9 * before_s) if config.answered else 0
         self._from_us = 0
         self._last = np.full(height * width, -(2**62), np.int64) if config.refractory_us else None
-        # Next to be drawn.
-        self._batch = 0
-        # Where the last batch ended.
-        self._t_ns: int | None = None
-        # And not given yet.
-        self._drawn = Events.empty()
+        self._batch = 0  # next to be drawn
+        self._t_ns: int | None = None  # where the last batch ended
+        self._drawn = Events.empty()  # and not given yet
 
     def step(self, events: Events, until_us: int) -> Events:
         """``events`` without those of dead pixels, with the noise up to ``until_us`` (that microsecond included); of

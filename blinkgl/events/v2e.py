@@ -423,8 +423,7 @@ class V2e(Emulator):
         # Half of the rate for each polarity, at its value in the dark, per ns.
         self._shot_unit = 0.5 * config.shot_noise_rate_hz * DARKEST * 1e-9
         self._shot_table = shot_tables(self._on, self._off, on, off) if shot else np.empty((0, 0), np.float32)
-        # If all pixels were dark.
-        self._shots_per_ns = self._shot_unit * float(self._shot_table[:, -1:].sum())
+        self._shots_per_ns = self._shot_unit * float(self._shot_table[:, -1:].sum())  # if all pixels were dark
         self._inverse_threshold = 1.0 / float(min(self._on.min(), self._off.min()))
         self._scale = np.float32(config.full_scale)
         told = pixels if config.causes else 0

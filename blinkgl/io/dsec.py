@@ -30,6 +30,7 @@ BLOCK = 1 << 17
 """Events per HDF5 chunk and per write."""
 
 _COLUMNS = {"x": np.uint16, "y": np.uint16, "t": np.uint32, "p": np.uint8}
+# Entries of ms_to_idx that are written at once.
 _MS_PIECE = 1 << 20
 _MAX_RELATIVE_US = np.iinfo(np.uint32).max
 
@@ -75,6 +76,7 @@ class DsecEventWriter:
         self.t_end_us: int | None = None  # may be set any time before close
         self._last_t = self.t_offset_us
         self._codec = codec
+        # Entries of ms_to_idx written so far; events written so far; events in the block.
         self._next_ms = 0
         self._written = 0
         self._fill = 0
@@ -111,6 +113,7 @@ class DsecEventWriter:
         self.count += len(events)
         start = 0
         while start < len(events):
+            # What fits into the block; a full one goes to the writer.
             stop = min(len(events), start + BLOCK - self._fill)
             into = slice(self._fill, self._fill + stop - start)
             for name in (name for name in self._columns if name != "t"):
@@ -128,6 +131,7 @@ class DsecEventWriter:
         last event's, so that ``ms_to_idx`` covers windows up to it."""
         if self._closed:
             return
+        # The table covers the whole recording, events or not.
         t_end_us = self.t_end_us if t_end_us is None else t_end_us
         end = max(
             self._last_t + 1 if self.count else self.t_offset_us,
@@ -142,7 +146,8 @@ class DsecEventWriter:
             with output_errors(self.path):
                 # One entry past the last millisecond: a slicer asks for ceil(end).
                 last_ms = -(-(end - self.t_offset_us) // 1000)
-                while self._next_ms <= last_ms:  # an eventless day is 700 MB in one piece; pieces end where chunks do
+                # An eventless day is 700 MB in one piece; pieces end where chunks do.
+                while self._next_ms <= last_ms:
                     stop = min((self._next_ms // _MS_PIECE + 1) * _MS_PIECE, last_ms + 1)
                     self._store_ms(np.full(stop - self._next_ms, self._written, np.uint64))
                 self._file.close()
@@ -203,13 +208,15 @@ class DsecEventWriter:
         if self._queue is not None:
             self._queue.put(block)
         elif block is not None:
+            # Without a thread the caller compresses.
             with output_errors(self.path):
                 self._store(block)
 
     def _run(self) -> None:
         while (block := self._queue.get()) is not None:
             if self._error is not None:
-                continue  # keep draining, so that a blocked producer wakes up and sees the error
+                # Keep draining, so that a blocked producer wakes up and sees the error.
+                continue
             try:
                 with output_errors(self.path):
                     self._store(block)

@@ -48,6 +48,7 @@ def ranked(values: np.ndarray, percent: float) -> Ranked:
     values = values.ravel()
     values = values[(values >= SLOWEST) & np.isfinite(values)]
     if not len(values):
+        # The k-th smallest and the one above it, without sorting all.
         return STILL
     k, share = place(len(values), percent)
     above = min(k + 1, len(values) - 1)

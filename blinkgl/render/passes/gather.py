@@ -71,6 +71,7 @@ class Gather(ScreenPass):
         self.bind(uniforms, shot)
         if self.smooth:
             texture = shot.inputs["picked_0"].texture(self.inputs[0].output)
+            # The mean reads between texels; beyond the edge the outermost one counts.
             texture.filter, texture.repeat_x, texture.repeat_y = (LINEAR, LINEAR), False, False
             lens.slopes(*shot.size).use(_FREE_UNIT + 3)
             uniforms["slopes"].value = _FREE_UNIT + 3

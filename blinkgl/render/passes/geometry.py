@@ -52,10 +52,12 @@ class Geometry(ScenePass):
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
         programs, values = painter.programs(self), self._values(shot)
+        # Uniforms that only programs of changing shapes have.
         of_shapes = {name for label in self.names for name in LABELS[label].of_shapes}
         checked = set()
         for item in self.items(shot.moment) if items is None else items:
             uniforms = programs[item.kind]
+            # Once per kind and frame: programs of one kind have the same uniforms.
             if item.kind not in checked:
                 checked.add(item.kind)
                 given = {k: v for k, v in values.items() if item.deformer is not None or k not in of_shapes}
@@ -110,6 +112,7 @@ class Geometry(ScenePass):
                 f"'{name}'"
             )
         for name, (label, _) in values.items():
+            # A uniform that the compiler removed is not in the program.
             try:
                 uniforms[name]
             except KeyError:

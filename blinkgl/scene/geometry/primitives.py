@@ -59,6 +59,7 @@ PARAMETERS = {
 
 _LEAST = {"segments": 3, "sides": 3, "tube_segments": 3, "rings": 2, "subdivisions": 1, "variant": 0, "coat": 0}
 _MAX_SEGMENTS = 4096
+# "variant" and "coat" pick from many; their numbers are no sizes.
 _MOST = {"variant": 10**9, "coat": 10**9}
 _WORDS = {"clip": tuple(CLIPS)}
 _PART = (0.7, 1.4)
@@ -98,6 +99,7 @@ def primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Calla
         bound.apply_defaults()
         for key, value in bound.arguments.items():
             default = signature.parameters[key].default
+            # A range for this primitive alone comes before that of all.
             within = _RANGES.get(f"{where}.{key}", _RANGES.get(key))
             if isinstance(default, str):
                 if value not in _WORDS[key]:
@@ -115,6 +117,7 @@ def primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Calla
                     raise AssetError("bad parameter", where=f"{where}.{key}", value=value, accepted=accepted)
                 bound.arguments[key] = float(value)
             elif isinstance(default, int):
+                # Each subdivision has four times the triangles: 7 are 327,680.
                 low, high = (0, 7) if where == "icosphere" else (_LEAST[key], _MOST.get(key, _MAX_SEGMENTS))
                 if np.shape(value) or not low <= value <= high or float(value) != int(value):
                     raise AssetError(
@@ -154,6 +157,7 @@ def primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Calla
 
 def join(pieces: Sequence[Surface]) -> Surface:
     """One body of several (positions, normals, uvs, faces)."""
+    # Numbers of vertices count on from piece to piece.
     offsets = np.cumsum([0] + [len(p[0]) for p in pieces[:-1]])
     positions, normals, uvs = (np.concatenate([p[i] for p in pieces]) for i in range(3))
     return positions, normals, uvs, np.concatenate([p[3] + o for p, o in zip(pieces, offsets)])
@@ -161,6 +165,7 @@ def join(pieces: Sequence[Surface]) -> Surface:
 
 def lattice(columns: int, rows: int) -> np.ndarray:
     """(2*columns*rows, 3) faces of a vertex lattice numbered row by row (row r+1 above row r), counter-clockwise."""
+    # A cell's two triangles: (i, right, above right) and (i, above right, above).
     c, r = np.meshgrid(np.arange(columns), np.arange(rows))
     i = (r * (columns + 1) + c).ravel()
     right, up = i + 1, i + columns + 1
@@ -184,8 +189,10 @@ def _revolve(profile: np.ndarray, normals: np.ndarray, v: np.ndarray, segments: 
     A row with r = 0 is a pole: the triangles that would collapse there are left out.
     """
     angle = 2 * math.pi * np.arange(segments + 1) / segments
+    # The seam has two columns, at u = 0 and u = 1.
     cos, sin = np.cos(angle), np.sin(angle)
-    cos[-1], sin[-1] = 1.0, 0.0  # the seam's two columns coincide exactly
+    # The seam's two columns coincide exactly.
+    cos[-1], sin[-1] = 1.0, 0.0
     r, z = profile[:, :1], profile[:, 1:]
     positions = np.stack([r * cos, r * sin, np.broadcast_to(z, (len(profile), segments + 1))], axis=2).reshape(-1, 3)
     n = np.stack(
@@ -196,7 +203,8 @@ def _revolve(profile: np.ndarray, normals: np.ndarray, v: np.ndarray, segments: 
     faces = lattice(segments, len(profile) - 1)
     pole = np.repeat(np.abs(profile[:, 0]) < 1e-12, segments + 1)
     positions[pole, :2] = 0.0
-    uvs[pole, 0] += 0.5 / segments  # a pole's vertex belongs to one segment: its middle
+    # a pole's vertex belongs to one segment: its middle.
+    uvs[pole, 0] += 0.5 / segments
     return positions, n.reshape(-1, 3), uvs, faces[pole[faces].sum(axis=1) < 2]
 
 
@@ -204,6 +212,7 @@ def _disc(radius: float, z: float, up: bool, segments: int, turn: float = 0.0) -
     """Flat cap: the texture's inscribed disc, seen from outside."""
     angle = turn + 2 * math.pi * np.arange(segments) / segments
     rim = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(segments, z)], axis=1)
+    # A fan round the middle.
     positions = np.concatenate([[[0.0, 0.0, z]], rim])
     side = 1.0 if up else -1.0
     uvs = np.stack([0.5 + 0.5 * side * positions[:, 0] / radius, 0.5 - 0.5 * positions[:, 1] / radius], axis=1)
@@ -320,6 +329,7 @@ def icosphere(radius: float = 0.5, subdivisions: int = 3) -> Surface:
             (9, 8, 1),
         ]
     )
+    # Every edge gets a vertex on the sphere, every triangle becomes four.
     for _ in range(subdivisions):
         edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
         unique, index = np.unique(edges, axis=0, return_inverse=True)
@@ -350,6 +360,7 @@ def cone(radius: float = 0.5, height: float = 1.0, segments: int = 32, rings: in
     t = np.linspace(0, 1, rings)
     profile = np.stack([radius * (1 - t), (t - 0.5) * height], axis=1)
     profile[-1, 0] = 0.0
+    # The normal of a cone's side is the same along a line to its tip.
     slope = np.array([height, radius]) / math.hypot(height, radius)
     positions, normals, uvs, faces = _revolve(profile, np.broadcast_to(slope, profile.shape), 1 - t, segments)
     # The normals at the tip belong to the middle of their segment, as the uvs there do.
@@ -384,10 +395,12 @@ def capsule(radius: float = 0.25, height: float = 0.5, segments: int = 32, rings
     latitude = np.linspace(0, math.pi / 2, half + 1)
     top = np.stack([np.cos(latitude), np.sin(latitude)], axis=1)
     top[-1], top[0] = (0, 1), (1, 0)
+    # The lower half is the upper one mirrored, its rows from the pole upwards.
     direction = np.concatenate([top[::-1] * [1, -1], top])
     profile = radius * direction + np.concatenate(
         [np.full((half + 1, 2), [0, -height / 2]), np.full((half + 1, 2), [0, height / 2])]
     )
+    # v by the length along the profile, so that the texture is not stretched over the caps.
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
     return _revolve(profile, direction, 1 - length / length[-1], segments)
 

@@ -136,7 +136,7 @@ def exp_f32(v: float) -> float:
     p = p * r + _E32_2
     p = p * r + _E32_1
     p = p * r + _E32_0
-    # 2^n written as an exponent field.
+    # 2^n is written straight into the exponent field.
     return _F(p * _I((_I(n) + _BIAS_32) << _EXP23).view(np.float32))
 
 
@@ -278,7 +278,7 @@ def cos_sin_turn(u: float) -> tuple[float, float]:
     """(cos 2 pi u, sin 2 pi u) for u in [0, 1], float64, absolute error < 4e-16."""
     turns = u * _D4
     nearest = (turns + _ROUND_64) - _ROUND_64
-    # Quarter turns, in [-1/2, 1/2].
+    # f: quarter turns from the nearest one, in [-1/2, 1/2].
     f = turns - nearest
     quadrant = _L(nearest) & _L3
     z = f * f

@@ -26,7 +26,7 @@ def prefetch(typingctx: Any, array: Any, index: Any) -> Any:
         place, word = builder.gep(data, [arguments[1]]), ir.IntType(32)
         kind = ir.FunctionType(ir.VoidType(), [place.type, word, word, word])
         fetch = builder.module.declare_intrinsic("llvm.prefetch", [place.type], kind)
-        # To be read, near, data.
+        # Arguments of llvm.prefetch: 0 read, 3 keep in all caches, 1 data (not instructions).
         builder.call(fetch, [place, word(0), word(3), word(1)])
         return context.get_dummy_value()
 
@@ -63,9 +63,9 @@ def lookup_both_block(
         a[i], b[i] = table_a[codes[i]], table_b[codes[i]]
 
 
-# Multiplied with eight bytes of 0 or 1 this constant gathers them in the top byte.
+# The product of eight bytes of 0 or 1 with this constant has them as the bits of its top byte.
 _BYTES_TO_BITS, _S56 = np.uint64(0x0102040810204080), np.uint64(56)
-# For every byte the positions of its set bits, and how many there are.
+# Tables over all bytes: positions of the set bits, and their number.
 _BIT_POSITIONS = np.zeros((256, 8), np.int32)
 for _mask in range(256):
     _set = [_bit for _bit in range(8) if _mask >> _bit & 1]

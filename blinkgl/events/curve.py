@@ -68,13 +68,13 @@ def end_slopes(
     newer_ns 0: there is no such frame."""
     change = np.float64(now - before)
     secant = change / dt_ns
-    # 1, the straight line's slope, where no neighbour says otherwise.
+    # Without a neighbour the slope is 1, that of the straight line.
     alpha = beta = 1.0
     if older_ns > 0.0:
         alpha = limited(slope_between(np.float64(before - older) / older_ns, secant, older_ns, dt_ns) / secant)
     if newer_ns > 0.0:
         beta = limited(slope_between(secant, np.float64(newer - now) / newer_ns, dt_ns, newer_ns) / secant)
-    # At the first and last frame a one-sided parabola.
+    # The first and last frame take the slope of a one-sided parabola.
     if older_ns == 0.0 and newer_ns > 0.0:
         alpha = limited(slope_at_end(secant, np.float64(newer - now) / newer_ns, dt_ns, newer_ns) / secant)
     if newer_ns == 0.0 and older_ns > 0.0:
@@ -91,7 +91,7 @@ def curve_time(y: float, alpha: float, beta: float, low: float) -> float:
     # y(s) = ((a s + b) s + alpha) s.
     a, b = alpha + beta - 2.0, 3.0 - 2.0 * alpha - beta
     high = 1.0
-    # Where the straight line meets it.
+    # The straight line gives the first guess.
     s = min(max(y, low), 1.0)
     for _ in range(100):
         value = ((a * s + b) * s + alpha) * s - y
@@ -101,7 +101,7 @@ def curve_time(y: float, alpha: float, beta: float, low: float) -> float:
         else:
             low = s
         slope = (3.0 * a * s + 2.0 * b) * s + alpha
-        # Unless Newton's step stays inside.
+        # Bisection is the fallback where Newton's step leaves the bracket.
         new = 0.5 * (low + high)
         if slope > 0.0:
             newton = s - value / slope

@@ -102,7 +102,7 @@ def _flag_block(level, upper, lower, flags):
 @register_jitable
 def crossing_ns(part: float, whole: float, dt_ns: int) -> int:
     """floor(part / whole * dt_ns) for 0 <= part <= whole < 2^31, exactly, for any dt_ns < 2^52."""
-    # Both factors below 2^31: the product fits.
+    # Both factors are below 2^31, so the product fits int64.
     if dt_ns < _LONG_NS:
         return np.int64(np.uint64(part * dt_ns) // np.uint64(whole))
     # Schoolbook division of part * dt by whole, dt as two digits of base 2^20: no product reaches 2^63.
@@ -138,7 +138,7 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin, curve, slop
         polarity = np.int64(level >= above)
         # How far the signal ends beyond the level being passed.
         gap = max(level - above, below - level)
-        # The word of packing.py but for its time.
+        # The packed word (packing.py) without its time.
         pixel = (y << 17) | ((i - row_end + v.width) << 1) | polarity
         # The pixel's own thresholds; ``up`` and ``down`` are those now in force, with jitter.
         step_on, step_off = (v.on_all, v.off_all)
@@ -190,7 +190,7 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin, curve, slop
                 down = max(v.floor_off, step_off + np.int64(np.floor(v.jitter * b + 0.5)))
                 step = down + polarity * (up - down)
             gap -= step
-        # The last level passed: the new reference.
+        # The last level passed is the new reference.
         passed = level - (2 * polarity - 1) * (gap + step)
         p.upper[i] = np.int32(passed + up)
         p.lower[i] = np.int32(passed - down)
@@ -231,7 +231,7 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
                 return block, filled, cut
             filled, cut_here = _emit_block(active, count, s, now, p, v, cap, packed, filled, None, None)
             cut += cut_here
-        # Last: until here p.log is the frame before.
+        # The copy comes last, because p.log is the previous frame until here.
         copy_block(now[:n], p.log[s:e])
     return stop_block, filled, cut
 

@@ -192,7 +192,7 @@ def noise_size(k: np.ndarray | float, events_per_time_constant: np.ndarray, dead
     out = np.empty(k.shape)
     for index in np.ndindex(k.shape):
         row, w = rows[index], wanted[index]
-        # Below the first entry on in a straight line.
+        # Below the first entry the table continues as a straight line.
         out[index] = q[0] + (w - row[0]) * (q[1] - q[0]) / (row[1] - row[0]) if w < row[0] else np.interp(w, row, q)
     return 1 / np.sqrt(out)
 
@@ -202,7 +202,7 @@ def _dead_time_factors(k: np.ndarray, dead_frames: float) -> np.ndarray:
     by_k = np.empty((len(DEAD_K), len(DEAD_SIZES)))
     # Factors above 1 only act in part within seconds, see IN_SECONDS.
     table = np.where(_DEAD > 0, IN_SECONDS * _DEAD, _DEAD)
-    # 0 without a dead time.
+    # Without a dead time the logarithm of the factor is 0.
     for i, j in np.ndindex(by_k.shape):
         by_k[i, j] = np.interp(np.log1p(dead_frames), np.log1p([0, *DEAD_FRAMES]), [0, *table[:, i, j]])
     # Linear in ln k between the rows, and held at the ends.

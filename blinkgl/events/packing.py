@@ -57,7 +57,7 @@ def _count_digits(packed, start, stop, shift, mask, histogram):
 def _scatter(packed, start, stop, shift, mask, offsets, out):
     for i in range(start, stop):
         digit = (packed[i] >> shift) & mask
-        # The next free place of this part's events of this digit.
+        # offsets: the next free place for this part's events with this digit.
         out[offsets[digit]] = packed[i]
         offsets[digit] += 1
 

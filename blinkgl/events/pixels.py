@@ -150,7 +150,7 @@ class PixelNoise:
 @numba.njit(**JIT)
 def _delay(pixel, t_us, delay, last, out):
     for i in range(t_us.size):
-        # No event overtakes another of its pixel.
+        # Events of one pixel keep their order.
         out[i] = max(t_us[i] + np.int64(delay[i]), last[pixel[i]])
         last[pixel[i]] = out[i]
 

@@ -149,11 +149,11 @@ def _emit_plain(active, count, first, x_now, constants, p, v, cap, packed, begin
         polarity = np.int64(end >= up)
         level, step = (up, on) if polarity else (down, -off)
         sign = 1.0 if polarity else -1.0
-        # The word of packing.py but for its time.
+        # The packed word (packing.py) without its time.
         pixel = (y << 17) | ((i - row_end + v.width) << 1) | polarity
         emitted, s = 0, 0.0
         while sign * (end - level) >= 0.0:
-            # 0 / 0 where it stands on the level: now.
+            # 0 / 0 is NaN where the signal already stands on the level; max and min then give s.
             s = min(max(s, (level - before) / rise), 1.0)
             # ``packed`` has room for ``cap`` events of each listed pixel; further ones are counted
             # only.

@@ -196,7 +196,7 @@ def shot_block(
     gaps, picks, accepts = draws
     # The expected number of candidates and two standard deviations more.
     expected = rate * v.dt_ns
-    # Whole vectors.
+    # The count is rounded up to whole vectors of four.
     wanted = min(gaps.size, (np.int64(min(expected + 2.0 * np.sqrt(expected), 1e6)) + 5) // 4 * 4)
     drawn = wanted
     while t_ns <= end_ns:
@@ -224,11 +224,12 @@ def shot_block(
             # Thinning: the candidate's rate is that of the dark, DARKEST.
             if accept * DARKEST < shot_factor(intensity):
                 if count == keys.size:
-                    # The caller doubles ``keys`` and begins the block anew: draws know no state.
+                    # The caller doubles ``keys`` and repeats the block; draws have no state, so they
+                    # come out the same.
                     return -1, t_ns, index
                 key = ((before + offset) << 42) | (after << 1) | np.int64(on)
                 slot = count
-                # A few are put where they belong, many are sorted at the end.
+                # A few keys are inserted in order; many are sorted at the end.
                 if count < _INSERTION_LIMIT:
                     while slot > 0 and keys[slot - 1] > key:
                         keys[slot] = keys[slot - 1]

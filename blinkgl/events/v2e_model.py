@@ -36,7 +36,7 @@ REBASE = 0.02
 def lin_log(intensity: float) -> float:
     """ln(I) above 20 DN, the chord from the origin below (v2e, ``lin_log``); float32."""
     dim = select(intensity < DARK, _ZERO, intensity * _SLOPE)
-    # Both sides are computed; the logarithm is held to arguments where it is used.
+    # select computes both sides, so the logarithm's argument is clamped to its range.
     return select(intensity <= _JOINT, dim, log_f32(np.maximum(intensity, _JOINT)))
 
 
@@ -102,7 +102,7 @@ def curve_of(base: float, drift: float, dx: float, lag: float, k: float) -> tupl
     """
     if k < 0:
         return base, drift + dx, 0.0
-    # How far a low-pass stays behind a ramp in the end.
+    # behind: the final lag of a low-pass behind a ramp.
     behind = dx / k
     return base - behind, drift + dx, lag + behind
 
@@ -123,7 +123,7 @@ def crossing_fraction(
 
     The inverse cubic Hermite interpolant of z, then Newton's method inside a shrinking bracket; the error is below
     1e-6 of the interval unless the curve is flat there."""
-    # ``start`` of a signal that stands on the level, 0 / 0.
+    # 0 / 0 is NaN where the signal stands on the level; max and min then give ``start``.
     if k < 0:
         return min(max(start, (target - c) / rise), 1.0)
     # An OFF crossing is an ON crossing of -z.
@@ -139,7 +139,7 @@ def crossing_fraction(
     v_low, v_high = sign * (rise - k * fall * e_low), sign * (rise - k * (end - c - rise))
     width, height = high - low, f_high - f_low
     u = -f_low / height
-    # Where the chord meets the level.
+    # The first guess is where the chord meets the level.
     s = low + width * u
     if v_low > 0 and v_high > 0:
         # s as a cubic of z: slopes 1 / z' at both ends.
@@ -213,7 +213,7 @@ def next_noise(noise: float, k: float, size: float, normal: float) -> float:
 @register_jitable
 def noise_place(k: float) -> tuple[int, float]:
     """Place in the table of sizes: (entry below, fraction)."""
-    # Held to the table's ends on both sides.
+    # The place is clamped to the table.
     place = (log_f32(np.maximum(k, _SMALLEST_K)) - _TABLE_LOW) * _TABLE_PER
     below = np.int32(np.minimum(np.maximum(place, _ZERO), _TABLE_LAST))
     return below, _F(np.minimum(place, _TABLE_LAST) - _F(below))
@@ -283,7 +283,7 @@ def draw_start(
         each = config.contrast_threshold / on.astype(np.float64) + nominal_off / off.astype(np.float64)
         shot = 0.5 * config.shot_noise_rate_hz * (1.0 - 0.75 * level) * each
     moving = np.flatnonzero(leak > 0) if leak.size else np.empty(0, np.int64)
-    # Mean time from one event to the next.
+    # between: mean time from one event to the next, s.
     between = np.where(shot > 0, 1.0 / np.maximum(shot, 1e-300), np.inf)
     leak = leak.copy()
     if moving.size:
@@ -291,7 +291,7 @@ def draw_start(
         # The mean time to the next event, of leak after T or shot noise before it: (1 - e^-RT)/R = T (1
         # - e^-q)/q, q = R T.
         weight = lambda time: time * _one_minus_exp_over(rate * time)
-        # Exact without jitter, and to its square with.
+        # This is exact without jitter; with jitter the error is of second order in it.
         between[moving] = weight(mean)
         time = mean * _length_of_interval(config.leak_jitter, rate * mean, pixels[moving], seed)
         age = _age(first[moving], rate * time) * time
@@ -342,12 +342,12 @@ def _length_of_interval(jitter: float, q: np.ndarray, pixels: np.ndarray, seed: 
     longest = 1.0 + jitter * _MOST_ROUGH
     most = longest * _one_minus_exp_over(q * longest)
     wanted = np.arange(len(q))
-    # By rejection: two of three are kept at the largest jitter.
+    # Rejection sampling keeps two of three at the largest jitter.
     for turn in range(_TURNS):
         if not wanted.size:
             break
         index = np.uint64(_JITTER_TURN + turn)
-        # Numbers behind those of the uniforms.
+        # The normals' draw numbers follow those of the uniforms.
         normal = rough_normal(seed, pixels[wanted], np.uint64(Stream.START), np.uint64(index + _U2 * np.uint64(_TURNS)))
         tried = np.maximum(0.1, 1.0 + jitter * normal)
         u, _ = uniform2(seed, pixels[wanted], np.uint64(Stream.START), index)
@@ -383,6 +383,6 @@ def draw_leaks(height: int, width: int, config: V2eConfig, on: np.ndarray, seed:
         u, v = uniform2(seed, pixels, np.uint64(Stream.HOT), np.uint64(0))
         rate = np.where(u < config.hot_pixel_fraction, -log_f64(v) * config.hot_pixel_rate_hz, rate)
     leak = (rate * on).astype(np.float32)
-    # An event in 10^11 years, and none that a product makes subnormal.
+    # Less than an event in 10^11 years becomes 0, so that no product is subnormal.
     leak[leak < 1e-20] = 0.0
     return leak

@@ -296,7 +296,7 @@ def _change_leaks(floats, ints, count, jitter, since_0, since_1, dt):
         drawn = np.float64(np.float32(floats[j + _MEAN_LEAK] / select(spread > 0.1, spread, 0.1)))
         change = select(ints[j + _FIRES] != 0, drawn - leak, 0.0)
         floats[j + _LEAK] = leak + change
-        # The same reference, seen from the new drift.
+        # The reference stays where it is; its value relative to the new drift changes.
         floats[j + _TARGET] += change * (since_0 + floats[j + _AT] * dt)
         floats[j + _C] += change * since_0
         floats[j + _RISE] += change * dt
@@ -413,7 +413,7 @@ def _part(active, p, v, ints):
         ints[awake + _AWAKE] = ints[asleep + _WAKING] = i
         awake += _U(not sleeps)
         asleep += _U(sleeps)
-    # Of those in their dead time the ones that are released in the interval, likewise.
+    # The second pass keeps, of the pixels in their dead time, those released in the interval.
     for j in range(asleep):
         i = _U(ints[j + _WAKING])
         ints[waking + _WAKING] = i
@@ -427,7 +427,7 @@ def _gather(count, first, now, p, v, floats, ints):
     intensity_now, x_now, lag_now, noise_now = now
     # A row at a time: what a feature that is off would need is not read.
     origin = _U(first)
-    # What the block's own loops have not brought along: by itself, so that the misses overlap.
+    # The constants are not in the cache yet; a loop of their own lets the cache misses overlap.
     for j in range(count):
         i = _U(ints[j + _PIXEL])
         floats[j + _ON], floats[j + _OFF] = p.constants[i, 0], p.constants[i, 1]
@@ -465,7 +465,7 @@ def _number_shots(count, first, keys, key, noise_end, ints):
     while key < noise_end and j < count:
         pixel = first + (keys[key] >> 42)
         if pixel < ints[j + _PIXEL]:
-            # Of a pixel that is in its dead time.
+            # This key belongs to a pixel in its dead time.
             key += 1
         else:
             if pixel == ints[j + _PIXEL]:
@@ -605,7 +605,7 @@ def emit_waves(
     now : (intensity, x, lag, noise) of the block at the interval's end.   keys : of ``noise_end`` shot noise events,
     sorted.   p, v : Pixels and Interval of v2e.py.   cap : most events of a pixel; there is room for so many of each.
     floats, ints : scratch of FLOATS and INTS.   Returns (end of the events, cut)."""
-    # a literal 0 would have everything compiled for it, too.
+    # np.int64(0), because a literal 0 would compile the kernel for a second type.
     out, cut, key = begin, 0, np.int64(0)
     for start in range(0, count, SLOTS):
         here = active[start : min(start + SLOTS, count)]
@@ -726,7 +726,7 @@ def _emit(active, first, now, keys, key, noise_end, p, v, cap, packed, begin, fl
             for j in range(left):
                 ints[j + _NOW] = ints[j + _AT_NS]
                 floats[j + _S] = floats[j + _AT]
-            # Noise leaves the reference wherever the signal is.
+            # After shot noise the reference is the signal itself.
             if noise_end:
                 for j in range(left):
                     if ints[j + _BY_NOISE]:

@@ -74,7 +74,7 @@ def drift_and_noise(
 ) -> tuple[float, float]:
     """(mu dt, sigma sqrt(dt)) of an interval, elementwise; k4_dt = k4 dt, root_dt = sqrt(dt), dt in us."""
     mean = _HALF * (before + now)
-    # Of the logarithm.
+    # gain: slope of the logarithm.
     gain = _ONE / (mean + k2)
     return k1 * (now - before) * gain + k4_dt + k5_dt * mean, (k3 * np.sqrt(mean) * gain + k6) * root_dt
 
@@ -95,7 +95,7 @@ def near_threshold(v: float, v_end: float, variance: float, here: float) -> bool
     # The mean path is straight, so its extremes are at its ends.
     high, low = select(v > v_end, v, v_end), select(v > v_end, v_end, v)
     above, below = _ONE - _F(high) * _V_UNIT, _ONE + _F(low) * _V_UNIT
-    # Negative where the mean path crosses.
+    # room is negative where the mean path crosses a threshold.
     room = select(above < below, above, below)
     # room |room| <= 6.5^2 variance is room <= 6.5 sigma without a root, and holds for negative room as
     # well.
@@ -131,7 +131,7 @@ def hitting_time(distance: float, mu: float, sigma: float, normal: float, unifor
     if denominator == 0.0:
         return np.inf
     root = distance / denominator
-    # root / mean.
+    # ratio: root divided by the mean.
     ratio = root * speed / distance
     # Michael, Schucany, Haas: the smaller root with probability mean/(mean + root), else mean^2/root.
     if uniform * (1.0 + ratio) <= 1.0:
@@ -189,7 +189,7 @@ def start_voltage(intensity: np.ndarray, config: VoltmeterConfig, seed: np.uint6
     mu = c.k4 + c.k5 * level
     sigma = c.k3 * np.sqrt(level) / (level + c.k2) + c.k6
     with np.errstate(divide="ignore", invalid="ignore"):
-        # Infinite without noise, NaN where nothing moves.
+        # r is infinite without noise and NaN without drift and noise.
         r = np.minimum(2.0 * np.abs(mu) / sigma**2, 1e12)
         # Mean time between events, for the share of the dead time: tanh(r/2)/mu, 1/sigma^2 without drift.
         between = np.where(r > 1e-9, one_minus_exp(r) / (2.0 - one_minus_exp(r)) / np.abs(mu), 1 / sigma**2)
@@ -335,7 +335,7 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
         while i >= row_end:
             y += 1
             row_end += v.width
-        # The word of packing.py but for time and polarity.
+        # The packed word (packing.py) without time and polarity.
         pixel = (y << 17) | ((i - row_end + v.width) << 1)
         mu, leak_rate, sigma = rates(np.float64(p.intensity[i]), np.float64(now[i - first]), dt_us, v)
         voltage, variance = p.v[i] / V_ONE, np.float64(p.unspent[i])
@@ -458,7 +458,7 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
         most = np.float64(min(most, _MAX_BOUND))
         count = compact_flags(flags, scratch, s, active)
         if count:
-            # Far beyond what chance adds to the mean.
+            # The cap is far above what chance adds to the mean.
             cap = min(np.int64(2 * most + 8 * np.sqrt(most)) + 8, v.bound_per_pixel)
             # Every block has its share of max_events_per_step.
             if count * cap > share:
@@ -471,7 +471,7 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
                 active, count, s, now, v_end, unspent_end, light_end, leak_end, p, v, cap, packed, filled
             )
             cut += cut_here
-        # Last: until here p holds the frame before.
+        # The copies come last, because p holds the previous frame until here.
         copy_block(now[:n], p.intensity[s:e])
         copy_block(v_end[:n], p.v[s:e])
         copy_block(unspent_end[:n], p.unspent[s:e])

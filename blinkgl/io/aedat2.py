@@ -114,7 +114,7 @@ class Aedat2Reader:
     def _kind(self, kind: int, records: int = 1 << 17) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
         """(index of the first record looked at, addresses, times) of one kind of records; the others are checked, too,
         that what a file holds is refused whatever is asked of it."""
-        # Last time, and the last time of every kind.
+        # state: the last time, then the last time of each kind.
         state = np.full(5, -1, np.int64)
         for first, raw in self._raw(records):
             address, stamp = raw["address"].astype(np.int64), raw["t"].astype(np.int64)
@@ -256,7 +256,7 @@ class _Frames:
         begin = 0
         while begin < len(address):
             begin = _assemble(address, t, begin, self._reset, self._signal, self._times)
-            # a sample of the frame that follows.
+            # The next sample belongs to the following frame.
             if begin < len(address):
                 yield from self.end()
 

@@ -146,7 +146,8 @@ class DsecEventWriter:
             with output_errors(self.path):
                 # One entry past the last millisecond: a slicer asks for ceil(end).
                 last_ms = -(-(end - self.t_offset_us) // 1000)
-                # An eventless day is 700 MB in one piece; pieces end where chunks do.
+                # Entries are written in pieces: an eventless day would be 700 MB at once. Pieces end
+                # where chunks do.
                 while self._next_ms <= last_ms:
                     stop = min((self._next_ms // _MS_PIECE + 1) * _MS_PIECE, last_ms + 1)
                     self._store_ms(np.full(stop - self._next_ms, self._written, np.uint64))

@@ -45,7 +45,7 @@ def encode(x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray) -> bytes:
     not decreasing. p : 0 or 1. The caller has checked them."""
     x, y, p = (np.ascontiguousarray(c, np.int64) for c in (x, y, p))
     t = np.ascontiguousarray(t, np.int64)
-    # The longest: 16 bytes of a number, then a count.
+    # The longest entry is 16 bytes of a number, a count byte and the u2 that follows it.
     times = np.empty(20 * len(t), np.uint8)
     head = t[:1].astype("<i8").tobytes()
     # evlib 0.13.2 takes a small first time for the chunk's header, unless the fourth byte after it has bit 7.

@@ -186,7 +186,7 @@ def _read_header(path: Path) -> tuple[str, int]:
                         f"header line {len(lines) + 1} is longer than {_LONGEST_LINE} bytes", where=str(path)
                     )
                 if not line.startswith(b" ") or not line.endswith(b"\n"):
-                    # a word that happens to begin with '%'.
+                    # The data begins here: this is a word whose first byte happens to be '%'.
                     break
                 lines.append("%" + line.decode("latin-1").rstrip())
                 if lines[-1] == "% end":

@@ -239,7 +239,7 @@ def _parse(buffer, x, y, t, p, unit):
             if c == 32 or c == 9 or c == 44 or c == 13:
                 i += 1
                 continue
-            # Comment.
+            # The rest of a comment line is skipped.
             if (c == 35 or c == 37) and field == 0:
                 while buffer[i] != 10:
                     i += 1
@@ -255,9 +255,9 @@ def _parse(buffer, x, y, t, p, unit):
             # Decimal times are seconds: six more places make microseconds.
             values[field], ok = _scaled(mantissa, exponent + (6 if field == 0 and not integer else 0))
             if not ok or (field > 0 and exponent < 0 and values[field] * 10.0**-exponent != mantissa):
-                # Also of coordinates between pixels: rectified events are not raw events.
+                # Coordinates between pixels are refused as well: rectified events are not raw events.
                 return n, line, False
-            # a plain 0 is the same in both.
+            # A plain 0 is the same time in both units.
             if field == 0 and (values[0] != 0 or not integer):
                 kind = 0 if integer else 1
                 if unit[0] >= 0 and unit[0] != kind:

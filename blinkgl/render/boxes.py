@@ -28,7 +28,6 @@ def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -
         T_world_obj = thing.path.pose(t_ns)
         T_cam_obj = cam_from_obj(T_world_cam, T_world_obj)
         x0, y0, x1, y1, seen = (int(n) for n in shown[thing.instance_id])
-        # Out of the picture, by its ball: nothing to compute.
         if not seen and not thing.deforms and _aside(camera, thing, T_cam_obj):
             continue
         vertices, faces = _solid(thing, t_ns)
@@ -39,14 +38,13 @@ def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -
             continue
         corners = px[np.unique(drawn)]
         amodal = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
-        # Not seen and outside of the picture.
         if not seen and ((amodal[2:] < whole[:2]) | (amodal[:2] > whole[2:])).any():
             continue
         # Pixels that it would cover if nothing were in front of it.
         mask = np.zeros(ids.shape, np.bool_)
         cover(px, drawn, mask)
         pixels = max(int(np.count_nonzero(mask)), seen)
-        # Between the centres of pixels.
+        # An object between the pixel centres has no box.
         if not pixels:
             continue
         low, high = vertices.min(axis=0), vertices.max(axis=0)

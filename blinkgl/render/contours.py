@@ -215,11 +215,11 @@ def _emit(numbers, bodies, culled, T_cam_obj, mvps, starts, places, faces, plane
     """Writes the lines of all items; their number. numbers, bodies, culled : of each item, its contour's place in the
     pool, its object's, and whether the backs of its faces are not drawn."""
     front = np.empty(len(planes), np.bool_)
-    # a literal 0 would have _emit_one compiled for it, too.
+    # np.int64(0), because a literal 0 would compile _emit_one for a second type.
     count = np.int64(0)
     for n in range(len(numbers)):
         number, T = numbers[n], T_cam_obj[bodies[n]]
-        # The camera's place, in the mesh's axes.
+        # (x, y, z): the camera's centre in the mesh's axes, -R^T t.
         x = -(T[0, 3] * T[0, 0] + T[1, 3] * T[1, 0] + T[2, 3] * T[2, 0])
         y = -(T[0, 3] * T[0, 1] + T[1, 3] * T[1, 1] + T[2, 3] * T[2, 1])
         z = -(T[0, 3] * T[0, 2] + T[1, 3] * T[1, 2] + T[2, 3] * T[2, 2])
@@ -248,7 +248,7 @@ def _emit_one(mvp, places, faces, planes, edges, sharp, front, culled, width, he
                     continue
                 kind = sharp[e]
             elif culled:
-                # As the face that is seen has it: the other way round.
+                # The edge follows the order of the face that is seen.
                 if not towards:
                     v0, v1, towards = v1, v0, True
                 # Hollow: the one face's third corner is before the other.
@@ -326,7 +326,7 @@ def _most(lines):
 @nb.njit(cache=True, nogil=True)
 def _around(x, y):
     """Where a ray from a pixel's centre leaves its square, along the boundary, in half sides: 8 all round."""
-    # a line that ends in the centre itself.
+    # A line that ends in the pixel's centre has no direction.
     if x == 0.0 and y == 0.0:
         return 0.0
     if abs(x) >= abs(y):

@@ -84,7 +84,6 @@ class Painter:
         target.fbo.use()
         ctx.viewport = (0, 0, target.fbo.width, target.fbo.height)
         ctx.enable_only(moderngl.DEPTH_TEST)
-        # Reversed-Z.
         ctx.depth_func = ">"
         # Reversed depth: 1 at the near plane, so larger is nearer.
         ctx.front_face = "cw"  # counter-clockwise meshes in an image whose y points down

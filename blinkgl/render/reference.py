@@ -188,7 +188,7 @@ def cast(scene: Scene, t_ns: int, xy: np.ndarray | None = None, *, exhaustive: b
 def _rays(camera: CameraModel, xy: np.ndarray) -> np.ndarray:
     """(N, 3) rays of length 1 along the optical axis; nan for a pixel without one that points forward."""
     rays = camera.rays(xy)
-    # nan rays hit nothing, since every comparison with nan is false.
+    # nan marks a pixel that has no ray with Z > 0.
     return rays / np.where(rays[:, 2:] > 0, rays[:, 2:], np.nan)
 
 
@@ -348,7 +348,7 @@ def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
     with np.errstate(divide="ignore", invalid="ignore"):
         # fx (dX - rx dZ) / Z1 and likewise in y, as the module's docstring derives it.
         flow = np.where(valid[:, None], camera.displacement(_rays(camera, hits.xy), hits.depth, change), np.nan)
-        # a lens may not see it there.
+        # A lens may not see the point at its new place.
         valid &= np.isfinite(flow).all(axis=1)
         there = hits.xy + flow
         inside = valid & ((there >= -0.5) & (there < [camera.width - 0.5, camera.height - 0.5])).all(axis=1)
@@ -442,7 +442,7 @@ def surface(scene: Scene, hits: Hits) -> Surface:
         bary = hits.bary[rows]
         # Interpolated over the triangle, as the rasteriser does, then made unit.
         blend = np.einsum("nc,nck->nk", bary, normals_at(part.mesh, hits.t_ns)[corners].astype(np.float64))
-        # a zero normal stays zero.
+        # The maximum keeps a zero normal zero instead of NaN.
         length = np.maximum(np.linalg.norm(blend, axis=1, keepdims=True), 1e-15)
         # A surface seen from behind is lit from that side.
         sign = np.where(hits.front[rows], 1.0, -1.0)[:, None]
@@ -644,7 +644,7 @@ def seen_share(scene: Scene, t_ns: int, lamp: Lamp, points: np.ndarray, own: np.
         return np.ones(len(points))
     # Part numbers among the casters.
     skip = np.ascontiguousarray(np.column_stack([number[own[:, 0]], own[:, 1]]).astype(np.int32))
-    # a camera that looks where it shines.
+    # A lamp shines along -z, a camera looks along +z: y and z are turned round.
     pose = lamp.path.pose(t_ns) @ np.diag([1.0, -1.0, -1.0, 1.0])
     middle = points.mean(axis=0)
     size = 1.0 + float(np.linalg.norm(points - middle, axis=1).max())

@@ -222,10 +222,9 @@ def half_floats(image: np.ndarray) -> np.ndarray:
 
     For pictures of 8 bits, whose own steps are 9 to 90 times coarser. A smooth one of floats would get steps that it
     has not, and rates of them."""
-    # NaN fails both comparisons, so such a picture stays float32.
     brightest = image.max(axis=2)
     lit = brightest[brightest > 0]
-    # NaN does not.
+    # A NaN makes the mean NaN, and the picture stays float32.
     fits = lit.size > 0 and lit.min() >= HALF_LEAST and lit.max() <= HALF_MOST
     return image.astype(np.float16) if fits and brightest.mean(dtype=np.float64) >= HALF_LEAST else image
 

@@ -264,14 +264,14 @@ class TensorEsim(Batch):
 
     def _at_once(self, f: Firing, counts: Tensor, sizes: Sizes, v: Interval, cap: Tensor | None) -> Found:
         """All events in raster order; moves the levels."""
-        # The last level passed.
+        # passed: the last level passed.
         passed = f.log - (2 * f.polarity - 1) * (f.gap - (counts - 1) * f.step)
         self._upper.index_copy_(0, f.flat, (passed + f.on).to(torch.int32))
         self._lower.index_copy_(0, f.flat, (passed - f.off).to(torch.int32))
         # word: pixel number and polarity, as Found has it.
         part, whole, word, env = f.whole - f.gap, f.whole, (f.flat << 1) | f.polarity, f.env
         first = owner = f.flat
-        # Else every pixel that fires has one event.
+        # With at most one event per pixel nothing has to be repeated.
         if sizes.most > 1:
             # Number of the first event of each pixel among all events; then every event's pixel and its
             # own number there.
@@ -295,7 +295,7 @@ class TensorEsim(Batch):
             keep = self._awake(f, counts, first, sizes.most, after + 1000 * v.of(v.base_us, env))
         if cap is not None:
             let = keep.to(torch.int64)
-            # Events let through before this one; less those of earlier pixels.
+            # rank: events of the same pixel that were let through before this one.
             before = let.cumsum(0) - let
             rank = before - before.index_select(0, first.index_select(0, owner))
             within = rank < cap.index_select(0, owner)
@@ -310,7 +310,7 @@ class TensorEsim(Batch):
         size depends on what is lost."""
         # Levels passed are walked together over all pixels, j-th with j-th.
         last = self._last_ns.index_select(0, f.flat)
-        # The last place takes what is none.
+        # The additional last element takes the writes of pixels without a j-th level.
         keep = torch.zeros(len(t_ns) + 1, dtype=torch.bool, device=self.device)
         for j in range(most):
             there = counts > j

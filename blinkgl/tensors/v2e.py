@@ -43,7 +43,7 @@ _INF = float("inf")
 
 def lin_log(intensity: Tensor) -> Tensor:
     """ln(I) above 20 DN, the chord from the origin below; float32. See ``v2e_model.lin_log``."""
-    # Both sides are computed; the logarithm is held to arguments where it is used.
+    # torch.where computes both sides, so the logarithm's argument is clamped to its range.
     dim = torch.where(intensity < _DARK, 0.0, intensity * _SLOPE)
     return torch.where(intensity <= 20.0, dim, log_f32(intensity.clamp(min=20.0)))
 

@@ -75,7 +75,7 @@ def add_curves(r: Rows, v: Step, has: Parts) -> None:
     r["rise"], r["s"], r["e"] = drift + dx, torch.zeros_like(dx), torch.ones_like(dx)
     if has.low_pass:
         r["k"] = ((r["i0"] + r["i1"]) * 0.5 + 20.0) * v.kappa
-        # How far a low-pass stays behind a ramp in the end.
+        # behind: the final lag of a low-pass behind a ramp.
         behind = dx / r["k"]
         r["c"], r["fall"], r["end"] = base - behind, r["lag0"] + behind, base + drift + dx + r["lag1"]
     else:
@@ -168,7 +168,7 @@ def _meet(r: Rows) -> None:
 
 def _meet_lines(r: Rows) -> None:
     s = (r["target"] - r["c"]) / r["rise"]
-    # 0 / 0 where the signal stands on the level: now.
+    # 0 / 0 is NaN where the signal stands on the level; the comparison then selects s.
     s = torch.where(s > r["s"], s, r["s"])
     r["at"] = torch.where(s < 1.0, s, torch.ones_like(s))
 
@@ -181,7 +181,7 @@ def _let_shots_come_first(r: Rows, shots: Shots, v: Step) -> None:
     mine = lambda key: (key < end) & (at(shots.flat, key) == r["flat"])
     key = r["shot"]
     while bool((early := mine(key) & (at(shots.after_ns, key) < r["now"])).any()):
-        # Of the pixel's dead time.
+        # Shot noise of the pixel's dead time is skipped.
         key = key + early.to(torch.int64)
     noise_ns = at(shots.after_ns, key)
     # At the same ns noise comes before the crossing.
@@ -204,7 +204,7 @@ def _change_leaks(r: Rows, v: Step, jitter: float) -> None:
     fresh = (r["mean_leak"] / spread).to(torch.float32).to(torch.float64)
     change = torch.where(r["fires"], fresh - r["leak"], torch.zeros_like(fresh))
     r["leak"] = r["leak"] + change
-    # The same reference, seen from the new drift.
+    # The reference stays where it is; its value relative to the new drift changes.
     r["target"] = r["target"] + change * (r["at"] * v.dt + v.since_0)
     r["c"] = r["c"] + change * v.since_0
     r["rise"] = r["rise"] + change * v.dt
@@ -237,7 +237,7 @@ def _new_references(r: Rows, v: Step, has: Parts, shots: Shots | None) -> None:
         r["dead"] = fires & (r["now"] > v.dt_ns)
     else:
         r["now"], r["s"], r["dead"] = r["at_ns"], r["at"], torch.zeros_like(fires)
-        # Noise leaves the reference wherever the signal is.
+        # After shot noise the reference is the signal itself.
         if shots is not None:
             here = _curve_at(r, r["at"], _decayed(r, r["at"], has.low_pass), has.low_pass)
             r["target"] = torch.where(r["by_noise"], here, r["target"])
@@ -261,7 +261,7 @@ def waves(
             _meet(r)
         else:
             _meet_lines(r)
-        # The others' are no numbers, perhaps.
+        # Pixels that do not fire may have NaN here.
         at = torch.where(r["fires"], r["at"], torch.zeros_like(r["at"]))
         r["at_ns"], r["by_noise"] = torch.floor(at * v.dt_ns).to(torch.int64), torch.zeros_like(r["fires"])
         if shots is not None:

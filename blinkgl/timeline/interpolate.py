@@ -206,7 +206,7 @@ def _look(light, log, places, out):
     for row in range(out.shape[0]):
         for column in range(out.shape[1]):
             x, y = places[row, column, 0], places[row, column, 1]
-            # 0 for NaN, too.
+            # NaN becomes 0 as well.
             x = min(x, np.float32(width - 1)) if x > 0 else np.float32(0)
             y = min(y, np.float32(height - 1)) if y > 0 else np.float32(0)
             i, j = int(x), int(y)

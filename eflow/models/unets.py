@@ -94,7 +94,7 @@ class Consensus(nn.Module):
         self.weight, self.mix = nn.Conv2d(channels, groups, 1), nn.Conv2d(channels, channels, 1)
 
     def forward(self, x: Tensor) -> Tensor:
-        # 0 to 1: how much a place has to say.
+        # The weight of each place, 0 to 1.
         weight = torch.sigmoid(self.weight(x).float())
         with torch.autocast(x.device.type, enabled=False):
             field = self.fitted(x.float(), weight)
@@ -110,7 +110,7 @@ class Consensus(nn.Module):
             indexing="ij",
         )
         u, v = u.reshape(1, 1, -1), v.reshape(1, 1, -1)
-        # 1e-4 keeps the sum above 0 where no place has a say.
+        # 1e-4 keeps the sum above 0 where all weights vanish.
         w = weight.flatten(2) + 1e-4
         w = w / w.sum(2, keepdim=True)  # (N, groups, h w)
         # Coordinates from the weighted middle: the mean then separates from the slopes.

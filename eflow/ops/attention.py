@@ -33,7 +33,7 @@ class WindowAttention(nn.Module):
         tokens = x.view(n, rows, s, columns, s, c).transpose(2, 3).reshape(n * rows * columns, s * s, c)
         q, k, v = self.qkv(tokens).view(len(tokens), s * s, 3, self.heads, c // self.heads).permute(2, 0, 3, 1, 4)
         mask = None
-        # a size that is not known yet may need it.
+        # While compiling, the size is unknown and may need the mask.
         if torch.compiler.is_compiling() or down or right:
             # True where a key is a real token, the same for all queries of a window.
             real = x.new_zeros(rows * s, columns * s, dtype=torch.bool)

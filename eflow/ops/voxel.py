@@ -53,7 +53,7 @@ def _splat_t(x, y, t, p, t0, t1, scale, grid):
         if x[i] >= width or y[i] >= height or t[i] < t0 or t[i] > t1:
             outside += 1
             continue
-        # Integer difference first: float64 of a large absolute time would lose microseconds.
+        # Times are subtracted as integers, which is exact.
         c = np.float64(t[i] - t0) * scale
         # t == t1 belongs wholly to the last bin.
         b = min(int(c), max(bins - 2, 0))
@@ -79,7 +79,7 @@ def _splat_xyt(x, y, t, p, t0, t1, scale, grid):
         s = np.float32(1) if p[i] else np.float32(-1)
         # Rectified coordinates lie between pixels; each event goes to the four around it.
         fx, fy = np.floor(x[i]), np.floor(y[i])
-        # Also drops NaN.
+        # NaN fails these comparisons and is dropped.
         if not (fx >= -1 and fx < width and fy >= -1 and fy < height):
             continue
         ix, iy = int(fx), int(fy)

@@ -195,7 +195,7 @@ def _pieces(body: Proportions, bind: np.ndarray) -> list[_Piece]:
     add("neck", (-0.005, 0, -0.02), (0.01, 0, 0.09), 0.056, 0.052)
     add("head", (0.012, 0, 0.085), (0.002, 0, 0.115), 0.082, 0.095, (1.08, 0.84))
     add("head", (0.035, 0, 0.012), (0.03, 0, 0.07), 0.048, 0.062, (1.0, 0.92))
-    # a nose.
+    # The nose.
     add("head", (0.10, 0, 0.055), (0.09, 0, 0.085), 0.014, 0.008)
     for side, sign in (("l", 1.0), ("r", -1.0)):
         sole = body.ankle
@@ -205,11 +205,11 @@ def _pieces(body: Proportions, bind: np.ndarray) -> list[_Piece]:
         add(f"forearm_{side}", (0, 0, -0.005), (0, 0, -0.23), 0.042, 0.029)
         add(f"hand_{side}", (0, 0, -0.02), (0.004, 0, -0.085), 0.029, 0.033, (1.25, 0.62))
         add(f"hand_{side}", (0.006, 0, -0.09), (0.002, 0, -0.155), 0.030, 0.022, (1.2, 0.5))
-        # a thumb.
+        # The thumb.
         add(f"hand_{side}", (0.02, 0, -0.03), (0.05, 0, -0.085), 0.015, 0.012)
         add(f"thigh_{side}", (0.0, 0, -0.02), (0.004, 0, -0.40), 0.089, 0.057)
         add(f"shank_{side}", (0.002, 0, 0), (0, 0, -0.38), 0.055, 0.037)
-        # a calf.
+        # The calf.
         add(f"shank_{side}", (-0.018, 0, -0.09), (-0.014, 0, -0.18), 0.047, 0.040)
         add(f"foot_{side}", (-0.018, 0, 0.037 - sole), (0.07, 0, 0.039 - sole), 0.042, 0.043, (1, 0.92))
         add(f"foot_{side}", (0, 0, -0.01), (0.03, 0, 0.042 - sole), 0.040, 0.043, (1, 0.92))
@@ -260,7 +260,7 @@ def _unwrapped(
 ) -> np.ndarray:
     """(F, 3, 2) texture coordinates of the corners of an average body's faces."""
     names = list(CHARTS)
-    # Left and right.
+    # A column for each chart, left and right.
     share = np.zeros((len(points), 2 * len(names)))
     # Each face goes to the chart in which its corners have most weight.
     for joint, name in enumerate(JOINTS):

@@ -81,7 +81,7 @@ def fish(
 ) -> tuple[Surface, Deformer]:
     """A fish that swims along x, its nose at x = length / 2: a wave runs down its body, larger towards the tail."""
     rings, segments = 48, 28
-    # 0 the nose, 1 the end of the tail; finer at both.
+    # s: 0 at the nose, 1 at the end of the tail; rings are denser at both ends.
     s = (1 - np.cos(math.pi * np.arange(rings + 1) / rings)) / 2
     # Outlines along the body: trunk, tail fin, back fin and the stalk between.
     body = np.sqrt(np.clip(s / 0.78, 0, 1)) * np.clip(1 - (s / 0.80) ** 2.2, 0, 1) ** 0.8
@@ -104,7 +104,7 @@ def fish(
     # The rings at nose and tail shrink to a point.
     positions = np.stack([x, y, z], axis=2)
     positions[[0, -1]] = positions[[0, -1]].mean(axis=1, keepdims=True)
-    # Rows go to the tail.
+    # Rows run to the tail, so the faces are turned round to look outwards.
     faces = lattice(segments, rings)[:, ::-1]
     flat = positions.reshape(-1, 3)
     # Triangles that collapse there are left out.

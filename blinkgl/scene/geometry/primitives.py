@@ -203,7 +203,7 @@ def _revolve(profile: np.ndarray, normals: np.ndarray, v: np.ndarray, segments: 
     faces = lattice(segments, len(profile) - 1)
     pole = np.repeat(np.abs(profile[:, 0]) < 1e-12, segments + 1)
     positions[pole, :2] = 0.0
-    # a pole's vertex belongs to one segment: its middle.
+    # A pole has a vertex for each segment, with the u of the segment's middle.
     uvs[pole, 0] += 0.5 / segments
     return positions, n.reshape(-1, 3), uvs, faces[pole[faces].sum(axis=1) < 2]
 

@@ -213,7 +213,7 @@ class _Search:
 
     def run(self):
         yield from self.at_start()
-        # Equal times, ordered pairs: a heap already.
+        # All times are equal and the pairs are ordered, so the list is a heap already.
         queue = [(self.t0, i, j) for i, j in self._pairs()]
         while queue:
             t, i, j = heapq.heappop(queue)

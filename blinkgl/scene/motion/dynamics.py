@@ -183,7 +183,7 @@ class _World:
         a body in flight is on a parabola."""
         model = self._model(weighed=False)
         for body in self.moving:
-            # Behind the world.
+            # Body 0 of the model is the world.
             at = body.at + 1
             # The first model has the density radius^-5, so that its masses are neither tiny nor huge.
             body.centre, body.volume = model.body_ipos[at].copy(), float(model.body_mass[at]) * body.radius**5
@@ -197,11 +197,11 @@ class _World:
         option.timestep, option.gravity = self.step, list(self.settings.gravity)
         # An elliptic friction cone: Coulomb's law itself, not its pyramid.
         option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_IMPLICIT, mujoco.mjtCone.mjCONE_ELLIPTIC
-        # Friction as hard as the contact: what lies on a slope does not creep.
+        # Friction is stiffer than contact, so that bodies at rest on a slope do not creep.
         option.impratio = 10.0
         option.sleep_tolerance = _SLOW_S * float(np.linalg.norm(self.settings.gravity))
         option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-        # An explosion has to be seen.
+        # Without the automatic reset an explosion shows in the state, see _check_sound.
         option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         heaviest = max((body.mass for body in self.dynamic), default=1.0)
         # MuJoCo takes no inertia below 1e-15 kg m², a ball of a millimetre; in another unit of mass nothing moves

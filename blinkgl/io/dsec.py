@@ -92,6 +92,7 @@ class DsecEventWriter:
             }
             self._ms_to_idx = blosc_dataset(self._file, "ms_to_idx", (0,), np.uint64, (1 << 13,), codec)
             self._file.create_dataset("t_offset", data=np.int64(self.t_offset_us), track_times=False)
+            # Compression runs beside the simulation; a full queue makes append wait.
             self._file.attrs["height"], self._file.attrs["width"] = self.height, self.width
         self._queue: queue.Queue | None = None
         if background:
@@ -115,6 +116,7 @@ class DsecEventWriter:
         while start < len(events):
             # What fits into the block; a full one goes to the writer.
             stop = min(len(events), start + BLOCK - self._fill)
+            # Relative times fit uint32, which _check has made sure of.
             into = slice(self._fill, self._fill + stop - start)
             for name in (name for name in self._columns if name != "t"):
                 self._block[name][into] = getattr(events, name)[start:stop]
@@ -163,6 +165,7 @@ class DsecEventWriter:
             return
         self._closed = True
         if self._queue is not None and self._thread.is_alive():
+            # An error that is already known stays the one that is raised.
             self._error = self._error or RuntimeError("aborted")  # the thread drops what is queued
             self._queue.put(None)
             self._thread.join()

@@ -300,8 +300,8 @@ class Batch(ABC):
     def _events(self, interval: Interval, found: Found, cause: Tensor | None, waves: bool) -> TensorEvents:
         """Columns in their order, from events that lie pixel by pixel, or wave by wave with each wave in raster order.
 
-        # Sorted by environment, then time; without environments to tell apart that key is left out.
         waves : events of one pixel are not beside each other yet."""
+        # Sorted by environment, then time; without environments to tell apart that key is left out.
         env = self._env_of(found.word >> 1) if self.envs > 1 else None
         keys = [(found.after_us, (interval.longest_ns // 1000 + 1).bit_length())]
         if env is not None:

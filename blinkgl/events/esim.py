@@ -89,7 +89,7 @@ def log_block(intensity: np.ndarray, eps: float, out: np.ndarray) -> None:
 
 @numba.njit(**JIT)
 def _flag_block(level, upper, lower, flags):
-    """Flags (uint8) of the pixels at or beyond a level; returns how far the farthest is beyond (negative: none is)."""
+    """Flag (uint8) the pixels at or beyond a level, and return how far the farthest is beyond (negative: none is)."""
     farthest = _FAR_BELOW
     for i in range(level.size):
         # The reference lies between the two levels, so at most one of them has been reached.
@@ -113,7 +113,8 @@ def crossing_ns(part: float, whole: float, dt_ns: int) -> int:
 
 @numba.njit(**JIT)
 def _emit_block(active, count, first, now, p, v, cap, packed, begin, curve, slope):
-    """Events of the listed pixels of one block into ``packed[begin:]``, in raster order; moves levels.
+    """Write the events of the listed pixels of one block to ``packed[begin:]``, in raster order, and move their
+    levels.
 
     curve : None for the straight line (the branches on it are then not compiled).   slope : of the block, at the
     interval's end; [] where the curve takes its slopes from other frames.
@@ -199,7 +200,7 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin, curve, slop
 
 @numba.njit(**JIT)
 def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p, v):
-    """Band kernel, see :meth:`Emulator._run`."""
+    """Process the blocks of a band, see :meth:`Emulator._run`."""
     # Scratch memory of one block. compact_flags writes eight numbers at a time, so ``active`` has eight
     # more.
     cut, pixels = 0, p.log.size
@@ -254,8 +255,9 @@ def _bands(taken, start, edges, progress, share, packed, frame, codes, table, p,
 def _band_curve(
     first_block, stop_block, share, packed, filled, frame, codes, table, rate, decode, log_now, curve, p, v
 ):
-    """Band kernel for cubics. With slopes (``rate`` given, per second): the interval up to ``frame``. Without: the
-    interval up to ``log_now``; the frame that lies after it only goes into ``curve.newer``."""
+    """Process a band with cubics instead of straight lines. With slopes (``rate`` given, per second): the interval
+    up to ``frame``. Without: the interval up to ``log_now``; the frame that lies after it only goes into
+    ``curve.newer``."""
     cut, pixels = 0, p.log.size
     flags, scratch = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64)
     active, fresh = np.empty(BLOCK + 8, np.int32), np.empty(BLOCK, np.int32)
@@ -365,7 +367,7 @@ class Esim(Emulator):
 
     @property
     def _looks_around(self) -> bool:
-        """Whether slopes are of the neighbouring frames, so that the last ones are kept."""
+        """Return whether slopes come from the neighbouring frames, so that the last frames are kept."""
         return self.reconstruction == "pchip"
 
     @classmethod
@@ -475,7 +477,7 @@ class Esim(Emulator):
         return self._run(_bands, (*source, levels, interval), base_us, t_ns // 1000 - base_us)
 
     def _advance_late(self, source: tuple, t_ns: int) -> Events:
-        """Takes the logarithm of frame k = ``frames`` and returns the events between the two frames before it."""
+        """Take the logarithm of frame k = ``frames`` and return the events between the two frames before it."""
         k = self.frames
         # The usual case: frame k gives the slope at the end of the interval from k - 2 to k - 1, which
         # is emitted now.
@@ -493,14 +495,15 @@ class Esim(Emulator):
         return Events.empty()
 
     def _stale(self, k: int) -> tuple[int, int]:
-        """Pixels in which row k mod 4 differs from frame k: those that changed since frame k - 4 was written there."""
+        """Return the pixels in which row k mod 4 differs from frame k: those that changed since frame k - 4 was
+        written there."""
         self._ring_rows[k % 4] = self._changed
         rows = self._ring_rows[[j % 4 for j in range(max(0, k - 3), k + 1)]]
         rows = rows[rows[:, 0] < rows[:, 1]]
         return (int(rows[:, 0].min()), int(rows[:, 1].max())) if len(rows) else (0, 0)
 
     def _pass_interval(self, k: int, source: tuple | None) -> Events:
-        """Events between frames k - 1 and k; ``source`` is frame k + 1, None when there is none yet."""
+        """Return the events between frames k - 1 and k. ``source`` is frame k + 1, None when there is none yet."""
         # Row and time of frame j in the ring of four.
         ring, ns = (lambda j: self._ring[j % 4]), (lambda j: int(self._ring_ns[j % 4]))
         curve = Curve(

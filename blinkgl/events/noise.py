@@ -198,7 +198,7 @@ def noise_size(k: np.ndarray | float, events_per_time_constant: np.ndarray, dead
 
 
 def _dead_time_factors(k: np.ndarray, dead_frames: float) -> np.ndarray:
-    """ln of the factor by which a dead time changes the rate of each of RATE_SIZES, k.shape + (15,)."""
+    """Return ln of the factor by which a dead time changes the rate of each of RATE_SIZES, k.shape + (15,)."""
     by_k = np.empty((len(DEAD_K), len(DEAD_SIZES)))
     # Factors above 1 only act in part within seconds, see IN_SECONDS.
     table = np.where(_DEAD > 0, IN_SECONDS * _DEAD, _DEAD)
@@ -248,5 +248,5 @@ def start_places(rate_hz: float, corner_hz: np.ndarray, uniform: np.ndarray) -> 
 
 
 def _some_corners(corner_hz: np.ndarray) -> np.ndarray:
-    """64 frequencies that span these."""
+    """Return 64 frequencies that span these, evenly spaced in the logarithm."""
     return np.exp(np.linspace(np.log(corner_hz.min()), np.log(corner_hz.max()) + 1e-9, 64))

@@ -64,7 +64,8 @@ def _scatter(packed, start, stop, shift, mask, offsets, out):
 
 @numba.njit(**JIT)
 def _histograms_to_offsets(histogram):
-    """Exclusive prefix sum over (digit, band), in place: where each band writes its events of each digit."""
+    """Replace counts by their exclusive prefix sum over (digit, band): where each band writes its events of each
+    digit."""
     total = 0
     for digit in range(histogram.shape[1]):
         for band in range(histogram.shape[0]):
@@ -209,7 +210,7 @@ def unpacked(
 
 
 def _even_split(counts: np.ndarray, parts: int) -> np.ndarray:
-    """First row of each part and the end, (parts + 1,) int64: about as many events in each."""
+    """Return the first row of each part and the end, (parts + 1,) int64, with about as many events in each part."""
     if parts == 1:
         return np.array([0, len(counts)])
     # Rows at which the running number of events reaches each part's share.

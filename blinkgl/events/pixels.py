@@ -26,7 +26,8 @@ _DEFECT, _OWN, _LATE = np.uint64(Stream.DEFECT), np.uint64(Stream.OWN_NOISE), np
 
 @numba.njit(**JIT)
 def _awake(pixel, t_us, dead_us, last):
-    """(n,) bool: events that come at least ``dead_us`` after the last one of their pixel that did; ``last`` follows."""
+    """Return (n,) bool: which events come at least ``dead_us`` after the last such event of their pixel. ``last`` is
+    updated."""
     out = np.empty(t_us.size, np.bool_)
     for i in range(t_us.size):
         out[i] = t_us[i] - last[pixel[i]] >= dead_us
@@ -100,8 +101,8 @@ class PixelNoise:
         return both.part(np.argsort(both.t, kind="stable"))
 
     def _more(self) -> Events:
-        """The next batch of a Poisson process of the sensor as a whole, with their answers behind them; pixels in
-        proportion to their rates."""
+        """Draw the next batch of a Poisson process of the whole sensor and the answers to its events. Pixels are
+        drawn in proportion to their rates."""
         index = np.uint64(self._batch * _BATCH) + np.arange(_BATCH, dtype=np.uint64)
         self._batch += 1
         # Draw 0 of an event: the time to it and its pixel; draw 1: polarity and whether it is answered;

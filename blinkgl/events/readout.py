@@ -93,12 +93,12 @@ class Readout:
         return self._stamped(sent.part(slice(count)))
 
     def _stamped(self, events: Events) -> Events:
-        """With the last tick of the clock that has passed."""
+        """Return the events stamped with the last tick of the clock."""
         tick = self.config.clock_us
         return events if tick == 1 else replace(events, t=events.t - events.t % tick)
 
     def _serve(self, events: Events) -> Events:
-        """Those that find a place, with the times at which they leave."""
+        """Return the events that find a place in the queue, with the times at which they leave the bus."""
         # 2^43 us are 8.8e18 ps, just below 2^63.
         if max(abs(int(events.t[0])), abs(int(events.t[-1]))) > 2**43:
             raise EventDataError(

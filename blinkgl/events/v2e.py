@@ -126,7 +126,7 @@ class Interval(NamedTuple):
 
 @numba.njit(**JIT)
 def _emit_plain(active, count, first, x_now, constants, p, v, cap, packed, begin):
-    """:func:`emit_waves` without low-pass, leak, noise and dead time: the same bits, straight lines only."""
+    """Do :func:`emit_waves` without low-pass, leak, noise and dead time: the same bits, from straight lines."""
     out, cut, dt_ns = begin, 0, v.dt_ns
     # Start of the interval after the microsecond base, 0 to 999 ns.
     start_ns = v.t0_ns - 1000 * v.base_us
@@ -171,7 +171,7 @@ def _emit_plain(active, count, first, x_now, constants, p, v, cap, packed, begin
 
 @numba.njit(**JIT)
 def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x_table, p, v):
-    """Band kernel, see :meth:`Emulator._run`."""
+    """Process the blocks of a band, see :meth:`Emulator._run`."""
     cut, pixels, most = 0, p.x.size, GROUP * BLOCK
     # Scratch memory: what is one block long is used again for every block, what is ``most`` long holds
     # the group until its events are made. compact_flags writes eight numbers at a time.
@@ -521,7 +521,7 @@ class V2e(Emulator):
             )
 
     def _make_noise_sizes(self, dt_ns: int) -> None:
-        """The table of the photoreceptor's noise for frames so far apart."""
+        """Make the table of the photoreceptor's noise for this frame spacing."""
         if self._noise.size and dt_ns != self._sizes_dt_ns:
             config = self.config
             self._noise_sizes = noise_table(
@@ -530,7 +530,7 @@ class V2e(Emulator):
             self._sizes_dt_ns = dt_ns
 
     def _interval(self, t_ns: int, brightest: float) -> Interval:
-        """From the last frame to that at ``t_ns``.   brightest : DN, of both."""
+        """Return the interval from the last frame to ``t_ns``.   brightest : DN, of both."""
         config, (epoch,), (start_ns, dt_ns) = self.config, self._epoch_ns.tolist(), (self.t_ns, t_ns - self.t_ns)
         # 275 DN is 255 + 20, full scale in v2e's formula for the corner frequency.
         kappa = 2 * np.pi * config.cutoff_hz * dt_ns * 1e-9 / 275.0
@@ -559,7 +559,7 @@ class V2e(Emulator):
         )
 
     def _begin_leaks_anew(self, t_ns: int) -> None:
-        """What has leaked until ``t_ns`` goes over into the levels."""
+        """Move what has leaked until ``t_ns`` into the levels, and restart the leak clock."""
         gone = self._leak * np.float32((t_ns - int(self._epoch_ns[0])) * 1e-9)
         self._upper -= gone
         self._lower -= gone

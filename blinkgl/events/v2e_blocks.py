@@ -162,7 +162,7 @@ def flag_block_leaking(
 
 @numba.njit(**JIT)
 def _shot_draws(seed, block, index, rate_per_ns, gaps, picks, accepts):
-    """Of the candidates from number ``index`` on: more than are wanted, but in vector instructions."""
+    """Draw the candidates from number ``index`` on: more than needed, but in vector instructions."""
     for j in range(gaps.size):
         number = index + np.uint64(j)
         gaps[j], picks[j] = shot_draw(seed, block, number, rate_per_ns)

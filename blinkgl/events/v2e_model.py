@@ -63,7 +63,7 @@ def decay(k: float) -> tuple[float, float]:
 
 @register_jitable
 def _gentle_growth(k):
-    """(1 - e^-k)/k for k < 1/2, Taylor."""
+    """Return (1 - e^-k)/k for k < 1/2 by its Taylor series."""
     p = k * _P6 + _P5
     p = p * k + _P4
     p = p * k + _P3
@@ -320,21 +320,22 @@ def draw_start(
 
 
 def _one_minus_exp_over(q: np.ndarray) -> np.ndarray:
-    """(1 - e^-q)/q for q >= 0."""
+    """Return (1 - e^-q)/q for q >= 0."""
     small = q < 1e-4
     safe = np.where(small, 1.0, q)
     return np.where(small, 1.0 - q * (0.5 - q / 6.0), (1.0 - exp_f64(-safe)) / safe)
 
 
 def _age(uniform: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Of density e^-qa in (0, 1), by the inverse of its cumulative law."""
+    """Draw an age a in (0, 1) of density e^-qa, by inverting its cumulative distribution."""
     small = q < 1e-6
     safe = np.where(small, 1.0, q)
     return np.where(small, uniform, np.minimum(-log_f64(1.0 - uniform * (1.0 - exp_f64(-safe))) / safe, 1.0))
 
 
 def _length_of_interval(jitter: float, q: np.ndarray, pixels: np.ndarray, seed: np.uint64) -> np.ndarray:
-    """Leak intervals under way at one moment, in mean intervals; q: shot noise events in a mean one."""
+    """Draw the lengths of the leak intervals under way at one moment, in mean intervals. q : shot noise events per
+    mean interval."""
     length = np.ones(len(q))
     if jitter == 0:
         return length

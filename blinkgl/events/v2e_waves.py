@@ -74,20 +74,20 @@ _TWO52, _BITS52, _LOW52 = np.float64(2.0**52), np.int64(0x433 << 52), np.int64(2
 
 @register_jitable(inline="always")
 def _number(ns):
-    """float64 of an int64 of 0 to 2^52 - 1: its bits beside the exponent of 2^52. (The conversion itself is no vector
-    instruction before AVX-512.)"""
+    """Return an int64 of 0 to 2^52 - 1 as float64, by its bits beside the exponent of 2^52. (The conversion itself
+    is no vector instruction before AVX-512.)"""
     return np.int64(ns | _BITS52).view(np.float64) - _TWO52
 
 
 @register_jitable(inline="always")
 def _whole(x):
-    """int64 of a float64 of 0 to 2^52 - 1, what is behind the point left out; likewise."""
+    """Return a float64 of 0 to 2^52 - 1 as int64 without its fraction, in the same way."""
     return np.float64(np.floor(x) + _TWO52).view(np.int64) & _LOW52
 
 
 @numba.njit(**JIT)
 def _curves(floats, count, kappa, since, dt, low_pass):
-    """Of what was gathered: C, RISE, FALL, K, END (see curve_of), at S = 0."""
+    """Compute the rows C, RISE, FALL, K and END (see curve_of) from the gathered ones, with S = 0."""
     if low_pass:
         # The rows that were gathered share memory with those of the curve: all are read before the
         # first is written.
@@ -124,7 +124,7 @@ def _curves(floats, count, kappa, since, dt, low_pass):
 
 @numba.njit(**JIT)
 def _wake(floats, ints, count, dt_ns):
-    """Levels of those whose dead time ends in the interval, at its end (NOW)."""
+    """Set the levels of pixels whose dead time ends in the interval, from the signal at that time (NOW)."""
     for j in range(count):
         # The dead time's end as a fraction of the interval; the signal there is the new reference.
         s = _number(ints[j + _NOW]) / dt_ns
@@ -148,7 +148,7 @@ def _wake_lines(floats, ints, count, dt_ns):
 
 @numba.njit(**JIT)
 def _aim(floats, ints, count):
-    """Which level is met by the interval's end, if any."""
+    """Find the level that each pixel reaches by the interval's end, if any (TARGET, SIGN, POLARITY, FIRES)."""
     for j in range(count):
         # At most one of both levels has been reached, so one target is enough.
         end, up, down = floats[j + _END], floats[j + _UP], floats[j + _DOWN]
@@ -164,7 +164,8 @@ def _aim(floats, ints, count):
 
 @numba.njit(**JIT)
 def _guess(floats, ints, count):
-    """Where the inverse cubic meets the level (AT); OPEN is 1 where the signal stands beyond it to begin with."""
+    """Estimate where the signal meets the level (AT) by an inverse cubic; OPEN is 1 where the signal is beyond the
+    level at the start."""
     for j in range(count):
         c, rise, fall, k = floats[j + _C], floats[j + _RISE], floats[j + _FALL], floats[j + _K]
         low, e_low, target, sign = floats[j + _S], floats[j + _E], floats[j + _TARGET], floats[j + _SIGN]
@@ -187,7 +188,8 @@ def _guess(floats, ints, count):
 
 @register_jitable(inline="always")
 def _turn(s, low, high, target, sign, c, rise, fall, k):
-    """A step of Newton's method, or half of the bracket where it leaves it: (s, bracket, whether that will do)."""
+    """Return (s, bracket, whether s is accurate enough) after a Newton step, or after a bisection where that leaves
+    the bracket."""
     # The bracket shrinks to s on the side on which f says that it lies.
     e = fall * fall_f64(k * s)
     f = sign * (c + rise * s + e - target)
@@ -204,7 +206,7 @@ def _turn(s, low, high, target, sign, c, rise, fall, k):
 
 @numba.njit(**JIT)
 def _first_turn(floats, ints, count):
-    """From the guess to AT, LOWER, UPPER; OPEN where another turn is wanted."""
+    """Improve the guess once: set AT, LOWER and UPPER, and OPEN where another step is needed."""
     for j in range(count):
         # Beyond the level to begin with: the event is at S.
         low, at_once = floats[j + _S], ints[j + _OPEN] != 0
@@ -230,7 +232,7 @@ def _another_turn(floats, ints, count):
 
 @numba.njit(**JIT)
 def _meet(floats, ints, count, wide):
-    """AT of those that fire."""
+    """Compute AT, the time of the crossing, of the pixels that fire."""
     _guess(floats, ints, wide)
     _first_turn(floats, ints, wide)
     # Those that want more turns are listed, and their rows copied together into the second half of both
@@ -287,7 +289,7 @@ def _draw_leaks(floats, ints, count, seed, t0_ns):
 
 @numba.njit(**JIT)
 def _change_leaks(floats, ints, count, jitter, since_0, since_1, dt):
-    """Every event draws the leak anew: what follows moves over to its line."""
+    """Draw a new leak after every event, and move the rest of the curve to the new drift."""
     for j in range(count):
         leak = floats[j + _LEAK]
         # The length of the next leak interval is normal around 1, at least a tenth; float32 as it will
@@ -324,7 +326,7 @@ def _reference_of_lines_after_dead_time(floats, ints, count, dt_ns):
 
 @numba.njit(**JIT)
 def _look_again(floats, count):
-    """E at S."""
+    """Compute E at S."""
     for j in range(count):
         floats[j + _E] = fall_f64(floats[j + _K] * floats[j + _S])
 
@@ -340,8 +342,8 @@ def _set_levels(floats, ints, count):
 
 @numba.njit(**JIT)
 def _go_on(floats, ints, wide, left, noise_end, dt_ns, dead_time):
-    """Which of the pixels that fired are in their dead time at the interval's end (DEAD), and which have another event
-    (AGAIN); returns whether any has."""
+    """Find which pixels that fired are in their dead time at the interval's end (DEAD) and which have another event
+    (AGAIN). Return whether any has."""
     if dead_time:
         for j in range(wide):
             ints[j + _DEAD] = np.int64((ints[j + _FIRES] != 0) & (ints[j + _NOW] > dt_ns))
@@ -362,7 +364,7 @@ def _go_on(floats, ints, wide, left, noise_end, dt_ns, dead_time):
 
 @numba.njit(**JIT)
 def _put_back(floats, ints, count, first, noise_now, dead_time, p, v):
-    """Levels and what else was changed, of all: those that have another event are put back again after it."""
+    """Write levels and changed state of all pixels back; pixels with another event are written again after it."""
     for j in range(count):
         i, dead = _U(ints[j + _PIXEL]), ints[j + _DEAD] != 0
         # In a dead time both levels are passed, whatever comes: the pixel is looked at until it is released.
@@ -388,7 +390,7 @@ def _put_back(floats, ints, count, first, noise_now, dead_time, p, v):
 
 @numba.njit(**JIT)
 def _keep(floats, ints, count):
-    """Rows of those that have another event, together; returns how many."""
+    """Move the rows of pixels with another event together and return their number."""
     # Compaction: rows move forwards only, so none is overwritten before it is read.
     kept = _U0
     for j in range(count):
@@ -403,8 +405,8 @@ def _keep(floats, ints, count):
 
 @numba.njit(**JIT)
 def _part(active, p, v, ints):
-    """Splits the list into those that are not in their dead time (AWAKE) and those whose dead time ends in the interval
-    (WAKING); returns how many of each. The others are left out."""
+    """Split the list into pixels outside their dead time (AWAKE) and pixels whose dead time ends in the interval
+    (WAKING), and return both numbers. The others are left out."""
     awake, asleep, waking, end_ns = _U0, _U0, _U0, v.t0_ns + v.dt_ns
     # Both lists are written and one of them moves on, which is no branch.
     for j in range(_U(active.size)):
@@ -423,7 +425,7 @@ def _part(active, p, v, ints):
 
 @numba.njit(**JIT)
 def _gather(count, first, now, p, v, floats, ints):
-    """Rows of the pixels that PIXEL says, but for NOW, SHOT and SLOT."""
+    """Fill the rows of the pixels in PIXEL, except NOW, SHOT and SLOT."""
     intensity_now, x_now, lag_now, noise_now = now
     # A row at a time: what a feature that is off would need is not read.
     origin = _U(first)
@@ -459,7 +461,8 @@ def _gather(count, first, now, p, v, floats, ints):
 
 @numba.njit(**JIT)
 def _number_shots(count, first, keys, key, noise_end, ints):
-    """SHOT of pixels that lie in raster order; ``key`` : of their first shot noise, and returned, of the next."""
+    """Fill SHOT of pixels in raster order. ``key`` is the place of their first shot noise; return that of the next
+    pixels'."""
     j = _U0
     # Keys and pixels both rise: one walk through both.
     while key < noise_end and j < count:
@@ -478,8 +481,8 @@ def _number_shots(count, first, keys, key, noise_end, ints):
 
 @numba.njit(**JIT)
 def _settle(count, first, noise_now, noise_end, p, v, floats, ints):
-    """Levels of the pixels that wake up and do nothing else in the interval, a third of all that are listed; returns
-    how many do, which are put down (WOKEN)."""
+    """Write the levels of pixels that wake up and do not fire, a third of all listed ones. List those that do fire
+    (WOKEN) and return their number."""
     woken, told = _U0, p.since_ns.size > 0
     for j in range(count):
         # Pixels that fire after waking up are put down with their levels and dealt with together with
@@ -501,7 +504,7 @@ def _settle(count, first, noise_now, noise_end, p, v, floats, ints):
 
 @numba.njit(**JIT)
 def _merge(awake, woken, ints):
-    """PIXEL of both, in raster order; puts down the places of the second (WOKEN_SLOT)."""
+    """Merge both lists into PIXEL in raster order, and store the places of the second one's pixels (WOKEN_SLOT)."""
     a, w = _U0, _U0
     # A merge of two sorted lists.
     while w < woken:
@@ -518,7 +521,7 @@ def _merge(awake, woken, ints):
 
 @numba.njit(**JIT)
 def _shots(floats, ints, count, keys, noise_end, dt_ns):
-    """Where shot noise comes before the crossing, it is the event."""
+    """Replace the crossing by shot noise where that comes first."""
     for j in range(count):
         key = ints[j + _SHOT]
         ints[j + _BY_NOISE] = 0
@@ -540,7 +543,8 @@ def _shots(floats, ints, count, keys, noise_end, dt_ns):
 
 @numba.njit(**JIT)
 def _cause(floats, ints, j, noise_then, p, v):
-    """Of the event of pixel j, shifted to its place; noise_then : the photoreceptor's noise at it."""
+    """Return the cause of pixel j's event, shifted to its place in the word. noise_then : the photoreceptor's noise
+    at the event."""
     if ints[j + _BY_NOISE]:
         return _CAUSE_SHOT << CAUSE_SHIFT
     # How far leak and noise have moved the signal since the reference was taken; light is the rest of
@@ -556,7 +560,7 @@ def _cause(floats, ints, j, noise_then, p, v):
 
 @numba.njit(**JIT)
 def _noise_at(floats, ints, j, s, first, noise_now, p):
-    """The photoreceptor's noise of pixel j at s."""
+    """Return the photoreceptor's noise of pixel j at s."""
     if not p.noise.size:
         return 0.0
     i = ints[j + _PIXEL]
@@ -567,7 +571,7 @@ def _noise_at(floats, ints, j, s, first, noise_now, p):
 
 @numba.njit(**JIT)
 def _in_order(packed, begin, end, owners, slots, ints):
-    """Events that lie wave by wave, pixel by pixel."""
+    """Sort events from wave by wave to pixel by pixel."""
     # A counting sort by pixel. It is stable, so the events of a pixel stay in their order.
     waves = packed[begin:end].copy()
     for j in range(slots):
@@ -616,7 +620,8 @@ def emit_waves(
 
 @numba.njit(**JIT)
 def _emit(active, first, now, keys, key, noise_end, p, v, cap, packed, begin, floats, ints):
-    """:func:`emit_waves` of at most SLOTS pixels; ``key`` : of their first shot noise, and returned, of the next."""
+    """Do :func:`emit_waves` for at most SLOTS pixels. ``key`` is the place of their first shot noise; return that of
+    the next pixels'."""
     noise_now, dt_ns, dt = now[3], v.dt_ns, v.dt_ns * 1e-9
     # Start of the interval after the microsecond base, 0 to 999 ns.
     start_ns = v.t0_ns - 1000 * v.base_us

@@ -267,8 +267,8 @@ class Interval(NamedTuple):
 
 @numba.njit(**JIT)
 def _sense_block(before, now, v, unspent, interval, v_end, unspent_end, flags):
-    """Mean and variance of V at the end into ``v_end`` and ``unspent_end``, flags of pixels to look at; returns the
-    largest mean number of events."""
+    """Write mean and variance of V at the end to ``v_end`` and ``unspent_end``, and flag the pixels to look at.
+    Return the largest mean number of events."""
     dt_us = interval.dt_ns * 1e-3
     # Once per block and in float32; dt_us multiplies what is a rate.
     k1, k2, k3, k6 = _F(interval.k1), _F(interval.k2), _F(interval.k3), _F(interval.k6)
@@ -292,7 +292,7 @@ def _sense_block(before, now, v, unspent, interval, v_end, unspent_end, flags):
 
 @numba.njit(**JIT)
 def _share_block(before, now, by_light, by_leak, interval, light_end, leak_end):
-    """What light and leak will have moved V by at the interval's end, if nothing fires."""
+    """Compute how far light and leak have moved V by the interval's end if nothing fires."""
     dt_us = interval.dt_ns * 1e-3
     k1, k2, k4_dt, k5_dt = _F(interval.k1), _F(interval.k2), _F(interval.k4 * dt_us), _F(interval.k5 * dt_us)
     for i in range(now.size):
@@ -320,7 +320,8 @@ def cause_at(side: int, since_us: float, light: float, leak: float, mu: float, l
 
 @numba.njit(**JIT)
 def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_end, p, v, cap, packed, begin):
-    """Events of the listed pixels of one block into ``packed[begin:]``, in raster order; moves their voltages.
+    """Write the events of the listed pixels of one block to ``packed[begin:]``, in raster order, and move their
+    voltages.
 
     Returns (end of the events, events cut)."""
     out, cut = begin, 0
@@ -434,7 +435,7 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
 
 @numba.njit(**JIT)
 def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p, v):
-    """Band kernel, see :meth:`Emulator._run`."""
+    """Process the blocks of a band, see :meth:`Emulator._run`."""
     cut, pixels = 0, p.v.size
     # Scratch memory of one block. compact_flags writes eight numbers at a time.
     flags, scratch, active = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64), np.empty(BLOCK + 8, np.int32)

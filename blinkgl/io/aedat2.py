@@ -218,7 +218,8 @@ def _scale(header: str, key: str, prefix: str, usual: float) -> float:
 
 def _kinds(address: np.ndarray) -> np.ndarray:
     # Bits 11 and 10 tell the kinds of records with and without bit 31 apart.
-    """_DVS, _PIN, _APS or _IMU of every address (int64); frame samples of the sub-type that nobody has are _PIN."""
+    """Return _DVS, _PIN, _APS or _IMU for every address (int64); frame samples of the sub-type that nobody has are
+    _PIN."""
     low = address >> 10 & 3
     return np.where(
         address >> 31 == 0, np.where(low & 1, _PIN, _DVS), np.where(low == 3, _IMU, np.where(low == 2, _PIN, _APS))
@@ -227,7 +228,7 @@ def _kinds(address: np.ndarray) -> np.ndarray:
 
 @numba.njit(cache=True, nogil=True)
 def _unwrap(address, kinds, stamp, state, height, width, t):
-    """Fills times, int64 µs; returns (index of the first bad record, or -1; 1: outside the sensor, 2: backwards).
+    """Fill times, int64 µs, and return (index of the first bad record, or -1; 1: outside the sensor, 2: backwards).
 
     Records of one kind keep the order of time; of different kinds they may be out of order by less than half of what 32
     bits count."""
@@ -295,7 +296,7 @@ def _rectangular(mask: np.ndarray) -> bool:
 
 @numba.njit(cache=True, nogil=True)
 def _assemble(address, t, begin, reset, signal, times):
-    """Index of the first sample of the frame after: of a pixel that was read, a reset or another read."""
+    """Return the index of the next frame's first sample: a reset or another read of a pixel that was read."""
     for i in range(begin, len(address)):
         # Bit fields of a frame sample: x, y, and the 10 bits of the ADC.
         x, y, sample = address[i] >> 12 & 0x3FF, address[i] >> 22 & 0x1FF, address[i] & 0x3FF

@@ -116,7 +116,7 @@ def _four_in_three(values: np.ndarray, s: int, word: str) -> bytes:
 
 
 def _three_to_four(raw: np.ndarray, at: int, s: int, word: str, count: int) -> tuple[np.ndarray, int]:
-    """``count`` values, and where they end; -1 where they do not fit, or ``at`` is -1 already."""
+    """Return ``count`` values and where they end; -1 where they do not fit or ``at`` is -1 already."""
     groups = -(-count // 4)
     end = at + groups * 3 * np.dtype(word).itemsize
     if at < 0 or end > len(raw):
@@ -197,7 +197,7 @@ def _encode_columns(x, out):
 
 @numba.njit(cache=True, nogil=True)
 def _decode_times(raw, at, start, t):
-    """Fills t; returns the byte after the times, -1 where they do not fit."""
+    """Fill t and return the byte after the times, -1 where they do not fit."""
     i, now, step, shift = 0, start, np.uint64(0), np.uint64(0)
     while i < len(t):
         if at >= len(raw):
@@ -227,7 +227,7 @@ def _decode_times(raw, at, start, t):
 
 @numba.njit(cache=True, nogil=True)
 def _number(raw, at, size):
-    """Of ``size`` bytes; -1 where there are not so many."""
+    """Return the number in ``size`` bytes, -1 where there are fewer."""
     if at < 0 or at + size > len(raw):
         return -1
     number = 0
@@ -238,7 +238,7 @@ def _number(raw, at, size):
 
 @numba.njit(cache=True, nogil=True)
 def _decode_runs(raw, at, bits, size, values):
-    """Fills ``values`` as of :func:`_encode_runs`; the byte after them, -1 where they do not fit."""
+    """Fill ``values`` from what :func:`_encode_runs` wrote. Return the byte after them, -1 where they do not fit."""
     most, i = (1 << bits) - 1, 0
     while i < len(values):
         head = _number(raw, at, size)

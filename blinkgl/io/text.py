@@ -169,8 +169,8 @@ class TextWriter:
 @numba.njit(cache=True, nogil=True)
 # Characters by their codes: 45 "-", 43 "+", 46 ".", 48 to 57 digits, 101 and 69 "e", "E".
 def _number(buffer, i):
-    """(mantissa, decimal exponent, integer?, next index); next index -1: not a number, or
-    more digits than int64 holds."""
+    """Return (mantissa, decimal exponent, integer?, next index); next index -1: not a number, or more digits than
+    int64 holds."""
     mantissa, exponent, digits, integer = np.int64(0), 0, False, True
     negative = buffer[i] == 45
     if buffer[i] == 45 or buffer[i] == 43:
@@ -207,8 +207,8 @@ def _number(buffer, i):
 
 @numba.njit(cache=True, nogil=True)
 def _scaled(mantissa, exponent):
-    """mantissa · 10^exponent rounded to the nearest integer, exactly (half away from zero);
-    ok False when it overflows."""
+    """Return mantissa · 10^exponent rounded to the nearest integer, exactly (half away from zero); ok False when it
+    overflows."""
     value = abs(mantissa)
     while exponent > 0 and value != 0:
         # value * 10 must stay below 2^63.
@@ -227,7 +227,8 @@ def _scaled(mantissa, exponent):
 
 @numba.njit(cache=True, nogil=True)
 def _parse(buffer, x, y, t, p, unit):
-    """Events in whole lines of text. Returns (count, index of the first bad line or -1, bad for its unit of time?).
+    """Parse the events in whole lines of text. Return (count, index of the first bad line or -1, bad for its unit of
+    time?).
 
     unit[0] : of the times so far, -1 not known, 0 integers (µs), 1 decimals (s); kept up to date."""
     n, line, i = 0, 0, 0
@@ -279,7 +280,7 @@ def _parse(buffer, x, y, t, p, unit):
 
 @numba.njit(cache=True, nogil=True)
 def _put(value, digits, buffer, n):
-    """Decimal digits of ``value`` at ``buffer[n:]``, at least ``digits`` of them; returns the new end."""
+    """Write the decimal digits of ``value``, at least ``digits`` of them, to ``buffer[n:]`` and return the new end."""
     # The number of digits first, then the digits from the last one on.
     length, rest = 1, value // 10
     while rest > 0:

@@ -82,7 +82,8 @@ class Contour:
 
 
 def _edges(faces: np.ndarray, places: int) -> np.ndarray:
-    """(E, 4) int32, see :class:`Contour`. Where more than two faces meet, those behind the second are borders."""
+    """Return (E, 4) int32, see :class:`Contour`. Where more than two faces meet, the sides of those after the
+    second are borders."""
     # Every face's three sides, as (from, to) in the face's order.
     count = len(faces)
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
@@ -199,7 +200,7 @@ class Lines:
 
 @nb.njit(cache=True, nogil=True)
 def _planes(places, faces, out):
-    """Writes (F, 4) float64, see :class:`Contour`."""
+    """Write (F, 4) float64, see :class:`Contour`."""
     # Normal by the cross product of two sides, of twice the triangle's area; its product with a corner.
     for f in range(len(faces)):
         a, b, c = places[faces[f, 0]], places[faces[f, 1]], places[faces[f, 2]]
@@ -212,8 +213,8 @@ def _planes(places, faces, out):
 
 @nb.njit(cache=True, nogil=True)
 def _emit(numbers, bodies, culled, T_cam_obj, mvps, starts, places, faces, planes, edges, sharp, width, height, out):
-    """Writes the lines of all items; their number. numbers, bodies, culled : of each item, its contour's place in the
-    pool, its object's, and whether the backs of its faces are not drawn."""
+    """Write the lines of all items and return their number. numbers, bodies, culled : of each item, its contour's
+    place in the pool, its object's, and whether the backs of its faces are not drawn."""
     front = np.empty(len(planes), np.bool_)
     # np.int64(0), because a literal 0 would compile _emit_one for a second type.
     count = np.int64(0)
@@ -236,7 +237,7 @@ def _emit(numbers, bodies, culled, T_cam_obj, mvps, starts, places, faces, plane
 
 @nb.njit(cache=True, nogil=True)
 def _emit_one(mvp, places, faces, planes, edges, sharp, front, culled, width, height, out, count):
-    """Writes the lines of one item behind the first ``count``; their number then."""
+    """Append the lines of one item to the first ``count``, and return the new number."""
     ends = np.empty((2, 4))
     for e in range(len(edges)):
         # Kinds and directions from which faces are seen.
@@ -315,7 +316,7 @@ def _emit_one(mvp, places, faces, planes, edges, sharp, front, culled, width, he
 
 @nb.njit(cache=True, nogil=True)
 def _most(lines):
-    """So many pixels are crossed at most."""
+    """Return an upper bound of the number of pixels crossed."""
     count = 0
     for n in range(len(lines)):
         # A line enters a new pixel at most once for each column and row that it passes.
@@ -325,7 +326,7 @@ def _most(lines):
 
 @nb.njit(cache=True, nogil=True)
 def _around(x, y):
-    """Where a ray from a pixel's centre leaves its square, along the boundary, in half sides: 8 all round."""
+    """Return where a ray from a pixel's centre leaves its square, along the boundary, in half sides: 8 all round."""
     # A line that ends in the pixel's centre has no direction.
     if x == 0.0 and y == 0.0:
         return 0.0
@@ -336,7 +337,7 @@ def _around(x, y):
 
 @nb.njit(cache=True, nogil=True)
 def _cross(lines, width, height, out, places):
-    """The crossings of each line, one after another along it, and each one's pixel, y * width + x; their number.
+    """Write the crossings of each line, in order along it, and each one's pixel, y * width + x. Return their number.
 
     A line is cut where it passes from pixel to pixel. The share is the area between the part and the square's boundary
     as seen from the centre: the triangle that it makes with the centre, less the square's sector between the same
@@ -391,7 +392,8 @@ def _cross(lines, width, height, out, places):
 
 @nb.njit(cache=True, nogil=True)
 def _by_pixel(crossings, places, width, counts, pixels, out):
-    """Crossings of the same pixel one behind the other in ``out``; the number of pixels. counts : zeros, left so."""
+    """Write the crossings to ``out``, those of a pixel together, and return the number of pixels. counts : zeros,
+    left so."""
     # A counting sort. ``counts`` first holds numbers, then write positions, and is zero again at the
     # end.
     found = 0

@@ -88,7 +88,7 @@ class Holes(NamedTuple):
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _build(triangles, lower, upper, child, count):
-    """Median split along the longest side of the centroids' box. Returns (order, number of nodes)."""
+    """Build the tree by median splits along the longest side of the centroids' box. Return (order, number of nodes)."""
     n = triangles.shape[0]
     order = np.arange(n)
     centre = np.empty((n, 3))
@@ -177,7 +177,7 @@ def join_trees(trees: list[Tree], cull: list[bool], holes: list[Holes | None] | 
 
 
 def _holes(parts: int, holes: list[Holes | None]) -> tuple[np.ndarray, ...]:
-    """The last five of a :class:`Forest`."""
+    """Return the last five fields of a :class:`Forest`."""
     mask, rows, uvs, texels = np.full(parts, -1, np.int32), [], [np.empty((0, 3, 2))], [np.empty(0, np.float32)]
     for p, one in enumerate(holes):
         if one is not None:
@@ -203,7 +203,7 @@ def _texel_index(i, size, wrap):
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _is_hole(mask, uvs, cutoff, texels, face, a, b, c):
-    """Whether the point of a face with these barycentrics is cut out: bilinear in ``texels``. mask : a row of
+    """Return whether the point of a face with these barycentrics is cut out, bilinear in ``texels``. mask : a row of
     ``Forest.masks``."""
     first, start, height, width = mask[0] + face, mask[1], mask[2], mask[3]
     # Texture coordinates are affine in the barycentrics; texel centres lie at half-integers.
@@ -221,7 +221,8 @@ def _is_hole(mask, uvs, cutoff, texels, face, a, b, c):
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _shear(d):
-    """Axes and shear that turn direction d into +z (Woop et al., section 3.1): kx, ky, kz, sx, sy, sz."""
+    """Return the axes and the shear that turn direction d into +z (Woop et al., section 3.1): kx, ky, kz, sx, sy,
+    sz."""
     # The longest axis of d becomes z, so that the division below is well conditioned.
     kz = 0
     if abs(d[1]) > abs(d[kz]):
@@ -238,7 +239,7 @@ def _shear(d):
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _triangle(tri, o, kx, ky, kz, sx, sy, sz):
-    """(s, u, v, w, front): ray parameter and barycentrics of corners 0, 1, 2; s = inf for a miss."""
+    """Return (s, u, v, w, front): ray parameter and barycentrics of corners 0, 1, 2; s = inf for a miss."""
     # Corners relative to the ray's origin, sheared so that the ray runs along z (Woop et al., section
     # 3.2).
     az, bz, cz = tri[0, kz] - o[kz], tri[1, kz] - o[kz], tri[2, kz] - o[kz]
@@ -265,9 +266,9 @@ def _local_ray(axes, rx, ry, d):
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _balls(forest, origins, axes):
-    """Balls round the parts, a little too large, camera axes: (P, 3) middles, (P,) radii, and (P,) the square of the
-    length of the tangents from the camera's centre, a little too short; <= 0: it is inside. Most rays pass most parts
-    by, and a ball says so before a ray is turned into a part's axes."""
+    """Return balls around the parts, slightly too large, in camera axes: (P, 3) middles, (P,) radii, and (P,) the
+    square of the length of the tangents from the camera's centre, a little too short; <= 0: it is inside. Most
+    rays pass most parts by, and a ball says so before a ray is turned into a part's axes."""
     count = forest.root.shape[0]
     centre, radius, outside = np.empty((count, 3)), np.empty(count), np.empty(count)
     for p in range(count):

@@ -186,7 +186,7 @@ def cast(scene: Scene, t_ns: int, xy: np.ndarray | None = None, *, exhaustive: b
 
 
 def _rays(camera: CameraModel, xy: np.ndarray) -> np.ndarray:
-    """(N, 3) rays of length 1 along the optical axis; nan for a pixel without one that points forward."""
+    """Return (N, 3) rays of length 1 along the optical axis; nan for a pixel without a ray that points forward."""
     rays = camera.rays(xy)
     # nan marks a pixel that has no ray with Z > 0.
     return rays / np.where(rays[:, 2:] > 0, rays[:, 2:], np.nan)
@@ -226,7 +226,7 @@ def _forest(scene: Scene, t_ns: int) -> Forest:
 
 
 def _holes_of(part: Part) -> Holes | None:
-    """As the ray caster takes them."""
+    """Return a part's holes as the ray caster takes them."""
     mask, mesh = part.material.mask, part.mesh
     if mask is None:
         return None
@@ -236,8 +236,9 @@ def _holes_of(part: Part) -> Holes | None:
 
 
 def _nearest(scene, t_ns, rays, far=None, skip=None, exhaustive=False, eye=None, near=None, any_will_do=False):
-    """(hit (N, 3) int32, bary (N, 3), depth (N,)) as described at :func:`raycast.nearest_tree`. eye, near : of other
-    rays than the camera's: (4, 4) pose where they come from, Z at which they begin.   any_will_do : as there."""
+    """Return (hit (N, 3) int32, bary (N, 3), depth (N,)) as described at :func:`raycast.nearest_tree`. eye, near :
+    of other rays than the camera's: (4, 4) pose where they come from, Z at which they begin.   any_will_do : as
+    there."""
     forest = _forest(scene, int(t_ns))
     camera_pose = scene.camera_path.pose(t_ns) if eye is None else eye
     # relative to the camera by differences of positions, so that a common offset from the origin cancels first
@@ -266,7 +267,7 @@ def _nearest(scene, t_ns, rays, far=None, skip=None, exhaustive=False, eye=None,
 
 
 def _by_part(part: np.ndarray):
-    """(p, indices of the points on part p) for every part that was hit."""
+    """Return (p, indices of the points on part p) for every part that was hit."""
     return [(int(p), np.flatnonzero(part == p)) for p in np.unique(part) if p >= 0]
 
 
@@ -274,7 +275,7 @@ def _by_part(part: np.ndarray):
 
 
 def _relative_pose(camera: np.ndarray, body: np.ndarray) -> np.ndarray:
-    """(4, 4) inv(camera) @ body for rigid poses."""
+    """Return the (4, 4) inv(camera) @ body of rigid poses."""
     m = np.eye(4)
     m[:3, :3] = camera[:3, :3].T @ body[:3, :3]
     m[:3, 3] = camera[:3, :3].T @ (body[:3, 3] - camera[:3, 3])
@@ -282,7 +283,7 @@ def _relative_pose(camera: np.ndarray, body: np.ndarray) -> np.ndarray:
 
 
 def _relative_change(scene: Scene, thing: SceneObject, t0_ns: int, t1_ns: int) -> np.ndarray:
-    """(3, 4) M(t1) - M(t0) with M the pose in the camera's frame, from the differences of the poses."""
+    """Return (3, 4) M(t1) - M(t0) with M the pose in the camera's frame, from the differences of the poses."""
     c0, c1 = scene.camera_path.pose(t0_ns), scene.camera_path.pose(t1_ns)
     b0, b1 = thing.path.pose(t0_ns), thing.path.pose(t1_ns)
     # M1 - M0 = C1^T (B1 - B0) + (C1 - C0)^T B0, and likewise for the translation: differences only.
@@ -295,7 +296,7 @@ def _relative_change(scene: Scene, thing: SceneObject, t0_ns: int, t1_ns: int) -
 
 
 def _relative_rate(scene: Scene, thing: SceneObject, t_ns: int) -> np.ndarray:
-    """(3, 4) dM/dt in 1/s: the analytic twist of the body as the moving camera sees it."""
+    """Return (3, 4) dM/dt in 1/s: the analytic twist of the body as the moving camera sees it."""
     c, dc = scene.camera_path.pose(t_ns), scene.camera_path.derivative(t_ns)
     b, db = thing.path.pose(t_ns), thing.path.derivative(t_ns)
     rate = np.empty((3, 4))
@@ -414,7 +415,8 @@ def relative_pose_at(scene: Scene, thing: SceneObject, t_ns: int) -> np.ndarray:
 
 
 def _faces_camera(scene: Scene, hits: Hits, t_ns: int, rows: np.ndarray) -> np.ndarray:
-    """(N,) bool: the triangle of each hit is drawn from where the camera is at t_ns (False only for culled ones)."""
+    """Return (N,) bool: the triangle of each hit is drawn from where the camera is at t_ns (False only for culled
+    ones)."""
     shown = np.ones(len(rows), bool)
     for p, (thing, part) in enumerate(scene_parts(scene)):
         on = np.flatnonzero(rows & (hits.part == p))
@@ -697,7 +699,7 @@ _inside_out: WeakKeyDictionary = WeakKeyDictionary()
 
 
 def _turned_out(thing: SceneObject) -> SceneObject:
-    """With the faces of what is drawn from one side alone turned round."""
+    """Return the object with the faces of one-sided parts turned round."""
     parts = (
         replace(part, mesh=replace(part.mesh, faces=np.ascontiguousarray(part.mesh.faces[:, ::-1])))
         if part.culled
@@ -713,7 +715,8 @@ def casts(scene: Scene) -> bool:
 
 
 def _casters(scene: Scene) -> tuple[Scene, np.ndarray]:
-    """The scene with what casts shadows alone, and what number each part has in it, -1: none (and -1 of no part)."""
+    """Return the scene with only the parts that cast shadows, and each part's number in it, -1 for none (and for no
+    part)."""
     if scene not in _shadowers:
         kept, number, count = [], [], 0
         for thing in scene.objects:
@@ -752,7 +755,7 @@ _as_numbers: WeakKeyDictionary = WeakKeyDictionary()
 
 
 def _wrapped(index: np.ndarray, size: int, wrap: str) -> np.ndarray:
-    """Of (N,) texel numbers, where a picture goes on beyond its edges."""
+    """Return (N,) texel numbers inside the picture, continued beyond its edges as ``wrap`` says."""
     if wrap == "clamp":
         return np.clip(index, 0, size - 1)
     if wrap == "mirror":

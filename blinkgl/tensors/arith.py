@@ -15,7 +15,7 @@ from blinkgl.events import arith
 
 
 def _c(name: str) -> float:
-    """A constant of the numba functions."""
+    """Return a constant of the numba functions."""
     return float(getattr(arith, name))
 
 

@@ -143,7 +143,7 @@ class Batch(ABC):
 
     @property
     def _host_is_near(self) -> bool:
-        """Whether a look at a number costs nothing, because the host is the device."""
+        """Return whether reading a number costs nothing, because the host is the device."""
         return self.device.type == "cpu"
 
     def __init__(self, height: int, width: int, envs: int, device: Any, seed: int):
@@ -233,7 +233,8 @@ class Batch(ABC):
         return frames.detach().reshape(-1)
 
     def _interval(self, t_ns: Any) -> Interval:
-        """Of the step to ``t_ns``. Raises EventDataError naming the first environment whose time cannot be."""
+        """Return the interval of the step to ``t_ns``. Raises EventDataError naming the first environment whose time
+        cannot be."""
         try:
             # An integer, or one per environment; a tensor on a card is brought to the host.
             times = np.asarray(t_ns.cpu() if isinstance(t_ns, Tensor) else t_ns)
@@ -287,18 +288,19 @@ class Batch(ABC):
             raise error
 
     def _chunks(self) -> list[slice]:
-        """The flat pixels, in pieces."""
+        """Return slices that cut the flat pixels into pieces."""
         # Without an entry for the device a piece has 2^24 pixels.
         size, total = _CHUNK.get(self.device.type, 2**24), self.envs * self._pixels
         return [slice(a, min(a + size, total)) for a in range(0, total, size)]
 
     # -- events --------------------------------------------------------------------------------------------------
     def _env_of(self, flat: Tensor) -> Tensor:
-        """Environments of flat pixel numbers."""
+        """Return the environments of flat pixel numbers."""
         return torch.div(flat, self._pixels, rounding_mode="trunc") if self.envs > 1 else torch.zeros_like(flat)
 
     def _events(self, interval: Interval, found: Found, cause: Tensor | None, waves: bool) -> TensorEvents:
-        """Columns in their order, from events that lie pixel by pixel, or wave by wave with each wave in raster order.
+        """Return the sorted columns of events that lie pixel by pixel, or wave by wave with each wave in raster
+        order.
 
         waves : events of one pixel are not beside each other yet."""
         # Sorted by environment, then time; without environments to tell apart that key is left out.
@@ -329,8 +331,8 @@ class Batch(ABC):
 
     @abstractmethod
     def _advance(self, flat: Tensor, interval: Interval) -> TensorEvents:
-        """The events of a step; changes nothing where it raises."""
+        """Return the events of a step; nothing changes where it raises."""
 
     @abstractmethod
     def _forget(self, k: int) -> None:
-        """Environment k waits for its first frame."""
+        """Reset environment k, which then waits for its first frame."""

@@ -123,7 +123,7 @@ class TensorEsim(Batch):
         self._state = ("_log", "_upper", "_lower", "_fired", "_last_ns")
 
     def _draw(self, k: int, on: float, off: float) -> int:
-        """Draws the thresholds of environment k, which stay; returns the smallest."""
+        """Draw the thresholds of environment k, which stay fixed, and return the smallest."""
         c, here = self.config, self._rows(k)
         drawn = draw_thresholds(
             self.height, self.width, on, off, c.threshold_sigma, np.uint64(self.seeds[k]), c.threshold_correlation
@@ -133,7 +133,7 @@ class TensorEsim(Batch):
         return int(min(to_q25(one.min()) for one in drawn))
 
     def _rows(self, k: int) -> slice:
-        """The pixels of environment k."""
+        """Return the slice of environment k's pixels."""
         return slice(k * self._pixels, (k + 1) * self._pixels)
 
     def _forget(self, k: int) -> None:
@@ -143,7 +143,7 @@ class TensorEsim(Batch):
         self._fired[here if self._jitter else slice(0)] = 0
 
     def _first_levels(self, k: int) -> None:
-        """Levels round the first frame of environment k."""
+        """Set the levels around the first frame of environment k."""
         here = self._rows(k)
         on, off = (self._on[here], self._off[here]) if self._spread else (self._on, self._off)
         if self._jitter:
@@ -153,7 +153,7 @@ class TensorEsim(Batch):
         self._lower[here] = (self._log[here] - off).to(torch.int32)
 
     def _jittered(self, key: Any, pixel: Tensor, fired: Tensor, on: Any, off: Any) -> tuple[Tensor, Tensor]:
-        """Thresholds for the level after ``fired`` of them, int64."""
+        """Return the thresholds for the level after ``fired`` levels, int64."""
         a, b = normal2(key, pixel, int(Stream.JITTER), fired)
         up = on + torch.floor(a * self._jitter + 0.5).to(torch.int64)
         down = off + torch.floor(b * self._jitter + 0.5).to(torch.int64)
@@ -178,7 +178,8 @@ class TensorEsim(Batch):
         return self._events(interval, found, causes, waves=self._jitter > 0)
 
     def _look(self, flat: Tensor) -> Tensor:
-        """The first half: log intensity, distance beyond the levels; the extremes of the frames' bits."""
+        """Compute log intensities and distances beyond the levels (the first half), and return the extremes of the
+        frames' bits."""
         extremes = []
         for piece in self._chunks():
             now, beyond = self._now[piece], self._beyond[piece]
@@ -191,7 +192,7 @@ class TensorEsim(Batch):
         return torch.stack(extremes)
 
     def _sized(self, flat: Tensor, extremes: Tensor) -> tuple[Firing, Tensor, Sizes]:
-        """The pixels that fire, the levels that each passes, and what the host has to know of both.
+        """Return the pixels that fire, the number of levels that each passes, and what the host has to know of both.
 
         Here the host waits, once. Raises EventDataError: an intensity that cannot be used."""
         # The host may look as often as it likes, so only pixels that fire are counted.
@@ -219,12 +220,12 @@ class TensorEsim(Batch):
 
     # A block's worst case: every pixel as far beyond its level as the farthest one.
     def _may_cut(self, v: Interval, farthest: int) -> bool:
-        """Whether some block of pixels could have more events than its share."""
+        """Return whether some block of pixels could have more events than its share."""
         return BLOCK * (int(max(farthest, 0) * self._inverse_threshold) + 2) > self._share
 
     def _caps(self, v: Interval, f: Firing) -> Tensor:
-        """Most events of each pixel that fires, (M,) int64, as the kernel of the single emulator shares them out among
-        the pixels that fire of a block of 1024."""
+        """Return the largest number of events of each pixel that fires, (M,) int64, as the kernel of the single
+        emulator shares them out among the pixels that fire of a block of 1024."""
         blocks = -(-self._pixels // BLOCK)
         # Padded to whole blocks; -1 is a pixel that does not fire.
         beyond = torch.full((self.envs, blocks * BLOCK), -1, dtype=torch.int32, device=self.device)
@@ -263,7 +264,7 @@ class TensorEsim(Batch):
         return Firing(index, self._env_of(index), log, whole, gap, above.to(torch.int64), on, off, step)
 
     def _at_once(self, f: Firing, counts: Tensor, sizes: Sizes, v: Interval, cap: Tensor | None) -> Found:
-        """All events in raster order; moves the levels."""
+        """Return all events in raster order and move the levels."""
         # passed: the last level passed.
         passed = f.log - (2 * f.polarity - 1) * (f.gap - (counts - 1) * f.step)
         self._upper.index_copy_(0, f.flat, (passed + f.on).to(torch.int32))
@@ -304,7 +305,7 @@ class TensorEsim(Batch):
         return Found(*(one[keep] for one in found))
 
     def _awake(self, f: Firing, counts: Tensor, first: Tensor, most: int, t_ns: Tensor) -> Tensor:
-        """Which events come after their pixel's refractory period, (N,) bool; the others are lost.
+        """Return which events come after their pixel's refractory period, (N,) bool; the others are lost.
 
         first : each pixel's first event.   t_ns : of all events, pixel by pixel. One turn a level, over all pixels: no
         size depends on what is lost."""
@@ -323,7 +324,7 @@ class TensorEsim(Batch):
         return keep[:-1]
 
     def _walk(self, f: Firing, v: Interval, cap: Tensor | None) -> Found:
-        """:meth:`_at_once` level by level, with thresholds drawn anew at each."""
+        """Do :meth:`_at_once` level by level, with thresholds drawn anew at each."""
         slots = torch.arange(len(f.flat), device=self.device)
         gap, fired = f.gap.clone(), self._fired.index_select(0, f.flat).to(torch.int64)
         up, down, emitted = torch.zeros_like(gap), torch.zeros_like(gap), torch.zeros_like(gap)

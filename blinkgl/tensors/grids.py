@@ -19,7 +19,7 @@ NEVER_US = NEVER_NS // 1000
 
 
 def _cells(events: TensorEvents, channel: Tensor, channels: int) -> Tensor:
-    """Places in a flat (environments, channels, H, W) array, (N,) int64."""
+    """Return the events' places in a flat (environments, channels, H, W) array, (N,) int64."""
     _, height, width = events.shape
     return ((events.env.to(torch.int64) * channels + channel) * height + events.y) * width + events.x
 

@@ -63,7 +63,7 @@ def decay(k: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _decay_of(k: float) -> tuple[float, float]:
-    """:func:`decay` of one number, rounded to float32 first."""
+    """Return :func:`decay` of one number, rounded to float32 first."""
     keep, ramp = model.decay(np.array(k, np.float32))  # type: ignore[arg-type]
     return float(keep), float(ramp)
 
@@ -142,7 +142,7 @@ class TensorV2e(Batch):
         self._sizes: dict[int, Tensor] = {}
 
     def _make_state(self, config: V2eConfig) -> None:
-        """Tensors for the state, by the names of V2e's arrays, and for what is drawn once; flat."""
+        """Make flat tensors for the state, by the names of V2e's arrays, and for what is drawn once."""
         memory = self._has.low_pass or config.shot_noise_rate_hz > 0
         float32, int64, pixels, blocks = torch.float32, torch.int64, self._pixels, self._blocks
         # Name: type, elements per environment, whether the configuration needs it.
@@ -231,7 +231,8 @@ class TensorV2e(Batch):
         return self._events(interval, Found(word, after), cause if self.config.causes else None, waves=True)
 
     def _numbers(self, v: Interval) -> Numbers:
-        """Computed in double precision on the host, as V2e does; rounded once where float32 is asked for."""
+        """Return the step's numbers, computed in double precision on the host as V2e does, and rounded once where
+        float32 is needed."""
         config, lengths = self.config, v.lengths_ns
         # A fresh environment's leak clock starts with its frame.
         epoch = np.where(self._clock[:, 0] == 1, self._clock[:, 3], v.start_ns)
@@ -265,8 +266,8 @@ class TensorV2e(Batch):
             )
 
     def _look(self, frames: Tensor, each: Numbers) -> tuple[dict[str, Tensor], Tensor]:
-        """The first half: what the photoreceptors hold at the interval's end, by the name of the state, and how far
-        their signals lie beyond the levels; (environments, pixels) float32."""
+        """Compute the first half: what the photoreceptors hold at the interval's end, by the name of the state, and
+        how far their signals lie beyond the levels; (environments, pixels) float32."""
         before: Callable[[str], Tensor] = lambda name: getattr(self, name).view(self.envs, -1)
         intensity = frames * self.config.full_scale
         x = lin_log(intensity)
@@ -292,7 +293,7 @@ class TensorV2e(Batch):
         return now, torch.maximum(signal - before("_upper"), before("_lower") - signal)
 
     def _next_noise(self, noise: Tensor, k: Tensor, each: Numbers) -> Tensor:
-        """Photoreceptor noise at the interval's end: the exact step of an Ornstein-Uhlenbeck process."""
+        """Return the photoreceptor noise at the interval's end, by the exact step of an Ornstein-Uhlenbeck process."""
         pairs = torch.arange((self._pixels + 1) // 2, device=self.device)
         # Pixels 2j and 2j + 1 share a draw. One environment at a time: its draws take forty times their memory.
         drawn = [
@@ -310,7 +311,7 @@ class TensorV2e(Batch):
         return noise * a + (low + part * (high - low)) * sqrt(1.0 - a * a) * normal
 
     def _noise_sizes(self, dt_ns: int) -> Tensor:
-        """The table of the noise's size over ln k, (TABLE_SIZE,) float32, for frames so far apart."""
+        """Return the table of the noise's size over ln k, (TABLE_SIZE,) float32, for this frame spacing."""
         if dt_ns not in self._sizes:
             c = self.config
             made = noise_table(c.shot_noise_rate_hz, dt_ns * 1e-9, model.noise_threshold(c), c.refractory_us * 1e-6)
@@ -320,8 +321,8 @@ class TensorV2e(Batch):
         return self._sizes[dt_ns]
 
     def _draw_shots(self, interval: Interval, now: dict[str, Tensor]) -> Shots | None:
-        """Shot noise of the interval, None without any. One Poisson clock a block of 1024 pixels, as fast as if all
-        were dark, thinned to what their intensities allow (Lewis and Shedler 1979); moves the clocks."""
+        """Draw the shot noise of the interval, None without any. One Poisson clock a block of 1024 pixels, as fast
+        as if all were dark, thinned to what their intensities allow (Lewis and Shedler 1979); moves the clocks."""
         table = self._shot_table.view(-1, 2 * BLOCK)
         # Every block of every environment has a clock; those that are due move on together, one
         # candidate a turn.
@@ -365,7 +366,7 @@ class TensorV2e(Batch):
         return value[env] if isinstance(value, Tensor) else torch.full_like(env, value)
 
     def _flagged(self, beyond: Tensor, shots: Shots | None) -> Tensor:
-        """``beyond``, flat, not negative where shot noise falls."""
+        """Return ``beyond``, flat, with 0 where shot noise falls."""
         flags = beyond.reshape(-1)
         if shots is not None:
             flags[shots.flat] = 0.0
@@ -374,7 +375,7 @@ class TensorV2e(Batch):
     def _rows(
         self, flat: Tensor, now: dict[str, Tensor], shots: Shots | None, each: Numbers, v: Interval
     ) -> tuple[Rows, Step]:
-        """Rows of the pixels that are looked at, without those that stay in their dead time; their times."""
+        """Return the rows of the pixels to look at, without those that stay in their dead time, and their times."""
         if self._has.refractory_ns:
             end_ns = torch.from_numpy(v.end_ns).to(self.device)[self._env_of(flat)]
             # A level of -inf marks the dead time; of those only the pixels that are released now take
@@ -407,8 +408,8 @@ class TensorV2e(Batch):
         return r, step
 
     def _put_back(self, r: Rows, v: Step) -> None:
-        """Levels and what else a wave has changed. In a dead time both levels are passed, whatever comes: the pixel is
-        looked at until it is released."""
+        """Write levels and other state that a wave has changed back. In a dead time both levels are passed, whatever
+        comes: the pixel is looked at until it is released."""
         flat, dead = r["flat"], r["dead"]
         self._upper[flat] = torch.where(dead, -_INF, r["up"].to(torch.float32))
         self._lower[flat] = torch.where(dead, _INF, r["down"].to(torch.float32))
@@ -421,7 +422,8 @@ class TensorV2e(Batch):
             self._noise_then[flat] = r["noise_then"].to(torch.float32)
 
     def _rest_leaks(self, interval: Interval, each: Numbers) -> None:
-        """What has leaked goes over into the levels where the leak clock has run for long, so that float32 will do."""
+        """Move what has leaked into the levels where the leak clock has run for long, so that float32 is accurate
+        enough."""
         due = (self._clock[:, 0] == 1) & (interval.end_ns - self._clock[:, 3] >= self._rebase_ns)
         for k in np.flatnonzero(due):
             here = slice(int(k) * self._pixels, (int(k) + 1) * self._pixels)
@@ -432,7 +434,7 @@ class TensorV2e(Batch):
             self._clock[k, 3] = interval.end_ns[k]
 
     def _begin(self, k: int, flat: Tensor, t_ns: int) -> None:
-        """Environment k's state at its first frame, drawn by the emulator on the host."""
+        """Set environment k's state at its first frame, drawn by the emulator on the host."""
         # The numba emulator on the host draws it: the same draws as everywhere.
         single = V2e(self.height, self.width, self.config, self.seeds[k])
         single.step(flat.view(self.envs, self.height, self.width)[k].cpu().numpy(), t_ns)

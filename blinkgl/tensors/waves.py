@@ -107,7 +107,7 @@ def wake(r: Rows, v: Step, has: Parts, waking: Tensor) -> None:
 
 
 def _aim(r: Rows) -> None:
-    """Which level is met by the interval's end, if any."""
+    """Find the level that each pixel reaches by the interval's end, if any."""
     above = r["end"] >= r["up"]
     # At most one of both levels has been reached.
     r["target"] = torch.where(above, r["up"], r["down"])
@@ -117,7 +117,8 @@ def _aim(r: Rows) -> None:
 
 
 def _turn(s: Tensor, low: Tensor, high: Tensor, r: Rows) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """A step of Newton's method, or half of the bracket where it leaves it: (s, bracket, whether that will do)."""
+    """Return (s, bracket, whether s is accurate enough) after a Newton step, or after a bisection where that leaves
+    the bracket."""
     k, sign = r["k"], r["sign"]
     e = r["fall"] * fall_f64(k * s)
     f = sign * (r["c"] + r["rise"] * s + e - r["target"])
@@ -133,7 +134,7 @@ def _turn(s: Tensor, low: Tensor, high: Tensor, r: Rows) -> tuple[Tensor, Tensor
 
 
 def _meet(r: Rows) -> None:
-    """Row ``at``: where the signal of a pixel with a low-pass meets its level."""
+    """Compute row ``at``: where the signal of a pixel with a low-pass meets its level."""
     c, rise, fall, k, end = (r[name] for name in ("c", "rise", "fall", "k", "end"))
     low, e_low, target, sign = (r[name] for name in ("s", "e", "target", "sign"))
     f_low, f_high = sign * (c + rise * low + fall * e_low - target), sign * (end - target)
@@ -174,7 +175,7 @@ def _meet_lines(r: Rows) -> None:
 
 
 def _let_shots_come_first(r: Rows, shots: Shots, v: Step) -> None:
-    """Where shot noise comes before the crossing, it is the event. Row ``shot``: a pixel's next one, or their end."""
+    """Replace the crossing by shot noise where that comes first. Row ``shot``: a pixel's next one, or their end."""
     end = len(shots.flat)
     # Indices are held inside the list; ``mine`` says whether they mean anything.
     at = lambda column, key: column[key.clamp(max=end - 1)]
@@ -195,7 +196,7 @@ def _let_shots_come_first(r: Rows, shots: Shots, v: Step) -> None:
 
 
 def _change_leaks(r: Rows, v: Step, jitter: float) -> None:
-    """Every event draws the leak anew: what follows moves over to its line."""
+    """Draw a new leak after every event, and move the rest of the curve to the new drift."""
     drawn = rough_normal((v.low, v.high), r["pixel"], int(Stream.LEAK_JITTER), r["at_ns"] + v.t0_ns)
     spread = drawn * jitter + 1.0
     # A leak interval is at least a tenth of its mean.
@@ -212,7 +213,7 @@ def _change_leaks(r: Rows, v: Step, jitter: float) -> None:
 
 
 def _cause_bits(r: Rows) -> Tensor:
-    """The cause of each event, in the place that packing.py gives it: the largest part of what moved the pixel."""
+    """Return the cause of each event, in its place in the packed word: the largest part of what moved the pixel."""
     sign, size = r["sign"], torch.where(r["polarity"].bool(), r["on"], r["off"])
     # How far leak and noise have moved the signal since the reference was taken; light is the rest.
     by_leak = sign * r["leak"] * ((r["at_ns"] - r["since"]).to(torch.float64) * 1e-9)
@@ -225,7 +226,8 @@ def _cause_bits(r: Rows) -> Tensor:
 
 
 def _new_references(r: Rows, v: Step, has: Parts, shots: Shots | None) -> None:
-    """Levels after the wave's events, and which pixels are in their dead time at the interval's end (``dead``)."""
+    """Set the levels after the wave's events, and find the pixels in their dead time at the interval's end
+    (``dead``)."""
     fires = r["fires"]
     if has.refractory_ns:
         # After an event the reference is taken at the end of the dead time, else at the event.

@@ -44,7 +44,8 @@ _EDGES = np.logspace(-3, 8, 1101)
 
 @numba.njit(cache=True, nogil=True)
 def _left_out(scheme, older, a, middle, b, newer, slope_a, slope_b, t, error, weight):
-    """Error at the left-out frame as a fraction of the step over it, and the change across it, per sample.
+    """Compute per sample the error at the left-out frame, as a fraction of the step over it, and the change across
+    it.
 
     t : (5,) float64 s, times of the five frames; t[0] = t[1] or t[4] = t[3] where there is no such frame."""
     step, s_middle = t[3] - t[1], (t[2] - t[1]) / (t[3] - t[1])
@@ -113,7 +114,7 @@ class TimeError:
         return float(speed / np.exp(min(log_d, x + np.log(2.0))))
 
     def _line(self) -> tuple[float, float, float]:
-        """A point (log d, log g) of the line and its slope."""
+        """Return a point (log d, log g) of the line and its slope."""
         n, sx, sy, sxx, sxy = self._sums
         x, y = sx / n, sy / n
         m0 = _PRIOR[self.reconstruction][1]

@@ -69,7 +69,7 @@ def _segment(a, b, slope_a: np.ndarray, slope_b: np.ndarray, factor: int) -> Ite
 
 @numba.njit(cache=True, nogil=True)
 def _monotone(d0, d1, h0, h1, out):
-    """Slope at a node: weighted harmonic mean of the secants beside it, 0 at an extremum."""
+    """Compute the slope at a node: the weighted harmonic mean of the secants beside it, 0 at an extremum."""
     # Fritsch and Butland's weights for unequal spacings.
     share = np.float32((2 * h1 + h0) / (3 * (h0 + h1)))
     for i in range(len(out)):
@@ -200,7 +200,7 @@ def _between(a, b, t_a, t_b, forward, backward, steps) -> Iterator[Timed]:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _look(light, log, places, out):
-    """``out`` = light at ``places`` (H, W, 2), x and y in px; beyond the border it is that of the border."""
+    """Write the light at ``places`` (H, W, 2), x and y in px, to ``out``; the border continues outwards."""
     height, width = log.shape
     wx, wy = np.empty(4, np.float32), np.empty(4, np.float32)
     for row in range(out.shape[0]):
@@ -229,7 +229,7 @@ def _look(light, log, places, out):
 
 @numba.njit(cache=True, nogil=True)
 def _catmull_rom(f, out):
-    """Weights of the four samples round a place that is ``f`` beyond the second: exact for parabolas."""
+    """Compute the weights of the four samples around a place that is ``f`` beyond the second: exact for parabolas."""
     half, one = np.float32(0.5), np.float32(1)
     out[0] = half * f * (f * (np.float32(2) - f) - one)
     out[1] = half * (f * f * (np.float32(3) * f - np.float32(5)) + np.float32(2))
@@ -238,7 +238,7 @@ def _catmull_rom(f, out):
 
 
 def _consistent(flow: np.ndarray, back: np.ndarray) -> np.ndarray:
-    """1 where going there and back returns, 0.01 where not."""
+    """Return 1 where going there and back returns, 0.01 elsewhere."""
     # Forward and back again should end where it began.
     miss = np.hypot(*np.moveaxis(flow + back, -1, 0))
     return np.where(miss <= 1 + 0.05 * np.hypot(flow[..., 0], flow[..., 1]), np.float32(1), np.float32(0.01))

@@ -114,8 +114,9 @@ class EFlowFormer(Eraft):
         return correlation.match_backward(*self._prior()) if self.want_backward else None
 
     def _prior(self) -> tuple[Tensor | None, Tensor | None]:
-        """Price of a displacement and gain of the logits, both learnt: without them the softmax of features that know
-        nothing yet is flat, and its expectation the middle of the image, far worse than no flow at all."""
+        """Return the cost of a displacement and the gain of the logits, both learnt: without them the softmax of
+        features that know nothing yet is flat, and its expectation the middle of the image, far worse than no
+        flow at all."""
         if self.log_prior is None:
             return None, None
         # Logarithms keep both positive.

@@ -239,9 +239,10 @@ class Eraft(FlowModel):
 
     @torch.no_grad()
     def _burn_in(self, h: Tensor, flow: Tensor, context, correlation, grid: Tensor) -> tuple[Tensor, Tensor]:
-        """State and flow after a number of refinements that nothing is learnt from, so that those that follow learn to
-        go on from any, and to stand still where nothing is left to do. (Half of the steps have none: every answer
-        begins with the first refinement.) The draw is of torch's generator, whose state checkpoints hold."""
+        """Return state and flow after a number of refinements that nothing is learnt from, so that those that follow
+        learn to go on from any, and to stand still where nothing is left to do. (Half of the steps have none:
+        every answer begins with the first refinement.) The draw is of torch's generator, whose state checkpoints
+        hold."""
         most = self._most
         if not most:
             return h, flow

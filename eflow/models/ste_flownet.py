@@ -93,14 +93,15 @@ class SteFlowNet(FlowModel):
         return FlowPrediction(answer if self.training else answer[-1:], kind="scales")
 
     def _look(self, counts: Tensor) -> list[Tensor]:
-        """Features of a slice (N, 2, H, W) at 1/2, 1/4, 1/8, 1/16, which no state has touched: they are compared."""
+        """Return the features of a slice (N, 2, H, W) at 1/2, 1/4, 1/8, 1/16, independent of any state, for the
+        correlation."""
         features = [leaky(self.encoders[0](counts))]
         for layer in self.tower:
             features.append(leaky(layer(features[-1])))
         return features
 
     def _decode(self, hidden: list, before: list[Tensor]) -> list[Tensor]:
-        """What the decoders make of the states, added to the slice's flow ``before``, coarse to fine."""
+        """Return the decoders' flow from the states plus the slice's flow ``before``, coarse to fine."""
         # The coarsest state, and what the residual blocks make of it.
         x = torch.cat([hidden[3], self.residuals(leaky(self.entry(hidden[3])))], 1)
         after = []

@@ -34,7 +34,7 @@ def convex_upsample(flow: Tensor, mask: Tensor, border: str = "replicate") -> Te
 
 
 def _padded(flow: Tensor, border: str) -> Tensor:
-    """Full-resolution px with a pixel round it."""
+    """Return the flow in full-resolution px, padded by one pixel."""
     # Low-resolution px times 8 are full-resolution px.
     return F.pad(SCALE * flow.float(), (1, 1, 1, 1), mode={"replicate": "replicate", "zero": "constant"}[border])
 

@@ -170,7 +170,7 @@ def _average() -> tuple[np.ndarray, ...]:
 
 
 def _bind(body: Proportions) -> np.ndarray:
-    """(21, 4, 4) of the joints as they are bound."""
+    """Return the (21, 4, 4) poses of the joints as they are bound."""
     rest = Locals.rest(len(JOINTS))
     rest.translation[:] = body.offsets
     for name, degrees in _BIND.items():
@@ -180,7 +180,7 @@ def _bind(body: Proportions) -> np.ndarray:
 
 
 def _pieces(body: Proportions, bind: np.ndarray) -> list[_Piece]:
-    """The capsules of an average body's bones. Places are m in the joint's frame."""
+    """Return the capsules of an average body's bones. Places are m in the joint's frame."""
     made = []
 
     def add(joint: str, a, b, r0: float, r1: float, flat=(1.0, 1.0)) -> None:
@@ -258,7 +258,7 @@ _AXES = {  # chart: (joint, its upper and its lower end in m of an average body,
 def _unwrapped(
     points: np.ndarray, faces: np.ndarray, normals: np.ndarray, weights: np.ndarray, bind: np.ndarray
 ) -> np.ndarray:
-    """(F, 3, 2) texture coordinates of the corners of an average body's faces."""
+    """Return (F, 3, 2) texture coordinates of the corners of an average body's faces."""
     names = list(CHARTS)
     # A column for each chart, left and right.
     share = np.zeros((len(points), 2 * len(names)))

@@ -74,8 +74,8 @@ def isosurface(
 
 
 def _values(distance: Callable[[np.ndarray], np.ndarray], grid: np.ndarray, step: float) -> np.ndarray:
-    """Of the points of a (X, Y, Z, 3) grid: exact where a block of them can be near the surface, of the right sign
-    elsewhere."""
+    """Return the values at the points of a (X, Y, Z, 3) grid: exact where a block of them can be near the surface,
+    of the right sign elsewhere."""
     # Blocks of four points a side are judged by one in their middle.
     shape, middles = grid.shape[:3], [np.minimum(np.arange(2, n + 4, 4), n - 1) for n in grid.shape[:3]]
     coarse = distance(grid[np.ix_(*middles)].reshape(-1, 3)).reshape([len(m) for m in middles])

@@ -128,7 +128,7 @@ def fish(
 
 
 def _smooth_normals(positions: np.ndarray, faces: np.ndarray, area: np.ndarray) -> np.ndarray:
-    """(V, 3) means of the faces round each point, across seams of the texture, too."""
+    """Return (V, 3) mean normals of the faces around each point, also across seams of the texture."""
     points, welded = weld(positions, faces)
     total = np.zeros_like(points)
     np.add.at(total, welded, area[:, None])

@@ -183,7 +183,7 @@ def square(origin: ArrayLike, right: ArrayLike, up: ArrayLike, columns: int, row
 
 
 def _revolve(profile: np.ndarray, normals: np.ndarray, v: np.ndarray, segments: int) -> Surface:
-    """Surface of revolution about z.
+    """Return a surface of revolution about z.
 
     profile : (K, 2) r, z from bottom to top as seen with the outside on the right.   normals : (K, 2) likewise.
     A row with r = 0 is a pole: the triangles that would collapse there are left out.
@@ -209,7 +209,7 @@ def _revolve(profile: np.ndarray, normals: np.ndarray, v: np.ndarray, segments: 
 
 
 def _disc(radius: float, z: float, up: bool, segments: int, turn: float = 0.0) -> Surface:
-    """Flat cap: the texture's inscribed disc, seen from outside."""
+    """Return a flat cap with the texture's inscribed disc, seen from outside."""
     angle = turn + 2 * math.pi * np.arange(segments) / segments
     rim = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(segments, z)], axis=1)
     # A fan round the middle.

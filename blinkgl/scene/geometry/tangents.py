@@ -25,7 +25,7 @@ def tangents(mesh: Mesh) -> np.ndarray:
 
 
 def _of_faces(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """(F, 3) dp/du, of any length, and (F,) the area in (u, -v): below 0 where the picture is mirrored."""
+    """Return (F, 3) dp/du, of any length, and the (F,) area in (u, -v), below 0 where the picture is mirrored."""
     p, uv = mesh.vertices[mesh.faces], mesh.uvs[mesh.faces].astype(np.float64)
     # dp/du from p = p0 + u dp/du + v dp/dv at the triangle's two sides.
     e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]

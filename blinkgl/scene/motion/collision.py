@@ -286,7 +286,8 @@ class _Search:
         return True
 
     def _advance(self, i: int, j: int, t: int) -> tuple[int, float | None]:
-        """(next time up to which the pair is known to be apart, None), or (t, separation) for a collision at t."""
+        """Return (next time up to which the pair is known to be apart, None), or (t, separation) for a collision at
+        t."""
         a, b = self.bodies[i], self.bodies[j]
         Ta, Tb = a.path.pose(t), b.path.pose(t)
         room, nearer = self._room(i, j, a, b, Ta, Tb)
@@ -303,8 +304,8 @@ class _Search:
         return (later, None) if later > t else (t, separation)
 
     def _room(self, i: int, j: int, a: _Body, b: _Body, Ta, Tb):
-        """How much the two may approach before they have to be looked at again, without an exact distance, and the
-        bound on a body's share in the approach. Room 0 when only the exact distance can tell."""
+        """Return how much the two may approach before they have to be looked at again, without an exact distance,
+        and the bound on a body's share in the approach. Room 0 when only the exact distance can tell."""
         # A resting body may sink by the margin; 0.975 of it is left before a closer look.
         if (i, j) in self.resting:
             plane, lowest = self.resting[i, j]
@@ -327,7 +328,7 @@ class _Search:
         return 0.0, None
 
     def _later(self, a: _Body, b: _Body, t: int, room: float, speed_bound) -> int:
-        """Latest time for which ``speed_bound`` allows no more than ``room`` of approach since t."""
+        """Return the latest time for which ``speed_bound`` allows no more than ``room`` of approach since t."""
         window = self.t1 - t
         for _ in range(4):
             speed = sum(speed_bound(body, t, t + window) for body in (a, b) if not body.is_static)
@@ -342,7 +343,7 @@ class _Search:
         return t + step
 
     def _ball_gap(self, a, b, Ta, Tb) -> float:
-        """Lower bound of the distance: between bounding balls, or of a ball and a static body's faces."""
+        """Return a lower bound of the distance: between bounding balls, or of a ball and a static body's faces."""
         ca, cb = Ta[:3, :3] @ a.centre + Ta[:3, 3], Tb[:3, :3] @ b.centre + Tb[:3, 3]
         # The balls' distance; a static convex body's faces often say more.
         gap = float(np.linalg.norm(ca - cb)) - a.radius - b.radius
@@ -364,8 +365,8 @@ class _Search:
 
 
 def _body_speed(body: _Body, ta: int, tb: int) -> float:
-    """Upper bound over [ta, tb] of the speed of any of the body's points. (A pad is round:
-    turning moves it nowhere.)"""
+    """Return an upper bound over [ta, tb] of the speed of any of the body's points. (A pad is round: turning moves
+    it nowhere.)"""
     v, w = body.path.speed_bound(ta, tb)
     return v + w * body.reach
 
@@ -376,7 +377,7 @@ def _centre_speed(body: _Body, ta: int, tb: int) -> float:
 
 
 def _speed_along(normal: np.ndarray):
-    """As :func:`_body_speed`, along one direction only, for paths that can tell."""
+    """Return a bound like :func:`_body_speed` along one direction, for paths that have one."""
     normal = np.ascontiguousarray(normal)
 
     def speed(body: _Body, ta: int, tb: int) -> float:
@@ -391,7 +392,7 @@ def _moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
 
 
 def _heights(planes: np.ndarray, body: _Body, T: np.ndarray) -> np.ndarray:
-    """(P,) height of the body's lowest point over each plane."""
+    """Return the (P,) heights of the body's lowest point over each plane."""
     local = planes[:, :3] @ T[:3, :3]
     return (local @ body.hull.T).min(axis=1) + planes[:, :3] @ T[:3, 3] - planes[:, 3] - body.pad
 
@@ -404,7 +405,7 @@ def _hull(points: np.ndarray) -> np.ndarray:
 
 
 def _face_planes(used: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
-    """(P, 4) face planes of a convex mesh, both sides of a flat one; None when it is neither."""
+    """Return the (P, 4) face planes of a convex mesh, both sides of a flat one; None when it is neither."""
     corners = vertices[faces]
     # Faces without area have no plane.
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -435,8 +436,8 @@ def _face_planes(used: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> n
 
 
 def _winding(point: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Generalised winding number of a closed mesh round ``point``: 0 outside, +-1 inside (solid angles of its
-    triangles; Van Oosterom & Strackee 1983)."""
+    """Return the generalised winding number of a closed mesh round ``point``: 0 outside, +-1 inside (solid angles of
+    its triangles; Van Oosterom & Strackee 1983)."""
     a, b, c = (vertices[faces[:, k]] - point for k in range(3))
     la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
     det = np.einsum("ij,ij->i", a, np.cross(b, c))

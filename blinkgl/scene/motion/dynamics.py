@@ -179,8 +179,8 @@ class _World:
     # ---- the model ---------------------------------------------------------------------------------------------------
 
     def _compile(self) -> None:
-        """Once with any density, to know volumes and centres of mass; then with those as the bodies' origins, so that
-        a body in flight is on a parabola."""
+        """Compile the model twice: with any density, to know volumes and centres of mass; then with those as the
+        bodies' origins, so that a body in flight is on a parabola."""
         model = self._model(weighed=False)
         for body in self.moving:
             # Body 0 of the model is the world.
@@ -341,8 +341,8 @@ class _World:
             self.data.qvel[6 * at : 6 * at + 6] = qvel[k]
 
     def _let_sleep(self, qvel: np.ndarray) -> None:
-        """Bodies that were slow for all of a chunk may fall asleep in the next: what is slow for a moment only is at
-        the top of its flight."""
+        """Let bodies that were slow for a whole chunk fall asleep in the next. A body that is slow only for a moment
+        may be at the top of its flight."""
         policies = self.mujoco.mjtSleepPolicy
         for body in self.dynamic:
             v = qvel[:, 6 * body.at : 6 * body.at + 6] * np.repeat([1.0, body.radius], 3)
@@ -455,8 +455,8 @@ class _Record:
         self.pieces.append((first + np.flatnonzero(keep), p[keep], v[keep], q[keep], w[keep]))
 
     def _note_impacts(self, first: int, v: np.ndarray, gravity: np.ndarray) -> None:
-        """The step of the hardest push of each impact. Of one there is talk when it would stop a twentieth of the
-        body's own speed, and is ten times what gravity does."""
+        """Note the step of the hardest push of each impact. A push counts when it would stop a twentieth of the
+        body's own speed and is ten times gravity's."""
         # Acceleration other than gravity's.
         push = np.linalg.norm(np.diff(v, axis=0) / self.step - gravity, axis=1)[1:]
         frequency = math.pi / (self.impact_steps * self.step)
@@ -482,7 +482,7 @@ def _times(steps: np.ndarray, t0_ns: int, rate: float) -> np.ndarray:
 
 
 def _quaternions(R: np.ndarray) -> np.ndarray:
-    """(n, 4) w x y z of (n, 3, 3)."""
+    """Return the (n, 4) quaternions, w x y z, of (n, 3, 3) rotations."""
     return Rotation.from_matrix(R).as_quat()[:, [3, 0, 1, 2]]
 
 
@@ -503,7 +503,7 @@ def damping_ratio(restitution: float, steps: float) -> float:
 
 @njit(cache=True)
 def _given_back(ratio: float, steps: float) -> float:
-    """Mean of the share of its speed with which a body leaves the contact, by the engine's recurrence."""
+    """Return the mean share of its speed with which a body leaves the contact, by the engine's recurrence."""
     # w: angle of the spring per step. The contact only pushes, hence min(..., 0).
     w, total, phases = math.pi / steps, 0.0, 16
     for phase in range(phases):
@@ -577,7 +577,7 @@ def _solid(points: np.ndarray, config: BodyConfig) -> Shape:
 
 
 def _hull(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Its vertices (V, 3), and its volume."""
+    """Return the convex hull's vertices (V, 3) and its volume."""
     try:
         hull = ConvexHull(points)
     except (QhullError, ValueError):
@@ -598,7 +598,7 @@ def _framed(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _plane(side: Barrier) -> Shape:
-    """An endless one, its z axis the normal."""
+    """Return an endless plane whose z axis is the normal."""
     normal = np.asarray(side.normal, dtype=np.float64)
     rotation, _ = Rotation.align_vectors([normal], [[0.0, 0.0, 1.0]])
     return Shape("PLANE", (1.0, 1.0, 1.0), normal * side.offset, rotation.as_matrix())

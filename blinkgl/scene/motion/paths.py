@@ -246,7 +246,7 @@ class PausedPath:
         self.stop_ns, self.hold_ns, self.ramp_ns = int(stop_ns), int(hold_ns), int(ramp_ns)
 
     def _clock(self, t_ns: int) -> tuple[int, float]:
-        """Time on ``path``'s clock, ns, and how fast that runs, in [0, 1]."""
+        """Return the time on ``path``'s clock, ns, and how fast that runs, in [0, 1]."""
         ramp, since = self.ramp_ns, t_ns - self.stop_ns
         if since <= 0:
             # Before the stop, slowing down, standing, setting out, after; ramp/2 is the integral of the
@@ -402,7 +402,7 @@ def _checked_keys(times_ns, positions, rotations, where):
 
 
 def _ascending(c: np.ndarray) -> np.ndarray:
-    """scipy's (k, pieces, 3) coefficients, highest power first, as contiguous (pieces, 4, 3), lowest first."""
+    """Return scipy's (k, pieces, 3) coefficients, highest power first, as contiguous (pieces, 4, 3), lowest first."""
     out = np.zeros((c.shape[1], 4, 3))
     out[:, : len(c)] = c[::-1].transpose(1, 0, 2)
     return out
@@ -410,9 +410,9 @@ def _ascending(c: np.ndarray) -> np.ndarray:
 
 @njit(cache=True)
 def _hermite_piece(h, p0, p1, v0, v1, q0, q1, w0, w1, cp, cr):
-    """Fills ``cp`` and ``cr`` (4, 3), the cubics of one piece of ``h`` seconds (see the module's docstring), from
-    positions p, velocities v, quaternions q (w x y z) and body rates w at its ends. Returns the angle from the first
-    rotation to the last, rad.
+    """Fill ``cp`` and ``cr`` (4, 3), the cubics of one piece of ``h`` seconds (see the module's docstring), from
+    positions p, velocities v, quaternions q (w x y z) and body rates w at its ends. Returns the angle from the
+    first rotation to the last, rad.
 
     phi = log(R0^T R1); the rate of phi at the end is J_r^-1(phi) w1, with J_r^-1 = I + [phi]x / 2 + k [phi]x^2,
     k = 1 / a^2 - cot(a / 2) / (2 a), a = |phi|."""
@@ -573,8 +573,8 @@ def _poses(times, knots, cp, cr, rot, T):
 
 @njit(cache=True)
 def _derivative(t, knots, cp, cr, rot, D):
-    """D = dT/dt. Body rate w = J_r(phi) phi' with the right Jacobian of SO(3),
-    J_r = I - (1 - cos a)/a^2 [phi]x + (a - sin a)/a^3 [phi]x^2, a = |phi|."""
+    """Write D = dT/dt. Body rate w = J_r(phi) phi' with the right Jacobian of SO(3), J_r = I - (1 - cos a)/a^2
+    [phi]x + (a - sin a)/a^3 [phi]x^2, a = |phi|."""
     T = np.empty((4, 4))
     _pose(t, knots, cp, cr, rot, T)
     i = _piece(t, knots)
@@ -606,7 +606,8 @@ def _derivative(t, knots, cp, cr, rot, D):
 
 @njit(cache=True)
 def _quadratic_bound(c, ua, ub):
-    """Upper bound of |p'(u)| over [ua, ub] for the cubic p: the largest norm of the three Bezier points of p'."""
+    """Return an upper bound of |p'(u)| over [ua, ub] for the cubic p: the largest norm of the three Bezier points of
+    p'."""
     best = 0.0
     # The bound is that of the convex hull of the control points.
     for corner in range(3):
@@ -623,7 +624,7 @@ def _quadratic_bound(c, ua, ub):
 
 @njit(cache=True)
 def _cubic_bound(c, ua, ub):
-    """Upper bound of |p(u)| over [ua, ub]: the largest norm of the four Bezier points of p."""
+    """Return an upper bound of |p(u)| over [ua, ub]: the largest norm of the four Bezier points of p."""
     # The blossom of a cubic at (v, w, x): a control point each.
     best = 0.0
     for corner in range(4):

@@ -307,6 +307,7 @@ class DsecEventReader:
 
         Raises EventDataError as :func:`~blinkgl.io.columns.check_events`; AssetError: damaged,
         or a table that leaves events out."""
+        # Times on the file's own clock; the table is asked for whole milliseconds around them.
         r0, r1 = int(t0_us) - self.t_offset_us, int(t1_us) - self.t_offset_us
         start, stop = self._index(r0 // 1000, 0), self._index(-(-r1 // 1000), self.count)
         if not 0 <= start <= stop <= self.count:
@@ -322,6 +323,7 @@ class DsecEventReader:
     def number(self, t_us: int) -> int:
         """How many events lie before t_us, image clock: the number of the first that does not. Raises as
         :meth:`slice`."""
+        # The event lies within one millisecond, between two entries of the table.
         ms = (int(t_us) - self.t_offset_us) // 1000
         start, stop = self._index(ms, 0), self._index(ms + 1, self.count)
         if not 0 <= start <= stop <= self.count:

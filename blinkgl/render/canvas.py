@@ -245,8 +245,7 @@ class Canvas:
         started = working_clock()
         planes = {name: component for name, (attachment, component) in self.planes.items() if attachment == i}
         for r in [None] if stale is None else stale:
-            # The whole of a picture that is the attachment itself goes straight into the caller's
-            # memory.
+            # A picture that is the whole attachment is read straight into the memory held for it.
             if r is None and not self.outputs[i].components and len(planes) == 1:
                 (name,) = planes
                 pictures = {name: self.target.read(i, out=pictures.get(name))}

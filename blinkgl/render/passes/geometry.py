@@ -69,8 +69,10 @@ class Geometry(ScenePass):
                 uniforms["image_size"].value = shot.size
             if "target_size" in uniforms:
                 uniforms["target_size"].value = shot.size
+            # Uniforms of the lens: which ray looks at a fragment, and its model.
             if self.lens and painter.lens is not None:
                 painter.lens.set(uniforms, shot, LENS_UNIT)
+            # Values of the labels, of this item's object.
             for name, (_, rows) in values.items():
                 if item.deformer is None and name in of_shapes:
                     continue

@@ -260,9 +260,12 @@ def die(size: float = 1.0, rounding: float = 0.12, subdivisions: int = 4) -> Sur
     # Seen from outside: what is out of the face, to its right, up in it.
     faces = ((z, x, y), (x, y, z), (y, -x, z), (-y, x, z), (-x, -y, z), (-z, -x, y))
     for number, (out, right, above) in enumerate(faces):
+        # A point of the cube, the nearest point of the core inside it, and the rounding's normal
+        # between them.
         cube = half * out + across[..., None] * right + up[..., None] * above
         core = np.clip(cube, -(half - radius), half - radius)
         normals = (cube - core) / np.linalg.norm(cube - core, axis=2, keepdims=True)
+        # The number of the face is its place in the texture, row by row.
         row, column = divmod(number, DIE_FACES[1])
         uvs = np.stack([(column + 0.5 + across / size) / DIE_FACES[1], (row + 0.5 - up / size) / DIE_FACES[0]], axis=2)
         sides.append((*(a.reshape((n + 1) ** 2, -1) for a in (core + radius * normals, normals, uvs)), cells))
@@ -280,6 +283,7 @@ def sphere(radius: float = 0.5, segments: int = 32, rings: int = 16) -> Surface:
     """Sphere by longitude and latitude."""
     latitude = np.linspace(-math.pi / 2, math.pi / 2, rings + 1)
     direction = np.stack([np.cos(latitude), np.sin(latitude)], axis=1)
+    # The poles are exact, so that _revolve recognises them.
     direction[[0, -1]] = [[0, -1], [0, 1]]
     return _revolve(radius * direction, direction, 1 - np.arange(rings + 1) / rings, segments)
 
@@ -287,6 +291,7 @@ def sphere(radius: float = 0.5, segments: int = 32, rings: int = 16) -> Surface:
 @primitive
 def icosphere(radius: float = 0.5, subdivisions: int = 3) -> Surface:
     """Sphere of 20 * 4**subdivisions nearly equal triangles, box-projected texture."""
+    # The golden ratio: three rectangles with these sides span the icosahedron's corners.
     g = (1 + math.sqrt(5)) / 2
     points = np.array(
         [

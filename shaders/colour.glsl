@@ -48,6 +48,7 @@ void main()
 #ifdef TINTED
     radiance *= tint;
 #endif
+// The light on the surface: of surface.glsl (below), of the vertex stage, of light.glsl, or none.
 #ifdef SURFACED
     float side = SIDE;
 #elif defined(LIT_AT_CORNERS)
@@ -67,6 +68,7 @@ void main()
 #ifndef NEEDS_UV
     const vec2 uv = vec2(0.0);
 #endif
+// radiated() gives everything; what goes through the albedo is taken off again and multiplied at the end.
 #ifdef GLOSSY
     Spot spot = Spot(radiance, normal, along, local, uv);
     added = radiated(spot, side);
@@ -87,6 +89,7 @@ void main()
     added += emission;
 #endif
 #endif
+// For the shader debugger alone: the terms of the light, in the luminance of what they fall on.
 #ifdef SHOW_LOOKUP
 #ifndef LIT
     const float shown_direct = 0.0, shown_arrives = 0.0, shown_around = 0.0;

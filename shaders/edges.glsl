@@ -68,6 +68,7 @@ float depth_at(ivec2 place)
 void main()
 {
     ivec2 here = in_pixel.xy;
+    // One point in the middle of its pixel, in NDC.
     gl_Position = vec4((vec2(here) + 0.5) / image_size * 2.0 - 1.0, 0.5, 1.0);
 
     LIGHT seen[9]; // row by row, the pixel itself in the middle
@@ -84,6 +85,8 @@ void main()
     float shares = 0.0, sizes = 0.0, creases = 0.0, bent = 0.0;
     vec2 towards = vec2(0.0);
 
+    // The pixel's crossings, CROSSING numbers each in two texels (contours.py): share, turn, room, depth; left, gain,
+    // kind.
     for (int n = in_pixel.z; n < in_pixel.w; ++n) {
         ivec2 at = ivec2(2 * (n % ROW), n / ROW);
         vec4 first = texelFetch(crossings, at, 0), second = texelFetch(crossings, at + ivec2(1, 0), 0);
@@ -126,6 +129,7 @@ void main()
             in_front += near ? weight : 0.0;
         }
         bool known;
+        // Something behind the line is seen around the pixel: the picture has a step here.
         if (at_back > 0.0) {
             if (own > (inside ? before : depth * (1.0 + COVER * pixel)))
                 continue; // something else hides the line
@@ -183,6 +187,7 @@ void main()
                 other += on_left ? 8.0 : -8.0;
             share -= 0.125 * (other - turn);
         }
+        // The crossing moves its share of the pixel from the one surface to the other.
         change += share * (front - back);
         shares += share;
         sizes += abs(share);

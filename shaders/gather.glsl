@@ -14,6 +14,7 @@ uniform vec2 flat_size;     // px of the flat picture in which places are
 uniform sampler2D slopes;   // d(place) / d(px), columns
 #endif
 
+// Up to eight outputs; the renderer defines as many SAMPLER_k and TEXEL_k as the pass has.
 #define PICKED(k, SAMPLER, TEXEL) uniform SAMPLER picked_##k; layout(location = k) out TEXEL out_##k;
 #ifdef SAMPLER_0
 PICKED(0, SAMPLER_0, TEXEL_0)
@@ -42,6 +43,7 @@ PICKED(7, SAMPLER_7, TEXEL_7)
 
 void main()
 {
+    // Places are px of the flat picture; its target may have more samples than that.
     ivec2 pixel = ivec2(gl_FragCoord.xy);
     vec2 size = vec2(textureSize(picked_0, 0)), scale = size / flat_size;
     vec2 place = texelFetch(places, pixel, 0).xy * scale;

@@ -18,6 +18,7 @@
 //            MASKED     has holes, see vertex.glsl
 //            SHOW_LOOKUP  the shader debugger's: also writes what was looked up, see lookup.glsl
 
+// CHANGES: the surface's own look differs from pixel to pixel, so that its motion changes the luminance.
 #if defined(RATE) && (defined(TEXTURED) || defined(LIT) || defined(FOG) || defined(TINTED))
 #define CHANGES
 #endif
@@ -104,6 +105,7 @@ void main()
 #ifdef NEEDS_UV
     vec2 uv = within_reach(uv); // hides the varying
 #endif
+// Albedo: the texture's, filtered in one of four ways, or the uniform.
 #ifdef TEXTURED
 #ifdef TAPS4
 #ifdef STRETCHED
@@ -148,6 +150,7 @@ void main()
 #ifdef RATE
     ALBEDO change = ALBEDO(0.0);
 #endif
+// How the albedo changes: the texture slides by with the image motion.
 #ifdef CHANGES
     vec2 motion = velocity(rate, local, image_size);
 #ifdef TEXTURED
@@ -162,6 +165,7 @@ void main()
 #endif
 #endif
 #endif
+// The product rule on albedo and tint.
 #ifdef TINTED
 #ifdef CHANGES
     change = change * TINT(tint) + luminance * TINT(seen_rate(tint, motion));
@@ -169,6 +173,7 @@ void main()
     luminance *= TINT(tint);
 #endif
     ALBEDO unlit = luminance;
+// Light, and the product rule on albedo and light.
 #ifdef LIT
 #ifdef SURFACED
     float side = SIDE;
@@ -252,6 +257,7 @@ void main()
     float seen_change = change;
 #endif
 #endif
+// Light of its own goes through no albedo.
 #ifdef EMISSIVE
 #ifdef EMISSION_MAP
     vec2 emission_uv = emission_map_place * vec3(uv, 1.0);
@@ -263,6 +269,7 @@ void main()
     float own = emission;
 #endif
 #endif
+// For the shader debugger alone: the terms of the light, in the luminance of what they fall on.
 #ifdef SHOW_LOOKUP
 #ifdef SURFACED
     ILLUMINANT light = shown_matt;
@@ -289,6 +296,7 @@ void main()
 #ifdef EMISSIVE
     seen += own;
 #endif
+// Fog comes last: it is between the surface and the camera.
 #ifdef FOG
 #ifdef CHANGES
     seen_change = in_fog_rate(seen, seen_change, motion);

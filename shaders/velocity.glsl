@@ -20,6 +20,7 @@ uniform vec2 image_scale;
 void main()
 {
     image_velocity = velocity(rate, local, image_size);
+// motion.glsl takes image_size as the target's: from px of the small picture to px of the image.
 #if defined(SMALL) && !defined(LENS)
     image_velocity *= image_scale;
 #endif

@@ -33,9 +33,12 @@ Q = 25
 Q_ONE = 1 << Q
 LOG_MAX_INPUT = float(2.0**30)
 """Largest intensity :func:`log_q25` takes (and 2^-30 the smallest): a log, a threshold and their difference fit."""
+# ln 2 and 1 in units of 2^-25.
 _Q_LN2 = _I(round(np.log(2.0) * Q_ONE))
 _Q_SCALE = _F(Q_ONE)
+# 0x3F3504F3 is the bit pattern of sqrt(1/2) in float32, whose fraction has 23 bits.
 _F1, _SQRT_HALF_BITS, _EXP23 = _F(1.0), _I(0x3F3504F3), _I(23)
+# Coefficients of p in log(1 + f) = f + f^2 p(f).
 _A0, _A1, _A2, _A3, _A4, _A5, _A6, _A7, _A8 = (
     _F(c)
     for c in (
@@ -55,7 +58,8 @@ _A0, _A1, _A2, _A3, _A4, _A5, _A6, _A7, _A8 = (
 @register_jitable
 def _log1p_reduced(f):
     """log(1 + f) for f in [sqrt(1/2) - 1, sqrt(2) - 1], float32, absolute error < 5e-8."""
-    p = f * _A8 + _A7  # Horner: log(1 + f) = f + f^2 p(f), so that small f keep all their digits
+    # Horner: log(1 + f) = f + f^2 p(f), so that small f keep all their digits.
+    p = f * _A8 + _A7
     p = p * f + _A6
     p = p * f + _A5
     p = p * f + _A4
@@ -77,7 +81,8 @@ def log_q25(v: float) -> float:
     # sqrt(1/2) taken off the bits, the exponent field changes at sqrt(1/2) 2^n instead of at 2^n: the reduced interval
     # lies round 1.
     bits = _F(v).view(np.int32)
-    exponent = _I(_I(bits - _SQRT_HALF_BITS) >> _EXP23)  # v = m 2^exponent with m in [sqrt(1/2), sqrt(2))
+    # v = m 2^exponent with m in [sqrt(1/2), sqrt(2)).
+    exponent = _I(_I(bits - _SQRT_HALF_BITS) >> _EXP23)
     f = _F(_I(bits - _I(exponent << _EXP23)).view(np.float32) - _F1)
     return _I(_I(exponent * _Q_LN2) + _I(_log1p_reduced(f) * _Q_SCALE))
 
@@ -88,6 +93,7 @@ _LN2_32 = _F(np.log(2.0))
 @register_jitable
 def log_f32(v: float) -> float:
     """ln(v), float32 to float32, v normal and positive. Error < 1.3e-7 + 1.5 ulp of the result."""
+    # The same split as in log_q25: v = m 2^exponent, f = m - 1.
     bits = _F(v).view(np.int32)
     exponent = _I(_I(bits - _SQRT_HALF_BITS) >> _EXP23)
     f = _F(_I(bits - _I(exponent << _EXP23)).view(np.float32) - _F1)
@@ -95,8 +101,11 @@ def log_f32(v: float) -> float:
 
 
 # --- exponential, float32 --------------------------------------------------------------------------------
+# log2(e), and ln 2 in two parts: 355/512 has nine bits, so that n times it is exact; the second part is
+# the rest.
 _LOG2E_32, _LN2_HI_32, _LN2_LO_32 = _F(1.4426950408889634), _F(0.693359375), _F(-2.12194440e-4)
 _ROUND_32 = _F(12582912.0)  # 1.5 * 2^23: adding and subtracting it rounds to the nearest integer
+# Chebyshev fit of e^r on |r| <= ln(2)/2; close to 1/n!.
 _E32_0, _E32_1, _E32_2, _E32_3, _E32_4, _E32_5, _E32_6 = (
     _F(c)
     for c in (
@@ -109,6 +118,7 @@ _E32_0, _E32_1, _E32_2, _E32_3, _E32_4, _E32_5, _E32_6 = (
         0.0013941108433972674,
     )
 )
+# Below e^-87 the result would become subnormal. 127 is the bias of the exponent of a float32.
 _EXP_MIN_32, _BIAS_32 = _F(-87.0), _I(127)
 
 
@@ -126,12 +136,15 @@ def exp_f32(v: float) -> float:
     p = p * r + _E32_2
     p = p * r + _E32_1
     p = p * r + _E32_0
-    return _F(p * _I((_I(n) + _BIAS_32) << _EXP23).view(np.float32))  # 2^n written as an exponent field
+    # 2^n is written straight into the exponent field.
+    return _F(p * _I((_I(n) + _BIAS_32) << _EXP23).view(np.float32))
 
 
 # --- double precision ------------------------------------------------------------------------------------
 _D1, _D2, _HALF = _D(1.0), _D(2.0), _D(0.5)
+# The bit pattern of sqrt(1/2) in float64, whose fraction has 52 bits.
 _SQRT_HALF_BITS_64, _EXP52, _LN2_64 = _L(0x3FE6A09E667F3BCD), _L(52), _D(np.log(2.0))
+# Coefficients of p in ln m = 2 s + s^3 p(s^2), s = (m - 1)/(m + 1); close to 2/3, 2/5, 2/7, ...
 _B0, _B1, _B2, _B3, _B4, _B5, _B6 = (
     _D(c)
     for c in (
@@ -152,7 +165,8 @@ def log_f64(v: float) -> float:
     bits = _D(v).view(np.int64)
     exponent = _L(_L(bits - _SQRT_HALF_BITS_64) >> _EXP52)
     m = _L(bits - _L(exponent << _EXP52)).view(np.float64)
-    s = (m - _D1) / (m + _D1)  # ln m = 2 artanh(s) = 2 s + s^3 p(s^2): odd, so half as many terms
+    # ln m = 2 artanh(s) = 2 s + s^3 p(s^2): odd, so half as many terms.
+    s = (m - _D1) / (m + _D1)
     z = s * s
     p = z * _B6 + _B5
     p = p * z + _B4
@@ -163,12 +177,15 @@ def log_f64(v: float) -> float:
     return _D(exponent) * _LN2_64 + (_D2 * s + s * z * p)
 
 
+# log2(e), and ln 2 in two parts, the first with zeros at its end.
 _LOG2E_64, _LN2_HI_64, _LN2_LO_64 = (
     _D(1.4426950408889634),
     _D(6.93147180369123816490e-01),
     _D(1.90821492927058770002e-10),
 )
+# 1.5 * 2^52 rounds as _ROUND_32 does. 1023 is the bias of the exponent of a float64.
 _ROUND_64, _EXP_MIN_64, _BIAS_64 = _D(6755399441055744.0), _D(-700.0), _L(1023)
+# Chebyshev fit of e^r on |r| <= 1/2; close to 1/n!.
 _X0, _X1, _X2, _X3, _X4, _X5, _X6, _X7, _X8, _X9, _X10, _X11, _X12 = (
     _D(c)
     for c in (
@@ -226,6 +243,7 @@ def fall_f64(x: float) -> float:
     return p * _L((_D(t).view(np.int64) + _BIAS_64) << _EXP52).view(np.float64)
 
 
+# sin(pi/2 f) = f (s0 + s1 f^2 + ...) for |f| <= 1/2.
 _S0, _S1, _S2, _S3, _S4, _S5, _S6 = (
     _D(c)
     for c in (
@@ -238,6 +256,7 @@ _S0, _S1, _S2, _S3, _S4, _S5, _S6 = (
         5.633933781537854e-08,
     )
 )
+# cos(pi/2 f) = c0 + c1 f^2 + ... for |f| <= 1/2.
 _C0, _C1, _C2, _C3, _C4, _C5, _C6, _C7 = (
     _D(c)
     for c in (
@@ -259,7 +278,8 @@ def cos_sin_turn(u: float) -> tuple[float, float]:
     """(cos 2 pi u, sin 2 pi u) for u in [0, 1], float64, absolute error < 4e-16."""
     turns = u * _D4
     nearest = (turns + _ROUND_64) - _ROUND_64
-    f = turns - nearest  # quarter turns, in [-1/2, 1/2]
+    # f: quarter turns from the nearest one, in [-1/2, 1/2].
+    f = turns - nearest
     quadrant = _L(nearest) & _L3
     z = f * f
     s = z * _S6 + _S5
@@ -275,7 +295,9 @@ def cos_sin_turn(u: float) -> tuple[float, float]:
     c = c * z + _C2
     c = c * z + _C1
     c = c * z + _C0
+    # In odd quadrants sine and cosine of the rest change places.
     odd = _D(quadrant & _L1)  # blends rather than branches: exact, since odd is 0 or 1
+    # The cosine is negative in quadrants 1 and 2, the sine in 2 and 3.
     cos_sign = _D1 - _D2 * _D(((quadrant + _L1) & _L2) >> _L1)
     sin_sign = _D1 - _D2 * _D((quadrant & _L2) >> _L1)
     return cos_sign * (c * (_D1 - odd) + s * odd), sin_sign * (s * (_D1 - odd) + c * odd)

@@ -26,7 +26,8 @@ def prefetch(typingctx: Any, array: Any, index: Any) -> Any:
         place, word = builder.gep(data, [arguments[1]]), ir.IntType(32)
         kind = ir.FunctionType(ir.VoidType(), [place.type, word, word, word])
         fetch = builder.module.declare_intrinsic("llvm.prefetch", [place.type], kind)
-        builder.call(fetch, [place, word(0), word(3), word(1)])  # to be read, near, data
+        # Arguments of llvm.prefetch: 0 read, 3 keep in all caches, 1 data (not instructions).
+        builder.call(fetch, [place, word(0), word(3), word(1)])
         return context.get_dummy_value()
 
     return types.void(array, index), codegen
@@ -62,7 +63,9 @@ def lookup_both_block(
         a[i], b[i] = table_a[codes[i]], table_b[codes[i]]
 
 
+# The product of eight bytes of 0 or 1 with this constant has them as the bits of its top byte.
 _BYTES_TO_BITS, _S56 = np.uint64(0x0102040810204080), np.uint64(56)
+# Tables over all bytes: positions of the set bits, and their number.
 _BIT_POSITIONS = np.zeros((256, 8), np.int32)
 for _mask in range(256):
     _set = [_bit for _bit in range(8) if _mask >> _bit & 1]
@@ -80,6 +83,8 @@ def compact_flags(flags: np.ndarray, scratch: np.ndarray, first_pixel: int, out:
     """
     words = flags.view(np.uint64)
     used = 0
+    # Numbers of the words with any flag, listed without a branch: always written, kept where the count
+    # moves on.
     for k in range(words.size):
         scratch[used] = k
         used += np.int64(words[k] != np.uint64(0))
@@ -89,6 +94,8 @@ def compact_flags(flags: np.ndarray, scratch: np.ndarray, first_pixel: int, out:
         # Byte b of the (little-endian) word lands on bit b of the top byte.
         mask = np.int64((words[k] * _BYTES_TO_BITS) >> _S56)
         base = np.int32(first_pixel + 8 * k)
+        # All eight places are written; only the set ones are counted, and the next word writes over the
+        # rest.
         for b in range(8):
             out[count + b] = np.int32(base + _BIT_POSITIONS[mask, b])
         count += _BIT_COUNTS[mask]

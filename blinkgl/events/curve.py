@@ -68,11 +68,13 @@ def end_slopes(
     newer_ns 0: there is no such frame."""
     change = np.float64(now - before)
     secant = change / dt_ns
+    # Without a neighbour the slope is 1, that of the straight line.
     alpha = beta = 1.0
     if older_ns > 0.0:
         alpha = limited(slope_between(np.float64(before - older) / older_ns, secant, older_ns, dt_ns) / secant)
     if newer_ns > 0.0:
         beta = limited(slope_between(secant, np.float64(newer - now) / newer_ns, dt_ns, newer_ns) / secant)
+    # The first and last frame take the slope of a one-sided parabola.
     if older_ns == 0.0 and newer_ns > 0.0:
         alpha = limited(slope_at_end(secant, np.float64(newer - now) / newer_ns, dt_ns, newer_ns) / secant)
     if newer_ns == 0.0 and older_ns > 0.0:
@@ -86,17 +88,21 @@ def curve_time(y: float, alpha: float, beta: float, low: float) -> float:
     bracket that shrinks at every step, bisection where it would leave it; error 1e-15 where the curve is not flat."""
     if y >= 1.0:
         return 1.0
-    a, b = alpha + beta - 2.0, 3.0 - 2.0 * alpha - beta  # y(s) = ((a s + b) s + alpha) s
+    # y(s) = ((a s + b) s + alpha) s.
+    a, b = alpha + beta - 2.0, 3.0 - 2.0 * alpha - beta
     high = 1.0
-    s = min(max(y, low), 1.0)  # where the straight line meets it
+    # The straight line gives the first guess.
+    s = min(max(y, low), 1.0)
     for _ in range(100):
         value = ((a * s + b) * s + alpha) * s - y
         if value > 0.0:
+            # A bracket that holds the crossing: value <= 0 at ``low``, > 0 at ``high``.
             high = s
         else:
             low = s
         slope = (3.0 * a * s + 2.0 * b) * s + alpha
-        new = 0.5 * (low + high)  # unless Newton's step stays inside
+        # Bisection is the fallback where Newton's step leaves the bracket.
+        new = 0.5 * (low + high)
         if slope > 0.0:
             newton = s - value / slope
             if low <= newton <= high:
@@ -111,5 +117,6 @@ def curve_time(y: float, alpha: float, beta: float, low: float) -> float:
 @numba.njit(**JIT)
 def slope_block(rate: np.ndarray, intensity: np.ndarray, eps: float, out: np.ndarray) -> None:
     """d ln(I + eps)/dt in 2^-25 per ns from dI/dt per second, float32."""
+    # d ln(I + eps)/dt = dI/dt / (I + eps).
     for i in range(rate.size):
         out[i] = np.float32(rate[i] / np.float32(intensity[i] + eps)) * PER_SECOND

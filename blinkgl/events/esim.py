@@ -37,10 +37,14 @@ from blinkgl.events.table import register
 from blinkgl.events.threads import take_part
 from blinkgl.types.events import Events
 
+# Typed constants: an int literal is int64 to numba and would widen the int32 loops. _FAR_BELOW is the
+# least int32, the start of a maximum.
 _I0, _FAR_BELOW = np.int32(0), np.int32(-(2**31))
 _U1000 = np.uint64(1000)
 _JITTER = np.uint64(Stream.JITTER)
+# Intervals of this length or more take the long division of crossing_ns.
 _LONG_NS = 2**31
+# Smallest threshold in ln units that spread and jitter may draw.
 MIN_THRESHOLD = 0.01
 
 
@@ -79,13 +83,14 @@ class Interval(NamedTuple):
 @numba.njit(**JIT)
 def log_block(intensity: np.ndarray, eps: float, out: np.ndarray) -> None:
     """ln(intensity + eps) into ``out``, int32, 2^-25."""
+    # No branch and no call of libm in the loop, so that LLVM vectorises it.
     for i in range(intensity.size):
         out[i] = log_q25(np.float32(intensity[i] + eps))
 
 
 @numba.njit(**JIT)
 def _flag_block(level, upper, lower, flags):
-    """Flags (uint8) of the pixels at or beyond a level; returns how far the farthest is beyond (negative: none is)."""
+    """Flag (uint8) the pixels at or beyond a level, and return how far the farthest is beyond (negative: none is)."""
     farthest = _FAR_BELOW
     for i in range(level.size):
         # The reference lies between the two levels, so at most one of them has been reached.
@@ -98,7 +103,8 @@ def _flag_block(level, upper, lower, flags):
 @register_jitable
 def crossing_ns(part: float, whole: float, dt_ns: int) -> int:
     """floor(part / whole * dt_ns) for 0 <= part <= whole < 2^31, exactly, for any dt_ns < 2^52."""
-    if dt_ns < _LONG_NS:  # both factors below 2^31: the product fits
+    # Both factors are below 2^31, so the product fits int64.
+    if dt_ns < _LONG_NS:
         return np.int64(np.uint64(part * dt_ns) // np.uint64(whole))
     # Schoolbook division of part * dt by whole, dt as two digits of base 2^20: no product reaches 2^63.
     high, low = dt_ns >> 20, dt_ns & 0xFFFFF
@@ -108,15 +114,19 @@ def crossing_ns(part: float, whole: float, dt_ns: int) -> int:
 
 @numba.njit(**JIT)
 def _emit_block(active, count, first, now, p, v, cap, packed, begin, curve, slope):
-    """Events of the listed pixels of one block into ``packed[begin:]``, in raster order; moves levels.
+    """Write the events of the listed pixels of one block to ``packed[begin:]``, in raster order, and move their
+    levels.
 
     curve : None for the straight line (the branches on it are then not compiled).   slope : of the block, at the
     interval's end; [] where the curve takes its slopes from other frames.
     Returns (end of the events, events cut by ``cap``)."""
     out, cut = begin, 0
+    # The listed pixels are in raster order, so the row is counted along instead of divided out.
+    # ``row_end`` is the number of the first pixel behind row y.
     y = first // v.width
     row_end = (y + 1) * v.width
-    start_ns = v.t0_ns - 1000 * v.base_us  # the interval's start after the microsecond base, 0 to 999
+    # The interval's start after the microsecond base, 0 to 999.
+    start_ns = v.t0_ns - 1000 * v.base_us
     for j in range(count):
         i = np.int64(active[j])
         while i >= row_end:
@@ -128,8 +138,10 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin, curve, slop
         level, above, below = np.int64(now[i - first]), np.int64(p.upper[i]), np.int64(p.lower[i])
         whole = abs(level - p.log[i])
         polarity = np.int64(level >= above)
-        gap = max(level - above, below - level)  # how far the signal ends beyond the level being passed
-        pixel = (y << 17) | ((i - row_end + v.width) << 1) | polarity  # the word of packing.py but for its time
+        # How far the signal ends beyond the level being passed.
+        gap = max(level - above, below - level)
+        # The packed word (packing.py) without its time.
+        pixel = (y << 17) | ((i - row_end + v.width) << 1) | polarity
         # The pixel's own thresholds; ``up`` and ``down`` are those now in force, with jitter.
         step_on, step_off = (v.on_all, v.off_all)
         if p.on.size:
@@ -156,14 +168,15 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin, curve, slop
             else:
                 s = curve_time((whole - gap) / whole, alpha, beta, s)
                 after_ns = start_ns + np.int64(s * v.dt_ns)
-            alive = (
-                True  # out of the refractory period; if not, the event is lost, but the reference moves all the same
-            )
+            # In the refractory period the event is lost, but the reference moves all the same.
+            alive = True
             if p.last_ns.size:
                 alive = v.base_us * 1000 + after_ns - p.last_ns[i] >= v.refractory_ns
                 if alive:
                     p.last_ns[i] = v.base_us * 1000 + after_ns
             if alive:
+                # ``packed`` has room for ``cap`` events of each listed pixel; further ones are counted
+                # only.
                 if emitted < cap:
                     packed[out] = (np.int64(np.uint64(after_ns) // _U1000) << T_SHIFT) | pixel
                     out += 1
@@ -179,7 +192,8 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin, curve, slop
                 down = max(v.floor_off, step_off + np.int64(np.floor(v.jitter * b + 0.5)))
                 step = down + polarity * (up - down)
             gap -= step
-        passed = level - (2 * polarity - 1) * (gap + step)  # the last level passed: the new reference
+        # The last level passed is the new reference.
+        passed = level - (2 * polarity - 1) * (gap + step)
         p.upper[i] = np.int32(passed + up)
         p.lower[i] = np.int32(passed - down)
     return out, cut
@@ -187,7 +201,9 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin, curve, slop
 
 @numba.njit(**JIT)
 def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p, v):
-    """Band kernel, see :meth:`Emulator._run`."""
+    """Process the blocks of a band, see :meth:`Emulator._run`."""
+    # Scratch memory of one block. compact_flags writes eight numbers at a time, so ``active`` has eight
+    # more.
     cut, pixels = 0, p.log.size
     flags, scratch = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64)
     active, now = np.empty(BLOCK + 8, np.int32), np.empty(BLOCK, np.int32)
@@ -196,7 +212,9 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
         e = min(s + BLOCK, pixels)
         n = e - s
         if n < BLOCK:
-            flags[:] = 0  # the last block is shorter, and compact_flags looks at whole words
+            # The last block is shorter, and compact_flags looks at whole words.
+            flags[:] = 0
+        # A uint8 frame needs 256 logarithms, which are in the table.
         if codes.size:
             lookup_block(codes[s:e], table, now[:n])
         else:
@@ -215,12 +233,15 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
                 return block, filled, cut
             filled, cut_here = _emit_block(active, count, s, now, p, v, cap, packed, filled, None, None)
             cut += cut_here
-        copy_block(now[:n], p.log[s:e])  # last: until here p.log is the frame before
+        # The copy comes last, because p.log is the previous frame until here.
+        copy_block(now[:n], p.log[s:e])
     return stop_block, filled, cut
 
 
 @numba.njit(**JIT)
 def _bands(taken, start, edges, progress, share, packed, frame, codes, table, p, v):
+    # A row of ``progress`` is a band: next block, events written, events cut. A thread takes bands
+    # until none is left.
     b = take_part(taken, start)
     while b >= 0:
         block, filled, cut = _band(
@@ -235,8 +256,9 @@ def _bands(taken, start, edges, progress, share, packed, frame, codes, table, p,
 def _band_curve(
     first_block, stop_block, share, packed, filled, frame, codes, table, rate, decode, log_now, curve, p, v
 ):
-    """Band kernel for cubics. With slopes (``rate`` given, per second): the interval up to ``frame``. Without: the
-    interval up to ``log_now``; the frame that lies after it only goes into ``curve.newer``."""
+    """Process a band with cubics instead of straight lines. With slopes (``rate`` given, per second): the interval
+    up to ``frame``. Without: the interval up to ``log_now``; the frame that lies after it only goes into
+    ``curve.newer``."""
     cut, pixels = 0, p.log.size
     flags, scratch = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64)
     active, fresh = np.empty(BLOCK + 8, np.int32), np.empty(BLOCK, np.int32)
@@ -246,12 +268,15 @@ def _band_curve(
         e = min(s + BLOCK, pixels)
         n = e - s
         if n < BLOCK:
+            # As in _band: compact_flags reads whole words of eight flags.
             flags[:] = 0
         if codes.size:
             lookup_block(codes[s:e], table, fresh[:n])
         elif frame.size:
             log_block(frame[s:e], v.eps, fresh[:n])
         now = fresh
+        # hermite: the slope of the log intensity at the interval's end, from the rendered rate of
+        # change.
         if rate.size:
             if codes.size:
                 lookup_block(codes[s:e], decode, intensity[:n])
@@ -259,12 +284,15 @@ def _band_curve(
             else:
                 slope_block(rate[s:e], frame[s:e], v.eps, slopes[:n])
         else:
+            # pchip: the frame just read lies one interval ahead and only gives a slope. The interval
+            # ends at the logarithm that was taken one step before.
             if curve.newer_ns > 0.0:
                 copy_block(fresh[:n], curve.newer[s:e])
             now = log_now[s:e]
         farthest = _flag_block(now[:n], p.upper[s:e], p.lower[s:e], flags)
         if farthest >= 0:
             count = compact_flags(flags, scratch, s, active)
+            # The same room as in _band.
             cap = min(np.int64(farthest * v.inverse_threshold) + 2, v.bound_per_pixel)
             if count * cap > share:
                 cap = max(1, share // count)
@@ -272,6 +300,8 @@ def _band_curve(
                 return block, filled, cut
             filled, cut_here = _emit_block(active, count, s, now, p, v, cap, packed, filled, curve, slopes)
             cut += cut_here
+        # With hermite the end of this interval is the start of the next one. With pchip the ring of
+        # frames already holds it.
         if rate.size:
             copy_block(now[:n], p.log[s:e])
             copy_block(slopes[:n], p.slope[s:e])
@@ -320,6 +350,8 @@ def draw_thresholds(
 
     For nominal thresholds under 0.02 the floor is half the nominal one.   correlation : of C+ with C-.
     """
+    # Draw 0 of the stream, one pair of normals per pixel: thresholds are fixed for the life of the
+    # sensor.
     a, b = normal2(seed, pixel_counters(height, width), np.uint64(Stream.THRESHOLD), np.uint64(0))
     b = correlated(a, b, correlation)
     clip = lambda c, n: np.clip(c + sigma * n, min(MIN_THRESHOLD, c / 2), 10.0)
@@ -337,7 +369,7 @@ class Esim(Emulator):
 
     @property
     def _looks_around(self) -> bool:
-        """Whether slopes are of the neighbouring frames, so that the last ones are kept."""
+        """Return whether slopes come from the neighbouring frames, so that the last frames are kept."""
         return self.reconstruction == "pchip"
 
     @classmethod
@@ -368,6 +400,8 @@ class Esim(Emulator):
         self.config = config = config or EsimConfig()
         pixels = self.height * self.width
         on, off = config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold
+        # Thresholds become fixed point here. One pair of integers serves all pixels unless they are
+        # spread.
         self._on_all, self._off_all = int(to_q25(on)), int(to_q25(off))
         self._on = self._off = np.empty(0, np.int32)
         smallest = min(self._on_all, self._off_all)
@@ -380,6 +414,8 @@ class Esim(Emulator):
             )
             smallest = int(min(self._on.min(), self._off.min()))
         self._floor_on, self._floor_off = (int(to_q25(min(MIN_THRESHOLD, c / 2))) for c in (on, off))
+        # With jitter every event may draw the floor, so the worst case of events per unit of change is
+        # that of the floor.
         if config.threshold_jitter:
             smallest = min(self._floor_on, self._floor_off)
         self._inverse_threshold = 1.0 / smallest
@@ -417,6 +453,8 @@ class Esim(Emulator):
         up, down = (self._on, self._off) if self._on.size else (self._on_all, self._off_all)
         if self._fired.size:
             jitter = self.config.threshold_jitter * Q_ONE
+            # Draw 0 is the pair of thresholds in force at the first frame. _emit_block counts on from
+            # 1.
             a, b = normal2(self.seed, pixel_counters(self.height, self.width), _JITTER, np.uint64(0))
             up = np.maximum(self._floor_on, up + np.floor(jitter * a + 0.5).astype(np.int64))
             down = np.maximum(self._floor_off, down + np.floor(jitter * b + 0.5).astype(np.int64))
@@ -441,8 +479,10 @@ class Esim(Emulator):
         return self._run(_bands, (*source, levels, interval), base_us, t_ns // 1000 - base_us)
 
     def _advance_late(self, source: tuple, t_ns: int) -> Events:
-        """Takes the logarithm of frame k = ``frames`` and returns the events between the two frames before it."""
+        """Take the logarithm of frame k = ``frames`` and return the events between the two frames before it."""
         k = self.frames
+        # The usual case: frame k gives the slope at the end of the interval from k - 2 to k - 1, which
+        # is emitted now.
         if self._passed[0] < k - 1:
             self._ring_ns[k % 4] = t_ns
             return self._pass_interval(k - 1, source)
@@ -457,14 +497,16 @@ class Esim(Emulator):
         return Events.empty()
 
     def _stale(self, k: int) -> tuple[int, int]:
-        """Pixels in which row k mod 4 differs from frame k: those that changed since frame k - 4 was written there."""
+        """Return the pixels in which row k mod 4 differs from frame k: those that changed since frame k - 4 was
+        written there."""
         self._ring_rows[k % 4] = self._changed
         rows = self._ring_rows[[j % 4 for j in range(max(0, k - 3), k + 1)]]
         rows = rows[rows[:, 0] < rows[:, 1]]
         return (int(rows[:, 0].min()), int(rows[:, 1].max())) if len(rows) else (0, 0)
 
     def _pass_interval(self, k: int, source: tuple | None) -> Events:
-        """Events between frames k - 1 and k; ``source`` is frame k + 1, None when there is none yet."""
+        """Return the events between frames k - 1 and k. ``source`` is frame k + 1, None when there is none yet."""
+        # Row and time of frame j in the ring of four.
         ring, ns = (lambda j: self._ring[j % 4]), (lambda j: int(self._ring_ns[j % 4]))
         curve = Curve(
             ring(k - 2) if k >= 2 else NO_LOG,
@@ -475,6 +517,8 @@ class Esim(Emulator):
         if source:
             self._changed = self._stale(k + 1)
         else:
+            # Without a next frame nothing is read, and only pixels that changed in frame k can have passed
+            # a level.
             self._changed = tuple(self._ring_rows[k % 4].tolist())
         self._passed[0] = k
         base_us = ns(k - 1) // 1000
@@ -503,6 +547,8 @@ class Esim(Emulator):
 
     def _interval(self, t0_ns: int, t1_ns: int) -> Interval:
         dt_ns = t1_ns - t0_ns
+        # In the order of the fields of Interval. The last bound: at most one event per refractory
+        # period, and one at either end.
         return Interval(
             t0_ns,
             dt_ns,

@@ -20,6 +20,7 @@ def voxel_grid(events: Events, t0_us: int, t1_us: int, height: int, width: int, 
 def _vote(x, y, t, p, t0, t1, grid):
     last = grid.shape[0] - 1
     scale = last / np.float64(t1 - t0)
+    # The weights of the two bins beside the event's place add up to 1.
     for i in range(len(t)):
         place = (t[i] - t0) * scale
         b = min(max(np.int64(place), 0), last)

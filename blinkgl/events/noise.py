@@ -26,6 +26,7 @@ from scipy.interpolate import PchipInterpolator
 RATE_SIZES = np.array([0.15, 0.175, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5])
 RATE_K = np.array([0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
 # fmt: off
+# ln(events per time constant): rows by RATE_K, columns by RATE_SIZES.
 _LOG_RATE = np.array(
     [
         [
@@ -75,6 +76,7 @@ TABLE_LOW, TABLE_STEP = np.log(1e-6), np.log(1e9) / (TABLE_SIZE - 2)
 """The per-step table runs over ln k from 1e-6 to 1e3."""
 
 
+# Axes of _DEAD: dead time in frames, time constants per frame, noise in thresholds.
 DEAD_FRAMES = np.array([0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 16.0])
 DEAD_K = np.array([0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
 DEAD_SIZES = np.array([0.25, 0.3, 0.45, 0.7, 1.0, 2.5])
@@ -147,7 +149,9 @@ by events, and those of the quiet ones are rare. Chosen on clips of 2 s at 5 Hz;
 clips, too, where thresholds are spread, not where they are equal."""
 
 
+# ln rate is nearly linear in 1/s^2: that is what sizes are interpolated in.
 _DEAD_Q = 1 / DEAD_SIZES**2
+# A matrix that takes a row over DEAD_SIZES to one over RATE_SIZES.
 _TO_SIZES = np.array([np.interp(1 / RATE_SIZES**2, _DEAD_Q[::-1], row[::-1]) for row in np.eye(len(DEAD_SIZES))])
 # Below the smallest size on in a straight line, of 1 / s^2.
 _BEYOND = np.maximum(1 / RATE_SIZES**2 - _DEAD_Q[0], 0.0) / (_DEAD_Q[0] - _DEAD_Q[1])
@@ -166,6 +170,7 @@ _OVER_K = PchipInterpolator(
 
 def noise_rate(size: float, k: float) -> float:
     """Events per time constant, without a dead time: the table between its entries. size : in thresholds."""
+    # Beyond the last k samples are independent, and the rate per time constant falls as 1/k.
     row, q = _OVER_K(np.sqrt(min(k, RATE_K[-1]))), 1 / RATE_SIZES**2
     return float(np.exp(np.interp(1 / size**2, q[::-1], row[::-1]))) / max(k / RATE_K[-1], 1.0)
 
@@ -182,20 +187,25 @@ def noise_size(k: np.ndarray | float, events_per_time_constant: np.ndarray, dead
     if dead_frames:
         # Where noise is large the dead time decides the rate, and the size hardly matters.
         rows = np.maximum.accumulate(rows + _dead_time_factors(k, dead_frames), axis=-1)
-    q = 1 / RATE_SIZES**2  # ln r is nearly linear in it
+    # ln r is nearly linear in it.
+    q = 1 / RATE_SIZES**2
     out = np.empty(k.shape)
     for index in np.ndindex(k.shape):
         row, w = rows[index], wanted[index]
+        # Below the first entry the table continues as a straight line.
         out[index] = q[0] + (w - row[0]) * (q[1] - q[0]) / (row[1] - row[0]) if w < row[0] else np.interp(w, row, q)
     return 1 / np.sqrt(out)
 
 
 def _dead_time_factors(k: np.ndarray, dead_frames: float) -> np.ndarray:
-    """ln of the factor by which a dead time changes the rate of each of RATE_SIZES, k.shape + (15,)."""
+    """Return ln of the factor by which a dead time changes the rate of each of RATE_SIZES, k.shape + (15,)."""
     by_k = np.empty((len(DEAD_K), len(DEAD_SIZES)))
+    # Factors above 1 only act in part within seconds, see IN_SECONDS.
     table = np.where(_DEAD > 0, IN_SECONDS * _DEAD, _DEAD)
-    for i, j in np.ndindex(by_k.shape):  # 0 without a dead time
+    # Without a dead time the logarithm of the factor is 0.
+    for i, j in np.ndindex(by_k.shape):
         by_k[i, j] = np.interp(np.log1p(dead_frames), np.log1p([0, *DEAD_FRAMES]), [0, *table[:, i, j]])
+    # Linear in ln k between the rows, and held at the ends.
     places = np.interp(np.log(np.maximum(k, 1e-300)), np.log(DEAD_K), np.arange(len(DEAD_K)))
     below = np.minimum(places.astype(int), len(DEAD_K) - 2)
     part = (places - below)[..., None]
@@ -211,6 +221,7 @@ def noise_table(rate_hz: float, dt_s: float, threshold: float, dead_s: float = 0
 def start_sizes(rate_hz: float, corner_hz: np.ndarray, threshold: float) -> np.ndarray:
     """Noise sizes in ln units for pixels with these corner frequencies, whatever the frame spacing will be."""
     corners = _some_corners(corner_hz)
+    # k = 0: frames so dense that only the corner frequency counts.
     sizes = noise_size(0.0, rate_hz / (2 * np.pi * corners))
     return threshold * np.interp(np.log(corner_hz), np.log(corners), sizes)
 
@@ -221,12 +232,15 @@ def start_places(rate_hz: float, corner_hz: np.ndarray, uniform: np.ndarray) -> 
     The time on a ladder is in inverse proportion to its rate, which grows from 0 to 1/2 as e^{span h}, h nearly the
     same for all sizes: that of the way back to a rung, 1 - (1 - place)^2. uniform : (N,) in (0, 1)."""
     corners = _some_corners(corner_hz)
+    # Each pixel takes the nearest of the corner frequencies, in the logarithm.
     which = np.searchsorted(np.sqrt(corners[1:] * corners[:-1]), corner_hz)
     spans = np.interp(noise_size(0.0, rate_hz / (2 * np.pi * corners)), RATE_SIZES, _SPANS)
     places, out = np.linspace(0, 0.5, 129), np.empty(len(uniform))
     side, depth = np.where(uniform < 0.5, -1.0, 1.0), np.abs(2 * uniform - 1)
     for number in np.unique(which):
+        # 0.75 is 1 - (1 - 1/2)^2, so that the exponent is the whole span at half a threshold.
         time = np.exp(-spans[number] * (1 - (1 - places) ** 2) / 0.75)
+        # The cumulative law by the trapezoidal rule.
         law = np.concatenate([[0.0], np.cumsum(time[1:] + time[:-1])])
         here = which == number
         out[here] = side[here] * np.interp(depth[here], law / law[-1], places)
@@ -234,5 +248,5 @@ def start_places(rate_hz: float, corner_hz: np.ndarray, uniform: np.ndarray) -> 
 
 
 def _some_corners(corner_hz: np.ndarray) -> np.ndarray:
-    """64 frequencies that span these."""
+    """Return 64 frequencies that span these, evenly spaced in the logarithm."""
     return np.exp(np.linspace(np.log(corner_hz.min()), np.log(corner_hz.max()) + 1e-9, 64))

@@ -17,22 +17,27 @@ from numba.extending import register_jitable
 from blinkgl.events.threads import run, take_part
 from blinkgl.types.events import Cause, Events
 
+# Bit 0: polarity; 1 to 16: x; 17 to 32: y; 33 and up: time. Causes: bits 31 and 32.
 T_SHIFT = 33
 CAUSE_SHIFT = 31
 MAX_CAUSE_ROWS = 2**14
 _SIGNAL, _LEAK, _SHOT = int(Cause.SIGNAL), int(Cause.LEAK), int(Cause.SHOT)
 MAX_INTERVAL_NS = (2**30 - 1) * 1000
 """Longest interval between two frames: 30 bits of microseconds (the word stays positive), 17 minutes."""
+# Times of up to 14 bits (16 ms) take one pass with 16384 counters.
 _SINGLE_PASS_BITS, _DIGIT_BITS = 14, 11
 _EVENTS_PER_THREAD, _PARTS_PER_THREAD = 2**15, 2
 """Fewer events than that are sorted in the time another thread takes to wake up."""
 
+# nogil: bands run in threads. error_model "numpy": a division by zero gives inf or NaN instead of an
+# exception, whose test would keep loops from vectorising.
 JIT = dict(nogil=True, cache=True, error_model="numpy", boundscheck=False)
 
 
 @register_jitable
 def cause_of(light: float, leak: float, noise: float) -> int:
     """The :class:`~blinkgl.types.events.Cause` of a crossing: the largest part, all in its direction."""
+    # Parts are of the change in the event's own direction, so the largest one caused it.
     if light >= leak and light >= noise:
         return _SIGNAL
     return _LEAK if leak >= noise else _SHOT
@@ -52,13 +57,15 @@ def _count_digits(packed, start, stop, shift, mask, histogram):
 def _scatter(packed, start, stop, shift, mask, offsets, out):
     for i in range(start, stop):
         digit = (packed[i] >> shift) & mask
-        out[offsets[digit]] = packed[i]  # the next free place of this part's events of this digit
+        # offsets: the next free place for this part's events with this digit.
+        out[offsets[digit]] = packed[i]
         offsets[digit] += 1
 
 
 @numba.njit(**JIT)
 def _histograms_to_offsets(histogram):
-    """Exclusive prefix sum over (digit, band), in place: where each band writes its events of each digit."""
+    """Replace counts by their exclusive prefix sum over (digit, band): where each band writes its events of each
+    digit."""
     total = 0
     for digit in range(histogram.shape[1]):
         for band in range(histogram.shape[0]):
@@ -69,6 +76,7 @@ def _histograms_to_offsets(histogram):
 
 @numba.njit(**JIT)
 def _unpack(packed, start, stop, base_us, x, y, t, p):
+    # Slices that are indexed from 0: the loop then vectorises.
     word, xs, ys, ts, ps = packed[start:stop], x[start:stop], y[start:stop], t[start:stop], p[start:stop]
     for i in range(word.size):
         xs[i] = np.uint16((word[i] >> 1) & 0xFFFF)
@@ -81,6 +89,7 @@ def _unpack(packed, start, stop, base_us, x, y, t, p):
 def _unpack_causes(packed, start, stop, y, cause):
     word, ys, causes = packed[start:stop], y[start:stop], cause[start:stop]
     for i in range(word.size):
+        # With causes y has 14 bits.
         ys[i] = np.uint16((word[i] >> 17) & 0x3FFF)
         causes[i] = np.uint8((word[i] >> CAUSE_SHIFT) & 3)
 
@@ -90,6 +99,7 @@ def _unpack_causes(packed, start, stop, y, cause):
 
 @numba.njit(**JIT)
 def _count_parts(taken, start, packed, starts, counts, first_row, shift, mask, histogram):
+    # A part is a range of rows; its digits are counted in its own row of ``histogram``.
     part = take_part(taken, start)
     while part >= 0:
         histogram[part] = 0
@@ -100,6 +110,7 @@ def _count_parts(taken, start, packed, starts, counts, first_row, shift, mask, h
 
 @numba.njit(**JIT)
 def _scatter_parts(taken, start, packed, starts, counts, first_row, shift, mask, offsets, out):
+    # Every part has its own write positions, so threads never write to the same place.
     part = take_part(taken, start)
     while part >= 0:
         for row in range(first_row[part], first_row[part + 1]):
@@ -108,6 +119,7 @@ def _scatter_parts(taken, start, packed, starts, counts, first_row, shift, mask,
 
 
 @numba.njit(**JIT)
+# ``edges`` cut the sorted events into parts of about the same length.
 def _unpack_parts(taken, start, packed, edges, base_us, x, y, t, p, cause):
     part = take_part(taken, start)
     while part >= 0:
@@ -150,12 +162,15 @@ class PackedBuffer:
         total = int(counts.sum())
         if total == 0:
             return Events.empty()
+        # Waking a thread takes longer than sorting a few thousand events.
         threads = max(1, min(threads, total // _EVENTS_PER_THREAD))
         parts = 1 if threads == 1 else min(_PARTS_PER_THREAD * threads, len(counts))
         # Short intervals take one pass; longer ones passes of 11 bits, whose 2048 counters and write positions stay in
         # the first-level cache.
         bits = max(1, int(span_us).bit_length())
         digit_bits = bits if bits <= _SINGLE_PASS_BITS else _DIGIT_BITS
+        # A pass reads one buffer and writes the other; one pass needs one. A quarter more, so that the
+        # next step fits.
         if self._sorted.shape[1] < total:
             self._sorted = np.empty((2 if bits > digit_bits else 1, total + total // 4), np.int64)
         if len(self._sorted) < 2 and bits > digit_bits:
@@ -195,8 +210,9 @@ def unpacked(
 
 
 def _even_split(counts: np.ndarray, parts: int) -> np.ndarray:
-    """First row of each part and the end, (parts + 1,) int64: about as many events in each."""
+    """Return the first row of each part and the end, (parts + 1,) int64, with about as many events in each part."""
     if parts == 1:
         return np.array([0, len(counts)])
+    # Rows at which the running number of events reaches each part's share.
     inner = np.searchsorted(np.cumsum(counts), counts.sum() * np.arange(1, parts) / parts)
     return np.concatenate(([0], inner, [len(counts)]))

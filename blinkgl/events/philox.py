@@ -19,9 +19,12 @@ from numba.extending import register_jitable
 from blinkgl.events.arith import cos_sin_turn, log_f64
 
 _U, _D = np.uint64, np.float64
+# 32-bit words are held in uint64. 11 = 64 - 53: bits that a float64 in (0, 1) cannot hold.
 _MASK32, _S32, _S11 = _U(0xFFFFFFFF), _U(32), _U(11)
+# Multipliers and key increments of Philox4x32 (Salmon et al. 2011).
 _M0, _M1 = _U(0xD2511F53), _U(0xCD9E8D57)
 _W0, _W1 = _U(0x9E3779B9), _U(0xBB67AE85)
+# 2^-53 is the spacing of the uniforms.
 _HALF, _ULP53, _MINUS2 = _D(0.5), _D(2.0**-53), _D(-2.0)
 
 
@@ -73,11 +76,13 @@ def uniform2(seed: int, pixel: int, stream: int, index: int) -> tuple[float, flo
 def normal2(seed: int, pixel: int, stream: int, index: int) -> tuple[float, float]:
     """Two independent standard normals (Box-Muller), float64."""
     u, v = uniform2(seed, pixel, stream, index)
+    # Box and Muller: radius sqrt(-2 ln u), angle 2 pi v. u is never 0.
     radius = np.sqrt(_MINUS2 * log_f64(u))
     c, s = cos_sin_turn(v)
     return radius * c, radius * s
 
 
+# A uniform has the variance 1/12, the sum of four 1/3.
 _THREE_ROOT, _TWO, _ULP32 = _D(np.sqrt(3.0)), _D(2.0), _D(2.0**-32)
 
 
@@ -94,6 +99,7 @@ def rough_normal(seed: int, pixel: int, stream: int, index: int) -> float:
 def normal2_and_uniform(seed: int, pixel: int, stream: int, index: int) -> tuple[float, float, float]:
     """Two independent standard normals (angle of 32 bits) and an independent uniform (32 bits) from one block."""
     w0, w1, w2, w3 = philox4x32(pixel & _MASK32, stream, index & _MASK32, index >> _S32, seed & _MASK32, seed >> _S32)
+    # Words 0 and 1 give the 53 bits of the radius, word 2 the angle, word 3 the spare uniform.
     u = (_D(((w1 << _S32) | w0) >> _S11) + _HALF) * _ULP53
     c, s = cos_sin_turn((_D(w2) + _HALF) * _ULP32)
     radius = np.sqrt(_MINUS2 * log_f64(u))

@@ -18,13 +18,16 @@ from blinkgl.events.packing import JIT
 from blinkgl.events.philox import Stream, normal2, pixel_counters, uniform2
 from blinkgl.types.events import OPTIONAL, Cause, Events
 
+# Events drawn at once; the highest rate, one event per microsecond; the longest time before the
+# recording.
 _BATCH, _MOST_HZ, _LONGEST_BEFORE_S = 1024, 1e6, 5.0
 _DEFECT, _OWN, _LATE = np.uint64(Stream.DEFECT), np.uint64(Stream.OWN_NOISE), np.uint64(Stream.LATENCY)
 
 
 @numba.njit(**JIT)
 def _awake(pixel, t_us, dead_us, last):
-    """(n,) bool: events that come at least ``dead_us`` after the last one of their pixel that did; ``last`` follows."""
+    """Return (n,) bool: which events come at least ``dead_us`` after the last such event of their pixel. ``last`` is
+    updated."""
     out = np.empty(t_us.size, np.bool_)
     for i in range(t_us.size):
         out[i] = t_us[i] - last[pixel[i]] >= dead_us
@@ -43,15 +46,20 @@ class PixelNoise:
         self.config, self._width, self._causes = config, width, causes
         self._seed = np.uint64(int(seed) & (2**64 - 1))
         pixels = pixel_counters(height, width)
+        # Draws 0 and 1 of the stream: uniforms for what a pixel is, normals for how much.
         which, other = uniform2(self._seed, pixels, _DEFECT, np.uint64(0))
         spread, prefers = normal2(self._seed, pixels, _DEFECT, np.uint64(1))
         self.hot = which < config.hot_fraction
         self.dead = other < config.dead_fraction
+        # Log-normal rates: a median and a spread in decades.
         median = np.where(self.hot, config.hot_rate_hz, config.rate_hz)
         decades = np.where(self.hot, config.hot_spread_decades, config.spread_decades)
         rates = np.minimum(median * exp_f64(np.log(10.0) * decades * spread), _MOST_HZ)
         self.rates = np.where(self.dead, 0.0, rates)
+        # Running sums, in which a uniform finds its pixel. Answers come on top of the drawn events,
+        # which are therefore as many fewer.
         self._sums = np.cumsum(self.rates / (1.0 + np.where(self.hot, 0.0, config.answered)))
+        # The odds of ON against OFF are log-normal over the hot pixels.
         off = (1.0 - config.hot_on_share) * exp_f64(-config.hot_on_spread * prefers)
         self.on_shares = np.where(self.hot, config.hot_on_share / (config.hot_on_share + off), config.on_share)
         self._decades = np.log(10.0) * config.answer_spread_decades
@@ -69,13 +77,16 @@ class PixelNoise:
         one microsecond the noise comes last. The first step says when the noise begins."""
         if self.dead.any() and len(events):
             events = events.part(~self.dead[events.y.astype(np.int64) * self._width + events.x])
+        # No pixel fires by itself.
         if not (self._sums.size and self._sums[-1] > 0):
             return events
         if self._t_ns is None:
+            # Noise begins early enough for its late answers to fall into the recording.
             self._t_ns, self._from_us = 1000 * until_us - self._before_ns, until_us
             return events
         while self._t_ns // 1000 <= until_us:
             drawn = Events.concatenate([self._drawn, self._more()])
+            # Answers are late, so those of one batch may come after the next batch has begun.
             self._drawn = drawn.part(np.argsort(drawn.t, kind="stable")) if self._before_ns else drawn
         count = int(np.searchsorted(self._drawn.t, until_us, side="right"))
         own, self._drawn = self._drawn.part(slice(count)), self._drawn.part(slice(count, None))
@@ -90,13 +101,16 @@ class PixelNoise:
         return both.part(np.argsort(both.t, kind="stable"))
 
     def _more(self) -> Events:
-        """The next batch of a Poisson process of the sensor as a whole, with their answers behind them; pixels in
-        proportion to their rates."""
+        """Draw the next batch of a Poisson process of the whole sensor and the answers to its events. Pixels are
+        drawn in proportion to their rates."""
         index = np.uint64(self._batch * _BATCH) + np.arange(_BATCH, dtype=np.uint64)
         self._batch += 1
+        # Draw 0 of an event: the time to it and its pixel; draw 1: polarity and whether it is answered;
+        # draw 2: how late.
         wait, pick = uniform2(self._seed, index, _OWN, np.uint64(0))
         polarity, answers = uniform2(self._seed, index, _OWN, np.uint64(1))
         total = self._sums[-1]
+        # Exponential waiting times, ns.
         gaps = np.minimum(-log_f64(wait) * (1e9 / total), 2.0**55).astype(np.int64)
         t_ns = self._t_ns + np.cumsum(gaps)
         self._t_ns = int(t_ns[-1])
@@ -112,11 +126,13 @@ class PixelNoise:
         if not self._before_ns:
             return own
         late, _ = normal2(self._seed, index, _OWN, np.uint64(2))
+        # Log-normal around ``answer_ms``. An answer has the other polarity.
         wait_ns = 1e6 * self.config.answer_ms * exp_f64(self._decades * late)
         chosen = (answers < self.config.answered) & ~self.hot[pixel]
         answer = own.part(chosen)
         at_us = (t_ns[chosen] + np.minimum(wait_ns[chosen], 2.0**55).astype(np.int64)) // 1000
         both = Events.concatenate([own, replace(answer, t=at_us, p=1 - answer.p)])
+        # What lies before the recording was only drawn for its answers.
         return both.part(both.t > self._from_us)
 
     def state_dict(self) -> dict[str, np.ndarray]:
@@ -135,7 +151,8 @@ class PixelNoise:
 @numba.njit(**JIT)
 def _delay(pixel, t_us, delay, last, out):
     for i in range(t_us.size):
-        out[i] = max(t_us[i] + np.int64(delay[i]), last[pixel[i]])  # no event overtakes another of its pixel
+        # Events of one pixel keep their order.
+        out[i] = max(t_us[i] + np.int64(delay[i]), last[pixel[i]])
         last[pixel[i]] = out[i]
 
 
@@ -162,6 +179,7 @@ class Latency:
             c = self.config
             pixel = events.y.astype(np.int64) * self._width + events.x
             intensity = luminance.reshape(-1)[pixel].astype(np.float64) * c.full_scale
+            # A constant part, and one that falls with the photocurrent; +1 keeps it finite in the dark.
             delay = c.fixed_us + c.dark_us / (intensity + 1.0)
             if c.jitter_us:
                 index = np.uint64(self._count) + np.arange(len(events), dtype=np.uint64)
@@ -171,6 +189,7 @@ class Latency:
             t = np.empty(len(events), np.int64)
             _delay(pixel, events.t, np.maximum(delay, 0.0), self._last, t)
             self._held = Events.concatenate([self._held, replace(events, t=t)])
+            # Delays differ between pixels: events that are held back may be overtaken.
             self._held = self._held.part(np.argsort(self._held.t, kind="stable"))
         count = int(np.searchsorted(self._held.t, until_us, side="right"))
         known, self._held = self._held.part(slice(count)), self._held.part(slice(count, None)).copy()

@@ -24,6 +24,7 @@ from blinkgl.errors import EventDataError
 from blinkgl.events.packing import JIT
 from blinkgl.types.events import OPTIONAL, Events
 
+# Time on the bus is counted in ps, so that the rounding of 1 / events_per_second does not add up.
 _PS_PER_US = 1_000_000
 
 
@@ -35,10 +36,13 @@ def _serve(t_us, y, event_ps, row_ps, waiting, state, keep, out_us):
     accepted, free_ps, row = state[0], state[1], state[2]
     for i in range(t_us.size):
         arrival = t_us[i] * _PS_PER_US
+        # The place in the ring of the event ``size`` places ahead.
         slot = accepted % size
         if accepted >= size and waiting[slot] > arrival:
-            continue  # the event ``size`` places ahead has not left: the queue is full
+            # The event ``size`` places ahead has not left: the queue is full.
+            continue
         start = max(arrival, free_ps)
+        # The row's address is sent when the row changes or the bus was idle.
         if row_ps and (np.int64(y[i]) != row or start > free_ps):
             start += row_ps
         row, free_ps = np.int64(y[i]), start + event_ps
@@ -65,6 +69,7 @@ class Readout:
         self._event_ps = 0 if rate is None else max(1, round(1e12 / rate))
         self._row_ps = round(config.row_ns * 1000)
         self._waiting = np.zeros(config.queue_events, np.int64)
+        # Events accepted; time from which the bus is free (always has been); its row (none).
         self._state = np.array([0, -(2**62), -1], np.int64)
         self._on_bus = Events.empty()
 
@@ -80,6 +85,7 @@ class Readout:
         ``until_us`` : the time up to which the emulator has given its events, int µs.
         Raises EventDataError for times beyond 100 days, which picoseconds in int64 cannot hold."""
         sent = self._serve(events) if len(events) and self._event_ps else events
+        # Events that have been served are already in order and later than those still on the bus.
         if self.late:
             sent = Events.concatenate([self._on_bus, sent])
         count = len(sent) if until_us is None else int(np.searchsorted(sent.t, until_us, side="right"))
@@ -87,12 +93,13 @@ class Readout:
         return self._stamped(sent.part(slice(count)))
 
     def _stamped(self, events: Events) -> Events:
-        """With the last tick of the clock that has passed."""
+        """Return the events stamped with the last tick of the clock."""
         tick = self.config.clock_us
         return events if tick == 1 else replace(events, t=events.t - events.t % tick)
 
     def _serve(self, events: Events) -> Events:
-        """Those that find a place, with the times at which they leave."""
+        """Return the events that find a place in the queue, with the times at which they leave the bus."""
+        # 2^43 us are 8.8e18 ps, just below 2^63.
         if max(abs(int(events.t[0])), abs(int(events.t[-1]))) > 2**43:
             raise EventDataError(
                 "event time too large for the read-out model", value=int(events.t[-1]), accepted="at most 100 days"

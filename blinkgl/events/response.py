@@ -31,6 +31,8 @@ class Response(NamedTuple):
 
     def signal(self, luminance: np.ndarray) -> np.ndarray:
         """float32."""
+        # The logarithm above the joint; below it the logarithm stays, and the straight line adds what
+        # is missing.
         joint = np.float32(self.joint)
         log = np.float32(self.gain) * np.log(np.maximum(luminance, joint) + np.float32(self.offset))
         return log + np.float32(self.low_slope) * np.minimum(luminance - joint, 0) if self.low_slope else log

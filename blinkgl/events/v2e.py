@@ -68,9 +68,12 @@ from blinkgl.events.v2e_waves import FLOATS, INTS, emit_waves
 from blinkgl.types.events import Events
 
 _F = np.float32
+# Typed float32 constants: a float literal is float64 to numba and would widen the loops.
 _ZERO, _HALF, _JOINT = _F(0), _F(0.5), _F(20.0)
 _SHOT, _NOISE = np.uint64(Stream.SHOT), np.uint64(Stream.NOISE)
 _U2, _U1, _U1000 = np.uint64(2), np.uint64(1), np.uint64(1000)
+# Pixels in their dead time have infinite levels and lie infinitely far beyond them: the distance is cut
+# here.
 _FARTHEST = _F(1e6)
 GROUP = 4
 """Blocks whose events are made in one go."""
@@ -124,11 +127,13 @@ class Interval(NamedTuple):
 
 @numba.njit(**JIT)
 def _emit_plain(active, count, first, x_now, constants, p, v, cap, packed, begin):
-    """:func:`emit_waves` without low-pass, leak, noise and dead time: the same bits, straight lines only."""
+    """Do :func:`emit_waves` without low-pass, leak, noise and dead time: the same bits, from straight lines."""
     out, cut, dt_ns = begin, 0, v.dt_ns
+    # Start of the interval after the microsecond base, 0 to 999 ns.
     start_ns = v.t0_ns - 1000 * v.base_us
     y = first // v.width
     row_end = (y + 1) * v.width
+    # A loop of its own, so that the cache misses of all pixels overlap.
     for j in range(count):
         for c in range(2):
             constants[j, c] = p.constants[active[j], c]
@@ -137,6 +142,7 @@ def _emit_plain(active, count, first, x_now, constants, p, v, cap, packed, begin
         while i >= row_end:
             y += 1
             row_end += v.width
+        # From here on float64, as in emit_waves, so that both kernels emit the same bits.
         before, on, off = np.float64(p.x[i]), np.float64(constants[j, 0]), np.float64(constants[j, 1])
         rise = np.float64(x_now[i - first]) - before
         end = before + rise
@@ -144,10 +150,14 @@ def _emit_plain(active, count, first, x_now, constants, p, v, cap, packed, begin
         polarity = np.int64(end >= up)
         level, step = (up, on) if polarity else (down, -off)
         sign = 1.0 if polarity else -1.0
+        # The packed word (packing.py) without its time.
         pixel = (y << 17) | ((i - row_end + v.width) << 1) | polarity
         emitted, s = 0, 0.0
         while sign * (end - level) >= 0.0:
-            s = min(max(s, (level - before) / rise), 1.0)  # 0 / 0 where it stands on the level: now
+            # 0 / 0 is NaN where the signal already stands on the level; max and min then give s.
+            s = min(max(s, (level - before) / rise), 1.0)
+            # ``packed`` has room for ``cap`` events of each listed pixel; further ones are counted
+            # only.
             if emitted < cap:
                 packed[out] = (np.int64(np.uint64(start_ns + np.int64(s * dt_ns)) // _U1000) << T_SHIFT) | pixel
                 out += 1
@@ -162,8 +172,10 @@ def _emit_plain(active, count, first, x_now, constants, p, v, cap, packed, begin
 
 @numba.njit(**JIT)
 def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x_table, p, v):
-    """Band kernel, see :meth:`Emulator._run`."""
+    """Process the blocks of a band, see :meth:`Emulator._run`."""
     cut, pixels, most = 0, p.x.size, GROUP * BLOCK
+    # Scratch memory: what is one block long is used again for every block, what is ``most`` long holds
+    # the group until its events are made. compact_flags writes eight numbers at a time.
     flags, scratch, active = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64), np.empty(most + 8, np.int32)
     z, normals = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     intensity, x = np.empty(most, np.float32), np.empty(most, np.float32)
@@ -174,6 +186,7 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
     floats, ints = np.empty(FLOATS, np.float64), np.empty(INTS, np.int64)
     draws = np.empty(DRAWS, np.int64), np.empty(DRAWS), np.empty(DRAWS)
     clocks = np.empty((GROUP, 2), np.int64)
+    # Running sums over the group's blocks: pixels listed, shot-noise events; and the cap of each block.
     listed, shot, caps = np.zeros(GROUP + 1, np.int64), np.zeros(GROUP + 1, np.int64), np.zeros(GROUP, np.int64)
     kappa, since = np.float32(v.kappa), np.float32(v.since_epoch_1)
     plain = not (p.lag.size or p.leak.size or p.noise.size or p.release.size or p.clock_ns.size)
@@ -188,6 +201,7 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
             if n < BLOCK:
                 flags[:] = 0
             x_now, intensity_now, lag_now = x[a : a + n], intensity[a : a + n], lag[a : a + n]
+            # uint8 frames: luminance and lin-log of all 256 codes are in tables.
             if codes.size:
                 if p.intensity.size:
                     lookup_both_block(codes[s:e], x_table, x_now, table, intensity_now)
@@ -196,11 +210,13 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
             else:
                 scale_block(frame[s:e], v.scale, intensity_now)
                 lin_log_block(intensity_now, x_now)
+            # The second low-pass comes first, see the module. It replaces x by its output.
             if p.second_lag.size:
                 second_block(
                     p.second_lag[s:e], p.before_second[s:e], x_now, v.second_keep, v.second_ramp,
                     before_second[a : a + n], second_lag[a : a + n],
                 )  # fmt: skip
+            # The low-pass of the photoreceptor. z is what the comparator sees.
             if p.lag.size:
                 if v.gentle:
                     relax_block_gently(
@@ -211,6 +227,8 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
             elif p.noise.size:
                 copy_block(x_now, z[:n])
             if p.noise.size:
+                # noise_block adds to z, so leak is added here as well. Without noise the comparison
+                # itself adds it.
                 if p.leak.size:
                     add_scaled_block(p.leak[s:e], since, z[:n])
                 noise_block(
@@ -224,10 +242,13 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
                 farthest = flag_block(signal, p.upper[s:e], p.lower[s:e], flags)
             shots = 0
             if p.clock_ns.size:
+                # The group's keys lie block after block; those of this block begin here.
                 so_far = shot[b]
                 shots, clocks[b, 0], clocks[b, 1] = shot_block(
                     group + b, n, a, p, v, intensity_now, keys[so_far:], draws
                 )
+                # -1 event: no room. Draws are functions of their numbers, so the block is done again
+                # with twice the room.
                 while shots < 0:
                     longer = np.empty(2 * keys.size, np.int64)
                     longer[:so_far] = keys[:so_far]
@@ -235,6 +256,8 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
                     shots, clocks[b, 0], clocks[b, 1] = shot_block(
                         group + b, n, a, p, v, intensity_now, keys[so_far:], draws
                     )
+                # A pixel with shot noise is listed even where its signal reaches no level. Bits 42 and
+                # up: its number in the group.
                 for j in range(so_far, so_far + shots):
                     flags[(keys[j] >> 42) - a] = 1
             shot[b + 1] = shot[b] + shots
@@ -257,8 +280,10 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
         together = not clamped and listed[blocks] * largest <= blocks * share
         if together:
             room = listed[blocks] * largest
-        if filled + room > packed.size:  # no room for the worst case; nothing of this group has been touched
+        # No room for the worst case; nothing of this group has been touched.
+        if filled + room > packed.size:
             return group, filled, cut
+        # The state at the interval's end of the whole group, in the order that emit_waves unpacks.
         now = (intensity, x, lag, noise)
         for b in range(1 if together else blocks):
             stop = blocks if together else b + 1
@@ -295,6 +320,8 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
 
 @numba.njit(**JIT)
 def _bands(taken, start, edges, progress, share, packed, frame, codes, table, x_table, p, v):
+    # A row of ``progress`` is a band: next block, events written, events cut. A thread takes bands
+    # until none is left.
     b = take_part(taken, start)
     while b >= 0:
         block, filled, cut = _band(
@@ -359,6 +386,7 @@ class V2e(Emulator):
         super().__init__(height, width, seed, reconstruction)
         self.config = config = config or V2eConfig()
         pixels = self.height * self.width
+        # Arrays of features that are off have size 0, which the kernels test.
         frame = lambda wanted=True: np.zeros(pixels if wanted else 0, np.float32)
         on, off = config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold
         self._on, self._off = (
@@ -375,13 +403,16 @@ class V2e(Emulator):
         self._noise_sizes, self._sizes_dt_ns = np.empty(0, np.float32), -1
 
         self._leak = draw_leaks(height, width, config, self._on, self.seed)
+        # Four floats per pixel: whatever a pixel that fires needs of them is in one line of the cache.
         self._constants = np.zeros((pixels, 4), np.float32)
         self._constants[:, 0], self._constants[:, 1] = self._on, self._off
         if self._leak.size:
             self._constants[:, 2] = self._leak
         self._leak_jitter = config.leak_jitter if self._leak.size else 0.0
+        # Never, unless some pixel leaks.
         self._rebase_ns = 2**61
         if self._leak.size and self._leak.max() > 0:
+            # The leak clock starts anew when the median pixel has leaked REBASE.
             self._rebase_ns = int(REBASE / float(np.median(self._leak[self._leak > 0])) * 1e9)
         self._epoch_ns, self._brightest = np.zeros(1, np.int64), np.zeros(1)
 
@@ -391,6 +422,7 @@ class V2e(Emulator):
         shot = config.shot_noise_rate_hz > 0 and not config.photoreceptor_noise
         blocks = -(-pixels // BLOCK) if shot else 0
         self._clock_ns, self._clock_index = np.zeros(blocks, np.int64), np.zeros(blocks, np.int64)
+        # Half of the rate for each polarity, at its value in the dark, per ns.
         self._shot_unit = 0.5 * config.shot_noise_rate_hz * DARKEST * 1e-9
         self._shot_table = shot_tables(self._on, self._off, on, off) if shot else np.empty((0, 0), np.float32)
         self._shots_per_ns = self._shot_unit * float(self._shot_table[:, -1:].sum())  # if all pixels were dark
@@ -408,6 +440,7 @@ class V2e(Emulator):
     def memory_s(self, luminance: np.ndarray) -> np.ndarray | None:
         if self.config.cutoff_hz == 0:
             return None
+        # The corner frequency of the first low-pass, f_c (I + 20)/275, as in v2e_model.relax.
         corner = self.config.cutoff_hz * (luminance.astype(np.float64) * self.config.full_scale + 20.0) / 275.0
         second = self.config.second_cutoff_hz
         return _TAIL / (2 * np.pi * corner) + (_TAIL / (2 * np.pi * second) if second else 0.0)
@@ -428,6 +461,7 @@ class V2e(Emulator):
         self._upper[...], self._lower[...] = reference + self._on, reference - self._off
         self._leak[...] = start.leak
         dead = np.flatnonzero(start.dead_ns)
+        # Levels that every signal has passed mark the dead time, so that the kernel looks at the pixel.
         self._upper[dead], self._lower[dead] = -np.inf, np.inf
         self._release[dead] = t_ns + start.dead_ns[dead]
         if self.causes:
@@ -435,6 +469,7 @@ class V2e(Emulator):
             if self._noise.size:
                 self._noise_then[...] = self._noise + start.by_noise
         for block in range(len(self._clock_ns)):
+            # Number 2^62 is beyond all that the running clock draws.
             rate = self._shot_unit * float(self._shot_table[block, -1])
             gap, _ = shot_draw(self.seed, np.uint64(block), np.uint64(2**62), rate)
             self._clock_ns[block] = t_ns + gap
@@ -488,7 +523,7 @@ class V2e(Emulator):
             )
 
     def _make_noise_sizes(self, dt_ns: int) -> None:
-        """The table of the photoreceptor's noise for frames so far apart."""
+        """Make the table of the photoreceptor's noise for this frame spacing."""
         if self._noise.size and dt_ns != self._sizes_dt_ns:
             config = self.config
             self._noise_sizes = noise_table(
@@ -497,11 +532,13 @@ class V2e(Emulator):
             self._sizes_dt_ns = dt_ns
 
     def _interval(self, t_ns: int, brightest: float) -> Interval:
-        """From the last frame to that at ``t_ns``.   brightest : DN, of both."""
+        """Return the interval from the last frame to ``t_ns``.   brightest : DN, of both."""
         config, (epoch,), (start_ns, dt_ns) = self.config, self._epoch_ns.tolist(), (self.t_ns, t_ns - self.t_ns)
+        # 275 DN is 255 + 20, full scale in v2e's formula for the corner frequency.
         kappa = 2 * np.pi * config.cutoff_hz * dt_ns * 1e-9 / 275.0
         second = config.second_cutoff_hz
         second_keep, second_ramp = decay(_F(2 * np.pi * second * dt_ns * 1e-9)) if second else (_ZERO, _ZERO)
+        # In the order of the fields of Interval. 0.499 rather than 1/2, for rounding in float32.
         return Interval(
             start_ns,
             dt_ns,
@@ -524,7 +561,7 @@ class V2e(Emulator):
         )
 
     def _begin_leaks_anew(self, t_ns: int) -> None:
-        """What has leaked until ``t_ns`` goes over into the levels."""
+        """Move what has leaked until ``t_ns`` into the levels, and restart the leak clock."""
         gone = self._leak * np.float32((t_ns - int(self._epoch_ns[0])) * 1e-9)
         self._upper -= gone
         self._lower -= gone

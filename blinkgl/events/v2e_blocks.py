@@ -27,9 +27,11 @@ from blinkgl.events.v2e_model import (
 )
 
 _F = np.float32
+# Typed constants keep the loops in float32. _JOINT: the 20 DN that v2e adds to the intensity.
 _ZERO, _HALF, _JOINT = _F(0), _F(0.5), _F(20.0)
 _SHOT, _NOISE = np.uint64(Stream.SHOT), np.uint64(Stream.NOISE)
 _U2, _U1 = np.uint64(2), np.uint64(1)
+# Up to so many events of shot noise are kept in order one by one. _FAR_BELOW is the least int32.
 _INSERTION_LIMIT, _FAR_BELOW = 32, np.int32(-(2**31))
 DRAWS = 16
 """Candidates of shot noise that are drawn in one go, at most."""
@@ -54,6 +56,7 @@ def relax_block(
     z: np.ndarray,
 ) -> None:
     """The low-pass: its lag at the end into ``out``, and with what it follows into ``z``."""
+    # z = x + (y - x) is the low-pass's output y.
     for i in range(now.size):
         lag_now = relax(lag[i], before[i], now[i], intensity_before[i], intensity_now[i], kappa)
         out[i] = lag_now
@@ -83,6 +86,8 @@ def second_block(
     lag: np.ndarray, before: np.ndarray, x: np.ndarray, keep: float, ramp: float, now: np.ndarray, lag_now: np.ndarray
 ) -> None:
     """``x`` through the second low-pass; what it was into ``now``."""
+    # keep = e^-k and ramp = (1 - e^-k)/k are the same at all pixels: this corner does not move with the
+    # light.
     for i in range(x.size):
         now[i] = x[i]
         lag_now[i] = settled(lag[i] * keep - (x[i] - before[i]) * ramp)
@@ -111,10 +116,12 @@ def noise_block(
     z: np.ndarray,
 ) -> None:
     """The photoreceptor's noise at the end into ``out``, and added to ``z``.   normals : scratch, at least as long."""
+    # Blocks begin at even pixels, so pairs do not straddle them.
     for j in range((out.size + 1) // 2):  # pixels 2j and 2j + 1 share a draw
         a, b = normal2(seed, np.uint64(first // 2 + j), _NOISE, np.uint64(step))
         normals[2 * j], normals[2 * j + 1] = np.float32(a), np.float32(b)
     for i in range(out.size):
+        # k: time constants in the interval, of the mean intensity. The size is interpolated in ln k.
         k = np.float32(kappa * (_HALF * (intensity_before[i] + intensity_now[i]) + _JOINT))
         below, part = noise_place(k)
         size = np.float32(sizes[below] + part * (sizes[below + 1] - sizes[below]))
@@ -128,10 +135,12 @@ def flag_block(z: np.ndarray, upper: np.ndarray, lower: np.ndarray, flags: np.nd
     """Flags (uint8) of the pixels at or beyond a level; returns how far the farthest is beyond (negative: none is)."""
     farthest = _FAR_BELOW
     for i in range(z.size):
+        # Levels of a pixel in its dead time are infinite: it is then always beyond.
         above, below = np.float32(z[i] - upper[i]), np.float32(lower[i] - z[i])
         beyond = np.float32(select(above > below, above, below))
         flags[i] = np.uint8(beyond >= _ZERO)
-        farthest = max(farthest, beyond.view(np.int32))  # floats >= 0 are ordered as their bits; this loop vectorises
+        # Floats >= 0 are ordered as their bits; this loop vectorises.
+        farthest = max(farthest, beyond.view(np.int32))
     return np.int32(farthest).view(np.float32)
 
 
@@ -142,6 +151,7 @@ def flag_block_leaking(
     """:func:`flag_block` of z with what has leaked."""
     farthest = _FAR_BELOW
     for i in range(z.size):
+        # Rounded to float32 twice, as add_scaled_block does, so that both ways agree.
         leaked = np.float32(z[i] + np.float32(leak[i] * since))
         above, below = np.float32(leaked - upper[i]), np.float32(lower[i] - leaked)
         beyond = np.float32(select(above > below, above, below))
@@ -152,7 +162,7 @@ def flag_block_leaking(
 
 @numba.njit(**JIT)
 def _shot_draws(seed, block, index, rate_per_ns, gaps, picks, accepts):
-    """Of the candidates from number ``index`` on: more than are wanted, but in vector instructions."""
+    """Draw the candidates from number ``index`` on: more than needed, but in vector instructions."""
     for j in range(gaps.size):
         number = index + np.uint64(j)
         gaps[j], picks[j] = shot_draw(seed, block, number, rate_per_ns)
@@ -174,6 +184,7 @@ def shot_block(
     """Shot noise of one block in the interval: accepted events into ``keys`` (pixel in block and ``before`` << 42 | ns
     from the interval's start << 1 | polarity), sorted. Returns (events, time and number of the next candidate); -1
     events when ``keys`` is too small."""
+    # The clock stands at the next candidate, whose number is ``index``.
     count, first, end_ns = 0, block * BLOCK, v.t0_ns + v.dt_ns
     table = p.shot_table[block]
     whole = np.float64(table[table.size - 1])
@@ -183,8 +194,10 @@ def shot_block(
     # one a pixel.
     rate = v.shot_unit_per_ns * whole
     gaps, picks, accepts = draws
+    # The expected number of candidates and two standard deviations more.
     expected = rate * v.dt_ns
-    wanted = min(gaps.size, (np.int64(min(expected + 2.0 * np.sqrt(expected), 1e6)) + 5) // 4 * 4)  # whole vectors
+    # The count is rounded up to whole vectors of four.
+    wanted = min(gaps.size, (np.int64(min(expected + 2.0 * np.sqrt(expected), 1e6)) + 5) // 4 * 4)
     drawn = wanted
     while t_ns <= end_ns:
         if drawn == wanted:
@@ -200,17 +213,24 @@ def shot_block(
             place -= 1
         while place < table.size - 1 and table[place] <= weight:
             place += 1
-        offset, on = place & (BLOCK - 1), place < BLOCK  # the table holds the ON half of all pixels, then the OFF half
+        # The table holds the ON half of all pixels, then the OFF half.
+        offset, on = place & (BLOCK - 1), place < BLOCK
         if offset < pixels_in_block:
             i = first + offset
+            # Time after the interval's start and the intensity there, on the straight line between the
+            # frames.
             after = max(t_ns - v.t0_ns, 0)
             intensity = p.intensity[i] + (intensity_now[offset] - p.intensity[i]) * (after / v.dt_ns)
+            # Thinning: the candidate's rate is that of the dark, DARKEST.
             if accept * DARKEST < shot_factor(intensity):
                 if count == keys.size:
-                    return -1, t_ns, index  # the caller doubles ``keys`` and begins the block anew: draws know no state
+                    # The caller doubles ``keys`` and repeats the block; draws have no state, so they
+                    # come out the same.
+                    return -1, t_ns, index
                 key = ((before + offset) << 42) | (after << 1) | np.int64(on)
                 slot = count
-                if count < _INSERTION_LIMIT:  # a few are put where they belong, many are sorted at the end
+                # A few keys are inserted in order; many are sorted at the end.
+                if count < _INSERTION_LIMIT:
                     while slot > 0 and keys[slot - 1] > key:
                         keys[slot] = keys[slot - 1]
                         slot -= 1

@@ -18,8 +18,11 @@ from blinkgl.events.noise import TABLE_LOW, TABLE_SIZE, TABLE_STEP, start_places
 from blinkgl.events.philox import Stream, normal2, pixel_counters, rough_normal, uniform2
 
 _F = np.float32
+# _SLOPE is that of the chord from (0, 0) to (20, ln 20).
 _ZERO, _ONE, _HALF, _JOINT, _SLOPE = _F(0), _F(1), _F(0.5), _F(20.0), _F(np.log(20.0) / 20.0)
 _SHOT, _U2, _SMALLEST_K = np.uint64(Stream.SHOT), np.uint64(2), _F(1e-6)
+# Place in the table of noise sizes: ln k of its first entry, entries per unit of ln k, the last but one
+# entry.
 _TABLE_LOW, _TABLE_PER, _TABLE_LAST = _F(TABLE_LOW), _F(1 / TABLE_STEP), _F(TABLE_SIZE - 2)
 DARK, SETTLED = _F(2.0**-60), _F(2.0**-90)
 """DN below which there is no light, and ln units below which a lag is over: nothing subnormal comes up, which takes a
@@ -33,6 +36,7 @@ REBASE = 0.02
 def lin_log(intensity: float) -> float:
     """ln(I) above 20 DN, the chord from the origin below (v2e, ``lin_log``); float32."""
     dim = select(intensity < DARK, _ZERO, intensity * _SLOPE)
+    # select computes both sides, so the logarithm's argument is clamped to its range.
     return select(intensity <= _JOINT, dim, log_f32(np.maximum(intensity, _JOINT)))
 
 
@@ -42,6 +46,7 @@ def settled(lag: float) -> float:
     return select(np.abs(lag) < SETTLED, _ZERO, lag)
 
 
+# (1 - e^-k)/k = 1 - k/2! + k^2/3! - ...
 _P0, _P1, _P2, _P3, _P4, _P5, _P6 = (_F(c) for c in (1, -1 / 2, 1 / 6, -1 / 24, 1 / 120, -1 / 720, 1 / 5040))
 
 
@@ -58,7 +63,7 @@ def decay(k: float) -> tuple[float, float]:
 
 @register_jitable
 def _gentle_growth(k):
-    """(1 - e^-k)/k for k < 1/2, Taylor."""
+    """Return (1 - e^-k)/k for k < 1/2 by its Taylor series."""
     p = k * _P6 + _P5
     p = p * k + _P4
     p = p * k + _P3
@@ -82,6 +87,7 @@ def relax_gently(
 ) -> float:
     """:func:`relax` where k < 1/2 everywhere: the same bits for half the work."""
     k = kappa * (_HALF * (intensity_before + intensity_now) + _JOINT)
+    # e^-k = 1 - k g without an exponential.
     g = _gentle_growth(k)
     return settled(lag * (_ONE - k * g) - (now - before) * g)
 
@@ -96,7 +102,8 @@ def curve_of(base: float, drift: float, dx: float, lag: float, k: float) -> tupl
     """
     if k < 0:
         return base, drift + dx, 0.0
-    behind = dx / k  # how far a low-pass stays behind a ramp in the end
+    # behind: the final lag of a low-pass behind a ramp.
+    behind = dx / k
     return base - behind, drift + dx, lag + behind
 
 
@@ -116,22 +123,27 @@ def crossing_fraction(
 
     The inverse cubic Hermite interpolant of z, then Newton's method inside a shrinking bracket; the error is below
     1e-6 of the interval unless the curve is flat there."""
-    if k < 0:  # ``start`` of a signal that stands on the level, 0 / 0
+    # 0 / 0 is NaN where the signal stands on the level; max and min then give ``start``.
+    if k < 0:
         return min(max(start, (target - c) / rise), 1.0)
-    sign = 1.0 if polarity else -1.0  # an OFF crossing is an ON crossing of -z
+    # An OFF crossing is an ON crossing of -z.
+    sign = 1.0 if polarity else -1.0
     low, high = start, 1.0
     e_low = 1.0 if start == 0.0 else fall_f64(k * start)
     f_low = sign * (c + rise * start + fall * e_low - target)
     if f_low >= 0:
         return start
     f_high = sign * (end - target)
+    # f < 0 before the crossing, f >= 0 from it on, for either polarity.
     # z' at both ends; at the end fall e^-k follows from z itself.
     v_low, v_high = sign * (rise - k * fall * e_low), sign * (rise - k * (end - c - rise))
     width, height = high - low, f_high - f_low
     u = -f_low / height
-    s = low + width * u  # where the chord meets the level
+    # The first guess is where the chord meets the level.
+    s = low + width * u
     if v_low > 0 and v_high > 0:
-        stretch = height / (width * v_low * v_high)  # s as a cubic of z: slopes 1 / z' at both ends
+        # s as a cubic of z: slopes 1 / z' at both ends.
+        stretch = height / (width * v_low * v_high)
         guess = u * ((1.0 - u) * stretch * ((1.0 - u) * v_high - u * v_low) + u * (3.0 - 2.0 * u))
         if 0.0 < guess < 1.0:
             s = low + width * guess
@@ -183,6 +195,7 @@ def shot_tables(on: np.ndarray, off: np.ndarray, theta_on: float, theta_off: flo
     weights = np.zeros((blocks, 2, BLOCK))
     for polarity, (nominal, theta) in enumerate(((theta_on, on), (theta_off, off))):
         padded = np.zeros(blocks * BLOCK)
+        # Shot noise is in inverse proportion to the threshold; 0 beyond the last pixel.
         padded[: len(on)] = nominal / theta.astype(np.float64)
         weights[:, polarity] = padded.reshape(blocks, BLOCK)
     return np.cumsum(weights.reshape(blocks, 2 * BLOCK), axis=1).astype(np.float32)
@@ -192,13 +205,15 @@ def shot_tables(on: np.ndarray, off: np.ndarray, theta_on: float, theta_off: flo
 @register_jitable
 def next_noise(noise: float, k: float, size: float, normal: float) -> float:
     """Photoreceptor noise k time constants later: the exact step of its stationary process. float32."""
-    a, _ = decay(k)  # Ornstein-Uhlenbeck: n(k) = n e^-k + size sqrt(1 - e^-2k) N(0, 1), of any step
+    # Ornstein-Uhlenbeck: n(k) = n e^-k + size sqrt(1 - e^-2k) N(0, 1), of any step.
+    a, _ = decay(k)
     return noise * a + size * np.sqrt(_ONE - a * a) * normal
 
 
 @register_jitable
 def noise_place(k: float) -> tuple[int, float]:
     """Place in the table of sizes: (entry below, fraction)."""
+    # The place is clamped to the table.
     place = (log_f32(np.maximum(k, _SMALLEST_K)) - _TABLE_LOW) * _TABLE_PER
     below = np.int32(np.minimum(np.maximum(place, _ZERO), _TABLE_LAST))
     return below, _F(np.minimum(place, _TABLE_LAST) - _F(below))
@@ -211,6 +226,7 @@ def noise_threshold(config: V2eConfig) -> float:
 
 # --- what is drawn once ------------------------------------------------------------------------------------
 def draw_start_noise(intensity: np.ndarray, config: V2eConfig, seed: np.uint64) -> np.ndarray:
+    # The low-pass's corner f_c (I + 20)/275 Hz.
     """Photoreceptor noise at the first frame, already stationary, (H*W,) float32 ln units."""
     corner = config.cutoff_hz * (intensity.astype(np.float64) + 20.0) / 275.0
     _, normal = normal2(seed, np.arange(len(intensity), dtype=np.uint64), np.uint64(Stream.START), np.uint64(1))
@@ -250,31 +266,41 @@ def draw_start(
     pixels = np.arange(len(on), dtype=np.uint64)
     offset, dead_ns = np.zeros(len(on), np.float32), np.zeros(len(on) if config.refractory_us else 0, np.int64)
     age_ns, by_noise = np.zeros(len(on), np.int64), np.zeros(len(on), np.float32)
+    # One pair of uniforms per pixel: the first is the age of the interval or the place on the ladder.
     first, second = uniform2(seed, pixels, np.uint64(Stream.START), np.uint64(0))
     if config.start == "balanced":
-        place = first - second  # triangular: where a Brownian motion that is put back to 0 at -1 and 1 is found
+        # Triangular: where a Brownian motion that is put back to 0 at -1 and 1 is found.
+        place = first - second
         offset = (-place * np.where(place > 0, on, off)).astype(np.float32)
     if config.start != "stationary" or not (leak.size or config.shot_noise_rate_hz):
         return Start(offset, leak, dead_ns, age_ns, by_noise)
     nominal_off = config.contrast_threshold_off or config.contrast_threshold
     shot = np.zeros(len(on))
     if config.shot_noise_rate_hz and not config.photoreceptor_noise:
+        # Shot noise per second of both polarities: half the rate each, less in bright light, more at
+        # low thresholds.
         level = np.minimum((intensity.astype(np.float64) + 20.0) / 275.0, 1.0)
         each = config.contrast_threshold / on.astype(np.float64) + nominal_off / off.astype(np.float64)
         shot = 0.5 * config.shot_noise_rate_hz * (1.0 - 0.75 * level) * each
     moving = np.flatnonzero(leak > 0) if leak.size else np.empty(0, np.int64)
-    between = np.where(shot > 0, 1.0 / np.maximum(shot, 1e-300), np.inf)  # mean time from one event to the next
+    # between: mean time from one event to the next, s.
+    between = np.where(shot > 0, 1.0 / np.maximum(shot, 1e-300), np.inf)
     leak = leak.copy()
     if moving.size:
         rate, mean = shot[moving], on[moving].astype(np.float64) / leak[moving]
+        # The mean time to the next event, of leak after T or shot noise before it: (1 - e^-RT)/R = T (1
+        # - e^-q)/q, q = R T.
         weight = lambda time: time * _one_minus_exp_over(rate * time)
-        between[moving] = weight(mean)  # exact without jitter, and to its square with
+        # This is exact without jitter; with jitter the error is of second order in it.
+        between[moving] = weight(mean)
         time = mean * _length_of_interval(config.leak_jitter, rate * mean, pixels[moving], seed)
         age = _age(first[moving], rate * time) * time
+        # The signal has drifted from the reference by the share of the threshold that has leaked.
         offset[moving] = -(age / time * on[moving]).astype(np.float32)
         leak[moving] = (on[moving] / time).astype(np.float32)
         age_ns[moving] = np.minimum(age * 1e9, 2.0**61).astype(np.int64)
     if dead_ns.size:
+        # The chance to be in the dead time is its share of the whole cycle.
         u, v = uniform2(seed, pixels, np.uint64(Stream.START), np.uint64(_TURNS))
         dead_s = config.refractory_us * 1e-6
         dead_ns = np.where(u * (dead_s + between) < dead_s, np.ceil(v * dead_s * 1e9), 0.0).astype(np.int64)
@@ -284,6 +310,7 @@ def draw_start(
         often[moving] = mean * config.shot_noise_rate_hz > 1.0 if moving.size else False
         corner = config.cutoff_hz * (intensity.astype(np.float64) + 20.0) / 275.0
         place = start_places(config.shot_noise_rate_hz, corner, first) * np.where(first > 0.5, on, off)
+        # Rungs, one threshold apart, that the noise has passed upwards and downwards.
         up, down = np.floor((noise - place) / on), np.floor((place - noise) / off)
         rung = place + np.maximum(up, 0.0) * on - np.maximum(down, 0.0) * off
         by_noise = np.where(often, rung - noise, 0.0).astype(np.float32)
@@ -293,31 +320,35 @@ def draw_start(
 
 
 def _one_minus_exp_over(q: np.ndarray) -> np.ndarray:
-    """(1 - e^-q)/q for q >= 0."""
+    """Return (1 - e^-q)/q for q >= 0."""
     small = q < 1e-4
     safe = np.where(small, 1.0, q)
     return np.where(small, 1.0 - q * (0.5 - q / 6.0), (1.0 - exp_f64(-safe)) / safe)
 
 
 def _age(uniform: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Of density e^-qa in (0, 1), by the inverse of its cumulative law."""
+    """Draw an age a in (0, 1) of density e^-qa, by inverting its cumulative distribution."""
     small = q < 1e-6
     safe = np.where(small, 1.0, q)
     return np.where(small, uniform, np.minimum(-log_f64(1.0 - uniform * (1.0 - exp_f64(-safe))) / safe, 1.0))
 
 
 def _length_of_interval(jitter: float, q: np.ndarray, pixels: np.ndarray, seed: np.uint64) -> np.ndarray:
-    """Leak intervals under way at one moment, in mean intervals; q: shot noise events in a mean one."""
+    """Draw the lengths of the leak intervals under way at one moment, in mean intervals. q : shot noise events per
+    mean interval."""
     length = np.ones(len(q))
     if jitter == 0:
         return length
+    # Rejection sampling: ``most`` is the largest value of the weight, at the longest interval.
     longest = 1.0 + jitter * _MOST_ROUGH
     most = longest * _one_minus_exp_over(q * longest)
     wanted = np.arange(len(q))
-    for turn in range(_TURNS):  # by rejection: two of three are kept at the largest jitter
+    # Rejection sampling keeps two of three at the largest jitter.
+    for turn in range(_TURNS):
         if not wanted.size:
             break
         index = np.uint64(_JITTER_TURN + turn)
+        # The normals' draw numbers follow those of the uniforms.
         normal = rough_normal(seed, pixels[wanted], np.uint64(Stream.START), np.uint64(index + _U2 * np.uint64(_TURNS)))
         tried = np.maximum(0.1, 1.0 + jitter * normal)
         u, _ = uniform2(seed, pixels[wanted], np.uint64(Stream.START), index)
@@ -347,10 +378,12 @@ def draw_leaks(height: int, width: int, config: V2eConfig, on: np.ndarray, seed:
     pixels = pixel_counters(height, width)
     spread, _ = normal2(seed, pixels, np.uint64(Stream.LEAK), np.uint64(0))
     # Log-normal tails of several decades ask for more events than there are microseconds: that is noise without end.
+    # 10^(cov N) as a power of e.
     rate = np.minimum(config.leak_rate_hz * exp_f64(np.log(10.0) * config.leak_cov_decades * spread), MAX_LEAK_HZ)
     if config.hot_pixel_fraction:
         u, v = uniform2(seed, pixels, np.uint64(Stream.HOT), np.uint64(0))
         rate = np.where(u < config.hot_pixel_fraction, -log_f64(v) * config.hot_pixel_rate_hz, rate)
     leak = (rate * on).astype(np.float32)
-    leak[leak < 1e-20] = 0.0  # an event in 10^11 years, and none that a product makes subnormal
+    # Less than an event in 10^11 years becomes 0, so that no product is subnormal.
+    leak[leak < 1e-20] = 0.0
     return leak

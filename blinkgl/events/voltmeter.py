@@ -46,11 +46,15 @@ from blinkgl.events.threads import take_part
 from blinkgl.types.events import Events
 
 _F = np.float32
+# Typed constants: a float literal is float64 to numba and would widen the float32 loops.
 _ZERO, _HALF, _ONE, _I0 = _F(0.0), _F(0.5), _F(1.0), np.int32(0)
 V_ONE = 2**29
+# V_ONE is one threshold; a drift beyond 2.25 thresholds is cut.
 _V_SCALE, _V_UNIT, _DRIFT_LIMIT = _F(V_ONE), _F(1.0 / V_ONE), _F(2.25)
 _DIFFUSION, _START = np.uint64(Stream.DIFFUSION), np.uint64(Stream.START)
+# Draw numbers are step * 2^20 + draw within the step.
 _U1000, _U20, _U1, _U2, _MAX_BOUND = np.uint64(1000), np.uint64(20), np.uint64(1), np.uint64(2), np.float32(1e7)
+# Standard deviations up to which a threshold counts as in reach, see the module.
 _FAR_64 = 6.5
 _FAR_SQUARED = np.float32(6.5**2)
 MOST_STEPS = np.float32(2.0**16)
@@ -71,7 +75,8 @@ def drift_and_noise(
 ) -> tuple[float, float]:
     """(mu dt, sigma sqrt(dt)) of an interval, elementwise; k4_dt = k4 dt, root_dt = sqrt(dt), dt in us."""
     mean = _HALF * (before + now)
-    gain = _ONE / (mean + k2)  # of the logarithm
+    # gain: slope of the logarithm.
+    gain = _ONE / (mean + k2)
     return k1 * (now - before) * gain + k4_dt + k5_dt * mean, (k3 * np.sqrt(mean) * gain + k6) * root_dt
 
 
@@ -88,9 +93,13 @@ def near_threshold(v: float, v_end: float, variance: float, here: float) -> bool
 
     v, v_end : mean voltage at both ends, int32, 2^-29.   variance : unspent at the end, float32.   here : of it, this
     interval's."""
+    # The mean path is straight, so its extremes are at its ends.
     high, low = select(v > v_end, v, v_end), select(v > v_end, v_end, v)
     above, below = _ONE - _F(high) * _V_UNIT, _ONE + _F(low) * _V_UNIT
-    room = select(above < below, above, below)  # negative where the mean path crosses
+    # room is negative where the mean path crosses a threshold.
+    room = select(above < below, above, below)
+    # room |room| <= 6.5^2 variance is room <= 6.5 sigma without a root, and holds for negative room as
+    # well.
     return (room * abs(room) <= _FAR_SQUARED * variance) | (variance > MOST_STEPS * here)
 
 
@@ -119,10 +128,13 @@ def hitting_time(distance: float, mu: float, sigma: float, normal: float, unifor
     speed = abs(mu)
     g = normal * normal * sigma * sigma / (2.0 * distance)
     denominator = speed + g + np.sqrt(g * (g + 2.0 * speed))
+    # Neither drift nor noise towards the threshold: it is never met.
     if denominator == 0.0:
         return np.inf
     root = distance / denominator
-    ratio = root * speed / distance  # root / mean
+    # ratio: root divided by the mean.
+    ratio = root * speed / distance
+    # Michael, Schucany, Haas: the smaller root with probability mean/(mean + root), else mean^2/root.
     if uniform * (1.0 + ratio) <= 1.0:
         return root
     return distance / (speed * ratio)
@@ -136,6 +148,7 @@ def reach_of_part(v: float, mu: float, sigma: float, left: float) -> tuple[float
     part, rate = left, _FAR_64 * _FAR_64 * sigma * sigma
     while True:
         drift, squared = mu * part, rate * part
+        # As in near_threshold, for a part of the interval.
         above, below = 1.0 - max(v, v + drift), 1.0 + min(v, v + drift)  # negative where the mean path crosses
         up, down = above * abs(above) <= squared, below * abs(below) <= squared
         if not (up and down):
@@ -148,6 +161,7 @@ def reached(distance: float, toward: float, sigma: float) -> float:
     """Probability that a threshold is ever met; ``toward`` is the drift towards it."""
     if toward >= 0.0:
         return 1.0
+    # Of a motion that drifts away the chance to ever arrive is exp(-2 |mu| a / sigma^2).
     return exp_f64(2.0 * toward * distance / (sigma * sigma)) if sigma > 0.0 else 0.0
 
 
@@ -157,6 +171,7 @@ def crosses(before: float, after: float, noise: float) -> float:
     distances there, ``noise`` is sigma sqrt(dt)."""
     if after <= 0.0:
         return 1.0
+    # Reflection principle: exp(-2 a b / (sigma^2 dt)).
     variance = noise * noise
     return exp_f64(-2.0 * before * after / variance) if variance > 0.0 else 0.0
 
@@ -171,10 +186,12 @@ def start_voltage(intensity: np.ndarray, config: VoltmeterConfig, seed: np.uint6
     """
     c = config
     level = intensity.astype(np.float64)
+    # Drift and noise of a scene that does not change.
     mu = c.k4 + c.k5 * level
     sigma = c.k3 * np.sqrt(level) / (level + c.k2) + c.k6
     with np.errstate(divide="ignore", invalid="ignore"):
-        r = np.minimum(2.0 * np.abs(mu) / sigma**2, 1e12)  # infinite without noise, NaN where nothing moves
+        # r is infinite without noise and NaN without drift and noise.
+        r = np.minimum(2.0 * np.abs(mu) / sigma**2, 1e12)
         # Mean time between events, for the share of the dead time: tanh(r/2)/mu, 1/sigma^2 without drift.
         between = np.where(r > 1e-9, one_minus_exp(r) / (2.0 - one_minus_exp(r)) / np.abs(mu), 1 / sigma**2)
     v = np.zeros(level.size)
@@ -188,14 +205,17 @@ def start_voltage(intensity: np.ndarray, config: VoltmeterConfig, seed: np.uint6
         flat = rate < 1e-9
         rate = np.where(flat, 1.0, rate)
         shape = one_minus_exp(rate * (1.0 - np.abs(place))) / one_minus_exp(rate)
+        # Below 0 the density is that of the mirrored place times e^{rv}.
         density = np.where(place > 0, shape, shape * exp_f64(rate * np.minimum(place, 0.0)))
         kept = b < np.where(flat, 1.0 - np.abs(place), density)
         v[wanted[kept]] = place[kept]
         wanted = wanted[~kept]
+    # For r < 0 the mirror image.
     v = np.where(mu < 0, -v, v)
     left = np.zeros(level.size)
     if c.refractory_us:
         a, b = uniform2(seed, np.arange(level.size, dtype=np.uint64), _START, np.uint64(1000))
+        # The chance to be in the dead time is its share of the whole cycle.
         dead = np.isfinite(r) & (a * (c.refractory_us + between) < c.refractory_us)
         left[dead] = b[dead] * c.refractory_us
     return (np.clip(v, -NEAREST, NEAREST) * V_ONE).astype(np.int32), left
@@ -208,6 +228,7 @@ def start_by_leak(v: np.ndarray, intensity: np.ndarray, config: VoltmeterConfig)
     mu = config.k4 + config.k5 * level
     sigma = config.k3 * np.sqrt(level) / (level + config.k2) + config.k6
     with np.errstate(divide="ignore", invalid="ignore"):
+        # tanh(r/2) = (1 - e^-r)/(1 + e^-r).
         e = exp_f64(-np.minimum(2.0 * np.abs(mu) / sigma**2, 700.0))
     share = np.where(mu == 0, 0.0, (1.0 - e) / (1.0 + e))
     held = np.where(np.abs(v) < V_ONE, v / V_ONE, 0.0)
@@ -247,9 +268,10 @@ class Interval(NamedTuple):
 
 @numba.njit(**JIT)
 def _sense_block(before, now, v, unspent, interval, v_end, unspent_end, flags):
-    """Mean and variance of V at the end into ``v_end`` and ``unspent_end``, flags of pixels to look at; returns the
-    largest mean number of events."""
+    """Write mean and variance of V at the end to ``v_end`` and ``unspent_end``, and flag the pixels to look at.
+    Return the largest mean number of events."""
     dt_us = interval.dt_ns * 1e-3
+    # Once per block and in float32; dt_us multiplies what is a rate.
     k1, k2, k3, k6 = _F(interval.k1), _F(interval.k2), _F(interval.k3), _F(interval.k6)
     k4_dt, k5_dt, root_dt = _F(interval.k4 * dt_us), _F(interval.k5 * dt_us), _F(np.sqrt(dt_us))
     most = _I0
@@ -264,13 +286,14 @@ def _sense_block(before, now, v, unspent, interval, v_end, unspent_end, flags):
         # Mean number of events between thresholds at +-1: |mu| dt of the drift alone, sigma^2 dt of the diffusion
         # alone.
         mean_events = _F(abs(drift) + here)
-        most = max(most, mean_events.view(np.int32))  # floats >= 0 are ordered as their bits; this loop vectorises
+        # Floats >= 0 are ordered as their bits; this loop vectorises.
+        most = max(most, mean_events.view(np.int32))
     return np.int32(most).view(np.float32)
 
 
 @numba.njit(**JIT)
 def _share_block(before, now, by_light, by_leak, interval, light_end, leak_end):
-    """What light and leak will have moved V by at the interval's end, if nothing fires."""
+    """Compute how far light and leak have moved V by the interval's end if nothing fires."""
     dt_us = interval.dt_ns * 1e-3
     k1, k2, k4_dt, k5_dt = _F(interval.k1), _F(interval.k2), _F(interval.k4 * dt_us), _F(interval.k5 * dt_us)
     for i in range(now.size):
@@ -292,17 +315,21 @@ def rates(before: float, after: float, dt_us: float, v: Interval) -> tuple[float
 def cause_at(side: int, since_us: float, light: float, leak: float, mu: float, leak_rate: float) -> int:
     """Of an event at the threshold ``side`` (1, -1), ``since_us`` after V's parts were ``light`` and ``leak``."""
     by_light, by_leak = light + (mu - leak_rate) * since_us, leak + leak_rate * since_us
+    # Light, leak, and as noise the rest of the way to the threshold.
     return cause_of(side * by_light, side * by_leak, 1.0 - side * (by_light + by_leak))
 
 
 @numba.njit(**JIT)
 def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_end, p, v, cap, packed, begin):
-    """Events of the listed pixels of one block into ``packed[begin:]``, in raster order; moves their voltages.
+    """Write the events of the listed pixels of one block to ``packed[begin:]``, in raster order, and move their
+    voltages.
 
     Returns (end of the events, events cut)."""
     out, cut = begin, 0
     dt_us = v.dt_ns * 1e-3
     start_ns = v.t0_ns - 1000 * v.base_us
+    # The listed pixels are in raster order: the row is counted along. ``row_end``: first pixel behind
+    # row y.
     y = first // v.width
     row_end = (y + 1) * v.width
     for j in range(count):
@@ -310,18 +337,22 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
         while i >= row_end:
             y += 1
             row_end += v.width
+        # The packed word (packing.py) without time and polarity.
         pixel = (y << 17) | ((i - row_end + v.width) << 1)
         mu, leak_rate, sigma = rates(np.float64(p.intensity[i]), np.float64(now[i - first]), dt_us, v)
         voltage, variance = p.v[i] / V_ONE, np.float64(p.unspent[i])
         t_us = 0.0
         if p.release.size and p.release[i] != NEVER_NS:
+            # Dead to the interval's end: nothing fires, and V stays the mark.
             if p.release[i] > v.t0_ns + v.dt_ns:
                 v_end[i - first], unspent_end[i - first] = IN_DEAD_TIME, _ZERO
                 if p.by_light.size:
                     light_end[i - first] = leak_end[i - first] = _ZERO
                 continue
+            # Released within the interval: V is known to be 0 at that time.
             t_us, voltage, variance = max(p.release[i] - v.t0_ns, 0) * 1e-3, 0.0, 0.0
             p.release[i] = NEVER_NS
+        # What light and leak have moved V by when it was last known, and when that was.
         since_us, light, leak = t_us, 0.0, 0.0
         if p.by_light.size:
             light, leak = np.float64(p.by_light[i]), np.float64(p.by_leak[i])
@@ -333,12 +364,15 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
         past, normal, uniform = normal2_and_uniform(v.seed, np.uint64(i), _DIFFUSION, draw)
         unused = True
         if variance > 0.0:
+            # Spends the variance: V at the interval's start is drawn around its mean.
             voltage = max(min(voltage + np.sqrt(variance) * past, NEAREST), -NEAREST)
             variance = 0.0
         # One turn per part of the interval, at most one event in each, until no threshold is in reach.
         while t_us < dt_us:
             left_us = dt_us - t_us
             part_us, side = reach_of_part(voltage, mu, sigma, left_us)
+            # Neither threshold is in reach of what is left: nothing is drawn, the variance stays
+            # unspent.
             if side == 0 and part_us == left_us:
                 voltage += mu * left_us
                 variance = sigma * sigma * left_us
@@ -348,6 +382,8 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
                 _, normal, uniform = normal2_and_uniform(v.seed, np.uint64(i), _DIFFUSION, draw)
             unused = False
             distance, toward, fires = 1.0 - side * voltage, side * mu, False
+            # One uniform decides whether the threshold is ever met and, divided by the chance, which
+            # root the time is.
             chance = reached(distance, toward, sigma) if side else 0.0
             if uniform < chance:
                 which = uniform if chance == 1.0 else uniform / chance
@@ -357,6 +393,7 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
                 t_us += after_us
                 event_ns = min(np.int64(t_us * 1e3), v.dt_ns)
                 voltage = 0.0
+                # An event moves V back to 0, and what is left of the interval goes on from there.
                 if emitted == cap or draw >= last:  # too many to draw them all: count what is to be expected
                     cut += 1 + np.int64((dt_us - t_us) * max(abs(mu), sigma * sigma))
                     break
@@ -367,6 +404,7 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
                 out += 1
                 emitted += 1
                 if p.release.size:
+                    # Dead beyond the interval's end, or V starts anew from 0 within it.
                     release_ns = event_ns + v.refractory_ns
                     if release_ns > v.dt_ns:
                         p.release[i] = v.t0_ns + release_ns
@@ -375,6 +413,8 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
                     t_us = release_ns * 1e-3
                 since_us, light, leak = t_us, 0.0, 0.0
             else:
+                # Not met in this part: V at its end, drawn until it fits that. A Brownian bridge says
+                # how likely it was not met.
                 noise, stop = sigma * np.sqrt(part_us), draw + _TRIES
                 while True:
                     draw += _U1
@@ -396,8 +436,9 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
 
 @numba.njit(**JIT)
 def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p, v):
-    """Band kernel, see :meth:`Emulator._run`."""
+    """Process the blocks of a band, see :meth:`Emulator._run`."""
     cut, pixels = 0, p.v.size
+    # Scratch memory of one block. compact_flags writes eight numbers at a time.
     flags, scratch, active = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64), np.empty(BLOCK + 8, np.int32)
     now, v_end, unspent_end = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32), np.empty(BLOCK, np.float32)
     shares = BLOCK if p.by_light.size else 0
@@ -407,6 +448,7 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
         e = min(s + BLOCK, pixels)
         n = e - s
         if n < BLOCK:
+            # compact_flags reads whole words of eight flags.
             flags[:] = 0
         if codes.size:
             lookup_block(codes[s:e], table, now[:n])
@@ -418,16 +460,20 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
         most = np.float64(min(most, _MAX_BOUND))
         count = compact_flags(flags, scratch, s, active)
         if count:
-            # Far beyond what chance adds to the mean.
+            # The cap is far above what chance adds to the mean.
             cap = min(np.int64(2 * most + 8 * np.sqrt(most)) + 8, v.bound_per_pixel)
+            # Every block has its share of max_events_per_step.
             if count * cap > share:
                 cap = max(1, share // count)
+            # No room for the worst case; nothing of this block has been touched: the caller makes room
+            # and comes back to it.
             if filled + count * cap > packed.size:
                 return block, filled, cut
             filled, cut_here = _emit_block(
                 active, count, s, now, v_end, unspent_end, light_end, leak_end, p, v, cap, packed, filled
             )
             cut += cut_here
+        # The copies come last, because p holds the previous frame until here.
         copy_block(now[:n], p.intensity[s:e])
         copy_block(v_end[:n], p.v[s:e])
         copy_block(unspent_end[:n], p.unspent[s:e])
@@ -439,6 +485,8 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
 
 @numba.njit(**JIT)
 def _bands(taken, start, edges, progress, share, packed, frame, codes, table, p, v):
+    # A row of ``progress`` is a band: next block, events written, events cut. A thread takes bands
+    # until none is left.
     b = take_part(taken, start)
     while b >= 0:
         block, filled, cut = _band(
@@ -478,6 +526,7 @@ class DvsVoltmeter(Emulator):
         super().__init__(height, width, seed, reconstruction)
         self.config = config = config or VoltmeterConfig()
         pixels = self.height * self.width
+        # Arrays of features that are off have size 0, which the kernels test.
         self._intensity, self._v = np.zeros(pixels, np.float32), np.zeros(pixels, np.int32)
         self._unspent = np.zeros(pixels, np.float32)
         self._by_light, self._by_leak = (np.zeros(pixels if config.causes else 0, np.float32) for _ in range(2))
@@ -503,6 +552,8 @@ class DvsVoltmeter(Emulator):
     def _advance(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
         c, dt_ns, base_us = self.config, t_ns - self.t_ns, self.t_ns // 1000
         pixels = Pixels(self._intensity, self._v, self._unspent, self._release, self._by_light, self._by_leak)
+        # In the order of the fields of Interval. The last bound: at most one event per dead time, and
+        # one at either end.
         interval = Interval(
             self.t_ns,
             dt_ns,

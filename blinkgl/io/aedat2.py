@@ -33,12 +33,16 @@ SIZES = {
     "DAVIS640": (480, 640),
 }
 """(height, width) of chips; their names go on with letters that do not matter here."""
+# A header beyond these sizes, in bytes, is damage.
 _MAX_LINE, _MAX_HEADER = 1 << 16, 1 << 26
+# Big-endian records of 8 bytes, see the module.
 _RECORD = np.dtype([("address", ">u4"), ("t", ">u4")])
+# Values of an IMU sample: three accelerations, the temperature, three rates.
 _VALUES = 7
 _FULL_SCALE = 1 << 15
 _DEFAULT_RATE, _DEFAULT_ACCELERATION = 1000.0, 8.0
 """Full scales, degrees/s and g, that jAER sets a camera to where its header does not say."""
+# Kinds of records. Kind k has its last time in state[1 + k] of _unwrap.
 _DVS, _PIN, _APS, _IMU = range(4)
 
 
@@ -68,6 +72,7 @@ class Aedat2Reader:
     def chunks(self, records: int = 1 << 17) -> Iterator[Events]:
         """All events, as decoded from ``records`` records at a time."""
         for _, address, t in self._kind(_DVS, records):
+            # The file counts x of events from the right and y from the bottom.
             x = self.width - 1 - (address >> 12 & 0x3FF)
             y = self.height - 1 - (address >> 22 & 0x1FF)
             yield Events(x.astype(np.uint16), y.astype(np.uint16), t, (address >> 11 & 1).astype(np.uint8))
@@ -88,6 +93,7 @@ class Aedat2Reader:
         parts = [(address, t) for _, address, t in self._kind(_IMU)]
         address = np.concatenate([a for a, _ in parts]) if parts else np.empty(0, np.int64)
         t = np.concatenate([t for _, t in parts]) if parts else np.empty(0, np.int64)
+        # The 16-bit values are signed. ``which`` is 0 for the first value of a sample.
         which, value = address >> 28 & 7, (address >> 12 & 0xFFFF).astype(np.uint16).view(np.int16).astype(np.float64)
         # A sample is seven values in their order; a file may begin or end within one.
         begins = np.flatnonzero(which == 0)
@@ -95,6 +101,7 @@ class Aedat2Reader:
         rows = begins[:, None] + np.arange(_VALUES)
         rows = rows[(which[rows] == np.arange(_VALUES)).all(1)]
         values = value[rows] if len(rows) else np.empty((0, _VALUES))
+        # A signed 16-bit value of 2^15 stands for the full scale.
         rate = _scale(self._header, "ImuGyroScale", "GyroFullScaleDegPerSec", _DEFAULT_RATE) / _FULL_SCALE
         pull = _scale(self._header, "ImuAccelScale", "ImuAccelScaleG", _DEFAULT_ACCELERATION) / _FULL_SCALE
         return ImuSamples(
@@ -114,8 +121,10 @@ class Aedat2Reader:
     def _kind(self, kind: int, records: int = 1 << 17) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
         """(index of the first record looked at, addresses, times) of one kind of records; the others are checked, too,
         that what a file holds is refused whatever is asked of it."""
-        state = np.full(5, -1, np.int64)  # last time, and the last time of every kind
+        # state: the last time, then the last time of each kind.
+        state = np.full(5, -1, np.int64)
         for first, raw in self._raw(records):
+            # int64, so that shifts and differences cannot overflow.
             address, stamp = raw["address"].astype(np.int64), raw["t"].astype(np.int64)
             kinds = _kinds(address)
             t = np.empty(len(raw), np.int64)
@@ -208,7 +217,9 @@ def _scale(header: str, key: str, prefix: str, usual: float) -> float:
 
 
 def _kinds(address: np.ndarray) -> np.ndarray:
-    """_DVS, _PIN, _APS or _IMU of every address (int64); frame samples of the sub-type that nobody has are _PIN."""
+    # Bits 11 and 10 tell the kinds of records with and without bit 31 apart.
+    """Return _DVS, _PIN, _APS or _IMU for every address (int64); frame samples of the sub-type that nobody has are
+    _PIN."""
     low = address >> 10 & 3
     return np.where(
         address >> 31 == 0, np.where(low & 1, _PIN, _DVS), np.where(low == 3, _IMU, np.where(low == 2, _PIN, _APS))
@@ -217,20 +228,23 @@ def _kinds(address: np.ndarray) -> np.ndarray:
 
 @numba.njit(cache=True, nogil=True)
 def _unwrap(address, kinds, stamp, state, height, width, t):
-    """Fills times, int64 µs; returns (index of the first bad record, or -1; 1: outside the sensor, 2: backwards).
+    """Fill times, int64 µs, and return (index of the first bad record, or -1; 1: outside the sensor, 2: backwards).
 
     Records of one kind keep the order of time; of different kinds they may be out of order by less than half of what 32
     bits count."""
     for i in range(len(address)):
         kind = kinds[i]
+        # Only events and frame samples have coordinates.
         if kind == 0 or kind == 2:
             if (address[i] >> 12 & 0x3FF) >= width or (address[i] >> 22 & 0x1FF) >= height:
                 return i, 1
+        # Unwrapping: the difference to the last time modulo 2^32, taken as a signed number.
         if state[0] < 0:
             now = stamp[i]
         else:
             step = (stamp[i] - state[0]) & 0xFFFFFFFF
             now = state[0] + (step if step < 0x80000000 else step - 0x100000000)
+        # Within its own kind a record must not be earlier than the one before.
         if now < state[1 + kind] or now < 0:
             state[0] = state[1 + kind]
             return i, 2
@@ -255,16 +269,19 @@ class _Frames:
         begin = 0
         while begin < len(address):
             begin = _assemble(address, t, begin, self._reset, self._signal, self._times)
-            if begin < len(address):  # a sample of the frame that follows
+            # The next sample belongs to the following frame.
+            if begin < len(address):
                 yield from self.end()
 
     def end(self) -> Iterator[CameraFrame]:
         """The frame so far, where it is one."""
+        # A frame is complete where each pixel that was reset has also been read, in a rectangle.
         read, there = self._signal >= 0, self._reset >= 0
         if read.any() or there.any():
             if read.any() and np.array_equal(read, there) and _rectangular(read):
                 image = np.where(read, np.maximum(self._reset - self._signal, 0), 0).astype(np.uint16)
                 first, last, signal = self._times.tolist()
+                # A global shutter resets all rows before the first is read; a rolling one does not.
                 begin = last if last <= signal else first
                 yield CameraFrame(image[::-1].copy(), begin, max(signal, begin))
             else:
@@ -279,16 +296,19 @@ def _rectangular(mask: np.ndarray) -> bool:
 
 @numba.njit(cache=True, nogil=True)
 def _assemble(address, t, begin, reset, signal, times):
-    """Index of the first sample of the frame after: of a pixel that was read, a reset or another read."""
+    """Return the index of the next frame's first sample: a reset or another read of a pixel that was read."""
     for i in range(begin, len(address)):
+        # Bit fields of a frame sample: x, y, and the 10 bits of the ADC.
         x, y, sample = address[i] >> 12 & 0x3FF, address[i] >> 22 & 0x1FF, address[i] & 0x3FF
         if address[i] >> 10 & 1:
+            # A second read of a pixel belongs to the next frame.
             if signal[y, x] >= 0:
                 return i
             signal[y, x] = sample
             if times[2] < 0:
                 times[2] = t[i]
         else:
+            # So does a reset of a pixel that has been reset or read.
             if reset[y, x] >= 0 or signal[y, x] >= 0:
                 return i
             reset[y, x] = sample

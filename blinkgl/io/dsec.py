@@ -30,6 +30,7 @@ BLOCK = 1 << 17
 """Events per HDF5 chunk and per write."""
 
 _COLUMNS = {"x": np.uint16, "y": np.uint16, "t": np.uint32, "p": np.uint8}
+# Entries of ms_to_idx that are written at once.
 _MS_PIECE = 1 << 20
 _MAX_RELATIVE_US = np.iinfo(np.uint32).max
 
@@ -75,6 +76,7 @@ class DsecEventWriter:
         self.t_end_us: int | None = None  # may be set any time before close
         self._last_t = self.t_offset_us
         self._codec = codec
+        # Entries of ms_to_idx written so far; events written so far; events in the block.
         self._next_ms = 0
         self._written = 0
         self._fill = 0
@@ -90,6 +92,7 @@ class DsecEventWriter:
             }
             self._ms_to_idx = blosc_dataset(self._file, "ms_to_idx", (0,), np.uint64, (1 << 13,), codec)
             self._file.create_dataset("t_offset", data=np.int64(self.t_offset_us), track_times=False)
+            # Compression runs beside the simulation; a full queue makes append wait.
             self._file.attrs["height"], self._file.attrs["width"] = self.height, self.width
         self._queue: queue.Queue | None = None
         if background:
@@ -111,7 +114,9 @@ class DsecEventWriter:
         self.count += len(events)
         start = 0
         while start < len(events):
+            # What fits into the block; a full one goes to the writer.
             stop = min(len(events), start + BLOCK - self._fill)
+            # Relative times fit uint32, which _check has made sure of.
             into = slice(self._fill, self._fill + stop - start)
             for name in (name for name in self._columns if name != "t"):
                 self._block[name][into] = getattr(events, name)[start:stop]
@@ -128,6 +133,7 @@ class DsecEventWriter:
         last event's, so that ``ms_to_idx`` covers windows up to it."""
         if self._closed:
             return
+        # The table covers the whole recording, events or not.
         t_end_us = self.t_end_us if t_end_us is None else t_end_us
         end = max(
             self._last_t + 1 if self.count else self.t_offset_us,
@@ -142,7 +148,9 @@ class DsecEventWriter:
             with output_errors(self.path):
                 # One entry past the last millisecond: a slicer asks for ceil(end).
                 last_ms = -(-(end - self.t_offset_us) // 1000)
-                while self._next_ms <= last_ms:  # an eventless day is 700 MB in one piece; pieces end where chunks do
+                # Entries are written in pieces: an eventless day would be 700 MB at once. Pieces end
+                # where chunks do.
+                while self._next_ms <= last_ms:
                     stop = min((self._next_ms // _MS_PIECE + 1) * _MS_PIECE, last_ms + 1)
                     self._store_ms(np.full(stop - self._next_ms, self._written, np.uint64))
                 self._file.close()
@@ -157,6 +165,7 @@ class DsecEventWriter:
             return
         self._closed = True
         if self._queue is not None and self._thread.is_alive():
+            # An error that is already known stays the one that is raised.
             self._error = self._error or RuntimeError("aborted")  # the thread drops what is queued
             self._queue.put(None)
             self._thread.join()
@@ -203,13 +212,15 @@ class DsecEventWriter:
         if self._queue is not None:
             self._queue.put(block)
         elif block is not None:
+            # Without a thread the caller compresses.
             with output_errors(self.path):
                 self._store(block)
 
     def _run(self) -> None:
         while (block := self._queue.get()) is not None:
             if self._error is not None:
-                continue  # keep draining, so that a blocked producer wakes up and sees the error
+                # Keep draining, so that a blocked producer wakes up and sees the error.
+                continue
             try:
                 with output_errors(self.path):
                     self._store(block)
@@ -296,6 +307,7 @@ class DsecEventReader:
 
         Raises EventDataError as :func:`~blinkgl.io.columns.check_events`; AssetError: damaged,
         or a table that leaves events out."""
+        # Times on the file's own clock; the table is asked for whole milliseconds around them.
         r0, r1 = int(t0_us) - self.t_offset_us, int(t1_us) - self.t_offset_us
         start, stop = self._index(r0 // 1000, 0), self._index(-(-r1 // 1000), self.count)
         if not 0 <= start <= stop <= self.count:
@@ -311,6 +323,7 @@ class DsecEventReader:
     def number(self, t_us: int) -> int:
         """How many events lie before t_us, image clock: the number of the first that does not. Raises as
         :meth:`slice`."""
+        # The event lies within one millisecond, between two entries of the table.
         ms = (int(t_us) - self.t_offset_us) // 1000
         start, stop = self._index(ms, 0), self._index(ms + 1, self.count)
         if not 0 <= start <= stop <= self.count:

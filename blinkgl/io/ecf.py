@@ -35,6 +35,7 @@ MAX_EVENTS = 65535
 """of one chunk: the longest run that can be written."""
 _HEADER = 12
 _FORMS = 3
+# y: 11 bits and 5 of count in a u2; p: 1 bit and 7 of count in a byte.
 _ROWS, _SIGNS = (5, 2), (7, 1)
 """Of runs: bits of the count, and bytes of count and value together."""
 
@@ -44,12 +45,14 @@ def encode(x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray) -> bytes:
     not decreasing. p : 0 or 1. The caller has checked them."""
     x, y, p = (np.ascontiguousarray(c, np.int64) for c in (x, y, p))
     t = np.ascontiguousarray(t, np.int64)
-    times = np.empty(20 * len(t), np.uint8)  # the longest: 16 bytes of a number, then a count
+    # The longest entry is 16 bytes of a number, a count byte and the u2 that follows it.
+    times = np.empty(20 * len(t), np.uint8)
     head = t[:1].astype("<i8").tobytes()
     # evlib 0.13.2 takes a small first time for the chunk's header, unless the fourth byte after it has bit 7.
     # Four times none of a number's bits mean nothing to a decoder, and have it.
     head += b"\xf0" * 4 if int(t[0]) % (1 << 32) < 1 << 18 else b""
     head += times[: _encode_times(t.view(np.uint64), times)].tobytes()
+    # All three forms are made and the shortest is taken.
     wide = _four_in_three(y << 12 | x << 1 | p, 8, "<u4")
     words, runs = np.empty(len(t), np.uint16), np.empty(4 * len(t), np.uint8)
     rows = runs[: _encode_runs(y, *_ROWS, runs)].tobytes()
@@ -65,6 +68,7 @@ def decode(data: bytes, most: int, where: str) -> tuple[np.ndarray, np.ndarray, 
 
     Raises AssetError: truncated, bytes left over, more events than that, a form that ECF does not have, runs that do
     not end with the events."""
+    # events << 2 | form.
     count, form = divmod(int.from_bytes(data[:4], "little"), 4)
     if form >= _FORMS:
         raise AssetError("damaged: an ECF chunk of an unknown form", where=where, value=form, accepted="0 to 2")
@@ -77,6 +81,7 @@ def decode(data: bytes, most: int, where: str) -> tuple[np.ndarray, np.ndarray, 
     t = np.empty(count, np.uint64)
     at = -1
     if len(raw) >= _HEADER:
+        # The first time is a u8 right behind the header's u4.
         start = np.frombuffer(data, "<u8", 1, 4).astype(np.uint64)[0]
         at = _decode_times(raw, _HEADER, start, t)
     if form == 2:
@@ -102,14 +107,16 @@ def decode(data: bytes, most: int, where: str) -> tuple[np.ndarray, np.ndarray, 
 
 
 def _four_in_three(values: np.ndarray, s: int, word: str) -> bytes:
+    # Padded with zeros to a multiple of four.
     v = np.zeros((-(-len(values) // 4), 4), np.int64)
     v.reshape(-1)[: len(values)] = values
+    # Each word has the high part of one value and the low part of the next.
     words = [(v[:, k] >> k * s) << (k + 1) * s | v[:, k + 1] & (1 << (k + 1) * s) - 1 for k in range(3)]
     return np.stack(words, 1).astype(word).tobytes()
 
 
 def _three_to_four(raw: np.ndarray, at: int, s: int, word: str, count: int) -> tuple[np.ndarray, int]:
-    """``count`` values, and where they end; -1 where they do not fit, or ``at`` is -1 already."""
+    """Return ``count`` values and where they end; -1 where they do not fit or ``at`` is -1 already."""
     groups = -(-count // 4)
     end = at + groups * 3 * np.dtype(word).itemsize
     if at < 0 or end > len(raw):
@@ -127,11 +134,13 @@ def _encode_times(t, out):
     """t : (N,) uint64, so that differences of any two int64 fit. Returns bytes written."""
     n, i, now = 0, 0, t[0]
     while i < len(t):
+        # Events of the same us are one byte.
         end = i + 1
         while end < len(t) and t[end] == t[i]:
             end += 1
         later, count = t[i] - now, end - i
         now = t[i]
+        # Larger steps in groups of four bits, the lowest first, each with 15 in the high half.
         if later >= np.uint64(15):
             while later > np.uint64(0):
                 out[n] = np.uint64(0xF0) | (later & np.uint64(15))
@@ -152,6 +161,7 @@ def _put(out, n, number, size):
     return n + size
 
 
+# Little endian.
 @numba.njit(cache=True, nogil=True)
 def _encode_runs(values, bits, size, out):
     """``value << bits | count`` in ``size`` bytes; a count that has no room is all ones there, and follows as u2."""
@@ -171,6 +181,7 @@ def _encode_runs(values, bits, size, out):
 @numba.njit(cache=True, nogil=True)
 def _encode_columns(x, out):
     n, i = 0, 0
+    # Up to five neighbours to the right go into the mask.
     while i < len(x):
         base, mask = x[i], 0
         i += 1
@@ -186,13 +197,14 @@ def _encode_columns(x, out):
 
 @numba.njit(cache=True, nogil=True)
 def _decode_times(raw, at, start, t):
-    """Fills t; returns the byte after the times, -1 where they do not fit."""
+    """Fill t and return the byte after the times, -1 where they do not fit."""
     i, now, step, shift = 0, start, np.uint64(0), np.uint64(0)
     while i < len(t):
         if at >= len(raw):
             return -1
         later, count = raw[at] >> 4, np.int64(raw[at] & 15)
         at += 1
+        # Four more bits of the step; more than 64 are damage.
         if later == 15:
             if shift > np.uint64(60):
                 return -1
@@ -202,6 +214,7 @@ def _decode_times(raw, at, start, t):
         if count == 15:
             count = _number(raw, at, 2)
             at += 2
+        # Runs must end with the events.
         if count < 0 or count > len(t) - i:
             return -1
         now += step + np.uint64(later)
@@ -214,7 +227,7 @@ def _decode_times(raw, at, start, t):
 
 @numba.njit(cache=True, nogil=True)
 def _number(raw, at, size):
-    """Of ``size`` bytes; -1 where there are not so many."""
+    """Return the number in ``size`` bytes, -1 where there are fewer."""
     if at < 0 or at + size > len(raw):
         return -1
     number = 0
@@ -225,7 +238,7 @@ def _number(raw, at, size):
 
 @numba.njit(cache=True, nogil=True)
 def _decode_runs(raw, at, bits, size, values):
-    """Fills ``values`` as of :func:`_encode_runs`; the byte after them, -1 where they do not fit."""
+    """Fill ``values`` from what :func:`_encode_runs` wrote. Return the byte after them, -1 where they do not fit."""
     most, i = (1 << bits) - 1, 0
     while i < len(values):
         head = _number(raw, at, size)

@@ -72,9 +72,12 @@ class EvtWriter:
             events, str(self.path), self._count, height=self.height, width=self.width, after=int(self._state[0])
         )
         if self.version == "evt2":
+            # At most a TIME_HIGH word before each event.
             words = np.empty(2 * len(t) + 1, np.uint32)
             n = _encode_evt2(events.x, events.y, t, events.p, self._state, not self._count, words)
         else:
+            # An event takes at most TIME_LOW, ADDR_Y and ADDR_X, and a TIME_HIGH for every 4096 us
+            # passed.
             words = np.empty(4 * len(t) + 2 + int((t[-1] >> 12) - (self._state[0] >> 12)), np.uint16)
             n = _encode_evt3(events.x, events.y, t, events.p, self._state, not self._count, words)
         self._count += len(t)
@@ -103,6 +106,7 @@ class EvtReader:
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)
         header, self._start = _read_header(self.path)
+        # Either line of the header names the version.
         version = re.search(r"^% evt (\d+\.?\d*)", header, re.M) or re.search(r"^% format EVT(\d+)", header, re.M)
         if not version:
             raise AssetError("not an EVT file: header without '% evt'", where=str(path))
@@ -122,9 +126,11 @@ class EvtReader:
         # events without a time.
         state = np.array([-1, 0, 0] if self.version == "evt2" else [-1, 0, 0, 0, 0, 0, 0], np.int64)
         position = self._start
+        # Words decode to at most so many events: a vector of EVT3 holds twelve.
         decode, most = (_decode_evt2, 1) if self.version == "evt2" else (_decode_evt3, 12)
         with open(self.path, "rb") as file:
             file.seek(self._start)
+            # A file that ends within a word is truncated, which is said after its whole words.
             while data := file.read(words * dtype.itemsize):
                 whole = len(data) // dtype.itemsize * dtype.itemsize
                 raw = np.frombuffer(data[:whole], dtype)
@@ -180,7 +186,8 @@ def _read_header(path: Path) -> tuple[str, int]:
                         f"header line {len(lines) + 1} is longer than {_LONGEST_LINE} bytes", where=str(path)
                     )
                 if not line.startswith(b" ") or not line.endswith(b"\n"):
-                    break  # a word that happens to begin with '%'
+                    # The data begins here: this is a word whose first byte happens to be '%'.
+                    break
                 lines.append("%" + line.decode("latin-1").rstrip())
                 if lines[-1] == "% end":
                     start = file.tell()
@@ -193,6 +200,7 @@ def _read_header(path: Path) -> tuple[str, int]:
 @numba.njit(cache=True, nogil=True)
 def _encode_evt2(x, y, t, p, state, first, words):
     n = 0
+    # -1 is no time, so that the first event has its TIME_HIGH.
     high = -1 if first else state[0] >> 6
     for i in range(len(t)):
         if t[i] >> 6 != high:
@@ -215,11 +223,13 @@ def _decode_evt2(words, state, x, y, t, p):
         kind = word >> 28
         if kind == 8:
             new = word & 0xFFFFFFF
+            # The 28-bit counter fell by more than half of its range: it has wrapped.
             if high - new > 1 << 27:
                 wraps += 1
             high = new
         elif kind <= 1:
-            if high < 0:  # before the first TIME_HIGH the time is unknown
+            # Before the first TIME_HIGH the time is unknown.
+            if high < 0:
                 untimed += 1
                 continue
             x[n], y[n], p[n] = (word >> 11) & 0x7FF, word & 0x7FF, kind
@@ -236,12 +246,14 @@ def _decode_evt2(words, state, x, y, t, p):
 def _encode_evt3(x, y, t, p, state, first, words):
     n = 0
     time, row = state
+    # TIME_HIGH 0.
     if first:
         words[0] = 0x8000
         n, time = 1, -1
     for i in range(len(t)):
         if t[i] != time:
             # Every 4096 µs step is written: a reader counts the 24-bit counter's wraps by seeing it fall.
+            # EVT3's time field counts on by itself in the reader; it must not miss a wrap.
             high = max(time, 0) >> 12
             while high < t[i] >> 12:
                 high += 1
@@ -250,6 +262,7 @@ def _encode_evt3(x, y, t, p, state, first, words):
             words[n] = 0x6000 | (t[i] & 0xFFF)
             n += 1
             time = t[i]
+        # ADDR_Y holds for all events until the next.
         if y[i] != row:
             row = y[i]
             words[n] = row
@@ -272,7 +285,8 @@ def _decode_evt3(words, state, x, y, t, p):
         if kind == 0:
             row = word & 0x7FF
         elif kind == 2:
-            if high < 0:  # before the first TIME_HIGH the time is unknown
+            # Before the first TIME_HIGH the time is unknown.
+            if high < 0:
                 untimed += 1
                 continue
             x[n], y[n], p[n] = word & 0x7FF, row, (word >> 11) & 1
@@ -282,6 +296,7 @@ def _decode_evt3(words, state, x, y, t, p):
             base, polarity = word & 0x7FF, (word >> 11) & 1
         elif kind == 4 or kind == 5:
             width = 12 if kind == 4 else 8
+            # Bit k of a vector is the pixel base + k; the base then moves on by the vector's width.
             for k in range(width):
                 if (word >> k) & 1:
                     if base + k > 0x7FF:
@@ -300,6 +315,7 @@ def _decode_evt3(words, state, x, y, t, p):
             low = word & 0xFFF
         elif kind == 8:
             new = word & 0xFFF
+            # The 12-bit counter fell by more than half of its range: it has wrapped.
             if high - new > 1 << 11:
                 wraps += 1
             high = new

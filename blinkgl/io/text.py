@@ -50,6 +50,7 @@ class TextReader:
                         )
                     text = line.decode("utf-8-sig", "replace").strip()
                     if text and text[0] not in "#%":
+                        # Two integers before the first event are the sensor's size.
                         size = re.fullmatch(r"(\d{1,9})[ \t,]+(\d{1,9})", text)
                         if size and self.width is None:
                             self.width, self.height = int(size[1]), int(size[2])
@@ -88,6 +89,7 @@ class TextReader:
             line, rest = self._lines, b""
             while True:
                 data = file.read(size)
+                # At the end of the file the last line may lack its newline.
                 text = rest + data if data else rest + b"\n"
                 cut = text.rfind(b"\n") + 1
                 text, rest = text[:cut], text[cut:]
@@ -100,6 +102,7 @@ class TextReader:
                 capacity = text.count(b"\n")
                 x, y, p = np.empty(capacity, np.uint16), np.empty(capacity, np.uint16), np.empty(capacity, np.uint8)
                 t = np.empty(capacity, np.int64)
+                # The kernel indexes lines from 0 within this piece of text.
                 n, bad, mixed = _parse(buffer, x, y, t, p, unit)
                 if bad >= 0:
                     content = text.split(b"\n", bad + 1)[bad].decode("latin-1")
@@ -164,9 +167,10 @@ class TextWriter:
 
 
 @numba.njit(cache=True, nogil=True)
+# Characters by their codes: 45 "-", 43 "+", 46 ".", 48 to 57 digits, 101 and 69 "e", "E".
 def _number(buffer, i):
-    """(mantissa, decimal exponent, integer?, next index); next index -1: not a number, or
-    more digits than int64 holds."""
+    """Return (mantissa, decimal exponent, integer?, next index); next index -1: not a number, or more digits than
+    int64 holds."""
     mantissa, exponent, digits, integer = np.int64(0), 0, False, True
     negative = buffer[i] == 45
     if buffer[i] == 45 or buffer[i] == 43:
@@ -194,6 +198,7 @@ def _number(buffer, i):
             return mantissa, exponent, integer, -1
         power = 0
         while 48 <= buffer[i] <= 57:
+            # 1000 is beyond anything that fits, and keeps the sum in range.
             power = min(power * 10 + (buffer[i] - 48), 1000)
             i += 1
         exponent += sign * power
@@ -202,10 +207,11 @@ def _number(buffer, i):
 
 @numba.njit(cache=True, nogil=True)
 def _scaled(mantissa, exponent):
-    """mantissa · 10^exponent rounded to the nearest integer, exactly (half away from zero);
-    ok False when it overflows."""
+    """Return mantissa · 10^exponent rounded to the nearest integer, exactly (half away from zero); ok False when it
+    overflows."""
     value = abs(mantissa)
     while exponent > 0 and value != 0:
+        # value * 10 must stay below 2^63.
         if value > 10**17:
             return np.int64(0), False
         value *= 10
@@ -214,13 +220,15 @@ def _scaled(mantissa, exponent):
         divisor = np.int64(1)
         for _ in range(min(-exponent, 18)):
             divisor *= 10
+        # Half away from zero; beyond 18 places nothing is left.
         value = (value + divisor // 2) // divisor if exponent >= -18 else np.int64(0)
     return (value if mantissa >= 0 else -value), True
 
 
 @numba.njit(cache=True, nogil=True)
 def _parse(buffer, x, y, t, p, unit):
-    """Events in whole lines of text. Returns (count, index of the first bad line or -1, bad for its unit of time?).
+    """Parse the events in whole lines of text. Return (count, index of the first bad line or -1, bad for its unit of
+    time?).
 
     unit[0] : of the times so far, -1 not known, 0 integers (µs), 1 decimals (s); kept up to date."""
     n, line, i = 0, 0, 0
@@ -232,7 +240,8 @@ def _parse(buffer, x, y, t, p, unit):
             if c == 32 or c == 9 or c == 44 or c == 13:
                 i += 1
                 continue
-            if (c == 35 or c == 37) and field == 0:  # comment
+            # The rest of a comment line is skipped.
+            if (c == 35 or c == 37) and field == 0:
                 while buffer[i] != 10:
                     i += 1
                 break
@@ -244,10 +253,13 @@ def _parse(buffer, x, y, t, p, unit):
             c = buffer[i]
             if not (c == 32 or c == 9 or c == 44 or c == 13 or c == 10):
                 return n, line, False
+            # Decimal times are seconds: six more places make microseconds.
             values[field], ok = _scaled(mantissa, exponent + (6 if field == 0 and not integer else 0))
             if not ok or (field > 0 and exponent < 0 and values[field] * 10.0**-exponent != mantissa):
-                return n, line, False  # also coordinates between pixels: rectified events are not raw events
-            if field == 0 and (values[0] != 0 or not integer):  # a plain 0 is the same in both
+                # Coordinates between pixels are refused as well: rectified events are not raw events.
+                return n, line, False
+            # A plain 0 is the same time in both units.
+            if field == 0 and (values[0] != 0 or not integer):
                 kind = 0 if integer else 1
                 if unit[0] >= 0 and unit[0] != kind:
                     return n, line, True
@@ -255,6 +267,7 @@ def _parse(buffer, x, y, t, p, unit):
             field += 1
         i += 1
         if field == 4:
+            # -1 and 0 are both OFF.
             if not (0 <= values[1] <= 65535 and 0 <= values[2] <= 65535 and -1 <= values[3] <= 1):
                 return n, line, False
             t[n], x[n], y[n], p[n] = values[0], values[1], values[2], max(values[3], 0)
@@ -267,7 +280,8 @@ def _parse(buffer, x, y, t, p, unit):
 
 @numba.njit(cache=True, nogil=True)
 def _put(value, digits, buffer, n):
-    """Decimal digits of ``value`` at ``buffer[n:]``, at least ``digits`` of them; returns the new end."""
+    """Write the decimal digits of ``value``, at least ``digits`` of them, to ``buffer[n:]`` and return the new end."""
+    # The number of digits first, then the digits from the last one on.
     length, rest = 1, value // 10
     while rest > 0:
         length, rest = length + 1, rest // 10

@@ -40,14 +40,18 @@ def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -
         amodal = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
         if not seen and ((amodal[2:] < whole[:2]) | (amodal[:2] > whole[2:])).any():
             continue
+        # Pixels that it would cover if nothing were in front of it.
         mask = np.zeros(ids.shape, np.bool_)
         cover(px, drawn, mask)
         pixels = max(int(np.count_nonzero(mask)), seen)
-        if not pixels:  # between the centres of pixels
+        # An object between the pixel centres has no box.
+        if not pixels:
             continue
         low, high = vertices.min(axis=0), vertices.max(axis=0)
+        # The box's own axes are the object's; its origin is the box's middle.
         middle = np.eye(4)
         middle[:3, 3] = 0.5 * (low + high)
+        # What of the box is in the picture, and its area against the whole.
         inside = np.clip(amodal.reshape(2, 2), whole[:2], whole[2:])
         area = np.prod(amodal[2:] - amodal[:2])
         rows.append(
@@ -104,6 +108,7 @@ def _projected(camera: CameraModel, points: np.ndarray, faces: np.ndarray) -> tu
 def before(points: np.ndarray, faces: np.ndarray, near: float) -> tuple[np.ndarray, np.ndarray]:
     """Triangles of (V, 3) points cut at Z = near: points with those of the cuts behind them, and faces of what is
     farther."""
+    # Corners that are far enough away, and how many of each triangle.
     there = points[:, 2] >= near
     count = there[faces].sum(axis=1)
     kept, extra = [faces[count == 3]], [points]
@@ -117,6 +122,7 @@ def before(points: np.ndarray, faces: np.ndarray, near: float) -> tuple[np.ndarr
         a, b, c = (some[np.arange(len(some)), (alone + k) % 3] for k in range(3))
         cuts = []
         for other in (b, c):
+            # Where the two sides that cross the plane meet it; exactly at near, whatever the rounding.
             share = (near - points[a, 2]) / (points[other, 2] - points[a, 2])
             cut = points[a] + share[:, None] * (points[other] - points[a])
             cut[:, 2] = near
@@ -124,6 +130,7 @@ def before(points: np.ndarray, faces: np.ndarray, near: float) -> tuple[np.ndarr
             cuts.append(begin + np.arange(len(some)))
             begin += len(some)
         ab, ac = cuts
+        # One corner inside leaves a triangle, two a quadrilateral, which is two triangles.
         kept += [np.stack([a, ab, ac], 1)] if inside == 1 else [np.stack([ab, b, c], 1), np.stack([ab, c, ac], 1)]
     return np.concatenate(extra), np.concatenate(kept)
 
@@ -141,11 +148,13 @@ def cover(px: np.ndarray, faces: np.ndarray, mask: np.ndarray) -> None:
         ax, ay = px[faces[f, 0]]
         bx, by = px[faces[f, 1]]
         cx, cy = px[faces[f, 2]]
+        # Twice the signed area; clockwise triangles are turned round.
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         if area == 0.0:
             continue
         if area < 0.0:
             bx, by, cx, cy = cx, cy, bx, by
+        # Rows whose centres lie within the triangle's height.
         first = int(max(np.ceil(min(ay, by, cy) - _EDGE), 0.0))
         last = int(min(np.floor(max(ay, by, cy) + _EDGE), height - 1.0))
         if not max(ax, bx, cx) >= -_EDGE or not min(ax, bx, cx) <= width - 1.0 + _EDGE:

@@ -138,6 +138,7 @@ class Canvas:
         self.pass_, self.painter, self.number = pass_, painter, 0
         self.outputs = pass_.outputs
         self.target = self.make_target(width, height)
+        # A format with several components may hold several pictures, such as luminance and rate.
         self.planes: dict[str, tuple[int, int | None]] = {}
         """Name of each picture -> attachment, and component where it is one of several."""
         for i, output in enumerate(self.outputs):
@@ -160,6 +161,7 @@ class Canvas:
 
     def draw(self, shot: Shot) -> Frame:
         """What the pass draws of a moment into :attr:`target`."""
+        # Of a pass that looks at its inputs pixel by pixel only what changed in them can have changed.
         changed = self._changed(shot)
         self._used = dict(shot.inputs) if self.pass_.pointwise else {}
         if changed is None or changed:
@@ -175,6 +177,7 @@ class Canvas:
     def _changed(self, shot: Shot) -> list[Rectangle] | None:
         if not self.pass_.pointwise or not self._used:
             return None
+        # Unknown for one input is unknown for all.
         parts = [frame.changed_since(self._used.get(name)) for name, frame in shot.inputs.items()]
         if any(part is None for part in parts):
             return None
@@ -188,6 +191,7 @@ class Canvas:
 
     def read(self, name: str, out: np.ndarray | None) -> np.ndarray:
         i, component = self._place(name)
+        # Another context may have been made current in this thread since.
         self.painter.gl.resume()
         self.painter.finish()
         started = working_clock()
@@ -205,6 +209,7 @@ class Canvas:
         self.painter.gl.resume()
         number, pictures = self._held.get(i, (0, {}))
         if number != self.number:
+            # Only a picture of the frame right before this one is right outside of what changed.
             stale = frame.changed if number == self.number - 1 and number > 0 else None
             self._held[i] = self.number, self._update(i, pictures, stale)
         seen = self._held[i][1][name or next(iter(self.planes))].view()
@@ -240,6 +245,7 @@ class Canvas:
         started = working_clock()
         planes = {name: component for name, (attachment, component) in self.planes.items() if attachment == i}
         for r in [None] if stale is None else stale:
+            # A picture that is the whole attachment is read straight into the memory held for it.
             if r is None and not self.outputs[i].components and len(planes) == 1:
                 (name,) = planes
                 pictures = {name: self.target.read(i, out=pictures.get(name))}

@@ -50,6 +50,7 @@ class Contour:
     normal, any length, and its product with a point of the face."""
 
     def __init__(self, mesh: Mesh):
+        # + 0.0 makes -0.0 and 0.0 one place.
         _, self.corners, place = np.unique(
             np.ascontiguousarray(mesh.vertices, np.float64) + 0.0, axis=0, return_index=True, return_inverse=True
         )
@@ -66,28 +67,36 @@ class Contour:
         texture."""
         first, second = self.edges[:, 2], self.edges[:, 3]
         bent, torn = second >= 0, second >= 0
+        # Only edges with two faces can be either; both ends have to agree.
         for end in (0, 1):
+            # The vertex of each face that is at this end of the edge.
             one, other = (
                 mesh.faces[face, (self.faces[face] == self.edges[:, end, None]).argmax(axis=1)]
                 for face in (first, second)
             )
             bent &= (mesh.normals[one] * mesh.normals[other]).sum(axis=1) < CREASE
+            # Whole turns of the texture are no seam.
             apart = mesh.uvs[one] - mesh.uvs[other]
             torn &= np.abs(apart - np.round(apart)).max(axis=1) > 1e-5
         return np.where(bent, BENT, np.where(torn, TORN, 0)).astype(np.int8)
 
 
 def _edges(faces: np.ndarray, places: int) -> np.ndarray:
-    """(E, 4) int32, see :class:`Contour`. Where more than two faces meet, those behind the second are borders."""
+    """Return (E, 4) int32, see :class:`Contour`. Where more than two faces meet, the sides of those after the
+    second are borders."""
+    # Every face's three sides, as (from, to) in the face's order.
     count = len(faces)
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
     face = np.tile(np.arange(count), 3)
+    # Sides of no length belong to degenerate triangles.
     there = ends[:, 0] != ends[:, 1]
     ends, face = ends[there], face[there]
+    # One number per unordered pair of places: equal ones are the same edge.
     key = ends.min(axis=1) * places + ends.max(axis=1)
     order = np.argsort(key, kind="stable")
     key, ends, face = key[order], ends[order], face[order]
     first = np.flatnonzero(np.r_[True, key[1:] != key[:-1]]) if len(key) else np.zeros(0, np.int64)
+    # Which one it is of its edge's sides: 0 the first, 1 the second.
     rank = np.arange(len(key)) - np.repeat(first, np.diff(np.r_[first, len(key)]))
     lead = np.flatnonzero(rank != 1)
     second = np.full(len(lead), -1)
@@ -104,6 +113,7 @@ class _Pool:
 
     def __init__(self, contours: list[Contour]):
         sizes = [(len(c.rest), len(c.faces), len(c.edges)) for c in contours]
+        # Running sums, so that numbers count on from contour to contour.
         self.starts = np.concatenate([np.zeros((1, 3), np.int64), np.cumsum(np.reshape(sizes, (-1, 3)), axis=0)])
         self.starts = self.starts.astype(np.int64)
         empty = [(np.empty((0, 3)), np.empty((0, 3), np.int32), np.empty((0, 4)), np.empty((0, 4), np.int32))]
@@ -151,6 +161,7 @@ class Lines:
         bodies = np.array([item.object_index for item in items], np.int64)
         culled = np.array([not item.two_sided for item in items], np.bool_)
         for number, item in zip(numbers, items, strict=True):
+            # The shape of this moment: its planes, too, are those of now.
             if item.mesh.deformer is not None:
                 contour, (place, face, _) = self._contours[number], pool.starts[number]
                 there = slice(face, face + len(contour.faces))
@@ -158,6 +169,7 @@ class Lines:
                     item.mesh, moment.t_ns
                 )[contour.corners]
                 _planes(pool.places, pool.faces[there], pool.planes[there])
+        # Every edge of every item may be a line.
         room = int((pool.starts[numbers + 1, 2] - pool.starts[numbers, 2]).sum())
         if room > len(self._lines):
             self._lines = np.empty((2 * room, LINE))
@@ -188,7 +200,8 @@ class Lines:
 
 @nb.njit(cache=True, nogil=True)
 def _planes(places, faces, out):
-    """Writes (F, 4) float64, see :class:`Contour`."""
+    """Write (F, 4) float64, see :class:`Contour`."""
+    # Normal by the cross product of two sides, of twice the triangle's area; its product with a corner.
     for f in range(len(faces)):
         a, b, c = places[faces[f, 0]], places[faces[f, 1]], places[faces[f, 2]]
         ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
@@ -200,16 +213,19 @@ def _planes(places, faces, out):
 
 @nb.njit(cache=True, nogil=True)
 def _emit(numbers, bodies, culled, T_cam_obj, mvps, starts, places, faces, planes, edges, sharp, width, height, out):
-    """Writes the lines of all items; their number. numbers, bodies, culled : of each item, its contour's place in the
-    pool, its object's, and whether the backs of its faces are not drawn."""
+    """Write the lines of all items and return their number. numbers, bodies, culled : of each item, its contour's
+    place in the pool, its object's, and whether the backs of its faces are not drawn."""
     front = np.empty(len(planes), np.bool_)
-    count = np.int64(0)  # a literal 0 would have _emit_one compiled for it, too
+    # np.int64(0), because a literal 0 would compile _emit_one for a second type.
+    count = np.int64(0)
     for n in range(len(numbers)):
         number, T = numbers[n], T_cam_obj[bodies[n]]
-        x = -(T[0, 3] * T[0, 0] + T[1, 3] * T[1, 0] + T[2, 3] * T[2, 0])  # the camera's place, in the mesh's axes
+        # (x, y, z): the camera's centre in the mesh's axes, -R^T t.
+        x = -(T[0, 3] * T[0, 0] + T[1, 3] * T[1, 0] + T[2, 3] * T[2, 0])
         y = -(T[0, 3] * T[0, 1] + T[1, 3] * T[1, 1] + T[2, 3] * T[2, 1])
         z = -(T[0, 3] * T[0, 2] + T[1, 3] * T[1, 2] + T[2, 3] * T[2, 2])
         for f in range(starts[number, 1], starts[number + 1, 1]):
+            # The camera lies on the outer side of the face's plane.
             front[f] = planes[f, 0] * x + planes[f, 1] * y + planes[f, 2] * z > planes[f, 3]
         mine = edges[starts[number, 2] : starts[number + 1, 2]]
         torn = sharp[starts[number, 2] : starts[number + 1, 2]]
@@ -221,9 +237,10 @@ def _emit(numbers, bodies, culled, T_cam_obj, mvps, starts, places, faces, plane
 
 @nb.njit(cache=True, nogil=True)
 def _emit_one(mvp, places, faces, planes, edges, sharp, front, culled, width, height, out, count):
-    """Writes the lines of one item behind the first ``count``; their number then."""
+    """Append the lines of one item to the first ``count``, and return the new number."""
     ends = np.empty((2, 4))
     for e in range(len(edges)):
+        # Kinds and directions from which faces are seen.
         v0, v1, towards, kind = edges[e, 0], edges[e, 1], front[edges[e, 2]], SILHOUETTE
         if edges[e, 3] >= 0:
             other = front[edges[e, 3]]
@@ -232,17 +249,21 @@ def _emit_one(mvp, places, faces, planes, edges, sharp, front, culled, width, he
                     continue
                 kind = sharp[e]
             elif culled:
-                if not towards:  # as the face that is seen has it: the other way round
+                # The edge follows the order of the face that is seen.
+                if not towards:
                     v0, v1, towards = v1, v0, True
-                for k in range(3):  # hollow: the one face's third corner is before the other
+                # Hollow: the one face's third corner is before the other.
+                for k in range(3):
                     p = places[faces[edges[e, 3], k]]
                     if faces[edges[e, 3], k] != v0 and faces[edges[e, 3], k] != v1:
                         plane = planes[edges[e, 2]]
                         if plane[0] * p[0] + plane[1] * p[1] + plane[2] * p[2] > plane[3]:
                             kind = BACK_AGAIN
         elif culled and not towards:
+            # A border of a surface that is seen from behind and culled.
             continue
-        if towards:  # the surface lies to the left of its line, x to the right and y down
+        # The surface lies to the left of its line, x to the right and y down.
+        if towards:
             v0, v1 = v1, v0
         for k in range(2):
             p = places[v0] if k == 0 else places[v1]
@@ -254,17 +275,20 @@ def _emit_one(mvp, places, faces, planes, edges, sharp, front, culled, width, he
             continue
         if r0 <= 0 or r1 <= 0:
             t = r0 / (r0 - r1)
+            # Where the edge meets the near plane; the end behind it moves there.
             k = 0 if r0 <= 0 else 1
             for r in range(4):
                 ends[k, r] = ends[0, r] + t * (ends[1, r] - ends[0, r])
         if not (ends[0, 3] > 0 and ends[1, 3] > 0):
             continue
+        # NDC to px: both axes from -1 to 1, y down already in the projection.
         ax = (ends[0, 0] / ends[0, 3] + 1) * 0.5 * width
         ay = (ends[0, 1] / ends[0, 3] + 1) * 0.5 * height
         bx = (ends[1, 0] / ends[1, 3] + 1) * 0.5 * width
         by = (ends[1, 1] / ends[1, 3] + 1) * 0.5 * height
         ad, bd = ends[0, 2] / ends[0, 3], ends[1, 2] / ends[1, 3]
         # Inside of the picture and a pixel more: float32 places lines well there.
+        # Liang and Barsky: [low, high] is what of the line is in the rectangle.
         low, high, dx, dy = 0.0, 1.0, bx - ax, by - ay
         for k in range(4):
             d = -dx if k == 0 else dx if k == 1 else -dy if k == 2 else dy
@@ -292,17 +316,19 @@ def _emit_one(mvp, places, faces, planes, edges, sharp, front, culled, width, he
 
 @nb.njit(cache=True, nogil=True)
 def _most(lines):
-    """So many pixels are crossed at most."""
+    """Return an upper bound of the number of pixels crossed."""
     count = 0
     for n in range(len(lines)):
+        # A line enters a new pixel at most once for each column and row that it passes.
         count += 4 + int(abs(lines[n, 3] - lines[n, 0]) + abs(lines[n, 4] - lines[n, 1]))
     return count
 
 
 @nb.njit(cache=True, nogil=True)
 def _around(x, y):
-    """Where a ray from a pixel's centre leaves its square, along the boundary, in half sides: 8 all round."""
-    if x == 0.0 and y == 0.0:  # a line that ends in the centre itself
+    """Return where a ray from a pixel's centre leaves its square, along the boundary, in half sides: 8 all round."""
+    # A line that ends in the pixel's centre has no direction.
+    if x == 0.0 and y == 0.0:
         return 0.0
     if abs(x) >= abs(y):
         return y / x + (0.0 if x > 0.0 else 4.0)
@@ -311,7 +337,7 @@ def _around(x, y):
 
 @nb.njit(cache=True, nogil=True)
 def _cross(lines, width, height, out, places):
-    """The crossings of each line, one after another along it, and each one's pixel, y * width + x; their number.
+    """Write the crossings of each line, in order along it, and each one's pixel, y * width + x. Return their number.
 
     A line is cut where it passes from pixel to pixel. The share is the area between the part and the square's boundary
     as seen from the centre: the triangle that it makes with the centre, less the square's sector between the same
@@ -320,6 +346,7 @@ def _cross(lines, width, height, out, places):
     for n in range(len(lines)):
         ax, ay, dx, dy = lines[n, 0], lines[n, 1], lines[n, 3] - lines[n, 0], lines[n, 4] - lines[n, 1]
         length, longer = np.sqrt(dx * dx + dy * dy), max(abs(dx), abs(dy))
+        # Unit vector to the left of the way; what depth gains over the whole line.
         lx, ly, gain = -dy / length, dx / length, lines[n, 5] - lines[n, 2]
         # The pixel that it begins in, and where along it (0 to 1) the next column and the next row begin.
         x, y = int(np.floor(ax)), int(np.floor(ay))
@@ -329,19 +356,23 @@ def _cross(lines, width, height, out, places):
             y -= 1
         step_x, step_y = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
         by_x, by_y = (1 / abs(dx) if dx != 0 else np.inf), (1 / abs(dy) if dy != 0 else np.inf)
+        # Amanatides and Woo: walk from pixel to pixel by whichever border comes first.
         next_x = ((x + 1 - ax) if dx > 0 else (ax - x)) * by_x if dx != 0 else np.inf
         next_y = ((y + 1 - ay) if dy > 0 else (ay - y)) * by_y if dy != 0 else np.inf
         low = 0.0
         while low < 1.0:
             high = min(1.0, next_x, next_y)
             if high > low and 0 <= x < width and 0 <= y < height:
+                # Both ends of the part, from the pixel's centre.
                 fx, fy = ax - (x + 0.5), ay - (y + 0.5)
                 px, py, qx, qy = fx + low * dx, fy + low * dy, fx + high * dx, fy + high * dy
                 room = -(lx * fx + ly * fy)
+                # The short way round, unless the centre lies on the other side of the line.
                 turn = _around(qx, qy) - _around(px, py)
                 turn -= 8.0 * np.round(turn / 8.0)
                 if (room > 0.0) != (turn > 0.0) and abs(turn) > 2.0:
                     turn += 8.0 if room > 0.0 else -8.0
+                # Triangle with the centre, less the sector: 8 half sides are an area of 1.
                 out[count, 0] = 0.5 * (px * qy - py * qx) - 0.125 * turn
                 out[count, 1] = turn
                 out[count, 2], out[count, 3] = room, lines[n, 2] + 0.5 * (low + high) * gain
@@ -361,7 +392,10 @@ def _cross(lines, width, height, out, places):
 
 @nb.njit(cache=True, nogil=True)
 def _by_pixel(crossings, places, width, counts, pixels, out):
-    """Crossings of the same pixel one behind the other in ``out``; the number of pixels. counts : zeros, left so."""
+    """Write the crossings to ``out``, those of a pixel together, and return the number of pixels. counts : zeros,
+    left so."""
+    # A counting sort. ``counts`` first holds numbers, then write positions, and is zero again at the
+    # end.
     found = 0
     for n in range(len(crossings)):
         place = places[n]

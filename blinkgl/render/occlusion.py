@@ -40,6 +40,7 @@ def near_thin(ids: np.ndarray, depth: np.ndarray) -> np.ndarray:
     ids : (H, W) uint32.   depth : (H, W), 0 where nothing is."""
     height, width = ids.shape
     near = np.zeros((height, width), np.bool_)
+    # Twice: along rows, then along columns.
     for down in range(2):
         dx, dy = 1 - down, down
         lines, length = (width, height) if down else (height, width)
@@ -47,11 +48,14 @@ def near_thin(ids: np.ndarray, depth: np.ndarray) -> np.ndarray:
             start = 0
             while start < length:
                 y, x = (start, line) if down else (line, start)
+                # A run of one object: its pixels, one beside the other.
                 own = ids[y, x]
                 end = start + 1
                 while end < length and ids[y + (end - start) * dy, x + (end - start) * dx] == own:
                     end += 1
                 width_here = end - start
+                # Narrow, with something on both sides that is farther away: it may be missing in the
+                # next row.
                 if width_here <= NARROW and start > 0 and end < length and depth[y, x] > 0:
                     before = depth[y - dy, x - dx]
                     after = depth[y + width_here * dy, x + width_here * dx]
@@ -99,6 +103,7 @@ def judged_by_samples(
         for x in range(width):
             if not valid[y, x]:
                 continue
+            # Where the point is at t'; pixel centres are at integers.
             xt = np.float64(x) + flow[y, x, 0]
             yt = np.float64(y) + flow[y, x, 1]
             if not (-0.5 <= xt < width - 0.5 and -0.5 <= yt < height - 0.5) or z_there[y, x] < near:
@@ -111,6 +116,8 @@ def judged_by_samples(
             y0 = min(max(int(np.floor(yt)), 0), last_y)
             x1, y1 = min(x0 + 1, width - 1), min(y0 + 1, height - 1)
             ax, ay, own = xt - x0, yt - y0, ids[y, x]
+            # All four show the own object: seen, unless the interpolated surface is in front of the
+            # point.
             if (
                 ids_there[y0, x0] == own
                 and ids_there[y0, x1] == own
@@ -122,6 +129,7 @@ def judged_by_samples(
                 if (1.0 - ay) * above + ay * below > inverse * (1.0 + _SAME) or thin[y0, x0]:
                     verdict[y, x] = UNDECIDED
                 continue
+            # Otherwise hidden, unless some pixel shows the own object or something that is not nearer.
             limit = inverse * (1.0 + _IN_FRONT)
             verdict[y, x] = HIDDEN
             for dy in range(2):
@@ -160,6 +168,7 @@ def undecided(verdict: np.ndarray, flow: np.ndarray, z_there: np.ndarray) -> tup
     they are then, (N,) float64 how far away."""
     width = verdict.shape[1]
     flat = verdict.reshape(-1)
+    # Two passes: the first counts, so that arrays have the right size.
     count = 0
     for k in range(len(flat)):
         count += flat[k] == UNDECIDED

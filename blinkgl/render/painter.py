@@ -42,6 +42,7 @@ class Programs(dict["Kind", Uniforms]):
         self._painter, self._pass = painter, pass_
 
     def __missing__(self, kind: Kind) -> Uniforms:
+        # Defines of the pass, of the material, of the light and of the fog make the variant.
         foggy = {"FOG": 1} if self._pass.lit and self._painter.scene.fog is not None else {}
         defines = (
             self._pass.defines(kind)
@@ -83,7 +84,8 @@ class Painter:
         target.fbo.use()
         ctx.viewport = (0, 0, target.fbo.width, target.fbo.height)
         ctx.enable_only(moderngl.DEPTH_TEST)
-        ctx.depth_func = ">"  # reversed-Z
+        ctx.depth_func = ">"
+        # Reversed depth: 1 at the near plane, so larger is nearer.
         ctx.front_face = "cw"  # counter-clockwise meshes in an image whose y points down
         ctx.cull_face = "back"
         self._culling = False
@@ -108,6 +110,7 @@ class Painter:
             # Every time: the context's programs are shared with other renderers, their uniforms included.
             light = self.scene.light
             uniforms["light_strength"].value = (light.sun, light.sky)
+            # v @ R is R^T v: a world direction in the object's axes; R[2] is that of world z.
             R = moment.T_world_obj[index, :3, :3]
             uniforms["sun_direction"].value = tuple(light.sun_direction @ R)
             uniforms["up_direction"].value = tuple(R[2])
@@ -147,10 +150,12 @@ class Painter:
         name = "surroundings" if coloured else "surrounding_luminance"
         self._look_up(uniforms, name, self.resources.surroundings_texture(coloured))
         pose = moment.T_world_obj[item.object_index]
+        # The camera's centre in the object's axes, R^T (camera - object).
         R, away = pose[:3, :3], moment.T_world_cam[:3, 3] - pose[:3, 3]
         uniforms["eye"].value = tuple(away @ R)
         uniforms["to_world"].write(np.ascontiguousarray(R.T, np.float32).tobytes())
         if "eye_rate" in uniforms:
+            # The product rule on R^T (camera - object).
             rate = moment.rates.T_world_obj[item.object_index]
             dR, moving = rate[:3, :3], moment.dT_world_cam[:3, 3] - rate[:3, 3]
             uniforms["eye_rate"].value = tuple(away @ dR + moving @ R)
@@ -162,6 +167,7 @@ class Painter:
         texture.use(unit)
         uniforms[name].value = unit
         if map_ is not None:
+            # A 2x3 affine map as GLSL stores it, column by column.
             a, b, c, d, e, f = map_.at
             uniforms[f"{name}_place"].value = (a, d, b, e, c, f)
 
@@ -183,6 +189,7 @@ class Painter:
 
     def fog(self, uniforms: Uniforms, shot: Shot) -> None:
         """Sets what fog.glsl takes: the fog, and how a fragment's place in the target becomes its ray (X, Y) / Z."""
+        # NDC x is P00 X/Z + P02; solved for X/Z, with 2 px / width - 1 for NDC.
         fog, P = self.scene.fog, shot.moment.view.projection
         assert fog is not None
         width, height = shot.size
@@ -196,6 +203,7 @@ class Painter:
 
     def draw(self, uniforms: Uniforms, item: DrawItem) -> None:
         cull = not item.two_sided
+        # State changes cost: culling is switched only where it differs.
         if cull != self._culling:
             (self.gl.ctx.enable if cull else self.gl.ctx.disable)(moderngl.CULL_FACE)
             self._culling = cull

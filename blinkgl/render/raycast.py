@@ -72,6 +72,7 @@ class Forest(NamedTuple):
     texels: np.ndarray
 
 
+# Their indices are what _texel_index takes as ``wrap``.
 WRAPS = ("repeat", "mirror", "clamp")
 
 
@@ -87,7 +88,7 @@ class Holes(NamedTuple):
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _build(triangles, lower, upper, child, count):
-    """Median split along the longest side of the centroids' box. Returns (order, number of nodes)."""
+    """Build the tree by median splits along the longest side of the centroids' box. Return (order, number of nodes)."""
     n = triangles.shape[0]
     order = np.arange(n)
     centre = np.empty((n, 3))
@@ -100,6 +101,7 @@ def _build(triangles, lower, upper, child, count):
     while depth > 0:
         depth -= 1
         node, a, b = stack[depth]
+        # The box of the range's triangles, and the axis along which their centroids spread most.
         axis, widest = 0, -1.0
         for k in range(3):
             lo, hi, clo, chi = np.inf, -np.inf, np.inf, -np.inf
@@ -114,8 +116,11 @@ def _build(triangles, lower, upper, child, count):
         if b - a <= LEAF_TRIANGLES:
             child[node], count[node] = a, b - a
             continue
+        # A stable sort: equal centroids keep their order, so the tree does not depend on the sort's
+        # implementation.
         part = order[a:b].copy()
         order[a:b] = part[np.argsort(centre[part, axis], kind="mergesort")]
+        # Children are neighbours in memory: one number finds both.
         middle = (a + b) // 2
         child[node], count[node] = nodes, 0
         stack[depth] = (nodes, a, middle)
@@ -130,7 +135,8 @@ def build_tree(vertices: np.ndarray, faces: np.ndarray) -> Tree:
     corners = np.ascontiguousarray(np.asarray(vertices, np.float64)[np.asarray(faces)])
     n = len(corners)
     lower, upper = np.empty((2 * n, 3)), np.empty((2 * n, 3))
-    child, count = np.empty(2 * n, np.int32), np.empty(2 * n, np.int32)  # leaves hold 2 to 4 triangles: < 2 n nodes
+    # Leaves hold 2 to 4 triangles: < 2 n nodes.
+    child, count = np.empty(2 * n, np.int32), np.empty(2 * n, np.int32)
     order, nodes = _build(corners, lower, upper, child, count)
     return Tree(corners[order], order.astype(np.int32), lower[:nodes], upper[:nodes], child[:nodes], count[:nodes])
 
@@ -148,6 +154,7 @@ def join_trees(trees: list[Tree], cull: list[bool], holes: list[Holes | None] | 
     size = np.array([len(tree.face) for tree in trees], np.int32)
     first = starts(size)
     root = starts([len(tree.child) for tree in trees])
+    # Children count on over the trees, leaves over the triangles, inner nodes over the nodes.
     child = [tree.child + np.where(tree.count > 0, first[p], root[p]) for p, tree in enumerate(trees)]
     return Forest(
         triangles=joined("triangles", (0, 3, 3)),
@@ -170,7 +177,7 @@ def join_trees(trees: list[Tree], cull: list[bool], holes: list[Holes | None] | 
 
 
 def _holes(parts: int, holes: list[Holes | None]) -> tuple[np.ndarray, ...]:
-    """The last five of a :class:`Forest`."""
+    """Return the last five fields of a :class:`Forest`."""
     mask, rows, uvs, texels = np.full(parts, -1, np.int32), [], [np.empty((0, 3, 2))], [np.empty(0, np.float32)]
     for p, one in enumerate(holes):
         if one is not None:
@@ -189,15 +196,17 @@ def _texel_index(i, size, wrap):
         return min(max(i, 0), size - 1)
     if wrap == 1:
         i %= 2 * size
+        # The texture mirrored and not, one period of 2 size.
         return i if i < size else 2 * size - 1 - i
     return i % size
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _is_hole(mask, uvs, cutoff, texels, face, a, b, c):
-    """Whether the point of a face with these barycentrics is cut out: bilinear in ``texels``. mask : a row of
+    """Return whether the point of a face with these barycentrics is cut out, bilinear in ``texels``. mask : a row of
     ``Forest.masks``."""
     first, start, height, width = mask[0] + face, mask[1], mask[2], mask[3]
+    # Texture coordinates are affine in the barycentrics; texel centres lie at half-integers.
     u = a * uvs[first, 0, 0] + b * uvs[first, 1, 0] + c * uvs[first, 2, 0]
     v = a * uvs[first, 0, 1] + b * uvs[first, 1, 1] + c * uvs[first, 2, 1]
     x, y = u * width - 0.5, v * height - 0.5
@@ -212,7 +221,9 @@ def _is_hole(mask, uvs, cutoff, texels, face, a, b, c):
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _shear(d):
-    """Axes and shear that turn direction d into +z (Woop et al., section 3.1): kx, ky, kz, sx, sy, sz."""
+    """Return the axes and the shear that turn direction d into +z (Woop et al., section 3.1): kx, ky, kz, sx, sy,
+    sz."""
+    # The longest axis of d becomes z, so that the division below is well conditioned.
     kz = 0
     if abs(d[1]) > abs(d[kz]):
         kz = 1
@@ -220,18 +231,22 @@ def _shear(d):
         kz = 2
     kx = (kz + 1) % 3
     ky = (kx + 1) % 3
-    if d[kz] < 0.0:  # keep the handedness, and with it the sign that tells front from back
+    # Keep the handedness, and with it the sign that tells front from back.
+    if d[kz] < 0.0:
         kx, ky = ky, kx
     return kx, ky, kz, d[kx] / d[kz], d[ky] / d[kz], 1.0 / d[kz]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _triangle(tri, o, kx, ky, kz, sx, sy, sz):
-    """(s, u, v, w, front): ray parameter and barycentrics of corners 0, 1, 2; s = inf for a miss."""
+    """Return (s, u, v, w, front): ray parameter and barycentrics of corners 0, 1, 2; s = inf for a miss."""
+    # Corners relative to the ray's origin, sheared so that the ray runs along z (Woop et al., section
+    # 3.2).
     az, bz, cz = tri[0, kz] - o[kz], tri[1, kz] - o[kz], tri[2, kz] - o[kz]
     ax, ay = tri[0, kx] - o[kx] - sx * az, tri[0, ky] - o[ky] - sy * az
     bx, by = tri[1, kx] - o[kx] - sx * bz, tri[1, ky] - o[ky] - sy * bz
     cx, cy = tri[2, kx] - o[kx] - sx * cz, tri[2, ky] - o[ky] - sy * cz
+    # Scaled barycentrics: the edges' signed areas. Both triangles at an edge compute the same products.
     u = cx * by - cy * bx
     v = ax * cy - ay * cx
     w = bx * ay - by * ax
@@ -243,6 +258,7 @@ def _triangle(tri, o, kx, ky, kz, sx, sy, sz):
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
+# The ray (rx, ry, 1) in the part's axes: the parameter stays the depth.
 def _local_ray(axes, rx, ry, d):
     for k in range(3):
         d[k] = axes[k, 0] * rx + axes[k, 1] * ry + axes[k, 2]
@@ -250,19 +266,22 @@ def _local_ray(axes, rx, ry, d):
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _balls(forest, origins, axes):
-    """Balls round the parts, a little too large, camera axes: (P, 3) middles, (P,) radii, and (P,) the square of the
-    length of the tangents from the camera's centre, a little too short; <= 0: it is inside. Most rays pass most parts
-    by, and a ball says so before a ray is turned into a part's axes."""
+    """Return balls around the parts, slightly too large, in camera axes: (P, 3) middles, (P,) radii, and (P,) the
+    square of the length of the tangents from the camera's centre, a little too short; <= 0: it is inside. Most
+    rays pass most parts by, and a ball says so before a ray is turned into a part's axes."""
     count = forest.root.shape[0]
     centre, radius, outside = np.empty((count, 3)), np.empty(count), np.empty(count)
     for p in range(count):
         node, half, square, scale = forest.root[p], 0.0, 0.0, forest.extent[p]
         away = np.empty(3)
+        # Half the diagonal of the root's box, and its middle as seen from the camera; an empty part is
+        # a point.
         for k in range(3):
             scale = max(scale, abs(origins[p, k]))
             side = 0.5 * (forest.upper[node, k] - forest.lower[node, k]) if forest.size[p] else 0.0
             half += side * side
             away[k] = (forest.lower[node, k] + side if forest.size[p] else 0.0) - origins[p, k]
+        # Into the camera's axes; the radius and the tangent take the rounding of all this.
         for k in range(3):
             centre[p, k] = axes[p, 0, k] * away[0] + axes[p, 1, k] * away[1] + axes[p, 2, k] * away[2]
             square += centre[p, k] * centre[p, k]
@@ -300,14 +319,18 @@ def nearest_tree(
     centre, radius, outside = _balls(forest, origins, axes)
     for i in range(rays.shape[0]):
         best = far[i]
+        # Squared length of (rx, ry, 1), for the balls' test.
         length = rays[i, 0] * rays[i, 0] + rays[i, 1] * rays[i, 1] + 1.0
         depth[i] = np.inf
         hit[i] = -1
         for p in range(root.shape[0]):
             if any_will_do and hit[i, 0] >= 0:
                 break
+            # The ball begins behind the best hit so far.
             if size[p] == 0 or centre[p, 2] - radius[p] > best:
                 continue
+            # Ray and ball: the angle to the middle is wider than the tangent's, or the ball lies
+            # behind.
             along = centre[p, 0] * rays[i, 0] + centre[p, 1] * rays[i, 1] + centre[p, 2]
             if outside[p] > 0.0 and (along < 0.0 or along * along < outside[p] * length):
                 continue
@@ -317,6 +340,8 @@ def nearest_tree(
                 scale = max(scale, abs(o[k]))
             _local_ray(axes[p], rays[i, 0], rays[i, 1], d)
             kx, ky, kz, sx, sy, sz = _shear(d)
+            # inf for an axis that the ray does not move along; origins are moved apart by the slack of
+            # the box test.
             for k in range(3):
                 inverse[k] = 1.0 / d[k] if d[k] != 0.0 else np.inf
                 o_lo[k], o_hi[k] = o[k] + _BOX_SLACK * scale, o[k] - _BOX_SLACK * scale
@@ -324,6 +349,7 @@ def nearest_tree(
             n = 1
             while n > 0 and not (any_will_do and hit[i, 0] >= 0):
                 n -= 1
+                # Entered beyond the best hit: its whole subtree is.
                 if entry[n] > best:
                     continue
                 node = stack[n]
@@ -334,6 +360,8 @@ def nearest_tree(
                         s, u, v, w, front = _triangle(triangles[j], o, kx, ky, kz, sx, sy, sz)
                         if s < near or s > best or s >= far[i] or (cull[p] and not front):
                             continue
+                        # Equal depths go to the lower (part, triangle), in whatever order they are
+                        # found.
                         if s == best and (hit[i, 0] < p or hit[i, 1] < face[j]):
                             continue
                         k = mask[p]
@@ -343,6 +371,7 @@ def nearest_tree(
                         hit[i, 0], hit[i, 1], hit[i, 2] = p, face[j], front
                         bary[i, 0], bary[i, 1], bary[i, 2] = u, v, w
                     continue
+                # Slabs: the ray is inside of the box between the largest entry and the least exit.
                 for c in range(child[node], child[node] + 2):
                     enter, leave = 0.0, np.inf
                     for k in range(3):
@@ -392,6 +421,7 @@ def nearest_exhaustive(
                 if skip[i, 0] == p and skip[i, 1] == face[j]:
                     continue
                 s, u, v, w, front = _triangle(triangles[j], origins[p], kx, ky, kz, sx, sy, sz)
+                # The same conditions as in nearest_tree, with depth[i] as the best.
                 if s < near or s > depth[i] or s >= far[i] or (cull[p] and not front):
                     continue
                 if s == depth[i] and (hit[i, 0] < p or hit[i, 1] < face[j]):

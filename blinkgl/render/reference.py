@@ -174,6 +174,7 @@ def cast(scene: Scene, t_ns: int, xy: np.ndarray | None = None, *, exhaustive: b
     xy = pixel_grid(scene.camera) if xy is None else np.atleast_2d(np.asarray(xy, np.float64))
     hit, bary, depth = _nearest(scene, t_ns, _rays(scene.camera, xy)[:, :2], exhaustive=exhaustive)
     parts = scene_parts(scene)
+    # A part's number -1 (nothing hit) indexes the added 0 at the end.
     found = hit[:, 0] >= 0
     ids = np.array([thing.instance_id for thing, _ in parts] + [0], np.int32)
     local = np.full((len(xy), 3), np.nan)
@@ -185,8 +186,9 @@ def cast(scene: Scene, t_ns: int, xy: np.ndarray | None = None, *, exhaustive: b
 
 
 def _rays(camera: CameraModel, xy: np.ndarray) -> np.ndarray:
-    """(N, 3) rays of length 1 along the optical axis; nan for a pixel without one that points forward."""
+    """Return (N, 3) rays of length 1 along the optical axis; nan for a pixel without a ray that points forward."""
     rays = camera.rays(xy)
+    # nan marks a pixel that has no ray with Z > 0.
     return rays / np.where(rays[:, 2:] > 0, rays[:, 2:], np.nan)
 
 
@@ -197,6 +199,7 @@ def vertices_at(mesh: Mesh, t_ns: int) -> np.ndarray:
     kept = _shapes.setdefault(mesh, {})
     if t_ns not in kept:
         kept[t_ns] = mesh.deformer.positions(mesh, t_ns)
+        # The oldest shape goes; dictionaries keep the order of insertion.
         while len(kept) > KEPT:
             kept.pop(next(iter(kept)))
     return kept[t_ns]
@@ -204,6 +207,7 @@ def vertices_at(mesh: Mesh, t_ns: int) -> np.ndarray:
 
 def _forest(scene: Scene, t_ns: int) -> Forest:
     kept = _forests.setdefault(scene, {})
+    # One forest for all times, unless some shape changes.
     key = t_ns if any(thing.deforms for thing in scene.objects) else None
     if key not in kept:
         parts = scene_parts(scene)
@@ -222,17 +226,19 @@ def _forest(scene: Scene, t_ns: int) -> Forest:
 
 
 def _holes_of(part: Part) -> Holes | None:
-    """As the ray caster takes them."""
+    """Return a part's holes as the ray caster takes them."""
     mask, mesh = part.material.mask, part.mesh
     if mask is None:
         return None
+    # The same scale as in the shader's texture coordinates.
     uvs = mesh.uvs[mesh.faces].astype(np.float64) * np.asarray(part.material.uv_scale)
     return Holes(uvs, mask.alpha.astype(np.float32) / np.float32(255), mask.threshold, part.material.wrap)
 
 
 def _nearest(scene, t_ns, rays, far=None, skip=None, exhaustive=False, eye=None, near=None, any_will_do=False):
-    """(hit (N, 3) int32, bary (N, 3), depth (N,)) as described at :func:`raycast.nearest_tree`. eye, near : of other
-    rays than the camera's: (4, 4) pose where they come from, Z at which they begin.   any_will_do : as there."""
+    """Return (hit (N, 3) int32, bary (N, 3), depth (N,)) as described at :func:`raycast.nearest_tree`. eye, near :
+    of other rays than the camera's: (4, 4) pose where they come from, Z at which they begin.   any_will_do : as
+    there."""
     forest = _forest(scene, int(t_ns))
     camera_pose = scene.camera_path.pose(t_ns) if eye is None else eye
     # relative to the camera by differences of positions, so that a common offset from the origin cancels first
@@ -261,7 +267,7 @@ def _nearest(scene, t_ns, rays, far=None, skip=None, exhaustive=False, eye=None,
 
 
 def _by_part(part: np.ndarray):
-    """(p, indices of the points on part p) for every part that was hit."""
+    """Return (p, indices of the points on part p) for every part that was hit."""
     return [(int(p), np.flatnonzero(part == p)) for p in np.unique(part) if p >= 0]
 
 
@@ -269,7 +275,7 @@ def _by_part(part: np.ndarray):
 
 
 def _relative_pose(camera: np.ndarray, body: np.ndarray) -> np.ndarray:
-    """(4, 4) inv(camera) @ body for rigid poses."""
+    """Return the (4, 4) inv(camera) @ body of rigid poses."""
     m = np.eye(4)
     m[:3, :3] = camera[:3, :3].T @ body[:3, :3]
     m[:3, 3] = camera[:3, :3].T @ (body[:3, 3] - camera[:3, 3])
@@ -277,9 +283,10 @@ def _relative_pose(camera: np.ndarray, body: np.ndarray) -> np.ndarray:
 
 
 def _relative_change(scene: Scene, thing: SceneObject, t0_ns: int, t1_ns: int) -> np.ndarray:
-    """(3, 4) M(t1) - M(t0) with M the pose in the camera's frame, from the differences of the poses."""
+    """Return (3, 4) M(t1) - M(t0) with M the pose in the camera's frame, from the differences of the poses."""
     c0, c1 = scene.camera_path.pose(t0_ns), scene.camera_path.pose(t1_ns)
     b0, b1 = thing.path.pose(t0_ns), thing.path.pose(t1_ns)
+    # M1 - M0 = C1^T (B1 - B0) + (C1 - C0)^T B0, and likewise for the translation: differences only.
     turn = (c1[:3, :3] - c0[:3, :3]).T
     shift = (b1[:3, 3] - b0[:3, 3]) - (c1[:3, 3] - c0[:3, 3])
     change = np.empty((3, 4))
@@ -289,10 +296,11 @@ def _relative_change(scene: Scene, thing: SceneObject, t0_ns: int, t1_ns: int) -
 
 
 def _relative_rate(scene: Scene, thing: SceneObject, t_ns: int) -> np.ndarray:
-    """(3, 4) dM/dt in 1/s: the analytic twist of the body as the moving camera sees it."""
+    """Return (3, 4) dM/dt in 1/s: the analytic twist of the body as the moving camera sees it."""
     c, dc = scene.camera_path.pose(t_ns), scene.camera_path.derivative(t_ns)
     b, db = thing.path.pose(t_ns), thing.path.derivative(t_ns)
     rate = np.empty((3, 4))
+    # The product rule on C^T B and on C^T (b - c).
     rate[:, :3] = dc[:3, :3].T @ b[:3, :3] + c[:3, :3].T @ db[:3, :3]
     rate[:, 3] = dc[:3, :3].T @ (b[:3, 3] - c[:3, 3]) + c[:3, :3].T @ (db[:3, 3] - dc[:3, 3])
     return rate
@@ -339,8 +347,10 @@ def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
     depth = hits.depth + change[:, 2]
     valid = hits.hit & (depth > 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
+        # fx (dX - rx dZ) / Z1 and likewise in y, as the module's docstring derives it.
         flow = np.where(valid[:, None], camera.displacement(_rays(camera, hits.xy), hits.depth, change), np.nan)
-        valid &= np.isfinite(flow).all(axis=1)  # a lens may not see it there
+        # A lens may not see the point at its new place.
+        valid &= np.isfinite(flow).all(axis=1)
         there = hits.xy + flow
         inside = valid & ((there >= -0.5) & (there < [camera.width - 0.5, camera.height - 0.5])).all(axis=1)
 
@@ -355,6 +365,7 @@ def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
 def moved_in_space(scene: Scene, hits: Hits, t_ns: int) -> np.ndarray:
     """(N, 3) how far every hit point moves in the world from ``hits.t_ns`` to t_ns, in the camera's axes at
     ``hits.t_ns``; nan where nothing is hit."""
+    # The shape's own change, and the pose's.
     own = replace(hits, local=local_at(scene, hits, t_ns) - hits.local)
     carried = applied(scene, hits, lambda thing: (thing.path.pose(t_ns) - thing.path.pose(hits.t_ns))[:3])
     changed = applied(scene, own, lambda thing: np.c_[thing.path.pose(t_ns)[:3, :3], np.zeros(3)])
@@ -373,6 +384,7 @@ def is_seen(
     hidden_by = np.full((len(hits.hit), 2), -1, np.int32)
     rows = np.flatnonzero(candidate)
     skip = np.ascontiguousarray(np.stack([hits.part[rows], hits.triangle[rows]], axis=1))
+    # The ray stops a little before the point, so that its own surface does not hide it.
     far = moved[rows, 2] * (1.0 - VISIBILITY_SLACK)
     blocker, _, _ = _nearest(scene, t_ns, moved[rows, :2] / moved[rows, 2:], far=far, skip=skip)
     hidden_by[rows] = blocker[:, :2]
@@ -403,7 +415,8 @@ def relative_pose_at(scene: Scene, thing: SceneObject, t_ns: int) -> np.ndarray:
 
 
 def _faces_camera(scene: Scene, hits: Hits, t_ns: int, rows: np.ndarray) -> np.ndarray:
-    """(N,) bool: the triangle of each hit is drawn from where the camera is at t_ns (False only for culled ones)."""
+    """Return (N,) bool: the triangle of each hit is drawn from where the camera is at t_ns (False only for culled
+    ones)."""
     shown = np.ones(len(rows), bool)
     for p, (thing, part) in enumerate(scene_parts(scene)):
         on = np.flatnonzero(rows & (hits.part == p))
@@ -411,6 +424,7 @@ def _faces_camera(scene: Scene, hits: Hits, t_ns: int, rows: np.ndarray) -> np.n
             m = relative_pose_at(scene, thing, t_ns)
             eye = -m[:3, :3].T @ m[:3, 3]
             a, b, c = np.moveaxis(vertices_at(part.mesh, t_ns)[part.mesh.faces[hits.triangle[on]]], 1, 0)
+            # The eye is on the outer side of the triangle's plane.
             shown[on] = (np.cross(b - a, c - a) * (eye - a)).sum(axis=1) > 0.0
     return shown
 
@@ -428,8 +442,11 @@ def surface(scene: Scene, hits: Hits) -> Surface:
         thing, part = parts[p]
         corners = part.mesh.faces[hits.triangle[rows]]
         bary = hits.bary[rows]
+        # Interpolated over the triangle, as the rasteriser does, then made unit.
         blend = np.einsum("nc,nck->nk", bary, normals_at(part.mesh, hits.t_ns)[corners].astype(np.float64))
-        length = np.maximum(np.linalg.norm(blend, axis=1, keepdims=True), 1e-15)  # a zero normal stays zero
+        # The maximum keeps a zero normal zero instead of NaN.
+        length = np.maximum(np.linalg.norm(blend, axis=1, keepdims=True), 1e-15)
+        # A surface seen from behind is lit from that side.
         sign = np.where(hits.front[rows], 1.0, -1.0)[:, None]
         normal[rows] = sign * (blend / length) @ thing.path.pose(hits.t_ns)[:3, :3].T
         uv[rows] = np.einsum("nc,nck->nk", bary, part.mesh.uvs[corners].astype(np.float64))
@@ -449,6 +466,7 @@ def seen_through_fog(scene: Scene, hits: Hits, colour: np.ndarray) -> np.ndarray
     if scene.fog is None:
         return colour
     rays = _rays(scene.camera, hits.xy)
+    # The distance is Z times the length of the ray (X, Y, Z) / Z.
     distance = hits.depth * np.linalg.norm(rays / rays[:, 2:], axis=1)
     arrives = np.exp(-scene.fog.density * distance)[:, None]
     return np.where(hits.hit[:, None], colour * arrives + scene.fog.radiance * (1 - arrives), colour)
@@ -479,6 +497,7 @@ def radiated(
     normal map.   uv : (N, 2)."""
     thing, part = scene_parts(scene)[int(hits.part[rows[0]])]
     material, pose = part.material, thing.path.pose(hits.t_ns)
+    # Maps are looked up at the base colour's coordinates.
     at = uv * np.asarray(material.uv_scale)
     emission = np.broadcast_to(np.asarray(material.emission, np.float64), albedo.shape)
     if material.emission_map is not None:
@@ -508,15 +527,19 @@ def bumped(
     assert bumps is not None
     corners, bary = mesh.faces[hits.triangle[rows]], hits.bary[rows]
     given = tangents(mesh).astype(np.float64)
-    if mesh.deformer is not None:  # the way along the texture turns as a normal does
+    # The way along the texture turns as a normal does.
+    if mesh.deformer is not None:
         turned = mesh.deformer.normals(replace(mesh, normals=given[:, :3].astype(np.float32)), hits.t_ns)
         given = np.column_stack([turned, given[:, 3]])
     side = np.where(hits.front[rows], 1.0, -1.0)[:, None]
+    # Everything below is of the front; the result is turned back to the side that is seen.
     n = normal * side
     along = np.einsum("nc,nck->nk", bary, given[:, :3][corners]) @ pose[:3, :3].T
+    # Gram and Schmidt: the tangent without its part along the normal.
     along = along - n * (along * n).sum(axis=1, keepdims=True)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-15)
     hand = np.sign(np.einsum("nc,nc->n", bary, given[:, 3][corners]))[:, None]
+    # Stored 0 to 1, meant -1 to 1.
     bump = 2.0 * sample_map(bumps, at) - 1.0
     x, y, z = (bump[:, k : k + 1] for k in range(3))
     scale = part.material.bump_scale
@@ -537,21 +560,25 @@ def shone(
 ) -> tuple[np.ndarray, np.ndarray]:
     """((N, 1) share of the light that goes through the albedo, (N, 3) radiance that is mirrored) of a surface with a
     gloss (:mod:`blinkgl.scene.surfaces.gloss`). light : what a matt one receives there.   eye : (N, 3) unit vectors."""
+    # The same limits as in surface.glsl; the lobe of a perfect mirror would divide by 0.
     roughness = np.maximum(roughness, gloss.SMOOTHEST)
     nv = np.clip((normal * eye).sum(axis=1), 1e-3, 1.0)
     part = gloss.energy_at(nv, roughness)
+    # What single reflection loses of even light, which several reflections return.
     lost = (1.0 / part.sum(axis=1) - 1.0)[:, None]
     mix = metallic[:, None]
     clear = 1.0 + gloss.several(np.full((1, 1), gloss.DIELECTRIC), roughness) * lost
     metal = 1.0 + gloss.several(albedo, roughness) * lost
     even_clear = clear * (gloss.DIELECTRIC * part[:, :1] + part[:, 1:])
     even_metal = metal * (albedo * part[:, :1] + part[:, 1:])
+    # The mirror direction 2 (n.v) n - v.
     away = 2.0 * (normal * eye).sum(axis=1, keepdims=True) * normal - eye
     if id(scene.light) not in _surroundings:
         _surroundings.clear()
         _surroundings[id(scene.light)] = scene.light, surroundings_of(scene.light)
     around = gloss.around(_surroundings[id(scene.light)][1], normal, away, nv, roughness)
     out = around * (even_clear * (1 - mix) + even_metal * mix)
+    # Lamps: GGX lobe with Schlick's Fresnel term, half vector between lamp and eye.
     for k, lamp in enumerate(lamps_of(scene.light)):
         towards, _ = beam(lamp, lamp.path.pose(t_ns), points)
         nl = (towards * normal).sum(axis=1)
@@ -617,23 +644,29 @@ def seen_share(scene: Scene, t_ns: int, lamp: Lamp, points: np.ndarray, own: np.
     casters, number = _casters(scene)
     if not casters.objects or not len(points):
         return np.ones(len(points))
+    # Part numbers among the casters.
     skip = np.ascontiguousarray(np.column_stack([number[own[:, 0]], own[:, 1]]).astype(np.int32))
-    pose = lamp.path.pose(t_ns) @ np.diag([1.0, -1.0, -1.0, 1.0])  # a camera that looks where it shines
+    # A lamp shines along -z, a camera looks along +z: y and z are turned round.
+    pose = lamp.path.pose(t_ns) @ np.diag([1.0, -1.0, -1.0, 1.0])
     middle = points.mean(axis=0)
     size = 1.0 + float(np.linalg.norm(points - middle, axis=1).max())
     count = SOFT_SAMPLES if scene.light.shadows == "soft" and lamp.size > 0 else 1
     total = np.zeros(len(points))
+    # Sunflower seeds over the lamp's disc: 2.39996323 rad is the golden angle.
     for i in range(count):
         radius, angle = math.sqrt((i + 0.5) / count), i * 2.39996323
         aside = (0.5 * lamp.size * radius if count > 1 else 0.0) * np.array([math.cos(angle), math.sin(angle)])
         eye = pose.copy()
+        # A sun: the direction is turned by the angle, and the eye is far away along it.
         if lamp.kind == "sun":
             ahead = eye[:3, 2] + eye[:3, :2] @ np.tan(aside)
             eye[:3, 3] = middle - ahead * (_FAR_AWAY * size)
         else:
             eye[:3, 3] += eye[:3, :2] @ aside
+        # Points in the lamp's axes: Z is the distance along it.
         there = (points - eye[:3, 3]) @ eye[:3, :3]
         before = there[:, 2] > 0
+        # Ends a little before the point, so that it does not shade itself.
         far = np.where(before, there[:, 2] - 1e-7 * size, 0.0)
         rays = np.where(before[:, None], there[:, :2] / np.where(before, there[:, 2], 1.0)[:, None], 0.0)
         hit, _, _ = _nearest(casters, t_ns, np.ascontiguousarray(rays), far=far, skip=skip, eye=eye, near=1e-9)
@@ -655,6 +688,7 @@ def seen_by_lamp(
     if not casters.objects:
         return np.full(len(rays), np.inf), np.full(len(rays), -1, np.int32)
     if casters not in _inside_out:
+        # Seen from inside, so that a face away from the lamp counts as front.
         _inside_out[casters] = replace(casters, objects=tuple(_turned_out(thing) for thing in casters.objects))
     turned = _inside_out[casters]
     hit, _, depth = _nearest(turned, t_ns, np.ascontiguousarray(rays[:, :2]), eye=eye, near=near)
@@ -665,7 +699,7 @@ _inside_out: WeakKeyDictionary = WeakKeyDictionary()
 
 
 def _turned_out(thing: SceneObject) -> SceneObject:
-    """With the faces of what is drawn from one side alone turned round."""
+    """Return the object with the faces of one-sided parts turned round."""
     parts = (
         replace(part, mesh=replace(part.mesh, faces=np.ascontiguousarray(part.mesh.faces[:, ::-1])))
         if part.culled
@@ -681,11 +715,13 @@ def casts(scene: Scene) -> bool:
 
 
 def _casters(scene: Scene) -> tuple[Scene, np.ndarray]:
-    """The scene with what casts shadows alone, and what number each part has in it, -1: none (and -1 of no part)."""
+    """Return the scene with only the parts that cast shadows, and each part's number in it, -1 for none (and for no
+    part)."""
     if scene not in _shadowers:
         kept, number, count = [], [], 0
         for thing in scene.objects:
             casting = [thing.category in ("object", "wall") and not part.material.unlit for part in thing.parts]
+            # Numbers among the casting parts, in the scene's order.
             number += [count + sum(casting[:k]) if one else -1 for k, one in enumerate(casting)]
             count += sum(casting)
             if any(casting):
@@ -705,6 +741,7 @@ def sample_albedo(material: Material, uv: np.ndarray) -> np.ndarray:
 def sample_map(given: Map, at: np.ndarray, colour: bool = False) -> np.ndarray:
     """(N, 3) of a map at (N, 2) coordinates of the base colour: numbers as they are stored, 0 to 1, or linear light."""
     a, b, c, d, e, f = given.at
+    # The map's own affine transform of the coordinates.
     there = at @ np.array([[a, b], [d, e]]).T + [c, f]
     texture = given.texture
     if not colour:
@@ -718,10 +755,11 @@ _as_numbers: WeakKeyDictionary = WeakKeyDictionary()
 
 
 def _wrapped(index: np.ndarray, size: int, wrap: str) -> np.ndarray:
-    """Of (N,) texel numbers, where a picture goes on beyond its edges."""
+    """Return (N,) texel numbers inside the picture, continued beyond its edges as ``wrap`` says."""
     if wrap == "clamp":
         return np.clip(index, 0, size - 1)
     if wrap == "mirror":
+        # The texture mirrored and not, one period of 2 size.
         index = np.mod(index, 2 * size)
         return np.where(index < size, index, 2 * size - 1 - index)
     return np.mod(index, size)
@@ -733,6 +771,7 @@ def sample_bilinear(texture: Texture, uv: np.ndarray, wrap: tuple[str, str] = RE
     size = np.array([image.shape[1], image.shape[0]])
     at = uv * size - 0.5
     low = np.floor(at)
+    # Column and row of the first of the four texels, and the fraction to the next.
     frac = at - low
     x0, x1 = (_wrapped(low[:, 0].astype(np.int64) + k, size[0], wrap[0]) for k in (0, 1))
     y0, y1 = (_wrapped(low[:, 1].astype(np.int64) + k, size[1], wrap[1]) for k in (0, 1))
@@ -804,6 +843,7 @@ def silhouette_band(ids: np.ndarray, depth: np.ndarray, width: int = 1, jump: fl
     along x or y above ``jump`` of its largest value there: 1 / Z is affine in the image of a plane, however steep the
     plane is seen, so that slanted ground is not taken for an edge.
     """
+    # Second differences of 1/Z vanish on a plane; along x and along y in turn.
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = np.nan_to_num(1.0 / np.asarray(depth, np.float64), nan=0.0, posinf=0.0, neginf=0.0)
     band = np.zeros(ids.shape, bool)
@@ -814,6 +854,7 @@ def silhouette_band(ids: np.ndarray, depth: np.ndarray, width: int = 1, jump: fl
         b[:-1] |= change
         bend = np.abs(z[2:] - 2.0 * z[1:-1] + z[:-2]) > jump * np.maximum(np.maximum(z[2:], z[1:-1]), z[:-2])
         b[1:-1] |= bend
+    # Neighbours over a corner.
     diagonal = ids[1:, 1:] != ids[:-1, :-1]
     other = ids[1:, :-1] != ids[:-1, 1:]
     band[1:, 1:] |= diagonal

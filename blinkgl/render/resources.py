@@ -26,9 +26,11 @@ from blinkgl.scene.types import IDENTITY, REPEAT, Light, Map, Material, Mesh, Pa
 
 MADE.append(includes)
 
+# OpenGL's enums: GL_TEXTURE_2D, GL_TEXTURE_LOD_BIAS; GL_TEXTURE_WRAP_S and _T; their values.
 _TEXTURE_2D, _TEXTURE_LOD_BIAS = 0x0DE1, 0x8501
 _TEXTURE_WRAP = 0x2802, 0x2803
 _WRAPS = {"repeat": 0x2901, "mirror": 0x8370, "clamp": 0x812F}
+# The interleaved vertex: name, format, bytes; 32 bytes in all.
 _ATTRIBUTES = (("in_position", "3f", 12), ("in_normal", "3f", 12), ("in_uv", "2f", 8))
 
 
@@ -92,6 +94,7 @@ def shape_of(deformer: Deformer | None) -> tuple[tuple[str, int], ...]:
 def padded_rows(deformer: Deformer) -> int:
     """Rows of numbers that its programs have room for: the next power of two, so that one program serves many
     skeletons."""
+    # At least 4 rows.
     return 1 << max(deformer.rows - 1, 3).bit_length()
 
 
@@ -157,6 +160,7 @@ class Shape:
     BINDING = 0
 
     def __init__(self, ctx: moderngl.Context, deformer: Deformer):
+        # std140: a row of four floats is 16 bytes.
         self.ctx, self.deformer, self._rows = ctx, deformer, padded_rows(deformer)
         size = 16 * self._rows * len(self.SETS)
         limit = ctx.info["GL_MAX_UNIFORM_BLOCK_SIZE"]
@@ -220,7 +224,8 @@ def half_floats(image: np.ndarray) -> np.ndarray:
     has not, and rates of them."""
     brightest = image.max(axis=2)
     lit = brightest[brightest > 0]
-    fits = lit.size > 0 and lit.min() >= HALF_LEAST and lit.max() <= HALF_MOST  # NaN does not
+    # A NaN makes the mean NaN, and the picture stays float32.
+    fits = lit.size > 0 and lit.min() >= HALF_LEAST and lit.max() <= HALF_MOST
     return image.astype(np.float16) if fits and brightest.mean(dtype=np.float64) >= HALF_LEAST else image
 
 
@@ -239,6 +244,7 @@ class _Greys:
     def hued(self, material: Material, mesh: Mesh) -> bool:
         gloss = None if material.unlit else material.gloss
         metal = gloss is not None and gloss.metallic > 0
+        # One channel is enough unless light, metal or vertex colours may change the hue.
         if not (metal or mesh.colours is not None or (self._coloured_light and not material.unlit)):
             return False
         pictured = material.texture is not None and not self._grey(material.texture.image)
@@ -264,6 +270,7 @@ class _Facets:
     def flat(self, mesh: Mesh) -> bool:
         if not self._asked or mesh.deformer is not None:
             return False
+        # Normals of each face's corners against its first one's.
         if id(mesh) not in self._known:
             corners = mesh.normals[mesh.faces]
             self._known[id(mesh)] = bool((np.abs(corners[:, 1:] - corners[:, :1]) <= 1e-6).all())
@@ -282,6 +289,8 @@ class SceneResources:
         self._shapes: dict[int, Shape] = {}
         self._volumes: dict[str, moderngl.Texture3D] = {}
         grey, facets = _Greys(is_coloured(scene.light)), _Facets(scene.light)
+        # Parts are numbered object by object; items are numbered after sorting, in the order in which
+        # they are drawn.
         self.items = [
             _draw_item(index, obj, part, scene, grey, facets)
             for index, obj in enumerate(scene.objects)
@@ -299,6 +308,7 @@ class SceneResources:
 
     def vertex_array(self, program: moderngl.Program, item: DrawItem) -> moderngl.VertexArray:
         """VAO of the attributes ``program`` uses; the rest of the interleaved vertex is skipped."""
+        # The texture coordinates of a buffer depend on both, so they are part of its key.
         whole = _by_whole_repeats(item.material)
         key = (id(program), id(item.mesh), item.material.uv_scale, whole)
         if key not in self._vaos:
@@ -306,6 +316,7 @@ class SceneResources:
             formats, names = [], []
             for name, fmt, size in _ATTRIBUTES:
                 used = name in program
+                # "12x" skips the bytes of an attribute that the program does not use.
                 formats.append(fmt if used else f"{size}x")
                 if used:
                     names.append(name)
@@ -340,6 +351,7 @@ class SceneResources:
         :meth:`luminance_texture`, and so is the rest."""
         key = ("shares", id(material.texture), material.base_color, material.wrap)
         if key not in self._textures:
+            # Each channel's share of the luminance, so that r + g + b of the texture is it.
             shares = (LUMA * np.asarray(material.base_color, np.float64)).astype(np.float32)
             image = linear_image(material.texture.image) * shares
             self._textures[key] = self._light(image, material.texture, material.wrap)
@@ -470,6 +482,7 @@ class SceneResources:
             data[:, :3], data[:, 3:6] = mesh.vertices, mesh.normals
             uvs = mesh.uvs * np.asarray(uv_scale, np.float64)
             data[:, 6:] = _near_zero(uvs) if whole else uvs
+            # A GPU would draw infinities and NaN anywhere.
             if not np.isfinite(data).all():
                 first = int(np.flatnonzero(~np.isfinite(data).all(axis=1))[0])
                 raise AssetError(
@@ -506,7 +519,8 @@ class SceneResources:
                 value=(width, height),
                 accepted=f"at most {limit} px on a side",
             )
-        if image.dtype != np.uint8 and not (image.min() >= 0 and image.max() <= MAX_RADIANCE):  # NaN too
+        # NaN too.
+        if image.dtype != np.uint8 and not (image.min() >= 0 and image.max() <= MAX_RADIANCE):
             y, x, _ = np.argwhere(~((image >= 0) & (image <= MAX_RADIANCE)))[0].tolist()
             raise AssetError(
                 f"texel x={x}, y={y} cannot be drawn",
@@ -525,6 +539,7 @@ class SceneResources:
             dtype=dtype,
             internal_format=internal_format,
         )
+        # moderngl knows repeat and clamp alone; mirroring needs the call itself.
         if wrap != REPEAT:
             texture.use(0)
             for axis, kind in zip(_TEXTURE_WRAP, wrap):
@@ -561,9 +576,11 @@ def _draw_item(index: int, thing: SceneObject, part: Part, scene: Scene, grey: _
         centre = (low + high) / 2
         radius = float(np.sqrt(((mesh.vertices - centre) ** 2).sum(axis=1).max()))
     else:
+        # Of a shape that changes the box of all that it sweeps.
         low, high = mesh.deformer.bounds(mesh, scene.t0_ns, scene.t1_ns)
         centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
-    if not radius <= MAX_RADIUS:  # NaN too
+    # NaN too.
+    if not radius <= MAX_RADIUS:
         raise AssetError(
             "mesh is too large to be drawn in float32",
             where=mesh.name or f"object {index}",

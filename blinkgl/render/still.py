@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from blinkgl.render.passes.base import Shot
     from blinkgl.render.resources import DrawItem
 
+# OpenGL's enums: GL_READ_FRAMEBUFFER, GL_DRAW_FRAMEBUFFER; depth and colour bits; GL_NEAREST.
 _READ_FRAMEBUFFER, _DRAW_FRAMEBUFFER = 0x8CA8, 0x8CA9
 _DEPTH, _COLOUR_AND_DEPTH, _NEAREST = 0x0100, 0x4000 | 0x0100, 0x2600
 
@@ -50,6 +51,7 @@ class StillCanvas(Canvas):
                 if rectangle is not None:
                     movers.append((item, rectangle))
         covered = [rectangle for _, rectangle in movers]
+        # The first frame draws what stands still, once.
         if self._picture is None:
             self._picture = self.make_target(camera.width, camera.height)
             still = replace(shot, target=self._picture)
@@ -57,12 +59,15 @@ class StillCanvas(Canvas):
             pass_.paint(painter, still, [item for item in visible if not item.moves])
             stale = [Rectangle(0, 0, camera.width, camera.height)]
         else:
+            # Where movers are now and where they were: both have to be restored.
             stale = merged([*self._covered, *covered])
         self._covered = tuple(covered)
         painter.prepare(self.target)
         for rectangle in stale:
+            # Rectangles are in px of the image, the target may be finer.
             fine = rectangle.scaled(pass_.samples.grid)
             painter.gl.ctx.scissor = (fine.x0, fine.y0, fine.x1 - fine.x0, fine.y1 - fine.y0)
+            # Restore first, then draw what touches the rectangle, under the scissor.
             self._restore(fine)
             pass_.paint(painter, shot, [item for item, place in movers if place.meets(rectangle)])
         painter.gl.ctx.scissor = None
@@ -77,6 +82,7 @@ class StillCanvas(Canvas):
             self._blit = gl.function("glBlitFramebuffer", None, *[ctypes.c_int] * 8, ctypes.c_uint, ctypes.c_uint)
         self._bind(_READ_FRAMEBUFFER, self._picture.fbo.glo)
         self._bind(_DRAW_FRAMEBUFFER, self.target.fbo.glo)
+        # A pass without colour outputs has a depth buffer alone.
         edges = (rectangle.x0, rectangle.y0, rectangle.x1, rectangle.y1)
         self._blit(*edges, *edges, _COLOUR_AND_DEPTH if self.outputs else _DEPTH, _NEAREST)
         self.target.fbo.use()

@@ -15,7 +15,7 @@ from blinkgl.events import arith
 
 
 def _c(name: str) -> float:
-    """A constant of the numba functions."""
+    """Return a constant of the numba functions."""
     return float(getattr(arith, name))
 
 
@@ -45,19 +45,22 @@ def horner(v: Tensor, coefficients: list[float], out: Tensor | None = None) -> T
 def log_q25_(v: Tensor, out: Tensor, first: Tensor, second: Tensor) -> None:
     """ln(v) in units of 2^-25 into ``out``.   v : float32 in [2^-30, 2^30], overwritten.   out : int32.
     first, second : scratch, float32. All of one size."""
+    # In place throughout, with the caller's scratch memory.
     # No memory is asked for: that would cost as much as the arithmetic.
     # v = m 2^exponent with m in [sqrt(1/2), sqrt(2)): taking sqrt(1/2) off the bits moves the exponent's step there.
     bits, shifted = v.view(torch.int32), first.view(torch.int32)
     exponent = torch.sub(bits, _ROOT_BITS_32, out=out)
     exponent >>= 23
     bits -= torch.bitwise_left_shift(exponent, 23, out=shifted)
-    v -= 1.0  # f = m - 1; then f + f^2 p(f)
+    # f = m - 1; then f + f^2 p(f).
+    v -= 1.0
     p = horner(v, _LOG32, out=first)
     p *= torch.mul(v, v, out=second)
     p += v
     p *= _Q_SCALE
     exponent *= _Q_LN2
-    exponent += v.view(torch.int32).copy_(p)  # towards zero, as the numba kernel does
+    # Towards zero, as the numba kernel does.
+    exponent += v.view(torch.int32).copy_(p)
 
 
 def sqrt(v: Tensor) -> Tensor:
@@ -70,6 +73,7 @@ def sqrt(v: Tensor) -> Tensor:
 def log_f32(v: Tensor) -> Tensor:
     """ln(v), float32 to float32, v normal and positive."""
     bits = v.view(torch.int32)
+    # As in log_q25_, with a result in float32.
     exponent = (bits - _ROOT_BITS_32) >> 23
     f = (bits - (exponent << 23)).view(torch.float32) - 1.0
     return exponent.to(torch.float32) * _LN2_32 + (f + f * f * horner(f, _LOG32))
@@ -78,6 +82,7 @@ def log_f32(v: Tensor) -> Tensor:
 def exp_f32(v: Tensor) -> Tensor:
     """exp(v), float32, v <= 80; below -87 it stays at exp(-87)."""
     v = v.clamp(min=-87.0)
+    # Adding and subtracting 1.5 * 2^23 rounds to an integer, as in arith.exp_f32.
     n = (v * _LOG2E_32 + _ROUND_32) - _ROUND_32
     r = (v - n * _LN2_HI_32) - n * _LN2_LO_32
     return horner(r, _EXP32) * ((n.to(torch.int32) + 127) << 23).view(torch.float32)
@@ -88,6 +93,7 @@ def log_f64(v: Tensor) -> Tensor:
     bits = v.view(torch.int64)
     exponent = (bits - _ROOT_BITS_64) >> 52
     m = (bits - (exponent << 52)).view(torch.float64)
+    # ln m = 2 artanh(s), a series in s^2.
     s = (m - 1.0) / (m + 1.0)
     z = s * s
     return exponent.to(torch.float64) * _LN2_64 + (s * 2.0 + s * z * horner(z, _LOG64))
@@ -95,27 +101,33 @@ def log_f64(v: Tensor) -> Tensor:
 
 def fall_f64(x: Tensor) -> Tensor:
     """e^-x, float64, x >= 0; beyond 600 it stays at e^-600."""
+    # For x <= 1/2 the exponent is 0 and nothing is reduced, as in arith.fall_f64.
     v = (-x).clamp(min=-600.0)
     t = torch.where(x <= 0.5, torch.full_like(x, _ROUND_64), v * _LOG2E_64 + _ROUND_64)
     n = t - _ROUND_64
     r = (v - n * _LN2_HI_64) - n * _LN2_LO_64
     c, r2 = _EXP64, r * r
-    r4 = r2 * r2  # Estrin's scheme, in the order of arith._exp_reduced
+    # Estrin's scheme, in the order of arith._exp_reduced.
+    r4 = r2 * r2
     low = (r * c[1] + c[0]) + r2 * (r * c[3] + c[2])
     middle = (r * c[5] + c[4]) + r2 * (r * c[7] + c[6])
     high = (r * c[9] + c[8]) + r2 * (r * c[11] + c[10])
     p = low + r4 * (middle + r4 * (high + r4 * c[12]))
-    return p * ((t.view(torch.int64) + 1023) << 52).view(torch.float64)  # the rounding constant's bits are shifted out
+    # The rounding constant's bits are shifted out.
+    return p * ((t.view(torch.int64) + 1023) << 52).view(torch.float64)
 
 
 def cos_sin_turn(u: Tensor) -> tuple[Tensor, Tensor]:
     """(cos 2 pi u, sin 2 pi u), float64, u in [0, 1]."""
     turns = u * 4.0
     nearest = (turns + _ROUND_64) - _ROUND_64
-    f = turns - nearest  # quarter turns, in [-1/2, 1/2]
+    # Quarter turns, in [-1/2, 1/2].
+    f = turns - nearest
     quadrant = nearest.to(torch.int64) & 3
     z = f * f
     s, c = horner(z, _SIN) * f, horner(z, _COS)
-    odd = (quadrant & 1).bool()  # an odd quadrant exchanges the two; the kernels blend, which is exact, too
+    # An odd quadrant exchanges the two; the kernels blend, which is exact, too.
+    odd = (quadrant & 1).bool()
     cos, sin = torch.where(odd, s, c), torch.where(odd, c, s)
+    # Cosine negative in quadrants 1 and 2, sine in 2 and 3.
     return torch.where(((quadrant + 1) & 2).bool(), -cos, cos), torch.where((quadrant & 2).bool(), -sin, sin)

@@ -108,6 +108,7 @@ def stable_order(keys: Sequence[tuple[Tensor, int]]) -> Tensor:
     keys : (N,) int64 >= 0, with the number of bits that they take."""
     order: Any = None
     for key, bits in reversed(keys):
+        # On a card torch's own sort is fast, and stable as well.
         if key.device.type != "cpu":
             fresh = torch.sort(key if order is None else key[order], stable=True).indices
             order = fresh if order is None else order[fresh]
@@ -126,7 +127,8 @@ def stable_order(keys: Sequence[tuple[Tensor, int]]) -> Tensor:
 
 def places(flags: Tensor) -> Tensor:
     """Indices of the elements >= 0 of a flat int32 or float32 tensor, ascending; the host learns how many there are."""
-    if flags.device.type == "cpu":  # NumPy's comparison and search take a quarter of torch's time
+    # NumPy's comparison and search take a quarter of torch's time.
+    if flags.device.type == "cpu":
         return torch.from_numpy(np.flatnonzero(flags.numpy() >= 0))
     return torch.nonzero(flags >= 0).view(-1)
 
@@ -141,7 +143,7 @@ class Batch(ABC):
 
     @property
     def _host_is_near(self) -> bool:
-        """Whether a look at a number costs nothing, because the host is the device."""
+        """Return whether reading a number costs nothing, because the host is the device."""
         return self.device.type == "cpu"
 
     def __init__(self, height: int, width: int, envs: int, device: Any, seed: int):
@@ -152,6 +154,7 @@ class Batch(ABC):
                 accepted=f"sides of 1 to {MAX_SIDE - 1}, fewer than 2^31 pixels in all",
             )
         self.height, self.width, self.envs = int(height), int(width), int(envs)
+        # "cuda" becomes "cuda:0", so that frames' devices compare equal.
         self.device = torch.empty(0, device=device).device  # with its number, as tensors say it
         self.seed = int(seed) & (2**64 - 1)
         self.seeds = tuple((self.seed + k) & (2**64 - 1) for k in range(self.envs))
@@ -175,6 +178,7 @@ class Batch(ABC):
         flat = self._checked(frames)
         interval = self._interval(t_ns)
         events = self._advance(flat, interval)
+        # Only after the step succeeded.
         self._clock[:, 0], self._clock[:, 1] = 1, interval.end_ns
         self._clock[:, 2] += 1
         return events
@@ -191,6 +195,7 @@ class Batch(ABC):
                 value=(mask.dtype, mask.shape),
                 accepted=f"({self.envs},) bool",
             )
+        # 0 in the first column: not started.
         self._clock[mask] = 0
         for k in np.flatnonzero(mask):
             self._forget(int(k))
@@ -224,11 +229,14 @@ class Batch(ABC):
             raise EventDataError(
                 "frames on another device", where="frames", value=str(frames.device), accepted=str(self.device)
             )
+        # One flat array of all environments, whose gradient is not followed.
         return frames.detach().reshape(-1)
 
     def _interval(self, t_ns: Any) -> Interval:
-        """Of the step to ``t_ns``. Raises EventDataError naming the first environment whose time cannot be."""
+        """Return the interval of the step to ``t_ns``. Raises EventDataError naming the first environment whose time
+        cannot be."""
         try:
+            # An integer, or one per environment; a tensor on a card is brought to the host.
             times = np.asarray(t_ns.cpu() if isinstance(t_ns, Tensor) else t_ns)
             if times.dtype.kind not in "iu" or times.shape not in ((), (self.envs,)):
                 raise ValueError
@@ -236,6 +244,7 @@ class Batch(ABC):
         except (TypeError, ValueError, OverflowError):
             accepted = f"whole nanoseconds, one or {self.envs}"
             raise EventDataError("not time stamps", where="t_ns", value=t_ns, accepted=accepted) from None
+        # A fresh environment has no interval: its time before is its own.
         started, before = self._clock[:, 0] == 1, np.where(self._clock[:, 0] == 1, self._clock[:, 1], times)
         late = np.where(started, times <= before, False) | (np.abs(times) >= 2**61)
         wrong = np.flatnonzero(late | (times - before > MAX_INTERVAL_NS))
@@ -247,7 +256,8 @@ class Batch(ABC):
                 value=f"{times[k]} ns",
                 accepted=f"more than {before[k]} ns" if started[k] else "less than 2^61 ns",
             )
-        length = np.where(started, times - before, 1)  # no division by an interval that does not exist
+        # No division by an interval that does not exist.
+        length = np.where(started, times - before, 1)
 
         def given(values: np.ndarray) -> Any:
             alike = (values == values[0]).all()
@@ -263,6 +273,7 @@ class Batch(ABC):
         frame check all of it. Only -0.0 looks wrong and is not."""
         if lowest >= 0 and highest <= int(INTENSITY_LIMIT_BITS):
             return
+        # Which pixel it is matters only when there is an error.
         bad = torch.nonzero(~((flat >= 0) & (flat <= LOG_MAX_INPUT))).view(-1)
         if len(bad):
             k, pixel = divmod(int(bad[0]), self._pixels)
@@ -277,26 +288,31 @@ class Batch(ABC):
             raise error
 
     def _chunks(self) -> list[slice]:
-        """The flat pixels, in pieces."""
+        """Return slices that cut the flat pixels into pieces."""
+        # Without an entry for the device a piece has 2^24 pixels.
         size, total = _CHUNK.get(self.device.type, 2**24), self.envs * self._pixels
         return [slice(a, min(a + size, total)) for a in range(0, total, size)]
 
     # -- events --------------------------------------------------------------------------------------------------
     def _env_of(self, flat: Tensor) -> Tensor:
-        """Environments of flat pixel numbers."""
+        """Return the environments of flat pixel numbers."""
         return torch.div(flat, self._pixels, rounding_mode="trunc") if self.envs > 1 else torch.zeros_like(flat)
 
     def _events(self, interval: Interval, found: Found, cause: Tensor | None, waves: bool) -> TensorEvents:
-        """Columns in their order, from events that lie pixel by pixel, or wave by wave with each wave in raster order.
+        """Return the sorted columns of events that lie pixel by pixel, or wave by wave with each wave in raster
+        order.
 
         waves : events of one pixel are not beside each other yet."""
+        # Sorted by environment, then time; without environments to tell apart that key is left out.
         env = self._env_of(found.word >> 1) if self.envs > 1 else None
         keys = [(found.after_us, (interval.longest_ns // 1000 + 1).bit_length())]
         if env is not None:
             keys.insert(0, (env, (self.envs - 1).bit_length()))
-        if waves:  # raster order among equal times; the sort itself keeps a pixel's events in the order they came
+        # Raster order among equal times; the sort itself keeps a pixel's events in the order they came.
+        if waves:
             keys.append((found.word >> 1, (self.envs * self._pixels - 1).bit_length()))
         order = stable_order(keys)
+        # Columns from the word: polarity in the lowest bit, the pixel above it.
         word, after = found.word.index_select(0, order), found.after_us.index_select(0, order)
         env, pixel = torch.zeros_like(word) if env is None else env.index_select(0, order), word >> 1
         if self.envs > 1:
@@ -315,8 +331,8 @@ class Batch(ABC):
 
     @abstractmethod
     def _advance(self, flat: Tensor, interval: Interval) -> TensorEvents:
-        """The events of a step; changes nothing where it raises."""
+        """Return the events of a step; nothing changes where it raises."""
 
     @abstractmethod
     def _forget(self, k: int) -> None:
-        """Environment k waits for its first frame."""
+        """Reset environment k, which then waits for its first frame."""

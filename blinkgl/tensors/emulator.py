@@ -38,11 +38,13 @@ class _OnDevice(Emulator):
         self.tensor_device = self._batch.device
 
     def step(self, luminance: Any, t_ns: int, rows: Any = None, rate: Any = None) -> Events:
+        # Arrays take the checks of the emulator on the processor, which then calls _start or _advance.
         if not isinstance(luminance, Tensor):
             return super().step(luminance, t_ns, rows, rate)
         # A frame that lies on the device: the batch checks it there.
         t_ns = self._checked_time(t_ns)
         events = self._made(luminance[None] if luminance.ndim == 2 else luminance, t_ns)
+        # Rows that changed are not known of a frame on the device.
         self.t_ns, self._rows_before = t_ns, None
         self.frames += 1
         return events
@@ -75,6 +77,7 @@ class _OnDevice(Emulator):
     def state_dict(self) -> dict[str, np.ndarray]:
         """That of the emulator on the processor."""
         there = self._batch.state_dict()
+        # The leak clock and the brightest pixel are state of V2e that the batch keeps in another form.
         epoch = {"_epoch_ns": there["clock"][:, 3]}
         if "_intensity" in there:
             epoch["_brightest"] = there["_intensity"].amax()[None].to(torch.float64)
@@ -87,6 +90,7 @@ class _OnDevice(Emulator):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         super().load_state_dict(state)
         there = self._batch.state_dict()
+        # The batch's clock: started, time, frames, start of the leak clock (Batch._clock).
         epoch = int(getattr(self, "_epoch_ns", [0])[0])
         clock = [self.t_ns is not None, self.t_ns or 0, self.frames, epoch]
         there["clock"] = torch.tensor([clock], dtype=torch.int64)
@@ -174,8 +178,10 @@ def same_events(kind: Any, config: Any, device: Any) -> bool:
     # The trial's few pixels are not to be cut: the limit is compared with each step.
     limit = type(config).model_fields["max_events_per_step"].default
     config = config.model_copy(update={"max_events_per_step": limit})
+    # The trial's result is kept for the process: a card does not change in between.
     key = (str(device), config.model_dump_json())
     if key not in _trials:
+        # Noise fires pixels of both polarities; 1_000_003 ns is no whole number of microseconds.
         rng = np.random.default_rng(1)
         clip = np.exp(rng.normal(-1, 0.5, (4, 32, 64))).astype(np.float32)
         both = KINDS[kind](32, 64, config, 1, device), kind(32, 64, config, 1)

@@ -54,9 +54,11 @@ class Sizes(NamedTuple):
 
 def crossing_ns(part: Tensor, whole: Tensor, dt_ns: Any, longest_ns: int) -> Tensor:
     """floor(part / whole * dt_ns) for 0 <= part <= whole < 2^31, exactly: ``crossing_ns`` of blinkgl.events.esim."""
+    # Both factors are below 2^31, so the product fits int64.
     if longest_ns < _LONG_NS:
         return torch.div(part * dt_ns, whole, rounding_mode="trunc")
-    high, low = dt_ns >> 20, dt_ns & 0xFFFFF  # schoolbook division: no product reaches 2^63
+    # Schoolbook division: no product reaches 2^63.
+    high, low = dt_ns >> 20, dt_ns & 0xFFFFF
     ahead = part * high
     quotient = torch.div(ahead, whole, rounding_mode="trunc")
     rest = ahead - quotient * whole
@@ -99,6 +101,7 @@ class TensorEsim(Batch):
         total = self.envs * self._pixels
         zeros = lambda dtype, wanted=True: torch.zeros(total if wanted else 0, dtype=dtype, device=self.device)
         on, off = config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold
+        # Fixed point from here on; one number where all pixels share it, else a tensor.
         self._on: Any = int(to_q25(on))
         self._off: Any = int(to_q25(off))
         smallest = min(self._on, self._off)
@@ -107,23 +110,28 @@ class TensorEsim(Batch):
             self._on, self._off = zeros(torch.int32), zeros(torch.int32)
             smallest = min(self._draw(k, on, off) for k in range(self.envs))
         self._floor_on, self._floor_off = (int(to_q25(min(MIN_THRESHOLD, c / 2))) for c in (on, off))
+        # With jitter every event may draw the floor, which bounds the number of events.
         self._jitter = config.threshold_jitter * Q_ONE
         if self._jitter:
             smallest = min(self._floor_on, self._floor_off)
         self._inverse_threshold = 1.0 / smallest
         self._refractory_ns = round(config.refractory_us * 1000)
+        # Each block of 1024 pixels may have its share of max_events_per_step, at least one event a
+        # pixel.
         self._share = max(BLOCK, config.max_events_per_step // -(-self._pixels // BLOCK))
         self._log, self._upper, self._lower = (zeros(torch.int32) for _ in range(3))
+        # Levels out of reach until the environment's first frame.
         self._upper += _ASLEEP
         self._lower -= _ASLEEP
         self._fired = zeros(torch.int32, self._jitter > 0)
         self._last_ns = zeros(torch.int64, self._refractory_ns > 0) + NEVER_NS
-        self._now, self._beyond = zeros(torch.int32), zeros(torch.int32)  # of the first half
+        # Of the first half.
+        self._now, self._beyond = zeros(torch.int32), zeros(torch.int32)
         self._scratch = torch.empty((3, len(self._now[self._chunks()[0]])), device=self.device)
         self._state = ("_log", "_upper", "_lower", "_fired", "_last_ns")
 
     def _draw(self, k: int, on: float, off: float) -> int:
-        """Draws the thresholds of environment k, which stay; returns the smallest."""
+        """Draw the thresholds of environment k, which stay fixed, and return the smallest."""
         c, here = self.config, self._rows(k)
         drawn = draw_thresholds(
             self.height, self.width, on, off, c.threshold_sigma, np.uint64(self.seeds[k]), c.threshold_correlation
@@ -133,7 +141,7 @@ class TensorEsim(Batch):
         return int(min(to_q25(one.min()) for one in drawn))
 
     def _rows(self, k: int) -> slice:
-        """The pixels of environment k."""
+        """Return the slice of environment k's pixels."""
         return slice(k * self._pixels, (k + 1) * self._pixels)
 
     def _forget(self, k: int) -> None:
@@ -143,7 +151,7 @@ class TensorEsim(Batch):
         self._fired[here if self._jitter else slice(0)] = 0
 
     def _first_levels(self, k: int) -> None:
-        """Levels round the first frame of environment k."""
+        """Set the levels around the first frame of environment k."""
         here = self._rows(k)
         on, off = (self._on[here], self._off[here]) if self._spread else (self._on, self._off)
         if self._jitter:
@@ -153,7 +161,7 @@ class TensorEsim(Batch):
         self._lower[here] = (self._log[here] - off).to(torch.int32)
 
     def _jittered(self, key: Any, pixel: Tensor, fired: Tensor, on: Any, off: Any) -> tuple[Tensor, Tensor]:
-        """Thresholds for the level after ``fired`` of them, int64."""
+        """Return the thresholds for the level after ``fired`` levels, int64."""
         a, b = normal2(key, pixel, int(Stream.JITTER), fired)
         up = on + torch.floor(a * self._jitter + 0.5).to(torch.int64)
         down = off + torch.floor(b * self._jitter + 0.5).to(torch.int64)
@@ -163,8 +171,11 @@ class TensorEsim(Batch):
     def _advance(self, flat: Tensor, interval: Interval) -> TensorEvents:
         extremes = self._look(flat)
         firing, counts, sizes = self._sized(flat, extremes)
+        # Caps are only computed where some block could exceed its share: they cost a pass over all
+        # pixels.
         cap = self._caps(interval, firing) if self._may_cut(interval, sizes.farthest) else None
-        self._log, self._now = self._now, self._log  # from here on the state changes
+        # From here on the state changes.
+        self._log, self._now = self._now, self._log
         if self._jitter:
             found = self._walk(firing, interval, cap)
         else:
@@ -175,7 +186,8 @@ class TensorEsim(Batch):
         return self._events(interval, found, causes, waves=self._jitter > 0)
 
     def _look(self, flat: Tensor) -> Tensor:
-        """The first half: log intensity, distance beyond the levels; the extremes of the frames' bits."""
+        """Compute log intensities and distances beyond the levels (the first half), and return the extremes of the
+        frames' bits."""
         extremes = []
         for piece in self._chunks():
             now, beyond = self._now[piece], self._beyond[piece]
@@ -188,14 +200,17 @@ class TensorEsim(Batch):
         return torch.stack(extremes)
 
     def _sized(self, flat: Tensor, extremes: Tensor) -> tuple[Firing, Tensor, Sizes]:
-        """The pixels that fire, the levels that each passes, and what the host has to know of both.
+        """Return the pixels that fire, the number of levels that each passes, and what the host has to know of both.
 
         Here the host waits, once. Raises EventDataError: an intensity that cannot be used."""
-        if self._host_is_near:  # the host may look as often as it likes, so only pixels that fire are counted
+        # The host may look as often as it likes, so only pixels that fire are counted.
+        if self._host_is_near:
             self._refuse(flat, int(extremes[:, 0].amin()), int(extremes[:, 1].amax()))
             firing = self._gathered(places(self._beyond))
-            if self._jitter:  # how many levels a pixel passes is known when they are drawn
+            # How many levels a pixel passes is known when they are drawn.
+            if self._jitter:
                 return firing, firing.gap, Sizes(0, 0, int(self._beyond.amax()))
+            # Levels that fit between the first one passed and the signal, and the first one itself.
             counts = torch.div(firing.gap, firing.step, rounding_mode="trunc") + 1
             most = int(counts.amax()) if len(counts) else 0
             return firing, counts, Sizes(int(counts.sum()), most, int(self._beyond.amax()))
@@ -203,6 +218,7 @@ class TensorEsim(Batch):
         active = self._beyond >= 0
         step = self._on if self._same_steps else torch.where(self._now >= self._upper, self._on, self._off)
         levels = torch.where(active, torch.div(self._beyond, step, rounding_mode="trunc") + 1, 0)
+        # All numbers in one transfer, for which the host waits.
         numbers = (extremes[:, 0].amin(), extremes[:, 1].amax(), active.sum(), levels.sum(), levels.amax())
         looked = torch.stack([one.to(torch.int64) for one in (*numbers, self._beyond.amax())]).tolist()
         self._refuse(flat, looked[0], looked[1])
@@ -210,24 +226,28 @@ class TensorEsim(Batch):
         counts = levels.index_select(0, firing.flat).to(torch.int64)
         return firing, counts, Sizes(*looked[3:])
 
+    # A block's worst case: every pixel as far beyond its level as the farthest one.
     def _may_cut(self, v: Interval, farthest: int) -> bool:
-        """Whether some block of pixels could have more events than its share."""
+        """Return whether some block of pixels could have more events than its share."""
         return BLOCK * (int(max(farthest, 0) * self._inverse_threshold) + 2) > self._share
 
     def _caps(self, v: Interval, f: Firing) -> Tensor:
-        """Most events of each pixel that fires, (M,) int64, as the kernel of the single emulator shares them out among
-        the pixels that fire of a block of 1024."""
+        """Return the largest number of events of each pixel that fires, (M,) int64, as the kernel of the single
+        emulator shares them out among the pixels that fire of a block of 1024."""
         blocks = -(-self._pixels // BLOCK)
+        # Padded to whole blocks; -1 is a pixel that does not fire.
         beyond = torch.full((self.envs, blocks * BLOCK), -1, dtype=torch.int32, device=self.device)
         beyond[:, : self._pixels] = self._beyond.view(self.envs, -1)
         beyond = beyond.view(-1, BLOCK)
         count, farthest = (beyond >= 0).sum(1), beyond.amax(1)
         cap = (farthest.to(torch.float64) * self._inverse_threshold).to(torch.int64) + 2
+        # At most one event per refractory period, and one at either end.
         if self._refractory_ns:
             env = torch.arange(self.envs, device=self.device).repeat_interleave(blocks)
             dt_ns = torch.as_tensor(v.of(v.dt_ns, env), device=self.device)
             bound = torch.div(dt_ns, self._refractory_ns, rounding_mode="trunc") + 2
             cap = torch.minimum(cap, bound)
+        # The share is split among the pixels of the block that fire.
         shared = torch.div(self._share, count.clamp(min=1), rounding_mode="trunc").clamp(min=1)
         cap = torch.where(count * cap > self._share, shared, cap)
         block = torch.div(f.flat - f.env * self._pixels, BLOCK, rounding_mode="trunc") + f.env * blocks
@@ -241,6 +261,7 @@ class TensorEsim(Batch):
         return not self._spread and self._on == self._off
 
     def _gathered(self, index: Tensor) -> Firing:
+        # Gathered as int64, in which products of two 31-bit numbers fit.
         take = lambda tensor: tensor.index_select(0, index).to(torch.int64)
         log, upper, lower = take(self._now), take(self._upper), take(self._lower)
         on, off = (take(self._on), take(self._off)) if self._spread else (self._on, self._off)
@@ -251,13 +272,18 @@ class TensorEsim(Batch):
         return Firing(index, self._env_of(index), log, whole, gap, above.to(torch.int64), on, off, step)
 
     def _at_once(self, f: Firing, counts: Tensor, sizes: Sizes, v: Interval, cap: Tensor | None) -> Found:
-        """All events in raster order; moves the levels."""
-        passed = f.log - (2 * f.polarity - 1) * (f.gap - (counts - 1) * f.step)  # the last level passed
+        """Return all events in raster order and move the levels."""
+        # passed: the last level passed.
+        passed = f.log - (2 * f.polarity - 1) * (f.gap - (counts - 1) * f.step)
         self._upper.index_copy_(0, f.flat, (passed + f.on).to(torch.int32))
         self._lower.index_copy_(0, f.flat, (passed - f.off).to(torch.int32))
+        # word: pixel number and polarity, as Found has it.
         part, whole, word, env = f.whole - f.gap, f.whole, (f.flat << 1) | f.polarity, f.env
         first = owner = f.flat
-        if sizes.most > 1:  # else every pixel that fires has one event
+        # With at most one event per pixel nothing has to be repeated.
+        if sizes.most > 1:
+            # Number of the first event of each pixel among all events; then every event's pixel and its
+            # own number there.
             first = counts.cumsum(0) - counts
             owner = torch.repeat_interleave(counts, output_size=sizes.total)
             of_owner = lambda c: c.index_select(0, owner) if isinstance(c, Tensor) else c
@@ -272,12 +298,14 @@ class TensorEsim(Batch):
             return found
         if sizes.most <= 1:
             first = owner = torch.arange(len(word), device=self.device)
+        # Some events may be lost from here on.
         keep = torch.ones(len(word), dtype=torch.bool, device=self.device)
         if self._refractory_ns:
             keep = self._awake(f, counts, first, sizes.most, after + 1000 * v.of(v.base_us, env))
         if cap is not None:
             let = keep.to(torch.int64)
-            before = let.cumsum(0) - let  # events let through before this one; less those of earlier pixels
+            # rank: events of the same pixel that were let through before this one.
+            before = let.cumsum(0) - let
             rank = before - before.index_select(0, first.index_select(0, owner))
             within = rank < cap.index_select(0, owner)
             self._count_cut(env, keep & ~within)
@@ -285,12 +313,14 @@ class TensorEsim(Batch):
         return Found(*(one[keep] for one in found))
 
     def _awake(self, f: Firing, counts: Tensor, first: Tensor, most: int, t_ns: Tensor) -> Tensor:
-        """Which events come after their pixel's refractory period, (N,) bool; the others are lost.
+        """Return which events come after their pixel's refractory period, (N,) bool; the others are lost.
 
         first : each pixel's first event.   t_ns : of all events, pixel by pixel. One turn a level, over all pixels: no
         size depends on what is lost."""
+        # Levels passed are walked together over all pixels, j-th with j-th.
         last = self._last_ns.index_select(0, f.flat)
-        keep = torch.zeros(len(t_ns) + 1, dtype=torch.bool, device=self.device)  # the last place takes what is none
+        # The additional last element takes the writes of pixels without a j-th level.
+        keep = torch.zeros(len(t_ns) + 1, dtype=torch.bool, device=self.device)
         for j in range(most):
             there = counts > j
             at = torch.where(there, first + j, len(t_ns))
@@ -302,12 +332,13 @@ class TensorEsim(Batch):
         return keep[:-1]
 
     def _walk(self, f: Firing, v: Interval, cap: Tensor | None) -> Found:
-        """:meth:`_at_once` level by level, with thresholds drawn anew at each."""
+        """Do :meth:`_at_once` level by level, with thresholds drawn anew at each."""
         slots = torch.arange(len(f.flat), device=self.device)
         gap, fired = f.gap.clone(), self._fired.index_select(0, f.flat).to(torch.int64)
         up, down, emitted = torch.zeros_like(gap), torch.zeros_like(gap), torch.zeros_like(gap)
         last = self._last_ns.index_select(0, f.flat) if self._refractory_ns else gap
         found: list[Found] = []
+        # One turn per level; pixels that pass no further one drop out.
         while len(slots):
             flat, env, whole = (one.index_select(0, slots) for one in (f.flat, f.env, f.whole))
             here, polarity = gap.index_select(0, slots), f.polarity.index_select(0, slots)
@@ -334,6 +365,7 @@ class TensorEsim(Batch):
             for target, values in ((fired, number), (up, new_up), (down, new_down), (gap, here)):
                 target.index_copy_(0, slots, values)
             slots = slots[here >= 0]
+        # The last level passed, from what is left of the gap: the new reference.
         passed = f.log - (2 * f.polarity - 1) * (gap + torch.where(f.polarity.bool(), up, down))
         self._upper.index_copy_(0, f.flat, (passed + up).to(torch.int32))
         self._lower.index_copy_(0, f.flat, (passed - down).to(torch.int32))

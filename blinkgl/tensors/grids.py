@@ -19,7 +19,7 @@ NEVER_US = NEVER_NS // 1000
 
 
 def _cells(events: TensorEvents, channel: Tensor, channels: int) -> Tensor:
-    """Places in a flat (environments, channels, H, W) array, (N,) int64."""
+    """Return the events' places in a flat (environments, channels, H, W) array, (N,) int64."""
     _, height, width = events.shape
     return ((events.env.to(torch.int64) * channels + channel) * height + events.y) * width + events.x
 
@@ -31,6 +31,7 @@ def voxel_grid(events: TensorEvents, t0_us: Any, t1_us: Any, bins: int) -> Tenso
     t0_us, t1_us : microseconds, one for all environments or (environments,) int64 tensors on the events' device.
     On a processor the numbers are those of :func:`blinkgl.events.grids.voxel_grid`, bit for bit; on a card sums are
     made in any order, so they agree to float32's rounding. Source: Zhu et al., CVPR 2019, section 3.1."""
+    # The kernel max(0, 1 - |place - bin|) of Zhu et al. touches two bins.
     envs, height, width = events.shape
     env = events.env.to(torch.int64)
     start, end = (value[env] if isinstance(value, Tensor) else int(value) for value in (t0_us, t1_us))
@@ -65,6 +66,7 @@ def latest_times(events: TensorEvents, before: Tensor | None = None) -> Tensor:
     shape = (envs, 2, height, width)
     start = torch.full(shape, NEVER_US, dtype=torch.int64, device=events.t.device) if before is None else before
     cells = _cells(events, events.p.to(torch.int64), 2)
+    # amax is the same in any order, so the result does not depend on the device.
     return start.reshape(-1).scatter_reduce(0, cells, events.t, "amax").view(shape)
 
 

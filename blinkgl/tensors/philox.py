@@ -30,6 +30,7 @@ def philox4x32(key: tuple[Any, ...], pixel: Any, stream: int, index: Any) -> lis
     c0, c1, c2, c3 = pixel & _MASK32, stream, index & _MASK32, (index >> 32) & _MASK32
     k0, k1 = key
     for turn in range(10):
+        # 32 x 32 bits: the low 64 bits are exact, also in signed arithmetic.
         p0, p1 = c0 * _M0, c2 * _M1
         c0, c1, c2, c3 = ((p1 >> 32) & _MASK32) ^ c1 ^ k0, p1 & _MASK32, ((p0 >> 32) & _MASK32) ^ c3 ^ k1, p0 & _MASK32
         if turn < 9:
@@ -56,5 +57,6 @@ def normal2(key: tuple[Any, ...], pixel: Any, stream: int, index: Any) -> tuple[
 def rough_normal(key: tuple[Any, ...], pixel: Any, stream: int, index: Any) -> Tensor:
     """Mean 0, variance 1, near normal: the sum of four uniforms, float64."""
     w0, w1, w2, w3 = philox4x32(key, pixel, stream, index)
+    # Mean 2 and variance 1/3, shifted and scaled as in events.philox.rough_normal.
     total = (w0 + w1 + w2 + w3).to(torch.float64)
     return (total * _ULP32 + (2.0 * _ULP32 - 2.0)) * math.sqrt(3.0)

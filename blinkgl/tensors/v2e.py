@@ -32,6 +32,7 @@ from blinkgl.tensors.batch import Batch, Found, Interval, TensorEvents, places, 
 from blinkgl.tensors.philox import normal2, uniform2
 from blinkgl.tensors.waves import Parts, Rows, Shots, Step, add_curves, wake, waves
 
+# Constants of the numba functions, so that there is one copy of each.
 _SLOPE, _DARK, _SETTLED = (float(getattr(model, name)) for name in ("_SLOPE", "DARK", "SETTLED"))
 _SMALLEST_K = float(vars(model)["_SMALLEST_K"])
 _GROWTH = [float(getattr(model, f"_P{k}")) for k in range(6, -1, -1)]
@@ -42,6 +43,7 @@ _INF = float("inf")
 
 def lin_log(intensity: Tensor) -> Tensor:
     """ln(I) above 20 DN, the chord from the origin below; float32. See ``v2e_model.lin_log``."""
+    # torch.where computes both sides, so the logarithm's argument is clamped to its range.
     dim = torch.where(intensity < _DARK, 0.0, intensity * _SLOPE)
     return torch.where(intensity <= 20.0, dim, log_f32(intensity.clamp(min=20.0)))
 
@@ -54,13 +56,14 @@ def settled(lag: Tensor) -> Tensor:
 def decay(k: Tensor) -> tuple[Tensor, Tensor]:
     """(e^-k, (1 - e^-k)/k), float32, k >= 0. See ``v2e_model.decay``."""
     small, large = k.clamp(max=0.5), k.clamp(min=0.5)
+    # Taylor series below k = 1/2, the exponential above.
     p, e = horner(small, _GROWTH), exp_f32(-large)
     gentle = k < 0.5
     return torch.where(gentle, 1.0 - small * p, e), torch.where(gentle, p, (1.0 - e) / large)
 
 
 def _decay_of(k: float) -> tuple[float, float]:
-    """:func:`decay` of one number, rounded to float32 first."""
+    """Return :func:`decay` of one number, rounded to float32 first."""
     keep, ramp = model.decay(np.array(k, np.float32))  # type: ignore[arg-type]
     return float(keep), float(ramp)
 
@@ -128,6 +131,7 @@ class TensorV2e(Batch):
         self._shots = config.shot_noise_rate_hz > 0 and not config.photoreceptor_noise
         if not self._leaky:
             self._has = replace(self._has, leak_jitter=0.0)
+        # Whole blocks of 1024 pixels, the last one padded.
         self._blocks = -(-self._pixels // BLOCK)
         self._shot_unit = 0.5 * config.shot_noise_rate_hz * model.DARKEST * 1e-9
         self._shots_per_ns, self._rebase_ns = np.zeros(self.envs), np.full(self.envs, 2**61)
@@ -138,9 +142,10 @@ class TensorV2e(Batch):
         self._sizes: dict[int, Tensor] = {}
 
     def _make_state(self, config: V2eConfig) -> None:
-        """Tensors for the state, by the names of V2e's arrays, and for what is drawn once; flat."""
+        """Make flat tensors for the state, by the names of V2e's arrays, and for what is drawn once."""
         memory = self._has.low_pass or config.shot_noise_rate_hz > 0
         float32, int64, pixels, blocks = torch.float32, torch.int64, self._pixels, self._blocks
+        # Name: type, elements per environment, whether the configuration needs it.
         wanted = {
             "_x": (float32, pixels, True),
             "_upper": (float32, pixels, True),
@@ -179,6 +184,7 @@ class TensorV2e(Batch):
         leak = model.draw_leaks(*size, c, on, seed)
         drawn = {"_on": on, "_off": off, "_mean_leak": leak}
         if leak.size and leak.max() > 0:
+            # The leak clock starts anew when the median pixel has leaked REBASE.
             self._rebase_ns[k] = int(model.REBASE / float(np.median(leak[leak > 0])) * 1e9)
         if c.causes:
             drawn["_hot"] = model.draw_hot(*size, c, seed)
@@ -195,7 +201,8 @@ class TensorV2e(Batch):
 
     def _forget(self, k: int) -> None:
         rows = lambda name: getattr(self, name).view(self.envs, -1)[k]
-        rows("_upper").fill_(_INF)  # levels that no signal reaches
+        # Levels that no signal reaches.
+        rows("_upper").fill_(_INF)
         rows("_lower").fill_(-_INF)
         if self._shots:
             rows("_clock_ns").fill_(_NOT_YET_NS)
@@ -204,6 +211,7 @@ class TensorV2e(Batch):
     # -- a step --------------------------------------------------------------------------------------------------
     def _advance(self, flat: Tensor, interval: Interval) -> TensorEvents:
         self._refuse_noise(interval)
+        # Extremes first: a frame that is refused must change nothing.
         bits = torch.aminmax(flat.view(torch.int32))
         lowest, highest = torch.stack(bits).tolist()
         self._refuse(flat, lowest, highest)
@@ -212,6 +220,7 @@ class TensorV2e(Batch):
         shots = self._draw_shots(interval, now) if self._shots else None
         rows, step = self._rows(places(self._flagged(beyond, shots)), now, shots, each, interval)
         found = waves(rows, step, self._has, shots, self._put_back)
+        # The second half is done: what the photoreceptors hold becomes the state.
         for name, value in now.items():
             getattr(self, name).copy_(value.reshape(-1))
         self._rest_leaks(interval, each)
@@ -222,8 +231,10 @@ class TensorV2e(Batch):
         return self._events(interval, Found(word, after), cause if self.config.causes else None, waves=True)
 
     def _numbers(self, v: Interval) -> Numbers:
-        """Computed in double precision on the host, as V2e does; rounded once where float32 is asked for."""
+        """Return the step's numbers, computed in double precision on the host as V2e does, and rounded once where
+        float32 is needed."""
         config, lengths = self.config, v.lengths_ns
+        # A fresh environment's leak clock starts with its frame.
         epoch = np.where(self._clock[:, 0] == 1, self._clock[:, 3], v.start_ns)
         since_0, since_1 = ([one * 1e-9 for one in (times - epoch).tolist()] for times in (v.start_ns, v.end_ns))
 
@@ -233,6 +244,7 @@ class TensorV2e(Batch):
             return torch.tensor(values, dtype=torch.float64, device=self.device)
 
         column = lambda v: v.to(torch.float32)[:, None] if isinstance(v, Tensor) else float(np.float32(v))
+        # kappa = 2 pi f_c dt / 275, time constants per DN of (I + 20).
         kappa = given([2 * np.pi * config.cutoff_hz * dt * 1e-9 / 275.0 for dt in lengths])
         dt, since = given([dt * 1e-9 for dt in lengths]), given(since_1)
         step = Step(v.t0_ns, v.t0_ns - 1000 * v.base_us, v.dt_ns, dt, given(since_0), since, kappa, None, None)
@@ -254,19 +266,21 @@ class TensorV2e(Batch):
             )
 
     def _look(self, frames: Tensor, each: Numbers) -> tuple[dict[str, Tensor], Tensor]:
-        """The first half: what the photoreceptors hold at the interval's end, by the name of the state, and how far
-        their signals lie beyond the levels; (environments, pixels) float32."""
+        """Compute the first half: what the photoreceptors hold at the interval's end, by the name of the state, and
+        how far their signals lie beyond the levels; (environments, pixels) float32."""
         before: Callable[[str], Tensor] = lambda name: getattr(self, name).view(self.envs, -1)
         intensity = frames * self.config.full_scale
         x = lin_log(intensity)
         now = {"_intensity": intensity} if "_intensity" in self._state else {}
         if self.config.second_cutoff_hz:
+            # Second low-pass: lag e^-k - dx (1 - e^-k)/k, the same k at all pixels.
             lag = settled(before("_second_lag") * each.second_keep - (x - before("_before_second")) * each.second_ramp)
             now["_before_second"], now["_second_lag"] = x, lag
             x = x + lag
         now["_x"] = signal = x
         k = None
         if self._has.low_pass:
+            # First low-pass, whose corner follows the mean intensity of the interval.
             k = ((before("_intensity") + intensity) * 0.5 + 20.0) * each.kappa_32
             a, g = decay(k)
             now["_lag"] = settled(before("_lag") * a - (x - before("_x")) * g)
@@ -279,7 +293,7 @@ class TensorV2e(Batch):
         return now, torch.maximum(signal - before("_upper"), before("_lower") - signal)
 
     def _next_noise(self, noise: Tensor, k: Tensor, each: Numbers) -> Tensor:
-        """Photoreceptor noise at the interval's end: the exact step of an Ornstein-Uhlenbeck process."""
+        """Return the photoreceptor noise at the interval's end, by the exact step of an Ornstein-Uhlenbeck process."""
         pairs = torch.arange((self._pixels + 1) // 2, device=self.device)
         # Pixels 2j and 2j + 1 share a draw. One environment at a time: its draws take forty times their memory.
         drawn = [
@@ -287,6 +301,7 @@ class TensorV2e(Batch):
             for e in range(self.envs)
         ]
         normal = torch.stack(drawn)[:, : self._pixels].to(torch.float32)
+        # The size is interpolated in ln k, as in v2e_model.noise_place.
         place = (log_f32(k.clamp(min=_SMALLEST_K)) - _TABLE_LOW) * _TABLE_PER
         below = place.clamp(min=0.0, max=float(_TABLE_LAST)).to(torch.int64)
         part = place.clamp(max=float(_TABLE_LAST)) - below.to(torch.float32)
@@ -296,18 +311,21 @@ class TensorV2e(Batch):
         return noise * a + (low + part * (high - low)) * sqrt(1.0 - a * a) * normal
 
     def _noise_sizes(self, dt_ns: int) -> Tensor:
-        """The table of the noise's size over ln k, (TABLE_SIZE,) float32, for frames so far apart."""
+        """Return the table of the noise's size over ln k, (TABLE_SIZE,) float32, for this frame spacing."""
         if dt_ns not in self._sizes:
             c = self.config
             made = noise_table(c.shot_noise_rate_hz, dt_ns * 1e-9, model.noise_threshold(c), c.refractory_us * 1e-6)
+            # Tables of a few spacings are kept; with varying spacings they would pile up.
             self._sizes = {**(self._sizes if len(self._sizes) < 2 * self.envs else {})}
             self._sizes[dt_ns] = torch.from_numpy(made).to(self.device)
         return self._sizes[dt_ns]
 
     def _draw_shots(self, interval: Interval, now: dict[str, Tensor]) -> Shots | None:
-        """Shot noise of the interval, None without any. One Poisson clock a block of 1024 pixels, as fast as if all
-        were dark, thinned to what their intensities allow (Lewis and Shedler 1979); moves the clocks."""
+        """Draw the shot noise of the interval, None without any. One Poisson clock a block of 1024 pixels, as fast
+        as if all were dark, thinned to what their intensities allow (Lewis and Shedler 1979); moves the clocks."""
         table = self._shot_table.view(-1, 2 * BLOCK)
+        # Every block of every environment has a clock; those that are due move on together, one
+        # candidate a turn.
         env = torch.arange(self.envs, device=self.device).repeat_interleave(self._blocks)
         block = torch.arange(self._blocks, device=self.device).repeat(self.envs)
         end_ns = torch.from_numpy(interval.end_ns).to(self.device)[env]
@@ -325,18 +343,22 @@ class TensorV2e(Batch):
             pixel, on = b * BLOCK + (place & (BLOCK - 1)), place < BLOCK
             inside = pixel < self._pixels
             flat = torch.where(inside, pixel, 0) + env[due] * self._pixels
+            # Intensity at the candidate's time, on the straight line between the frames.
             after = (self._clock_ns[due] - start_ns[due]).clamp(min=0)
             before = self._intensity[flat]
             change = (now["_intensity"].view(-1)[flat] - before).to(torch.float64)
             light = before.to(torch.float64) + change * (after.to(torch.float64) / dt_ns[due])
+            # Thinning from the rate of the dark, see v2e_model.shot_factor.
             factor = 1.0 - ((light + 20.0) / 275.0).clamp(0.0, 1.0) * 0.75
             let = inside & (accept * model.DARKEST < factor)
             found.append((flat[let], after[let], on[let].to(torch.int64)))
+            # Exponential waiting time; at least 1 ns, so that the clock moves on.
             gap = (-log_f64(u) / rate[due]).clamp(max=1e18).to(torch.int64) + 1
             self._clock_ns[due] += gap
             self._clock_index[due] += 1
         none = torch.empty(0, dtype=torch.int64, device=self.device)
         flat, after, on = (torch.cat([none, *(one[c] for one in found)]) for c in range(3))
+        # Bits of each key: pixel number, ns within an interval, polarity.
         order = stable_order([(flat, 31), (after, 41), (on, 1)])
         return Shots(flat[order], after[order], on[order]) if len(flat) else None
 
@@ -344,7 +366,7 @@ class TensorV2e(Batch):
         return value[env] if isinstance(value, Tensor) else torch.full_like(env, value)
 
     def _flagged(self, beyond: Tensor, shots: Shots | None) -> Tensor:
-        """``beyond``, flat, not negative where shot noise falls."""
+        """Return ``beyond``, flat, with 0 where shot noise falls."""
         flags = beyond.reshape(-1)
         if shots is not None:
             flags[shots.flat] = 0.0
@@ -353,13 +375,16 @@ class TensorV2e(Batch):
     def _rows(
         self, flat: Tensor, now: dict[str, Tensor], shots: Shots | None, each: Numbers, v: Interval
     ) -> tuple[Rows, Step]:
-        """Rows of the pixels that are looked at, without those that stay in their dead time; their times."""
+        """Return the rows of the pixels to look at, without those that stay in their dead time, and their times."""
         if self._has.refractory_ns:
             end_ns = torch.from_numpy(v.end_ns).to(self.device)[self._env_of(flat)]
+            # A level of -inf marks the dead time; of those only the pixels that are released now take
+            # part.
             asleep = self._upper[flat] == -_INF
             flat = flat[~asleep | (self._release[flat] <= end_ns)]
         env = self._env_of(flat)
         zero = torch.zeros(len(flat), dtype=torch.float64, device=self.device)
+        # Features that are off have empty tensors and count as 0.
         old = lambda name: getattr(self, name)[flat].to(torch.float64) if getattr(self, name).numel() else zero
         new = lambda name: now[name].view(-1)[flat].to(torch.float64) if name in now else zero
         step = each.step.of(env)._replace(low=self._keys[env, 0], high=self._keys[env, 1])
@@ -371,6 +396,7 @@ class TensorV2e(Batch):
         if self.config.causes:
             r |= {"since": self._since_ns[flat] - step.t0_ns, "noise_then": old("_noise_then"), "hot": self._hot[flat]}
         if shots is not None:
+            # Where the pixel's shot noise begins in the sorted list, or the list's end.
             first = torch.searchsorted(shots.flat, flat)
             mine = (first < len(shots.flat)) & (shots.flat[first.clamp(max=len(shots.flat) - 1)] == flat)
             r["shot"] = torch.where(mine, first, len(shots.flat))
@@ -382,8 +408,8 @@ class TensorV2e(Batch):
         return r, step
 
     def _put_back(self, r: Rows, v: Step) -> None:
-        """Levels and what else a wave has changed. In a dead time both levels are passed, whatever comes: the pixel is
-        looked at until it is released."""
+        """Write levels and other state that a wave has changed back. In a dead time both levels are passed, whatever
+        comes: the pixel is looked at until it is released."""
         flat, dead = r["flat"], r["dead"]
         self._upper[flat] = torch.where(dead, -_INF, r["up"].to(torch.float32))
         self._lower[flat] = torch.where(dead, _INF, r["down"].to(torch.float32))
@@ -396,17 +422,20 @@ class TensorV2e(Batch):
             self._noise_then[flat] = r["noise_then"].to(torch.float32)
 
     def _rest_leaks(self, interval: Interval, each: Numbers) -> None:
-        """What has leaked goes over into the levels where the leak clock has run for long, so that float32 will do."""
+        """Move what has leaked into the levels where the leak clock has run for long, so that float32 is accurate
+        enough."""
         due = (self._clock[:, 0] == 1) & (interval.end_ns - self._clock[:, 3] >= self._rebase_ns)
         for k in np.flatnonzero(due):
             here = slice(int(k) * self._pixels, (int(k) + 1) * self._pixels)
+            # In float32, as V2e does it, so that the levels get the same bits.
             gone = self._leak[here] * float(np.float32((int(interval.end_ns[k]) - int(self._clock[k, 3])) * 1e-9))
             self._upper[here] -= gone
             self._lower[here] -= gone
             self._clock[k, 3] = interval.end_ns[k]
 
     def _begin(self, k: int, flat: Tensor, t_ns: int) -> None:
-        """Environment k's state at its first frame, drawn by the emulator on the host."""
+        """Set environment k's state at its first frame, drawn by the emulator on the host."""
+        # The numba emulator on the host draws it: the same draws as everywhere.
         single = V2e(self.height, self.width, self.config, self.seeds[k])
         single.step(flat.view(self.envs, self.height, self.width)[k].cpu().numpy(), t_ns)
         state = single.state_dict()

@@ -67,15 +67,19 @@ class Step(NamedTuple):
 
 
 def add_curves(r: Rows, v: Step, has: Parts) -> None:
+    # z(s) = c + rise s + fall e^(-k s), as in v2e_model.curve_of; noise and leak move on straight
+    # lines.
     """c, rise, fall, k, end of the rows' signals, seen from the interval's start (s = 0, e = e^(-k s) = 1)."""
     dx = r["x1"] - r["x0"]
     base, drift = r["x0"] + r["noise"] + r["leak"] * v.since_0, r["shift"] + r["leak"] * v.dt
     r["rise"], r["s"], r["e"] = drift + dx, torch.zeros_like(dx), torch.ones_like(dx)
     if has.low_pass:
         r["k"] = ((r["i0"] + r["i1"]) * 0.5 + 20.0) * v.kappa
-        behind = dx / r["k"]  # how far a low-pass stays behind a ramp in the end
+        # behind: the final lag of a low-pass behind a ramp.
+        behind = dx / r["k"]
         r["c"], r["fall"], r["end"] = base - behind, r["lag0"] + behind, base + drift + dx + r["lag1"]
     else:
+        # k = -1: no low-pass.
         r["k"], r["c"], r["fall"] = torch.full_like(dx, -1.0), base, torch.zeros_like(dx)
         r["end"] = base + drift + dx
 
@@ -91,6 +95,7 @@ def _decayed(r: Rows, s: Tensor, low_pass: bool) -> Tensor:
 
 def wake(r: Rows, v: Step, has: Parts, waking: Tensor) -> None:
     """Levels of the pixels whose dead time ends in the interval, at its end (row ``now``)."""
+    # The signal at the end of the dead time is the new reference.
     s = r["now"].to(torch.float64) / v.dt_ns
     e = _decayed(r, s, has.low_pass)
     reference = _curve_at(r, s, e, has.low_pass)
@@ -102,8 +107,9 @@ def wake(r: Rows, v: Step, has: Parts, waking: Tensor) -> None:
 
 
 def _aim(r: Rows) -> None:
-    """Which level is met by the interval's end, if any."""
+    """Find the level that each pixel reaches by the interval's end, if any."""
     above = r["end"] >= r["up"]
+    # At most one of both levels has been reached.
     r["target"] = torch.where(above, r["up"], r["down"])
     r["sign"] = above.to(torch.float64) * 2.0 - 1.0
     r["polarity"] = above.to(torch.int64)
@@ -111,7 +117,8 @@ def _aim(r: Rows) -> None:
 
 
 def _turn(s: Tensor, low: Tensor, high: Tensor, r: Rows) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """A step of Newton's method, or half of the bracket where it leaves it: (s, bracket, whether that will do)."""
+    """Return (s, bracket, whether s is accurate enough) after a Newton step, or after a bisection where that leaves
+    the bracket."""
     k, sign = r["k"], r["sign"]
     e = r["fall"] * fall_f64(k * s)
     f = sign * (r["c"] + r["rise"] * s + e - r["target"])
@@ -127,22 +134,25 @@ def _turn(s: Tensor, low: Tensor, high: Tensor, r: Rows) -> tuple[Tensor, Tensor
 
 
 def _meet(r: Rows) -> None:
-    """Row ``at``: where the signal of a pixel with a low-pass meets its level."""
+    """Compute row ``at``: where the signal of a pixel with a low-pass meets its level."""
     c, rise, fall, k, end = (r[name] for name in ("c", "rise", "fall", "k", "end"))
     low, e_low, target, sign = (r[name] for name in ("s", "e", "target", "sign"))
     f_low, f_high = sign * (c + rise * low + fall * e_low - target), sign * (end - target)
     # The inverse cubic Hermite interpolant of z guesses; its slopes are 1 / z' at both ends.
     v_low, v_high = sign * (rise - k * fall * e_low), sign * (rise - k * (end - c - rise))
     width, height = 1.0 - low, f_high - f_low
+    # u: where the chord meets the level.
     u = -f_low / height
     s = low + width * u
     stretch = height / (width * v_low * v_high)
     v = 1.0 - u
     guess = u * (v * stretch * (v * v_high - u * v_low) + u * (3.0 - u * 2.0))
     s = torch.where((v_low > 0) & (v_high > 0) & (guess > 0.0) & (guess < 1.0), low + width * guess, s)
-    at_once = f_low >= 0  # the signal stands beyond the level to begin with
+    # The signal stands beyond the level to begin with.
+    at_once = f_low >= 0
     following, lower, upper, done = _turn(s, low, torch.ones_like(low), r)
     r["at"] = torch.where(at_once, low, following)
+    # Pixels whose first turn was not enough; few, so they are gathered.
     left = torch.nonzero(r["fires"] & ~(at_once | done)).view(-1)
     names = ("c", "rise", "fall", "k", "target", "sign")
     part = {name: r[name][left] for name in names}
@@ -159,19 +169,23 @@ def _meet(r: Rows) -> None:
 
 def _meet_lines(r: Rows) -> None:
     s = (r["target"] - r["c"]) / r["rise"]
-    s = torch.where(s > r["s"], s, r["s"])  # 0 / 0 where the signal stands on the level: now
+    # 0 / 0 is NaN where the signal stands on the level; the comparison then selects s.
+    s = torch.where(s > r["s"], s, r["s"])
     r["at"] = torch.where(s < 1.0, s, torch.ones_like(s))
 
 
 def _let_shots_come_first(r: Rows, shots: Shots, v: Step) -> None:
-    """Where shot noise comes before the crossing, it is the event. Row ``shot``: a pixel's next one, or their end."""
+    """Replace the crossing by shot noise where that comes first. Row ``shot``: a pixel's next one, or their end."""
     end = len(shots.flat)
+    # Indices are held inside the list; ``mine`` says whether they mean anything.
     at = lambda column, key: column[key.clamp(max=end - 1)]
     mine = lambda key: (key < end) & (at(shots.flat, key) == r["flat"])
     key = r["shot"]
     while bool((early := mine(key) & (at(shots.after_ns, key) < r["now"])).any()):
-        key = key + early.to(torch.int64)  # of the pixel's dead time
+        # Shot noise of the pixel's dead time is skipped.
+        key = key + early.to(torch.int64)
     noise_ns = at(shots.after_ns, key)
+    # At the same ns noise comes before the crossing.
     first = mine(key) & (~r["fires"] | (noise_ns <= r["at_ns"]))
     r["fires"], r["by_noise"] = r["fires"] | first, first
     r["polarity"] = torch.where(first, at(shots.polarity, key), r["polarity"])
@@ -182,22 +196,26 @@ def _let_shots_come_first(r: Rows, shots: Shots, v: Step) -> None:
 
 
 def _change_leaks(r: Rows, v: Step, jitter: float) -> None:
-    """Every event draws the leak anew: what follows moves over to its line."""
+    """Draw a new leak after every event, and move the rest of the curve to the new drift."""
     drawn = rough_normal((v.low, v.high), r["pixel"], int(Stream.LEAK_JITTER), r["at_ns"] + v.t0_ns)
     spread = drawn * jitter + 1.0
+    # A leak interval is at least a tenth of its mean.
     spread = torch.where(spread > 0.1, spread, torch.full_like(spread, 0.1))
+    # Through float32, as it is stored, so that later steps see the same number.
     fresh = (r["mean_leak"] / spread).to(torch.float32).to(torch.float64)
     change = torch.where(r["fires"], fresh - r["leak"], torch.zeros_like(fresh))
     r["leak"] = r["leak"] + change
-    r["target"] = r["target"] + change * (r["at"] * v.dt + v.since_0)  # the same reference, seen from the new drift
+    # The reference stays where it is; its value relative to the new drift changes.
+    r["target"] = r["target"] + change * (r["at"] * v.dt + v.since_0)
     r["c"] = r["c"] + change * v.since_0
     r["rise"] = r["rise"] + change * v.dt
     r["end"] = r["end"] + change * v.since_1
 
 
 def _cause_bits(r: Rows) -> Tensor:
-    """The cause of each event, in the place that packing.py gives it: the largest part of what moved the pixel."""
+    """Return the cause of each event, in its place in the packed word: the largest part of what moved the pixel."""
     sign, size = r["sign"], torch.where(r["polarity"].bool(), r["on"], r["off"])
+    # How far leak and noise have moved the signal since the reference was taken; light is the rest.
     by_leak = sign * r["leak"] * ((r["at_ns"] - r["since"]).to(torch.float64) * 1e-9)
     by_noise = sign * (r["noise"] + r["shift"] * r["at"] - r["noise_then"])
     light = size - by_leak - by_noise
@@ -208,9 +226,11 @@ def _cause_bits(r: Rows) -> Tensor:
 
 
 def _new_references(r: Rows, v: Step, has: Parts, shots: Shots | None) -> None:
-    """Levels after the wave's events, and which pixels are in their dead time at the interval's end (``dead``)."""
+    """Set the levels after the wave's events, and find the pixels in their dead time at the interval's end
+    (``dead``)."""
     fires = r["fires"]
     if has.refractory_ns:
+        # After an event the reference is taken at the end of the dead time, else at the event.
         r["now"] = torch.where(fires, r["at_ns"] + has.refractory_ns, r["now"])
         s = r["now"].to(torch.float64) / v.dt_ns
         e = _decayed(r, s, has.low_pass)
@@ -219,7 +239,8 @@ def _new_references(r: Rows, v: Step, has: Parts, shots: Shots | None) -> None:
         r["dead"] = fires & (r["now"] > v.dt_ns)
     else:
         r["now"], r["s"], r["dead"] = r["at_ns"], r["at"], torch.zeros_like(fires)
-        if shots is not None:  # noise leaves the reference wherever the signal is
+        # After shot noise the reference is the signal itself.
+        if shots is not None:
             here = _curve_at(r, r["at"], _decayed(r, r["at"], has.low_pass), has.low_pass)
             r["target"] = torch.where(r["by_noise"], here, r["target"])
     r["up"] = torch.where(fires, r["target"] + r["on"], r["up"])
@@ -236,12 +257,14 @@ def waves(
     while len(r["flat"]):
         _aim(r)
         if has.low_pass:
+            # After an event without dead time s has moved, and e follows it.
             if found and not has.refractory_ns:
                 r["e"] = fall_f64(r["k"] * r["s"])
             _meet(r)
         else:
             _meet_lines(r)
-        at = torch.where(r["fires"], r["at"], torch.zeros_like(r["at"]))  # the others' are no numbers, perhaps
+        # Pixels that do not fire may have NaN here.
+        at = torch.where(r["fires"], r["at"], torch.zeros_like(r["at"]))
         r["at_ns"], r["by_noise"] = torch.floor(at * v.dt_ns).to(torch.int64), torch.zeros_like(r["fires"])
         if shots is not None:
             _let_shots_come_first(r, shots, v)
@@ -258,6 +281,8 @@ def waves(
             r["since"] = torch.where(new, r["now"], r["since"])
             r["noise_then"] = torch.where(new, r["noise"] + r["shift"] * r["s"], r["noise_then"])
         put_back(r, v)
+        # Another event follows if the end of the curve is beyond a level, or shot noise of the pixel is
+        # left.
         passed = (r["end"] >= r["up"]) | (r["end"] <= r["down"])
         if shots is not None:
             passed = passed | (r["shot"] != len(shots.flat))

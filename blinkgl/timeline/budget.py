@@ -38,12 +38,14 @@ of log d; smallest variance of it."""
 FOLLOW, CORRECTION = 0.3, (-0.7, 3.0)
 """Step of the correction per measurement with too many events beyond the target; its limits,
 log of the target's reduction."""
+# Bins of the histograms, us or px, 100 to a decade.
 _EDGES = np.logspace(-3, 8, 1101)
 
 
 @numba.njit(cache=True, nogil=True)
 def _left_out(scheme, older, a, middle, b, newer, slope_a, slope_b, t, error, weight):
-    """Error at the left-out frame as a fraction of the step over it, and the change across it, per sample.
+    """Compute per sample the error at the left-out frame, as a fraction of the step over it, and the change across
+    it.
 
     t : (5,) float64 s, times of the five frames; t[0] = t[1] or t[4] = t[3] where there is no such frame."""
     step, s_middle = t[3] - t[1], (t[2] - t[1]) / (t[3] - t[1])
@@ -52,6 +54,7 @@ def _left_out(scheme, older, a, middle, b, newer, slope_a, slope_b, t, error, we
         weight[i] = abs(change)
         error[i] = 0.0
         if change == 0.0:
+            # A pixel that does not change makes no event.
             continue
         alpha = beta = 1.0
         if scheme == _HERMITE:
@@ -66,6 +69,7 @@ def _left_out(scheme, older, a, middle, b, newer, slope_a, slope_b, t, error, we
                 t[1] - t[0],
                 t[4] - t[3],
             )
+        # Where the frame's value lies between its neighbours', as a fraction of the change.
         y = (np.float64(middle[i]) - np.float64(a[i])) / change
         error[i] = abs(curve_time(min(max(y, 0.0), 1.0), alpha, beta, 0.0) - s_middle)
 
@@ -92,6 +96,7 @@ class TimeError:
         self.reconstruction, self.target, self.in_px, self.percentile = reconstruction, target, in_px, percentile
         self._scheme, self._frames = _SCHEMES[reconstruction], deque(maxlen=5)
         g, self.m = _PRIOR[reconstruction]
+        # Begins with one measurement, the prior at one pixel per step.
         self._sums = np.array([1.0, 0.0, np.log(g), 0.0, 0.0])  # of 1, x, y, x^2, xy; x = log d, y = log g
         self._us, self._px = np.zeros(len(_EDGES) + 1), np.zeros(len(_EDGES) + 1)
         self.measurements, self._correction, self._mean_change = 0, 0.0, 0.0
@@ -101,15 +106,19 @@ class TimeError:
         if speed <= 0:
             return 0.0
         x, y, m = self._line()
-        wanted = self.target if self.in_px else self.target * speed  # d g(d) = target px, or d / speed g(d) = target s
+        # d g(d) = target px, or d / speed g(d) = target s.
+        wanted = self.target if self.in_px else self.target * speed
+        # log of d g(d) = A d^(1 + m), solved for d; never more than twice the mean of what was
+        # measured.
         log_d = (np.log(wanted) - self._correction - y + m * x) / (1 + m)
         return float(speed / np.exp(min(log_d, x + np.log(2.0))))
 
     def _line(self) -> tuple[float, float, float]:
-        """A point (log d, log g) of the line and its slope."""
+        """Return a point (log d, log g) of the line and its slope."""
         n, sx, sy, sxx, sxy = self._sums
         x, y = sx / n, sy / n
         m0 = _PRIOR[self.reconstruction][1]
+        # Least squares for the slope with a prior of weight STIFFNESS at m0.
         m = (sxy - n * x * y + STIFFNESS * SPREAD * m0) / (sxx - n * x * x + STIFFNESS * SPREAD)
         return x, y, float(np.clip(m, 0.0, _HIGHEST[self.reconstruction]))
 
@@ -122,10 +131,12 @@ class TimeError:
         if self._scheme == _PCHIP:
             if len(f) < 4:
                 return
-            five = [f[0], *f] if len(f) == 4 else f  # the first interval has no older neighbour
+            # The first interval has no older neighbour.
+            five = [f[0], *f] if len(f) == 4 else f
         elif len(f) < 3:
             return
         else:
+            # The straight line has no neighbours: only the last three frames count.
             five = [f[-3], *f[-3:], f[-1]]
         t = np.array([frame[0] - five[1][0] for frame in five]) * 1e-9
         error, weight = np.empty(signal.size), np.empty(signal.size)
@@ -147,6 +158,8 @@ class TimeError:
         if mean_speed <= 0 or not weight[ok].any():
             return
         step, s = t[3] - t[1], (t[2] - t[1]) / (t[3] - t[1])
+        # The error vanishes at both ends: 4 s (1 - s) is its shape, squared where slopes are given,
+        # too.
         shape = (4 * s * (1 - s)) ** (2 if self._scheme == _HERMITE else 1)
         error = np.minimum(error / max(shape, 0.2), 1.0)
         relative = speed / mean_speed if self.in_px else np.ones_like(speed)
@@ -159,6 +172,8 @@ class TimeError:
         self.measurements += 1
         beyond = 0.0
         for part, change in ((s, before), (1 - s, after)):
+            # The error of a part of the step: the fraction grows as the step^m, the step itself
+            # shrinks.
             seconds = error[ok] * step * part ** (1 + self.m)
             beyond += change[ok][(seconds * speed[ok] if self.in_px else seconds) > self.target].sum()
             self._us += np.bincount(np.searchsorted(_EDGES, seconds * 1e6), change[ok], len(self._us))
@@ -166,6 +181,7 @@ class TimeError:
         total = float((before + after)[ok].sum())
         self._mean_change = total if self._mean_change == 0 else FORGET * self._mean_change + (1 - FORGET) * total
         if total > 0:
+            # Too many events beyond the target make later steps shorter, more so after much change.
             off = (beyond / total - (1 - self.percentile / 100)) * min(total / self._mean_change, 3.0)
             self._correction = float(np.clip(self._correction + FOLLOW * off, *CORRECTION))
 

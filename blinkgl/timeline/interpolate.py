@@ -24,11 +24,14 @@ def cubic(frames: Iterable[Timed], factor: int = 4) -> Iterator[Timed]:
     """``factor - 1`` frames between any two by monotone piecewise-cubic interpolation of ln(1e-3 + I) over four
     neighbours (Fritsch and Butland 1984: no over-shoot, hence no invented events; unequal
     spacing is respected; linear at both ends)."""
-    a = b = None  # the last two nodes: (frame, log, t)
-    slope_a = secant = None  # slope at a, secant from a to b; per ms: float32 products of slopes per ns would underflow
+    # The last two nodes: (frame, log, t).
+    a = b = None
+    # Slope at a, secant from a to b; per ms: float32 products of slopes per ns would underflow.
+    slope_a = secant = None
     for frame, t in frames:
         c = (frame, np.log(frame + _EPS), t)
         if b is not None:
+            # The secant behind b is known only now, and with it the slope at b.
             following = (c[1] - b[1]) / np.float32((t - b[2]) * 1e-6)
             if a is not None:
                 slope_b = np.empty_like(secant)
@@ -53,6 +56,7 @@ def _segment(a, b, slope_a: np.ndarray, slope_b: np.ndarray, factor: int) -> Ite
         if t == a[2]:
             continue
         s = (t - a[2]) * 1e-6 / h
+        # Hermite's basis: values and slopes at both ends.
         weights = map(
             np.float32, ((1 + 2 * s) * (1 - s) ** 2, s * s * (3 - 2 * s), h * s * (1 - s) ** 2, h * s * s * (s - 1))
         )
@@ -65,7 +69,8 @@ def _segment(a, b, slope_a: np.ndarray, slope_b: np.ndarray, factor: int) -> Ite
 
 @numba.njit(cache=True, nogil=True)
 def _monotone(d0, d1, h0, h1, out):
-    """Slope at a node: weighted harmonic mean of the secants beside it, 0 at an extremum."""
+    """Compute the slope at a node: the weighted harmonic mean of the secants beside it, 0 at an extremum."""
+    # Fritsch and Butland's weights for unequal spacings.
     share = np.float32((2 * h1 + h0) / (3 * (h0 + h1)))
     for i in range(len(out)):
         product = d0[i] * d1[i]
@@ -127,6 +132,7 @@ def motion(
             forward, backward = dense(grey_a, grey)
             speed = np.hypot(forward[..., 0], forward[..., 1])
             statistics.add(speed)
+            # Never more steps than there are ns between the frames.
             steps = int(min(max(np.ceil(np.percentile(speed, 99.5) / max_px), 1), most, t - t_a))
             yield from _between(a, frame, t_a, t, forward, backward, steps)
             statistics.inserted += steps - 1
@@ -170,12 +176,15 @@ def _between(a, b, t_a, t_b, forward, backward, steps) -> Iterator[Timed]:
         return
     height, width = a.shape
     grid = np.stack(np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)), axis=-1)
+    # Flow is read at integer pixels and between them.
     look = lambda image, flow: cv2.remap(image, grid + flow, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     pictures = [(np.ascontiguousarray(one, np.float32), np.log(one + _EPS)) for one in (a, b)]
     seen_a, seen_b = _consistent(forward, look(backward, forward)), _consistent(backward, look(forward, backward))
     f = np.float32
     for k in range(1, steps):
         s = k / steps
+        # Flow from the intermediate time back to a and on to b, from both flows (Jiang et al. 2018,
+        # Super SloMo).
         to_a = forward * f(-s * (1 - s)) + backward * f(s * s)
         to_b = forward * f((1 - s) ** 2) - backward * f(s * (1 - s))
         # What b does not see (a's inconsistent pixels) comes from a, and the other way round.
@@ -191,24 +200,27 @@ def _between(a, b, t_a, t_b, forward, backward, steps) -> Iterator[Timed]:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _look(light, log, places, out):
-    """``out`` = light at ``places`` (H, W, 2), x and y in px; beyond the border it is that of the border."""
+    """Write the light at ``places`` (H, W, 2), x and y in px, to ``out``; the border continues outwards."""
     height, width = log.shape
     wx, wy = np.empty(4, np.float32), np.empty(4, np.float32)
     for row in range(out.shape[0]):
         for column in range(out.shape[1]):
             x, y = places[row, column, 0], places[row, column, 1]
-            x = min(x, np.float32(width - 1)) if x > 0 else np.float32(0)  # 0 for NaN, too
+            # NaN becomes 0 as well.
+            x = min(x, np.float32(width - 1)) if x > 0 else np.float32(0)
             y = min(y, np.float32(height - 1)) if y > 0 else np.float32(0)
             i, j = int(x), int(y)
             _catmull_rom(x - np.float32(i), wx)
             _catmull_rom(y - np.float32(j), wy)
             total = np.float32(0)
             for n in range(4):
+                # Rows and columns beyond the border repeat it.
                 line = log[min(max(j + n - 1, 0), height - 1)]
                 part = np.float32(0)
                 for m in range(4):
                     part += wx[m] * line[min(max(i + m - 1, 0), width - 1)]
                 total += wy[n] * part
+            # The four pixels around, between which the result is held.
             right, below = i + (x > i), j + (y > j)
             a, b, c, d = light[j, i], light[j, right], light[below, i], light[below, right]
             value = np.exp(total) - _EPS
@@ -217,7 +229,7 @@ def _look(light, log, places, out):
 
 @numba.njit(cache=True, nogil=True)
 def _catmull_rom(f, out):
-    """Weights of the four samples round a place that is ``f`` beyond the second: exact for parabolas."""
+    """Compute the weights of the four samples around a place that is ``f`` beyond the second: exact for parabolas."""
     half, one = np.float32(0.5), np.float32(1)
     out[0] = half * f * (f * (np.float32(2) - f) - one)
     out[1] = half * (f * f * (np.float32(3) * f - np.float32(5)) + np.float32(2))
@@ -226,6 +238,7 @@ def _catmull_rom(f, out):
 
 
 def _consistent(flow: np.ndarray, back: np.ndarray) -> np.ndarray:
-    """1 where going there and back returns, 0.01 where not."""
+    """Return 1 where going there and back returns, 0.01 elsewhere."""
+    # Forward and back again should end where it began.
     miss = np.hypot(*np.moveaxis(flow + back, -1, 0))
     return np.where(miss <= 1 + 0.05 * np.hypot(flow[..., 0], flow[..., 1]), np.float32(1), np.float32(0.01))

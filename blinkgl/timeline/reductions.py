@@ -48,6 +48,7 @@ def ranked(values: np.ndarray, percent: float) -> Ranked:
     values = values.ravel()
     values = values[(values >= SLOWEST) & np.isfinite(values)]
     if not len(values):
+        # The k-th smallest and the one above it, without sorting all.
         return STILL
     k, share = place(len(values), percent)
     above = min(k + 1, len(values) - 1)
@@ -58,11 +59,13 @@ def ranked(values: np.ndarray, percent: float) -> Ranked:
 def place(count: int, percent: float) -> tuple[int, float]:
     """Which of ``count`` values in order, and how far on to the next one [0, 1), in double precision."""
     at = (count - 1) * (percent / 100)
+    # percent = 100 would give the place behind the last by rounding.
     k = min(math.floor(at), count - 1)
     return k, at - k
 
 
 def between(below: np.float32, above: np.float32, share: float) -> float:
+    # NumPy interpolates from the nearer neighbour, which rounds otherwise than from below.
     """From one value towards the next in single precision, as NumPy's percentile rounds (from the nearer of them)."""
     apart = above - below
     if share < 0.5:

@@ -19,7 +19,8 @@ def uniform_times(fps: float, t0_ns: int, t1_ns: int) -> Iterator[int]:
     yield t0_ns
     last, k = t0_ns, 1
     while (t := t0_ns + round(k * step)) < t1_ns:
-        if t > last:  # above 1e9 fps neighbouring frames would round to the same nanosecond
+        # Above 1e9 fps neighbouring frames would round to the same nanosecond.
+        if t > last:
             yield t
             last = t
         k += 1
@@ -62,6 +63,7 @@ def bounded_times(
     while t < t1_ns:
         while ends and ends[0] <= t:
             ends.popleft()
+        # No step goes over a stop or the end.
         step = min(_step(1.0, v, min_step_ns, max_step_ns), (ends[0] if ends else t1_ns) - t)
         while True:
             end = t + step
@@ -83,6 +85,7 @@ def _apart(stops_ns: Sequence[int], least_ns: int, t0_ns: int, t1_ns: int) -> It
 
 
 def _step(steps: float, pace: float, low: int, high: int) -> int:
+    # A pace of 0 has no limit but the largest step.
     if pace * high <= steps * NS_PER_S:
         return high
     return max(low, int(steps / pace * NS_PER_S))

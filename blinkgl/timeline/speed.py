@@ -11,6 +11,7 @@ def _largest_squared(velocity):
     largest = np.float32(0.0)
     for y in range(velocity.shape[0]):
         for x in range(velocity.shape[1]):
+            # Squares are compared, one root at the end; inf and NaN fail the comparison.
             squared = velocity[y, x, 0] * velocity[y, x, 0] + velocity[y, x, 1] * velocity[y, x, 1]
             if squared > largest and squared < np.float32(np.inf):
                 largest = squared

@@ -65,6 +65,7 @@ class Timeline:
         """Steps per second that the scene asks for at one time."""
         raise NotImplementedError
 
+    # The strictest camera decides.
     def _counted(self, t_ns: int) -> float:
         self.looks += 1
         return max([self.pace(t_ns), *(other.pace(t_ns) for other in self.others)])
@@ -130,12 +131,15 @@ class Budget(Timeline):
 
     def pace(self, t_ns: int) -> float:
         speed = np.linalg.norm(self.pictures.velocity_of_movers(t_ns, self.config.sample_every).read(), axis=-1)
+        # The last eight speeds are kept: frames come a little after their pace was asked for.
         self._speeds = {**dict(list(self._speeds.items())[-7:]), t_ns: speed}
         return self.error.pace(contraharmonic_mean(speed))
 
     def observe(self, t_ns: int, luminance: np.ndarray, rate: np.ndarray | None = None) -> None:
-        if not self._speeds:  # the first frame is drawn before anything is asked about it
+        # The first frame is drawn before anything is asked about it.
+        if not self._speeds:
             self.pace(t_ns)
+        # The frame may lie between two times whose speeds are known.
         nearest = min(self._speeds, key=lambda t: abs(t - t_ns))
         speed = self._speeds[nearest]
         # Pixels at the centres of the small picture's, which covers the whole image even where that is no multiple of

@@ -37,5 +37,6 @@ def together(timelines: Sequence[Timeline]) -> list[Timeline]:
     if len(timelines) < 2:
         return list(timelines)
     lead = timelines[0]
+    # tee holds a time until every camera has taken it, so cameras may lag behind each other.
     lead.others = tuple(timelines[1:])
     return [Shared(own, times) for own, times in zip(timelines, itertools.tee(lead, len(timelines)), strict=True)]

@@ -65,6 +65,8 @@ class FlowModel(nn.Module):
         new = batch["new"]
         channels = self.representation.channels
         height, width = new.shape[-2:]
+        # The representation decides the channels; a tensor of another one would run through and mean
+        # nothing.
         if new.ndim != 4 or new.shape[1] != channels:
             raise EventDataError(
                 "event tensor of another representation",
@@ -91,6 +93,8 @@ class FlowModel(nn.Module):
 def initialise(module: nn.Module) -> None:
     """Kaiming for convolutions (fan-out, ReLU), ones and zeros for norms, Xavier for linear layers; biases zero."""
     for m in module.modules():
+        # Fan-out keeps the size of gradients from layer to layer. Of a transposed convolution, whose
+        # weight has inputs and outputs exchanged, torch's fan_in is just that.
         if isinstance(m, nn.Conv2d):
             nn.init.kaiming_normal_(m.weight, mode="fan_out", nonlinearity="relu")
         elif isinstance(m, nn.ConvTranspose2d):

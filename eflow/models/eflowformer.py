@@ -36,6 +36,7 @@ class Mlp(nn.Sequential):
         )
 
     def forward(self, x: Tensor) -> Tensor:
+        # With gradients the hidden layers are needed anyway, and a card is faster in one piece.
         if torch.is_grad_enabled() or x.device.type != "cpu" or torch.compiler.is_compiling():
             return super().forward(x)
         blocks = x.reshape(-1, x.shape[-1]).split(_TOKENS)
@@ -68,6 +69,7 @@ class EnhancementLayer(nn.Module):
         x = x + self.globally(y, y)
         x = x + self.mlp_global(x)
         y = self.norm_cross(x)
+        # The other half's features, in the same order: old queries new, new queries old.
         x = x + self.cross(y, torch.cat(y.chunk(2)[::-1]))
         return x + self.mlp_cross(x)
 
@@ -85,6 +87,7 @@ class EFlowFormer(Eraft):
         self.norm = nn.LayerNorm(dim) if count else None
         self.log_prior = self.log_gain = None
         if config.init == "match" and config.match_prior is not None:
+            # Each displacement of match_prior cells costs half a unit of the logit: 1 / (2 sigma^2).
             # Logits of features that know nothing yet differ by 1; the gain makes them small beside the prior.
             self.log_prior = nn.Parameter(torch.tensor(-math.log(2 * config.match_prior**2) / RATE))
             self.log_gain = nn.Parameter(torch.tensor(math.log(START_GAIN) / RATE))
@@ -94,6 +97,7 @@ class EFlowFormer(Eraft):
         if not len(self.layers):
             return f1, f2
         x = torch.cat([f1, f2])
+        # Channels last for attention, after the position code is added.
         x = (x + sine_position(*x.shape[-2:], x.shape[1], x).to(x.dtype)).permute(0, 2, 3, 1)
         for layer in self.layers:
             x = layer(x)
@@ -103,16 +107,19 @@ class EFlowFormer(Eraft):
         if self.config.init == "zero":
             return super().start(correlation, warm, like)
         matched = correlation.match(*self._prior())
+        # matched * 0 keeps the matching layer in the graph, so that all parameters have a gradient.
         return (matched if warm is None else matched * 0 + warm), bilinear_upsample(matched) if self.training else None
 
     def backward(self, correlation) -> Tensor | None:
         return correlation.match_backward(*self._prior()) if self.want_backward else None
 
     def _prior(self) -> tuple[Tensor | None, Tensor | None]:
-        """Price of a displacement and gain of the logits, both learnt: without them the softmax of features that know
-        nothing yet is flat, and its expectation the middle of the image, far worse than no flow at all."""
+        """Return the cost of a displacement and the gain of the logits, both learnt: without them the softmax of
+        features that know nothing yet is flat, and its expectation the middle of the image, far worse than no
+        flow at all."""
         if self.log_prior is None:
             return None, None
+        # Logarithms keep both positive.
         return (RATE * self.log_prior.float()).exp(), (RATE * self.log_gain.float()).exp()
 
     want_backward = False

@@ -63,6 +63,7 @@ class ResidualBlock(nn.Module):
 class Trunk(nn.Sequential):
     """(N, inputs, H, W) -> (N, outputs, H/8, W/8). widths : channels at 1/2, 1/4, 1/8."""
 
+    # RAFT: instance norm for the features that are compared, batch norm for the context.
     def __init__(self, inputs: int, widths: tuple[int, int, int], outputs: int, norm: str):
         make = {"instance": nn.InstanceNorm2d, "batch": nn.BatchNorm2d}[norm]
         half, quarter, eighth = widths
@@ -87,6 +88,7 @@ class MotionEncoder(nn.Module):
 
     def __init__(self, taps: int, hidden: int):
         super().__init__()
+        # 3:1 of correlation and flow features, as in RAFT's motion encoder.
         wide, narrow = hidden + hidden // 2, hidden // 2
         self.corr1, self.corr2 = nn.Conv2d(taps, 2 * hidden, 1), nn.Conv2d(2 * hidden, wide, 3, padding=1)
         self.flow1, self.flow2 = nn.Conv2d(2, hidden, 7, padding=3), nn.Conv2d(hidden, narrow, 3, padding=1)
@@ -97,6 +99,7 @@ class MotionEncoder(nn.Module):
         c = relu(self.corr2(relu(self.corr1(taps))))
         f = relu(self.flow2(relu(self.flow1(flow))))
         joined = relu(self.join(torch.cat([c, f], 1)))
+        # The flow itself goes along unchanged.
         return torch.cat([joined, flow.to(joined.dtype)], 1)
 
 
@@ -119,6 +122,8 @@ class SepConvGru(nn.Module):
     def prepare(self, context: Tensor) -> list[tuple[Tensor, Tensor]]:
         """For each convolution, its weights over [hidden, motion] and the context's contribution (bias included)."""
         ready, first, last = [], self.hidden, 2 * self.hidden
+        # Slices of each weight: [hidden | context | motion]. The context's product, with the bias, is
+        # the same in every turn.
         for conv in (c for pair in zip(self.gates, self.candidates, strict=True) for c in pair):
             weight = torch.cat([conv.weight[:, :first], conv.weight[:, last:]], 1)
             ready.append((weight, F.conv2d(context, conv.weight[:, first:last], conv.bias, padding=conv.padding)))
@@ -127,8 +132,10 @@ class SepConvGru(nn.Module):
     def forward(self, h: Tensor, ready: list[tuple[Tensor, Tensor]], motion: Tensor) -> Tensor:
         for i, gate in enumerate(self.gates):
             (w_gate, c_gate), (w_new, c_new) = ready[2 * i], ready[2 * i + 1]
+            # Update gate z, reset gate r; the candidate sees the reset state (Cho et al. 2014).
             z, r = torch.sigmoid(F.conv2d(torch.cat([h, motion], 1), w_gate, padding=gate.padding) + c_gate).chunk(2, 1)
             q = torch.tanh(F.conv2d(torch.cat([r * h, motion], 1), w_new, padding=gate.padding) + c_new)
+            # (1 - z) h + z q.
             h = torch.lerp(h, q.to(h.dtype), z.to(h.dtype))
         return h
 
@@ -178,6 +185,7 @@ class Eraft(FlowModel):
         self.divisor, self.least = 8, 8 * 2**w.levels
         if config.padding == "start":
             self.pad_to, self.pad_start = 32, True
+        # How many refinements beyond those trained on may happen in use.
         unseen = max(config.iterations - config.train_iterations, 0)
         self._most = unseen if config.burn_in is None else config.burn_in
         self.representation = VoxelGrid(config.input.bins, config.input.normalise, config.input.bounds)
@@ -192,7 +200,9 @@ class Eraft(FlowModel):
     def forward(self, batch: dict) -> FlowPrediction:
         """Optional ``batch["flow_init"]`` (N, 2, H/8, W/8): warm start, low-resolution px."""
         self.check_input(batch)
+        # Shared weights: both windows go through in one batch.
         f1, f2 = self.enhance(*self.features(torch.cat([batch["old"], batch["new"]])).chunk(2))
+        # One network gives the GRU's first state and its context.
         h, c = self.context(batch["new"]).chunk(2, 1)
         h, c = torch.tanh(h), F.relu(c)
         correlation = self._correlation(f1, f2)
@@ -205,6 +215,7 @@ class Eraft(FlowModel):
         h, flow = self._burn_in(h, flow, context, correlation, grid) if self.training else (h, flow)
         upsample = convex_upsample_slow if self.plain else convex_upsample
         for i in range(iterations):
+            # RAFT detaches the flow: gradients go through each update alone.
             flow = flow.detach()
             wanted = self.training or self.plain or i == iterations - 1
             step = lambda h, flow: self.update(h, context, correlation.lookup(grid + flow), flow, wanted)  # noqa: B023
@@ -212,8 +223,10 @@ class Eraft(FlowModel):
                 h, delta, mask = checkpoint(step, h, flow, use_reentrant=False)
             else:
                 h, delta, mask = step(h, flow)
+            # Refinements beyond all that training has seen are damped.
             beyond = 0 if self.training else max(i + 1 - self._most - self.config.train_iterations, 0)
             with fp32(flow):
+                # Flow adds up in fp32: updates of a thousandth of a px would be lost in bf16.
                 flow = flow + self.config.damping**beyond * delta.float()
             if wanted:
                 flows.append(upsample(flow, mask, self.config.border))
@@ -226,12 +239,14 @@ class Eraft(FlowModel):
 
     @torch.no_grad()
     def _burn_in(self, h: Tensor, flow: Tensor, context, correlation, grid: Tensor) -> tuple[Tensor, Tensor]:
-        """State and flow after a number of refinements that nothing is learnt from, so that those that follow learn to
-        go on from any, and to stand still where nothing is left to do. (Half of the steps have none: every answer
-        begins with the first refinement.) The draw is of torch's generator, whose state checkpoints hold."""
+        """Return state and flow after a number of refinements that nothing is learnt from, so that those that follow
+        learn to go on from any, and to stand still where nothing is left to do. (Half of the steps have none:
+        every answer begins with the first refinement.) The draw is of torch's generator, whose state checkpoints
+        hold."""
         most = self._most
         if not most:
             return h, flow
+        # Uniform over [0, 2 most): half of the draws give no refinement.
         draw = int(torch.randint(2 * most, ()))
         for _ in range(max(draw - most + 1, 0)):
             h, delta, _mask = self.update(h, context, correlation.lookup(grid + flow), flow, False)

@@ -27,6 +27,7 @@ class EvFlowNet(FlowModel):
         super().__init__()
         self.config = config
         self.representation = CountsAndTimes() if config.input == "counts" else VoxelGrid(config.bins)
+        # Channels in, then those of the four encoders, each twice the one before.
         widths = (self.representation.channels, *encoder_widths(config))
         w = widths[1]
         self.encoders = nn.ModuleList([nn.Conv2d(a, b, 3, 2, 1) for a, b in itertools.pairwise(widths)])
@@ -55,7 +56,9 @@ class EvFlowNet(FlowModel):
         if self.consensus is not None:
             x = self.consensus(x)
         x = self.residuals[1](x)
+        # From coarse to fine; skips are taken from the last encoder back.
         for decoder, head in zip(self.decoders, self.heads, strict=True):
+            # Flow in parts of its largest value, so that it is of the size of the features.
             parts = [x, skips.pop()] + ([flows[-1].to(x.dtype) / head.largest] if flows else [])
             x = F.relu(decoder(double(torch.cat(parts, 1))))
             flows.append(head(x))

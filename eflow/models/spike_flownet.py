@@ -20,16 +20,19 @@ class _Fire(torch.autograd.Function):
     @staticmethod
     def forward(ctx, membrane: Tensor, threshold: float) -> Tensor:
         ctx.threshold = threshold
+        # The threshold itself does not fire.
         spikes = (membrane > threshold).to(membrane.dtype)
         ctx.save_for_backward(spikes)
         return spikes
 
     @staticmethod
     def backward(ctx, gradient: Tensor):
+        # The surrogate gradient of Lee et al. 2020: 1 / threshold where a spike was.
         return gradient * ctx.saved_tensors[0] / ctx.threshold, None
 
 
 def integrate_and_fire(membrane: Tensor, threshold: float) -> tuple[Tensor, Tensor]:
+    # Hard reset: what exceeded the threshold is lost.
     """(spikes, membrane afterwards): neurons that spiked begin again at 0, whatever they exceeded the threshold by."""
     spikes = _Fire.apply(membrane, threshold)
     return spikes, membrane * (1 - spikes.detach())
@@ -57,6 +60,7 @@ class SpikeFlowNet(FlowModel):
         )
         self.residuals = nn.Sequential(LeakyResidual(w4, bias=False), LeakyResidual(w4, bias=False))
         ups = (w2, w1, 4)
+        # Skip, features of the decoder before, and two of flow.
         inputs = (w4, *(skip + up + 2 for skip, up in zip((w3, w2, w1), ups, strict=True)))
         self.decoders = nn.ModuleList(
             [UpDecoder(c, up, bias=False) for c, up in zip(inputs, (*ups, None), strict=True)]
@@ -67,12 +71,14 @@ class SpikeFlowNet(FlowModel):
         self.check_input(batch)
         steps = batch["new"]
         n, _, height, width = steps.shape
+        # (first and second half of the window, step, polarity): a step takes one frame of each half.
         groups = steps.view(n, 2, self.config.steps, 2, height, width)
         membranes: list[Tensor | float] = [0.0] * 4
         currents: list[Tensor | float] = [0.0] * 4
         for s in range(self.config.steps):
             x = groups[:, :, s].reshape(n, 4, height, width)
             for layer, encoder in enumerate(self.encoders):
+                # In float32: the sum over steps decides about spikes.
                 current = encoder(x).float()
                 currents[layer] = currents[layer] + current
                 x, membranes[layer] = integrate_and_fire(membranes[layer] + current, self.config.threshold)
@@ -82,5 +88,6 @@ class SpikeFlowNet(FlowModel):
             flows.append(flow)
             if up is not None:
                 x = torch.cat([currents[2 - scale].to(up.dtype), up, flow.to(up.dtype)], 1)
+        # Flow of a scale is in its own px.
         full = [to_size(f * (height / f.shape[-2]), height, width) for f in (flows if self.training else flows[-1:])]
         return FlowPrediction(full, kind="scales")

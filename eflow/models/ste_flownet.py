@@ -30,6 +30,7 @@ class ConvGru(nn.Module):
 
     def forward(self, x: Tensor, h: Tensor | None) -> Tensor:
         h = torch.zeros_like(x) if h is None else h
+        # Update gate z, reset gate r, as in eraft.SepConvGru with square kernels.
         z, r = torch.sigmoid(self.gates(torch.cat([h, x], 1))).chunk(2, 1)
         return torch.lerp(h, torch.tanh(self.candidate(torch.cat([r * h, x], 1))).to(h.dtype), z.to(h.dtype))
 
@@ -52,6 +53,7 @@ class SteFlowNet(FlowModel):
         self.radius = config.radius or RADII[config.size]
         width = config.width or (TINY if config.size == "tiny" else None)
         w1, w2, _, w4 = widths = encoder_widths(config.model_copy(update={"width": width}))
+        # Channels of a GRU: features and correlation taps of its scale.
         taps = (2 * self.radius + 1) ** 2
         states = [w + taps for w in widths]
         self.encoders = nn.ModuleList([nn.Conv2d(a, b, 3, 2, 1) for a, b in zip((2, *states[:3]), widths, strict=True)])
@@ -78,8 +80,10 @@ class SteFlowNet(FlowModel):
         seen = [self._look(slices[:, i]) for i in range(self.config.slices)]
         for _ in range(self.config.sweeps):
             for i in range(self.config.slices):
+                # seen[0]: features of slice 0, which all others are compared with.
                 for scale, (there, here) in enumerate(zip(seen[0], seen[i], strict=True)):
                     x = leaky(self.encoders[scale](hidden[scale - 1])) if scale else here
+                    # The coarsest scale (1/16) has no flow of its own yet.
                     aligned = here if scale == 3 else backward_warp(here, flows[i][2 - scale], border="replicate")
                     # The published code has the activation twice, in the correlation and after it.
                     taps = leaky(leaky(local_correlation(there, aligned.to(here.dtype), self.radius)))
@@ -89,14 +93,16 @@ class SteFlowNet(FlowModel):
         return FlowPrediction(answer if self.training else answer[-1:], kind="scales")
 
     def _look(self, counts: Tensor) -> list[Tensor]:
-        """Features of a slice (N, 2, H, W) at 1/2, 1/4, 1/8, 1/16, which no state has touched: they are compared."""
+        """Return the features of a slice (N, 2, H, W) at 1/2, 1/4, 1/8, 1/16, independent of any state, for the
+        correlation."""
         features = [leaky(self.encoders[0](counts))]
         for layer in self.tower:
             features.append(leaky(layer(features[-1])))
         return features
 
     def _decode(self, hidden: list, before: list[Tensor]) -> list[Tensor]:
-        """What the decoders make of the states, added to the slice's flow ``before``, coarse to fine."""
+        """Return the decoders' flow from the states plus the slice's flow ``before``, coarse to fine."""
+        # The coarsest state, and what the residual blocks make of it.
         x = torch.cat([hidden[3], self.residuals(leaky(self.entry(hidden[3])))], 1)
         after = []
         for scale, decoder in enumerate(self.decoders):

@@ -44,6 +44,7 @@ class UpDecoder(nn.Module):
         self.up = None if features is None else nn.ConvTranspose2d(inputs, features, 4, 2, 1, bias=bias)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor | None]:
+        # Flow in float32 whatever autocast does.
         return self.flow(self.up_flow(x)).float(), None if self.up is None else leaky(self.up(x))
 
 
@@ -93,6 +94,7 @@ class Consensus(nn.Module):
         self.weight, self.mix = nn.Conv2d(channels, groups, 1), nn.Conv2d(channels, channels, 1)
 
     def forward(self, x: Tensor) -> Tensor:
+        # The weight of each place, 0 to 1.
         weight = torch.sigmoid(self.weight(x).float())
         with torch.autocast(x.device.type, enabled=False):
             field = self.fitted(x.float(), weight)
@@ -108,9 +110,12 @@ class Consensus(nn.Module):
             indexing="ij",
         )
         u, v = u.reshape(1, 1, -1), v.reshape(1, 1, -1)
+        # 1e-4 keeps the sum above 0 where all weights vanish.
         w = weight.flatten(2) + 1e-4
         w = w / w.sum(2, keepdim=True)  # (N, groups, h w)
+        # Coordinates from the weighted middle: the mean then separates from the slopes.
         u, v = u - (w * u).sum(2, keepdim=True), v - (w * v).sum(2, keepdim=True)
+        # Weighted second moments: the normal equations of the slopes, a 2x2 system.
         uu, vv, uv = (
             (w * u * u).sum(2, keepdim=True) + self.RIDGE,
             (w * v * v).sum(2, keepdim=True) + self.RIDGE,
@@ -121,6 +126,7 @@ class Consensus(nn.Module):
         with_weight = lambda a: torch.matmul(x, a.unsqueeze(-1))  # (N, groups, C / groups, 1)
         mean, xu, xv = with_weight(w), with_weight(w * u), with_weight(w * v)
         uu, vv, uv, det, u, v = (a.unsqueeze(2) for a in (uu, vv, uv, det, u, v))
+        # Cramer's rule for both slopes.
         field = mean + (vv * xu - uv * xv) / det * u + (uu * xv - uv * xu) / det * v
         return field.reshape(n, channels, height, width)
 

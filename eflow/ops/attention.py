@@ -25,17 +25,22 @@ class WindowAttention(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         n, h, w, c = x.shape
         s = self.window
+        # -h % s is what is missing up to the next multiple.
         down, right = -h % s, -w % s
         x = F.pad(x, (0, 0, 0, right, 0, down))
         rows, columns = (h + down) // s, (w + right) // s
+        # (n h w) tokens as windows of s x s: split both axes, bring the two window axes together.
         tokens = x.view(n, rows, s, columns, s, c).transpose(2, 3).reshape(n * rows * columns, s * s, c)
         q, k, v = self.qkv(tokens).view(len(tokens), s * s, 3, self.heads, c // self.heads).permute(2, 0, 3, 1, 4)
         mask = None
-        if torch.compiler.is_compiling() or down or right:  # a size that is not known yet may need it
+        # While compiling, the size is unknown and may need the mask.
+        if torch.compiler.is_compiling() or down or right:
+            # True where a key is a real token, the same for all queries of a window.
             real = x.new_zeros(rows * s, columns * s, dtype=torch.bool)
             real[:h, :w].fill_(True)
             real = real.view(rows, s, columns, s).transpose(1, 2).reshape(1, rows * columns, 1, 1, s * s)
             mask = real.expand(n, -1, 1, s * s, -1).reshape(n * rows * columns, 1, s * s, s * s)
+        # softmax(q k^T / sqrt(d)) v, per head.
         out = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
         out = self.proj(out.transpose(1, 2).reshape(len(tokens), s * s, c))
         return out.view(n, rows, columns, s, s, c).transpose(2, 3).reshape(n, rows * s, columns * s, c)[:, :h, :w]
@@ -55,6 +60,7 @@ class GlobalAttention(nn.Module):
 
     def forward(self, x: Tensor, source: Tensor) -> Tensor:
         n, h, w, c = x.shape
+        # At a reduced resolution: as many keys as the map has blocks of r x r.
         r = self.reduction
         # At most r - 1 rows are padded, so that every reduced cell holds a real token and no key needs masking.
         padded = F.pad(source, (0, 0, 0, -w % r, 0, -h % r))
@@ -80,9 +86,11 @@ def sine_position(h: int, w: int, dim: int, like: Tensor) -> Tensor:
     """(1, dim, h, w) 2-D sine code (Parmar et al.; DETR's layout): dim/4 wavelengths 2π … 2π·10^4 of tokens, sine and
     cosine of y, then of x. Not normalised by the size, so that a crop and the full frame see the same periods."""
     k = torch.arange(dim // 4, device=like.device, dtype=torch.float32)
+    # Wavelengths 2 pi 10^(4 k / K): the exponent falls linearly with k.
     rate = torch.exp(-math.log(1e4) * k / (dim // 4))
     y = torch.arange(h, device=like.device, dtype=torch.float32)[None] * rate[:, None]
     x = torch.arange(w, device=like.device, dtype=torch.float32)[None] * rate[:, None]
+    # Rows depend on y alone, columns on x alone; both are spread over the map.
     rows = torch.cat([y.sin(), y.cos()])[:, :, None].expand(-1, -1, w)
     columns = torch.cat([x.sin(), x.cos()])[:, None, :].expand(-1, h, -1)
     return torch.cat([rows, columns])[None]

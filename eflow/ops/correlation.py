@@ -24,7 +24,9 @@ from torch import Tensor
 
 from eflow.ops.precision import fp32
 
+# Up to so many tokens the whole volume is held: beyond, its memory grows with their square.
 DENSE_TOKENS = 8192
+# Tokens per block of an on-demand look-up, and rows per block of the matching layer.
 _CHUNK, _ROWS = 2048, 256
 
 
@@ -50,11 +52,13 @@ class DenseCorrelation:
     def __init__(self, f1: Tensor, f2: Tensor, levels: int = 4, radius: int = 4, *, slow: bool = False):
         n, d, h, w = f1.shape
         self.shape, self.radius, self.slow = (n, h, w), radius, slow
+        # 1 / sqrt(D) keeps the products' spread independent of D (RAFT, section 3.2).
         with fp32(f1):
             scaled = f1.float().flatten(2).transpose(1, 2) * (1 / math.sqrt(d))
             self.volume = torch.bmm(scaled, f2.float().flatten(2))
             self.levels = [self.volume.view(n * h * w, 1, h, w)]
             for _ in range(levels - 1):
+                # Only the target's axes are pooled: every source pixel keeps its own row.
                 self.levels.append(F.avg_pool2d(self.levels[-1], 2))
         self.levels = [v.squeeze(1) for v in self.levels]
 
@@ -68,8 +72,10 @@ class DenseCorrelation:
         n, h, w = self.shape
         flat = coords.permute(0, 2, 3, 1).reshape(-1, 2)
         taps = []
+        # A level's coordinates are those of full resolution divided by its scale.
         for level, volume in enumerate(self.levels):
             index, inside, fraction = patch_index(flat / 2**level, *volume.shape[-2:], self.radius)
+            # Outside of the image the clamped index reads something, which ``inside`` sets to 0.
             patch = volume.flatten(1).gather(1, index.flatten(1)).view_as(inside) * inside
             taps.append(lerp_patch(patch, fraction))
         return torch.cat(taps, 1).view(n, h, w, -1).permute(0, 3, 1, 2)
@@ -97,7 +103,8 @@ class OnDemandCorrelation:
             pooled, self.levels = f2.float(), []
             for level in range(levels):
                 pooled = F.avg_pool2d(pooled, 2) if level else pooled
-                self.levels.append(pooled)  # pooling is linear: <f1, pool f2> = pool <f1, f2>
+                # Pooling is linear: <f1, pool f2> = pool <f1, f2>.
+                self.levels.append(pooled)
 
     def lookup(self, coords: Tensor) -> Tensor:
         """As :meth:`DenseCorrelation.lookup`."""
@@ -105,6 +112,7 @@ class OnDemandCorrelation:
         flat = coords.permute(0, 2, 3, 1).reshape(n, h * w, 2)
         with fp32(coords):
             rows = []
+            # In blocks of source tokens, so that the gathered patches stay small.
             for start in range(0, h * w, _CHUNK):
                 part, taps = slice(start, start + _CHUNK), []
                 for level, f2 in enumerate(self.levels):
@@ -117,6 +125,7 @@ class OnDemandCorrelation:
                             for t, i in zip(tokens, index.view(n, -1, index.shape[-1] * index.shape[-2]), strict=True)
                         ]
                     )
+                    # The dot product with each of the patch's (2r + 2)^2 features.
                     patch = torch.einsum("ntd,ntkd->ntk", self.f1[:, part], picked)
                     taps.append(lerp_patch(patch.reshape(inside.shape) * inside, fraction))
                 row = torch.cat(taps, 1)
@@ -166,9 +175,11 @@ def expected_position(
     logits = logits.float() if gain is None else gain * logits.float()
     if prior is not None:
         token = torch.arange(first, first + logits.shape[1], device=logits.device)
+        # Squared distances from each source token, along x and along y.
         across, down = ((x - (token % w)[:, None]) ** 2, (y - (token // w)[:, None]) ** 2)
         far = (down[:, :, None] + across[:, None]).flatten(1)
         logits = logits - prior.float() * far
+    # E[x] from the sum over y, and E[y] from the sum over x.
     p = logits.softmax(-1).unflatten(-1, (h, w))
     return torch.stack([(p.sum(-2) * x).sum(-1), (p.sum(-1) * y).sum(-1)], 1)
 
@@ -180,6 +191,7 @@ def patch_index(coords: Tensor, h: int, w: int, radius: int = 4) -> tuple[Tensor
     x, y = (coords[:, k].clamp(-(radius + 2.0), size + radius + 1.0) for k, size in ((0, w), (1, h)))
     coords = torch.stack([x, y], 1)
     base = coords.floor()
+    # 2r + 2 integer taps hold all four neighbours of each of the 2r + 1 bilinear ones.
     offsets = torch.arange(-radius, radius + 2, device=coords.device)
     ix, iy = (base[:, k].long()[:, None] + offsets for k in (0, 1))
     inside = ((iy >= 0) & (iy < h))[:, :, None] & ((ix >= 0) & (ix < w))[:, None, :]
@@ -189,6 +201,7 @@ def patch_index(coords: Tensor, h: int, w: int, radius: int = 4) -> tuple[Tensor
 def lerp_patch(patch: Tensor, fraction: Tensor) -> Tensor:
     """(M, 2r+2, 2r+2) integer taps and (M, 2) fractions -> (M, (2r+1)^2) bilinear taps."""
     fx, fy = fraction[:, 0, None, None], fraction[:, 1, None, None]
+    # All taps share the fraction, so the patch is interpolated as a whole, first in y, then in x.
     rows = torch.lerp(patch[:, :-1], patch[:, 1:], fy)
     return torch.lerp(rows[:, :, :-1], rows[:, :, 1:], fx).flatten(1)
 
@@ -204,6 +217,7 @@ def lookup_slow(levels: list[Tensor], coords: Tensor, radius: int = 4) -> Tensor
         centre = coords.permute(0, 2, 3, 1).reshape(-1, 1, 1, 2) / 2**level
         at = centre + torch.stack([dx, dy], -1)[None]
         size = torch.tensor([volume.shape[-1] - 1, volume.shape[-2] - 1], device=coords.device, dtype=coords.dtype)
+        # grid_sample takes -1 to 1 between the centres of the outermost cells (align_corners=True).
         sampled = F.grid_sample(volume[:, None], 2 * at / size - 1, align_corners=True)
         taps.append(sampled.view(n, h, w, -1))
     return torch.cat(taps, -1).permute(0, 3, 1, 2).contiguous()
@@ -226,12 +240,14 @@ def _taps(volume, coords, scale, radius, first, out):
     for m in range(len(coords)):
         x = min(max(coords[m, 0] * scale, np.float32(-radius - 2)), np.float32(w + radius + 1))
         y = min(max(coords[m, 1] * scale, np.float32(-radius - 2)), np.float32(h + radius + 1))
+        # NaN stays NaN, as in the other implementations.
         if not (np.isfinite(x) and np.isfinite(y)):
             out[m, first : first + side * side] = np.nan
             continue
         bx, by = np.floor(x), np.floor(y)
         fx, fy = x - bx, y - by
         left, top = int(bx) - radius, int(by) - radius
+        # Wholly inside: no test per tap.
         if left >= 0 and top >= 0 and left + side < w and top + side < h:
             for j in range(side + 1):
                 for i in range(side + 1):
@@ -241,6 +257,7 @@ def _taps(volume, coords, scale, radius, first, out):
                 for i in range(side + 1):
                     yy, xx = top + j, left + i
                     patch[j, i] = volume[m, yy, xx] if 0 <= yy < h and 0 <= xx < w else np.float32(0)
+        # The same order of interpolation as lerp_patch.
         for j in range(side):
             for i in range(side):
                 a = patch[j, i] + fy * (patch[j + 1, i] - patch[j, i])
@@ -252,6 +269,7 @@ def local_correlation(f1: Tensor, f2: Tensor, radius: int = 4) -> Tensor:
     """<f1(x), f2(x + d)> / D for |d| <= radius: (N, (2r+1)^2, h, w), rows of dy, zero
     outside; STE-FlowNet's 9x9 cost."""
     h, w = f1.shape[-2:]
+    # Zeros round f2, so that every displacement is a slice of it.
     padded = F.pad(f2, (radius,) * 4)
     side = 2 * radius + 1
     return torch.stack(

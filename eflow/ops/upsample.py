@@ -21,17 +21,21 @@ def convex_upsample(flow: Tensor, mask: Tensor, border: str = "replicate") -> Te
     """
     n, _, h, w = flow.shape
     with fp32(flow):
+        # Weights of the nine neighbours add up to 1 for each of the 64 sub-pixels: a convex
+        # combination.
         weights = mask.float().view(n, 9, SCALE * SCALE, h * w).softmax(1)
         padded = _padded(flow, border)
         neighbours = torch.stack([padded[..., dy : dy + h, dx : dx + w] for dy in range(3) for dx in range(3)], 2).view(
             n, 2, 9, 1, h * w
         )
         fine = torch.stack([(weights * neighbours[:, c]).sum(1) for c in range(2)], 1)  # (N, 2, 64, h*w)
+        # Channel (component, i, j) becomes pixel (8 y + i, 8 x + j).
         return F.pixel_shuffle(fine.view(n, 2 * SCALE * SCALE, h, w), SCALE)
 
 
 def _padded(flow: Tensor, border: str) -> Tensor:
-    """Full-resolution px with a pixel round it."""
+    """Return the flow in full-resolution px, padded by one pixel."""
+    # Low-resolution px times 8 are full-resolution px.
     return F.pad(SCALE * flow.float(), (1, 1, 1, 1), mode={"replicate": "replicate", "zero": "constant"}[border])
 
 

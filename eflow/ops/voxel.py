@@ -34,6 +34,7 @@ def voxel_grid(
     """
     grid = np.zeros((bins, height, width), np.float32)
     if len(t):
+        # An empty window has no length to divide by: all its events go to the first bin.
         scale = (bins - 1) / (int(t1) - int(t0)) if t1 > t0 else 0.0
         kernel = _splat_t if x.dtype.kind == "u" else _splat_xyt
         outside = kernel(x, y, t, p, np.int64(t0), np.int64(t1), scale, grid)
@@ -52,8 +53,10 @@ def _splat_t(x, y, t, p, t0, t1, scale, grid):
         if x[i] >= width or y[i] >= height or t[i] < t0 or t[i] > t1:
             outside += 1
             continue
+        # Times are subtracted as integers, which is exact.
         c = np.float64(t[i] - t0) * scale
-        b = min(int(c), max(bins - 2, 0))  # t == t1 belongs wholly to the last bin
+        # t == t1 belongs wholly to the last bin.
+        b = min(int(c), max(bins - 2, 0))
         w = np.float32(c - b)
         s = np.float32(1) if p[i] else np.float32(-1)
         grid[b, y[i], x[i]] += s * (np.float32(1) - w)
@@ -74,8 +77,10 @@ def _splat_xyt(x, y, t, p, t0, t1, scale, grid):
         b = min(int(c), max(bins - 2, 0))
         wt = np.float32(c - b)
         s = np.float32(1) if p[i] else np.float32(-1)
+        # Rectified coordinates lie between pixels; each event goes to the four around it.
         fx, fy = np.floor(x[i]), np.floor(y[i])
-        if not (fx >= -1 and fx < width and fy >= -1 and fy < height):  # also drops NaN
+        # NaN fails these comparisons and is dropped.
+        if not (fx >= -1 and fx < width and fy >= -1 and fy < height):
             continue
         ix, iy = int(fx), int(fy)
         wx, wy = np.float32(x[i] - fx), np.float32(y[i] - fy)
@@ -93,6 +98,7 @@ def _splat_xyt(x, y, t, p, t0, t1, scale, grid):
 
 @numba.njit(cache=True, nogil=True)
 def _normalise(cells, everything):
+    # Two passes in float64: mean first, then the sum of squared deviations, which does not cancel.
     n, total = 0, 0.0
     for v in cells:
         if everything or v != 0:
@@ -105,6 +111,7 @@ def _normalise(cells, everything):
     for v in cells:
         if everything or v != 0:
             square += (v - mean) ** 2
+    # The unbiased estimate, as torch.std has it.
     std = np.sqrt(square / (n - 1)) if n > 1 else 0.0
     scale = 1.0 / std if std > 0 else 1.0
     for i in range(len(cells)):
@@ -134,6 +141,7 @@ def _count(x, y, t, p, t0, span, counts):
         if x[i] >= width or y[i] >= height or d < 0 or d > span:
             outside += 1
             continue
+        # t == t1 would be slice number ``slices``.
         counts[min(d * slices // span, slices - 1), p[i], y[i], x[i]] += np.float32(1)
     return outside
 
@@ -159,6 +167,7 @@ def _latest(x, y, t, p, t0, span, out):
         if x[i] >= width or y[i] >= height or d < 0 or d > span:
             outside += 1
             continue
+        # Events come in order of time, so the last one written is the latest.
         out[p[i], y[i], x[i]] += np.float32(1)
         out[2 + p[i], y[i], x[i]] = np.float32(d / span)
     return outside
@@ -169,6 +178,7 @@ def _latest(x, y, t, p, t0, span, out):
 
 def voxel_grid_slow(x, y, t, p, t0, t1, bins, height, width, *, normalise="nonzero") -> np.ndarray:
     """:func:`voxel_grid` event by event in Python: every cell of the grid asks the tent kernel for its weight."""
+    # The definition itself: weight max(0, 1 - |distance|) in t, x and y.
     grid = np.zeros((bins, height, width), np.float64)
     for xi, yi, ti, pi in zip(x.astype(float), y.astype(float), t.tolist(), p.tolist(), strict=True):
         c = (bins - 1) * (ti - t0) / (t1 - t0)

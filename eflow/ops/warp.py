@@ -18,6 +18,7 @@ def backward_warp(image: Tensor, flow: Tensor, border: str = "zero") -> Tensor:
         at = (pixel_grid(h, w, flow) + flow.float()).permute(0, 2, 3, 1)
         beyond = {"zero": "zeros", "replicate": "border"}[border]
         # (Not divided by a tensor [w, h]: a card would wait for its two numbers.)
+        # grid_sample takes -1 to 1 between the image's outer edges (align_corners=False).
         normal = torch.stack([(2 * at[..., k] + 1) / size - 1 for k, size in ((0, w), (1, h))], -1)
         return F.grid_sample(image.float(), normal, align_corners=False, padding_mode=beyond)
 
@@ -27,14 +28,17 @@ def forward_warp(flow: Tensor) -> Tensor:
     where it points, averaged where several land, zero where none does. (N, 2, h, w) px."""
     n, _, h, w = flow.shape
     at = (pixel_grid(h, w, flow) + flow).flatten(2)
+    # The splat's sum of flow in channels 0 and 1, of weights in channel 2.
     base = at.floor()
     total = flow.new_zeros(n, 3, h * w)
     values = torch.cat([flow.flatten(2), torch.ones_like(at[:, :1])], 1)
     for dx in (0, 1):
         for dy in (0, 1):
             corner = base + torch.tensor([dx, dy], device=flow.device, dtype=flow.dtype)[:, None]
+            # Bilinear weight of this corner.
             weight = (1 - (at - corner).abs()).prod(1, keepdim=True)
             inside = (corner[:, :1] >= 0) & (corner[:, :1] < w) & (corner[:, 1:] >= 0) & (corner[:, 1:] < h)
             x, y = corner[:, :1].clamp(0, w - 1).long(), corner[:, 1:].clamp(0, h - 1).long()
             total.scatter_add_(2, (y * w + x).expand(-1, 3, -1), values * weight * inside)
+    # The mean where anything landed, else 0.
     return (total[:, :2] / total[:, 2:].clamp(min=1e-6) * (total[:, 2:] > 1e-6)).view(n, 2, h, w)

@@ -59,6 +59,7 @@ const float ASIDE = 0.51;
 // px: a corner so sharp that it would be moved further is cut off.
 const float FARTHEST = 4.0;
 
+// A corner at px from the picture's middle, with all that the fragment stage needs of the three true corners.
 void corner_at(vec2 px)
 {
 #define COPY(type, name) name##_0 = name[0]; name##_1 = name[1]; name##_2 = name[2];
@@ -92,6 +93,7 @@ void main()
     for (int k = 0; k < 3; ++k)
         c[k] = gl_in[k].gl_Position.xyw;
     float near = gl_in[0].gl_Position.z;
+    // All of it before the near plane: nothing is seen.
     if (max(max(c[0].z, c[1].z), c[2].z) < near)
         return;
     vec2 half_size = 0.5 * target_size;
@@ -121,6 +123,8 @@ void main()
     float away[3];
     for (int k = 0; k < 3; ++k)
         p[k] = c[k].xy / c[k].z * half_size;
+    // Signed area in px: its sign says which way the triangle is seen; outward: unit normals of its sides, px to move
+    // them.
     vec2 u = p[1] - p[0], v = p[2] - p[0];
     float turn = u.x * v.y - u.y * v.x;
     bool fits = turn != 0.0;
@@ -135,6 +139,7 @@ void main()
     {
         int before = (k + 2) % 3;
         vec2 a = outward[before], b = outward[k];
+        // Where two moved sides meet: Cramer's rule on their two line equations.
         vec2 by = vec2(away[before] * b.y - away[k] * a.y, away[k] * a.x - away[before] * b.x) / (a.x * b.y - a.y * b.x);
         fits = fits && max(abs(by.x), abs(by.y)) < FARTHEST; // NaN does not
         moved[k] = p[k] + by;
@@ -178,6 +183,7 @@ void look_along_ray()
         discard;
     ray_xy = gl_FragCoord.xy + shift;
     vec2 ndc = ray_xy / target_size * 2.0 - 1.0;
+    // Corners as seen along the ray: a corner on the ray is (0, 0). precise, so that neighbours get the same bits.
     precise vec2 q0 = corner_0.xy - corner_0.z * ndc;
     precise vec2 q1 = corner_1.xy - corner_1.z * ndc;
     precise vec2 q2 = corner_2.xy - corner_2.z * ndc;

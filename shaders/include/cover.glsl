@@ -3,6 +3,7 @@
 #ifdef VERTEX_SHADER
 void main()
 {
+    // (-1, -1), (3, -1), (-1, 3): corners of a triangle with all of NDC in it.
     gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.5, 1.0);
 }
 #endif

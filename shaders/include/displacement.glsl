@@ -13,6 +13,7 @@ vec3 displacement(vec3 d, vec2 image_size)
 {
     float w_next = 1.0 / INVERSE_DEPTH + d.z;
 #ifdef LENS
+    // The place on the lens's image plane, its change there, and what the lens makes of that in px.
     vec2 ndc = ndc_of_fragment(image_size), place = on_plane(ndc);
     vec2 change = (d.xy - ndc * d.z) / w_next * lens_plane.xy;
     vec2 flow = lens_difference(place, change) * lens_focal;

@@ -11,6 +11,7 @@ float fog_ray_length()
 
 float fog_transmittance()
 {
+    // gl_FragCoord.w is 1/Z, so the quotient is the distance d.
     return exp(-fog.x * fog_ray_length() / gl_FragCoord.w);
 }
 

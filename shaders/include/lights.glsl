@@ -80,6 +80,7 @@ vec3 here()
 
 Beam lamp_beam(int i, vec3 at)
 {
+    // Inverse square, faded to 0 at the lamp's reach by 1 - (d / reach)^4.
     vec3 way = NOW(lamp_place, i) - at;
     float square = max(dot(way, way), NEAREST * NEAREST), inverse = inversesqrt(square);
     vec3 towards = way * inverse;
@@ -121,6 +122,7 @@ uniform vec3 around_fourth_rate[5 * BANDS];
 #endif
 
 float around_band(int band, vec3 n)
+// The form of one channel at n, see above for the terms.
 {
     vec4 even = NOW(around_even, band);
     float sum = dot(even.xyz, n) + even.w;
@@ -150,6 +152,7 @@ ILLUMINANT irradiance(vec3 normal)
 {
     vec3 n = normal * inversesqrt(max(dot(normal, normal), 1e-30)); // zero stays zero
     ILLUMINANT sum = ILLUMINANT(0.0);
+// From all around; a fit may dip below 0, light does not.
 #ifdef AMBIENT
 #if AMBIENT > 1
     sum += max(ambient(n), 0.0);
@@ -158,6 +161,7 @@ ILLUMINANT irradiance(vec3 normal)
 #endif
     SHOW(around, sum)
 #endif
+// Suns: Lambert's cosine, times what the shadow map says is seen. SHADOW_SUNS of them have a map.
 #ifdef SUNS
     for (int i = 0; i < SUNS; ++i)
     {
@@ -178,6 +182,7 @@ ILLUMINANT irradiance(vec3 normal)
         sum += facing * beam.strength;
     }
 #endif
+// Point and spot lights likewise; of spot lights the first SHADOW_SPOTS have a map, behind those of the suns.
 #ifdef LAMPS
     for (int i = 0; i < LAMPS; ++i)
     {
@@ -260,6 +265,7 @@ ILLUMINANT irradiance_rate(vec3 normal, vec3 normal_rate, vec3 at_rate)
         // E = s (n.d) f(|d|) a(c): the product rule, with d the way to the lamp and c the cosine at a spot light's axis.
         vec3 way = lamp_place[i] - local, way_rate = lamp_place_rate[i] - at_rate;
         float square = dot(way, way), facing = dot(n, way);
+        // No rate where it does not shine, nor nearer than NEAREST, where the strength is held.
         if (facing <= 0.0 || square <= NEAREST * NEAREST)
             continue;
         float along = dot(way, way_rate) / square; // of d|d|/dt / |d|

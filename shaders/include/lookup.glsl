@@ -54,6 +54,7 @@ void show_lookup(vec3 unlit, vec3 light, float seen, vec3 mirrored, vec3 emissio
     shown_albedo = vec4(unlit, noted.w);
 }
 
+// From here on every look-up of the source that includes this goes through the functions above.
 #define texture noted_texture
 #define textureLod noted_texture_lod
 #define textureGrad noted_texture_grad

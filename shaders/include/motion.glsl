@@ -28,6 +28,7 @@ vec2 velocity(mat4x3 rate, vec3 local, vec2 image_size)
 #if defined(DEFORM) && defined(NEEDS_RATE)
     d += shape_rate;
 #endif
+// With a lens: motion on the image plane, times the Jacobian of the lens.
 #ifdef LENS
     vec2 ndc = ndc_of_fragment(image_size);
     vec2 v = lens_slope(on_plane(ndc)) * ((d.xy - ndc * d.z) * INVERSE_DEPTH * lens_plane.xy) * lens_focal;

@@ -43,6 +43,7 @@ vec2 seed(int i)
     return sqrt((float(i) + 0.5) / float(TAPS)) * vec2(cos(angle), sin(angle));
 }
 
+// A comparison at the four texels around, weighted bilinearly: what sampler2DShadow does.
 float nearer(SHADOW_MAP map, vec2 at, float depth)
 {
     vec2 size = vec2(textureSize(map, 0)), f = fract(at * size - 0.5);
@@ -53,6 +54,7 @@ float nearer(SHADOW_MAP map, vec2 at, float depth)
 // at: where the point is in the map; slope: of its plane's depth there; unit, texel: depth of a world unit, width of one.
 float seen_share(SHADOW_MAP map, vec3 at, vec2 slope, float unit, float texel, vec4 scale)
 {
+    // Least and most distance towards the lamp that spares a surface its own shadow, as depth.
     vec2 one = 1.0 / vec2(textureSize(map, 0));
     float most = FARTHEST * texel * unit, least = dot(abs(slope), one) + SPARE * texel * unit;
     bool sun = scale.z > 0.0;
@@ -72,6 +74,8 @@ float seen_share(SHADOW_MAP map, vec3 at, vec2 slope, float unit, float texel, v
     // llvmpipe computes both sides of an if, and a loop whose length is known; this one it leaves with the last pixel that stays.
     int taps = count > 0.0 ? TAPS : 0;
     float blocker = sum / max(count, 1.0);
+    // The penumbra's width: the sun's angle times the way from the blocker, or by similar triangles from the lamp's
+    // width.
     float width = sun ? scale.w * (blocker - at.z) / scale.z : scale.w * max(blocker / at.z - 1.0, 0.0);
     vec2 radius = clamp(0.5 * width / texel, 0.5, WIDEST) * one;
     float lit = 0.0;
@@ -103,6 +107,7 @@ float shadow(int k, vec3 n, float facing, vec3 aside)
         unit = c.z / w;
     }
 #endif
+// The slope of the surface's plane in the map: change of depth per unit of each map coordinate.
 #ifdef SOFT
     float through = dot(shadow_plane[k][2], n);
 #ifdef SHADOW_SPOTS
@@ -117,6 +122,7 @@ float shadow(int k, vec3 n, float facing, vec3 aside)
     c.z = max(c.z + min(1.5 * slant + SPARE, FARTHEST) * texel * unit, 0.0); // 0: behind all that casts
 #define SEEN(map) texture(map, c)
 #endif
+// Every map is a sampler of its own, which needs a branch of its own.
 #if SHADOWS > 3
     if (k == 3)
         return SEEN(shadow_map_3);

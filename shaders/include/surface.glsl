@@ -26,6 +26,7 @@ uniform float bump_scale;
 vec3 bumped(vec3 normal, vec3 along, float hand, vec2 at)
 {
     vec3 n = normal * inversesqrt(max(dot(normal, normal), 1e-30));
+    // Tangent made orthogonal to the normal (Gram and Schmidt); cross(n, t) times its hand is the way of v.
     vec3 t = along - n * dot(n, along);
     t *= inversesqrt(max(dot(t, t), 1e-30));
     vec3 bump = 2.0 * MAP(bumps, at).xyz - 1.0;
@@ -82,6 +83,7 @@ ILLUMINANT mirrored(vec3 d, float roughness)
 
 ILLUMINANT shone(ILLUMINANT base, vec3 normal, vec3 at, vec2 coordinates)
 {
+    // Normal and view direction; material parameters, of the map where there is one.
     vec3 n = normal * inversesqrt(max(dot(normal, normal), 1e-30)), v = normalize(EYE - at);
     float metallic = gloss.x, roughness = gloss.y;
 #ifdef GLOSS_MAP
@@ -90,23 +92,29 @@ ILLUMINANT shone(ILLUMINANT base, vec3 normal, vec3 at, vec2 coordinates)
     roughness *= given.g;
 #endif
     roughness = max(roughness, SMOOTHEST);
+    // GGX's alpha is roughness^2; square is alpha^2. cell: texture coordinates of texel centres in the tables.
     float facing_eye = clamp(dot(n, v), 1e-3, 1.0), square = roughness * roughness * roughness * roughness;
     vec2 cells = vec2(textureSize(energy, 0)), cell = (vec2(facing_eye, roughness) * (cells - 1.0) + 0.5) / cells;
     vec4 part = map_at(energy, cell, 0.0), look = map_at(looks, cell, 0.0);
     float lost = 1.0 / (part.r + part.g) - 1.0, clear;
     ILLUMINANT metal;
+    // Several reflections between the facets return the energy that one alone loses (lost).
     SEVERAL(DIELECTRIC, clear, part.b)
     SEVERAL(base, metal, part.b)
     clear = 1.0 + clear * lost;
     metal = 1.0 + metal * lost;
     float even_clear = clear * (DIELECTRIC * part.r + part.g);
     ILLUMINANT even_metal = metal * (base * part.r + part.g);
+    // Scattered light: what the dielectric's surface does not reflect. Metals scatter none.
     shown_matt = (1.0 - metallic) * (1.0 - even_clear) * irradiance(normal);
     ILLUMINANT sum = base * shown_matt;
+    // Mirrored surroundings: two looks between the normal and the mirror direction, weighted by energy's a.
     vec3 up = TO_WORLD * n, away = TO_WORLD * reflect(-v, n);
     ILLUMINANT first = mirrored(normalize(mix(up, away, look.r)), look.g), second = mirrored(normalize(mix(up, away, look.b)), look.a);
     sum += mix(second, first, part.a) * mix(ILLUMINANT(even_clear), even_metal, metallic);
 #if defined(SUNS) || defined(LAMPS)
+    // Lamps: D V F of GGX with Smith's height-correlated visibility and Schlick's Fresnel term; pi is in the
+    // strength.
     float seen = sqrt(facing_eye * facing_eye * (1.0 - square) + square);
 #define LOBE(beam, share) \
     float facing = dot(n, beam.towards); \
@@ -181,6 +189,7 @@ ILLUMINANT radiated(Spot spot, float side)
 // Over how much time the surface is looked at to either side: a quarter of a pixel, and a fraction of the width of a highlight.
 float pause(Spot spot, Spot change, float speed)
 {
+    // How fast directions turn, rad/s: of normals, suns, lamps and the eye. width: of a highlight.
     float turning = length(change.normal) * inversesqrt(max(dot(spot.normal, spot.normal), 1e-30)), width = 0.5;
 #ifdef SUNS
     for (int i = 0; i < SUNS; ++i)
@@ -202,6 +211,7 @@ ILLUMINANT radiated_rate(Spot spot, Spot change, float side, float speed)
 {
     float step = pause(spot, change, speed);
     local_seen = change.at;
+    // A central difference: second order in step.
     ILLUMINANT ends[2];
     for (int i = 0; i < 2; ++i)
     {

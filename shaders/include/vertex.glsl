@@ -111,6 +111,7 @@ out vec3 tangent_rate;
 
 void main()
 {
+// Position first: every pass has to get the same bits from it.
 #ifdef DEFORM
     vec3 position = deformed(in_position);
 #else
@@ -150,6 +151,7 @@ void main()
     tangent = in_tangent;
 #endif
 #endif
+// Rates and changes of the shape, from its formula's derivatives and not from two positions.
 #ifdef DEFORM
 #ifdef NEEDS_RATE
     shape_rate = clip_rate * deformed_rate(in_position);

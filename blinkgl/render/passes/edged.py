@@ -58,6 +58,7 @@ class Edged(Pass):
 
     def changed(self, painter: Painter, rectangles: list[Rectangle]) -> list[Rectangle]:
         seen = painter.scene.camera if painter.lens is None else painter.lens.flat
+        # px of the fine grid to px of the picture, rounded up.
         reach = -(-_REACH // self.samples.grid)  # rectangles are in pixels of the picture
         return merged([r.grown(reach, seen.width, seen.height) for r in rectangles])
 
@@ -70,17 +71,20 @@ class Edged(Pass):
         return {"LIGHT": light, "OF": "rgba"[:channels], "FLOOR": f"{light}({floor})"}
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
+        # Pixels without an edge keep their value.
         shot.inputs["picture"].target.copy_into(shot.target)
         moment, strokes = shot.moment, painter.strokes
         drawn = [item for item in (moment.visible if items is None else items) if item.layer != SKY]
         strokes.upload(moment, drawn, *shot.size)
         uniforms, array = strokes.program(self.program, self.defines(None))
-        if array is None:  # nothing in the picture has an edge
+        # Nothing in the picture has an edge.
+        if array is None:
             return
         self.bind(uniforms, shot)
         strokes.use(_CROSSINGS_UNIT)
         uniforms["crossings"].value = _CROSSINGS_UNIT
         uniforms["image_size"].value = shot.size
+        # Width of a pixel on the plane at distance 1: 2 / (width |P00|).
         uniforms["pixel"].value = 2 / (shot.size[0] * abs(moment.view.projection[0, 0]))
         strokes.draw(array, shot.target)
 

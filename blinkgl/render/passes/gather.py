@@ -52,6 +52,7 @@ class Gather(ScreenPass):
     def changed(self, painter: Painter, rectangles: list[Rectangle]) -> list[Rectangle]:
         assert painter.lens is not None
         seen = [painter.lens.rectangle(r) for r in rectangles]
+        # Rectangles of the flat picture that no pixel of the lens sees change nothing.
         return merged([r for r in seen if r is not None])
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
@@ -61,6 +62,7 @@ class Gather(ScreenPass):
             defines = {"SMOOTH": 1, "COLUMNS": columns, "ROWS": rows}
         for k, output in enumerate(self.outputs):
             whole = FORMATS[output.format].numpy.kind == "u"
+            # Integer formats need integer samplers and outputs, of unsigned numbers here.
             prefix = "u" if whole else ""
             defines |= {f"SAMPLER_{k}": f"{prefix}sampler2D", f"TEXEL_{k}": f"{prefix}vec4"}
         return defines
@@ -71,6 +73,7 @@ class Gather(ScreenPass):
         self.bind(uniforms, shot)
         if self.smooth:
             texture = shot.inputs["picked_0"].texture(self.inputs[0].output)
+            # The mean reads between texels; beyond the edge the outermost one counts.
             texture.filter, texture.repeat_x, texture.repeat_y = (LINEAR, LINEAR), False, False
             lens.slopes(*shot.size).use(_FREE_UNIT + 3)
             uniforms["slopes"].value = _FREE_UNIT + 3
@@ -82,6 +85,7 @@ class Gather(ScreenPass):
     @classmethod
     def every_kind(cls) -> Iterator[Pass]:
         lens = Radtan(4, 3, 4.0, 4.0, 1.5, 1.0)
+        # As many labels as there are outputs, see geometry.MOST_BUFFERS.
         yield cls(Colour(), lens, True)
         drawn = tuple(name for name, label in LABELS.items() if label.buffer)[:8]
         yield cls(Geometry(drawn, lens.shader), lens)

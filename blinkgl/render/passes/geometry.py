@@ -52,10 +52,12 @@ class Geometry(ScenePass):
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
         programs, values = painter.programs(self), self._values(shot)
+        # Uniforms that only programs of changing shapes have.
         of_shapes = {name for label in self.names for name in LABELS[label].of_shapes}
         checked = set()
         for item in self.items(shot.moment) if items is None else items:
             uniforms = programs[item.kind]
+            # Once per kind and frame: programs of one kind have the same uniforms.
             if item.kind not in checked:
                 checked.add(item.kind)
                 given = {k: v for k, v in values.items() if item.deformer is not None or k not in of_shapes}
@@ -67,8 +69,10 @@ class Geometry(ScenePass):
                 uniforms["image_size"].value = shot.size
             if "target_size" in uniforms:
                 uniforms["target_size"].value = shot.size
+            # Uniforms of the lens: which ray looks at a fragment, and its model.
             if self.lens and painter.lens is not None:
                 painter.lens.set(uniforms, shot, LENS_UNIT)
+            # Values of the labels, of this item's object.
             for name, (_, rows) in values.items():
                 if item.deformer is None and name in of_shapes:
                     continue
@@ -110,6 +114,7 @@ class Geometry(ScenePass):
                 f"'{name}'"
             )
         for name, (label, _) in values.items():
+            # A uniform that the compiler removed is not in the program.
             try:
                 uniforms[name]
             except KeyError:

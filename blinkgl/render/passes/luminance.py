@@ -41,6 +41,7 @@ class _Luminance(Shaded):
             uniforms["rate"].write(rows_xyw_bytes(shot.moment.rates.mvp[item.object_index]))
             uniforms["image_size"].value = shot.size
         if "sun_rate" in uniforms:
+            # Rates of directions in the object's axes, as painter.place sets the directions.
             dR = shot.moment.rates.T_world_obj[item.object_index, :3, :3]
             uniforms["sun_rate"].value = tuple(shot.scene.light.sun_direction @ dR)
             uniforms["up_rate"].value = tuple(dR[2])
@@ -67,6 +68,7 @@ class Luminance(_Luminance):
         )
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
+        # Taps are for textures; an even colour needs none.
         taps = {"TAPS4": 1} if self.samples.taps == 4 and kind.textured else {}
         return ({"RATE": 1} if self.rate else {}) | taps | ({"STRETCHED": 1} if taps and self.samples.edges else {})
 

@@ -34,6 +34,7 @@ class Mean(ScreenPass):
         return self.of.every
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
+        # Samples per pixel in x and in y.
         return {"FACTOR": self.of.samples.grid}
 
     @classmethod

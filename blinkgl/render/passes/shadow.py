@@ -53,6 +53,7 @@ class ShadowMap(ScenePass):
         """Half the memory where that is exact to a fraction of a texel: of a sun's, whose steps are equal."""
         if self.box is None:
             return "texture"
+        # 16 bits resolve 1/65535 of the map's depth.
         step = view_of(self.lamp, self.box, self.texels, np.eye(4))[0].camera.depth / 65535
         return "texture of 16 bits" if step < FINEST * scale_of(self.lamp, self.box, self.texels)[0] else "texture"
 
@@ -70,6 +71,7 @@ class ShadowMap(ScenePass):
         return [item for item in moment.visible if item.casts]
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
+        # Faces that look away from the lamp, see shadow.glsl.
         painter.gl.ctx.cull_face = "front"
         super().paint(painter, shot, items)
         painter.gl.ctx.cull_face = "back"
@@ -112,6 +114,8 @@ class Shaded(ScenePass):
         for unit, (name, map_) in enumerate(zip(_SAMPLERS, self.shadows), 1):
             if name in uniforms:
                 texture = shot.inputs[name].texture(DEPTH_BUFFER)
+                # The sampler compares: 1 where the surface is at least as near as what the map holds,
+                # filtered over four texels.
                 if not map_.soft and texture.compare_func != ">=":
                     texture.compare_func, texture.filter = ">=", (LINEAR, LINEAR)
                 texture.use(unit)
@@ -120,6 +124,7 @@ class Shaded(ScenePass):
     def set(self, painter: Painter, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
         if "shadow_rows" in uniforms:
             seen = [shot.inputs[name].moment for name, _ in zip(_SAMPLERS, self.shadows)]
+            # From the object's axes into each map's texture.
             rows = np.stack([moment.texture_from_obj[item.object_index] for moment in seen])
             uniforms["shadow_rows"].write(rows.tobytes())
             uniforms["shadow_scale"].write(_scales(self.shadows).tobytes())

@@ -42,6 +42,7 @@ class Velocity(ScenePass):
         uniforms["image_size"].value = width, height
         if self.lens:
             assert painter.lens is not None
+            # With a lens motion is in its own pixels at any size, so there is no scale.
             painter.lens.set(uniforms, shot, 0)
         elif self.every != 1:
             camera = shot.moment.view.camera

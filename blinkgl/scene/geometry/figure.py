@@ -79,6 +79,7 @@ class _Piece(NamedTuple):
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         scale = 1 / np.array([*self.flat, 1.0])
+        # Space is squeezed so that the flattened capsule is round.
         along, p = (self.b - self.a) * scale, (points - self.a) * scale
         t = np.clip(p @ along / max(along @ along, 1e-12), 0, 1)
         radius = self.radii[0] + (self.radii[1] - self.radii[0]) * t
@@ -92,12 +93,16 @@ def body_of(body: Proportions) -> Body:
     points, normals, faces, uvs, joints, weights = _average()
     bind, shape = _bind(body), _shape(body)
     turns = bind[:, :3, :3]
+    # The scale acts in each joint's own axes: R S R^T.
     shape = turns * shape[:, None] @ turns.transpose(0, 2, 1)
+    # Relative to the joint, scaled, and put at the joint of the new body; weighted over the bones.
     local = points[:, None] - _bind(Proportions())[joints, :3, 3]
     placed = (shape[joints] @ local[..., None])[..., 0] + bind[joints, :3, 3]
     vertices = (weights[..., None] * placed).sum(axis=1)
+    # Normals take the inverse of what positions take.
     outward = (weights[..., None] * (np.linalg.inv(shape)[joints] @ normals[:, None, :, None])[..., 0]).sum(axis=1)
     floor = bind[J["foot_l"], 2, 3] - body.ankle
+    # The soles go to z = 0, and the joints with them.
     vertices[:, 2] -= floor
     bind[:, 2, 3] -= floor
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
@@ -137,6 +142,7 @@ def _average() -> tuple[np.ndarray, ...]:
         """Of the blend of all, cut off below the soles."""
         near = np.stack([p.distance(points) for p in pieces])
         least = near.min(axis=0)
+        # A smooth minimum: -b ln sum exp(-d / b), relative to the least so that nothing overflows.
         blend = least - _BLEND * np.log(np.exp(-np.maximum(near - least, 0) / _BLEND).sum(axis=0))
         return np.maximum(blend, floor - points[:, 2])
 
@@ -146,8 +152,10 @@ def _average() -> tuple[np.ndarray, ...]:
     points, faces, normals = isosurface(distance, low, high, _STEP)
     weights = _weights(points, faces, pieces)
     uvs = _unwrapped(points, faces, normals, weights, bind)
+    # The four largest weights are kept, as the shader takes four.
     order = np.argsort(-weights, axis=1, kind="stable")[:, :4]
     four = np.take_along_axis(weights, order, 1)
+    # Corners with the same vertex and texture coordinates are one vertex of the mesh.
     corners = np.concatenate([faces.reshape(-1, 1), np.round(uvs.reshape(-1, 2) * 1e6).astype(np.int64)], axis=1)
     _, first, index = np.unique(corners, axis=0, return_index=True, return_inverse=True)
     old = faces.reshape(-1)[first]
@@ -162,7 +170,7 @@ def _average() -> tuple[np.ndarray, ...]:
 
 
 def _bind(body: Proportions) -> np.ndarray:
-    """(21, 4, 4) of the joints as they are bound."""
+    """Return the (21, 4, 4) poses of the joints as they are bound."""
     rest = Locals.rest(len(JOINTS))
     rest.translation[:] = body.offsets
     for name, degrees in _BIND.items():
@@ -172,7 +180,7 @@ def _bind(body: Proportions) -> np.ndarray:
 
 
 def _pieces(body: Proportions, bind: np.ndarray) -> list[_Piece]:
-    """The capsules of an average body's bones. Places are m in the joint's frame."""
+    """Return the capsules of an average body's bones. Places are m in the joint's frame."""
     made = []
 
     def add(joint: str, a, b, r0: float, r1: float, flat=(1.0, 1.0)) -> None:
@@ -187,7 +195,8 @@ def _pieces(body: Proportions, bind: np.ndarray) -> list[_Piece]:
     add("neck", (-0.005, 0, -0.02), (0.01, 0, 0.09), 0.056, 0.052)
     add("head", (0.012, 0, 0.085), (0.002, 0, 0.115), 0.082, 0.095, (1.08, 0.84))
     add("head", (0.035, 0, 0.012), (0.03, 0, 0.07), 0.048, 0.062, (1.0, 0.92))
-    add("head", (0.10, 0, 0.055), (0.09, 0, 0.085), 0.014, 0.008)  # a nose
+    # The nose.
+    add("head", (0.10, 0, 0.055), (0.09, 0, 0.085), 0.014, 0.008)
     for side, sign in (("l", 1.0), ("r", -1.0)):
         sole = body.ankle
         add("head", (0.0, sign * 0.078, 0.06), (-0.006, sign * 0.082, 0.085), 0.016, 0.018, (1, 0.6))
@@ -196,10 +205,12 @@ def _pieces(body: Proportions, bind: np.ndarray) -> list[_Piece]:
         add(f"forearm_{side}", (0, 0, -0.005), (0, 0, -0.23), 0.042, 0.029)
         add(f"hand_{side}", (0, 0, -0.02), (0.004, 0, -0.085), 0.029, 0.033, (1.25, 0.62))
         add(f"hand_{side}", (0.006, 0, -0.09), (0.002, 0, -0.155), 0.030, 0.022, (1.2, 0.5))
-        add(f"hand_{side}", (0.02, 0, -0.03), (0.05, 0, -0.085), 0.015, 0.012)  # a thumb
+        # The thumb.
+        add(f"hand_{side}", (0.02, 0, -0.03), (0.05, 0, -0.085), 0.015, 0.012)
         add(f"thigh_{side}", (0.0, 0, -0.02), (0.004, 0, -0.40), 0.089, 0.057)
         add(f"shank_{side}", (0.002, 0, 0), (0, 0, -0.38), 0.055, 0.037)
-        add(f"shank_{side}", (-0.018, 0, -0.09), (-0.014, 0, -0.18), 0.047, 0.040)  # a calf
+        # The calf.
+        add(f"shank_{side}", (-0.018, 0, -0.09), (-0.014, 0, -0.18), 0.047, 0.040)
         add(f"foot_{side}", (-0.018, 0, 0.037 - sole), (0.07, 0, 0.039 - sole), 0.042, 0.043, (1, 0.92))
         add(f"foot_{side}", (0, 0, -0.01), (0.03, 0, 0.042 - sole), 0.040, 0.043, (1, 0.92))
         add(f"foot_{side}", (0.04, 0, 0.037 - sole), (0.125, 0, 0.028 - sole), 0.041, 0.034, (1, 1.15))
@@ -212,6 +223,7 @@ def _weights(points: np.ndarray, faces: np.ndarray, pieces: list[_Piece]) -> np.
     far = np.full((len(points), len(JOINTS)), np.inf)
     for piece in pieces:
         far[:, piece.bone] = np.minimum(far[:, piece.bone], piece.distance(points))
+    # Two joints apart: the product of the relation with itself.
     near = np.zeros((len(JOINTS), len(JOINTS)), bool)
     for joint, parent in enumerate(PARENTS):
         near[joint, joint] = True
@@ -221,6 +233,7 @@ def _weights(points: np.ndarray, faces: np.ndarray, pieces: list[_Piece]) -> np.
     least = far.argmin(axis=1)
     weights = np.exp(-(far - far.min(axis=1, keepdims=True)) / _SOFT) * near[least]
     weights[weights < 0.02] = 0
+    # Weights are smoothed over the mesh's edges, three times half the neighbours' mean.
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     links = coo_matrix((np.ones(len(edges)), edges.T), shape=(len(points),) * 2).tocsr()
     links = links.multiply(1 / np.maximum(links.sum(axis=1), 1))
@@ -245,9 +258,11 @@ _AXES = {  # chart: (joint, its upper and its lower end in m of an average body,
 def _unwrapped(
     points: np.ndarray, faces: np.ndarray, normals: np.ndarray, weights: np.ndarray, bind: np.ndarray
 ) -> np.ndarray:
-    """(F, 3, 2) texture coordinates of the corners of an average body's faces."""
+    """Return (F, 3, 2) texture coordinates of the corners of an average body's faces."""
     names = list(CHARTS)
-    share = np.zeros((len(points), 2 * len(names)))  # left and right
+    # A column for each chart, left and right.
+    share = np.zeros((len(points), 2 * len(names)))
+    # Each face goes to the chart in which its corners have most weight.
     for joint, name in enumerate(JOINTS):
         bone, _, side = name.partition("_")
         share[:, 2 * names.index(_CHART_OF[bone]) + (side == "r")] += weights[:, joint]
@@ -266,15 +281,19 @@ def _unwrapped(
             outward = normals[faces[here]] @ T[:3, :3]
             top_, bottom_, ahead = (np.array(v, float) for v in (top, bottom, middle))
             mirror = paired and right
+            # Right limbs are the mirror image of left ones, so that the pattern runs alike.
             if mirror:
                 local, outward, ahead = (v * [1, -1, 1] for v in (local, outward, ahead))
                 ahead = np.array(middle, float)
             down = (bottom_ - top_) / np.linalg.norm(bottom_ - top_)
             across = np.cross(down, ahead)
+            # Cylindrical coordinates about the part's axis.
             p = local - top_
             # Caps: the direction of the surface says more of what is round than the place does.
             q = p + 0.03 * outward
             angle = np.arctan2(q @ across, q @ ahead) / (2 * math.pi)
+            # Angles of a face are brought within half a turn of its first, so that no face spans the
+            # chart.
             first = angle[:, :1]
             angle = first + (angle - first + 0.5) % 1.0 - 0.5
             if mirror:

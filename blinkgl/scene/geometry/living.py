@@ -53,10 +53,12 @@ def flag(
 ) -> tuple[Surface, Deformer]:
     """Cloth in wind, from its held edge at x = 0 along x, from z = 0 up, waving in y; the texture once on each side,
     seen through from the other."""
+    # Two sheets with a thin rim, so that the mesh is closed.
     thick = 0.004 * min(width, height)
     rows = max(round(subdivisions * height / width), 1)
     front = square((0, -thick, 0), (width, 0, 0), (0, 0, height), subdivisions, rows)
     back = square((width, thick, 0), (-width, 0, 0), (0, 0, height), subdivisions, rows)
+    # The back shows the texture's mirror image, as cloth that light shines through.
     back[2][:, 0] = 1 - back[2][:, 0]
     rim = [
         square((0, thick, 0), (0, -2 * thick, 0), (0, 0, height), 1, rows),
@@ -64,6 +66,7 @@ def flag(
         square((0, thick, 0), (width, 0, 0), (0, -2 * thick, 0), subdivisions, 1),
         square((0, -thick, height), (width, 0, 0), (0, 2 * thick, 0), subdivisions, 1),
     ]
+    # More wind beats faster and wider.
     beat = Beat(0.75 / wind**0.7, -2 * math.pi * phase)
     config = FlagConfig(amplitude=0.1 * wind**0.3, period=beat.period, phase=360 * phase)
     low, high = np.array([0, -thick, 0]), np.array([width, thick, height])
@@ -78,7 +81,9 @@ def fish(
 ) -> tuple[Surface, Deformer]:
     """A fish that swims along x, its nose at x = length / 2: a wave runs down its body, larger towards the tail."""
     rings, segments = 48, 28
-    s = (1 - np.cos(math.pi * np.arange(rings + 1) / rings)) / 2  # 0 the nose, 1 the end of the tail; finer at both
+    # s: 0 at the nose, 1 at the end of the tail; rings are denser at both ends.
+    s = (1 - np.cos(math.pi * np.arange(rings + 1) / rings)) / 2
+    # Outlines along the body: trunk, tail fin, back fin and the stalk between.
     body = np.sqrt(np.clip(s / 0.78, 0, 1)) * np.clip(1 - (s / 0.80) ** 2.2, 0, 1) ** 0.8
     tail = np.exp(-(((s - 0.97) / 0.085) ** 2)) * (s < 1)
     fin = np.exp(-(((s - 0.40) / 0.13) ** 4))
@@ -91,18 +96,23 @@ def fish(
     z = np.where(np.cos(angle) > 0, up[:, None], under[:, None]) * np.cos(angle)
     core = length * deep * (0.225 * body + stalk)[:, None]
     thin = np.clip((1 - np.clip(np.abs(z) / (core + 1e-9) - 0.25, 0, 1) ** 2), 0.06, 1)
+    # The ring's ends and its lowest point lie in the plane of symmetry.
     y = -wide[:, None] * np.sin(angle) * thin
     y[:, [0, segments // 2, -1]] = 0
     notch = 0.10 * length * tail[:, None] * (np.abs(z) / (0.17 * length * deep) - 0.55)
     x = length * (0.5 - s)[:, None] - notch
+    # The rings at nose and tail shrink to a point.
     positions = np.stack([x, y, z], axis=2)
     positions[[0, -1]] = positions[[0, -1]].mean(axis=1, keepdims=True)
-    faces = lattice(segments, rings)[:, ::-1]  # rows go to the tail
+    # Rows run to the tail, so the faces are turned round to look outwards.
+    faces = lattice(segments, rings)[:, ::-1]
     flat = positions.reshape(-1, 3)
+    # Triangles that collapse there are left out.
     corners = flat[faces]
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     faces, area = (a[np.linalg.norm(area, axis=1) > 1e-12 * length**2] for a in (faces, area))
     uvs = np.stack(np.broadcast_arrays(angle / (2 * math.pi), s[:, None]), axis=2).reshape(-1, 2)
+    # A wave that runs down the body, a little longer than it.
     wave = -2 * math.pi / (0.95 * length) * np.array([1.0, 0, 0])
     frequency = 1.9 * tempo * math.sqrt(0.3 / length)
     beat = Beat(1 / frequency, -2 * math.pi * phase)
@@ -118,7 +128,7 @@ def fish(
 
 
 def _smooth_normals(positions: np.ndarray, faces: np.ndarray, area: np.ndarray) -> np.ndarray:
-    """(V, 3) means of the faces round each point, across seams of the texture, too."""
+    """Return (V, 3) mean normals of the faces around each point, also across seams of the texture."""
     points, welded = weld(positions, faces)
     total = np.zeros_like(points)
     np.add.at(total, welded, area[:, None])

@@ -59,6 +59,7 @@ PARAMETERS = {
 
 _LEAST = {"segments": 3, "sides": 3, "tube_segments": 3, "rings": 2, "subdivisions": 1, "variant": 0, "coat": 0}
 _MAX_SEGMENTS = 4096
+# "variant" and "coat" pick from many; their numbers are no sizes.
 _MOST = {"variant": 10**9, "coat": 10**9}
 _WORDS = {"clip": tuple(CLIPS)}
 _PART = (0.7, 1.4)
@@ -98,6 +99,7 @@ def primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Calla
         bound.apply_defaults()
         for key, value in bound.arguments.items():
             default = signature.parameters[key].default
+            # A range for this primitive alone comes before that of all.
             within = _RANGES.get(f"{where}.{key}", _RANGES.get(key))
             if isinstance(default, str):
                 if value not in _WORDS[key]:
@@ -115,6 +117,7 @@ def primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Calla
                     raise AssetError("bad parameter", where=f"{where}.{key}", value=value, accepted=accepted)
                 bound.arguments[key] = float(value)
             elif isinstance(default, int):
+                # Each subdivision has four times the triangles: 7 are 327,680.
                 low, high = (0, 7) if where == "icosphere" else (_LEAST[key], _MOST.get(key, _MAX_SEGMENTS))
                 if np.shape(value) or not low <= value <= high or float(value) != int(value):
                     raise AssetError(
@@ -154,6 +157,7 @@ def primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Calla
 
 def join(pieces: Sequence[Surface]) -> Surface:
     """One body of several (positions, normals, uvs, faces)."""
+    # Numbers of vertices count on from piece to piece.
     offsets = np.cumsum([0] + [len(p[0]) for p in pieces[:-1]])
     positions, normals, uvs = (np.concatenate([p[i] for p in pieces]) for i in range(3))
     return positions, normals, uvs, np.concatenate([p[3] + o for p, o in zip(pieces, offsets)])
@@ -161,6 +165,7 @@ def join(pieces: Sequence[Surface]) -> Surface:
 
 def lattice(columns: int, rows: int) -> np.ndarray:
     """(2*columns*rows, 3) faces of a vertex lattice numbered row by row (row r+1 above row r), counter-clockwise."""
+    # A cell's two triangles: (i, right, above right) and (i, above right, above).
     c, r = np.meshgrid(np.arange(columns), np.arange(rows))
     i = (r * (columns + 1) + c).ravel()
     right, up = i + 1, i + columns + 1
@@ -178,14 +183,16 @@ def square(origin: ArrayLike, right: ArrayLike, up: ArrayLike, columns: int, row
 
 
 def _revolve(profile: np.ndarray, normals: np.ndarray, v: np.ndarray, segments: int) -> Surface:
-    """Surface of revolution about z.
+    """Return a surface of revolution about z.
 
     profile : (K, 2) r, z from bottom to top as seen with the outside on the right.   normals : (K, 2) likewise.
     A row with r = 0 is a pole: the triangles that would collapse there are left out.
     """
     angle = 2 * math.pi * np.arange(segments + 1) / segments
+    # The seam has two columns, at u = 0 and u = 1.
     cos, sin = np.cos(angle), np.sin(angle)
-    cos[-1], sin[-1] = 1.0, 0.0  # the seam's two columns coincide exactly
+    # The seam's two columns coincide exactly.
+    cos[-1], sin[-1] = 1.0, 0.0
     r, z = profile[:, :1], profile[:, 1:]
     positions = np.stack([r * cos, r * sin, np.broadcast_to(z, (len(profile), segments + 1))], axis=2).reshape(-1, 3)
     n = np.stack(
@@ -196,14 +203,16 @@ def _revolve(profile: np.ndarray, normals: np.ndarray, v: np.ndarray, segments: 
     faces = lattice(segments, len(profile) - 1)
     pole = np.repeat(np.abs(profile[:, 0]) < 1e-12, segments + 1)
     positions[pole, :2] = 0.0
-    uvs[pole, 0] += 0.5 / segments  # a pole's vertex belongs to one segment: its middle
+    # A pole has a vertex for each segment, with the u of the segment's middle.
+    uvs[pole, 0] += 0.5 / segments
     return positions, n.reshape(-1, 3), uvs, faces[pole[faces].sum(axis=1) < 2]
 
 
 def _disc(radius: float, z: float, up: bool, segments: int, turn: float = 0.0) -> Surface:
-    """Flat cap: the texture's inscribed disc, seen from outside."""
+    """Return a flat cap with the texture's inscribed disc, seen from outside."""
     angle = turn + 2 * math.pi * np.arange(segments) / segments
     rim = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(segments, z)], axis=1)
+    # A fan round the middle.
     positions = np.concatenate([[[0.0, 0.0, z]], rim])
     side = 1.0 if up else -1.0
     uvs = np.stack([0.5 + 0.5 * side * positions[:, 0] / radius, 0.5 - 0.5 * positions[:, 1] / radius], axis=1)
@@ -251,9 +260,12 @@ def die(size: float = 1.0, rounding: float = 0.12, subdivisions: int = 4) -> Sur
     # Seen from outside: what is out of the face, to its right, up in it.
     faces = ((z, x, y), (x, y, z), (y, -x, z), (-y, x, z), (-x, -y, z), (-z, -x, y))
     for number, (out, right, above) in enumerate(faces):
+        # A point of the cube, the nearest point of the core inside it, and the rounding's normal
+        # between them.
         cube = half * out + across[..., None] * right + up[..., None] * above
         core = np.clip(cube, -(half - radius), half - radius)
         normals = (cube - core) / np.linalg.norm(cube - core, axis=2, keepdims=True)
+        # The number of the face is its place in the texture, row by row.
         row, column = divmod(number, DIE_FACES[1])
         uvs = np.stack([(column + 0.5 + across / size) / DIE_FACES[1], (row + 0.5 - up / size) / DIE_FACES[0]], axis=2)
         sides.append((*(a.reshape((n + 1) ** 2, -1) for a in (core + radius * normals, normals, uvs)), cells))
@@ -271,6 +283,7 @@ def sphere(radius: float = 0.5, segments: int = 32, rings: int = 16) -> Surface:
     """Sphere by longitude and latitude."""
     latitude = np.linspace(-math.pi / 2, math.pi / 2, rings + 1)
     direction = np.stack([np.cos(latitude), np.sin(latitude)], axis=1)
+    # The poles are exact, so that _revolve recognises them.
     direction[[0, -1]] = [[0, -1], [0, 1]]
     return _revolve(radius * direction, direction, 1 - np.arange(rings + 1) / rings, segments)
 
@@ -278,6 +291,7 @@ def sphere(radius: float = 0.5, segments: int = 32, rings: int = 16) -> Surface:
 @primitive
 def icosphere(radius: float = 0.5, subdivisions: int = 3) -> Surface:
     """Sphere of 20 * 4**subdivisions nearly equal triangles, box-projected texture."""
+    # The golden ratio: three rectangles with these sides span the icosahedron's corners.
     g = (1 + math.sqrt(5)) / 2
     points = np.array(
         [
@@ -320,6 +334,7 @@ def icosphere(radius: float = 0.5, subdivisions: int = 3) -> Surface:
             (9, 8, 1),
         ]
     )
+    # Every edge gets a vertex on the sphere, every triangle becomes four.
     for _ in range(subdivisions):
         edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
         unique, index = np.unique(edges, axis=0, return_inverse=True)
@@ -350,6 +365,7 @@ def cone(radius: float = 0.5, height: float = 1.0, segments: int = 32, rings: in
     t = np.linspace(0, 1, rings)
     profile = np.stack([radius * (1 - t), (t - 0.5) * height], axis=1)
     profile[-1, 0] = 0.0
+    # The normal of a cone's side is the same along a line to its tip.
     slope = np.array([height, radius]) / math.hypot(height, radius)
     positions, normals, uvs, faces = _revolve(profile, np.broadcast_to(slope, profile.shape), 1 - t, segments)
     # The normals at the tip belong to the middle of their segment, as the uvs there do.
@@ -384,10 +400,12 @@ def capsule(radius: float = 0.25, height: float = 0.5, segments: int = 32, rings
     latitude = np.linspace(0, math.pi / 2, half + 1)
     top = np.stack([np.cos(latitude), np.sin(latitude)], axis=1)
     top[-1], top[0] = (0, 1), (1, 0)
+    # The lower half is the upper one mirrored, its rows from the pole upwards.
     direction = np.concatenate([top[::-1] * [1, -1], top])
     profile = radius * direction + np.concatenate(
         [np.full((half + 1, 2), [0, -height / 2]), np.full((half + 1, 2), [0, height / 2])]
     )
+    # v by the length along the profile, so that the texture is not stretched over the caps.
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
     return _revolve(profile, direction, 1 - length / length[-1], segments)
 

@@ -37,6 +37,7 @@ def _flattened(mesh: Mesh, dice: _Dice) -> Mesh:
 
 
 def _figure(dice: _Dice) -> Mesh:
+    # By its number, so that every part of a pool has all clips.
     does = ("walk", "dance", "run", "dance", "walk", "wave")[dice.index % 6]
     grown, parts = dice.between(1.2, 1.95), [dice.between(0.9, 1.1) for _ in range(3)]
     return living.figure(

@@ -25,11 +25,13 @@ def tangents(mesh: Mesh) -> np.ndarray:
 
 
 def _of_faces(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """(F, 3) dp/du, of any length, and (F,) the area in (u, -v): below 0 where the picture is mirrored."""
+    """Return (F, 3) dp/du, of any length, and the (F,) area in (u, -v), below 0 where the picture is mirrored."""
     p, uv = mesh.vertices[mesh.faces], mesh.uvs[mesh.faces].astype(np.float64)
+    # dp/du from p = p0 + u dp/du + v dp/dv at the triangle's two sides.
     e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     (u1, v1), (u2, v2) = (uv[:, 1] - uv[:, 0]).T, (uv[:, 2] - uv[:, 0]).T
-    area = u2 * v1 - u1 * v2  # v runs downwards
+    # v runs downwards.
+    area = u2 * v1 - u1 * v2
     return (e2 * v1[:, None] - e1 * v2[:, None]) * np.sign(area)[:, None], area
 
 
@@ -39,6 +41,7 @@ def _tangents(mesh: Mesh) -> np.ndarray:
     corners = mesh.vertices[mesh.faces]
     sums, sign = np.zeros((len(n), 3)), np.zeros(len(n))
     for k in range(3):
+        # Weighted by the angle at the corner, as normals are.
         a, b = corners[:, (k + 1) % 3] - corners[:, k], corners[:, (k + 2) % 3] - corners[:, k]
         angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1))
         at = mesh.faces[:, k]
@@ -48,6 +51,7 @@ def _tangents(mesh: Mesh) -> np.ndarray:
         np.add.at(sums, at, unit * angle[:, None])
         np.add.at(sign, at, np.sign(area) * angle)
     length = np.linalg.norm(sums, axis=1, keepdims=True)
+    # The axis farthest from the normal, made perpendicular: any direction will do.
     aside = np.eye(3)[np.abs(n).argmin(axis=1)]
     aside -= n * (aside * n).sum(axis=1, keepdims=True)
     known = length > 1e-6
@@ -60,6 +64,7 @@ def split_mirrored(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
     cancel, and (W,) int64, which of the given vertices each is. The mesh has no deformer yet."""
     _, area = _of_faces(mesh)
     mirrored, n = area < 0, len(mesh.vertices)
+    # Vertices that faces of both kinds use get a copy for the mirrored ones.
     plain, other = (np.zeros(n, bool) for _ in range(2))
     plain[mesh.faces[~mirrored]] = True
     other[mesh.faces[mirrored]] = True

@@ -142,6 +142,7 @@ class _Body:
         meshes = [part.mesh for part in obj.parts if len(part.mesh.faces)]
         swept = [None if mesh.deformer is None else mesh.deformer.sweep(mesh, t0, t1) for mesh in meshes]
         solids = [(mesh.vertices, mesh.faces) if sweep is None else sweep.hull for mesh, sweep in zip(meshes, swept)]
+        # Vertex numbers count on from part to part.
         first = np.cumsum([0] + [len(vertices) for vertices, _ in solids])
         closed = [solid for solid, mesh, sweep in zip(solids, meshes, swept) if mesh.closed or sweep is not None]
         return _Body(
@@ -165,6 +166,7 @@ class _Body:
 
     def __post_init__(self):
         self.vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
+        # The ball is round the middle of the box of vertices that faces use.
         used = self.vertices[np.unique(self.faces)]
         self.low, self.high = used.min(axis=0), used.max(axis=0)
         self.centre = 0.5 * (self.low + self.high)
@@ -174,6 +176,7 @@ class _Body:
         self.hull = _hull(used)
         self.is_static = self.path.is_static
         self.planes = None
+        # A static body's faces are in world coordinates, once and for all.
         if self.is_static and self.category != CAMERA:
             T = self.path.pose(self.path.t0_ns)
             self.planes = _face_planes(
@@ -194,6 +197,7 @@ class _Body:
 
     def encloses(self, points: np.ndarray, T: np.ndarray) -> bool:
         """Whether a closed part contains one of the world ``points``."""
+        # World points into the body's axes; only those inside its ball can be in it.
         local = (points - T[:3, 3]) @ T[:3, :3]
         near = local[(np.linalg.norm(local - self.centre, axis=1) < self.radius)]
         return any(abs(_winding(point, *part)) > 0.5 for part in self.closed for point in near)
@@ -209,12 +213,14 @@ class _Search:
 
     def run(self):
         yield from self.at_start()
-        queue = [(self.t0, i, j) for i, j in self._pairs()]  # equal times, ordered pairs: a heap already
+        # All times are equal and the pairs are ordered, so the list is a heap already.
+        queue = [(self.t0, i, j) for i, j in self._pairs()]
         while queue:
             t, i, j = heapq.heappop(queue)
             a, b = self.bodies[i], self.bodies[j]
             if a.is_static and b.is_static:
                 continue
+            # Either a collision now, or the next time at which to look.
             later, hit = self._advance(i, j, t)
             if hit is not None:
                 yield Collision(t, a.name, b.name, "contact", hit, self._stop(t, a, b))
@@ -227,6 +233,7 @@ class _Search:
         for i, j in self._pairs():
             a, b = self.bodies[i], self.bodies[j]
             Ta, Tb = a.path.pose(self.t0), b.path.pose(self.t0)
+            # Balls that far apart cannot touch.
             if self._ball_gap(a, b, Ta, Tb) > self._tol(a, b):
                 continue
             if a.encloses(_moved(b.probes, Tb), Ta):
@@ -247,6 +254,7 @@ class _Search:
         for i, a in enumerate(self.bodies):
             for j in range(i + 1, len(self.bodies)):
                 b = self.bodies[j]
+                # Ground, walls and sky may touch each other.
                 surroundings = a.category in ("sky", *_SUPPORTS) and b.category in ("sky", *_SUPPORTS)
                 if not surroundings and (CAMERA in (a.category, b.category) or not (a.is_static and b.is_static)):
                     yield i, j
@@ -258,6 +266,7 @@ class _Search:
     def _stop(self, t: int, *bodies: _Body) -> tuple[str, ...]:
         moving = [body for body in bodies if not body.is_static]
         for body in moving:
+            # Its path ends here, and it counts as static from now on.
             body.path, body.is_static, body.cut = CutPath(body.path, t), True, True
         return tuple(body.name for body in moving)
 
@@ -267,6 +276,7 @@ class _Search:
             a, b, Ta, Tb = b, a, Tb, Ta
         if b.category not in _SUPPORTS or b.planes is None or a.category == CAMERA:
             return False
+        # The plane that the body is farthest out of is the one it lies on.
         heights = _heights(b.planes, a, Ta)
         k = int(np.argmax(heights))
         # What is padded for want of times that were looked at was put down without its padding.
@@ -276,13 +286,15 @@ class _Search:
         return True
 
     def _advance(self, i: int, j: int, t: int) -> tuple[int, float | None]:
-        """(next time up to which the pair is known to be apart, None), or (t, separation) for a collision at t."""
+        """Return (next time up to which the pair is known to be apart, None), or (t, separation) for a collision at
+        t."""
         a, b = self.bodies[i], self.bodies[j]
         Ta, Tb = a.path.pose(t), b.path.pose(t)
         room, nearer = self._room(i, j, a, b, Ta, Tb)
         separation = room
         if room <= 0.0:
             tol = self._tol(a, b)
+            # Closer than the cheap bounds can tell: the exact distance.
             separation = self._distance(a, b, Ta, Tb)
             if separation <= tol:
                 return t, max(separation, 0.0)
@@ -292,8 +304,9 @@ class _Search:
         return (later, None) if later > t else (t, separation)
 
     def _room(self, i: int, j: int, a: _Body, b: _Body, Ta, Tb):
-        """How much the two may approach before they have to be looked at again, without an exact distance, and the
-        bound on a body's share in the approach. Room 0 when only the exact distance can tell."""
+        """Return how much the two may approach before they have to be looked at again, without an exact distance,
+        and the bound on a body's share in the approach. Room 0 when only the exact distance can tell."""
+        # A resting body may sink by the margin; 0.975 of it is left before a closer look.
         if (i, j) in self.resting:
             plane, lowest = self.resting[i, j]
             body, T = (b, Tb) if a.category in _SUPPORTS else (a, Ta)
@@ -305,6 +318,7 @@ class _Search:
         # Far apart the balls are as good as the triangles; close by an exact distance gains much larger steps.
         if gap > max(tol, 0.3 * min(a.radius, b.radius)):
             return gap - 0.5 * tol, _centre_speed
+        # The lowest point over a face of a static convex body is a separating plane.
         for solid, body, T in ((a, b, Tb), (b, a, Ta)):
             if solid.planes is not None:
                 heights = _heights(solid.planes, body, T)
@@ -314,10 +328,11 @@ class _Search:
         return 0.0, None
 
     def _later(self, a: _Body, b: _Body, t: int, room: float, speed_bound) -> int:
-        """Latest time for which ``speed_bound`` allows no more than ``room`` of approach since t."""
+        """Return the latest time for which ``speed_bound`` allows no more than ``room`` of approach since t."""
         window = self.t1 - t
         for _ in range(4):
             speed = sum(speed_bound(body, t, t + window) for body in (a, b) if not body.is_static)
+            # The whole rest of the time, if the bound allows it.
             if speed * window * 1e-9 <= room:
                 return t + window
             step = int(room / speed * 1e9)
@@ -328,8 +343,9 @@ class _Search:
         return t + step
 
     def _ball_gap(self, a, b, Ta, Tb) -> float:
-        """Lower bound of the distance: between bounding balls, or of a ball and a static body's faces."""
+        """Return a lower bound of the distance: between bounding balls, or of a ball and a static body's faces."""
         ca, cb = Ta[:3, :3] @ a.centre + Ta[:3, 3], Tb[:3, :3] @ b.centre + Tb[:3, 3]
+        # The balls' distance; a static convex body's faces often say more.
         gap = float(np.linalg.norm(ca - cb)) - a.radius - b.radius
         if b.planes is not None:
             gap = max(gap, float((b.planes[:, :3] @ ca - b.planes[:, 3]).max()) - a.radius)
@@ -344,12 +360,13 @@ class _Search:
             shape = body.shape()
             shape.setTransform(fcl.Transform(T[:3, :3], T[:3, 3]))
             shapes.append(shape)
+        # fcl gives a negative number for bodies that overlap.
         return max(fcl.distance(*shapes, _REQUEST, fcl.DistanceResult()), 0.0) - a.pad - b.pad
 
 
 def _body_speed(body: _Body, ta: int, tb: int) -> float:
-    """Upper bound over [ta, tb] of the speed of any of the body's points. (A pad is round:
-    turning moves it nowhere.)"""
+    """Return an upper bound over [ta, tb] of the speed of any of the body's points. (A pad is round: turning moves
+    it nowhere.)"""
     v, w = body.path.speed_bound(ta, tb)
     return v + w * body.reach
 
@@ -360,7 +377,7 @@ def _centre_speed(body: _Body, ta: int, tb: int) -> float:
 
 
 def _speed_along(normal: np.ndarray):
-    """As :func:`_body_speed`, along one direction only, for paths that can tell."""
+    """Return a bound like :func:`_body_speed` along one direction, for paths that have one."""
     normal = np.ascontiguousarray(normal)
 
     def speed(body: _Body, ta: int, tb: int) -> float:
@@ -375,7 +392,7 @@ def _moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
 
 
 def _heights(planes: np.ndarray, body: _Body, T: np.ndarray) -> np.ndarray:
-    """(P,) height of the body's lowest point over each plane."""
+    """Return the (P,) heights of the body's lowest point over each plane."""
     local = planes[:, :3] @ T[:3, :3]
     return (local @ body.hull.T).min(axis=1) + planes[:, :3] @ T[:3, 3] - planes[:, 3] - body.pad
 
@@ -388,8 +405,9 @@ def _hull(points: np.ndarray) -> np.ndarray:
 
 
 def _face_planes(used: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
-    """(P, 4) face planes of a convex mesh, both sides of a flat one; None when it is neither."""
+    """Return the (P, 4) face planes of a convex mesh, both sides of a flat one; None when it is neither."""
     corners = vertices[faces]
+    # Faces without area have no plane.
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1)
     keep = length > 0
@@ -398,6 +416,7 @@ def _face_planes(used: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> n
     normals = normals[keep] / length[keep, None]
     planes = np.column_stack([normals, np.einsum("ij,ij->i", normals, corners[keep, 0])])
     extent = float(np.linalg.norm(used.max(axis=0) - used.min(axis=0)))
+    # Coplanar triangles have one plane: compared to 1e-6, offsets relative to the extent.
     _, first = np.unique(np.round(planes / [1, 1, 1, max(extent, 1e-300)], 6), axis=0, return_index=True)
     planes = planes[np.sort(first)]
     if len(planes) > _MAX_PLANES:
@@ -407,6 +426,7 @@ def _face_planes(used: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> n
     slack = 1e-9 * max(extent, float(np.abs(used).max()))
     if offset.max() > slack:
         return None
+    # Planes are moved out to the outermost vertex, so that rounding leaves none outside.
     planes[:, 3] += np.maximum(offset.max(axis=0), 0.0)
     if offset.min() >= -slack:
         opposite = -planes
@@ -416,8 +436,8 @@ def _face_planes(used: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> n
 
 
 def _winding(point: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Generalised winding number of a closed mesh round ``point``: 0 outside, +-1 inside (solid angles of its
-    triangles; Van Oosterom & Strackee 1983)."""
+    """Return the generalised winding number of a closed mesh round ``point``: 0 outside, +-1 inside (solid angles of
+    its triangles; Van Oosterom & Strackee 1983)."""
     a, b, c = (vertices[faces[:, k]] - point for k in range(3))
     la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
     det = np.einsum("ij,ij->i", a, np.cross(b, c))
@@ -427,4 +447,5 @@ def _winding(point: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> floa
         + np.einsum("ij,ij->i", b, c) * la
         + np.einsum("ij,ij->i", c, a) * lb
     )
+    # Half the sum of solid angles over 2 pi: tan(angle / 2) = det / dot.
     return float(np.arctan2(det, dot).sum() / (2 * np.pi))

@@ -49,6 +49,7 @@ from blinkgl.scene.types import Dynamics, PosePath, SceneObject
 IMPACT_S = 1.6e-3
 """What an impact lasts, s: longer is softer. At a low rate it lasts ``LEAST_STEPS`` steps, which is longer."""
 LEAST_STEPS = 16
+# Steps are looked at and thinned in pieces of this many.
 _CHUNK = 1000  # steps between two looks at what came of them
 _TOLERANCE = 2e-6  # of the radius, and rad: how far a path may pass a step by
 _SINK = 1e-4  # of the smaller radius: how deep a body may be in another at the start
@@ -151,8 +152,10 @@ class _World:
     def __init__(self, mujoco, objects, bodies, settings, camera, sides, t0_ns, t1_ns):
         self.mujoco, self.objects, self.settings, self.sides = mujoco, tuple(objects), settings, sides
         self.t0_ns, self.t1_ns, self.step = t0_ns, t1_ns, 1.0 / settings.rate
+        # At a low rate the impact is stretched, or too few steps would lie in it.
         self.impact_steps = max(IMPACT_S * settings.rate, LEAST_STEPS)
         self.bodies: list[_Body] = []
+        # What is not there, has no faces, or is the sky touches nothing.
         for obj in self.objects:
             config = bodies.get(obj.name, IN_THE_WAY)
             if obj.category == "sky" or config.kind == "none" or not any(len(p.mesh.faces) for p in obj.parts):
@@ -163,6 +166,7 @@ class _World:
             path, radius = camera
             role = "fixed" if path.is_static else "pusher"
             self.bodies.append(_Body("the camera", role, IN_THE_WAY, path, [Shape("SPHERE", (radius, 0, 0))], radius))
+        # Moving bodies have a free joint and a place in qpos and qvel; fixed ones belong to the world.
         self.moving = [body for body in self.bodies if body.role != "fixed"]
         for at, body in enumerate(self.moving):
             body.at = at
@@ -175,11 +179,13 @@ class _World:
     # ---- the model ---------------------------------------------------------------------------------------------------
 
     def _compile(self) -> None:
-        """Once with any density, to know volumes and centres of mass; then with those as the bodies' origins, so that
-        a body in flight is on a parabola."""
+        """Compile the model twice: with any density, to know volumes and centres of mass; then with those as the
+        bodies' origins, so that a body in flight is on a parabola."""
         model = self._model(weighed=False)
         for body in self.moving:
-            at = body.at + 1  # behind the world
+            # Body 0 of the model is the world.
+            at = body.at + 1
+            # The first model has the density radius^-5, so that its masses are neither tiny nor huge.
             body.centre, body.volume = model.body_ipos[at].copy(), float(model.body_mass[at]) * body.radius**5
         self.model = self._model(weighed=True)
         self.data = self.mujoco.MjData(self.model)
@@ -189,11 +195,14 @@ class _World:
         spec = mujoco.MjSpec()
         option = spec.option
         option.timestep, option.gravity = self.step, list(self.settings.gravity)
+        # An elliptic friction cone: Coulomb's law itself, not its pyramid.
         option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_IMPLICIT, mujoco.mjtCone.mjCONE_ELLIPTIC
-        option.impratio = 10.0  # friction as hard as the contact: what lies on a slope does not creep
+        # Friction is stiffer than contact, so that bodies at rest on a slope do not creep.
+        option.impratio = 10.0
         option.sleep_tolerance = _SLOW_S * float(np.linalg.norm(self.settings.gravity))
         option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-        option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # an explosion has to be seen
+        # Without the automatic reset an explosion shows in the state, see _check_sound.
+        option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         heaviest = max((body.mass for body in self.dynamic), default=1.0)
         # MuJoCo takes no inertia below 1e-15 kg m², a ball of a millimetre; in another unit of mass nothing moves
         # otherwise.
@@ -204,6 +213,8 @@ class _World:
         for number, body in enumerate(self.bodies):
             T = body.path.pose(self.t0_ns)
             holder, density = spec.worldbody, body.radius**-5
+            # A free joint for all that moves; pushers are weightless and have their pose set at every
+            # step.
             if body.role != "fixed":
                 holder = spec.worldbody.add_body(
                     pos=T[:3, :3] @ body.centre + T[:3, 3],
@@ -214,6 +225,7 @@ class _World:
                 holder.add_freejoint()
                 if weighed:
                     density = unit * (_HEAVY * heaviest if body.role == "pusher" else body.mass) / body.volume
+            # A moving body's origin is its centre of mass.
             frame = T if body.role == "fixed" else _shifted(-body.centre)
             for k, shape in enumerate(body.shapes):
                 name, dynamic = f"{number} {k}", body.role == "dynamic"
@@ -226,6 +238,7 @@ class _World:
             ) from None
 
     def _geometry(self, spec, holder, name, shape, config: BodyConfig, radius, dynamic, density) -> None:
+        # The contact's spring: half a period lasts impact_steps steps.
         frequency = math.pi / (self.impact_steps * self.step)
         rolling = config.rolling * radius
         mesh = {}
@@ -239,11 +252,13 @@ class _World:
             pos=shape.position,
             quat=shape.quaternion,
             density=density,
+            # solref below 0 is -stiffness, -damping, per unit of mass: w^2 and 2 zeta w.
             solref=[-(frequency**2), -2.0 * damping_ratio(config.restitution, self.impact_steps) * frequency],
             solimp=[_IMPEDANCE, _IMPEDANCE, 1e-3, 0.5, 2.0],
             friction=[config.friction, rolling, rolling],
             condim=6,
             # Dynamic bodies meet all; the others do not meet each other.
+            # Bit masks: geometries meet where one's contype and the other's conaffinity share a bit.
             contype=1 if dynamic else 2,
             conaffinity=3 if dynamic else 0,
             **mesh,
@@ -255,12 +270,15 @@ class _World:
         """See :func:`simulate`. Steps are done one ahead of the poses that are kept: the velocity at a pose is the mean
         of the velocities before and after it."""
         model, data = self.model, self.data
+        # Steps up to t1; a rounding error adds none.
         count = math.ceil((self.t1_ns - self.t0_ns) * 1e-9 * self.settings.rate - 1e-6)
         qpos, qvel = np.empty((_CHUNK + 2, model.nq)), np.empty((_CHUNK + 2, model.nv))
         pushed = self._pushed(0)
         for body in self.dynamic:
             at, R = 6 * body.at, body.path.pose(self.t0_ns)[:3, :3]
+            # Velocities are those of half a step before: half a step of gravity is taken off.
             data.qvel[at : at + 3] = body.config.velocity - 0.5 * self.step * model.opt.gravity
+            # Angular velocity in the body's axes.
             data.qvel[at + 3 : at + 6] = np.radians(body.config.spin) @ R
         self._push(pushed, 0)
         self._lift()
@@ -278,12 +296,14 @@ class _World:
             for body in self.dynamic:
                 self.records[body.name].add(first, qpos[: steps + 1], qvel[: steps + 2], model.opt.gravity)
             self._let_sleep(qvel[: steps + 2])
+            # The last two rows of a chunk are the first two of the next.
             qpos[:2], qvel[:2] = qpos[steps : steps + 2].copy(), qvel[steps : steps + 2].copy()
         paths = {name: record.path(self.t0_ns, self.settings.rate) for name, record in self.records.items()}
         digest = hashlib.sha256()
         for path in paths.values():
             for array in path.coefficients:
                 digest.update(array.tobytes())
+        # Every impact once, though both bodies record it.
         impacts = sorted({step for record in self.records.values() for step in record.impacts})
         times = _times(np.array(impacts, np.int64), self.t0_ns, self.settings.rate)
         return (
@@ -308,6 +328,7 @@ class _World:
         found = []
         for body in self.pushers:
             T = body.path.poses(times)
+            # A pusher's velocity is what takes it to its next pose within one step.
             q, R = _quaternions(T[:, :3, :3]), Rotation.from_matrix(T[:, :3, :3])
             p = T[:, :3, 3] + T[:, :3, :3] @ body.centre
             turns = (R[:-1].inv() * R[1:]).as_rotvec()
@@ -320,8 +341,8 @@ class _World:
             self.data.qvel[6 * at : 6 * at + 6] = qvel[k]
 
     def _let_sleep(self, qvel: np.ndarray) -> None:
-        """Bodies that were slow for all of a chunk may fall asleep in the next: what is slow for a moment only is at
-        the top of its flight."""
+        """Let bodies that were slow for a whole chunk fall asleep in the next. A body that is slow only for a moment
+        may be at the top of its flight."""
         policies = self.mujoco.mjtSleepPolicy
         for body in self.dynamic:
             v = qvel[:, 6 * body.at : 6 * body.at + 6] * np.repeat([1.0, body.radius], 3)
@@ -341,6 +362,7 @@ class _World:
                 if depth > _LIFT * min(body.radius, other.radius):
                     break
                 # Where both can move, each its half.
+                # A fixed body or a pusher cannot move aside.
                 share = 0.5 if other.role == "dynamic" else 1.0
                 self.data.qpos[7 * body.at : 7 * body.at + 3] += share * depth * away
             else:
@@ -358,6 +380,7 @@ class _World:
         contact, model = self.data.contact, self.model
         for pair, distance, frame in zip(contact.geom, contact.dist, contact.frame):
             names = [model.geom(int(g)).name.split()[0] for g in pair]
+            # Names are "body shape"; a side of the region has no number.
             one, other = (self.bodies[int(name)] if name.isdigit() else self._side for name in names)
             for body, met, away in ((one, other, -frame[:3]), (other, one, frame[:3])):
                 if body.role == "dynamic":
@@ -368,6 +391,7 @@ class _World:
         limit = self.settings.max_speed
         for body in self.dynamic:
             p, v = qpos[:, 7 * body.at : 7 * body.at + 7], qvel[:, 6 * body.at : 6 * body.at + 3]
+            # Overflow is what is looked for here.
             with np.errstate(over="ignore", invalid="ignore"):
                 speed = np.where(np.isfinite(p).all(axis=1), np.linalg.norm(v, axis=1), np.inf)
             if not (speed <= limit).all():
@@ -409,6 +433,7 @@ class _Record:
         raw = qvel[:, 6 * at : 6 * at + 6]
         self._note_impacts(first, raw[:, :3], gravity)
         still = not raw[1:].any()
+        # A body at rest: the last piece only gets a new end.
         if still and self._still:  # the same pose for longer
             steps, *rest = self.pieces[-1]
             self.pieces[-1] = (np.append(steps[:-1], first + len(p) - 1), *rest)
@@ -416,25 +441,30 @@ class _Record:
         self._still = still
         mean = 0.5 * (raw[:-1] + raw[1:])
         v, w = mean[:, :3], mean[:, 3:]
+        # Quaternions drift from unit length by rounding.
         q = q / np.linalg.norm(q, axis=1, keepdims=True)
         R = Rotation.from_quat(q[:, [1, 2, 3, 0]])
+        # The path is of the object's origin, the engine's of the centre of mass.
         p = p - R.apply(body.centre)
         v = v - R.apply(np.cross(w, body.centre))
         keep = thin(self.step, p, v, q, w, _TOLERANCE * body.radius, _TOLERANCE)
+        # Its first pose is the last one of the piece before.
         keep[0] = not self.pieces  # the last of the piece before
         if still:
             v, w = np.zeros_like(v), np.zeros_like(w)
         self.pieces.append((first + np.flatnonzero(keep), p[keep], v[keep], q[keep], w[keep]))
 
     def _note_impacts(self, first: int, v: np.ndarray, gravity: np.ndarray) -> None:
-        """The step of the hardest push of each impact. Of one there is talk when it would stop a twentieth of the
-        body's own speed, and is ten times what gravity does."""
+        """Note the step of the hardest push of each impact. A push counts when it would stop a twentieth of the
+        body's own speed and is ten times gravity's."""
+        # Acceleration other than gravity's.
         push = np.linalg.norm(np.diff(v, axis=0) / self.step - gravity, axis=1)[1:]
         frequency = math.pi / (self.impact_steps * self.step)
         speed = np.linalg.norm(v[1:-1], axis=1)
         hard = push > 10.0 * np.linalg.norm(gravity) + 0.05 * frequency * speed
         for k in np.flatnonzero(hard):
             step = first + 1 + int(k)
+            # Later than a quarter of an impact after the last push: another impact.
             if step - self._last > self.impact_steps / 4:
                 self.impacts.append(step)
                 self._peak = 0.0
@@ -452,7 +482,7 @@ def _times(steps: np.ndarray, t0_ns: int, rate: float) -> np.ndarray:
 
 
 def _quaternions(R: np.ndarray) -> np.ndarray:
-    """(n, 4) w x y z of (n, 3, 3)."""
+    """Return the (n, 4) quaternions, w x y z, of (n, 3, 3) rotations."""
     return Rotation.from_matrix(R).as_quat()[:, [3, 0, 1, 2]]
 
 
@@ -463,6 +493,7 @@ def _quaternions(R: np.ndarray) -> np.ndarray:
 def damping_ratio(restitution: float, steps: float) -> float:
     """Of the contact of so many steps that gives back this share of the speed (0 to 1), in the mean over the phases in
     which a step meets the surface. The strongest gives back 0.02: that is what 0 becomes."""
+    # Bisection: a larger damping ratio gives back less.
     low, high = 0.0, 3.0
     for _ in range(40):
         middle = 0.5 * (low + high)
@@ -472,9 +503,11 @@ def damping_ratio(restitution: float, steps: float) -> float:
 
 @njit(cache=True)
 def _given_back(ratio: float, steps: float) -> float:
-    """Mean of the share of its speed with which a body leaves the contact, by the engine's recurrence."""
+    """Return the mean share of its speed with which a body leaves the contact, by the engine's recurrence."""
+    # w: angle of the spring per step. The contact only pushes, hence min(..., 0).
     w, total, phases = math.pi / steps, 0.0, 16
     for phase in range(phases):
+        # The phase is where within a step the surface is met.
         depth, v = (phase + 0.5) / phases, 1.0
         while depth > 0.0:
             v += min(-(w * w * depth + 2.0 * ratio * w * v), 0.0)
@@ -510,6 +543,7 @@ def shapes_of(obj: SceneObject, config: BodyConfig) -> list[Shape]:
     parts = [filled(part.mesh)[0] for part in obj.parts if len(part.mesh.faces)]
     if len(parts) > _MOST_PARTS:
         parts = [np.concatenate(parts)]
+    # A flat ground is an endless plane, which nothing falls off.
     if obj.category == "ground" and config.shape == "auto" and config.kind == "fixed" and len(parts) == 1:
         mesh = next(part.mesh for part in obj.parts if len(part.mesh.faces))
         centre, axes, extent = _framed(parts[0])
@@ -523,6 +557,7 @@ def _solid(points: np.ndarray, config: BodyConfig) -> Shape:
     low, high = points.min(axis=0), points.max(axis=0)
     centre, half = 0.5 * (low + high), 0.5 * (high - low)
     radii = np.linalg.norm(points - centre, axis=1)
+    # Thin in its smallest principal direction: a box of a little thickness.
     middle, axes, extent = _framed(points)
     if extent[2] < 0.005 * extent[0] and config.shape in ("auto", "hull"):
         return Shape("BOX", np.maximum(extent, 0.01 * extent.max()), middle, axes)
@@ -531,6 +566,7 @@ def _solid(points: np.ndarray, config: BodyConfig) -> Shape:
     if config.shape == "box":
         return Shape("BOX", np.maximum(half, 1e-3 * half.max()), centre)
     hull, volume = _hull(points)
+    # "auto": a ball or a box where the hull is one, to rounding.
     if config.shape == "auto":
         ball = 4 / 3 * math.pi * radii.max() ** 3
         if np.ptp(np.linalg.norm(hull - centre, axis=1)) < 1e-4 * radii.max() and volume > 0.9 * ball:
@@ -541,7 +577,7 @@ def _solid(points: np.ndarray, config: BodyConfig) -> Shape:
 
 
 def _hull(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Its vertices (V, 3), and its volume."""
+    """Return the convex hull's vertices (V, 3) and its volume."""
     try:
         hull = ConvexHull(points)
     except (QhullError, ValueError):
@@ -553,6 +589,7 @@ def _framed(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(centre (3,), axes (3, 3) as columns, a right-handed frame, half extents (3,) along them) of a box round the
     points, along their principal axes, longest first."""
     mean = points.mean(axis=0)
+    # Principal axes: eigenvectors of the covariance, smallest first.
     _, axes = np.linalg.eigh(np.cov(points.T, bias=True))
     axes = axes[:, ::-1] * np.sign(np.linalg.det(axes[:, ::-1]))
     along = (points - mean) @ axes
@@ -561,7 +598,7 @@ def _framed(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _plane(side: Barrier) -> Shape:
-    """An endless one, its z axis the normal."""
+    """Return an endless plane whose z axis is the normal."""
     normal = np.asarray(side.normal, dtype=np.float64)
     rotation, _ = Rotation.align_vectors([normal], [[0.0, 0.0, 1.0]])
     return Shape("PLANE", (1.0, 1.0, 1.0), normal * side.offset, rotation.as_matrix())

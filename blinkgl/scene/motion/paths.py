@@ -83,6 +83,7 @@ class KeyframePath:
         self.t0_ns, self.t1_ns = int(knots[0]), int(knots[-1])
         if len(knots) == 1:
             # One nanosecond of standing still, so that the evaluation below needs no special case.
+            # Both ends have the same pose, so every coefficient but the first is 0.
             knots = np.array([knots[0], knots[0] + 1])
             positions, rotations = np.repeat(positions, 2, axis=0), Rotation.concatenate([rotations, rotations])
         seconds = (knots - knots[0]) * 1e-9
@@ -90,6 +91,7 @@ class KeyframePath:
             cp = CubicSpline(seconds, positions).c
             cr = RotationSpline(seconds, rotations).interpolator.c
         elif interpolation == "linear":
+            # Straight lines and slerp: two coefficients each, highest power first as scipy has them.
             h = np.diff(seconds)[:, None]
             cp = np.stack([np.diff(positions, axis=0) / h, positions[:-1]])
             turn = (rotations[:-1].inv() * rotations[1:]).as_rotvec()
@@ -98,8 +100,10 @@ class KeyframePath:
             raise ConfigError("unknown interpolation", where=where, value=interpolation, accepted="spline or linear")
         self._knots = knots
         self._cp, self._cr = _ascending(cp), _ascending(cr)
+        # Rotation at the start of each piece; the polynomial phi turns on from there.
         self._rot = np.ascontiguousarray(rotations[:-1].as_matrix())
         self.key_times_ns = knots[:1] if self.t0_ns == self.t1_ns else knots
+        # Static: no coefficient above the constant one.
         self.is_static = not (self._cp[:, 1:].any() or self._cr[:, 1:].any())
 
     def pose(self, t_ns: int) -> np.ndarray:
@@ -168,6 +172,7 @@ class HermitePath(KeyframePath):
         self.t0_ns, self.t1_ns, self.key_times_ns = int(knots[0]), int(knots[-1]), knots
         if len(knots) == 1:
             knots, still = np.array([knots[0], knots[0] + 1]), np.zeros((2, 3))
+            # A single pose stands still.
             positions, quaternions = (np.repeat(a, 2, axis=0) for a in (positions, quaternions))
             velocities = rates = still
         self._knots = knots
@@ -187,6 +192,7 @@ class HermitePath(KeyframePath):
                 self._cp[i],
                 self._cr[i],
             )
+        # scipy wants x y z w.
         x, y, z = quaternions[:-1, 1:].T
         self._rot = np.ascontiguousarray(Rotation.from_quat(np.stack([x, y, z, quaternions[:-1, 0]], 1)).as_matrix())
         self.is_static = not (self._cp[:, 1:].any() or self._cr[:, 1:].any())
@@ -240,11 +246,14 @@ class PausedPath:
         self.stop_ns, self.hold_ns, self.ramp_ns = int(stop_ns), int(hold_ns), int(ramp_ns)
 
     def _clock(self, t_ns: int) -> tuple[int, float]:
-        """Time on ``path``'s clock, ns, and how fast that runs, in [0, 1]."""
+        """Return the time on ``path``'s clock, ns, and how fast that runs, in [0, 1]."""
         ramp, since = self.ramp_ns, t_ns - self.stop_ns
         if since <= 0:
+            # Before the stop, slowing down, standing, setting out, after; ramp/2 is the integral of the
+            # whole ramp.
             return t_ns, 1.0
-        if since < ramp:  # the rate is 1 - smoothstep, of which this is the integral
+        # The rate is 1 - smoothstep, of which this is the integral.
+        if since < ramp:
             u = since / ramp
             return self.stop_ns + round(ramp * (u - u**3 + u**4 / 2)), 1 - u * u * (3 - 2 * u)
         if since <= ramp + self.hold_ns:
@@ -296,6 +305,7 @@ class OffsetPath:
 
     def speed_bound(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
         v, w = self.path.speed_bound(ta_ns, tb_ns)
+        # |v + w x r| <= |v| + |w| |r|.
         return (v + w * self._arm) * _BOUND_MARGIN, w
 
 
@@ -309,10 +319,12 @@ def smoothed(
     if not aside_ns:
         return positions, rotations
     q = rotations.as_quat()
+    # q and -q are one rotation: signs are made to agree, or means would cancel.
     turned = np.cumprod(np.where(np.einsum("nk,nk->n", q[1:], q[:-1]) < 0, -1.0, 1.0))
     q[1:] *= turned[:, None]
     both, out = np.hstack([positions, q]), np.empty((len(q), 7))
     for i, t in enumerate(t_ns):
+        # As wide on both sides, so that the mean is not shifted.
         wide = min(aside_ns, t - t_ns[0], t_ns[-1] - t)
         a, b = np.searchsorted(t_ns, (t - wide, t + wide), side="left")
         b = max(min(b + 1, len(t_ns)), i + 1)
@@ -390,7 +402,7 @@ def _checked_keys(times_ns, positions, rotations, where):
 
 
 def _ascending(c: np.ndarray) -> np.ndarray:
-    """scipy's (k, pieces, 3) coefficients, highest power first, as contiguous (pieces, 4, 3), lowest first."""
+    """Return scipy's (k, pieces, 3) coefficients, highest power first, as contiguous (pieces, 4, 3), lowest first."""
     out = np.zeros((c.shape[1], 4, 3))
     out[:, : len(c)] = c[::-1].transpose(1, 0, 2)
     return out
@@ -398,9 +410,9 @@ def _ascending(c: np.ndarray) -> np.ndarray:
 
 @njit(cache=True)
 def _hermite_piece(h, p0, p1, v0, v1, q0, q1, w0, w1, cp, cr):
-    """Fills ``cp`` and ``cr`` (4, 3), the cubics of one piece of ``h`` seconds (see the module's docstring), from
-    positions p, velocities v, quaternions q (w x y z) and body rates w at its ends. Returns the angle from the first
-    rotation to the last, rad.
+    """Fill ``cp`` and ``cr`` (4, 3), the cubics of one piece of ``h`` seconds (see the module's docstring), from
+    positions p, velocities v, quaternions q (w x y z) and body rates w at its ends. Returns the angle from the
+    first rotation to the last, rad.
 
     phi = log(R0^T R1); the rate of phi at the end is J_r^-1(phi) w1, with J_r^-1 = I + [phi]x / 2 + k [phi]x^2,
     k = 1 / a^2 - cot(a / 2) / (2 a), a = |phi|."""
@@ -410,12 +422,15 @@ def _hermite_piece(h, p0, p1, v0, v1, q0, q1, w0, w1, cp, cr):
     y = q0[0] * q1[2] - q0[2] * q1[0] - q0[3] * q1[1] + q0[1] * q1[3]
     z = q0[0] * q1[3] - q0[3] * q1[0] - q0[1] * q1[2] + q0[2] * q1[1]
     s = math.sqrt(x * x + y * y + z * z)
+    # The short way round: atan2 with |w|, and the sign of w.
     a = 2.0 * math.atan2(s, abs(w))
     f = (a / s if s > 1e-12 else 2.0) * (1.0 if w >= 0.0 else -1.0)
     phi = np.array([f * x, f * y, f * z])
+    # k of the inverse right Jacobian; its series below 0.01 rad, where both terms cancel.
     k = 1.0 / (a * a) - 0.5 / (a * math.tan(0.5 * a)) if a > 1e-2 else 1.0 / 12.0 + a * a / 720.0
     c = np.cross(phi, w1)
     end = w1 + 0.5 * c + k * np.cross(phi, c)
+    # The cubic with these ends and slopes (Hermite).
     for r in range(3):
         cp[0, r], cp[1, r] = p0[r], v0[r]
         d = p1[r] - p0[r]
@@ -439,6 +454,7 @@ def thin(
     """(N,) bool: which of N poses, ``step`` seconds apart, a :class:`HermitePath` needs to pass all of them within
     ``tolerance`` (units) and ``angle`` (rad); both ends are. Arrays as there. From each pose that is kept the next is
     looked for by halving."""
+    # As large a step as passes all poses between, halved until it does.
     keep = np.empty(len(positions), dtype=bool)
     p, v, q, w = (np.ascontiguousarray(a, dtype=np.float64) for a in (positions, velocities, quaternions, rates))
     _thin(step, p, v, q, w, tolerance, angle, keep)
@@ -455,6 +471,7 @@ def _thin(step, positions, velocities, quaternions, rates, tolerance, angle, kee
     while a < last:
         b = last
         while b > a + 1:
+            # From pose a to pose b over what lies between them.
             turned = _hermite_piece(
                 (b - a) * step,
                 positions[a],
@@ -480,6 +497,7 @@ def _thin(step, positions, velocities, quaternions, rates, tolerance, angle, kee
 @njit(cache=True)
 def _passes(a, b, step, positions, quaternions, cp, cr, square, half):
     for i in range(a + 1, b):
+        # Position by Horner's scheme, then rotation.
         u = (i - a) * step
         q = 0.0
         for r in range(3):
@@ -487,6 +505,7 @@ def _passes(a, b, step, positions, quaternions, cp, cr, square, half):
             q += d * d
         if q > square:
             return False
+        # exp(phi / 2) as a quaternion.
         x = ((cr[3, 0] * u + cr[2, 0]) * u + cr[1, 0]) * u
         y = ((cr[3, 1] * u + cr[2, 1]) * u + cr[1, 1]) * u
         z = ((cr[3, 2] * u + cr[2, 2]) * u + cr[1, 2]) * u
@@ -508,6 +527,7 @@ def _passes(a, b, step, positions, quaternions, cp, cr, square, half):
 
 
 @njit(cache=True)
+# The piece that holds t; the first and last go on beyond their ends.
 def _piece(t, knots):
     i = np.searchsorted(knots, t, side="right") - 1
     return min(max(i, 0), len(knots) - 2)
@@ -517,6 +537,7 @@ def _piece(t, knots):
 def _pose(t, knots, cp, cr, rot, T):
     t = min(max(t, knots[0]), knots[-1])
     i = _piece(t, knots)
+    # Integer difference first, so that times far from 0 lose nothing.
     u = (t - knots[i]) * 1e-9
     x = ((cr[i, 3, 0] * u + cr[i, 2, 0]) * u + cr[i, 1, 0]) * u + cr[i, 0, 0]
     y = ((cr[i, 3, 1] * u + cr[i, 2, 1]) * u + cr[i, 1, 1]) * u + cr[i, 0, 1]
@@ -552,8 +573,8 @@ def _poses(times, knots, cp, cr, rot, T):
 
 @njit(cache=True)
 def _derivative(t, knots, cp, cr, rot, D):
-    """D = dT/dt. Body rate w = J_r(phi) phi' with the right Jacobian of SO(3),
-    J_r = I - (1 - cos a)/a^2 [phi]x + (a - sin a)/a^3 [phi]x^2, a = |phi|."""
+    """Write D = dT/dt. Body rate w = J_r(phi) phi' with the right Jacobian of SO(3), J_r = I - (1 - cos a)/a^2
+    [phi]x + (a - sin a)/a^3 [phi]x^2, a = |phi|."""
     T = np.empty((4, 4))
     _pose(t, knots, cp, cr, rot, T)
     i = _piece(t, knots)
@@ -571,10 +592,12 @@ def _derivative(t, knots, cp, cr, rot, D):
         # Both differences cancel at small angles; next terms are q^3/40320 and q^3/362880, below 1e-16.
         k1 = 0.5 - q * (1.0 / 24.0 - q / 720.0)
         k2 = 1.0 / 6.0 - q * (1.0 / 120.0 - q / 5040.0)
+    # phi x phi', and from it J_r phi'.
     c0, c1, c2 = p[1] * d[2] - p[2] * d[1], p[2] * d[0] - p[0] * d[2], p[0] * d[1] - p[1] * d[0]
     w0 = d[0] - k1 * c0 + k2 * (p[1] * c2 - p[2] * c1)
     w1 = d[1] - k1 * c1 + k2 * (p[2] * c0 - p[0] * c2)
     w2 = d[2] - k1 * c2 + k2 * (p[0] * c1 - p[1] * c0)
+    # R' = R [w]x, column by column.
     for r in range(3):
         D[r, 0] = T[r, 1] * w2 - T[r, 2] * w1
         D[r, 1] = T[r, 2] * w0 - T[r, 0] * w2
@@ -583,8 +606,10 @@ def _derivative(t, knots, cp, cr, rot, D):
 
 @njit(cache=True)
 def _quadratic_bound(c, ua, ub):
-    """Upper bound of |p'(u)| over [ua, ub] for the cubic p: the largest norm of the three Bezier points of p'."""
+    """Return an upper bound of |p'(u)| over [ua, ub] for the cubic p: the largest norm of the three Bezier points of
+    p'."""
     best = 0.0
+    # The bound is that of the convex hull of the control points.
     for corner in range(3):
         # Blossom of a quadratic: products u u -> v w, u -> (v + w) / 2.
         v = ub if corner == 2 else ua
@@ -599,7 +624,8 @@ def _quadratic_bound(c, ua, ub):
 
 @njit(cache=True)
 def _cubic_bound(c, ua, ub):
-    """Upper bound of |p(u)| over [ua, ub]: the largest norm of the four Bezier points of p."""
+    """Return an upper bound of |p(u)| over [ua, ub]: the largest norm of the four Bezier points of p."""
+    # The blossom of a cubic at (v, w, x): a control point each.
     best = 0.0
     for corner in range(4):
         v = ub if corner > 0 else ua
@@ -624,10 +650,12 @@ def _approach_bound(ta, tb, knots, cp, cr, rot, normal, reach):
     best = 0.0
     along, across, local = np.zeros((4, 3)), np.empty((4, 3)), np.empty(3)
     for i in range(_piece(ta, knots), _piece(tb, knots) + 1):
+        # The part of [ta, tb] that lies in piece i, in its own seconds.
         ua = (max(ta, knots[i]) - knots[i]) * 1e-9
         ub = (min(tb, knots[i + 1]) - knots[i]) * 1e-9
         for r in range(3):
             local[r] = rot[i, 0, r] * normal[0] + rot[i, 1, r] * normal[1] + rot[i, 2, r] * normal[2]
+        # Coefficients along the normal and across it.
         for k in range(4):
             along[k, 0] = cp[i, k, 0] * normal[0] + cp[i, k, 1] * normal[1] + cp[i, k, 2] * normal[2]
             dot = cr[i, k, 0] * local[0] + cr[i, k, 1] * local[1] + cr[i, k, 2] * local[2]

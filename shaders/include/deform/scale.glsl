@@ -18,6 +18,7 @@ vec3 deformed_change(vec3 p, int other)
 
 vec3 deformed_normal(vec3 p, vec3 n)
 {
+    // Normals scale by the inverse of what positions scale by.
     return n / shape[1].xyz;
 }
 

@@ -55,6 +55,7 @@ vec3 deformed(vec3 p)
 
 vec3 deformed_rate(vec3 p)
 {
+    // The product rule: joints move the shape, and morph targets change what the joints move.
     vec3 q = vec4(p + skin_morphed(0, 0), 1.0) * skin_blend(SHAPE_RATE);
 #ifdef SKIN_MORPHS
     q += vec4(skin_morphed(SHAPE_RATE, 0), 0.0) * skin_blend(0);

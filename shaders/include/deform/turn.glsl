@@ -10,6 +10,7 @@ vec3 turned(vec3 v, float angle)
 {
     vec3 b = shape[0].xyz;
     float half_sine = sine(0.5 * angle);
+    // Rodrigues' formula; 1 - cos a is written as 2 sin^2(a/2), which keeps its digits at small angles.
     return v + cross(b, v) * sine(angle) + cross(b, cross(b, v)) * (2.0 * half_sine * half_sine);
 }
 

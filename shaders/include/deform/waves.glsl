@@ -26,6 +26,7 @@ vec3 deformed_rate(vec3 p)
 vec3 deformed_change(vec3 p, int other)
 {
     vec4 change = shape[other + 4];
+    // sin(a + d) - sin(a) = 2 sin(d/2) cos(a + d/2): change.xy are d/2, change.zw 2 A sin(d/2).
     vec2 a = wave_angles(p) + change.xy;
     return shape[0].xyz * (wave_envelope(p) * (change.z * cosine(a.x) + change.w * cosine(a.y)));
 }

@@ -10,7 +10,7 @@ from blinkgl.types.events import Events
 
 def voxel_grid(events: Events, t0_us: int, t1_us: int, height: int, width: int, bins: int) -> np.ndarray:
     """(bins, H, W) float32: polarities (+1, -1), each shared between the two bins beside
-    (bins - 1) (t - t0) / (t1 - t0)."""
+    (bins - 1) (t - t0) / (t1 - t0); events outside [t0, t1] count as nothing."""
     grid = np.zeros((bins, height, width), np.float32)
     _vote(events.x, events.y, events.t, events.p, np.int64(t0_us), np.int64(t1_us), grid)
     return grid
@@ -23,6 +23,8 @@ def _vote(x, y, t, p, t0, t1, grid):
     # The weights of the two bins beside the event's place add up to 1.
     for i in range(len(t)):
         place = (t[i] - t0) * scale
+        if not 0 <= place <= last:  # outside the window, or a window without length
+            continue
         b = min(max(np.int64(place), 0), last)
         weight = np.float32(place - b)
         sign = np.float32(1) if p[i] else np.float32(-1)

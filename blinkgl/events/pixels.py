@@ -110,8 +110,8 @@ class PixelNoise:
         wait, pick = uniform2(self._seed, index, _OWN, np.uint64(0))
         polarity, answers = uniform2(self._seed, index, _OWN, np.uint64(1))
         total = self._sums[-1]
-        # Exponential waiting times, ns.
-        gaps = np.minimum(-log_f64(wait) * (1e9 / total), 2.0**55).astype(np.int64)
+        # Exponential waiting times, ns. None needs to be longer than 13 days: a batch of the longest still fits int64.
+        gaps = np.minimum(-log_f64(wait) * (1e9 / total), 2.0**50).astype(np.int64)
         t_ns = self._t_ns + np.cumsum(gaps)
         self._t_ns = int(t_ns[-1])
         pixel = np.minimum(np.searchsorted(self._sums, pick * total, side="right"), len(self._sums) - 1)

@@ -358,7 +358,7 @@ def nearest_tree(
                         if skip[i, 0] == p and skip[i, 1] == face[j]:
                             continue
                         s, u, v, w, front = _triangle(triangles[j], o, kx, ky, kz, sx, sy, sz)
-                        if s < near or s > best or s >= far[i] or (cull[p] and not front):
+                        if not (near <= s <= best and s < far[i]) or (cull[p] and not front):
                             continue
                         # Equal depths go to the lower (part, triangle), in whatever order they are
                         # found.
@@ -422,7 +422,7 @@ def nearest_exhaustive(
                     continue
                 s, u, v, w, front = _triangle(triangles[j], origins[p], kx, ky, kz, sx, sy, sz)
                 # The same conditions as in nearest_tree, with depth[i] as the best.
-                if s < near or s > depth[i] or s >= far[i] or (cull[p] and not front):
+                if not (near <= s <= depth[i] and s < far[i]) or (cull[p] and not front):
                     continue
                 if s == depth[i] and (hit[i, 0] < p or hit[i, 1] < face[j]):
                     continue

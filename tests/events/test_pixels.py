@@ -62,6 +62,13 @@ def test_noise_is_poisson_at_each_pixels_rate_at_any_frame_rate(step_us):
     assert abs(events.p.mean() - 0.7) < 4 * 0.5 / np.sqrt(len(events)) and (np.diff(events.t) >= 0).all()
 
 
+def test_a_rate_of_next_to_nothing_makes_no_events_and_ends():
+    """Waiting times beyond any recording are cut to what a clock of 64 bits can add up."""
+    stage = PixelNoise(PixelsConfig(rate_hz=1e-12), H, W, 5, False)
+    stage.step(Events.empty(), 0)
+    assert len(stage.step(Events.empty(), 172_800 * 10**6)) == 0
+
+
 def test_noise_does_not_depend_on_the_steps_and_resumes():
     _, whole = noise_of(NOISY, [0, 1_000_000], causes=True)
     stage, parts = PixelNoise(NOISY, H, W, 5, True), []

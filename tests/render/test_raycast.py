@@ -160,6 +160,14 @@ def test_near_and_far_are_half_open(kernel):
 
 
 @pytest.mark.parametrize("kernel", [nearest_tree, nearest_exhaustive])
+def test_a_ray_that_is_no_number_hits_nothing(kernel):
+    """Lenses have none where no light comes from; every comparison with it is false."""
+    forest = forest_of([np.array([[[-1, -1, 2], [1, -1, 2], [0, 1, 2.0]]])], [False])
+    found = ask(kernel, forest, np.zeros((1, 3)), np.eye(3)[None], np.full((1, 2), np.nan), 0.1, np.array([np.inf]))
+    assert found[0][0, 0] == -1
+
+
+@pytest.mark.parametrize("kernel", [nearest_tree, nearest_exhaustive])
 @pytest.mark.parametrize("turned", [False, True])
 def test_edges_and_corners_belong_to_the_triangle_seen_from_either_side(kernel, turned):
     """Rays exactly through them: an edge that two triangles share is missed by neither."""

@@ -32,6 +32,7 @@ def test_events_outside_the_window_count_as_nothing(events):
     for k, chunk in enumerate(events.numpy()):
         inside = chunk.part((chunk.t >= 2_000) & (chunk.t <= 6_000))
         assert np.array_equal(made[k].numpy(), grids.voxel_grid(inside, 2_000, 6_000, 11, 17, 3))
+        assert np.array_equal(made[k].numpy(), grids.voxel_grid(chunk, 2_000, 6_000, 11, 17, 3))
 
 
 def test_counts_and_time_surfaces(events):

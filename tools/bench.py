@@ -96,12 +96,12 @@ def events(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
 
 def generate(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
     """Whole sequences: a simulated second of the configuration, and wall time of each stage."""
-    from blinkgl.config.run import load_run
+    from blinkgl import load
     from blinkgl.dataset.generate import generate_run
 
     def row() -> dict[str, float]:
         with tempfile.TemporaryDirectory() as folder:
-            (report,) = generate_run(load_run(config_of(options), options.overrides), f"{folder}/out", 1)
+            (report,) = generate_run(load(config_of(options), options.overrides), f"{folder}/out", 1)
         return {"units": report.simulated_s, **report.seconds}
 
     return {config_of(options).stem: row}
@@ -109,11 +109,11 @@ def generate(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
 
 def scene_of(options: argparse.Namespace) -> tuple[Any, Scene]:
     """The first sequence of the configuration, and its scene."""
-    from blinkgl.config.run import load_run
+    from blinkgl import load
     from blinkgl.scene.build import sequence_scene
 
     path = config_of(options)
-    config = load_run(path, options.overrides).sequence(0)
+    config = load(path, options.overrides).sequence(0)
     return config, sequence_scene(config, 0, path.parent)
 
 
@@ -342,7 +342,8 @@ def started(stack: contextlib.ExitStack, folder: Path, arguments: list[str]) -> 
 
     def stop() -> None:
         assert process.stdin is not None
-        process.stdin.close()
+        with contextlib.suppress(BrokenPipeError):  # it has ended by an error of its own, which is reported
+            process.stdin.close()
         process.wait()
 
     stack.callback(stop)

@@ -14,6 +14,7 @@ EXTRAS = {  # extra of setup.cfg -> (distributions, what they are for)
         "Blender: blinkgl import, a path tracer; better in an environment of its own, see docs/install.md",
     ),
     "learn": (("torch", "safetensors", "tensorboard"), "training"),
+    "tensors": (("torch",), "events as tensors: TensorEsim, TensorV2e, events.device: cuda"),
     "onnx": (("onnx", "onnxscript", "onnxruntime"), "networks for programs without torch: eflow export"),
     "cluster": (("ray",), "many machines"),
     "physics": (("mujoco",), "scenes in which things fall"),

@@ -8,7 +8,7 @@ import pytest
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from blinkgl.config import base
+from blinkgl.config import problems
 from blinkgl.config.base import members
 from blinkgl.config.problems import PROBLEMS, validate
 from blinkgl.config.run import load_run
@@ -120,14 +120,14 @@ def put(tree, path, value):
 
 def test_every_error_of_every_key_is_plain(monkeypatch):
     seen: set[str] = set()
-    original = base._translate
+    original = problems._translate
 
     def spy(model, error: ValidationError, *rest):
         details: list[ErrorDetails] = error.errors(include_url=False)
         seen.update(d["type"] for d in details)
         return original(model, error, *rest)
 
-    monkeypatch.setattr(base, "_translate", spy)
+    monkeypatch.setattr(problems, "_translate", spy)
     messages = 0
     for root in ROOTS:
         spots = sorted(set(places(root)), key=str) + [()]

@@ -6,7 +6,6 @@ uniform mat4x3 difference_forward;
 vec4 label_flow_forward()
 {
     vec3 d = difference_forward * vec4(local, 1.0); // d.z is the w row
-// Of a shape that changes its own motion comes on top.
 #ifdef DEFORM
     d += shape_forward;
 #endif

@@ -226,13 +226,7 @@ def trade(
         str | None,
         typer.Option(help="What the front is drawn over: wall (default), or cpu on a busy machine (--suite: cpu)."),
     ] = None,
-    reference: Annotated[
-        str,
-        typer.Option(
-            help="raster, or cycles: judge by the same scene path-traced (extra [cycles]; seconds per frame, so with a "
-            "small camera and a short --clip)."
-        ),
-    ] = "raster",
+    reference: Annotated[str | None, typer.Option("--reference", hidden=True)] = None,
     reference_set: Annotated[
         list[str] | None,
         typer.Option(
@@ -246,6 +240,7 @@ def trade(
     as a table, a plot and a page."""
     from blinkgl.show import trade as command
 
+    _gone("scenes are no longer path-traced", "--reference-set", **{"--reference": reference})
     if suite:
         from blinkgl.show import suite as suite_command
 
@@ -266,7 +261,6 @@ def trade(
                 "--seed": seed is not None,
                 "--sequence": sequence is not None,
                 "--clip": clip is not None,
-                "--reference": reference != "raster",
                 "--reference-set": bool(reference_set),
             },
         )
@@ -284,7 +278,6 @@ def trade(
         rounds=rounds,
         minutes=minutes,
         cost=cost or "wall",
-        reference=reference,
         reference_set=reference_set,
         seed=seed,
     )

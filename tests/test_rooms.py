@@ -115,7 +115,7 @@ def test_imports_lead_down():
 
 FILLED_IN_LATER = set(
     """
-    BufferReport Collected Comparison Cost Displacement Document DrawItem Draws Example Explanation Finding Level
+    BufferReport Collected Comparison Displacement Document DrawItem Draws Example Explanation Finding Level
     Measured Omissions Outcome Parameter Pool RenderStats Result SequenceReport RecordingSide SimulationReport
     StreamStats Totals Verification _Arriving _Body
 """.split()

@@ -20,7 +20,7 @@ def _limit(default: float | None, most: float, what: str) -> float | None:
 
 class QualifyConfig(Config):
     """Which frames are near enough to each other to be interpolated. A pair of frames with a measure beyond its limit
-    does not qualify, and with too many such pairs the sequence does not. `blinkgl qualify` prints the measures;
+    does not qualify, and with too many such pairs the sequence does not. `blinkgl explain` prints the measures;
     the limits were chosen on rendered scenes whose in-between frames are known."""
 
     displacement: float | None = _limit(

@@ -187,8 +187,9 @@ def _verdict_in_words(found: Verdict | None) -> str:
     if found is None:
         return "not looked at (frames.qualify: null)"
     worst = ", ".join(f"{name} {shown(name, value)}" for name, value in found.worst.items())
+    absent = "".join(f"; not measured: {name} ({why})" for name, why in found.absent.items())
     refused = found.refusal()
-    return f"yes; largest of {len(found.pairs)} pairs: {worst}" if refused is None else f"no: {refused}"
+    return (f"yes; largest of {len(found.pairs)} pairs: {worst}" if refused is None else f"no: {refused}") + absent
 
 
 def _variant(defines: Iterable[tuple[str, Any]]) -> str:

@@ -102,13 +102,6 @@ class Verdict:
         }
 
     @property
-    def nearest(self) -> str | None:
-        """The measure whose largest value is nearest to its limit, or farthest beyond; None: nothing has a limit."""
-        worst = self.worst
-        judged = [name for name in worst if getattr(self.limits, name) is not None]
-        return max(judged, key=lambda name: _times(worst[name], getattr(self.limits, name)), default=None)
-
-    @property
     def farthest(self) -> Excess | None:
         """The excess that is largest for its limit; None where there is none."""
         return max(self.excesses, key=lambda excess: _times(excess.value, excess.limit), default=None)
@@ -148,17 +141,10 @@ def shown(measure: str, value: float) -> str:
     return f"{value:.3g}" if measure == "residual" else f"{100 * value:.3g} %"
 
 
-def verdict(
-    frames: FramesConfig,
-    folder: Path,
-    *,
-    limits: QualifyConfig | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> Verdict:
-    """Every pair of the frames of ``folder`` measured. Holds three frames at a time.
+def verdict(frames: FramesConfig, folder: Path) -> Verdict:
+    """Every pair of the frames of ``folder`` measured; limits those of ``frames``, or the standard ones where it has
+    none. Holds three frames at a time.
 
-    limits : default those of ``frames``, or the standard ones where it has none.   progress : called with pairs done
-    and all.
     Raises AssetError (unreadable, too few frames, flow files that are missing, of another size or without a single
     valid vector), EventDataError (a changed size, NaN or negative light), ConfigError (too long)."""
     files = used_images(frames, folder)
@@ -166,13 +152,10 @@ def verdict(
     backs = backward_files(folder, frames, files)
     light = _Light(frames, files)
     given = partial(_given, light.size, flows, masks, backs) if flows else None
-    pairs = []
-    for k, values in enumerate(measure(light, frames.interpolate, given)):
-        pairs.append(Pair(k, files[k].name, files[k + 1].name, values))
-        if progress is not None:
-            progress(len(pairs), len(files) - 1)
+    measured = enumerate(measure(light, frames.interpolate, given))
+    pairs = tuple(Pair(k, files[k].name, files[k + 1].name, values) for k, values in measured)
     absent = _absent(frames.interpolate == "motion" and _dense_fits(light.size), bool(flows), bool(backs or masks))
-    return Verdict(folder, limits or frames.qualify or QualifyConfig(), tuple(pairs), absent)
+    return Verdict(folder, frames.qualify or QualifyConfig(), pairs, absent)
 
 
 Given = tuple[np.ndarray, np.ndarray, np.ndarray | None]

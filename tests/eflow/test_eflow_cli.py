@@ -1,4 +1,4 @@
-"""``eflow evaluate``, ``predict``, ``submit``, ``bench`` from the command line, on tiny
+"""``eflow evaluate``, ``predict``, ``submit`` from the command line, on tiny
 files, with an untrained network."""
 
 import json
@@ -244,7 +244,7 @@ def test_methods_stand_where_a_checkpoint_does(data, tmp_path, capsys):
     assert result["methods"]["affine of the frame"]["total"]["AEE"] < 1e-5
     assert len(list((out / "pictures").glob("*.png"))) == 1
     write_events(tmp_path / "e.h5", moving_events(128, 144, 0, 3 * SPAN), 128, 144)
-    assert run(["predict", "planes", str(tmp_path / "e.h5"), "--out", str(tmp_path / "flow"), "--npy"]) == 0
+    assert run(["predict", "contrast-affine", str(tmp_path / "e.h5"), "--out", str(tmp_path / "flow"), "--npy"]) == 0
     assert "FWL" in capsys.readouterr().out
     assert np.load(tmp_path / "flow/npy/000000.npy").shape == (128, 144, 2)
 
@@ -256,8 +256,8 @@ def test_methods_stand_where_a_checkpoint_does(data, tmp_path, capsys):
             ["contrast-rotation", "E"],
             "error: --focal: a rotation's flow depends on the lens; expected its focal length",
         ),
-        (["planes", "E", "--iterations", "3"], "error: --iterations: planes is no network (got 3)"),
-        (["planes", "E", "--warm-start"], "error: --warm-start: planes is no network (got True)"),
+        (["contrast-affine", "E", "--iterations", "3"], "error: --iterations: contrast-affine is no network (got 3)"),
+        (["contrast-affine", "E", "--warm-start"], "error: --warm-start: contrast-affine is no network (got True)"),
         (["NETWORK", "E", "--focal", "200"], "error: --focal: only a method takes it (got 200.0); expected contrast-"),
         (
             ["contrast-affine", "FEW"],
@@ -341,39 +341,6 @@ def test_submit_blinkflow(network, tmp_path, full, capsys):
 
 
 @pytest.mark.slow
-def test_bench_reports_every_row(tmp_path, capsys):
-    assert (
-        run(
-            [
-                "bench",
-                "-m",
-                "ev_flownet",
-                "--size",
-                "64x48",
-                "--repeats",
-                "1",
-                "--no-training",
-                "--json",
-                str(tmp_path / "b.json"),
-            ]
-        )
-        == 0
-    )
-    rows = json.loads((tmp_path / "b.json").read_text())["rows"]
-    assert [r["mode"] for r in rows] == ["forward"] and all(
-        r["ms"] > 0 and r["peak_mib"] > 50 and r["gmacs"] > 0.3 for r in rows
-    )
-
-
-def test_bench_of_a_training_step():
-    from eflow.bench import measure
-
-    step, forward = (measure("ev_flownet", 48, 64, training=t, repeats=1, warmup=0) for t in (True, False))
-    assert (
-        (step["mode"], forward["mode"]) == ("train", "forward") and step["gmacs"] == forward["gmacs"] and step["ms"] > 0
-    )
-
-
 @pytest.mark.parametrize(
     "arguments, message",
     [
@@ -394,7 +361,7 @@ def test_bench_of_a_training_step():
             "--precision: unknown choice",
         ),
         (["submit", "{net}", "{data}", "--benchmark", "kitti", "--out", "{tmp}/a.zip"], "--benchmark: unknown choice"),
-        (["bench", "-m", "raft"], "--model: unknown model"),
+        (["train", "-m", "raft", "--data", "{data}"], "--model: unknown model"),
         (["train", "{tmp}/none.yaml", "--out", "{tmp}/o"], "none.yaml: no such file"),
     ],
 )

@@ -257,14 +257,12 @@ def test_recipes_that_cannot_be_rendered_are_refused_at_once(tmp_path, recipe, c
     assert said in str(caught.value) and where in (caught.value.where or "")
 
 
-def test_a_recipe_is_evaluated_by_density_without_files(recipe, capsys, tmp_path):
+def test_a_recipe_is_evaluated_without_files(recipe, capsys, tmp_path):
     out = tmp_path / "scores"
-    command = ["evaluate", "contrast-translation", str(recipe), "--window-ms", "5-30", "--by-density", "--limit", "3"]
+    command = ["evaluate", "contrast-translation", str(recipe), "--window-ms", "5-30", "--limit", "3"]
     assert run([*command, "--pictures", "0", "--out", str(out)]) == 0
     said = capsys.readouterr().out
-    assert "events per px of flow" in said and "3 samples" in said
-    rows = json.loads((out / "results.json").read_text())["lengths"]
-    assert sum(row["samples"] for row in rows) <= 3
+    assert "3 samples" in said and json.loads((out / "results.json").read_text())["samples"] == 3
     for wrong in ("5ms", "100-5", "-5", "1-2-3"):
         assert run([*command[:3], f"--window-ms={wrong}"]) == 2
         assert "--window-ms: not lengths of windows" in capsys.readouterr().err

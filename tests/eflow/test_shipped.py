@@ -157,7 +157,7 @@ def test_weights_that_are_not_the_cards(source, list_of):
     "name, change, message",
     [
         ("Toy Net", {}, "--name: not a name"),
-        ("planes", {}, "--name: not a name"),
+        ("contrast-affine", {}, "--name: not a name"),
         ("eraft", {}, "--name: not a name"),
         ("toy", {"scores": {}}, "card.yaml.*scores"),
         ("toy", {"commands": None}, "card.yaml.*commands"),

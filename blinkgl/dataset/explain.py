@@ -24,7 +24,6 @@ from blinkgl.config.run import RunTemplate
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.config.tracks import TracksConfig, track_times
 from blinkgl.dataset.choices import quality_in_words
-from blinkgl.dataset.effects import Effect, effects_of
 from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging import FrameCamera
 from blinkgl.labels import LABELS, LabelRequest, asked_for
@@ -66,8 +65,6 @@ class Explanation:
     scene: dict[str, str] = field(default_factory=dict)
     passes: list[Pass] = field(default_factory=list)
     left_out: list[tuple[str, str]] = field(default_factory=list)
-    effects: list[Effect] = field(default_factory=list)
-    frame_s: float = 0.0  # of an event frame
     frames: int = 0
     seconds: float = 0.0
     seconds_per_simulated_second: float = 0.0
@@ -91,7 +88,6 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
                 elif own.images is not None:
                     one.passes.append(_frame_camera(own.images, renderer, seen))
                 _left_out(own, seen, one)
-                one.effects = effects_of(renderer.scene)
             _join(result, name, one)
     simulated = (scene.t1_ns - scene.t0_ns) * 1e-9
     result.seconds = sum(p.seconds for p in result.passes)
@@ -117,7 +113,6 @@ def _join(result: Explanation, name: str, one: Explanation) -> None:
     result.passes += [replace(p, name=prefix + p.name) for p in one.passes]
     result.left_out += [pair for pair in one.left_out if pair not in result.left_out]
     result.frames = max(result.frames, one.frames)
-    result.effects, result.frame_s = one.effects, max(result.frame_s, one.frame_s)  # one light for all
 
 
 def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanation:
@@ -287,7 +282,7 @@ def _passes(
         frame = renderer.luminance(t, rate=rates)
         return frame.view(), frame.view("rate") if rates else None
 
-    result.frame_s = event_s = _timed(drawn, times)
+    event_s = _timed(drawn, times)
     fine = samples_of(config.render.antialiasing).stored
     probe = simulate_sequence(config, index, labels=False, scene=scene, renderer=renderer)
     seen = [chunk.t_ns for chunk in islice(probe.chunks(), 2 * PROBES)]  # a short stretch of it, as it will be

@@ -1,6 +1,6 @@
 """The ``blinkgl`` command: thin functions over the library, one line per error.
 
-Exit status: 0 done; 1 `shader diff`, `shader check` or `qualify` found something wrong; 2 the user's input or machine
+Exit status: 0 done; 1 `shader diff` or `shader check` found something wrong; 2 the user's input or machine
 (``error: …`` on stderr, one line); 3 done but for sequences (`trade --suite`: scenes) that were set aside; 130
 interrupted. A traceback means a bug in BlinkGL, or ``--debug``. What a command does and prints is
 ``blinkgl.show.COMMAND.run``, which returns the status; it is imported inside the function, so that ``--help`` answers
@@ -150,26 +150,6 @@ def explain(
     from blinkgl.show import explain as command
 
     return command.run(config, sequence=sequence, seed=seed, overrides=overrides or [])
-
-
-@app.command()
-def qualify(
-    sources: Annotated[
-        list[str],
-        typer.Argument(metavar="SOURCE...", help="Folders of frames, or one YAML file with frames: in it."),
-    ],
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="a.b=c", help="Override a value, such as frames.flow=null; may be repeated."),
-    ] = None,
-    pairs: Annotated[bool, typer.Option("--pairs", help="A row for every pair of frames.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
-) -> int:
-    """Say which folders of frames are fit to be interpolated, and why the others are not.
-    Writes nothing. Exit status 1: some are not."""
-    from blinkgl.show import qualify as command
-
-    return command.run(sources, overrides=overrides or [], pairs=pairs, as_json=as_json)
 
 
 @app.command()

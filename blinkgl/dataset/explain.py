@@ -36,9 +36,7 @@ from blinkgl.scene.lights import is_coloured, lamps_of
 from blinkgl.scene.shapes.table import DEFORMERS
 from blinkgl.scene.types import Light, Scene
 from blinkgl.sequence import simulate_sequence
-from blinkgl.sequence.folders import folder_of
 from blinkgl.sequence.inertial import measured
-from blinkgl.sequence.qualify import Verdict, shown, verdict
 from blinkgl.sequence.recorded import RECORDED
 from blinkgl.sequence.rendered import SURFACES, surfaces_at
 
@@ -119,9 +117,7 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
     """A sequence that is converted from recorded frames: nothing is rendered; the first few
     frames are converted and timed."""
     frames = config.frames
-    found = None if frames.qualify is None else verdict(frames, folder_of(frames, index, base))
-    unchecked = config.model_copy(update={"frames": frames.model_copy(update={"qualify": None})})
-    probe = simulate_sequence(unchecked, index, base=base, labels=False)
+    probe = simulate_sequence(config, index, base=base, labels=False)
     files, flows, masks = probe.files, probe.flows, probe.masks
     duration = (len(files) - 1) / frames.fps
     result = Explanation(machine=platform.processor() or platform.machine(), seconds=0.0)
@@ -134,7 +130,6 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
         "frames": f"{len(files)} of {probe.folder}, {probe.width}x{probe.height}, {frames.fps:g} Hz: {duration:.6g} s",
         "images": f"{files[0].name} … {files[-1].name}, {frames.gamma}",
         "flow": f"{len(flows)} files, {len(masks)} masks of occluded pixels" if flows else "none: no flow labels",
-        "qualify": _verdict_in_words(found),
         "not used": "camera, time, timeline, scene and render: nothing is rendered",
     }
     count = min(PROBES, len(files)) - 1
@@ -176,14 +171,6 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
     result.seconds = sum(p.seconds for p in result.passes)
     result.seconds_per_simulated_second = result.seconds / duration
     return result
-
-
-def _verdict_in_words(found: Verdict | None) -> str:
-    if found is None:
-        return "not looked at (frames.qualify: null)"
-    worst = ", ".join(f"{name} {shown(name, value)}" for name, value in found.worst.items())
-    refused = found.refusal()
-    return f"yes; largest of {len(found.pairs)} pairs: {worst}" if refused is None else f"no: {refused}"
 
 
 def _variant(defines: Iterable[tuple[str, Any]]) -> str:

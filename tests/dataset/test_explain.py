@@ -136,7 +136,14 @@ def test_recorded_frames_are_what_is_explained(tmp_path):
         cv2.imwrite(str(tmp_path / f"P0/image_left/{k:03d}.png"), np.roll(image, k, axis=1))
     path = tmp_path / "run.yaml"
     tree = {
-        "frames": {"folders": ["P0"], "fps": 10, "flow": None, "interpolate": "linear", "first": 1, "qualify": None},
+        "frames": {
+            "folders": ["P0"],
+            "fps": 10,
+            "flow": None,
+            "interpolate": "linear",
+            "first": 1,
+            "max_displacement": None,
+        },
         "preview": {"enabled": False},
         "camera": {"width": 99, "height": 99},
         "gl": {"backend": "egl", "device": 4000},
@@ -145,7 +152,7 @@ def test_recorded_frames_are_what_is_explained(tmp_path):
     run = load_run(path)
     told = explain(run)
     assert (
-        set(told.scene) == {"frames", "images", "flow", "qualify", "not used"}
+        set(told.scene) == {"frames", "images", "flow", "not used"}
         and "40x24" in told.scene["frames"]
         and "19 of" in told.scene["frames"]
     )

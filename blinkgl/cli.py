@@ -1,6 +1,6 @@
 """The ``blinkgl`` command: thin functions over the library, one line per error.
 
-Exit status: 0 done; 1 `shader diff`, `shader check` or `qualify` found something wrong; 2 the user's input or machine
+Exit status: 0 done; 1 `shader diff` or `shader check` found something wrong; 2 the user's input or machine
 (``error: …`` on stderr, one line); 3 done but for sequences (`trade --suite`: scenes) that were set aside; 130
 interrupted. A traceback means a bug in BlinkGL, or ``--debug``. What a command does and prints is
 ``blinkgl.show.COMMAND.run``, which returns the status; it is imported inside the function, so that ``--help`` answers
@@ -150,26 +150,6 @@ def explain(
     from blinkgl.show import explain as command
 
     return command.run(config, sequence=sequence, seed=seed, overrides=overrides or [])
-
-
-@app.command()
-def qualify(
-    sources: Annotated[
-        list[str],
-        typer.Argument(metavar="SOURCE...", help="Folders of frames, or one YAML file with frames: in it."),
-    ],
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="a.b=c", help="Override a value, such as frames.flow=null; may be repeated."),
-    ] = None,
-    pairs: Annotated[bool, typer.Option("--pairs", help="A row for every pair of frames.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
-) -> int:
-    """Say which folders of frames are fit to be interpolated, and why the others are not.
-    Writes nothing. Exit status 1: some are not."""
-    from blinkgl.show import qualify as command
-
-    return command.run(sources, overrides=overrides or [], pairs=pairs, as_json=as_json)
 
 
 @app.command()
@@ -341,7 +321,7 @@ def simulate(
         ),
     ],
     out: Annotated[
-        str, typer.Option("--out", "-o", help="Event file: .h5 (DSEC), .raw (EVT3), .aedat4, .txt, .csv, .npz, .npy.")
+        str, typer.Option("--out", "-o", help="Event file: .h5 (DSEC), .raw (EVT3), .txt, .csv, .npz, .npy.")
     ],
     emulator: Annotated[str, typer.Option("--emulator", "-e", help="esim, v2e or voltmeter.")] = "esim",
     sensor: Annotated[
@@ -504,14 +484,11 @@ def convert(
         str,
         typer.Argument(
             metavar="IN",
-            help="Event file: DSEC/BlinkFlow/MVSEC/Prophesee .h5, EVT2/EVT3 .raw, .aedat4, .aedat, .mcap, .txt, .csv, "
+            help="Event file: DSEC/BlinkFlow/MVSEC/Prophesee .h5, EVT2/EVT3 .raw, .aedat4, .aedat, .txt, .csv, "
             ".npz, .npy.",
         ),
     ],
     target: Annotated[str, typer.Argument(metavar="OUT", help="Event file; its ending names the format.")],
-    format: Annotated[
-        str | None, typer.Option("--format", help="Where the ending leaves a choice: evt2, prophesee.")
-    ] = None,
     size: Annotated[
         str | None, typer.Option(help="WIDTHxHEIGHT, where the file does not say (default: guessed).")
     ] = None,
@@ -527,9 +504,7 @@ def convert(
     """Convert an event file from one format to another."""
     from blinkgl.show import convert as command
 
-    return command.run(
-        source, target, format=format, size=size, zero_time=zero_time, time_unit=time_unit, overwrite=overwrite
-    )
+    return command.run(source, target, size=size, zero_time=zero_time, time_unit=time_unit, overwrite=overwrite)
 
 
 @app.command("import")

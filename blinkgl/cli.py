@@ -322,7 +322,7 @@ def simulate(
         ),
     ],
     out: Annotated[
-        str, typer.Option("--out", "-o", help="Event file: .h5 (DSEC), .raw (EVT3), .aedat4, .txt, .csv, .npz, .npy.")
+        str, typer.Option("--out", "-o", help="Event file: .h5 (DSEC), .raw (EVT3), .txt, .csv, .npz, .npy.")
     ],
     emulator: Annotated[str, typer.Option("--emulator", "-e", help="esim, v2e or voltmeter.")] = "esim",
     sensor: Annotated[
@@ -485,14 +485,11 @@ def convert(
         str,
         typer.Argument(
             metavar="IN",
-            help="Event file: DSEC/BlinkFlow/MVSEC/Prophesee .h5, EVT2/EVT3 .raw, .aedat4, .aedat, .mcap, .txt, .csv, "
+            help="Event file: DSEC/BlinkFlow/MVSEC/Prophesee .h5, EVT2/EVT3 .raw, .aedat4, .aedat, .txt, .csv, "
             ".npz, .npy.",
         ),
     ],
     target: Annotated[str, typer.Argument(metavar="OUT", help="Event file; its ending names the format.")],
-    format: Annotated[
-        str | None, typer.Option("--format", help="Where the ending leaves a choice: evt2, prophesee.")
-    ] = None,
     size: Annotated[
         str | None, typer.Option(help="WIDTHxHEIGHT, where the file does not say (default: guessed).")
     ] = None,
@@ -508,9 +505,7 @@ def convert(
     """Convert an event file from one format to another."""
     from blinkgl.show import convert as command
 
-    return command.run(
-        source, target, format=format, size=size, zero_time=zero_time, time_unit=time_unit, overwrite=overwrite
-    )
+    return command.run(source, target, size=size, zero_time=zero_time, time_unit=time_unit, overwrite=overwrite)
 
 
 @app.command("import")

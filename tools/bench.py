@@ -180,7 +180,7 @@ def formats(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
             file.sized().read()
 
     rows: Rows = {}
-    for ending in ("h5", "raw", "npz", "npy", "txt", "mcap"):
+    for ending in ("h5", "raw", "npz", "npy", "txt"):
         path = folder / f"e.{ending}"
         rows[f"write {ending}"] = lambda path=path: write_events(path, recording, HEIGHT, WIDTH) and None
         rows[f"read {ending}"] = lambda path=path: read(path)

@@ -63,9 +63,9 @@ def _events() -> Events:
     return Events(x, y, np.sort(t), p)
 
 
-def _events_as(kind: str | None = None) -> Format:
+def _events_as() -> Format:
     def make(path: Path) -> None:
-        write_events(path, _events(), HEIGHT, WIDTH, format=kind)
+        write_events(path, _events(), HEIGHT, WIDTH)
 
     def read(path: Path) -> None:
         with open_events(path) as file:
@@ -105,8 +105,7 @@ def _read_frames(path: Path) -> None:
 FRAMES = Format(_write_picture, _read_frames)
 MESH = Format(lambda path: trimesh.creation.box().export(path), load_asset)
 FORMATS = {
-    **{name: _events_as() for name in ("e.txt", "e.csv", "e.h5", "e.npz", "e.npy", "e.raw", "e.mcap")},
-    "evt2.raw": _events_as("evt2"),
+    **{name: _events_as() for name in ("e.txt", "e.csv", "e.h5", "e.npz", "e.npy", "e.raw")},
     "flow.png": Format(lambda path: write_flow_png(path, *_flow()), lambda path: _sound(*read_flow_png(path))),
     "flow.flo": Format(lambda path: write_flo(path, *_flow()), lambda path: _sound(*read_flo(path))),
     **{f"0.{ending}": FRAMES for ending in ("png", "jpg", "tiff", "pfm", "hdr")},

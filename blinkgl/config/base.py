@@ -12,14 +12,10 @@ keys that it names and nothing else:
             if least > most:
                 raise Refused(f"min_step_us must not exceed max_step_us = {most}")
 
-So what is looked at together is known without running anything, and :mod:`blinkgl.config.corners` tries all
-combinations of the ends of those distributions alone. pydantic's own validators of whole
-models, which see everything, are refused.
 """
 
 from __future__ import annotations
 
-import inspect
 import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -59,10 +55,6 @@ class Rule:
 
     keys: tuple[str, ...]
     check: Callable[..., None]
-
-    def paths(self) -> tuple[tuple[Path, bool], ...]:
-        """Path of every key, and whether it is read with all that is below it."""
-        return tuple((tuple(key.lstrip("?#").split(".")), key[0] not in "?#") for key in self.keys)
 
     def __call__(self, model: Config) -> None:
         self.check(*(_value(model, key) for key in self.keys))
@@ -122,19 +114,10 @@ class Config(BaseModel):
             if isinstance(value, Rule)
         }
         cls.rules = tuple(found.values())
-        decorators = cls.__pydantic_decorators__
-        others = {*decorators.model_validators, *decorators.field_validators, *decorators.validators} - {
-            "_remembered",
-            "_fill_preset",
-            "_keep_rules",
-        }
-        if others:
-            raise TypeError(f"{cls.__name__}.{others.pop()}: say by @rule which keys it reads")
         for name, one in found.items():
-            inspect.signature(one.check).bind(*one.keys)
-            for path, _whole in one.paths():
-                if not _fits(cls, path):
-                    raise TypeError(f"{cls.__name__}.{name}: there is no key {'.'.join(path)}")
+            for key in one.keys:
+                if not _fits(cls, _steps(key)):
+                    raise TypeError(f"{cls.__name__}.{name}: there is no key {key}")
 
     @model_validator(mode="before")
     @classmethod

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 from functools import lru_cache
 from importlib import resources
 from typing import Any, Literal
@@ -29,13 +28,6 @@ def load_quality(name: str) -> dict[str, Any]:
     if name == "auto":
         preset["timeline"]["first_look"] = True
     return preset
-
-
-@lru_cache
-def measured() -> dict[str, Any]:
-    """The run of the suite that the presets were chosen by (``configs/quality/measured.json``): ``settings``, name ->
-    timeline and render; ``scenes``, name -> its rows; not to be changed."""
-    return json.loads((resources.files("blinkgl.configs") / "quality" / "measured.json").read_text(encoding="utf-8"))
 
 
 @lru_cache

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from blinkgl.config.base import remembering
 from blinkgl.config.camera import with_calibrations
-from blinkgl.config.corners import Fill, corners, corners_of, sites
+from blinkgl.config.corners import Fill, corners, sites
 from blinkgl.config.draw import draw, is_distribution
 from blinkgl.config.labels import fill_causes
 from blinkgl.config.problems import validate, validate_field
@@ -34,19 +34,10 @@ if TYPE_CHECKING:
 
 
 FILLS = (
-    Fill(
-        ("quality", "timeline.kind", "events.emulator", "frames", "timeline.reconstruction"),
-        ("timeline", "render"),
-        fill_quality,
-    ),
-    Fill(
-        ("sensor", "events.emulator"),
-        ("camera.width", "camera.height", "events", "readout"),
-        fill_sensor,
-        (("events", "sensor.emulators.*"), ("events", "sensor"), ("camera", "sensor"), ("readout", "sensor.readout")),
-    ),
-    Fill(("labels.events", "events.emulator"), ("events.causes",), fill_causes),
-    Fill(("images",), ("labels.images",), lambda images: {} if images is None else {"labels": {"images": False}}),
+    Fill(("quality", "timeline.kind", "events.emulator", "frames", "timeline.reconstruction"), fill_quality),
+    Fill(("sensor", "events.emulator"), fill_sensor),
+    Fill(("labels.events", "events.emulator"), fill_causes),
+    Fill(("images",), lambda images: {} if images is None else {"labels": {"images": False}}),
 )
 
 
@@ -103,18 +94,12 @@ class RunTemplate:
                     value=self.tree[key],
                     accepted="plain values",
                 )
-        first = None
-        with remembering():
-            for tree in corners(SequenceConfig, with_default(self.tree), FILLS):
-                config = _validated(tree)
-                first = config if first is None else first
-        assert first is not None
-        return first
+        return self.corners()[0]
 
-    def corners_of(self, *keys: str) -> Iterator[SequenceConfig]:
-        """Configurations with every combination that can be drawn of the choices and ends at or below ``keys``."""
-        for tree in corners_of(keys, SequenceConfig, with_default(self.tree), FILLS):
-            yield _validated(tree)
+    def corners(self) -> list[SequenceConfig]:
+        """Configurations that stand for all that can be drawn (:mod:`blinkgl.config.corners`). Raises ConfigError."""
+        with remembering():
+            return [_validated(tree) for tree in corners(with_default(self.tree))]
 
 
 def _validated(tree: dict[str, Any]) -> SequenceConfig:

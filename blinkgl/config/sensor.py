@@ -22,7 +22,6 @@ A sequence draws one unit; whoever wants a single camera takes the middle, or a 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
@@ -149,17 +148,8 @@ def load_sensor(name: str, unit: int | None = None) -> SensorConfig:
 
 def _check(table: dict[str, Any], where: str) -> None:
     """Validates what stands for all that a sensor can draw. Raises ConfigError."""
-    for tree in (*corners(SensorConfig, table), *_mixed(table)):
+    for tree in corners(table):
         validate(SensorConfig, tree, where=where)
-
-
-def _mixed(table: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """Sensors of one emulator, with the combinations of what it can draw that the emulator looks at together."""
-    models, tables = EmulatorConfig.members.models, table.get("emulators")
-    for name, keys in tables.items() if isinstance(tables, dict) else ():
-        if name in models and isinstance(keys, dict) and _has_distributions(keys):
-            for tree in corners(models[name], keys):
-                yield middle({**table, "emulators": {name: tree}, "sources": {}, "uncertainty": {}})
 
 
 def sensor_table(name: Any) -> dict[str, Any]:

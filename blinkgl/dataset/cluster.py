@@ -16,7 +16,6 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from blinkgl.dataset.sockets import listening
 from blinkgl.dataset.work import Job, Maker, Message, Work, environment_differences, thread_environment
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.machine.extras import install
@@ -164,7 +163,6 @@ class RayCluster:
 
     def _start_own(self) -> None:
         """A cluster on 127.0.0.1 alone, with its files where no other user of the machine can read or write them."""
-        before = set(listening(os.getpid()))  # a notebook's kernel listens, too
         # 0700; Ray opens its own folder in it to everybody.
         self._folder = tempfile.mkdtemp(prefix="ray-", dir=_short_folder())
         with _loopback_only():
@@ -176,15 +174,6 @@ class RayCluster:
                 logging_level="ERROR",
                 configure_logging=True,
                 _temp_dir=f"{self._folder}/r",
-            )
-        if exposed := [s for s in listening(os.getpid()) if s not in before and not s.loopback]:
-            self._ours = True
-            self.close()
-            raise ConfigError(
-                f"Ray {self._ray.__version__} listens to other machines: {', '.join(map(str, exposed))}",
-                where="--executor",
-                value="ray",
-                accepted="Ray 2.60, which can be told not to; or a cluster of your own and its --address",
             )
 
     def _ask(self, node: dict[str, Any]) -> Message:
@@ -347,7 +336,14 @@ def _loopback_only() -> Iterator[None]:
     when a cluster starts. (``_node_ip_address="127.0.0.1"`` is turned into the outward address by Ray.)"""
     from ray._private import ray_constants
 
-    before = getattr(ray_constants, "ENABLE_RAY_CLUSTER", True)
+    before = getattr(ray_constants, "ENABLE_RAY_CLUSTER", None)
+    if before is None:
+        raise ConfigError(
+            "this Ray cannot be told to listen to this machine alone",
+            where="--executor",
+            value="ray",
+            accepted="Ray 2.60; or a cluster of your own and its --address",
+        )
     ray_constants.ENABLE_RAY_CLUSTER = False
     try:
         yield

@@ -28,8 +28,6 @@ from blinkgl.dataset.work import RUN_FOLDER, Maker, Message, Work, maker_of, thr
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.gl.context import egl_devices
 
-_SILENT_S = 60.0
-"""A worker says every second that it lives; after so long without a word it is mentioned."""
 _START_S = 600.0  # compiling every kernel for the first time on a slow machine
 _STOP_S = 20.0
 _BAD_STARTS = 3
@@ -136,8 +134,6 @@ class Local:
             process: _Process = key.data
             lines, ended = process.read()
             for message in lines:
-                if message["kind"] == "alive":
-                    continue
                 if message["kind"] == "refused":
                     raise BlinkGLError(message["error"])
                 if message["kind"] == "hello":
@@ -147,7 +143,7 @@ class Local:
                 messages.append(message)
             if ended:
                 messages += self._bury(process)
-        return messages + [message for process in self._processes if (message := process.silence())]
+        return messages
 
     def kill(self, task: int, reason: str) -> None:
         for process in self._processes:
@@ -208,7 +204,6 @@ class _Process:
     def __init__(self, slot: int, log: Path, environment: dict[str, str]):
         self.slot, self.log = slot, log
         self.ready, self.task, self.reason = False, None, ""
-        self._heard, self._mentioned = time.monotonic(), False
         self._rest = b""
         self.channel, write_end = os.pipe()
         try:
@@ -238,23 +233,8 @@ class _Process:
     def read(self) -> tuple[list[Message], bool]:
         """Whole messages that have come, and whether the channel has ended."""
         data = os.read(self.channel, 1 << 16)
-        self._heard, self._mentioned = time.monotonic(), False
         *lines, self._rest = (self._rest + data).split(b"\n")
         return [json.loads(line) for line in lines if line], not data
-
-    def silence(self) -> Message | None:
-        """A message, once, when a worker with a task has not said for a while that it lives."""
-        quiet = time.monotonic() - self._heard
-        if self.task is None or self._mentioned or quiet < _SILENT_S:
-            return None
-        self._mentioned = True
-        return {
-            "kind": "silent",
-            "task": self.task,
-            "pid": self.popen.pid,
-            "error": f"worker {self.slot} (pid {self.popen.pid}) {_condition(self.popen.pid)}: no word from it for "
-            f"{quiet:.0f} s; waiting for it, until --time-limit or its end",
-        }
 
     def stop(self) -> None:
         if self.popen.poll() is None:
@@ -270,15 +250,6 @@ class _Process:
         except OSError:
             pass
         os.close(self.channel)
-
-
-def _condition(pid: int) -> str:
-    """ "is stopped", "waits for a disk or a driver" or "hangs": the kernel's view of a process that says nothing."""
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except (OSError, IndexError):
-        state = ""
-    return {"T": "is stopped", "t": "is held by a debugger", "D": "waits for a disk or a driver"}.get(state, "hangs")
 
 
 def several_cards(job: Work) -> list[int] | None:

@@ -24,7 +24,6 @@ from blinkgl.config.run import RunTemplate
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.config.tracks import TracksConfig, track_times
 from blinkgl.dataset.choices import quality_in_words
-from blinkgl.dataset.effects import Effect, effects_of
 from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging import FrameCamera
 from blinkgl.labels import LABELS, LabelRequest, asked_for
@@ -37,9 +36,7 @@ from blinkgl.scene.lights import is_coloured, lamps_of
 from blinkgl.scene.shapes.table import DEFORMERS
 from blinkgl.scene.types import Light, Scene
 from blinkgl.sequence import simulate_sequence
-from blinkgl.sequence.folders import folder_of
 from blinkgl.sequence.inertial import measured
-from blinkgl.sequence.qualify import Verdict, shown, verdict
 from blinkgl.sequence.recorded import RECORDED
 from blinkgl.sequence.rendered import SURFACES, surfaces_at
 
@@ -66,8 +63,6 @@ class Explanation:
     scene: dict[str, str] = field(default_factory=dict)
     passes: list[Pass] = field(default_factory=list)
     left_out: list[tuple[str, str]] = field(default_factory=list)
-    effects: list[Effect] = field(default_factory=list)
-    frame_s: float = 0.0  # of an event frame
     frames: int = 0
     seconds: float = 0.0
     seconds_per_simulated_second: float = 0.0
@@ -91,7 +86,6 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
                 elif own.images is not None:
                     one.passes.append(_frame_camera(own.images, renderer, seen))
                 _left_out(own, seen, one)
-                one.effects = effects_of(renderer.scene)
             _join(result, name, one)
     simulated = (scene.t1_ns - scene.t0_ns) * 1e-9
     result.seconds = sum(p.seconds for p in result.passes)
@@ -117,16 +111,13 @@ def _join(result: Explanation, name: str, one: Explanation) -> None:
     result.passes += [replace(p, name=prefix + p.name) for p in one.passes]
     result.left_out += [pair for pair in one.left_out if pair not in result.left_out]
     result.frames = max(result.frames, one.frames)
-    result.effects, result.frame_s = one.effects, max(result.frame_s, one.frame_s)  # one light for all
 
 
 def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanation:
     """A sequence that is converted from recorded frames: nothing is rendered; the first few
     frames are converted and timed."""
     frames = config.frames
-    found = None if frames.qualify is None else verdict(frames, folder_of(frames, index, base))
-    unchecked = config.model_copy(update={"frames": frames.model_copy(update={"qualify": None})})
-    probe = simulate_sequence(unchecked, index, base=base, labels=False)
+    probe = simulate_sequence(config, index, base=base, labels=False)
     files, flows, masks = probe.files, probe.flows, probe.masks
     duration = (len(files) - 1) / frames.fps
     result = Explanation(machine=platform.processor() or platform.machine(), seconds=0.0)
@@ -139,7 +130,6 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
         "frames": f"{len(files)} of {probe.folder}, {probe.width}x{probe.height}, {frames.fps:g} Hz: {duration:.6g} s",
         "images": f"{files[0].name} … {files[-1].name}, {frames.gamma}",
         "flow": f"{len(flows)} files, {len(masks)} masks of occluded pixels" if flows else "none: no flow labels",
-        "qualify": _verdict_in_words(found),
         "not used": "camera, time, timeline, scene and render: nothing is rendered",
     }
     count = min(PROBES, len(files)) - 1
@@ -181,15 +171,6 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
     result.seconds = sum(p.seconds for p in result.passes)
     result.seconds_per_simulated_second = result.seconds / duration
     return result
-
-
-def _verdict_in_words(found: Verdict | None) -> str:
-    if found is None:
-        return "not looked at (frames.qualify: null)"
-    worst = ", ".join(f"{name} {shown(name, value)}" for name, value in found.worst.items())
-    absent = "".join(f"; not measured: {name} ({why})" for name, why in found.absent.items())
-    refused = found.refusal()
-    return (f"yes; largest of {len(found.pairs)} pairs: {worst}" if refused is None else f"no: {refused}") + absent
 
 
 def _variant(defines: Iterable[tuple[str, Any]]) -> str:
@@ -288,7 +269,7 @@ def _passes(
         frame = renderer.luminance(t, rate=rates)
         return frame.view(), frame.view("rate") if rates else None
 
-    result.frame_s = event_s = _timed(drawn, times)
+    event_s = _timed(drawn, times)
     fine = samples_of(config.render.antialiasing).stored
     probe = simulate_sequence(config, index, labels=False, scene=scene, renderer=renderer)
     seen = [chunk.t_ns for chunk in islice(probe.chunks(), 2 * PROBES)]  # a short stretch of it, as it will be

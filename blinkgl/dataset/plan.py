@@ -15,9 +15,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, overload
 
-from blinkgl.config.corners import sites
-from blinkgl.config.draw import is_distribution, options
-from blinkgl.config.primitives import kinds
 from blinkgl.config.problems import validate
 from blinkgl.config.reader import to_yaml
 from blinkgl.config.recipe import Group, all_groups
@@ -29,7 +26,6 @@ from blinkgl.scene.build import check_assets, panorama_of
 from blinkgl.scene.importing.mesh_files import dependencies
 from blinkgl.scene.motion.dynamics import engine_version
 from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash
-from blinkgl.scene.worlds.explicit import check_primitive
 from blinkgl.scene.worlds.pool import files_below, resolve
 from blinkgl.scene.worlds.random_world import pools
 from blinkgl.sequence.folders import matching_folders, used_images
@@ -191,6 +187,10 @@ class Plan:
         return to_yaml(self.template.tree)
 
 
+_ASSET_CORNERS = 48
+"""Configurations whose files are looked at: enough for every choice of a file, few enough for scenes that take long."""
+
+
 def _check_group(group: Group, count: int, hashes: dict[str, str]) -> None:
     base = group.template.base
     if _falls(group.template.tree):
@@ -221,29 +221,13 @@ def _check_group(group: Group, count: int, hashes: dict[str, str]) -> None:
 
 
 def _asset_corners(template: RunTemplate) -> Iterator[SequenceConfig]:
-    """Configurations with all that check_assets looks at, and all folders there are: meshes and materials one by one,
-    of figures, flags and fish (which are checked here) one parameter after the other."""
-    world = ("frames", "scene.kind", "scene.pool", "scene.textures", "scene.sky", "scene.objects.count", "scene.path")
-    scene = template.tree.get("scene")
-    tables = [scene.get(table) if isinstance(scene, dict) else None for table in ("meshes", "materials")]
-    if not all(isinstance(table, dict) and not is_distribution(table) for table in tables):
-        yield from template.corners_of(*world, "scene.meshes", "scene.materials")
-        return
-    meshes, materials = tables
-    yield from template.corners_of(*world)
-    for name, mesh in meshes.items():
-        kind, given = (mesh.get(key) if isinstance(mesh, dict) else None for key in ("primitive", "parameters"))
-        if isinstance(kind, str) and kind in kinds("living") and isinstance(given, dict) and not is_distribution(given):
-            for key, value in given.items():
-                path = ("scene", "meshes", name, "parameters", key)
-                for one in options(path, value) if is_distribution(value) else ():
-                    if not is_distribution(one):
-                        check_primitive(kind, {key: one}, name)
-        elif sites(mesh):
-            yield from template.corners_of(f"scene.meshes.{name}")
-    for name, material in materials.items():
-        if sites(material):
-            yield from template.corners_of(f"scene.materials.{name}")
+    """Configurations that stand for the scenes and frame folders that can be drawn; each once."""
+    seen = set()
+    for config in template.corners()[:_ASSET_CORNERS]:
+        said = repr((config.scene, config.frames))
+        if said not in seen:
+            seen.add(said)
+            yield config
 
 
 def _falls(tree: Any) -> bool:

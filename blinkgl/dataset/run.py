@@ -191,8 +191,6 @@ def _loop(
                 message["report"]["path"] = str(folder.out / task.name)  # as the user wrote it
                 outcome.made.add(report_of(message))
                 folder.add_cost(task, message, attempt)
-            elif message["kind"] == "silent":
-                folder.log(task.name, message["error"])
             elif message["kind"] == "failed":
                 attempt, _ = running.pop(number)
                 outcome.surprises += not message.get("expected", False)

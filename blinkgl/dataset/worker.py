@@ -6,7 +6,6 @@ the same way. When standard input ends, the driver is dead: whatever is being ma
 
 from __future__ import annotations
 
-import contextlib
 import faulthandler
 import json
 import os
@@ -14,13 +13,10 @@ import queue
 import signal
 import sys
 import threading
-import time
-from collections.abc import Callable
 
 from blinkgl.machine.interrupts import interruptible
 
 _GRACE_S = 20.0
-_ALIVE_EVERY_S = 1.0
 
 
 def main() -> int:
@@ -49,8 +45,6 @@ def _work() -> int:
         except OSError:  # nobody listens any more
             raise KeyboardInterrupt from None
 
-    threading.Thread(target=_pulse, args=(tell,), daemon=True).start()
-
     from blinkgl.dataset.work import maker_of
     from blinkgl.errors import BlinkGLError
 
@@ -77,14 +71,6 @@ def _listen(tasks: queue.Queue) -> None:
     os.kill(os.getpid(), signal.SIGTERM)
     threading.Event().wait(_GRACE_S)
     os._exit(1)
-
-
-def _pulse(tell: Callable[[dict], None]) -> None:
-    """Says that this process runs, which one that was stopped or that hangs in a driver does not."""
-    with contextlib.suppress(KeyboardInterrupt):  # nobody listens any more: the main thread sees to that
-        while True:
-            time.sleep(_ALIVE_EVERY_S)
-            tell({"kind": "alive"})
 
 
 if __name__ == "__main__":

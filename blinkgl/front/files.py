@@ -55,7 +55,6 @@ def write_events(
     height: int,
     width: int,
     *,
-    format: str | None = None,
     t_offset_us: int = 0,
     time_unit: str = "s",
     overwrite: bool = True,
@@ -63,7 +62,7 @@ def write_events(
     """Writes events, or chunks in order, of a sensor of height x width px; the file appears
     whole or not at all. Returns how many.
 
-    path : its ending names the format, or ``format`` does (docs/formats.md).   t_offset_us : DSEC's, µs.
+    path : its ending names the format (docs/formats.md).   t_offset_us : DSEC's, µs.
     time_unit : of text and CSV, "s" or "us". Raises OutputError, EventDataError, ConfigError."""
     path, height, width = (
         check.path(path, "path"),
@@ -76,7 +75,6 @@ def write_events(
         _chunks(events),
         height,
         width,
-        format=format,
         t_offset_us=offset,
         time_unit=time_unit,
         overwrite=overwrite,
@@ -100,7 +98,6 @@ def convert(
     source: str | os.PathLike,
     target: str | os.PathLike,
     *,
-    format: str | None = None,
     size: tuple[int, int] | None = None,
     zero_time: bool = False,
     time_unit: str = "s",
@@ -108,7 +105,7 @@ def convert(
 ) -> int:
     """Copies events from one file format to another, in pieces. Returns how many events.
 
-    size : (height, width), px, where ``source`` does not say.   format, time_unit : as of :func:`write_events`.
+    size : (height, width), px, where ``source`` does not say.   time_unit : as of :func:`write_events`.
     zero_time : count times from the first event. Raises AssetError, OutputError, EventDataError, ConfigError."""
     if size is not None:
         pair = check.one_of(size, "size", (list, tuple), "(height, width)")
@@ -118,7 +115,6 @@ def convert(
     return formats.convert(
         check.path(source, "source"),
         check.path(target, "target"),
-        format=format,
         size=size,
         zero_time=bool(zero_time),
         time_unit=time_unit,

@@ -111,13 +111,6 @@ class Aedat2Reader:
             values[:, 3] / 340 + 35,  # InvenSense MPU-6150, the unit of these cameras
         )
 
-    def counts(self) -> dict[str, int]:
-        """Records of each kind: events, pins, frame samples, IMU values."""
-        found = np.zeros(4, np.int64)
-        for _, raw in self._raw(1 << 17):
-            found += np.bincount(_kinds(raw["address"].astype(np.int64)), minlength=4)
-        return dict(zip(("events", "pins", "samples", "imu"), found.tolist()))
-
     def _kind(self, kind: int, records: int = 1 << 17) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
         """(index of the first record looked at, addresses, times) of one kind of records; the others are checked, too,
         that what a file holds is refused whatever is asked of it."""

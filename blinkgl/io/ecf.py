@@ -1,4 +1,4 @@
-"""ECF, the codec of Prophesee's HDF5 event tables (HDF5 filter 36559, 0x8ECF): one chunk of events to bytes and back.
+"""ECF, the codec of Prophesee's HDF5 event tables (HDF5 filter 36559, 0x8ECF): the events of one chunk, decoded.
 
 All numbers are little endian. A chunk is u4 ``events << 2 | form``, the times, then by form
 
@@ -17,8 +17,7 @@ x with masks: u2 ``x << 5 | mask``: events at x, and for each bit from bit 4 dow
 Four values a, b, c, d of 3 s bits in three words of 4 s: ``a << s | b % 2^s``, ``b >> s << 2 s | c % 2^2s`` and
 ``c >> 2 s << 3 s | d``.
 
-Which form is taken is the encoder's choice: here, of each chunk, the shortest. (Prophesee, hdf5_ecf, whose plugin reads
-these bytes and writes what is read here: tests/io/test_ecf.py.)
+(Prophesee, hdf5_ecf, whose plugin writes what is read here: tests/io/test_ecf.py.)
 """
 
 from __future__ import annotations
@@ -29,8 +28,6 @@ import numpy as np
 from blinkgl.errors import AssetError
 
 FILTER = 0x8ECF
-MAX_SIDE = 2048
-"""px: coordinates have 11 bits."""
 MAX_EVENTS = 65535
 """of one chunk: the longest run that can be written."""
 _HEADER = 12
@@ -38,29 +35,6 @@ _FORMS = 3
 # y: 11 bits and 5 of count in a u2; p: 1 bit and 7 of count in a byte.
 _ROWS, _SIGNS = (5, 2), (7, 1)
 """Of runs: bits of the count, and bytes of count and value together."""
-
-
-def encode(x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray) -> bytes:
-    """One chunk of at least one and at most :data:`MAX_EVENTS` events. x, y : below :data:`MAX_SIDE`. t : µs, int64,
-    not decreasing. p : 0 or 1. The caller has checked them."""
-    x, y, p = (np.ascontiguousarray(c, np.int64) for c in (x, y, p))
-    t = np.ascontiguousarray(t, np.int64)
-    # The longest entry is 16 bytes of a number, a count byte and the u2 that follows it.
-    times = np.empty(20 * len(t), np.uint8)
-    head = t[:1].astype("<i8").tobytes()
-    # evlib 0.13.2 takes a small first time for the chunk's header, unless the fourth byte after it has bit 7.
-    # Four times none of a number's bits mean nothing to a decoder, and have it.
-    head += b"\xf0" * 4 if int(t[0]) % (1 << 32) < 1 << 18 else b""
-    head += times[: _encode_times(t.view(np.uint64), times)].tobytes()
-    # All three forms are made and the shortest is taken.
-    wide = _four_in_three(y << 12 | x << 1 | p, 8, "<u4")
-    words, runs = np.empty(len(t), np.uint16), np.empty(4 * len(t), np.uint8)
-    rows = runs[: _encode_runs(y, *_ROWS, runs)].tobytes()
-    narrow = rows + _four_in_three(x << 1 | p, 4, "<u2")
-    masks = words[: _encode_columns(x, words)].astype("<u2").tobytes()
-    masked = rows + masks + runs[: _encode_runs(p, *_SIGNS, runs)].tobytes()
-    form, body = min(enumerate((masked, narrow, wide)), key=lambda one: len(one[1]))
-    return np.array(len(t) << 2 | form, "<u4").tobytes() + head + body
 
 
 def decode(data: bytes, most: int, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -106,15 +80,6 @@ def decode(data: bytes, most: int, where: str) -> tuple[np.ndarray, np.ndarray, 
     return x, y, t.view(np.int64), p
 
 
-def _four_in_three(values: np.ndarray, s: int, word: str) -> bytes:
-    # Padded with zeros to a multiple of four.
-    v = np.zeros((-(-len(values) // 4), 4), np.int64)
-    v.reshape(-1)[: len(values)] = values
-    # Each word has the high part of one value and the low part of the next.
-    words = [(v[:, k] >> k * s) << (k + 1) * s | v[:, k + 1] & (1 << (k + 1) * s) - 1 for k in range(3)]
-    return np.stack(words, 1).astype(word).tobytes()
-
-
 def _three_to_four(raw: np.ndarray, at: int, s: int, word: str, count: int) -> tuple[np.ndarray, int]:
     """Return ``count`` values and where they end; -1 where they do not fit or ``at`` is -1 already."""
     groups = -(-count // 4)
@@ -127,72 +92,6 @@ def _three_to_four(raw: np.ndarray, at: int, s: int, word: str, count: int) -> t
     high = [w[:, k] >> (k + 1) * s for k in range(3)]
     v = np.stack([high[0], low[0] | high[1] << s, low[1] | high[2] << 2 * s, low[2]], 1)
     return v.reshape(-1)[:count], end
-
-
-@numba.njit(cache=True, nogil=True)
-def _encode_times(t, out):
-    """t : (N,) uint64, so that differences of any two int64 fit. Returns bytes written."""
-    n, i, now = 0, 0, t[0]
-    while i < len(t):
-        # Events of the same us are one byte.
-        end = i + 1
-        while end < len(t) and t[end] == t[i]:
-            end += 1
-        later, count = t[i] - now, end - i
-        now = t[i]
-        # Larger steps in groups of four bits, the lowest first, each with 15 in the high half.
-        if later >= np.uint64(15):
-            while later > np.uint64(0):
-                out[n] = np.uint64(0xF0) | (later & np.uint64(15))
-                later >>= np.uint64(4)
-                n += 1
-        out[n] = np.int64(later) << 4 | min(count, 15)
-        n += 1
-        if count >= 15:
-            n = _put(out, n, count, 2)
-        i = end
-    return n
-
-
-@numba.njit(cache=True, nogil=True)
-def _put(out, n, number, size):
-    for k in range(size):
-        out[n + k] = number >> 8 * k & 0xFF
-    return n + size
-
-
-# Little endian.
-@numba.njit(cache=True, nogil=True)
-def _encode_runs(values, bits, size, out):
-    """``value << bits | count`` in ``size`` bytes; a count that has no room is all ones there, and follows as u2."""
-    most, n, i = (1 << bits) - 1, 0, 0
-    while i < len(values):
-        end = i + 1
-        while end < len(values) and values[end] == values[i]:
-            end += 1
-        count = end - i
-        n = _put(out, n, values[i] << bits | min(count, most), size)
-        if count >= most:
-            n = _put(out, n, count, 2)
-        i = end
-    return n
-
-
-@numba.njit(cache=True, nogil=True)
-def _encode_columns(x, out):
-    n, i = 0, 0
-    # Up to five neighbours to the right go into the mask.
-    while i < len(x):
-        base, mask = x[i], 0
-        i += 1
-        # Neighbours in order alone: a mask cannot say that x + 2 came before x + 1.
-        for k in range(1, 6):
-            if i < len(x) and x[i] == base + k:
-                mask |= 1 << (5 - k)
-                i += 1
-        out[n] = base << 5 | mask
-        n += 1
-    return n
 
 
 @numba.njit(cache=True, nogil=True)
@@ -238,7 +137,8 @@ def _number(raw, at, size):
 
 @numba.njit(cache=True, nogil=True)
 def _decode_runs(raw, at, bits, size, values):
-    """Fill ``values`` from what :func:`_encode_runs` wrote. Return the byte after them, -1 where they do not fit."""
+    """Fill ``values`` from runs, ``value << bits | count`` in ``size`` bytes each. Return the byte after them, -1 where
+    they do not fit."""
     most, i = (1 << bits) - 1, 0
     while i < len(values):
         head = _number(raw, at, size)

@@ -1,4 +1,4 @@
-"""Prophesee's EVT2 (32-bit words) and EVT3 (16-bit words), decoded and encoded by numba kernels.
+"""Prophesee's EVT2 (32-bit words, read only) and EVT3 (16-bit words), decoded and encoded by numba kernels.
 
 EVT2: type in bits 31..28 (0 OFF, 1 ON, 8 TIME_HIGH = t >> 6); t low 27..22, x 21..11, y 10..0.
 EVT3: type in bits 15..12: 0 ADDR_Y, 2 ADDR_X (polarity bit 11), 3 VECT_BASE_X, 4 VECT_12, 5 VECT_8, 6 TIME_LOW (t &
@@ -26,30 +26,30 @@ _WORD = {"evt2": np.dtype("<u4"), "evt3": np.dtype("<u2")}
 _MAX_SIDE = 2048
 _LONGEST_LINE = 4096
 _MAX_TIME = 1 << 34
-"""µs, 4.8 hours: EVT2's field; also the limit of what we fill with TIME_HIGH words in EVT3."""
+"""µs, 4.8 hours: the limit of what is filled with TIME_HIGH words."""
 
 
 class EvtWriter:
-    """Streams events into an EVT2 or EVT3 file with a header that names format and geometry.
+    """Streams events into an EVT3 file with a header that names format and geometry.
 
     Raises EventDataError for times outside [0, 2^34) µs or out of order, and coordinates
-    outside the sensor or the formats' 11 bits.
+    outside the sensor or the format's 11 bits.
     """
 
-    def __init__(self, path: str | os.PathLike, height: int, width: int, version: str = "evt3"):
+    def __init__(self, path: str | os.PathLike, height: int, width: int):
         if height > _MAX_SIDE or width > _MAX_SIDE:
             raise EventDataError(
-                f"{version.upper()} has 11-bit coordinates",
+                "EVT3 has 11-bit coordinates",
                 where=str(path),
                 value=(height, width),
                 accepted="at most 2048 px a side",
             )
-        self.path, self.height, self.width, self.version = Path(path), height, width, version
-        # time written so far, EVT3's row; -1: none yet
+        self.path, self.height, self.width = Path(path), height, width
+        # time written so far, the row; -1: none yet
         self._state = np.array([0, -1], np.int64)
         self._count = 0
         header = (
-            f"% evt {version[-1]}.0\n% format {version.upper()};height={height};width={width}\n"
+            f"% evt 3.0\n% format EVT3;height={height};width={width}\n"
             f"% geometry {width}x{height}\n% integrator_name BlinkGL\n% end\n"
         )
         with output_errors(path):
@@ -57,13 +57,13 @@ class EvtWriter:
             self._file.write(header.encode())
 
     def append(self, events: Events) -> None:
-        refuse_causes(events, self.version.upper(), str(self.path))
+        refuse_causes(events, "EVT3", str(self.path))
         if not len(events):
             return
         t = events.t
         if t[0] < 0 or t[-1] >= _MAX_TIME:
             raise EventDataError(
-                f"{self.version.upper()} times count from the recording's start",
+                "EVT3 times count from the recording's start",
                 where=str(self.path),
                 value=int(t[0] if t[0] < 0 else t[-1]),
                 accepted="0 to less than 2^34 µs; use --zero-time to shift",
@@ -71,18 +71,12 @@ class EvtWriter:
         check_events(
             events, str(self.path), self._count, height=self.height, width=self.width, after=int(self._state[0])
         )
-        if self.version == "evt2":
-            # At most a TIME_HIGH word before each event.
-            words = np.empty(2 * len(t) + 1, np.uint32)
-            n = _encode_evt2(events.x, events.y, t, events.p, self._state, not self._count, words)
-        else:
-            # An event takes at most TIME_LOW, ADDR_Y and ADDR_X, and a TIME_HIGH for every 4096 us
-            # passed.
-            words = np.empty(4 * len(t) + 2 + int((t[-1] >> 12) - (self._state[0] >> 12)), np.uint16)
-            n = _encode_evt3(events.x, events.y, t, events.p, self._state, not self._count, words)
+        # An event takes at most TIME_LOW, ADDR_Y and ADDR_X, and a TIME_HIGH for every 4096 us passed.
+        words = np.empty(4 * len(t) + 2 + int((t[-1] >> 12) - (self._state[0] >> 12)), np.uint16)
+        n = _encode_evt3(events.x, events.y, t, events.p, self._state, not self._count, words)
         self._count += len(t)
         with output_errors(self.path):
-            self._file.write(words[:n].astype(_WORD[self.version], copy=False).data)
+            self._file.write(words[:n].astype(_WORD["evt3"], copy=False).data)
 
     def close(self, t_end_us: int | None = None) -> None:
         with output_errors(self.path):
@@ -160,18 +154,6 @@ class EvtReader:
             raise AssetError(f"{state[-1]} events and no TIME_HIGH word, so no times", where=str(self.path))
 
 
-def decode_evt3(data: bytes, state: np.ndarray, where: str) -> Events:
-    """Events of EVT3 words without a header. state : (7,) int64, [-1, 0, 0, 0, 0, 0, 0] at first, goes on from call to
-    call. Raises AssetError: a word that the format does not have."""
-    raw = np.frombuffer(data[: len(data) // 2 * 2], _WORD["evt3"])
-    x, y, p = (np.empty(12 * len(raw), dtype) for dtype in (np.uint16, np.uint16, np.uint8))
-    t = np.empty(12 * len(raw), np.int64)
-    n, bad = _decode_evt3(raw, state, x, y, t, p)
-    if bad >= 0:
-        raise AssetError("damaged: no EVT3 word can stand here", where=where, value=f"0x{int(raw[bad]):04x}")
-    return Events(x[:n].copy(), y[:n].copy(), t[:n].copy(), p[:n].copy())
-
-
 def _read_header(path: Path) -> tuple[str, int]:
     lines = []
     try:
@@ -195,22 +177,6 @@ def _read_header(path: Path) -> tuple[str, int]:
     except OSError as error:
         raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
     return "\n".join(lines), start
-
-
-@numba.njit(cache=True, nogil=True)
-def _encode_evt2(x, y, t, p, state, first, words):
-    n = 0
-    # -1 is no time, so that the first event has its TIME_HIGH.
-    high = -1 if first else state[0] >> 6
-    for i in range(len(t)):
-        if t[i] >> 6 != high:
-            high = t[i] >> 6
-            words[n] = np.uint32((8 << 28) | high)
-            n += 1
-        words[n] = np.uint32((np.int64(p[i]) << 28) | ((t[i] & 63) << 22) | (np.int64(x[i]) << 11) | np.int64(y[i]))
-        n += 1
-    state[0] = t[-1]
-    return n
 
 
 @numba.njit(cache=True, nogil=True)

@@ -60,12 +60,10 @@ FORMATS = {
     for one in (
         EventFormat("dsec", HDF5, "dsec", "DsecEventReader", "DsecEventWriter", takes=("t_offset_us",), causes=True),
         EventFormat("mvsec", HDF5, "mvsec", "MvsecReader", dataset="davis/left/events"),
-        EventFormat("prophesee", HDF5, "prophesee", "PropheseeReader", "PropheseeWriter", dataset="CD/events"),
-        EventFormat("evt3", (".raw",), "evt", "EvtReader", "EvtWriter", fixed={"version": "evt3"}),
-        EventFormat("evt2", (".raw",), "evt", "EvtReader", "EvtWriter", fixed={"version": "evt2"}),
-        EventFormat("aedat4", (".aedat4",), "aedat4", "Aedat4Reader", "Aedat4Writer"),
+        EventFormat("prophesee", HDF5, "prophesee", "PropheseeReader", dataset="CD/events"),
+        EventFormat("evt3", (".raw",), "evt", "EvtReader", "EvtWriter"),
+        EventFormat("aedat4", (".aedat4",), "aedat4", "Aedat4Reader"),
         EventFormat("aedat2", (".aedat",), "aedat2", "Aedat2Reader"),
-        EventFormat("mcap", (".mcap",), "mcap", "McapReader", "McapWriter"),
         EventFormat(
             "text", (".txt",), "text", "TextReader", "TextWriter", fixed={"separator": " "}, takes=("time_unit",)
         ),
@@ -76,7 +74,7 @@ FORMATS = {
         EventFormat("npy", (".npy",), "arrays", "ArrayReader", "ArrayWriter", causes=True),
     )
 }
-"""By name. Of formats that share an ending the first is written unless another is named."""
+"""By name. Of formats that share an ending the first is written."""
 ENDINGS: dict[str, str] = {}
 """Ending -> the format that is written by it."""
 for _one in FORMATS.values():
@@ -84,7 +82,6 @@ for _one in FORMATS.values():
         ENDINGS.setdefault(_ending, _one.name)
 WITH_CAUSES = tuple(name for name, one in FORMATS.items() if one.causes)
 """Formats with a place for what caused each event; the others refuse events that have causes."""
-WRITABLE = tuple(name for name, one in FORMATS.items() if one.writer)
 SENSORS = ((180, 240), (240, 304), (260, 346), (320, 320), (480, 640), (720, 1280), (1080, 1920))
 """(height, width) of event cameras, smallest first: the guess for files that do not say."""
 
@@ -194,15 +191,15 @@ def open_events(path: str | os.PathLike) -> EventFile:
     return EventFile(path, kind, reader.height, reader.width, getattr(reader, "t_offset_us", 0), reader)
 
 
-def output_format(path: str | os.PathLike, format: str | None = None) -> str:
-    """The format to write ``path`` in; OutputError when neither its ending nor ``format`` names one."""
-    kind = format or ENDINGS.get(Path(path).suffix.lower())
-    if kind not in WRITABLE:
+def output_format(path: str | os.PathLike) -> str:
+    """The format to write ``path`` in. Raises OutputError: its ending names none that is written."""
+    kind = ENDINGS.get(Path(path).suffix.lower())
+    if kind is None or not FORMATS[kind].writer:
         raise OutputError(
-            "unknown event format" if format else "unknown event file ending",
+            "unknown event file ending" if kind is None else f"{kind} files are read only",
             where=str(path),
-            value=format or Path(path).suffix,
-            accepted=", ".join(WRITABLE if format else (end for end, kind in ENDINGS.items() if kind in WRITABLE)),
+            value=Path(path).suffix,
+            accepted=", ".join(end for end, kind in ENDINGS.items() if FORMATS[kind].writer),
         )
     return kind
 
@@ -233,7 +230,6 @@ def event_writer(
     height: int,
     width: int,
     *,
-    format: str | None = None,
     t_offset_us: int = 0,
     time_unit: str = "s",
     overwrite: bool = True,
@@ -244,7 +240,7 @@ def event_writer(
     t_offset_us : DSEC only, the time of the recording's start. time_unit : text and CSV only, "s" or "us".
     Raises OutputError, EventDataError.
     """
-    kind = output_format(path, format)
+    kind = output_format(path)
     with atomic_file(path, overwrite=overwrite) as temporary:
         writer = _writer(temporary, kind, height, width, t_offset_us, time_unit)
         try:
@@ -277,7 +273,6 @@ def convert(
     source: str | os.PathLike,
     target: str | os.PathLike,
     *,
-    format: str | None = None,
     size: tuple[int, int] | None = None,
     zero_time: bool = False,
     time_unit: str = "s",
@@ -286,12 +281,12 @@ def convert(
     """Copies events from one format to another, streaming.
 
     size : (height, width) for sources that do not say (default: guessed, see :meth:`EventFile.sized`).
-    time_unit : of text and CSV, "s" or "us". zero_time : shift times so that the first event is at 0, for formats that
-    count from the start (EVT2, EVT3).
+    time_unit : of text and CSV, "s" or "us". zero_time : shift times so that the first event is at 0, for EVT3, which
+    counts from the start.
     Causes of events are left out where the format cannot hold them.
     Returns the source with its size, and the number of events written.
     """
-    kind = output_format(target, format)
+    kind = output_format(target)
     with open_events(source) as file:
         if size is not None:
             file = replace(file, height=size[0], width=size[1])
@@ -308,7 +303,6 @@ def convert(
             shifted,
             file.height,
             file.width,
-            format=format,
             t_offset_us=offset,
             time_unit=time_unit,
             overwrite=overwrite,

@@ -19,10 +19,10 @@ EXTRAS = {  # extra of setup.cfg -> (distributions, what they are for)
     "cluster": (("ray",), "many machines"),
     "physics": (("mujoco",), "scenes in which things fall"),
     "formats": (
-        ("faery", "dv-processing"),
-        "dv-processing: AEDAT4 files; faery: checks of EVT2 and EVT3, which need nothing",
+        ("faery", "aedat"),
+        "aedat: AEDAT4 files; faery: checks of EVT2 and EVT3, which need nothing",
     ),
-    "exchange": (("mcap", "mlcroissant"), "MCAP files of ROS 2; checks of a data set's Croissant metadata"),
+    "exchange": (("mlcroissant",), "checks of a data set's Croissant metadata"),
     "viz": (("rerun-sdk",), "3D viewer"),
     "urdf": (("pybullet",), "its random meshes as an object pool"),
     "docs": (("zensical", "mkdocstrings", "towncrier"), "the documentation as a site"),

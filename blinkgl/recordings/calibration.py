@@ -328,7 +328,7 @@ def _own_frames(recording: str | os.PathLike) -> str | os.PathLike:
             if next(iter(file.frames()), None) is not None:
                 return recording
     except AssetError as error:
-        if "needs dv-processing" in error.problem or "damaged" in error.problem:
+        if "needs the package aedat" in error.problem or "damaged" in error.problem:
             raise
     raise EventDataError(
         "the recording has no frames, and without them nobody knows what the camera saw",

@@ -239,7 +239,7 @@ def file_to_events(
     **options: Any,
 ) -> SimulationReport:
     """Frames of ``source`` (see :func:`~blinkgl.io.frames.open_frames`) to an event file whose ending names the format
-    (.h5 .raw .aedat4 .txt .csv .npz .npy); options as :func:`frames_to_events`. The files appear whole or not at all.
+    (.h5 .raw .txt .csv .npz .npy); options as :func:`frames_to_events`. The files appear whole or not at all.
 
     preview : video of frames and events. progress : called with (report so far, fraction done or None) per given frame.
     """

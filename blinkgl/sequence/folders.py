@@ -98,11 +98,6 @@ def flow_files(folder: Path, frames: FramesConfig, images: list[Path]) -> tuple[
     return _flow_and_masks(folder / frames.flow, frames.first, images)
 
 
-def backward_files(folder: Path, frames: FramesConfig, images: list[Path]) -> list[Path]:
-    """Flow back, the k-th from frame k + 1 to frame k. AssetError as :func:`flow_files`."""
-    return [] if frames.backward is None else _flow_and_masks(folder / frames.backward, frames.first, images)[0]
-
-
 def _flow_and_masks(folder: Path, first: int, images: list[Path]) -> tuple[list[Path], list[Path]]:
     everything, pairs = _listed(folder, _FLOW), len(images) - 1
     masks = [p for p in everything if p.stem.endswith("_mask")]

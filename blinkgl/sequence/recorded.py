@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from blinkgl.config.sequence import SequenceConfig
-from blinkgl.errors import ConfigError
+from blinkgl.errors import AssetError, ConfigError
 from blinkgl.events.camera import EventCamera
 from blinkgl.labels import Flow, LabelFrame, asked_for
 from blinkgl.recordings.simulation import Decoder, stepped, timed
@@ -19,7 +19,6 @@ from blinkgl.rng import Role, kernel_seed
 from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.folders import flow_files, folder_of, read_flow_of, read_frame, read_mask_of, used_images
 from blinkgl.sequence.items import GroundTruth, Picture
-from blinkgl.sequence.qualify import verdict
 from blinkgl.sequence.simulate import Simulation
 from blinkgl.tensors.choice import make_on_device
 from blinkgl.types.events import Events
@@ -33,8 +32,8 @@ class RecordedSequence(Simulation):
 
     Label k is the flow from frame k + 1 to k + 2 (counted in the frames used), so that every label has a full interval
     of events before it, as in drawn sequences. Its ``config`` names the folder.   files : the
-    images.   flows, masks : files of labels, or none.   verdict : what ``frames.qualify`` found; None: not looked at.
-    Raises BlinkGLError: unreadable or unequal frames, flow that does not fit them, frames that do not qualify."""
+    images.   flows, masks : files of labels, or none.
+    Raises BlinkGLError: unreadable or unequal frames, flow that does not fit them, frames too far apart."""
 
     def __init__(
         self, config: SequenceConfig, index: int, *, base: Path, events: bool, labels: bool, pictures_hz: float | None
@@ -49,12 +48,10 @@ class RecordedSequence(Simulation):
             0: read_frame(self.files[0])
         }  # read already, and an image of a label to come
         size = self._kept[0].shape[:2]
-        self.verdict = None
-        if frames.qualify is not None:
+        if frames.max_displacement is not None:
             with clock("scene"):
-                self.verdict = verdict(frames, self.folder)
-            if refused := self.verdict.refusal():
-                raise refused
+                for first, flow in zip(self.files, self.flows):
+                    _refuse_far_apart(first, *read_flow_of(flow, size), frames.max_displacement)
         resolved = config.model_copy(
             update={"frames": frames.model_copy(update={"folders": (os.path.relpath(self.folder, base),)})}
         )
@@ -147,5 +144,17 @@ class RecordedSequence(Simulation):
                 "first": self.files[0].name,
                 "last": self.files[-1].name,
             },
-            **({} if self.verdict is None else {"qualified": self.verdict.facts()}),
         }
+
+
+def _refuse_far_apart(first: Path, flow: np.ndarray, valid: np.ndarray, most: float) -> None:
+    """AssetError where things move so far to the next frame that what lies between cannot be interpolated."""
+    length = np.hypot(flow[..., 0], flow[..., 1])[valid]
+    far = float(np.percentile(length, 99)) if length.size else 0.0
+    if far > most:
+        raise AssetError(
+            "too far from the next frame to be interpolated",
+            where=str(first),
+            value=f"{far:.3g} px",
+            accepted=f"at most {most:g} px (frames.max_displacement), or frames.max_displacement: null",
+        )

@@ -21,6 +21,6 @@ def run(source: str, target: str, *, size: str | None = None, **options: Any) ->
         known = (int(height), int(width))
     file, count = convert(source, target, size=known, **options)
     say(plain_console(), f"{target}: {count:,} events, {file.width}x{file.height}, from {file.format}")
-    if file.causes and output_format(target, options.get("format")) not in WITH_CAUSES:
+    if file.causes and output_format(target) not in WITH_CAUSES:
         say(plain_console(), "the causes of the events are left out: the format cannot hold them")
     return 0

@@ -19,7 +19,7 @@ def run(config: str, *, sequence: int | None = None, seed: int | None = None, ov
 
 
 def show(result: Explanation, console: Console) -> None:
-    """Four tables, of recorded frames three, and the cost."""
+    """Three tables and the cost."""
     scene = Table(title="what is modelled", title_justify="left", show_header=False)
     for key, value in result.scene.items():
         scene.add_row(key, value)
@@ -48,24 +48,8 @@ def show(result: Explanation, console: Console) -> None:
     for what, why in result.left_out:
         left.add_row(what, why)
     console.print(left)
-    if result.effects:
-        console.print(_effects(result))
     say(
         console,
         f"expected: about {result.frames:,} event frames, {result.seconds:.1f} s of drawing and events "
         f"({result.seconds_per_simulated_second:.1f} s per simulated second), plus scene, compression and video",
     )
-
-
-def _effects(result: Explanation) -> Table:
-    """Costs as they are here by how many times an event frame they were where they were measured."""
-    title = "light and materials: what each effect costs, and what it changed in flying_objects (measured once)"
-    table = Table(title=title, title_justify="left")
-    columns = ("effect", "asked", "ms/event frame", "events missed", "extra", "pictures", "labels")
-    for column in columns:
-        table.add_column(column, justify="left" if column in columns[:2] else "right")
-    for one in result.effects:
-        changed = (f"{value:.1f} %" if value else "0" for value in (one.missed, one.extra, one.pictures, one.labels))
-        cost = f"{'' if one.asked else '+'}{1e3 * one.cost(result.frame_s):.1f}"
-        table.add_row(one.name, "yes" if one.asked else f"no: {one.key}", cost, *changed)
-    return table

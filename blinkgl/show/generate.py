@@ -103,7 +103,7 @@ class Display:
                 else "labels, files"
             )
             self._bars.update(self._tasks[name], completed=message["fraction"], detail=detail)
-        elif kind != "silent":
+        else:
             self._at_work.pop(name, None)
             if name in self._tasks:
                 self._bars.remove_task(self._tasks.pop(name))
@@ -117,8 +117,6 @@ class Display:
             self._bytes += message["bytes"]
             if not self._console.is_terminal or self._todo > 1:
                 self._say(_line(report) + (f"; {self.summary()}" if self._todo > 1 else ""))
-        elif kind == "silent":
-            self._say(f"{name}: {message['error']}")
         elif kind == "failed":
             self._given_up += bool(message.get("given_up"))
             self._say(

@@ -166,11 +166,6 @@ class DenseFlow:
         return self._dis.calc(a, b, None), self._dis.calc(b, a, None)
 
 
-def halfway(a: np.ndarray, b: np.ndarray, forward: np.ndarray, backward: np.ndarray) -> np.ndarray:
-    """The frame that :func:`motion` makes in the middle of two, (H, W) float32, by flows (H, W, 2) px."""
-    return next(_between(a, b, 0, 2, forward, backward, 2))[0]
-
-
 def _between(a, b, t_a, t_b, forward, backward, steps) -> Iterator[Timed]:
     if steps < 2:
         return

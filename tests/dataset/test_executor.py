@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -34,7 +33,6 @@ for line in sys.stdin:
         half = json.dumps({"kind": "done", "task": 15, "report": "x" * 100_000}).encode() + b"\\n"
         for k in range(0, len(half), 30_000): os.write(fd, half[k : k + 30_000])
         continue
-    tell({"kind": "alive"})
     tell({"kind": "progress", "task": order["task"]})
     tell({"kind": "failed" if order["task"] == 16 else "done", "task": order["task"], "attempt": order["attempt"]})
 """
@@ -93,7 +91,7 @@ def test_tasks_go_to_who_is_free_and_come_back(job, local, tmp_path):
     said = []
     while len([m for m in said if m["kind"] != "progress"]) < 2:
         said += pool.poll(5.0)
-    assert pool.free() == 2 and not [m for m in said if m["kind"] == "alive"]
+    assert pool.free() == 2
     assert {(m["kind"], m["task"], m.get("attempt")) for m in said} == {
         ("progress", 1, None), ("done", 1, 4), ("progress", 16, None), ("failed", 16, 2)
     }  # fmt: skip
@@ -165,27 +163,6 @@ def test_workers_that_never_start(job, local, monkeypatch):
         pool.open(job())
 
 
-def test_a_worker_that_says_nothing_is_mentioned_once(job, local, monkeypatch):
-    now = [1000.0]
-    monkeypatch.setattr(executor, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    pool = local(1, [])
-    pool.open(job())
-    pool.submit(14, 1)
-    for after, count in ((59.9, 0), (60.0, 1), (500.0, 0)):
-        now[0] = 1000.0 + after
-        said = pool.poll(0)
-        assert len(said) == count, after
-        if said:
-            assert (
-                said[0]["kind"] == "silent" and said[0]["task"] == 14 and said[0]["pid"] == pool._processes[0].popen.pid
-            )
-            assert "hangs: no word from it for 60 s; waiting for it" in said[0]["error"]
-    process = pool._processes[0]
-    process.task = None
-    process._mentioned = False
-    assert process.silence() is None, "who has no task need not speak"
-
-
 def test_closing_ends_who_does_not_leave(job, monkeypatch):
     """SIGTERM first; SIGKILL for who does not hear it within the time that is given."""
     pool = Local(2, [])
@@ -196,17 +173,6 @@ def test_closing_ends_who_does_not_leave(job, monkeypatch):
     for pid in pids:
         with pytest.raises(ProcessLookupError):
             os.kill(pid, 0)
-
-
-@pytest.mark.parametrize(
-    "state, said",
-    [("S", "hangs"), ("T", "is stopped"), ("t", "is held by a debugger"), ("D", "waits for a disk or a driver")],
-)
-def test_what_a_process_does_that_says_nothing(monkeypatch, state, said):
-    monkeypatch.setattr(Path, "read_text", lambda self: f"7 (a) name) {state} 1 7 7")
-    assert executor._condition(7) == said
-    monkeypatch.setattr(Path, "read_text", lambda self: "")
-    assert executor._condition(7) == "hangs"
 
 
 CARDS = ["NVIDIA 0", "llvmpipe Software Rasterizer", "NVIDIA 1"]

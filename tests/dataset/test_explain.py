@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -11,14 +10,9 @@ import pytest
 import yaml
 
 from blinkgl.config.run import load_run
-from blinkgl.dataset.effects import effects_of
 from blinkgl.dataset.explain import explain
 from blinkgl.dataset.generate import generate_run
 from blinkgl.errors import ConfigError
-from blinkgl.machine.terminal import plain_console
-from blinkgl.scene.build import sequence_scene
-from blinkgl.scene.types import Light
-from blinkgl.show.explain import show
 
 SMALL = {
     "camera": {"width": 64, "height": 48},
@@ -142,7 +136,14 @@ def test_recorded_frames_are_what_is_explained(tmp_path):
         cv2.imwrite(str(tmp_path / f"P0/image_left/{k:03d}.png"), np.roll(image, k, axis=1))
     path = tmp_path / "run.yaml"
     tree = {
-        "frames": {"folders": ["P0"], "fps": 10, "flow": None, "interpolate": "linear", "first": 1, "qualify": None},
+        "frames": {
+            "folders": ["P0"],
+            "fps": 10,
+            "flow": None,
+            "interpolate": "linear",
+            "first": 1,
+            "max_displacement": None,
+        },
         "preview": {"enabled": False},
         "camera": {"width": 99, "height": 99},
         "gl": {"backend": "egl", "device": 4000},
@@ -151,7 +152,7 @@ def test_recorded_frames_are_what_is_explained(tmp_path):
     run = load_run(path)
     told = explain(run)
     assert (
-        set(told.scene) == {"frames", "images", "flow", "qualify", "not used"}
+        set(told.scene) == {"frames", "images", "flow", "not used"}
         and "40x24" in told.scene["frames"]
         and "19 of" in told.scene["frames"]
     )
@@ -196,38 +197,3 @@ def test_explain_in_plain_ascii(tmp_path):
     (tmp_path / "run.yaml").write_text("frames: {folders: [P0], images: images, flow: null}")
     done = command(["-m", "blinkgl.cli", "explain", str(tmp_path / "run.yaml")], ENVIRONMENTS[0])
     assert done.returncode == 0 and done.stderr == b"" and b"u0.png ... u2.png" in done.stdout
-
-
-def test_a_panoramas_price_is_of_its_own_colours_and_order(tmp_path):
-    scene = sequence_scene(template(tmp_path).sequence(0), 0)
-    form = lambda n, shares: tuple(((share,) * n,) * n for share in shares)
-    prices = {}
-    for name, shares in (("grey", (0.1, 0.1, 0.1)), ("coloured", (0.1, 0.2, 0.3))):
-        for finer in (None, form(9, (0.01, 0.01, 0.01))):
-            light = Light(sky=0.0, around=form(4, shares), finer=finer)
-            (row,) = [one for one in effects_of(replace(scene, light=light)) if one.name == "light of a panorama"]
-            prices[name, finer is not None] = row.times
-            assert row.asked and row.cost(row.times) == pytest.approx(row.times - 1)
-    assert prices == {("grey", False): 1.04, ("grey", True): 1.10, ("coloured", False): 1.10, ("coloured", True): 1.21}
-    (row,) = [one for one in effects_of(scene) if one.name == "light of a panorama"]
-    assert not row.asked and row.times == 1.10  # as most are
-
-
-def test_effects_of_light_and_materials(tmp_path, capsys):
-    """Which of them a scene asks for, and what that costs; without any, what it would."""
-    assert not any(one.asked for one in explain(template(tmp_path)).effects)
-    lit = {
-        "kind": "explicit",
-        "light": {"shadows": "hard", "sky_color": [0.5, 0.7, 1.0]},
-        "materials": {"lamp": {"color": [0.1, 0.1, 0.1], "emission": [1, 1, 1]}},
-        "meshes": {"die": {"primitive": "cuboid"}},
-        "objects": [{"mesh": "die", "material": "lamp", "position": [0, 3, 0]}],
-        "camera": {"keyframes": [{"time": 0, "position": [0, 0, 0]}, {"time": 0.2, "position": [0.1, 0, 0]}]},
-    }
-    told = explain(template(tmp_path, scene=lit))
-    assert {one.name for one in told.effects if one.asked} == {"coloured light", "hard shadows", "light of their own"}
-    shadows, soft = (next(one for one in told.effects if one.name == f"{kind} shadows") for kind in ("hard", "soft"))
-    assert shadows.cost(1.5) == pytest.approx(0.5) and soft.cost(1.0) == pytest.approx(soft.times - 1)
-    assert all(one.labels == 0 for one in told.effects if one.name != "holes")
-    show(told, plain_console())
-    assert "608.7 %" in (out := capsys.readouterr().out) and "measured" in out  # a table, whatever its width

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import re
-import socket
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,12 +14,11 @@ import yaml
 
 from blinkgl.config.run import load_run
 from blinkgl.config.sequence import PreviewConfig
-from blinkgl.dataset import preview as preview_module, sockets, work
+from blinkgl.dataset import preview as preview_module, work
 from blinkgl.dataset.explain import PROBES, explain
 from blinkgl.dataset.plan import Plan, check_output
 from blinkgl.dataset.preview import PreviewRecorder
 from blinkgl.dataset.report import STAGES, SequenceReport, Totals
-from blinkgl.dataset.sockets import Listening, descendants, listening
 from blinkgl.dataset.work import Job, Maker, SequenceLog, environment_differences, thread_environment
 from blinkgl.errors import ConfigError, OutputError, may_pass
 from blinkgl.sequence import EventChunk, Picture
@@ -164,42 +162,6 @@ def test_output_that_cannot_be_a_data_set(tmp_path):
         OutputError, match=r"odd/test: is a symbolic link; expected a folder .--out itself may be a link"
     ):
         check_output(str(tmp_path / "odd"))
-
-
-# --- sockets ----------------------------------------------------------------------------------------------------------
-
-
-def test_what_listens_is_found(tmp_path):
-    with socket.socket() as four, socket.socket() as all_, socket.socket() as idle:
-        for s, host in ((four, "127.0.0.1"), (all_, "0.0.0.0"), (idle, "127.0.0.1")):
-            s.bind((host, 0))
-        four.listen()
-        all_.listen()
-        found = {s.port: s for s in listening(os.getpid())}
-        assert found[four.getsockname()[1]].address == "127.0.0.1" and found[four.getsockname()[1]].loopback
-        assert found[all_.getsockname()[1]].address == "0.0.0.0" and not found[all_.getsockname()[1]].loopback
-        assert idle.getsockname()[1] not in found
-        assert f"on 127.0.0.1 port {four.getsockname()[1]}" in str(found[four.getsockname()[1]])
-    assert descendants(os.getpid())[0] == os.getpid() and os.getpid() in descendants(os.getppid())
-    assert sockets._name(2**30) == f"process {2**30}" and list(sockets._open_files(2**30)) == []
-
-
-@pytest.mark.parametrize(
-    "words, address, loopback",
-    [
-        ("0100007F", "127.0.0.1", True),
-        ("00000000", "0.0.0.0", False),
-        ("00000000000000000000000001000000", "::1", True),
-        ("0" * 32, "::", False),
-        ("0000000000000000FFFF00000100007F", "::ffff:127.0.0.1", True),
-        ("0000000000000000FFFF00000101A8C0", "::ffff:192.168.1.1", False),
-    ],
-)
-def test_addresses_as_the_kernel_writes_them(words, address, loopback):
-    import ipaddress
-
-    got = sockets._address(words)
-    assert ipaddress.ip_address(got) == ipaddress.ip_address(address) and Listening("p", got, 1).loopback is loopback
 
 
 # --- the preview's feeder ---------------------------------------------------------------------------------------------

@@ -87,7 +87,6 @@ def test_times_go_on_where_32_bits_end(tmp_path):
 def test_pins_are_no_pixels(tmp_path):
     path = put(tmp_path / "e.aedat", header() + records([1 << 10 | 511 << 22, 5 << 12, 1 << 10 | 1 << 11], [1, 2, 3]))
     assert len(open_events(path).read()) == 1
-    assert Aedat2Reader(path).counts() == {"events": 1, "pins": 2, "samples": 0, "imu": 0}
 
 
 def test_a_record_that_begins_like_a_line_of_the_header(tmp_path):
@@ -230,7 +229,6 @@ def test_a_recording_of_a_davis240c(tmp_path):
     found = file.read()
     assert len(found) == 162_771
     assert int(found.t[-1] - found.t[0]) == 2_072_651 and (found.x.max(), found.y.max()) == (239, 179)
-    assert Aedat2Reader(path).counts() == {"events": 162_771, "pins": 0, "samples": 0, "imu": 33_837}
     imu = file.imu()
     assert len(imu) == 4833
     assert (len(imu) - 1) / (imu.t[-1] - imu.t[0]) * 1e6 == pytest.approx(2332, abs=1)
@@ -308,7 +306,7 @@ def test_kinds_may_be_out_of_order_among_each_other(tmp_path):
 
 def test_it_is_not_written(tmp_path):
     given = put(tmp_path / "e.aedat", header() + records([0], [1]))
-    with pytest.raises(OutputError, match=r"unknown event file ending \(got '.aedat'\); expected .h5, .hdf5, .raw"):
+    with pytest.raises(OutputError, match=r"aedat2 files are read only \(got '.aedat'\); expected .h5, .hdf5, .raw"):
         convert(given, tmp_path / "out.aedat")
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import itertools
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from blinkgl.errors import AssetError, EventDataError
-from blinkgl.io import aedat4_decode
 from blinkgl.io.aedat4 import Aedat4Reader
 from blinkgl.io.formats import open_events
 from blinkgl.io.frames import open_frames
@@ -21,7 +22,7 @@ STILL = "data/events/aedat4/davis346_events_frames_imu.aedat4"
 
 def opened(name: str):
     path = shared(name)
-    pytest.importorskip("dv_processing", reason="AEDAT4 needs the optional package dv-processing")
+    pytest.importorskip("aedat", reason="optional extra [formats]")
     return open_events(path)
 
 
@@ -92,38 +93,56 @@ def test_a_recording_that_is_cut(tmp_path):
             assert "AEDAT4" in str(error) or "in the recording" in str(error)
 
 
-class Decoder:
-    """In place of the process: says what it is told to."""
+def recorded(monkeypatch, kind, packets):
+    """A recording of such packets, by a library of our own."""
 
-    def __init__(self, rows, images=()):
-        self.rows, self.images = rows, images
+    class Decoder:
+        def __init__(self, path):
+            self.packets = iter([{"stream_id": 1, kind: packet} for packet in packets])
 
-    def __iter__(self):
-        return iter([self.rows])
+        def id_to_stream(self):
+            return {0: {"type": "events", "height": 480, "width": 640}, 1: {"type": kind}}
 
-    def pictures(self):
-        return iter(list(zip(self.rows, self.images)))
+        def __iter__(self):
+            return self.packets
 
-    def close(self):
-        pass
-
-
-def reader(monkeypatch, decoder):
-    monkeypatch.setattr("blinkgl.io.aedat4._Decoder", lambda path, stream="events": decoder)
-    made = object.__new__(Aedat4Reader)
-    made.path = "e.aedat4"
-    return made
+    monkeypatch.setitem(sys.modules, "aedat", SimpleNamespace(Decoder=Decoder))
+    return Aedat4Reader("e.aedat4")
 
 
 @pytest.mark.parametrize("times", [[(10, 20), (10, 20)], [(10, 5)], [(30, 40), (20, 50)]])
 def test_frames_whose_times_do_not_increase(monkeypatch, times):
-    rows = np.array([(begin, end, 2, 2, 1, 1) for begin, end in times], aedat4_decode.FRAME)
+    frames = [
+        {"exposure_begin_t": begin, "exposure_end_t": end, "pixels": np.zeros((2, 2), np.uint8)} for begin, end in times
+    ]
     with pytest.raises(EventDataError, match=rf"times of frame {len(times) - 1} do not increase"):
-        list(reader(monkeypatch, Decoder(rows, [np.zeros((2, 2), np.uint8)] * len(times))).frames())
+        list(recorded(monkeypatch, "frame", frames).frames())
 
 
 def test_samples_whose_times_run_backwards(monkeypatch):
-    rows = np.zeros(3, aedat4_decode.IMU)
+    rows = np.zeros(3, [("t", "<u8")])
     rows["t"] = (5, 9, 8)
     with pytest.raises(EventDataError, match=r"times run backwards at sample 2 of the inertial unit \(got \(9, 8\)\)"):
-        reader(monkeypatch, Decoder(rows)).imu()
+        recorded(monkeypatch, "imus", [rows]).imu()
+
+
+class PanicException(BaseException):
+    """As the package raises for damage that it did not expect."""
+
+    __module__ = "pyo3_runtime"
+
+
+@pytest.mark.parametrize("error", [RuntimeError("no  such\n stream"), PanicException("no such stream")])
+def test_damage_is_one_line(monkeypatch, error):
+    def decoder(path):
+        raise error
+
+    monkeypatch.setitem(sys.modules, "aedat", SimpleNamespace(Decoder=decoder))
+    with pytest.raises(AssetError, match="^e.aedat4: damaged AEDAT4 file: no such stream$"):
+        Aedat4Reader("e.aedat4")
+
+
+def test_without_the_package_a_line_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "aedat", None)
+    with pytest.raises(AssetError, match="AEDAT4 needs the package aedat, which is not installed; run .*pip install"):
+        Aedat4Reader("e.aedat4")

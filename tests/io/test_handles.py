@@ -21,7 +21,6 @@ from blinkgl.types.events import Events
 FILES = {
     "dsec": "e.h5",
     "evt3": "e.raw",
-    "evt2": "e.raw",
     "text": "e.txt",
     "csv": "e.csv",
     "npz": "e.npz",
@@ -54,7 +53,7 @@ def nothing_stays():
 def test_writers(tmp_path, kind, how):
     path, writer = tmp_path / FILES[kind], None
     try:
-        with event_writer(path, 8, 8, format=kind) as writer:
+        with event_writer(path, 8, 8) as writer:
             writer.append(some())
             if how == "error":
                 raise KeyError
@@ -73,7 +72,7 @@ def test_writers(tmp_path, kind, how):
 def test_readers(tmp_path, kind):
     """To the end, and only to the first event; closed once more; of a file that is cut."""
     path = tmp_path / FILES[kind]
-    write_events(path, some(), 8, 8, format=kind)
+    write_events(path, some(), 8, 8)
     with open_events(path) as file:
         assert len(file.read()) == 5
         chunks = file.chunks()

@@ -43,7 +43,13 @@ def opened(clip: Path, index: int = 0, folders=("clip",), tree=None, **wanted):
     path.write_text(
         yaml.safe_dump(
             {
-                "frames": {"folders": list(folders), "fps": FPS, "interpolate": "linear", "qualify": None, **frames},
+                "frames": {
+                    "folders": list(folders),
+                    "fps": FPS,
+                    "interpolate": "linear",
+                    "max_displacement": None,
+                    **frames,
+                },
                 "events": {"emulator": "esim", "contrast_threshold": 0.1},
                 **(tree or {}),
             }
@@ -164,6 +170,15 @@ def test_a_flow_file_for_every_pair_that_is_used(clip, gone, frames, said):
     else:
         number = frames.get("first", 0) + 1
         assert truths(opened(clip, frames=frames))[0].frame.forward.flow[0, 0, 0] == number
+
+
+def test_frames_too_far_apart_are_refused(clip):
+    """The last pair's flow is (3, -3) everywhere."""
+    assert len(opened(clip, frames={"max_displacement": 4.3}).files) == 5
+    with pytest.raises(
+        AssetError, match=r"3.png: too far from the next frame .*got '4.24 px'.; expected at most 4.2 px"
+    ):
+        opened(clip, frames={"max_displacement": 4.2})
 
 
 def test_numbers_of_flow_may_be_shifted_where_none_is_missing(clip):

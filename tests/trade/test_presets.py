@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import json
+from functools import cache
 from importlib import resources
 
-from blinkgl.config.quality import measured
 from blinkgl.tools.quality_presets import meaning, preset_text, rows_of
 from blinkgl.trade.settings import suite_design
 from blinkgl.trade.suite import preset_names
@@ -20,6 +21,12 @@ MISSED = {("balanced", "deforming"), ("balanced", "tiny_textures")}
 (which `quality: auto` sees)."""
 SHORT: set[str] = set()
 """Presets that are beaten in more than a quarter of the scenes."""
+
+
+@cache
+def measured() -> dict:
+    """The run of the suite that the presets were chosen by."""
+    return json.loads((resources.files("blinkgl.configs") / "quality" / "measured.json").read_text())
 
 
 def recorded_rows(name: str) -> dict[str, tuple[dict, float]]:

@@ -274,7 +274,7 @@ def report(
     folder: Annotated[str, typer.Argument(metavar="DIR", help="Data set.")],
     out: Annotated[str | None, typer.Option("--out", "-o", help="The page (default: DIR/report.html).")] = None,
     examples: Annotated[int, typer.Option(min=0, max=100, help="Sequences shown in pictures.")] = 6,
-    card: Annotated[bool, typer.Option("--card", help="Also DIR/README.md and croissant.json, for data hubs.")] = False,
+    card: Annotated[bool, typer.Option("--card", help="Also DIR/README.md, for data hubs.")] = False,
     licence: Annotated[str | None, typer.Option("--license", help="On the card, e.g. cc-by-4.0.")] = None,
     url: Annotated[str | None, typer.Option("--url", help="On the card: where the data set is found.")] = None,
 ) -> int:

@@ -392,11 +392,8 @@ def submit(
 
 @app.command("import")
 def import_(
-    checkpoint: Annotated[str, typer.Argument(help="E-RAFT's dsec.tar, mvsec_20.tar …, or RAFT's .pth.")],
+    checkpoint: Annotated[str, typer.Argument(help="E-RAFT's dsec.tar, mvsec_20.tar ….")],
     out: Annotated[str, typer.Option("--out", "-o", help="New .safetensors file.")],
-    bins: Annotated[
-        int | None, typer.Option(min=2, max=64, help="RAFT: time bins that its three colours are spread over.")
-    ] = None,
 ) -> None:
     """Make a published checkpoint a file that predict, evaluate, submit and train (init_from) take.
 
@@ -404,7 +401,7 @@ def import_(
     from eflow.models import parameters_of
     from eflow.published import import_published
 
-    model = import_published(checkpoint, out, bins=bins)
+    model = import_published(checkpoint, out)
     typer.echo(f"written: {out}, {parameters_of(model) / 1e6:.2f} M parameters")
 
 
@@ -437,16 +434,14 @@ def pack(
     name: Annotated[str, typer.Option(help="What it will be called by.")],
     card: Annotated[str, typer.Option(help="YAML: about, data, training, scores, limits, commands (docs/eflow.md).")],
     out: Annotated[str, typer.Option("--out", "-o", help="Folder that its folder is made in; eflow/weights ships it.")],
-    store: Annotated[str, typer.Option(help="fp32, or fp16: half the size; it computes in fp32.")] = "fp32",
     raw: Annotated[bool, typer.Option("--raw", help="The last weights instead of the averaged ones.")] = False,
 ) -> None:
     """Make a training a network that can come with the package: weights and a card, 5 MB at most.
 
-    They are read back and compared before the folder appears."""
+    They are read back before the folder appears."""
     from eflow import shipped
 
-    _one_of("--store", store, ("fp32", "fp16"))
-    folder, full = shipped.pack(checkpoint, name, card, out, stored=store, averaged=not raw)
+    folder, full = shipped.pack(checkpoint, name, card, out, averaged=not raw)
     typer.echo(f"written: {folder}")
     for line in shipped.lines(full):
         typer.echo(line)

@@ -19,7 +19,7 @@ from blinkgl.io.formats import write_events  # noqa: E402
 from eflow import checkpoint as ckpt, submit  # noqa: E402
 from eflow.cli import run  # noqa: E402
 from eflow.models import build_model, model_config  # noqa: E402
-from eflow.pictures import BAR, FlowVideo, comparison  # noqa: E402
+from eflow.pictures import BAR, FlowVideo  # noqa: E402
 from flow_data import SPAN, blinkflow_set, blinkgl_set, dsec_set, moving_events, mvsec_set  # noqa: E402
 
 
@@ -126,15 +126,6 @@ def test_a_video_of_the_flow(network, tmp_path, capsys):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["e.h5", "flow.mp4"]
 
 
-def test_captions_stand_above_what_is_shown():
-    events, flow = np.full((40, 120, 3), 7, np.uint8), np.ones((40, 120, 2), np.float32)
-    strip = comparison(events, flow, flow, np.ones((40, 120), bool))
-    assert (strip[BAR:, :120] == 7).all() and strip.shape == (40 + BAR, 4 * 120 + 12, 3)
-    bars = [strip[:BAR, i * 124 : i * 124 + 120] for i in range(4)]
-    assert all((bar < 128).any() for bar in bars) and len({bar.tobytes() for bar in bars}) == 4
-    assert not np.array_equal(comparison(events, flow)[:BAR], comparison(events, 3 * flow)[:BAR]), "the scale is told"
-
-
 @pytest.mark.parametrize("speed", [20.0, 800.0])
 def test_a_window_as_long_as_things_need_to_move_by_five_pixels(speed, tmp_path, capsys):
     """Points at a known velocity, found again by contrast."""
@@ -190,27 +181,6 @@ def test_warm_start_runs(refined, tmp_path, capsys):
         assert run(["predict", refined, str(tmp_path / "e.h5"), "--window-ms", "70", *flag]) == 0
         outputs.append(capsys.readouterr().out.splitlines())
     assert outputs[0][0] == outputs[1][0] and outputs[0][1:] != outputs[1][1:]
-
-
-@pytest.mark.parametrize("burst", ["boxes_rotation", "shapes_rotation"])
-def test_predict_on_real_events(refined, burst, capsys):
-    folder = shared(f"data/events/ecd_rotation/{burst}")
-    assert (
-        run(
-            [
-                "predict",
-                refined,
-                str(folder / "events.txt"),
-                "--size",
-                "240x180",
-                "--whole",
-                "--truth",
-                str(folder / "flow.npy"),
-            ]
-        )
-        == 0
-    )
-    assert "cosine" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("burst", "limit"), [("boxes_rotation", 0.15), ("shapes_rotation", 0.1)])

@@ -19,7 +19,7 @@ from blinkgl.online.job import MIX  # noqa: E402
 from eflow.checkpoint import newest  # noqa: E402
 from eflow.cli import run  # noqa: E402
 from eflow.config import load_train_config  # noqa: E402
-from eflow.data.dataset import ENDLESS, Mixture, StepSampler  # noqa: E402
+from eflow.data.dataset import Mixture, StepSampler  # noqa: E402
 from eflow.data.online import open_online  # noqa: E402
 from eflow.train import train  # noqa: E402
 from small_recipe import RECIPE, asked, said  # noqa: E402
@@ -212,16 +212,6 @@ def test_trains_without_files_and_resumes_exactly(tmp_path, recipe):
     assert last["rendered"] >= 24 and last["render_ms"] > 0 and 0 < last["waited"] <= 1
     files = [sorted(p.name for p in newest(tmp_path / d).iterdir()) for d in ("whole", "parts")]
     assert files[0] == files[1]
-
-
-def test_folders_and_streams_in_one_mixture():
-    mixture = Mixture([100, None], [1, 3], seed=0)
-    keys = [mixture.key(n) for n in range(2 * mixture.epoch_length)]
-    live = [key.index for key in keys if key.source == 1]
-    assert live == list(range(len(live))) and abs(len(live) / len(keys) - 0.75) < 1e-3
-    assert mixture.epoch_length == 100 + ENDLESS
-    for n in (0, 1, 17, mixture.epoch_length, mixture.epoch_length + 5):
-        assert mixture.first(1, n) == sum(key.source == 1 for key in keys[:n])
 
 
 @pytest.mark.parametrize(

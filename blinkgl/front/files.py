@@ -255,7 +255,6 @@ def simulate(
     emulator: EmulatorSettings = "esim",
     gamma: str | float | None = None,
     interpolate: str = "linear",
-    factor: int = 4,
     max_px: float = 1.0,
     seed: int = 0,
     sensor: str | None = None,
@@ -268,8 +267,7 @@ def simulate(
     emulator : as of :func:`record`.
     sensor : the read-out limit of that camera, and with an emulator's name its values.
     gamma : "srgb", "linear" or an exponent; default: srgb for integers, linear for floats.
-    interpolate : "linear"; "cubic": ``factor - 1`` frames in between; "motion": dense
-    flow, at most ``max_px`` px a step.
+    interpolate : "linear"; "motion": dense flow, at most ``max_px`` px a step.
     report : a SimulationReport to be filled.
     Raises ConfigError at once; EventDataError as frames come, naming the frame."""
     from blinkgl.recordings import simulation
@@ -282,7 +280,7 @@ def simulate(
         gamma=gamma,
         interpolate=interpolate,
         report=report,
-        **_options(emulator, sensor, factor, max_px, seed),
+        **_options(emulator, sensor, max_px, seed),
     )
 
 
@@ -294,7 +292,6 @@ def simulate_file(
     emulator: EmulatorSettings = "esim",
     gamma: str | float | None = None,
     interpolate: str = "linear",
-    factor: int = 4,
     max_px: float = 1.0,
     seed: int = 0,
     sensor: str | None = None,
@@ -319,11 +316,11 @@ def simulate_file(
         timestamps=None if timestamps is None else check.path(timestamps, "timestamps"),
         preview=None if preview is None else check.path(preview, "preview"),
         overwrite=overwrite,
-        **_options(emulator, sensor, factor, max_px, seed),
+        **_options(emulator, sensor, max_px, seed),
     )
 
 
-def _options(emulator: EmulatorSettings, sensor: str | None, factor: int, max_px: float, seed: int) -> dict[str, Any]:
+def _options(emulator: EmulatorSettings, sensor: str | None, max_px: float, seed: int) -> dict[str, Any]:
     from blinkgl.config.sensor import load_sensor
     from blinkgl.recordings import simulation
 
@@ -333,7 +330,6 @@ def _options(emulator: EmulatorSettings, sensor: str | None, factor: int, max_px
         tree = {**camera.values(tree.get("emulator", "esim")), **tree}
     return dict(
         emulator=simulation.emulator_config(tree),
-        factor=check.whole(factor, "factor", 1, 1000),
         seed=check.seed(seed),
         max_px=check.number(max_px, "max_px", above=0, most=1e4),
         readout=None if camera is None else camera.readout,

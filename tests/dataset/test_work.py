@@ -247,7 +247,7 @@ EXPLAINED = {
         ({"timeline": {"kind": "uniform", "fps": 100}}, 26, 1, {"event frames": 8}),
         (
             {
-                "timeline": {"kind": "uniform", "fps": 100, "reconstruction": "hermite"},
+                "timeline": {"kind": "uniform", "fps": 100},
                 "render": {"antialiasing": "ssaa2"},
             },
             26,

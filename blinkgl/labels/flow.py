@@ -77,15 +77,6 @@ class FlowTo(Label):
     def written(self, labels: LabelsConfig) -> tuple[Form, ...]:
         return (self.forms[0], *(form for form in self.forms[1:] if form.ending in labels.float_flow))
 
-    def problem(self, value: Flow) -> str | None:
-        return None if np.isfinite(value.flow).all() else "a flow that is no finite number"
-
-    def agrees(self, one: Flow, other: Flow) -> bool:
-        if one.flow.shape != other.flow.shape:
-            return False
-        near = (np.abs(one.flow - other.flow).max(-1) <= _PX) & (one.valid == other.valid)
-        return bool(near.mean() >= _SHARE)
-
     @property
     def views(self) -> tuple[View, ...]:
         way = self.towards

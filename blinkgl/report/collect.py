@@ -13,7 +13,7 @@ from blinkgl.config.draw import is_distribution
 from blinkgl.config.reader import read_table
 from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.run_folder import RunFolder
-from blinkgl.dataset.verify.between import plan_of
+from blinkgl.dataset.verify.cross_checks import plan_of
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flow_png import read_flow_png

@@ -72,7 +72,7 @@ def test_a_row_per_event_of_what_the_scene_has(made):
 )
 def test_verify_sees_what_cannot_be(made, tmp_path, change, said):
     from blinkgl.dataset.verify.contents import _check_truth
-    from blinkgl.dataset.verify.found import guarded
+    from blinkgl.dataset.verify.problems import guarded
 
     folder = tmp_path / "s"
     shutil.copytree(sequence_of(made), folder)

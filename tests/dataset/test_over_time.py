@@ -13,7 +13,7 @@ from blinkgl.config.run import load_run
 from blinkgl.dataset.explain import explain
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.dataset.verify.contents import _check_tracks, check_imu
-from blinkgl.dataset.verify.found import guarded
+from blinkgl.dataset.verify.problems import guarded
 from blinkgl.io.imu import read_imu, read_imu_csv
 from blinkgl.io.tracks import read_tracks
 from blinkgl.sequence_files.sequence_dir import read_manifest

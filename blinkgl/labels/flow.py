@@ -71,7 +71,6 @@ class FlowTo(Label):
             Form(folder, "png", _png, _read),
             Form(folder + "_npy", "npy", _npy, _read),
             Form(folder + "_flo", "flo", _flo, _read),
-            Form(folder, "h5", rows=_rows),
         )
 
     def written(self, labels: LabelsConfig) -> tuple[Form, ...]:
@@ -126,10 +125,6 @@ def _flo(value: Flow) -> bytes:
     from blinkgl.io.flo import encode_flo
 
     return encode_flo(value.flow, value.valid)
-
-
-def _rows(value: Flow) -> dict[str, np.ndarray]:
-    return {"flow": np.where(value.valid[..., None], value.flow, np.float32(0)), "valid": value.valid.astype(np.uint8)}
 
 
 def _read(path: str | os.PathLike) -> Flow:

@@ -255,7 +255,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "backward": {"labels": {"flow": ["backward"]}},
         "none": {"labels": {"flow": []}},
     },
-    "float flow": {"none": NOTHING, **{name: {"labels": {"float_flow": [name]}} for name in ("npy", "flo", "h5")}},
+    "float flow": {"none": NOTHING, **{name: {"labels": {"float_flow": [name]}} for name in ("npy", "flo")}},
     "labels": {
         "default": NOTHING,
         "all": {

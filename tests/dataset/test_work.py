@@ -214,13 +214,11 @@ def test_the_preview_is_fed_and_ended(monkeypatch, rate, recorded, fails):
         "rate_hz": 50.0,
         "fps": 12.5,
         "label": "frame",
-        "tracks": None,
-        "curves": None,
     }
     assert calls[0] == ("made", "preview.mp4", (3, 4, about), 12.5)
     names = [name for name, *_ in calls[1:]]
     assert names == ["add_events", *([] if recorded else ["set_flow"]), "frame", "abort" if fails else "close"]
-    assert calls[-2][1:] == (0, 7999, "image", []) and sequence.clock.seconds["preview"] >= 0
+    assert calls[-2][1:] == (0, 7999, "image") and sequence.clock.seconds["preview"] >= 0
     if not recorded:
         assert (calls[2][1] == 2).all(), "px in a label interval"
 

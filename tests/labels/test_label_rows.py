@@ -88,7 +88,7 @@ def test_a_frame_has_what_was_asked_for_and_none_for_the_rest():
 
 # --- files ------------------------------------------------------------------------------------------------------------
 
-FLOW = ("flow/{}/000007.png", "flow/{}_npy/000007.npy", "flow/{}_flo/000007.flo", "flow/{}.h5")
+FLOW = ("flow/{}/000007.png", "flow/{}_npy/000007.npy", "flow/{}_flo/000007.flo")
 FILES = {
     "images": ["images/000007.png"],
     "flow_forward": [name.format("forward") for name in FLOW],
@@ -135,7 +135,7 @@ def test_where_labels_lie():
     }
 
 
-@pytest.mark.parametrize("endings", [(), ("npy",), ("flo", "h5"), ("npy", "flo", "h5")])
+@pytest.mark.parametrize("endings", [(), ("npy",), ("npy", "flo")])
 def test_float_flow_lies_beside_the_png(endings):
     labels = LabelsConfig(flow=["forward"], float_flow=endings)
     assert [form.ending for form in LABELS["flow_forward"].written(labels)] == ["png", *endings]
@@ -143,19 +143,11 @@ def test_float_flow_lies_beside_the_png(endings):
 
 
 def test_a_form_knows_its_own_files():
-    each, one = Form("flow/forward", "png"), Form("flow/forward", "h5", rows=lambda value: {})
+    each = Form("flow/forward", "png")
     assert list(each.files(2)) == ["flow/forward/000000.png", "flow/forward/000001.png"] and list(each.files(0)) == []
-    assert list(one.files(2)) == ["flow/forward.h5"] and list(one.files(0)) == []
-    assert each.holds("flow/forward/000000.png") and one.holds("flow/forward.h5")
-    for other in (
-        "flow/forward.png",
-        "flow/forward/a/0.png",
-        "flow/forward/0.npy",
-        "flow/forward0.png",
-        "flow/forwards/0.png",
-    ):
-        assert not each.holds(other) and not one.holds(other)
-    assert not one.holds("flow/forward/000000.h5") and not each.holds("flow/forward.h5")
+    assert each.holds("flow/forward/000000.png")
+    for other in ("flow/forward.png", "flow/forward/a/0.png", "flow/forward/0.npy", "flow/forward0.png"):
+        assert not each.holds(other)
 
 
 # --- values -----------------------------------------------------------------------------------------------------------

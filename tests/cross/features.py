@@ -274,7 +274,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "surfaces, ideal": {"tracks": {"points": 20, "choose": "surface", "rate": 300}, "imu": {"rate": 90}},
         "drawn": {"tracks": {"points": {"integer": [5, 9]}, "choose": "random"}},
     },
-    "preview": {"off": NOTHING, "on": {"preview": {"enabled": True, "rate": 100, "slowdown": 10}}},
+    "preview": {"off": NOTHING, "on": {"preview": {"enabled": True, "rate": 100}}},
     "time": {
         "from 0": NOTHING,
         "late": {"time": {"start": 3.0}},

@@ -152,6 +152,14 @@ def explain(
     return command.run(config, sequence=sequence, seed=seed, overrides=overrides or [])
 
 
+@app.command(hidden=True, context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
+def qualify() -> int:
+    """Refuse a command that earlier versions had."""
+    raise ConfigError(
+        "frames are checked where they are converted", where="qualify", accepted="blinkgl explain CONFIG or generate"
+    )
+
+
 @app.command()
 def trade(
     config: Annotated[
@@ -206,13 +214,7 @@ def trade(
         str | None,
         typer.Option(help="What the front is drawn over: wall (default), or cpu on a busy machine (--suite: cpu)."),
     ] = None,
-    reference: Annotated[
-        str,
-        typer.Option(
-            help="raster, or cycles: judge by the same scene path-traced (extra [cycles]; seconds per frame, so with a "
-            "small camera and a short --clip)."
-        ),
-    ] = "raster",
+    reference: Annotated[str | None, typer.Option("--reference", hidden=True)] = None,
     reference_set: Annotated[
         list[str] | None,
         typer.Option(
@@ -226,6 +228,7 @@ def trade(
     as a table, a plot and a page."""
     from blinkgl.show import trade as command
 
+    _gone("scenes are no longer path-traced", "--reference-set", **{"--reference": reference})
     if suite:
         from blinkgl.show import suite as suite_command
 
@@ -246,7 +249,6 @@ def trade(
                 "--seed": seed is not None,
                 "--sequence": sequence is not None,
                 "--clip": clip is not None,
-                "--reference": reference != "raster",
                 "--reference-set": bool(reference_set),
             },
         )
@@ -264,7 +266,6 @@ def trade(
         rounds=rounds,
         minutes=minutes,
         cost=cost or "wall",
-        reference=reference,
         reference_set=reference_set,
         seed=seed,
     )

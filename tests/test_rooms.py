@@ -115,9 +115,9 @@ def test_imports_lead_down():
 
 FILLED_IN_LATER = set(
     """
-    BufferReport Collected Comparison Cost Displacement Document DrawItem Draws Example Explanation Finding Level
+    BufferReport Collected Comparison Displacement Document DrawItem Example Explanation Finding Level
     Measured Omissions Outcome Parameter Pool RenderStats Result SequenceReport RecordingSide SimulationReport
-    StreamStats Totals Verification _Arriving _Body
+    StreamStats Totals Verification _Body
 """.split()
 )
 """Records that are written to while they are made. All others are values: who holds one may count on it."""

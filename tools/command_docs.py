@@ -41,6 +41,8 @@ def _commands(name: str, command) -> Iterator[tuple[str, object]]:
         yield name, command
         return
     for child, below in command.commands.items():
+        if below.hidden:
+            continue
         yield from _commands(f"{name} {child}", below)
 
 

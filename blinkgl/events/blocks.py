@@ -5,32 +5,10 @@ They take slices and index them from 0: numba then vectorises them, which it doe
 
 from __future__ import annotations
 
-from typing import Any
-
-import llvmlite.ir as ir
 import numba
 import numpy as np
-from numba.core import cgutils, types
-from numba.extending import intrinsic
 
 from blinkgl.events.packing import JIT
-
-
-@intrinsic
-def prefetch(typingctx: Any, array: Any, index: Any) -> Any:
-    """Asks for the line of memory of element ``index`` (in the order of memory) of a C-contiguous ``array``, and waits
-    for nothing; for what will be read at places that only the data know."""
-
-    def codegen(context, builder, signature, arguments):
-        data = cgutils.create_struct_proxy(signature.args[0])(context, builder, value=arguments[0]).data
-        place, word = builder.gep(data, [arguments[1]]), ir.IntType(32)
-        kind = ir.FunctionType(ir.VoidType(), [place.type, word, word, word])
-        fetch = builder.module.declare_intrinsic("llvm.prefetch", [place.type], kind)
-        # Arguments of llvm.prefetch: 0 read, 3 keep in all caches, 1 data (not instructions).
-        builder.call(fetch, [place, word(0), word(3), word(1)])
-        return context.get_dummy_value()
-
-    return types.void(array, index), codegen
 
 
 @numba.njit(**JIT)
@@ -52,15 +30,6 @@ def lookup_block(codes: np.ndarray, table: np.ndarray, out: np.ndarray) -> None:
     """``out[:] = table[codes]``."""
     for i in range(codes.size):
         out[i] = table[codes[i]]
-
-
-@numba.njit(**JIT)
-def lookup_both_block(
-    codes: np.ndarray, table_a: np.ndarray, a: np.ndarray, table_b: np.ndarray, b: np.ndarray
-) -> None:
-    """``a[:] = table_a[codes]`` and ``b[:] = table_b[codes]``."""
-    for i in range(codes.size):
-        a[i], b[i] = table_a[codes[i]], table_b[codes[i]]
 
 
 # The product of eight bytes of 0 or 1 with this constant has them as the bits of its top byte.

@@ -30,12 +30,11 @@ import numpy as np
 
 from blinkgl.config.events import EsimConfig, V2eConfig
 from blinkgl.errors import EventDataError
-from blinkgl.events.blocks import compact_flags, copy_block, lookup_block, lookup_both_block, prefetch, scale_block
+from blinkgl.events.blocks import compact_flags, copy_block, lookup_block, scale_block
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
 from blinkgl.events.esim import draw_thresholds
 from blinkgl.events.noise import noise_table
-from blinkgl.events.packing import JIT, T_SHIFT
-from blinkgl.events.philox import Stream
+from blinkgl.events.packing import JIT
 from blinkgl.events.response import Response, smallest_threshold
 from blinkgl.events.table import register
 from blinkgl.events.threads import take_part
@@ -43,14 +42,13 @@ from blinkgl.events.v2e_blocks import (
     DRAWS,
     add_scaled_block,
     flag_block,
-    flag_block_leaking,
     lin_log_block,
     noise_block,
     relax_block,
-    relax_block_gently,
     second_block,
     shot_block,
 )
+from blinkgl.events.v2e_emit import emit
 from blinkgl.events.v2e_model import (
     DARKEST,
     REBASE,
@@ -64,19 +62,14 @@ from blinkgl.events.v2e_model import (
     shot_draw,
     shot_tables,
 )
-from blinkgl.events.v2e_waves import FLOATS, INTS, emit_waves
 from blinkgl.types.events import Events
 
 _F = np.float32
-# Typed float32 constants: a float literal is float64 to numba and would widen the loops.
-_ZERO, _HALF, _JOINT = _F(0), _F(0.5), _F(20.0)
-_SHOT, _NOISE = np.uint64(Stream.SHOT), np.uint64(Stream.NOISE)
-_U2, _U1, _U1000 = np.uint64(2), np.uint64(1), np.uint64(1000)
+# Typed: a float literal is float64 to numba and would widen the loops.
+_ZERO = _F(0)
 # Pixels in their dead time have infinite levels and lie infinitely far beyond them: the distance is cut
 # here.
 _FARTHEST = _F(1e6)
-GROUP = 4
-"""Blocks whose events are made in one go."""
 
 
 class Pixels(NamedTuple):
@@ -111,7 +104,6 @@ class Interval(NamedTuple):
     since_epoch_0: float  # seconds from the leak epoch to both ends
     since_epoch_1: float
     kappa: float
-    gentle: bool  # k < 1/2 at every pixel
     scale: np.float32
     seed: np.uint64
     step: int
@@ -126,195 +118,86 @@ class Interval(NamedTuple):
 
 
 @numba.njit(**JIT)
-def _emit_plain(active, count, first, x_now, constants, p, v, cap, packed, begin):
-    """Do :func:`emit_waves` without low-pass, leak, noise and dead time: the same bits, from straight lines."""
-    out, cut, dt_ns = begin, 0, v.dt_ns
-    # Start of the interval after the microsecond base, 0 to 999 ns.
-    start_ns = v.t0_ns - 1000 * v.base_us
-    y = first // v.width
-    row_end = (y + 1) * v.width
-    # A loop of its own, so that the cache misses of all pixels overlap.
-    for j in range(count):
-        for c in range(2):
-            constants[j, c] = p.constants[active[j], c]
-    for j in range(count):
-        i = np.int64(active[j])
-        while i >= row_end:
-            y += 1
-            row_end += v.width
-        # From here on float64, as in emit_waves, so that both kernels emit the same bits.
-        before, on, off = np.float64(p.x[i]), np.float64(constants[j, 0]), np.float64(constants[j, 1])
-        rise = np.float64(x_now[i - first]) - before
-        end = before + rise
-        up, down = np.float64(p.upper[i]), np.float64(p.lower[i])
-        polarity = np.int64(end >= up)
-        level, step = (up, on) if polarity else (down, -off)
-        sign = 1.0 if polarity else -1.0
-        # The packed word (packing.py) without its time.
-        pixel = (y << 17) | ((i - row_end + v.width) << 1) | polarity
-        emitted, s = 0, 0.0
-        while sign * (end - level) >= 0.0:
-            # 0 / 0 is NaN where the signal already stands on the level; max and min then give s.
-            s = min(max(s, (level - before) / rise), 1.0)
-            # ``packed`` has room for ``cap`` events of each listed pixel; further ones are counted
-            # only.
-            if emitted < cap:
-                packed[out] = (np.int64(np.uint64(start_ns + np.int64(s * dt_ns)) // _U1000) << T_SHIFT) | pixel
-                out += 1
-                emitted += 1
-            else:
-                cut += 1
-            up, down = level + on, level - off
-            level += step
-        p.upper[i], p.lower[i] = np.float32(up), np.float32(down)
-    return out, cut
-
-
-@numba.njit(**JIT)
 def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x_table, p, v):
     """Process the blocks of a band, see :meth:`Emulator._run`."""
-    cut, pixels, most = 0, p.x.size, GROUP * BLOCK
-    # Scratch memory: what is one block long is used again for every block, what is ``most`` long holds
-    # the group until its events are made. compact_flags writes eight numbers at a time.
-    flags, scratch, active = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64), np.empty(most + 8, np.int32)
-    z, normals = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    intensity, x = np.empty(most, np.float32), np.empty(most, np.float32)
-    lag, noise = np.empty(most, np.float32), np.empty(most, np.float32)
-    seconds = most if p.second_lag.size else 0
-    before_second, second_lag = np.empty(seconds, np.float32), np.empty(seconds, np.float32)
-    keys, constants = np.empty(BLOCK, np.int64), np.empty((most, 2), np.float32)
-    floats, ints = np.empty(FLOATS, np.float64), np.empty(INTS, np.int64)
-    draws = np.empty(DRAWS, np.int64), np.empty(DRAWS), np.empty(DRAWS)
-    clocks = np.empty((GROUP, 2), np.int64)
-    # Running sums over the group's blocks: pixels listed, shot-noise events; and the cap of each block.
-    listed, shot, caps = np.zeros(GROUP + 1, np.int64), np.zeros(GROUP + 1, np.int64), np.zeros(GROUP, np.int64)
-    kappa, since = np.float32(v.kappa), np.float32(v.since_epoch_1)
-    plain = not (p.lag.size or p.leak.size or p.noise.size or p.release.size or p.clock_ns.size)
-    for group in range(first_block, stop_block, GROUP):
-        first, blocks = group * BLOCK, min(GROUP, stop_block - group)
-        room, largest, clamped = 0, 0, False
-        for b in range(blocks):
-            a = b * BLOCK
-            s = first + a
-            e = min(s + BLOCK, pixels)
-            n = e - s
-            if n < BLOCK:
-                flags[:] = 0
-            x_now, intensity_now, lag_now = x[a : a + n], intensity[a : a + n], lag[a : a + n]
-            # uint8 frames: luminance and lin-log of all 256 codes are in tables.
-            if codes.size:
-                if p.intensity.size:
-                    lookup_both_block(codes[s:e], x_table, x_now, table, intensity_now)
-                else:
-                    lookup_block(codes[s:e], x_table, x_now)
-            else:
-                scale_block(frame[s:e], v.scale, intensity_now)
-                lin_log_block(intensity_now, x_now)
-            # The second low-pass comes first, see the module. It replaces x by its output.
-            if p.second_lag.size:
-                second_block(
-                    p.second_lag[s:e], p.before_second[s:e], x_now, v.second_keep, v.second_ramp,
-                    before_second[a : a + n], second_lag[a : a + n],
-                )  # fmt: skip
-            # The low-pass of the photoreceptor. z is what the comparator sees.
-            if p.lag.size:
-                if v.gentle:
-                    relax_block_gently(
-                        p.lag[s:e], p.x[s:e], x_now, p.intensity[s:e], intensity_now, kappa, lag_now, z[:n]
-                    )
-                else:
-                    relax_block(p.lag[s:e], p.x[s:e], x_now, p.intensity[s:e], intensity_now, kappa, lag_now, z[:n])
-            elif p.noise.size:
-                copy_block(x_now, z[:n])
-            if p.noise.size:
-                # noise_block adds to z, so leak is added here as well. Without noise the comparison
-                # itself adds it.
-                if p.leak.size:
-                    add_scaled_block(p.leak[s:e], since, z[:n])
-                noise_block(
-                    p.noise[s:e], p.intensity[s:e], intensity_now, kappa, p.noise_sizes, v.seed, v.step, s, normals,
-                    noise[a : a + n], z[:n],
-                )  # fmt: skip
-            signal = z[:n] if p.lag.size or p.noise.size else x_now
-            if p.leak.size and not p.noise.size:
-                farthest = flag_block_leaking(signal, p.leak[s:e], since, p.upper[s:e], p.lower[s:e], flags)
-            else:
-                farthest = flag_block(signal, p.upper[s:e], p.lower[s:e], flags)
-            shots = 0
-            if p.clock_ns.size:
-                # The group's keys lie block after block; those of this block begin here.
-                so_far = shot[b]
-                shots, clocks[b, 0], clocks[b, 1] = shot_block(
-                    group + b, n, a, p, v, intensity_now, keys[so_far:], draws
-                )
-                # -1 event: no room. Draws are functions of their numbers, so the block is done again
-                # with twice the room.
-                while shots < 0:
-                    longer = np.empty(2 * keys.size, np.int64)
-                    longer[:so_far] = keys[:so_far]
-                    keys = longer
-                    shots, clocks[b, 0], clocks[b, 1] = shot_block(
-                        group + b, n, a, p, v, intensity_now, keys[so_far:], draws
-                    )
-                # A pixel with shot noise is listed even where its signal reaches no level. Bits 42 and
-                # up: its number in the group.
-                for j in range(so_far, so_far + shots):
-                    flags[(keys[j] >> 42) - a] = 1
-            shot[b + 1] = shot[b] + shots
-            count = 0
-            if farthest >= _ZERO or shots:
-                count = compact_flags(flags, scratch, s, active[listed[b] :])
-                # A miss of the caches a pixel, which is over when the group's events are made.
-                for j in range(listed[b], listed[b] + count):
-                    prefetch(p.constants, np.int64(active[j]) * 4)
+    cut, pixels = 0, p.x.size
+    # Scratch memory of one block. compact_flags writes eight numbers at a time.
+    flags, scratch, active = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64), np.empty(BLOCK + 8, np.int32)
+    now, second_now, normals = np.empty((5, BLOCK), _F), np.empty((2, BLOCK), _F), np.empty(BLOCK, _F)
+    keys, draws = np.empty(BLOCK, np.int64), (np.empty(DRAWS, np.int64), np.empty(DRAWS), np.empty(DRAWS))
+    clock_ns, clock_index = np.int64(0), np.int64(0)
+    for block in range(first_block, stop_block):
+        s = block * BLOCK
+        e = min(s + BLOCK, pixels)
+        n = e - s
+        if n < BLOCK:
+            flags[:] = 0
+        # The block's state at the interval's end; z is what the comparator sees. ``p`` is of the frame before.
+        intensity, x, lag, noise, z = now[0, :n], now[1, :n], now[2, :n], now[3, :n], now[4, :n]
+        # uint8 frames: luminance and lin-log of all 256 codes are in tables.
+        if codes.size:
+            lookup_block(codes[s:e], x_table, x)
+            lookup_block(codes[s:e], table, intensity)
+        else:
+            scale_block(frame[s:e], v.scale, intensity)
+            lin_log_block(intensity, x)
+        # The second low-pass comes first, see the module. It replaces x by its output.
+        if p.second_lag.size:
+            second_block(
+                p.second_lag[s:e], p.before_second[s:e], x, v.second_keep, v.second_ramp,
+                second_now[0, :n], second_now[1, :n],
+            )  # fmt: skip
+        # The low-pass of the photoreceptor.
+        if p.lag.size:
+            relax_block(p.lag[s:e], p.x[s:e], x, p.intensity[s:e], intensity, _F(v.kappa), lag, z)
+        else:
+            copy_block(x, z)
+        if p.leak.size:
+            add_scaled_block(p.leak[s:e], _F(v.since_epoch_1), z)
+        if p.noise.size:
+            noise_block(
+                p.noise[s:e], p.intensity[s:e], intensity, _F(v.kappa), p.noise_sizes, v.seed, v.step, s, normals,
+                noise, z,
+            )  # fmt: skip
+        farthest = flag_block(z, p.upper[s:e], p.lower[s:e], flags)
+        shots = 0
+        if p.clock_ns.size:
+            shots, clock_ns, clock_index = shot_block(block, n, p, v, intensity, keys, draws)
+            # -1 event: no room. Draws are functions of their numbers, so the block is done again with twice the room.
+            while shots < 0:
+                keys = np.empty(2 * keys.size, np.int64)
+                shots, clock_ns, clock_index = shot_block(block, n, p, v, intensity, keys, draws)
+            # A pixel with shot noise is listed even where its signal reaches no level. Bits 42 and up: its number.
+            for j in range(shots):
+                flags[keys[j] >> 42] = 1
+        if farthest >= _ZERO or shots:
+            count = compact_flags(flags, scratch, s, active)
             # As many events a pixel as levels fit between the first one and the farthest, rounded up, and its noise.
             cap = (
                 min(np.int64(max(min(farthest, _FARTHEST), _ZERO) * v.inverse_threshold) + 2, v.bound_per_pixel) + shots
             )
             if count * cap > share:
-                cap, clamped = max(1, share // count), True
-            listed[b + 1], caps[b] = listed[b] + count, cap
-            room += count * cap
-            largest = max(largest, cap if count else 0)
-        # Together where no block is held to its share: loops over few pixels are mostly their beginning and end.
-        together = not clamped and listed[blocks] * largest <= blocks * share
-        if together:
-            room = listed[blocks] * largest
-        # No room for the worst case; nothing of this group has been touched.
-        if filled + room > packed.size:
-            return group, filled, cut
-        # The state at the interval's end of the whole group, in the order that emit_waves unpacks.
-        now = (intensity, x, lag, noise)
-        for b in range(1 if together else blocks):
-            stop = blocks if together else b + 1
-            here, cap = active[listed[b] : listed[stop]], largest if together else caps[b]
-            if not here.size:
-                continue
-            if plain:
-                filled, cut_here = _emit_plain(here, here.size, first, x, constants, p, v, cap, packed, filled)
-            else:
-                shots = shot[stop] - shot[b]
-                filled, cut_here = emit_waves(
-                    here, here.size, first, now, keys[shot[b] : shot[stop]], shots, p, v, cap, packed, filled,
-                    floats, ints,
-                )  # fmt: skip
+                cap = max(1, share // count)
+            # No room for the worst case; nothing of this block has been touched.
+            if filled + count * cap > packed.size:
+                return block, filled, cut
+            filled, cut_here = emit(
+                active[:count], s, (intensity, x, lag, noise), keys[:shots], p, v, cap, packed, filled
+            )
             cut += cut_here
         # Last: until here these are of the frame before.
-        last = min(first + blocks * BLOCK, pixels)
-        n = last - first
         if p.intensity.size:
-            copy_block(intensity[:n], p.intensity[first:last])
-        copy_block(x[:n], p.x[first:last])
+            copy_block(intensity, p.intensity[s:e])
+        copy_block(x, p.x[s:e])
         if p.lag.size:
-            copy_block(lag[:n], p.lag[first:last])
+            copy_block(lag, p.lag[s:e])
         if p.second_lag.size:
-            copy_block(before_second[:n], p.before_second[first:last])
-            copy_block(second_lag[:n], p.second_lag[first:last])
+            copy_block(second_now[0, :n], p.before_second[s:e])
+            copy_block(second_now[1, :n], p.second_lag[s:e])
         if p.noise.size:
-            copy_block(noise[:n], p.noise[first:last])
+            copy_block(noise, p.noise[s:e])
         if p.clock_ns.size:
-            for b in range(blocks):
-                p.clock_ns[group + b], p.clock_index[group + b] = clocks[b, 0], clocks[b, 1]
+            p.clock_ns[block], p.clock_index[block] = clock_ns, clock_index
     return stop_block, filled, cut
 
 
@@ -357,7 +240,6 @@ class V2e(Emulator):
         "_clock_ns",
         "_clock_index",
         "_epoch_ns",
-        "_brightest",
         "_since_ns",
         "_noise_then",
         "_before_second",
@@ -414,7 +296,7 @@ class V2e(Emulator):
         if self._leak.size and self._leak.max() > 0:
             # The leak clock starts anew when the median pixel has leaked REBASE.
             self._rebase_ns = int(REBASE / float(np.median(self._leak[self._leak > 0])) * 1e9)
-        self._epoch_ns, self._brightest = np.zeros(1, np.int64), np.zeros(1)
+        self._epoch_ns = np.zeros(1, np.int64)
 
         self._refractory_ns = round(config.refractory_us * 1000)
         self._release = np.full(pixels if self._refractory_ns else 0, NEVER_NS, np.int64)
@@ -473,7 +355,7 @@ class V2e(Emulator):
             rate = self._shot_unit * float(self._shot_table[block, -1])
             gap, _ = shot_draw(self.seed, np.uint64(block), np.uint64(2**62), rate)
             self._clock_ns[block] = t_ns + gap
-        self._epoch_ns[0], self._brightest[0] = t_ns, intensity.max()
+        self._epoch_ns[0] = t_ns
         return Events.empty()
 
     def _advance(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
@@ -500,14 +382,12 @@ class V2e(Emulator):
             self._before_second,
             self._second_lag,
         )
-        brightest = float(self._table.max() if frame.dtype == np.uint8 else frame.max() * self._scale)
-        interval = self._interval(t_ns, max(brightest, self._brightest[0]))
+        interval = self._interval(t_ns)
         base_us = interval.base_us
         source = (NO_FRAME, frame) if frame.dtype == np.uint8 else (frame, NO_CODES)
         events = self._run(
             _bands, (*source, self._table, self._x_table, pixels, interval), base_us, t_ns // 1000 - base_us
         )
-        self._brightest[0] = brightest
         if t_ns - int(self._epoch_ns[0]) >= self._rebase_ns:
             self._begin_leaks_anew(t_ns)
         return events
@@ -531,14 +411,14 @@ class V2e(Emulator):
             )
             self._sizes_dt_ns = dt_ns
 
-    def _interval(self, t_ns: int, brightest: float) -> Interval:
-        """Return the interval from the last frame to ``t_ns``.   brightest : DN, of both."""
+    def _interval(self, t_ns: int) -> Interval:
+        """Return the interval from the last frame to ``t_ns``."""
         config, (epoch,), (start_ns, dt_ns) = self.config, self._epoch_ns.tolist(), (self.t_ns, t_ns - self.t_ns)
         # 275 DN is 255 + 20, full scale in v2e's formula for the corner frequency.
         kappa = 2 * np.pi * config.cutoff_hz * dt_ns * 1e-9 / 275.0
         second = config.second_cutoff_hz
         second_keep, second_ramp = decay(_F(2 * np.pi * second * dt_ns * 1e-9)) if second else (_ZERO, _ZERO)
-        # In the order of the fields of Interval. 0.499 rather than 1/2, for rounding in float32.
+        # In the order of the fields of Interval.
         return Interval(
             start_ns,
             dt_ns,
@@ -546,7 +426,6 @@ class V2e(Emulator):
             (start_ns - epoch) * 1e-9,
             (t_ns - epoch) * 1e-9,
             kappa,
-            kappa * (brightest + 20.0) < 0.499,
             self._scale,
             self.seed,
             self.frames,

@@ -10,7 +10,6 @@ import numba
 import numpy as np
 
 from blinkgl.events.arith import select
-from blinkgl.events.blocks import prefetch
 from blinkgl.events.emulator import BLOCK
 from blinkgl.events.packing import JIT
 from blinkgl.events.philox import Stream, normal2, uniform2
@@ -20,7 +19,6 @@ from blinkgl.events.v2e_model import (
     next_noise,
     noise_place,
     relax,
-    relax_gently,
     settled,
     shot_draw,
     shot_factor,
@@ -59,24 +57,6 @@ def relax_block(
     # z = x + (y - x) is the low-pass's output y.
     for i in range(now.size):
         lag_now = relax(lag[i], before[i], now[i], intensity_before[i], intensity_now[i], kappa)
-        out[i] = lag_now
-        z[i] = now[i] + lag_now
-
-
-@numba.njit(**JIT)
-def relax_block_gently(
-    lag: np.ndarray,
-    before: np.ndarray,
-    now: np.ndarray,
-    intensity_before: np.ndarray,
-    intensity_now: np.ndarray,
-    kappa: float,
-    out: np.ndarray,
-    z: np.ndarray,
-) -> None:
-    """:func:`relax_block` where k < 1/2 at every pixel."""
-    for i in range(now.size):
-        lag_now = relax_gently(lag[i], before[i], now[i], intensity_before[i], intensity_now[i], kappa)
         out[i] = lag_now
         z[i] = now[i] + lag_now
 
@@ -145,22 +125,6 @@ def flag_block(z: np.ndarray, upper: np.ndarray, lower: np.ndarray, flags: np.nd
 
 
 @numba.njit(**JIT)
-def flag_block_leaking(
-    z: np.ndarray, leak: np.ndarray, since: float, upper: np.ndarray, lower: np.ndarray, flags: np.ndarray
-) -> float:
-    """:func:`flag_block` of z with what has leaked."""
-    farthest = _FAR_BELOW
-    for i in range(z.size):
-        # Rounded to float32 twice, as add_scaled_block does, so that both ways agree.
-        leaked = np.float32(z[i] + np.float32(leak[i] * since))
-        above, below = np.float32(leaked - upper[i]), np.float32(lower[i] - leaked)
-        beyond = np.float32(select(above > below, above, below))
-        flags[i] = np.uint8(beyond >= _ZERO)
-        farthest = max(farthest, beyond.view(np.int32))
-    return np.int32(farthest).view(np.float32)
-
-
-@numba.njit(**JIT)
 def _shot_draws(seed, block, index, rate_per_ns, gaps, picks, accepts):
     """Draw the candidates from number ``index`` on: more than needed, but in vector instructions."""
     for j in range(gaps.size):
@@ -174,15 +138,14 @@ def _shot_draws(seed, block, index, rate_per_ns, gaps, picks, accepts):
 def shot_block(
     block: int,
     pixels_in_block: int,
-    before: int,
     p: Any,
     v: Any,
     intensity_now: np.ndarray,
     keys: np.ndarray,
     draws: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> tuple[int, int, int]:
-    """Shot noise of one block in the interval: accepted events into ``keys`` (pixel in block and ``before`` << 42 | ns
-    from the interval's start << 1 | polarity), sorted. Returns (events, time and number of the next candidate); -1
+    """Shot noise of one block in the interval: accepted events into ``keys`` (pixel in block << 42 | ns from the
+    interval's start << 1 | polarity), sorted. Returns (events, time and number of the next candidate); -1
     events when ``keys`` is too small."""
     # The clock stands at the next candidate, whose number is ``index``.
     count, first, end_ns = 0, block * BLOCK, v.t0_ns + v.dt_ns
@@ -202,8 +165,6 @@ def shot_block(
     while t_ns <= end_ns:
         if drawn == wanted:
             _shot_draws(v.seed, np.uint64(block), np.uint64(index), rate, gaps[:wanted], picks, accepts)
-            for j in range(wanted):
-                prefetch(table, np.int64(picks[j] * table.size))
             drawn = 0
         gap, pick, accept = gaps[drawn], picks[drawn], accepts[drawn]
         drawn += 1
@@ -227,7 +188,7 @@ def shot_block(
                     # The caller doubles ``keys`` and repeats the block; draws have no state, so they
                     # come out the same.
                     return -1, t_ns, index
-                key = ((before + offset) << 42) | (after << 1) | np.int64(on)
+                key = (offset << 42) | (after << 1) | np.int64(on)
                 slot = count
                 # A few keys are inserted in order; many are sorted at the end.
                 if count < _INSERTION_LIMIT:

@@ -81,17 +81,6 @@ def relax(lag: float, before: float, now: float, intensity_before: float, intens
     return settled(lag * a - (now - before) * g)
 
 
-@register_jitable
-def relax_gently(
-    lag: float, before: float, now: float, intensity_before: float, intensity_now: float, kappa: float
-) -> float:
-    """:func:`relax` where k < 1/2 everywhere: the same bits for half the work."""
-    k = kappa * (_HALF * (intensity_before + intensity_now) + _JOINT)
-    # e^-k = 1 - k g without an exponential.
-    g = _gentle_growth(k)
-    return settled(lag * (_ONE - k * g) - (now - before) * g)
-
-
 # --- where the signal meets a level ------------------------------------------------------------------------
 @register_jitable
 def curve_of(base: float, drift: float, dx: float, lag: float, k: float) -> tuple[float, float, float]:

@@ -11,7 +11,7 @@ EXTRAS = {  # extra of setup.cfg -> (distributions, what they are for)
     "check": (("pyrender",), "an independent renderer to compare with"),
     "cycles": (
         ("bpy",),
-        "Blender: blinkgl import, a path tracer; better in an environment of its own, see docs/install.md",
+        "Blender: blinkgl import; better in an environment of its own, see docs/install.md",
     ),
     "learn": (("torch", "safetensors", "tensorboard"), "training"),
     "tensors": (("torch",), "events as tensors: TensorEsim, TensorV2e, events.device: cuda"),

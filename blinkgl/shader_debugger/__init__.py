@@ -1,4 +1,4 @@
-"""The shader debugger: ``blinkgl shader passes | probe | diff | check | show | time | serve``.
+"""The shader debugger: ``blinkgl shader passes | probe | diff | check | show | serve``.
 
 In:    a configuration, a moment of one of its sequences, a folder of shaders.
 Out:   what every pass wrote there beside what a float64 reference says, as pictures, words and a page.
@@ -9,12 +9,11 @@ Start: cli.py (the commands), then session.py:
     silhouettes.py what `antialiasing: edges` puts together, and its slow twin
     lamps.py      shadow maps in float64, and where they may be off
     compare.py    one against the other, with tolerances and the silhouette band
-    suspicions.py what the error looks like; poses.py: which other pose would explain it
+    suspicions.py what the error looks like
     verdict.py    what is wrong first, on which object
     probe.py      everything about one pixel
     picture.py    arrays as pictures: colour maps, labelled PNGs, the contact sheet
-    check.py      every program in every variant (variants.py), errors at their own line (diagnostics.py, preprocess.py)
-    timing.py     timer queries per pass and variant
+    check.py      every program in every variant (variants.py), errors at their own line (diagnostics.py)
     server.py     the page (page/); questions.py: what it may ask; inspector.py: the answers
     cli.py        the commands
 

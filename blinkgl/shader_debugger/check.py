@@ -1,11 +1,8 @@
-"""``blinkgl shader check`` and ``show``: compile everything, say what is wrong where, and
-what is declared for nothing."""
+"""``blinkgl shader check`` and ``show``: compile everything, say what is wrong where."""
 
 from __future__ import annotations
 
-import re
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,15 +13,8 @@ from blinkgl.errors import ConfigError
 from blinkgl.gl import create_context
 from blinkgl.gl.shader import GEOMETRY, STAGES, ShaderError, ShaderSource, expand, link, stages_of
 from blinkgl.shader_debugger.diagnostics import Diagnostic, diagnose
-from blinkgl.shader_debugger.preprocess import active_lines
-from blinkgl.shader_debugger.session import EditedFolder, files_of, open_folder
+from blinkgl.shader_debugger.session import files_of, open_folder
 from blinkgl.shader_debugger.variants import lookups, variants
-
-_DECLARATION = re.compile(
-    r"^\s*(?:layout\s*\([^)]*\)\s*)?(?:(?:flat|smooth|noperspective|centroid|invariant|highp|mediump|lowp)\s+)*"
-    r"(in|out|uniform)\s+(?:(?:highp|mediump|lowp)\s+)?\w+\s+([^;{]+);"
-)
-_NAME = re.compile(r"^\s*(\w+)")
 
 
 @dataclass
@@ -39,27 +29,22 @@ class Finding:
 
 @dataclass
 class Result:
-    """renderer : what compiled.   programs : name -> number of variants.   errors, unused : findings, each once."""
+    """renderer : what compiled.   programs : name -> number of variants.   errors : findings, each once."""
 
     renderer: str = ""
     seconds: float = 0.0
     programs: dict[str, int] = field(default_factory=dict)
     errors: list[Finding] = field(default_factory=list)
-    unused: list[Finding] = field(default_factory=list)
 
     def as_dict(self) -> dict:
-        def plain(findings):
-            return [
-                f.diagnostic.as_dict() | {"program": f.program, "variants": f.count, "example": f.example}
-                for f in findings
-            ]
-
         return {
             "renderer": self.renderer,
             "seconds": self.seconds,
             "programs": self.programs,
-            "errors": plain(self.errors),
-            "unused": plain(self.unused),
+            "errors": [
+                f.diagnostic.as_dict() | {"program": f.program, "variants": f.count, "example": f.example}
+                for f in self.errors
+            ],
         }
 
 
@@ -94,8 +79,6 @@ def check_program(ctx: moderngl.Context, folder: Any, name: str, result: Result)
                 if diagnostic.kind == "error":
                     _add(result.errors, diagnostic, name, defines)
             continue
-        for diagnostic in unused(sources, set(program)):
-            _add(result.unused, diagnostic, name, defines)
         program.release()
 
 
@@ -109,60 +92,16 @@ def _add(findings: list[Finding], diagnostic: Diagnostic, program: str, defines:
     found.count += 1
 
 
-def unused(sources: dict[str, ShaderSource], members: set[str]) -> list[Diagnostic]:
-    """Uniforms and varyings that do nothing in this variant. members : uniforms and
-    attributes the linked program has."""
-    out = []
-    text = {stage: active_lines(source.text) for stage, source in sources.items()}
-    words = {stage: re.findall(r"\w+", "\n".join(line for _, line in lines)) for stage, lines in text.items()}
-    inputs = {name for kind, name, *_ in _declarations(text["fragment"]) if kind == "in"}
-    if GEOMETRY in sources:  # which declares what it hands on by macros
-        inputs |= set(re.findall(r"\w+", sources[GEOMETRY].text))
-    for stage, lines in text.items():
-        for kind, name, number, column in _declarations(lines):
-            mentioned = words[stage].count(name) > 1
-            problem = None
-            if kind == "uniform" and name not in members:
-                problem = (
-                    f"uniform '{name}' is never used"
-                    if not mentioned
-                    else f"uniform '{name}' has no effect on the output"
-                )
-            elif kind == "in" and stage == "fragment" and not mentioned:
-                problem = f"varying '{name}' is never read"
-            elif kind == "in" and stage == "vertex" and name not in members:
-                problem = f"vertex attribute '{name}' is never used"
-            elif kind == "out" and stage == "vertex" and name not in inputs:
-                problem = f"varying '{name}' is written but the fragment stage does not take it"
-            if problem:
-                file, line = sources[stage].locate(number)
-                out.append(Diagnostic(file, line, column, "unused", problem, stage))
-    return out
-
-
-def _declarations(lines: list[tuple[int, str]]):
-    """(kind, name, line number, column) of every in, out and uniform."""
-    for number, line in lines:
-        match = _DECLARATION.match(line)
-        for declarator in match[2].split(",") if match else ():
-            if name := _NAME.match(declarator):
-                column = re.search(rf"\b{name[1]}\b", line[match.start(2) :]).start() + match.start(2) + 1
-                yield match[1], name[1], number, column
-
-
 def _programs(files: list[str], shaders: str | None):
     """The folder, and the program files to compile."""
     folder = open_folder(shaders)
     if files and shaders is None:  # a file of another folder brings its folder along
         first = Path(files[0]).resolve()
         home = next((folder.parent for folder in first.parents if folder.name == "include"), first.parent)
-        if first.is_file() and home != Path(str(folder)).resolve():
+        if first.is_file() and home != folder.resolve():
             folder = open_folder(str(home))
     known = files_of(folder)
-    root = folder.path if isinstance(folder, EditedFolder) else Path(str(folder))
-    programs = [path.name for path in known if path.parent == root]
-    if isinstance(folder, EditedFolder) and "debug.glsl" not in programs:
-        programs.append("debug.glsl")
+    programs = [path.name for path in known if path.parent == folder]
     if not files:
         return folder, programs
     chosen: list[str] = []
@@ -171,7 +110,7 @@ def _programs(files: list[str], shaders: str | None):
             (
                 p
                 for p in known
-                if p.resolve() == Path(text).resolve() or str(p.relative_to(root)) == text or p.name == text
+                if p.resolve() == Path(text).resolve() or str(p.relative_to(folder)) == text or p.name == text
             ),
             None,
         )
@@ -180,12 +119,12 @@ def _programs(files: list[str], shaders: str | None):
                 "no such shader",
                 where="check",
                 value=text,
-                accepted="one of " + ", ".join(str(p.relative_to(root)) for p in known),
+                accepted="one of " + ", ".join(str(p.relative_to(folder)) for p in known),
             )
         wanted = (
             [path.name]
-            if path.parent == root
-            else [name for name in programs if _includes(folder, name, path.relative_to(root).as_posix())]
+            if path.parent == folder
+            else [name for name in programs if _includes(folder, name, path.relative_to(folder).as_posix())]
         )
         chosen += [name for name in wanted if name not in chosen]
     return folder, chosen
@@ -213,23 +152,13 @@ def as_text(result: Result) -> str:
             ),
             "",
         ]
-    for found in result.unused:
-        d = found.diagnostic
-        lines.append(
-            f"{d.where}: {d.text} in {found.count} of {result.programs[found.program]} variants of {found.program}, "
-            f"first {_defines(found.example)}"
-        )
-    if result.unused:
-        lines.append("")
     lines += [f"{name:<18} {count:>4} variants" for name, count in result.programs.items()]
     verdict = (
         f"{len(result.errors)} error{'s' if len(result.errors) != 1 else ''}"
         if result.errors
         else "all compile and link"
     )
-    lines.append(
-        f"{verdict}, {len(result.unused)} unused; {total} variants in {result.seconds:.1f} s on {result.renderer}"
-    )
+    lines.append(f"{verdict}; {total} variants in {result.seconds:.1f} s on {result.renderer}")
     return "\n".join(lines)
 
 
@@ -240,7 +169,7 @@ def _defines(defines: dict) -> str:
 # ------------------------------------------------------------------------------------------------- show
 
 
-def show_source(program: str, defines: list[str], stage: str, active: bool, numbers: bool, shaders: str | None) -> str:
+def show_source(program: str, defines: list[str], stage: str, numbers: bool, shaders: str | None) -> str:
     """What ``blinkgl shader show`` prints. Raises ConfigError, ShaderError."""
     table = {name: value or "1" for name, _, value in (text.partition("=") for text in defines)}
     if stage not in (*STAGES, GEOMETRY, "both"):
@@ -253,11 +182,7 @@ def show_source(program: str, defines: list[str], stage: str, active: bool, numb
         source = expand(program, one, table, folder)
         if stage == "both":
             out.append(f"// ---- {one} stage of {program}\n")
-        keep: Callable[[int], bool] = (
-            {n for n, _ in active_lines(source.text)}.__contains__ if active else (lambda n: True)
-        )
         for number, line in enumerate(source.text.split("\n")[:-1], 1):
-            if keep(number):
-                file, own = source.locate(number)
-                out.append((f"{f'{file}:{own}' if file else '-':<28} | " if numbers else "") + line + "\n")
+            file, own = source.locate(number)
+            out.append((f"{f'{file}:{own}' if file else '-':<28} | " if numbers else "") + line + "\n")
     return "".join(out)

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from blinkgl.errors import ConfigError
+
 app = typer.Typer(
     name="shader", no_args_is_help=True, rich_markup_mode=None, help="See what every pass wrote at a pixel, and why."
 )
@@ -124,8 +126,7 @@ def check(
     device: Annotated[int, typer.Option(min=0, help="EGL device.")] = 0,
     json: Json = False,
 ) -> None:
-    """Compile every program in every variant any configuration can ask for; list what is
-    unused. Exit status 1 on an error."""
+    """Compile every program in every variant any configuration can ask for. Exit status 1 on an error."""
     from blinkgl.shader_debugger import check as checking
 
     result = checking.check(files or [], shaders, backend, device)
@@ -141,36 +142,21 @@ def show(
         list[str] | None, typer.Option("--define", "-D", metavar="NAME[=VALUE]", help="May be repeated.")
     ] = None,
     stage: Annotated[str, typer.Option(help="vertex, geometry, fragment, or both for all.")] = "both",
-    active: Annotated[bool, typer.Option("--active", help="Only the lines that #if and #ifdef leave alive.")] = False,
     numbers: Annotated[bool, typer.Option("--numbers", help="File and line before each line.")] = False,
     shaders: Shaders = None,
 ) -> None:
     """Print a program's source as the compiler gets it, includes and defines written out."""
     from blinkgl.shader_debugger.check import show_source
 
-    typer.echo(show_source(program, define or [], stage, active, numbers, shaders), nl=False)
+    typer.echo(show_source(program, define or [], stage, numbers, shaders), nl=False)
 
 
-@app.command()
-def time(
-    config: Config,
-    at: Time = None,
-    seed: Seed = None,
-    sequence: Sequence = None,
-    shaders: Shaders = None,
-    overrides: Overrides = None,
-    repeat: Annotated[
-        int, typer.Option("--repeat", min=1, max=1000, help="Measurements; their median is reported.")
-    ] = 15,
-    json: Json = False,
-) -> None:
-    """GPU time of each pass and program variant, split into vertex and fragment work, with
-    draws, triangles and overdraw."""
-    from blinkgl.shader_debugger import timing
-
-    subject = _subject(config, seed, sequence, overrides)
-    result = timing.measure(subject, _when(subject, at, None), shaders, repeat)
-    typer.echo(_json.dumps(result) if json else timing.as_text(result))
+@app.command(hidden=True, context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
+def time() -> None:
+    """Refuse a command that earlier versions had."""
+    raise ConfigError(
+        "passes are no longer timed", where="shader time", accepted="your driver's profiler, or blinkgl trade"
+    )
 
 
 @app.command()

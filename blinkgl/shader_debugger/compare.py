@@ -23,7 +23,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -46,7 +45,6 @@ from blinkgl.shader_debugger.moments import (
     lookup_of,
     luma_of,
 )
-from blinkgl.shader_debugger.poses import displaced, pose_suspicions
 from blinkgl.shader_debugger.silhouettes import EDGED
 from blinkgl.shader_debugger.suspicions import suspicions
 
@@ -112,7 +110,16 @@ def _of_the_picture(g, r, gpu, ref):
 
 
 def _misplaced(g, r, gpu, ref):
-    return length(displaced(gpu, ref))
+    """(H, W) px from each pixel's centre to where the point drawn there lies by the true poses; inf where that is out
+    of the camera's sight. Needs nothing of the ray caster, so that a wrong pose is told apart from what comes later."""
+    part = gpu["part"]
+    out = np.zeros((*part.shape, 2))
+    for p, (thing, _) in enumerate(reference.scene_parts(ref.scene)):
+        y, x = np.nonzero(part == p)
+        pose = reference.relative_pose_at(ref.scene, thing, ref.when.t_ns)
+        seen = ref.scene.camera.project(gpu["local"][y, x].astype(np.float64) @ pose[:3, :3].T + pose[:3, 3])
+        out[y, x] = np.nan_to_num(seen - np.stack([x, y], axis=1), nan=np.inf)
+    return length(out)
 
 
 _TWIN = "against a CPU twin of mip-mapped sampling at the GPU's own uv and level; drivers may make mip maps differently"
@@ -359,37 +366,20 @@ class Comparison:
             raise TypeError(f"label '{name}': `reference` gives {np.shape(ref[name])} and not {np.shape(gpu[name])}")
         return gpu[name], ref[name]
 
-    def twin(self, of: str, **more: Any) -> np.ndarray:
-        """(H, W, 3) float64 albedo that pass ``of`` should have found with its own
-        coordinates; 0 where it drew nothing.
-        more : as for :meth:`twin_colour`."""
-        out = self.twin_colour(of, **more)
-        return out if of == "colour" else luma_of(out)
-
-    def twin_colour(
-        self, of: str, level: float = 0.0, texels: tuple[float, float] = (0.0, 0.0), material: Material | None = None
-    ) -> np.ndarray:
-        """:meth:`twin` in colour, for the luminance, too. Mistakes: a number of levels too coarse; coordinates moved by
-        texels of the full resolution; another material everywhere."""
-        gpu = self.gpu
+    def twin(self, of: str) -> np.ndarray:
+        """(H, W, 3) float64 albedo that pass ``of`` should have found with its own coordinates and level; 0 where it
+        drew nothing."""
+        gpu, frame = self.gpu, self.ref.frame
         out = np.zeros((*gpu["part"].shape, 3))
         for p, (_, part) in enumerate(reference.scene_parts(self.ref.scene)):
             on = gpu["part"] == p
-            used = material or part.material
-            move = 0.0 if used.texture is None else np.asarray(texels) / used.texture.image.shape[1::-1]
-            out[on] = mipmapped_albedo(
-                used,
-                np.nan_to_num(gpu[f"{of}_uv"][on].astype(np.float64)) + move,
-                gpu[f"{of}_level"][on].astype(np.float64) + level,
-            )
+            uv, level = (gpu[f"{of}_{what}"][on].astype(np.float64) for what in ("uv", "level"))
+            out[on] = mipmapped_albedo(part.material, np.nan_to_num(uv), level)
             if part.mesh.colours is not None:
-                frame = self.ref.frame
                 same = on & (frame.part == p)
-                tint = np.ones_like(out)
                 corners = part.mesh.colours[part.mesh.faces[frame.triangle[same]]].astype(np.float64)
-                tint[same] = np.einsum("nc,nck->nk", frame.bary[same], corners)
-                out[on] *= tint[on]
-        return out
+                out[same] *= np.einsum("nc,nck->nk", frame.bary[same], corners)
+        return out if of == "colour" else luma_of(out)
 
     def errors(self, name: str) -> np.ndarray:
         """(H, W) float64 in the quantity's unit; inf where the GPU wrote nan."""
@@ -425,8 +415,8 @@ class Comparison:
             quantity, self.tolerance(name) if tolerance is None else tolerance, errors, graded, band, value
         )
         report.objects = self._per_object(report)
-        if not report.passed and not of_map:
-            report.suspicions = pose_suspicions(self, report) if name == "local" else suspicions(self, report)
+        if not report.passed and not of_map and name != "local":
+            report.suspicions = suspicions(self, report)
         return report
 
     def _per_object(self, report: BufferReport) -> list[dict]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import queue
+import shutil
+import tempfile
 import threading
 from collections import OrderedDict
-from concurrent.futures import Future, wait
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,7 +31,6 @@ from blinkgl.shader_debugger.moments import (
 from blinkgl.shader_debugger.probe import _numbers, _surface_text, probe
 from blinkgl.shader_debugger.questions import SOURCES
 from blinkgl.shader_debugger.session import (
-    Snapshot,
     Subject,
     When,
     check_pixel,
@@ -47,9 +48,16 @@ MOST_ERRORS = 5  # shown at once
 
 
 class _Loader(ShaderLoader):
-    """Remembers what it was asked for last, to find the sources of an error."""
+    """Compiles from a copy of the shader folder: programs compile when something first asks for them, and one asked
+    for after a bad edit would be compiled from the bad file. Remembers what it was asked for last, to find the sources
+    of an error."""
 
     asked: tuple[str, dict] = ("", {})
+
+    def __init__(self, ctx: Any, folder: Path):
+        self._copy = tempfile.TemporaryDirectory(prefix="blinkgl-shaders-")
+        shutil.copytree(folder, self._copy.name, dirs_exist_ok=True)
+        super().__init__(ctx, Path(self._copy.name))
 
     def program(self, name, defines=None):
         self.asked = (name, dict(defines or {}))
@@ -74,7 +82,7 @@ class Inspector:
         self._context = open_renderer(self.subject, self._shaders)
         self.renderer = self._context.__enter__()
         try:
-            self.renderer.use_shaders(_Loader(self.renderer.gl.ctx, Snapshot.of(self.folder)))
+            self.renderer.use_shaders(_Loader(self.renderer.gl.ctx, self.folder))
             self._draw_all(when=self.first)
         except BaseException as error:
             self._context.__exit__(type(error), error, None)
@@ -134,7 +142,7 @@ class Inspector:
             "labels": [t * 1e-9 for t in config.time.label_times_ns],
             "interval": config.time.interval_ns * 1e-9,
             "maps": pictures.MAPS,
-            "folder": str(getattr(self.folder, "path", self.folder)),
+            "folder": str(self.folder),
             "passes": [
                 {"name": p.name, "title": p.title, "unit": p.unit, "kind": p.kind, "source": p.source}
                 for p in self._buffers().values()
@@ -191,7 +199,7 @@ class Inspector:
         """All buffers against the reference: what ``diff`` says first, and its text."""
         comparison = self._comparison(self._when(q["t"]))
         reports = [comparison.report(name) for name in comparison.names()]
-        found = verdict(comparison, reports)
+        found = verdict(reports)
         titles = {name: info.title for name, info in PASSES.items()}
         return _finite(
             found
@@ -221,7 +229,7 @@ class Inspector:
         """Takes the edited shaders when all of them compile and draw; otherwise keeps the old
         ones and :attr:`errors`."""
         old = self.renderer.gl.shaders
-        new = _Loader(self.renderer.gl.ctx, Snapshot.of(self.folder))
+        new = _Loader(self.renderer.gl.ctx, self.folder)
         self.renderer.use_shaders(new)
         try:
             self._draw_all(self._shown)
@@ -270,46 +278,27 @@ def _kept(cache: OrderedDict, key, make):
 
 
 class Worker:
-    """Runs an Inspector in its own thread, and watches its files. ``call`` may come from any thread."""
+    """Runs an Inspector in a thread of its own, and watches its files. ``call`` may come from any thread."""
 
     def __init__(self, inspector: Inspector):
         self.inspector = inspector
-        self._jobs: queue.Queue = queue.Queue()
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="render")
         self._stop = threading.Event()
         self.changed = threading.Condition()
         self.version = 1  # counts reloads, good and bad
-        opened: Future = Future()
-        self._thread = threading.Thread(target=self._run, args=(opened,), name="render", daemon=True)
-        self._thread.start()
-        opened.result()  # raises what opening raised
+        try:
+            self.call(inspector.open)
+        except BaseException:
+            self._thread.shutdown()
+            raise
         self._watcher = threading.Thread(target=self._watch, name="watch", daemon=True)
         self._watcher.start()
-
-    def _run(self, opened: Future) -> None:
-        try:
-            self.inspector.open()
-        except BaseException as error:  # noqa: BLE001 - raised by whoever waits
-            opened.set_exception(error)
-            return
-        opened.set_result(None)
-        while (job := self._jobs.get()) is not None:
-            function, arguments, answer = job
-            try:
-                answer.set_result(function(*arguments))
-            except BaseException as error:  # noqa: BLE001 - raised by whoever asked
-                answer.set_exception(error)
-        self.inspector.close()
 
     def call(self, function: Any, *arguments: Any) -> Any:
         """The result of ``function`` in the render thread; raises what it raised."""
         if self._stop.is_set():
             raise BlinkGLError("the server is stopping")
-        answer: Future = Future()
-        self._jobs.put((function, arguments, answer))
-        while not wait((answer,), 1.0).done:
-            if not self._thread.is_alive():
-                raise BlinkGLError("the server is stopping")
-        return answer.result()
+        return self._thread.submit(function, *arguments).result()
 
     def _watch(self) -> None:
         seen = last = self.inspector.stamps()
@@ -333,5 +322,5 @@ class Worker:
         with self.changed:
             self.changed.notify_all()
         self._watcher.join()
-        self._jobs.put(None)
-        self._thread.join()
+        self._thread.submit(self.inspector.close)
+        self._thread.shutdown()

@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from blinkgl.io.atomic import atomic_file, output_errors
-from blinkgl.io.colour import flow_wheel
 from blinkgl.io.pictures import map_scalar
 from blinkgl.shader_debugger.moments import PASSES, Pass
 
@@ -34,13 +33,6 @@ def _style(axes) -> None:
     axes.set_xticks([]), axes.set_yticks([])
     for spine in axes.spines.values():
         spine.set_color("#cbd5e1"), spine.set_linewidth(0.6)
-
-
-def _disc() -> np.ndarray:
-    """The flow wheel without its corners, RGBA."""
-    wheel = flow_wheel()
-    v, u = np.mgrid[-1 : 1 : len(wheel) * 1j, -1 : 1 : len(wheel) * 1j]
-    return np.dstack([wheel, np.where(np.hypot(u, v) <= 1, 255, 0).astype(np.uint8)])
 
 
 def _legend(figure: Figure, box: tuple[float, float, float, float], legend: dict, size: float) -> None:
@@ -73,22 +65,8 @@ def _legend(figure: Figure, box: tuple[float, float, float, float], legend: dict
         "unit": "r, g, b = x, y, z; grey is 0",
         "uv": "r, g = fractional part of u, v",
         "light": f"sRGB, white = {legend.get('high', 1):.3g}",
+        "wheel": f"hue: direction (+x red, +y yellow), saturated at {legend.get('high', 0):.3g}",
     }.get(kind, "")
-    if kind == "wheel":
-        ratio = figure.get_figheight() / figure.get_figwidth()
-        side = 2.1 * h
-        axes = figure.add_axes((x, y + h - side, side * ratio, side))
-        axes.imshow(_disc()), _style(axes)
-        axes.set_frame_on(False)
-        figure.text(
-            x + side * ratio * 1.25,
-            y + h / 2,
-            f"rim = {legend['high']:.3g}; hue is the direction",
-            fontsize=size,
-            color=MUTED,
-            va="center",
-        )
-        return
     figure.text(x, y + h / 2, text, fontsize=size, color=MUTED, va="center")
 
 
@@ -106,25 +84,23 @@ def _save(figure: Figure, path: Path, palette: bool = False) -> None:
         image.save(temporary, "PNG", optimize=palette)
 
 
+def _title(figure: Figure, ends: tuple[float, float], y: float, texts: tuple[str, str], colour: str = MUTED) -> None:
+    """A line above a picture: what it is at the left end, its unit at the right one (figure fractions)."""
+    figure.text(ends[0], y, texts[0], fontsize=8.5, color=INK, va="center", weight="bold")
+    figure.text(ends[1], y, texts[1], fontsize=7, color=colour, va="center", ha="right")
+
+
 def save_labelled(path: Path, info: Pass, rgb: np.ndarray, legend: dict, caption: str) -> None:
     """One buffer: title with unit, the pixels enlarged by a whole factor, colour bar, caption."""
     height, width = rgb.shape[:2]
     factor = max(1, round(700 / width))
     w, h, top, bottom = width * factor, height * factor, 46, 74
-    figure = Figure(figsize=((w + 40) / 100, (h + top + bottom) / 100))
     W, H = w + 40, h + top + bottom
+    figure = Figure(figsize=(W / 100, H / 100))
     axes = figure.add_axes((20 / W, bottom / H, w / W, h / H))
     axes.imshow(rgb, interpolation="nearest", aspect="auto"), _style(axes)
-    figure.text(20 / W, 1 - 18 / H, info.title, fontsize=12, color=INK, va="center", weight="bold")
-    figure.text(
-        1 - 20 / W,
-        1 - 18 / H,
-        f"{info.unit}   ·   {info.source}".strip(" ·"),
-        fontsize=8,
-        color=MUTED,
-        va="center",
-        ha="right",
-    )
+    said = f"{info.unit}   ·   {info.source}".strip(" ·")
+    _title(figure, (20 / W, 1 - 20 / W), 1 - 18 / H, (info.title, said))
     _legend(figure, (20 / W, 44 / H, min(360, w) / W, 14 / H), legend, 8)
     figure.text(20 / W, 10 / H, caption, fontsize=7, color=MUTED, va="center")
     _save(figure, path)
@@ -145,8 +121,7 @@ def save_contact_sheet(path: Path, tiles: list[tuple[Pass, np.ndarray, dict]], c
         y = H - top - (k // columns) * (h + head + foot) - head - h
         axes = figure.add_axes((x / W, y / H, w / W, h / H))
         axes.imshow(rgb, interpolation="antialiased", aspect="auto"), _style(axes)
-        figure.text(x / W, (y + h + 9) / H, info.title, fontsize=8.5, color=INK, va="center", weight="bold")
-        figure.text((x + w) / W, (y + h + 9) / H, info.unit, fontsize=7, color=MUTED, va="center", ha="right")
+        _title(figure, (x / W, (x + w) / W), (y + h + 9) / H, (info.title, info.unit))
         _legend(figure, (x / W, (y - 12) / H, w / W, 8 / H), legend, 6)
     _save(figure, path, palette=True)
 
@@ -171,24 +146,8 @@ def save_errors(path: Path, reports: list, caption: str) -> None:
         axes = figure.add_axes((x / W, y / H, w / W, h / H))
         axes.imshow(rgb, interpolation="antialiased", aspect="auto"), _style(axes)
         verdict, colour = ("ok", "#15803d") if report.passed else ("over tolerance", "#b91c1c")
-        figure.text(
-            x / W,
-            (y + h + 9) / H,
-            PASSES[report.quantity.name].title,
-            fontsize=8.5,
-            color=INK,
-            va="center",
-            weight="bold",
-        )
-        figure.text(
-            (x + w) / W,
-            (y + h + 9) / H,
-            f"{report.quantity.statistic} {report.value:.2g} {report.quantity.unit}: {verdict}",
-            fontsize=7,
-            color=colour,
-            va="center",
-            ha="right",
-        )
+        said = f"{report.quantity.statistic} {report.value:.2g} {report.quantity.unit}: {verdict}"
+        _title(figure, (x / W, (x + w) / W), (y + h + 9) / H, (PASSES[report.quantity.name].title, said), colour)
         bars = figure.add_axes((x / W, (y - 62) / H, w / W, 56 / H))
         inside = np.clip(decades[report.graded], -9, 2)
         bars.hist(inside, bins=np.linspace(-9, 2, 56), color="#3b6ea5")

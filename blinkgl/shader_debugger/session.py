@@ -29,7 +29,6 @@ from blinkgl.scene.types import Scene
 from blinkgl.shader_debugger.silhouettes import edged_of
 
 DEBUG_PROGRAM = "debug.glsl"
-LENT = (DEBUG_PROGRAM, "include/vertex.glsl")
 STEP_FRACTION = 100  # the step of dL/dt is this part of the label interval
 
 
@@ -124,29 +123,11 @@ def check_pixel(scene: Scene, text: str) -> tuple[int, int]:
     return x, y
 
 
-class EditedFolder:
-    """A user's copy of shaders/, to which :data:`DEBUG_PROGRAM`, and what that includes, is lent
-    when the copy is older than the debugger."""
-
-    def __init__(self, folder: Path, inside: str = ""):
-        self.path, self._inside = folder, inside
-
-    def __truediv__(self, name: str) -> Any:
-        inside = f"{self._inside}{name}"
-        if name == "include":
-            return EditedFolder(self.path, "include/")
-        own = self.path / inside
-        return shader_folder() / inside if inside in LENT and not own.exists() else own
-
-    def iterdir(self) -> Any:
-        return self.path.iterdir()
-
-
-def open_folder(shaders: str | None) -> Any:
+def open_folder(shaders: str | None) -> Path:
     """The folder whose shaders are debugged: ``shaders``, or the shipped ones. Raises
-    GLError when it cannot be read."""
+    GLError when it cannot be read, or is older than the debugger."""
     if shaders is None:
-        return shader_folder()
+        return Path(str(shader_folder()))
     folder = Path(shaders)
     accepted = "a copy of the shaders/ folder"
     if not folder.is_dir():
@@ -162,55 +143,16 @@ def open_folder(shaders: str | None) -> Any:
         )
     if not any(folder.glob("*.glsl")):
         raise GLError("no shaders in this folder", where="--shaders", value=shaders, accepted=accepted)
-    return EditedFolder(folder)
-
-
-class Snapshot:
-    """The shader folder as it was at one moment. Programs compile when something first asks for them: without it, a
-    variant asked for after a bad edit would be compiled from the bad file."""
-
-    def __init__(self, files: dict[str, bytes], path: str = ""):
-        self._files, self.path = files, path
-
-    @classmethod
-    def of(cls, folder: Any) -> Snapshot:
-        root = folder.path if isinstance(folder, EditedFolder) else Path(str(folder))
-        files = {}
-        places = {path.relative_to(root).as_posix(): path for path in files_of(folder)} | {
-            name: Path(str(folder / name)) for name in LENT
-        }
-        for name, path in places.items():
-            try:
-                files[name] = path.read_bytes()
-            except OSError:
-                pass  # gone or unreadable: missing here, and reported as missing when a program needs it
-        return cls(files)
-
-    @property
-    def name(self) -> str:
-        return self.path.rpartition("/")[2]
-
-    def __truediv__(self, name: str) -> Snapshot:
-        return Snapshot(self._files, f"{self.path}/{name}" if self.path else name)
-
-    def iterdir(self) -> Any:
-        inside = f"{self.path}/" if self.path else ""
-        return (
-            Snapshot(self._files, path)
-            for path in sorted(self._files)
-            if path.startswith(inside) and "/" not in path[len(inside) :]
+    if not (folder / DEBUG_PROGRAM).is_file():
+        raise GLError(
+            f"has no {DEBUG_PROGRAM}", where="--shaders", value=shaders, accepted=f"{accepted} of this version"
         )
-
-    def read_text(self, encoding: str = "utf-8") -> str:
-        if self.path not in self._files:
-            raise FileNotFoundError(self.path)
-        return self._files[self.path].decode(encoding)
+    return folder
 
 
-def files_of(folder: Any) -> list[Path]:
+def files_of(folder: Path) -> list[Path]:
     """Every shader file below ``folder``, for watching and for messages."""
-    root = folder.path if isinstance(folder, EditedFolder) else Path(str(folder))
-    return sorted([*root.glob("*.glsl"), *(root / "include").rglob("*.glsl")])
+    return sorted([*folder.glob("*.glsl"), *(folder / "include").rglob("*.glsl")])
 
 
 class _Nothing:
@@ -315,8 +257,8 @@ class DebugRenderer(Renderer):
 
     edged: tuple[str, ...] = ()
 
-    def __init__(self, gl: GLContext, scene: Scene, config: Any, painter: type[Painter] = DebugPainter):
-        super().__init__(gl, scene, config, whole=True, painter=painter)
+    def __init__(self, gl: GLContext, scene: Scene, config: Any):
+        super().__init__(gl, scene, config, whole=True, painter=DebugPainter)
 
     def use_shaders(self, loader: ShaderLoader) -> None:
         """Draw with another loader's programs from now on."""

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from blinkgl.shader_debugger.compare import QUANTITIES, BufferReport, Comparison
+from blinkgl.shader_debugger.compare import QUANTITIES, BufferReport
 
 
-def verdict(comparison: Comparison, reports: list[BufferReport]) -> dict:
+def verdict(reports: list[BufferReport]) -> dict:
     """Plain data (JSON).
 
     passed : every buffer is within its tolerance.
@@ -31,7 +31,7 @@ def verdict(comparison: Comparison, reports: list[BufferReport]) -> dict:
                     "pixels": one["pixels"],
                     "over_tolerance": one["over_tolerance"],
                     "then": [],
-                    "suspicion": _suspicion(report, one["object"], comparison.objects),
+                    "suspicion": next(iter(report.suspicions), ""),
                 },
             )
             if row["first"] != name:
@@ -47,19 +47,6 @@ def verdict(comparison: Comparison, reports: list[BufferReport]) -> dict:
             "objects": [row["object"] for row in rows.values() if row["first"] == top.name],
         }
     return {"passed": not failed, "first": first, "objects": list(rows.values())}
-
-
-def _suspicion(report: BufferReport, name: str, names: list[str]) -> str:
-    """The first that is about this object, or about no object."""
-    others = [n for n in names if n != name]
-    return next(
-        (
-            text
-            for text in report.suspicions
-            if not text.startswith(tuple(f"{n}{end}" for n in others for end in (":", " is ")))
-        ),
-        "",
-    )
 
 
 def as_text(found: dict) -> list[str]:

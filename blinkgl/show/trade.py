@@ -11,7 +11,7 @@ from rich.table import Table
 from blinkgl.config.run import load_run
 from blinkgl.errors import ConfigError
 from blinkgl.machine.terminal import plain_console, say
-from blinkgl.trade.measure import QUICK, TRACED_LEVELS, Options
+from blinkgl.trade.measure import QUICK, Options
 from blinkgl.trade.run import convergence_line, trade, write
 
 
@@ -30,7 +30,6 @@ def run(
     rounds: int | None,
     minutes: float | None,
     cost: str,
-    reference: str = "raster",
     reference_set: list[str] | None = None,
     seed: int | None = None,
 ) -> int:
@@ -40,8 +39,6 @@ def run(
     if suite_options:
         raise ConfigError("is of the suite", where=", ".join(suite_options), accepted="together with --suite")
     check_cost(cost)
-    if reference not in ("raster", "cycles"):
-        raise ConfigError("unknown reference", where="--reference", value=reference, accepted="raster or cycles")
     template = load_run(config, overrides, seed=seed)
     options = QUICK if quick else Options()
     changes: dict[str, Any] = {
@@ -49,8 +46,6 @@ def run(
         "sequence": template.sequence(0).output.first_index if sequence is None else sequence,
     }
     changes["reference_set"] = tuple(reference_set or ())
-    if reference == "cycles":
-        changes |= {"reference": reference, "levels": TRACED_LEVELS}
     if clip is not None:
         changes["clip_s"] = clip
     if rounds is not None:
@@ -108,19 +103,6 @@ def show(result: dict, console: Console) -> None:
     console.print(table)
     console.print(result["machine"], highlight=False, soft_wrap=True)
     for name, size in result["sizes"].items():
-        last = size["levels"][-1]
-        if last["frame_wall_s"] is not None:
-            mine = [r for r in result["settings"] if (r["size"] or "full") == name]
-            span = lambda key, mine=mine: " to ".join(
-                f"{f(r[key] / r['frames_per_s'] for r in mine):.4f}" for f in (min, max)
-            )
-            console.print(
-                f"seconds per frame of {size['width']}x{size['height']}, wall (processor): Cycles "
-                f"{last['frame_wall_s']:.2f} ({last['frame_cpu_s']:.2f}), the settings {span('wall_s')} "
-                f"({span('cpu_s')})",
-                highlight=False,
-                soft_wrap=True,
-            )
         line = convergence_line(result, name)
         console.print(
             ("" if name == "full" else f"{name}: ") + line,

@@ -77,10 +77,8 @@ class _OnDevice(Emulator):
     def state_dict(self) -> dict[str, np.ndarray]:
         """That of the emulator on the processor."""
         there = self._batch.state_dict()
-        # The leak clock and the brightest pixel are state of V2e that the batch keeps in another form.
+        # The batch keeps V2e's leak clock in another form.
         epoch = {"_epoch_ns": there["clock"][:, 3]}
-        if "_intensity" in there:
-            epoch["_brightest"] = there["_intensity"].amax()[None].to(torch.float64)
         for name, values in {**there, **epoch}.items():
             if name in self._state:
                 mine = getattr(self, name)

@@ -40,7 +40,7 @@ ENOUGH = 0.1
 
 @dataclass(frozen=True)
 class Density:
-    """How dense a reference has to be is the scene's affair: first frames come closer, at few samples a pixel, until
+    """How dense a reference has to be depends on the scene: first frames come closer, at few samples a pixel, until
     that moves the events by less than ``share`` of what is allowed (:data:`ENOUGH`); then samples are doubled at that
     step. What the last halving of the step moved is added to what the last doubling of the samples did.
 
@@ -71,7 +71,6 @@ class Options:
     height of the judged rectangles.
     levels : (samples per pixel side, px between frames) of the reference, rising until it has
     converged or ``reference_s`` is spent. A :class:`Density` instead: each scene's own.
-    reference : "raster", or "cycles" (extra [cycles]): the same scene path-traced, samples² paths a pixel.
     reference_set : overrides of the scene, "scene.a.b=c", that the reference alone has: effects that are left out.
     rounds, rounds_s : at most so many rounds, and no new one when so many seconds are gone."""
 
@@ -83,13 +82,11 @@ class Options:
     rounds_s: float = 1200.0
     limit_us: int = 10_000
     sequence: int = 0
-    reference: str = "raster"
     reference_set: tuple[str, ...] = ()
     labels: bool = True
     """Whether flow labels are judged, too."""
 
 
-TRACED_LEVELS = ((8, 0.5), (16, 0.25), (32, 0.125))
 QUICK = Options(
     tiles=(3, 2, 24, 18),
     levels=((8, 0.12), (16, 0.08), (32, 0.056)),
@@ -151,7 +148,7 @@ class Measured:
 @dataclass(eq=False)
 class Level:
     """One reference of the ladder. movement : errors of the level before, judged by this one; smallest : the smallest
-    error of any setting judged by this one. frame_wall_s, frame_cpu_s : of a path tracer, rendering alone, median."""
+    error of any setting judged by this one."""
 
     scale: int
     max_px: float
@@ -163,8 +160,6 @@ class Level:
     smallest: dict[str, float] | None = None
     whole: bool = True
     """Whether samples and step have both been changed: half a movement shows nothing."""
-    frame_wall_s: float | None = None
-    frame_cpu_s: float | None = None
 
     @property
     def ratio(self) -> dict[str, float]:
@@ -185,8 +180,6 @@ class Level:
             "frames": self.frames,
             "seconds": self.seconds,
             "events": len(self.events),
-            "frame_wall_s": self.frame_wall_s,
-            "frame_cpu_s": self.frame_cpu_s,
             "movement": self.movement,
             "smallest": self.smallest,
             "ratio": self.ratio,
@@ -206,10 +199,6 @@ class Bench:
         say: Callable[[str], None] = lambda _: None,
     ):
         self.gl, self.options, self.say = gl, options, say
-        if options.reference == "cycles":
-            from blinkgl.blender import process
-
-            process.require()  # now, not after minutes of measuring
         base = template.sequence(options.sequence)
         if base.frames is not None:
             raise ConfigError("nothing is rendered from recorded frames, so there is nothing to trade", where="frames")
@@ -331,14 +320,12 @@ class Bench:
                 self.say(f"reference: {scale}x{scale} at {max_px:g} px would take too long; stopped")
                 break
             started = time.perf_counter()
-            with self._source(scale) as source:
+            with FineTiles(self.gl, self.reference_scene, self.tiles, scale) as source:
                 times = list(source.times(max_px, self.t0_ns, self.t1_ns))
                 events, frames = reference_events(
                     source, times, self.emulator, self.height, self.width, self.seed, self.mask
                 )
             level = Level(scale, max_px, frames, time.perf_counter() - started, events)
-            if cost := source.cost:
-                level.frame_wall_s, level.frame_cpu_s = float(np.median(cost.wall_s)), float(np.median(cost.cpu_s))
             for result in results:
                 result.errors = self.errors(events, result.events, speeds)
             if levels and results:
@@ -369,13 +356,6 @@ class Bench:
         """What the step moved the last time that it alone was changed."""
         halved = [b.movement for a, b in pairwise(levels) if a.scale == b.scale and b.movement]
         return halved[-1] if halved else dict.fromkeys(JUDGED, 0.0)
-
-    def _source(self, scale: int):
-        if self.options.reference == "cycles":
-            from blinkgl.trade.traced import TracedFrames
-
-            return TracedFrames(self.gl, self.reference_scene, self.tiles, scale)
-        return FineTiles(self.gl, self.reference_scene, self.tiles, scale)
 
     def errors(self, reference: Events, events: Events, speeds: SpeedMaps) -> EventErrors:
         return event_errors(

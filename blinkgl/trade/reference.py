@@ -31,16 +31,13 @@ from blinkgl.types.events import Events
 SAMPLES = RenderConfig(antialiasing="edges", mip_bias=-1.0)
 """How the samples are drawn."""
 FrameSource = Callable[[Iterable[int]], Iterator[np.ndarray]]
-"""Times in ns -> luminance frames (H, W) float32, linear light; only the judged pixels count. What else renders the
-scene (a path tracer) takes the rasteriser's place by being one of these."""
+"""Times in ns -> luminance frames (H, W) float32, linear light; only the judged pixels count."""
 MAX_STEP_NS = 20_000_000
 
 
 class FineTiles(Cutouts):
     """Rectangles of a scene's image at ``scale`` x ``scale`` samples a pixel, and the times that they want. A context
     manager; calling it is a FrameSource."""
-
-    cost = None
 
     def __init__(
         self, gl: GLContext, scene: Scene, tiles: tuple[Rectangle, ...], scale: int, samples: RenderConfig = SAMPLES

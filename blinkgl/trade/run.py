@@ -122,7 +122,6 @@ def trade(
         "config": template.tree,
         "sequence": options.sequence,
         "quick": quick,
-        "reference": options.reference,
         "reference_set": list(options.reference_set),
         "only": only or [],
         "skip": skip or [],
@@ -143,11 +142,7 @@ def convergence_line(result: dict, size: str = "full") -> str:
     """One sentence on how far the reference can be trusted."""
     levels = result["sizes"][size]["levels"]
     last = levels[-1]
-    samples = (
-        f"{last['scale'] ** 2} paths a pixel by Cycles"
-        if result.get("reference") == "cycles"
-        else f"{last['scale']}x{last['scale']} samples a pixel"
-    )
+    samples = f"{last['scale']}x{last['scale']} samples a pixel"
     what = f"{samples}, {last['max_px']:g} px between frames ({last['frames']} frames)"
     if more := result.get("reference_set"):
         what += f", with {', '.join(more)}"

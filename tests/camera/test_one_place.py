@@ -6,7 +6,6 @@ from sources import parsed
 
 READS_OTHERS = {
     "blinkgl/scene/worlds/from_file.py",  # pyrender's cameras have such names
-    "blinkgl/trade/cycles.py",  # Blender's camera is told ours
 }
 
 

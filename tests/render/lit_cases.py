@@ -1,5 +1,5 @@
-"""Light and materials beside a path tracer: scenes of one effect each, and the same in Blender's Cycles (extra
-[cycles], ``blinkgl/trade/cycles.py``) at path depth 1.
+"""Light and materials beside a path tracer: scenes of one effect each, which Blender's Cycles has drawn at path
+depth 1 (``golden/cycles_light.npz``).
 
 Diffuse scenes: floor, ball, box, open sheet. Metal: five balls of five roughnesses, graded by themselves. Of each the
 relative difference of colours, (theirs - ours) / (theirs + 0.01), over pixels off silhouettes and, of hard shadows,
@@ -33,7 +33,6 @@ from blinkgl.scene.types import Fog, Gloss, Lamp, Light, Map, Mask, Material, Me
 from blinkgl.scene.worlds.sky import panorama_light
 from blinkgl.shader_debugger.lamps import near_an_edge
 from blinkgl.shader_debugger.session import DebugRenderer
-from blinkgl.trade.cycles import CyclesSettings, colours
 
 EXPOSURE_US = 20_000
 ROUGHNESSES = (0.1, 0.25, 0.45, 0.7, 1.0)
@@ -69,7 +68,7 @@ def _seen(objects, light: Light, size: tuple[int, int]) -> Scene:
     return Scene(tuple(objects), Rig.alone(camera, StaticPath(T)), 0, 1_000_000, light, 0.3)
 
 
-def matt(light: Light, size=(128, 96), **paint) -> Scene:
+def matt(light: Light, size=(64, 48), **paint) -> Scene:
     """Floor, ball, box and an open sheet; ``paint``: more of the materials of the last three."""
     return _seen(
         [
@@ -94,7 +93,7 @@ def matt(light: Light, size=(128, 96), **paint) -> Scene:
     )
 
 
-def metal(light: Light, smooth: bool, size=(160, 64)) -> Scene:
+def metal(light: Light, smooth: bool, size=(80, 32)) -> Scene:
     """Balls of metal, of the smooth ones of :data:`ROUGHNESSES` or of the others."""
     ball = sphere(radius=0.42, segments=128, rings=64)
     balls = [
@@ -191,25 +190,17 @@ def cases(panoramas: Path | None) -> Iterator[Case]:
     yield Case("fog", replace(matt(plain), fog=Fog(0.12, 0.5)), every)
     yield Case("defocus", matt(plain), every, images={"exposure_us": 1.0, "lens": {"aperture": 0.25, "focus": 4.8}})
     yield Case("motion blur", moving(matt(plain)), every, images={"exposure_us": EXPOSURE_US})
-    for smooth in (True, False):
-        yield Case("metal, sun and sky", metal(plain, smooth), (1, 2, 3, 4, 5))
+    for smooth, kind in ((True, "metal"), (False, "metal, rough")):
+        yield Case(f"{kind}, sun and sky", metal(plain, smooth), (1, 2, 3, 4, 5))
     for file in sorted(panoramas.glob("*.hdr")) if panoramas is not None else ():
         light = panorama_light(file, 0.0, 1.0, Light(), file.name)
         yield Case(f"panorama {file.stem}", matt(light), every)
-        for smooth in (True, False):
-            yield Case(f"metal, panorama {file.stem}", metal(light, smooth), (1, 2, 3, 4, 5))
+        for smooth, kind in ((True, "metal"), (False, "metal, rough")):
+            yield Case(f"{kind}, panorama {file.stem}", metal(light, smooth), (1, 2, 3, 4, 5))
 
 
-def compared(
-    gl, case: Case, samples: int, seed: int = 0
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, reference.ReferenceFrame]:
-    """((H, W, 3) ours, theirs, (H, W) bool what is graded, the reference's frame)."""
-    settings = CyclesSettings(samples, seed, shadows=case.shadows, occlusion=False, bounces=0)
-    if case.images is not None:
-        given = ImagesConfig(**case.images, times=(0.0,))
-        open_ns = 1000 * case.images["exposure_us"] if case.images["exposure_us"] > 1 else 0
-        settings = replace(settings, lens=given.lens, exposure_ns=int(open_ns))
-    (theirs,) = colours(case.scene, [0], settings)
+def graded(gl, case: Case, theirs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """((H, W) relative difference of our picture from theirs, (H, W) ids of the objects where it counts, else 0)."""
     with DebugRenderer(gl, case.scene, RenderConfig(image_antialiasing="ssaa4")) as renderer:
         at_once = ours = renderer.colour(0).read()
         if case.images is not None:
@@ -217,11 +208,12 @@ def compared(
         maps = renderer.maps
     true = reference.render(case.scene, 0)
     if case.images is not None:
-        return ours, theirs, relative(at_once, ours) > 0.02, true
-    graded = np.isin(true.instance, case.graded) & ~reference.silhouette_band(true.instance, true.depth)
+        counts = relative(at_once, ours) > 0.02
+    else:
+        counts = np.isin(true.instance, case.graded) & ~reference.silhouette_band(true.instance, true.depth)
     if case.scene.light.shadows == "hard":
-        graded &= ~near_an_edge(case.scene, true, maps)
-    return ours, theirs, graded, true
+        counts &= ~near_an_edge(case.scene, true, maps)
+    return relative(ours, theirs), np.where(counts, np.maximum(true.instance, 1), 0)
 
 
 def relative(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:

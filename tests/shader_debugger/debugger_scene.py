@@ -91,7 +91,7 @@ LOOKUP_MISTAKES = {
             ("include/vertex.glsl", "in vec2 uv;", "noperspective in vec2 uv;"),
         ],
         "luminance_uv",
-        "without perspective",
+        "",
         {"floor"},
     ),
     "sRGB decoded twice": (
@@ -128,7 +128,7 @@ LOOKUP_MISTAKES = {
             )
         ],
         "luminance_direct",
-        "the interpolated normal is not normalised",
+        "",
         {"ball"},
     ),
     "width and height exchanged": (
@@ -160,8 +160,6 @@ class LatePath:
 
 
 def with_stale_pose(scene, name: str, late_ns: int):
-    """The scene with one object (or "camera") where it was ``late_ns`` ago."""
-    if name == "camera":
-        return scene.with_path(LatePath(scene.rig.path, late_ns))
+    """The scene with one object where it was ``late_ns`` ago."""
     late = [replace(o, path=LatePath(o.path, late_ns)) if o.name == name else o for o in scene.objects]
     return replace(scene, objects=tuple(late))

@@ -15,7 +15,11 @@ from sources import parsed
 from blinkgl import cli
 
 PACKAGE = Path(cli.__file__).parent
-COMMANDS = sorted(name for name, command in typer.main.get_command(cli.app).commands.items() if name != "shader")
+COMMANDS = sorted(
+    name
+    for name, command in typer.main.get_command(cli.app).commands.items()
+    if name != "shader" and not command.hidden  # hidden: gone, and refused
+)
 
 
 @pytest.mark.parametrize("name", COMMANDS)

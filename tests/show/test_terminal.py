@@ -41,7 +41,7 @@ def test_help_says_every_word_of_every_option(name, capsys, monkeypatch):
 
 def test_extras_are_named_in_help(capsys):
     assert cli.run(["generate", "--help"]) == 0 and "[cluster]" in capsys.readouterr().out
-    assert cli.run(["trade", "--help"]) == 0 and "[cycles]" in capsys.readouterr().out
+    assert cli.run(["import", "--help"]) == 0 and "[cycles]" in capsys.readouterr().out
 
 
 def test_texts_tables_titles_and_bars_keep_their_brackets(capsys):

@@ -5,15 +5,12 @@ from __future__ import annotations
 import csv
 import json
 import re
-from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import yaml
-from rich.console import Console
 
-from blinkgl.blender import process
 from blinkgl.cli import run
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.config.run import load_run
@@ -23,8 +20,6 @@ from blinkgl.events.table import EMULATORS
 from blinkgl.render.cutouts import lattice, mask_of
 from blinkgl.render.rectangles import Rectangle
 from blinkgl.render.renderer import Renderer
-from blinkgl.show.trade import show
-from blinkgl.trade import cycles, run as run_module
 from blinkgl.trade.measure import Bench, Level, Options
 from blinkgl.trade.pareto import pareto_front
 from blinkgl.trade.reference import FineTiles
@@ -254,6 +249,7 @@ def test_errors(config, tmp_path, capsys):
     for arguments, message in (
         (["--only", "raytracing"], "--only, --skip: no setting is called that"),
         (["--cost", "euros"], "--cost: unknown cost"),
+        (["--reference", "cycles"], "--reference: scenes are no longer path-traced; expected --reference-set"),
         (["--set", "render.antialiasing=fxaa"], "render.antialiasing"),
     ):
         assert run(["trade", str(config), "-o", str(tmp_path / "x"), *arguments]) == 2
@@ -263,42 +259,6 @@ def test_errors(config, tmp_path, capsys):
     (tmp_path / "f.yaml").write_text("frames: {folders: nothing}\n")
     assert run(["trade", str(tmp_path / "f.yaml"), "-o", str(tmp_path / "x")]) == 2
     assert "nothing to trade" in capsys.readouterr().err
-
-
-def test_a_path_tracer_in_the_references_place(gl, config, monkeypatch, tmp_path, capsys):
-    """What Cycles would be asked for, drawn by the rasteriser: the same events as the reference
-    it replaces, and named in the sentence."""
-    asked = []
-
-    def frames(scene, times, settings, cost):
-        asked.append((settings.samples, settings.bounces, settings.shadows))
-        cost.wall_s, cost.cpu_s = [2.0, 3.0, 7.0], [5.0]
-        with FineTiles(gl, scene, (Rectangle(0, 0, scene.camera.width, scene.camera.height),), 2) as source:
-            yield from source(times)
-
-    monkeypatch.setattr(
-        run_module, "create_context", lambda *_: nullcontext(gl)
-    )  # else theirs is current, not this one
-    monkeypatch.setattr(cycles, "frames", frames)
-    monkeypatch.setattr(process, "available", lambda: "")
-    options = replace(OPTIONS, tiles=(1, 1, 64, 48), reference="cycles")
-    setting = (Setting("displacement 1 px"),)
-    result = trade(load_run(config), settings=setting, options=options)
-    assert asked == [(4, 4, True), (16, 4, True)] and "16 paths a pixel by Cycles" in convergence_line(result)
-    show(result, Console())
-    assert re.search(r"Cycles 3\.00 \(5\.00\), the settings \d+\.\d", capsys.readouterr().out), (
-        "theirs are timed: whatever they are"
-    )
-    same = trade(
-        load_run(config), settings=setting, options=replace(options, reference="raster", levels=((2, 0.5), (2, 0.25)))
-    )
-    assert result["settings"][0]["voxel"] == pytest.approx(same["settings"][0]["voxel"], rel=0.02)
-
-    monkeypatch.setattr(process, "available", lambda: "no bpy here")
-    assert run(["trade", str(config), "-o", str(tmp_path / "x"), "--reference", "cycles"]) == 2
-    assert run(["trade", str(config), "-o", str(tmp_path / "x"), "--reference", "truth"]) == 2
-    error = capsys.readouterr().err
-    assert "error: no bpy here" in error and "--reference: unknown reference" in error and error.count("\n") == 2
 
 
 def test_an_unchecked_reference_is_called_that():

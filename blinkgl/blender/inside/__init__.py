@@ -2,5 +2,5 @@
 
 In:    a folder with a job, the scene's file.
 Out:   a GLB in that folder, lines of JSON.
-Start: convert.py, the import; trace.py path-traces a scene by Cycles.
+Start: convert.py, the import.
 """

@@ -154,7 +154,9 @@ class PreviewConfig(Config):
 
     enabled: bool = Field(True, description="false: no preview")
     rate: float = Field(30.0, gt=0, le=1e4, description="pictures per second of simulated time, Hz")
-    slowdown: float = Field(2.0, gt=0, le=1000, description="play-back this many times slower than the simulation")
+    slowdown: ClassVar = 2.0
+    """Play-back is this many times slower than the simulation."""
+    fixed: ClassVar = ("slowdown",)
 
 
 def _file_name(name: str) -> str:

@@ -262,8 +262,7 @@ def _files(found: Collected) -> list[tuple[str, str, str, str]]:
     for label in LABELS.values():
         for form in label.forms:
             if any(form.holds(name) for name in names):
-                one = form.rows is not None
-                pattern = f"{form.folder}.{form.ending}" if one else f"{form.folder}/*.{form.ending}"
+                pattern = f"{form.folder}/*.{form.ending}"
                 kinds.append((pattern.replace("/*", "").replace("/", "_"), pattern, label.about))
     return [(kind, file, what, _ENCODINGS[file.rpartition(".")[2]]) for kind, file, what in kinds]
 

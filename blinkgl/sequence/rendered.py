@@ -22,7 +22,7 @@ from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.truth import Surfaces, SurfaceTruth
 from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging import FrameCamera
-from blinkgl.labels import LABELS, Label, LabelRequest, asked_for
+from blinkgl.labels import LABELS, LabelRequest, asked_for
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.tracks import Tracks, track_points
@@ -215,12 +215,8 @@ class RenderedSequence(Simulation):
         return GroundTruth(k, t_ns, frame, *leads_to, camera[0], objects[:, 0])
 
     def _picture(self, t_ns: int) -> Picture:
-        over = {}
-        if self._over:
-            frame = self.renderer.labels(t_ns, self._over)
-            over = {name: frame.values[name] for name in self._over}
         image = self.renderer.colour(t_ns, antialiasing="none").read()
-        return Picture(t_ns, image, self.renderer.velocity(t_ns).read(), over)
+        return Picture(t_ns, image, self.renderer.velocity(t_ns).read())
 
     @property
     def seconds(self) -> dict[str, float]:
@@ -251,14 +247,6 @@ class RenderedSequence(Simulation):
     @property
     def lens(self) -> CameraModel | None:
         return self.scene.camera if self.scene.camera.coefficients else None
-
-    @cached_property
-    def _over(self) -> LabelRequest:
-        """Labels that are drawn over pictures: those that are asked for and know how."""
-        if self.sensor.labels is None:
-            return LabelRequest()
-        asked = asked_for(self.sensor.labels)
-        return asked.only(name for name in asked if type(LABELS[name]).drawn_on is not Label.drawn_on)
 
     @property
     def rectifies(self) -> bool:

@@ -249,7 +249,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "backward": {"labels": {"flow": ["backward"]}},
         "none": {"labels": {"flow": []}},
     },
-    "float flow": {"none": NOTHING, **{name: {"labels": {"float_flow": [name]}} for name in ("npy", "flo", "h5")}},
+    "float flow": {"none": NOTHING, **{name: {"labels": {"float_flow": [name]}} for name in ("npy", "flo")}},
     "labels": {
         "default": NOTHING,
         "all": {
@@ -268,7 +268,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "surfaces, ideal": {"tracks": {"points": 20, "choose": "surface", "rate": 300}, "imu": {"rate": 90}},
         "drawn": {"tracks": {"points": {"integer": [5, 9]}, "choose": "random"}},
     },
-    "preview": {"off": NOTHING, "on": {"preview": {"enabled": True, "rate": 100, "slowdown": 10}}},
+    "preview": {"off": NOTHING, "on": {"preview": {"enabled": True, "rate": 100}}},
     "time": {
         "from 0": NOTHING,
         "late": {"time": {"start": 3.0}},

@@ -309,7 +309,7 @@ def test_only_requested_labels_are_written(tmp_path):
 def test_preview_shows_the_sequence(tmp_path):
     import imageio.v3 as iio
 
-    folder = generate(tmp_path, preview={"enabled": True, "rate": 40, "slowdown": 4})[0]
+    folder = generate(tmp_path, preview={"enabled": True, "rate": 40})[0]
     video = iio.imread(folder / "preview.mp4")
     assert len(video) == 11 and video.shape[2] > 3 * 64 and video.std() > 10
 

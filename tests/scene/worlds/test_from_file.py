@@ -325,11 +325,6 @@ def test_file_scene(tmp_path):
         ),
         ({"camera": 3}, animated, "scene.camera: no such camera in the file (got 3)"),
         ({}, lambda: (lambda b: (b.node(mesh=triangle(b)), b)[1])(GltfBuilder()), "scene.pose: the file has no camera"),
-        (
-            {"max_faces": 1},
-            lambda: (lambda b: (b.node(mesh=b.mesh(BOX.vertices, BOX.faces)), b)[1])(with_camera(GltfBuilder())),
-            "too many faces (got 12); expected at most 1",
-        ),
         ({}, lambda: with_camera(GltfBuilder()), "the scene has no faces"),
     ],
 )

@@ -345,11 +345,8 @@ def simulate(
         str | None,
         typer.Option(help="srgb, linear or an exponent (default: srgb for integer pixels, linear for floats)."),
     ] = None,
-    interpolate: Annotated[
-        str, typer.Option(help="Between frames: linear, cubic, or motion (dense-flow warp).")
-    ] = "linear",
+    interpolate: Annotated[str, typer.Option(help="Between frames: linear, or motion (dense-flow warp).")] = "linear",
     max_px: Annotated[float, typer.Option(min=0.01, help="motion: largest displacement per step, px.")] = 1.0,
-    factor: Annotated[int, typer.Option(min=1, max=1000, help="cubic: steps per given frame.")] = 4,
     seed: Annotated[int, typer.Option(help="Seed of the emulator.")] = 0,
     preview: Annotated[str | None, typer.Option(help="Also write a video of frames and events, .mp4.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
@@ -371,7 +368,6 @@ def simulate(
         gamma=gamma,
         interpolate=interpolate,
         max_px=max_px,
-        factor=factor,
         seed=seed,
         preview=preview,
         overwrite=overwrite,

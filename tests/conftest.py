@@ -35,7 +35,7 @@ class _Lender:
     WHERE = (
         "blinkgl.dataset.generate",
         "blinkgl.dataset.work",
-        "blinkgl.dataset.verify.again",
+        "blinkgl.dataset.verify.reproduce",
         "blinkgl.sequence.rendered",
         "blinkgl.sequence.rig",
         "blinkgl.trade.run",

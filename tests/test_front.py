@@ -321,7 +321,6 @@ WRONG = [
     ("Events.x", lambda d: b.Events([1], events.y, events.t, events.p)),
     ("frames", lambda d: b.simulate(5)),
     ("fps", lambda d: b.simulate([grey], fps="fast")),
-    ("factor", lambda d: b.simulate([grey], fps=10, interpolate="cubic", factor=0)),
     ("frames[1]", lambda d: list(b.simulate([grey, ["a", [1]]], fps=10))),
     ("frames[0]", lambda d: list(b.simulate([(grey, "noon"), (grey, "one")]))),
     ("gamma", lambda d: b.simulate([grey], fps=10, gamma=[])),

@@ -123,7 +123,7 @@ def build(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
 
 
 def passes(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
-    """A luminance frame of the configuration, drawn and read, by antialiasing; with rates."""
+    """A luminance frame of the configuration, drawn and read, by antialiasing."""
     from blinkgl.gl import create_context
     from blinkgl.render.renderer import Renderer
 
@@ -136,12 +136,9 @@ def passes(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
         return stack.enter_context(Renderer(gl, scene, render))
 
     drawn = {kind: renderer(kind) for kind in ("none", "edges", "ssaa2")}
-    rows: Rows = {
+    return {
         kind: lambda one=one: [one.luminance(next(times)).read() for _ in range(4)] and 4 for kind, one in drawn.items()
     }
-    plain = drawn["none"]
-    rows["none, rates"] = lambda: plain.luminance(next(times), rate=True).read() is None
-    return rows
 
 
 def labels(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:

@@ -113,19 +113,6 @@ class CameraModel(ABC):
         """How far, px, the image of a point moves at most when (X / Z, Y / Z) changes by a step of length 1."""
         return self.magnification
 
-    def pixels_per_unit(self, centres: np.ndarray, radius: float) -> np.ndarray:
-        """(n,) pixels in the image per unit of length on any surface in spheres about (n, 3) centres, at most: 0 for
-        a sphere out of the picture,
-        inf for one that reaches the near plane in it."""
-        distance = np.linalg.norm(centres, axis=1)
-        away = np.arctan2(np.hypot(centres[:, 0], centres[:, 1]), centres[:, 2])
-        half = np.arcsin(np.clip(radius / np.maximum(distance, 1e-300), 0.0, 1.0))
-        seen = (distance <= radius) | ((away <= self.half_angle + half) & (centres[:, 2] + radius > self.near))
-        nearest = centres[:, 2] - radius
-        with np.errstate(divide="ignore"):
-            scale = np.where(nearest > self.near, self.magnification / nearest, np.inf)
-        return np.where(seen, scale, 0.0)
-
     # ---- what follows ------------------------------------------------------------------------------------------
 
     def disparity(self, depth: np.ndarray, baseline: float) -> np.ndarray:

@@ -95,7 +95,8 @@ class Config(BaseModel):
 
     presets : values that the key ``preset`` of a model gives to those of its other keys that are not given.
     instead : keys that are given in the place of another, which then is null where it is not given itself.
-    removed : keys of earlier versions; see :class:`Removed`."""
+    removed : keys of earlier versions; see :class:`Removed`.
+    fixed : keys of earlier versions that have one value now, a constant of the class."""
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True, ignored_types=(Rule,)
@@ -103,6 +104,7 @@ class Config(BaseModel):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     instead: ClassVar[Mapping[str, str]] = {}
     removed: ClassVar[Mapping[str, Removed]] = {}
+    fixed: ClassVar[tuple[str, ...]] = ()
     rules: ClassVar[tuple[Rule, ...]] = ()
 
     @classmethod
@@ -122,7 +124,7 @@ class Config(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _fill_preset(cls, data: Any) -> Any:
-        if isinstance(data, dict) and not cls.removed.keys().isdisjoint(data):
+        if isinstance(data, dict) and not {*cls.removed, *cls.fixed}.isdisjoint(data):
             data = {key: value for key, value in data.items() if not cls._is_removed(key, value)}
         if cls.presets and isinstance(data, dict):
             name = data.get("preset", cls.model_fields["preset"].default)
@@ -132,6 +134,11 @@ class Config(BaseModel):
     @classmethod
     def _is_removed(cls, key: str, value: Any) -> bool:
         """Return whether a key of an earlier version may be ignored. Raises Refused where its value would matter."""
+        if key in cls.fixed:
+            now = getattr(cls, key)
+            if value not in (now, list(now) if isinstance(now, tuple) else now):
+                raise Refused("this key was removed", where=key, value=value, accepted=f"{now}, which holds always")
+            return True
         if key not in cls.removed:
             return False
         if not cls.removed[key].is_off(value):

@@ -84,7 +84,7 @@ class LabelsConfig(Growing):
         "are intervals of one's own, s, from each label's time on (`0.01`, `1/30`; negative: back), float32 .h5 "
         "(docs/over_time.md)",
     )
-    float_flow: tuple[Literal["npy", "flo", "h5"], ...] = Field((), description="float32 flow besides the PNG")
+    float_flow: tuple[Literal["npy", "flo"], ...] = Field((), description="float32 flow besides the PNG")
     occlusion: bool = Field(True, description="masks of pixels that are not visible at the flow's other end")
     depth: bool = Field(False, description="float32 .npy, world units along the optical axis")
     disparity: bool = Field(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field
 
@@ -152,10 +152,11 @@ class RandomLightsConfig(Config):
         ("point", "spot"), description="each light is one of these, all as likely"
     )
     strength: PositiveRange = Field((3.0, 30.0), description="of point and spot lights, see light.lights; log-uniform")
-    sun_strength: PositiveRange = Field((0.1, 0.6), description="of further suns; log-uniform")
-    saturation: Fraction = Field(
-        0.5, description="how colourful they are at most; the brightest channel is 1 and all hues are as likely"
-    )
+    sun_strength: ClassVar = (0.1, 0.6)
+    """Of further suns; log-uniform."""
+    saturation: ClassVar = 0.5
+    """How colourful they are at most; the brightest channel is 1 and all hues are as likely."""
+    fixed: ClassVar = ("sun_strength", "saturation")
     height: PositiveRange = Field((2.0, 6.0), description="above the ground, m; uniform")
     angle: PositiveRange = Field((30.0, 100.0), description="of a spot light's cone, degrees; uniform")
 

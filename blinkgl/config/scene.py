@@ -7,7 +7,7 @@ whether they exist; the models here only know shapes, units and limits.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
@@ -76,7 +76,8 @@ class PoolConfig(Config):
         "gives other scenes there",
     )
     max_faces: int = Field(50_000, ge=1, le=50_000_000, description="a mesh with more triangles is refused")
-    max_file_mb: float = Field(512.0, gt=0, description="a larger mesh file is refused unread")
+    max_file_mb: ClassVar = 512.0
+    fixed: ClassVar = ("max_file_mb",)
     test_fraction: Fraction = Field(0.1, description="fraction of meshes kept for split 'test', chosen by content hash")
     keep_materials: bool = Field(False, description="use the meshes' own colours and textures where they have any")
     animation: Literal["random", "rest"] = Field(
@@ -142,7 +143,8 @@ class WallsConfig(Config):
 
     count: int = Field(0, ge=0, le=4, description="how many of the region's four sides have a wall")
     height: PositiveRange = Field((1.5, 5.0), description="m; uniform")
-    thickness: float = Field(0.3, gt=0, description="m")
+    thickness: ClassVar = 0.3
+    fixed: ClassVar = ("thickness",)
     tile: PositiveRange = Field((2.0, 6.0), description="edge of one texture repeat, m; log-uniform")
 
 
@@ -151,7 +153,9 @@ class RegionConfig(Config):
 
     width: float = Field(30.0, gt=0, le=1e6, description="edge in x and y, m")
     height: float = Field(8.0, gt=0, le=1e6, description="m")
-    camera_height: PositiveRange = Field((1.0, 3.5), description="camera's first height above the ground, m; uniform")
+    camera_height: ClassVar = (1.0, 3.5)
+    """m, the camera's first height above the ground; uniform."""
+    fixed: ClassVar = ("camera_height",)
 
 
 class RandomSceneConfig(Config):
@@ -200,11 +204,12 @@ class RandomSceneConfig(Config):
         if sky is not None and sky < least:
             raise Refused(f"must be at least {least:g} to hold the region and its objects", where="sky.size", value=sky)
 
-    @rule("region.camera_height", "region.height")
-    def _camera_below_the_ceiling(camera_heights: tuple[float, float], height: float):
-        if camera_heights[0] >= height:
+    @rule("region.height")
+    def _camera_below_the_ceiling(height: float):
+        low = RegionConfig.camera_height[0]
+        if height <= low:
             raise Refused(
-                f"must begin below region.height {height:g}", where="region.camera_height", value=list(camera_heights)
+                "the camera begins above it", where="region.height", value=height, accepted=f"more than {low:g} m"
             )
 
     @rule("objects.size", "region.height")
@@ -228,10 +233,9 @@ class MeshConfig(Config):
         "(x, y, z) is drawn at (x, -z, y). auto: y for glb and gltf, as their standard says; z (the file's own "
         "coordinates) for obj, ply, stl",
     )
-    project_uvs: bool = Field(False, description="replace the file's texture coordinates by a box projection")
-    uv_size: float = Field(
-        1.0, gt=0, description="edge of one repeat of projected texture coordinates, in the mesh's units"
-    )
+    project_uvs: ClassVar = False
+    uv_size: ClassVar = 1.0
+    fixed: ClassVar = ("project_uvs", "uv_size")
 
     @rule("primitive", "file")
     def _one(primitive, file):
@@ -351,7 +355,8 @@ class ExplicitSceneConfig(Config):
     light: LightConfig = LightConfig()
     fog: FogConfig | None = FOG
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
-    max_faces: int = Field(5_000_000, ge=1, description="a mesh with more triangles is refused")
+    max_faces: ClassVar = 5_000_000
+    fixed: ClassVar = ("max_faces",)
 
     @rule("objects.*.mesh", "#meshes")
     def _meshes_are_known(used, known):
@@ -410,14 +415,15 @@ class FileSceneConfig(Config):
         description="file: the file's own lights (KHR_lights_punctual) shine in the place of light.sun, beside "
         "light.sky and light.lights",
     )
+    background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     lights_gain: Positive = Field(
         1.0,
         description="factor on the file's lights, whose lux and candela are divided by 683 lm/W, as Blender's exporter "
         "multiplies them",
     )
-    background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
-    max_faces: int = Field(5_000_000, ge=1, description="a scene with more triangles is refused")
-    max_texture_size: int = Field(2048, ge=1, le=16384, description="longer texture sides are reduced to this, px")
+    max_faces: ClassVar = 5_000_000
+    max_texture_size: ClassVar = 2048
+    fixed: ClassVar = ("max_faces", "max_texture_size")
 
     @rule("lights", "light.unlit")
     def _lit(lights, unlit):

@@ -11,7 +11,7 @@ camera_motion: {kind: static}
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
@@ -107,4 +107,6 @@ class CameraMotion(MotionConfig):
     shake: float = Field(
         0.0, ge=0, le=30, description="hand shake on top: standard deviation of the rotation about each axis, deg"
     )
-    shake_rate: float = Field(8.0, gt=0, le=200, description="shake impulses per second")
+    shake_rate: ClassVar = 8.0
+    """Shake impulses per second."""
+    fixed: ClassVar = ("shake_rate",)

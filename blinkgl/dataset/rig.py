@@ -36,8 +36,7 @@ def generate_rig(
     ):
         span_ns = rig.t1_ns - rig.t0_ns
         units = list(rig.inertial_units())
-        unit = units[0][2] if units else None
-        with PreviewRecorder(config.preview, rig.members, writer, unit) as preview, ExitStack() as stack:
+        with PreviewRecorder(config.preview, rig.members, writer) as preview, ExitStack() as stack:
             writers = {
                 member.name: stack.enter_context(writer_of(member, writer.folder(member.name), text))
                 for member in rig.members

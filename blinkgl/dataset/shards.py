@@ -126,7 +126,7 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
         (label for label in LABELS.values() if label.shard), key=lambda label: (label is not _FLOW, label.shard)
     ):
         for form in label.forms:
-            if form.rows is None and form.file(k) in manifest["files"]:
+            if form.file(k) in manifest["files"]:
                 name = label.shard.rpartition(".")[0]
                 yield f"{key}.{name}.{form.ending}", (folder / form.file(k)).read_bytes()
     for picture in manifest["frame_camera"]["pictures"] if taken is not None else ():

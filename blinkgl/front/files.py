@@ -257,7 +257,6 @@ class FrameOptions(TypedDict, total=False):
     emulator: EmulatorSettings
     gamma: str | float | None
     interpolate: str
-    factor: int
     max_px: float
     seed: int
     sensor: str | None
@@ -273,8 +272,7 @@ def simulate(
     emulator : as of :func:`record`.
     sensor : the read-out limit of that camera, and with an emulator's name its values.
     gamma : "srgb", "linear" or an exponent; default: srgb for integers, linear for floats.
-    interpolate : "linear"; "cubic": ``factor - 1`` frames in between; "motion": dense
-    flow, at most ``max_px`` px a step.
+    interpolate : "linear"; "motion": dense flow, at most ``max_px`` px a step.
     report : a SimulationReport to be filled.
     Raises ConfigError at once; EventDataError as frames come, naming the frame."""
     from blinkgl.recordings import simulation
@@ -301,7 +299,7 @@ def simulate_file(
     ``blinkgl simulate``; files appear whole or not at all.
 
     timestamps : file of times, one a frame.   preview : a video of frames and events to write.
-    frames : fps, emulator, gamma, interpolate, factor, max_px, seed, sensor as of :func:`simulate`.
+    frames : fps, emulator, gamma, interpolate, max_px, seed, sensor as of :func:`simulate`.
     Returns a report: frames, steps, events, lost … Raises AssetError, OutputError, EventDataError, ConfigError."""
     from blinkgl.recordings import simulation
 
@@ -321,7 +319,6 @@ def _options(
     emulator: EmulatorSettings = "esim",
     gamma: str | float | None = None,
     interpolate: str = "linear",
-    factor: int = 4,
     max_px: float = 1.0,
     seed: int = 0,
     sensor: str | None = None,
@@ -338,7 +335,6 @@ def _options(
         gamma=gamma,
         interpolate=interpolate,
         emulator=simulation.emulator_config(tree),
-        factor=check.whole(factor, "factor", 1, 1000),
         seed=check.seed(seed),
         max_px=check.number(max_px, "max_px", above=0, most=1e4),
         readout=None if camera is None else camera.readout,

@@ -43,9 +43,8 @@ Source = Scene | RunTemplate
 class Timeline:
     """When frames are drawn for the emulator: ``Timeline("displacement", max_px=0.5)``.
 
-    kind : "uniform" (fps, Hz), "displacement" (max_px, px), "brightness" (max_fraction_of_threshold) or "budget"
-    (max_time_error_us or max_time_error_px). values : keys of that kind, and ``reconstruction``;
-    see ``timeline:`` in docs/configuration.md.
+    kind : "uniform" (fps, Hz), "displacement" (max_px, px) or "brightness" (max_fraction_of_threshold).
+    values : keys of that kind, see ``timeline:`` in docs/configuration.md.
     Raises ConfigError."""
 
     def __init__(self, kind: str = "displacement", **values: Any):

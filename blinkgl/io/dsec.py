@@ -50,7 +50,6 @@ class DsecEventWriter:
         own readers ignore.
     t_offset_us : image-clock time of relative time 0. Events before it, or 2^32 µs (71.6 minutes) or more after it, are
         refused: the format's u4 cannot hold them.
-    background : False compresses in the caller's thread.
     codec : "zstd", as the published files, or "lz4".
     """
 
@@ -61,7 +60,6 @@ class DsecEventWriter:
         width: int,
         t_offset_us: int = 0,
         *,
-        background: bool = True,
         codec: str = "zstd",
     ):
         if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE):
@@ -94,11 +92,9 @@ class DsecEventWriter:
             self._file.create_dataset("t_offset", data=np.int64(self.t_offset_us), track_times=False)
             # Compression runs beside the simulation; a full queue makes append wait.
             self._file.attrs["height"], self._file.attrs["width"] = self.height, self.width
-        self._queue: queue.Queue | None = None
-        if background:
-            self._queue = queue.Queue(maxsize=4)
-            self._thread = threading.Thread(target=self._run, name="dsec-writer", daemon=True)
-            self._thread.start()
+        self._queue: queue.Queue = queue.Queue(maxsize=4)
+        self._thread = threading.Thread(target=self._run, name="dsec-writer", daemon=True)
+        self._thread.start()
 
     def append(self, events: Events) -> None:
         """Adds events (copied: the caller may reuse its arrays).
@@ -124,7 +120,7 @@ class DsecEventWriter:
             self._fill += stop - start
             start = stop
             if self._fill == BLOCK:
-                self._submit(self._block)
+                self._queue.put(self._block)
                 self._block, self._fill = _new_block(self._columns), 0
         self._raise_pending()
 
@@ -140,10 +136,9 @@ class DsecEventWriter:
             self.t_offset_us if t_end_us is None else int(t_end_us),
         )
         try:
-            self._submit({k: v[: self._fill] for k, v in self._block.items()})
-            self._submit(None)
-            if self._queue is not None:
-                self._thread.join()
+            self._queue.put({k: v[: self._fill] for k, v in self._block.items()})
+            self._queue.put(None)
+            self._thread.join()
             self._raise_pending()
             with output_errors(self.path):
                 # One entry past the last millisecond: a slicer asks for ceil(end).
@@ -164,7 +159,7 @@ class DsecEventWriter:
         if self._closed:
             return
         self._closed = True
-        if self._queue is not None and self._thread.is_alive():
+        if self._thread.is_alive():
             # An error that is already known stays the one that is raised.
             self._error = self._error or RuntimeError("aborted")  # the thread drops what is queued
             self._queue.put(None)
@@ -207,14 +202,6 @@ class DsecEventWriter:
             self._block = _new_block(self._columns)
         if (events.cause is not None) != ("cause" in self._columns):
             raise EventDataError("some events have causes and some do not", where=str(self.path))
-
-    def _submit(self, block: dict[str, np.ndarray] | None) -> None:
-        if self._queue is not None:
-            self._queue.put(block)
-        elif block is not None:
-            # Without a thread the caller compresses.
-            with output_errors(self.path):
-                self._store(block)
 
     def _run(self) -> None:
         while (block := self._queue.get()) is not None:
@@ -380,17 +367,6 @@ def write_rectify_map(path: str | os.PathLike, rectify_map: np.ndarray) -> None:
             track_times=False,
             compression=hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.SHUFFLE),
         )
-
-
-def read_rectify_map(path: str | os.PathLike) -> np.ndarray:
-    """(H, W, 2) float32 of a file of :func:`write_rectify_map`, or DSEC's own. Raises AssetError."""
-    path = Path(path)
-    with open_hdf5(path) as file, hdf5_errors(path, file):
-        given = file.get("rectify_map")
-        right = isinstance(given, h5py.Dataset) and given.ndim == 3 and given.shape[2] == 2
-        if right and given.dtype.kind == "f":
-            return np.asarray(given[()], np.float32)
-    raise AssetError("no rectify map", where=str(path), accepted="rectify_map, (H, W, 2) float32")
 
 
 def identity_rectify_map(height: int, width: int) -> np.ndarray:

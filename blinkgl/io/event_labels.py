@@ -140,12 +140,3 @@ def with_truth(events: Events, first: int, path: str | os.PathLike) -> Events:
                 accepted=f"at least {first + len(events)}",
             )
     return replace(events, truth=truth, cause=events.cause if cause is None else cause)
-
-
-def problem_of(truth: np.ndarray, instances: set[int]) -> str | None:
-    """What cannot be among rows of a scene with these instances, in words; None: nothing."""
-    if strange := set(np.unique(truth["instance"]).tolist()) - instances - {0}:
-        return f"instance {min(strange)}, which the scene does not have"
-    if not (truth["depth"] > 0).all():
-        return "a depth that is not above 0"
-    return None if np.isfinite(truth["velocity"]).all() else "a velocity that is no finite number"

@@ -105,14 +105,3 @@ def read_exposures(sequence: str | os.PathLike) -> list[ExposureLine]:
         raise AssetError("no frame camera here", where=str(path), accepted="a sequence made with images:") from None
     except (OSError, ValueError, csv.Error) as error:
         raise AssetError(f"damaged list of exposures: {' '.join(str(error).split())[:120]}", where=str(path)) from None
-
-
-def problem_of(codes: np.ndarray, images: ImagesConfig, height: int, width: int) -> str | None:
-    """What cannot be in a picture of this camera; None: nothing."""
-    shape = (height, width) if images.bayer is not None else (height, width, 3)
-    kind = np.dtype(np.uint8 if images.bits == 8 else np.uint16)
-    if codes.shape != shape or codes.dtype != kind:
-        return f"{codes.shape} {codes.dtype} and not {shape} {kind}"
-    if codes.size and int(codes.max()) >= 1 << images.bits:
-        return f"a code of {int(codes.max())}, beyond {images.bits} bits"
-    return None

@@ -20,7 +20,6 @@ import numpy as np
 
 from blinkgl.config.imu import ImuConfig
 from blinkgl.config.reader import to_yaml
-from blinkgl.errors import AssetError
 from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
 
 FOLDER = "imu"
@@ -60,38 +59,6 @@ def kalibr_yaml(config: ImuConfig, T_cam_imu: np.ndarray) -> str:
     )
     table = {**{key: getattr(config, key) for key in keys}, "update_rate": config.rate}
     return to_yaml({**table, "T_cam_imu": T_cam_imu.tolist()})
-
-
-def read_imu_csv(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(N,) int64 ns, (N, 3) rad/s, (N, 3) m/s² of a CSV in EuRoC's columns. Raises AssetError naming the line."""
-    path = Path(path)
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeError) as error:
-        raise AssetError(f"cannot be read: {' '.join(str(error).split())[:120]}", where=str(path)) from None
-    times, rows = [], []
-    for number, line in enumerate(lines, 1):
-        if not line.strip() or line.startswith("#"):
-            continue
-        try:
-            first, *rest = line.split(",")
-            values = [float(v) for v in rest]
-            if len(values) != 6 or not np.isfinite(values).all():
-                raise ValueError
-            times.append(int(first))
-            rows.append(values)
-        except ValueError:
-            raise AssetError(
-                f"line {number} is no measurement",
-                where=str(path),
-                value=line[:80],
-                accepted="whole ns, three rates, three accelerations",
-            ) from None
-    both = np.array(rows, np.float64).reshape(-1, 6)
-    t = np.array(times, np.int64)
-    if (np.diff(t) <= 0).any():
-        raise AssetError("times do not increase", where=str(path), value=int(t[int(np.argmax(np.diff(t) <= 0)) + 1]))
-    return t, both[:, :3], both[:, 3:]
 
 
 def read_imu(sequence: str | os.PathLike) -> dict[str, np.ndarray]:

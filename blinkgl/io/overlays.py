@@ -1,9 +1,8 @@
-"""What is drawn over pictures and beside them for people: boxes, tracks with tails, curves of an inertial unit."""
+"""What is drawn over pictures for people: boxes, and tracks with tails."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -14,9 +13,6 @@ from blinkgl.types.boxes import Boxes
 
 _FROM_PX = 160
 """Pictures less wide than this have no room for words."""
-_AXES = ((235, 105, 95), (110, 205, 120), (105, 160, 250))
-"""Colours of x, y and z."""
-_BACK, _LINE, _WORDS = (22, 24, 28), (70, 75, 84), (200, 205, 212)
 TAIL_US = 150_000
 """How long a point's tail is."""
 
@@ -80,61 +76,6 @@ class TrackLines:
     occluded: np.ndarray
     instance: np.ndarray
     resolution: np.ndarray
-
-
-class Curves:
-    """Rates and accelerations of an inertial unit as a strip, (height, width, 3) uint8, the left half rad/s, the right
-    m/s²; x red, y green, z blue. t_us : (N,) from ``span_us[0]`` to ``span_us[1]``.   rate, acceleration : (N, 3)."""
-
-    def __init__(
-        self,
-        t_us: np.ndarray,
-        rate: np.ndarray,
-        acceleration: np.ndarray,
-        span_us: tuple[int, int],
-        width: int,
-        height: int,
-    ):
-        half = width // 2
-        both = [
-            _plot(t_us, values, span_us, size, height, name)
-            for values, name, size in ((rate, "rad/s", half), (acceleration, "m/s^2", width - half))
-        ]
-        self._whole, self._halves, self._span = np.concatenate(both, axis=1), (half, width - half), span_us
-
-    def at(self, t_us: int) -> np.ndarray:
-        """The strip when t_us is now: what is to come is dim."""
-        out = self._whole.copy()
-        share = (t_us - self._span[0]) / max(self._span[1] - self._span[0], 1)
-        left = 0
-        for size in self._halves:
-            x = left + round(float(np.clip(share, 0, 1)) * (size - 1))
-            out[:, x + 1 : left + size] = (out[:, x + 1 : left + size] * 0.4 + np.array(_BACK) * 0.6).astype(np.uint8)
-            out[:, x] = _WORDS
-            left += size
-        return out
-
-
-def _plot(
-    t_us: np.ndarray, values: np.ndarray, span_us: tuple[int, int], width: int, height: int, unit: str
-) -> np.ndarray:
-    """(height, width, 3) uint8: three curves; of every column the range that its times have."""
-    out = np.empty((height, width, 3), np.uint8)
-    out[:] = _BACK
-    most = float(np.abs(values).max(initial=0)) or 1.0
-    column = np.clip((t_us - span_us[0]) * (width - 1) // max(span_us[1] - span_us[0], 1), 0, width - 1)
-    place = (height - 1) / 2 * (1 - 0.9 * values / most)
-    out[height // 2] = _LINE
-    for axis, colour in enumerate(_AXES):
-        low, high = np.full(width, np.inf), np.full(width, -np.inf)
-        np.minimum.at(low, column, place[:, axis])
-        np.maximum.at(high, column, place[:, axis])
-        there = np.flatnonzero(np.isfinite(low))
-        for a, b in pairwise(there):
-            cv2.line(out, (int(a), round(high[a])), (int(b), round(low[b])), colour, 1, cv2.LINE_AA)
-        for a in there[high[there] - low[there] > 1]:
-            cv2.line(out, (int(a), round(low[a])), (int(a), round(high[a])), colour, 1)
-    return _written(out, f"±{most:.3g} {unit}", (6, 2), _WORDS)
 
 
 def _between(times: np.ndarray, t_us: int) -> tuple[int, float]:

@@ -18,7 +18,6 @@ from blinkgl.errors import AssetError
 
 MAX_RECORD_BYTES = 512 << 20
 MAX_NAME_BYTES = 1024
-_BLOCK = 1 << 20
 
 
 def open_regular(path: str | os.PathLike) -> int:

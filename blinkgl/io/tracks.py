@@ -48,18 +48,3 @@ def read_tracks(path: str | os.PathLike) -> dict[str, np.ndarray]:
                 accepted=str(shape),
             )
     return arrays
-
-
-def problem_of(arrays: dict[str, np.ndarray], height: int, width: int, instances: set[int]) -> str | None:
-    """What cannot be in the tracks of a scene with these instances, in words; None: nothing."""
-    if not all(np.isfinite(arrays[name]).all() for name, (_, kind) in _SHAPES.items() if kind == "f"):
-        return "a number that is not finite"
-    if strange := set(np.unique(arrays["instance"]).tolist()) - instances:
-        return f"instance {min(strange)}, which the scene does not have"
-    seen = arrays["target_points"][~arrays["occluded"]]
-    if not ((seen >= -0.5) & (seen < [width - 0.5, height - 0.5])).all():
-        return "a point that is seen outside the image"
-    number = arrays["query_points"][:, 0]
-    if len(number) and not ((number >= 0) & (number < len(arrays["t_us"])) & (number % 1 == 0)).all():
-        return "a query at a time that is none of the tracks'"
-    return None

@@ -51,22 +51,6 @@ class ObjectBoxes(Label):
     def forms(self) -> tuple[Form, ...]:
         return (Form("boxes", "npz", _npz, _read), Form("boxes_kitti", "txt", _kitti))
 
-    def problem(self, value: Boxes) -> str | None:
-        if not all(np.isfinite(getattr(value, name)).all() for name, (_, kind) in SHAPES.items() if kind == "f"):
-            return "a number that is not finite"
-        if (np.diff(value.amodal_box.reshape(-1, 2, 2), axis=1) < 0).any() or (value.size < 0).any():
-            return "a box of negative size"
-        return (
-            None if (value.visible_pixels <= value.amodal_pixels).all() else "more of an object is seen than there is"
-        )
-
-    def agrees(self, one: Boxes, other: Boxes) -> bool:
-        """Which pixels show an object is the renderer's to say, where it is in space is not."""
-        return np.array_equal(one.instance, other.instance) and all(
-            np.allclose(getattr(one, name), getattr(other, name), rtol=1e-6, atol=1e-6)
-            for name in ("amodal_box", "size", "T_cam_box", "T_world_box")
-        )
-
     def drawn_on(self, picture: np.ndarray, value: Boxes) -> np.ndarray:
         return with_boxes(picture, value)
 

@@ -30,11 +30,5 @@ class Depth(Label):
         raw = drawn.raw("depth")
         return np.where(raw > 0, raw, np.float32(np.inf))
 
-    def problem(self, value: np.ndarray) -> str | None:
-        return None if (value > 0).all() else "a depth that is not above 0"
-
-    def agrees(self, one: np.ndarray, other: np.ndarray) -> bool:
-        return one.shape == other.shape and bool(np.isclose(one, other, rtol=1e-4).mean() >= _SHARE)
-
     def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
         return frame.depth

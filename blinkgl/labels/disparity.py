@@ -33,12 +33,6 @@ class Disparity(Label):
     def finish(self, drawn: Drawn) -> np.ndarray:
         return _of(drawn.scene, drawn.raw("depth")).astype(np.float32)
 
-    def problem(self, value: np.ndarray) -> str | None:
-        return None if (value >= 0).all() and np.isfinite(value).all() else "a disparity that is negative or no number"
-
-    def agrees(self, one: np.ndarray, other: np.ndarray) -> bool:
-        return one.shape == other.shape and bool(np.isclose(one, other, rtol=1e-4).mean() >= _SHARE)
-
     def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
         return _of(scene, np.where(np.isfinite(frame.depth), frame.depth, 0.0))
 

@@ -7,35 +7,29 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 
 @dataclass(frozen=True)
 class Form:
-    """``FOLDER/000000.ENDING``, one file a label, or ``FOLDER.ENDING``, one file for all of them.
+    """``FOLDER/000000.ENDING``, one file a label.
 
     encode : a value as the bytes of a file, or as (bytes, number of its pixels that the form cannot hold).
-    read : the value in a file; raises AssetError.
-    rows : of one file for all, name -> (H, W[, C]) array that is appended to the dataset of that name."""
+    read : the value in a file; raises AssetError."""
 
     folder: str
     ending: str
     encode: Callable[[Any], bytes | tuple[bytes, int]] | None = None
     read: Callable[[str | os.PathLike], Any] | None = None
-    rows: Callable[[Any], dict[str, np.ndarray]] | None = None
 
     def file(self, index: int) -> str:
         """Name of the ``index``-th label's file below the sequence."""
-        return f"{self.folder}.{self.ending}" if self.rows else f"{self.folder}/{index:06d}.{self.ending}"
+        return f"{self.folder}/{index:06d}.{self.ending}"
 
     def files(self, count: int) -> Iterator[str]:
         """Names of the files of so many labels."""
-        yield from (self.file(k) for k in range(1 if self.rows and count else count))
+        yield from (self.file(k) for k in range(count))
 
     def holds(self, name: str) -> bool:
         """Whether ``name`` is one of its files."""
-        if self.rows:
-            return name == self.file(0)
         return (
             name.startswith(self.folder + "/")
             and name.endswith("." + self.ending)

@@ -71,20 +71,10 @@ class FlowTo(Label):
             Form(folder, "png", _png, _read),
             Form(folder + "_npy", "npy", _npy, _read),
             Form(folder + "_flo", "flo", _flo, _read),
-            Form(folder, "h5", rows=_rows),
         )
 
     def written(self, labels: LabelsConfig) -> tuple[Form, ...]:
         return (self.forms[0], *(form for form in self.forms[1:] if form.ending in labels.float_flow))
-
-    def problem(self, value: Flow) -> str | None:
-        return None if np.isfinite(value.flow).all() else "a flow that is no finite number"
-
-    def agrees(self, one: Flow, other: Flow) -> bool:
-        if one.flow.shape != other.flow.shape:
-            return False
-        near = (np.abs(one.flow - other.flow).max(-1) <= _PX) & (one.valid == other.valid)
-        return bool(near.mean() >= _SHARE)
 
     @property
     def views(self) -> tuple[View, ...]:
@@ -135,10 +125,6 @@ def _flo(value: Flow) -> bytes:
     from blinkgl.io.flo import encode_flo
 
     return encode_flo(value.flow, value.valid)
-
-
-def _rows(value: Flow) -> dict[str, np.ndarray]:
-    return {"flow": np.where(value.valid[..., None], value.flow, np.float32(0)), "valid": value.valid.astype(np.uint8)}
 
 
 def _read(path: str | os.PathLike) -> Flow:

@@ -31,9 +31,6 @@ class Ids(Label):
     def forms(self) -> tuple[Form, ...]:
         return (files.ids_png("ids"),)
 
-    def problem(self, value: np.ndarray) -> str | None:
-        return None if value.dtype == np.uint16 else f"{value.dtype} and not uint16"
-
     def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
         return frame.instance
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from blinkgl.labels.files import Form
-from blinkgl.labels.flow import FlowTo, seconds_of
-from blinkgl.labels.frames import Flow, ending_within
+from blinkgl.labels.flow import seconds_of
+from blinkgl.labels.frames import Flow
 from blinkgl.labels.label import Drawn, Label
 
 if TYPE_CHECKING:
@@ -92,11 +92,6 @@ class _OverIntervals(Label):
         from_us, interval_ns, arrays = read_intervals(path, tuple(self.arrays))
         return self.made(from_us * 1000, interval_ns, **arrays)
 
-    def unlike(self, value: Any, labels: LabelsConfig, before_ns: int, after_ns: int) -> str | None:
-        asked = ending_within(self.intervals(labels), before_ns, after_ns)
-        there = value.interval_ns.tolist()
-        return None if there == asked else f"flow over {there} ns, config.yaml asks for {asked}"
-
     views = property(lambda self: ())  # the flow label at other times, which the debugger shows
 
 
@@ -118,15 +113,6 @@ class FlowIntervals(_OverIntervals):
     def finish(self, drawn: Drawn) -> Flows:
         flows = [frame.values["flow_forward"] for frame in drawn.leading.values()]
         return self._stacked(drawn, {name: [getattr(flow, name) for flow in flows] for name in self.arrays})
-
-    def problem(self, value: Flows) -> str | None:
-        return None if np.isfinite(value.flow).all() else "a flow that is no finite number"
-
-    def agrees(self, one: Flows, other: Flows) -> bool:
-        if not np.array_equal(one.interval_ns, other.interval_ns):
-            return False
-        pairs = ([Flow(flow, valid) for flow, valid in zip(value.flow, value.valid)] for value in (one, other))
-        return all(FlowTo.agrees(self, a, b) for a, b in zip(*pairs))  # type: ignore[arg-type]
 
 
 class OcclusionIntervals(_OverIntervals):

@@ -254,19 +254,6 @@ class Label:
         """Those of ``forms`` that ``labels:`` asks for; the label itself is asked for."""
         return self.forms
 
-    def problem(self, value: Any) -> str | None:
-        """What cannot be in a value that was read back; None: nothing."""
-        return None
-
-    def unlike(self, value: Any, labels: LabelsConfig, before_ns: int, after_ns: int) -> str | None:
-        """What of a value that was read back is not as ``labels:`` asks; None: nothing. before_ns, after_ns : from its
-        time to the sequence's begin (negative) and end."""
-        return None
-
-    def agrees(self, one: Any, other: Any) -> bool:
-        """Whether two machines may have drawn these for one moment. True: a renderer may change every pixel."""
-        return True
-
     def drawn_on(self, picture: np.ndarray, value: Any) -> np.ndarray | None:
         """(H, W, 3) uint8: the value drawn over a picture, of a label that is no picture itself; else None."""
         return None

@@ -26,10 +26,6 @@ class Normals(Label):
     def uniforms(self, shot: Shot) -> dict[str, np.ndarray]:
         return {"camera_from_local": shot.moment.T_cam_obj[:, :3, :3]}
 
-    def problem(self, value: np.ndarray) -> str | None:
-        # A mesh's own normals may be of no length, and are then no direction here either.
-        return None if (np.linalg.norm(value, axis=-1) < 1 + 1e-3).all() else "a normal longer than 1"
-
     def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
         rotation = scene.camera_path.pose(frame.t_ns)[:3, :3]
         return np.where(frame.hit[..., None], frame.normal @ rotation, 0.0)

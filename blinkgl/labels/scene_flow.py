@@ -44,13 +44,5 @@ class SceneFlow(Label):
         raw = drawn.raw(self.name)
         return np.where(raw[..., 3:] > 0, raw[..., :3], np.float32(0))
 
-    def problem(self, value: np.ndarray) -> str | None:
-        return None if np.isfinite(value).all() else "a scene flow that is no finite number"
-
-    def agrees(self, one: np.ndarray, other: np.ndarray) -> bool:
-        return one.shape == other.shape and bool(
-            np.isclose(one, other, rtol=1e-3, atol=1e-4).all(axis=-1).mean() >= _SHARE
-        )
-
     def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
         return frame.scene_flow(scene)

@@ -94,9 +94,6 @@ class Semantics(Label):
     def forms(self) -> tuple[Form, ...]:
         return (files.ids_png("semantics"),)
 
-    def problem(self, value: np.ndarray) -> str | None:
-        return None if value.dtype == np.uint16 else f"{value.dtype} and not uint16"
-
     def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
         return _of(scene, BY_NAME, frame.instance)
 

@@ -27,8 +27,5 @@ class Velocity(Label):
     def uniforms(self, shot: Shot) -> dict[str, np.ndarray]:
         return {"rate": shot.moment.rates.mvp[:, [0, 1, 3]]}
 
-    def problem(self, value: np.ndarray) -> str | None:
-        return None if np.isfinite(value).all() else "a velocity that is no finite number"
-
     def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
         return np.where(frame.hit[..., None], frame.velocity, 0.0)

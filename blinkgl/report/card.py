@@ -157,8 +157,7 @@ def _files(found: Collected) -> list[tuple[str, str]]:
     for label in LABELS.values():
         for form in label.forms:
             if any(form.holds(name) for name in names):
-                one = form.rows is not None
-                kinds.append((f"{form.folder}.{form.ending}" if one else f"{form.folder}/*.{form.ending}", label.about))
+                kinds.append((f"{form.folder}/*.{form.ending}", label.about))
     return kinds
 
 

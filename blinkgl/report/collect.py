@@ -13,13 +13,12 @@ from blinkgl.config.draw import is_distribution
 from blinkgl.config.reader import read_table
 from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.run_folder import RunFolder
-from blinkgl.dataset.verify.between import plan_of
+from blinkgl.dataset.verify.cross_checks import plan_of
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flow_png import read_flow_png
 from blinkgl.io.frame_camera import EXPOSURES, picture_file, read_codes, read_exposures
 from blinkgl.io.images import read_image
-from blinkgl.io.imu import H5 as IMU_H5, read_imu
 from blinkgl.io.records import shown
 from blinkgl.io.tracks import TRACKS, read_tracks
 from blinkgl.labels import LABELS
@@ -29,7 +28,6 @@ from blinkgl.sequence_files.sequence_dir import read_manifest, verify_sequence
 SAMPLED_SEQUENCES, LABELS_EACH, PIXEL_STEP = 150, 3, 8
 MAX_CONFIGS = 5000
 _FLOW = LABELS["flow_forward"]
-_CURVES = 480, 120
 """Width and height of the inertial unit's picture, px."""
 
 
@@ -243,8 +241,8 @@ def _of_the_camera(folder: Path, line: dict[str, Any], t_us: int) -> list[tuple[
 
 
 def _over_time(folder: Path, line: dict[str, Any], t_us: int, image: np.ndarray | None) -> list[tuple[str, np.ndarray]]:
-    """Point tracks over the image of a time, with tails, and the curves of an inertial unit."""
-    from blinkgl.io.overlays import Curves, TrackLines, with_tracks
+    """Point tracks over the image of a time, with tails."""
+    from blinkgl.io.overlays import TrackLines, with_tracks
 
     pictures = []
     if (folder / TRACKS).is_file():
@@ -253,12 +251,6 @@ def _over_time(folder: Path, line: dict[str, Any], t_us: int, image: np.ndarray 
         under = np.full((line["height"], line["width"], 3), 24, np.uint8) if image is None else image
         title = f"point tracks, {len(tracks['instance'])}"
         pictures.append((title, with_tracks(under, lines, t_us)))
-    if (folder / IMU_H5).is_file():
-        unit, manifest = read_imu(folder), read_manifest(folder)
-        begin = manifest["t_offset_us"]
-        span = begin, begin + manifest["duration_us"]
-        curves = Curves(unit["t_ns"] // 1000, unit["rate"], unit["acceleration"], span, *_CURVES)
-        pictures.append(("inertial unit: rates and accelerations, x red, y green, z blue", curves.at(span[1])))
     return pictures
 
 

@@ -66,10 +66,9 @@ def measured(path: PosePath, config: ImuConfig, t0_ns: int, t1_ns: int, rng: np.
     n, dt = len(times), 1 / config.rate
     white, walk = rng.normal(size=(2, n, 3)), rng.normal(size=(2, n, 3))
     walk[:, 0] = 0
-    bias_w = np.asarray(config.gyroscope_bias) + config.gyroscope_random_walk * np.sqrt(dt) * np.cumsum(walk[0], 0)
-    bias_a = np.asarray(config.accelerometer_bias) + config.accelerometer_random_walk * np.sqrt(dt) * np.cumsum(
-        walk[1], 0
-    )
+    # + 0.0: of no walk no negative zeros, which are other bytes.
+    bias_w = config.gyroscope_random_walk * np.sqrt(dt) * np.cumsum(walk[0], 0) + 0.0
+    bias_a = config.accelerometer_random_walk * np.sqrt(dt) * np.cumsum(walk[1], 0) + 0.0
     return Inertial(
         np.array(times, np.int64),
         rate + bias_w + config.gyroscope_noise_density / np.sqrt(dt) * white[0],

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -50,14 +48,11 @@ class Picture:
     """How it looks at t_ns, for somebody who watches: comes after the events up to then.
 
     image : (H, W, 3) or (H, W) float32 linear light.   velocity : (H, W, 2) float32 px/s, or None
-    where nobody knows (recorded frames).
-    over : values of labels that are drawn over pictures (:meth:`blinkgl.labels.Label.drawn_on`), by name, of those that
-    are asked for."""
+    where nobody knows (recorded frames)."""
 
     t_ns: int
     image: np.ndarray
     velocity: np.ndarray | None = None
-    over: Mapping[str, Any] = field(default_factory=dict)
 
 
 Item = EventChunk | GroundTruth | CameraImage | Picture

@@ -10,15 +10,12 @@ Made from the manifests alone and sorted by path: the same sequences give the sa
 from __future__ import annotations
 
 import contextlib
-import heapq
-import itertools
 import json
-import os
-import tempfile
 from collections import Counter
 from collections.abc import Iterator
+from operator import itemgetter
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter
 
@@ -28,7 +25,6 @@ from blinkgl.io.records import HereOrInside, parse, read_text, shown
 from blinkgl.sequence_files.sequence_dir import MANIFEST, is_rig_folder, read_manifest
 
 INDEX = "index.jsonl"
-_PART = 20_000
 _KEYS = (
     "split",
     "sequence",
@@ -91,60 +87,15 @@ def entry(root: Path, folder: Path) -> dict[str, Any]:
 
 def write_index(root: str | Path) -> int:
     """Writes ``index.jsonl`` of the sequences below ``root`` (damaged ones are left out);
-    returns how many. Raises OutputError.
-
-    Lines are sorted in parts of some thousands, which wait in files without names and are merged:
-    memory does not grow with the data set."""
+    returns how many. Raises OutputError."""
     root = Path(root)
-    count = 0
-    with atomic_file(root / INDEX) as path, output_errors(path), contextlib.ExitStack() as stack:
-        parts = [stack.enter_context(part) for part in _sorted_parts(root)]
-        with open(path, "w", encoding="utf-8") as file:
-            for line in heapq.merge(*parts, key=_path_of):
-                file.write(line)
-                count += 1
-    return count
-
-
-def _sorted_parts(root: Path) -> Iterator[IO[str]]:
-    """Open files of sorted lines."""
-    found = _lines(root)
-    while part := sorted(itertools.islice(found, _PART), key=_path_of):
-        file = tempfile.TemporaryFile("w+", encoding="utf-8", dir=root)  # noqa: SIM115 - whoever takes it closes it
-        file.writelines(part)
-        file.seek(0)
-        yield file
-
-
-def _lines(root: Path) -> Iterator[str]:
-    for folder in _unsorted(root):
+    entries = []
+    for folder in sequence_folders(root):
         with contextlib.suppress(BlinkGLError):
-            yield json.dumps(entry(root, folder), sort_keys=True) + "\n"
-
-
-def _path_of(line: str) -> str:
-    return json.loads(line)["path"]
-
-
-def _unsorted(root: Path) -> Iterator[Path]:
-    """The same as :func:`sequence_folders`, in no order, and without a list of them all."""
-    if (root / MANIFEST).is_file():
-        yield from _of_cameras(root)
-        return
-    for top in _visible(root):
-        if (top / MANIFEST).is_file():
-            yield from _of_cameras(top)
-            continue
-        for folder in _visible(top):
-            if (folder / MANIFEST).is_file():
-                yield from _of_cameras(folder)
-
-
-def _visible(folder: Path) -> Iterator[Path]:
-    with os.scandir(folder) as entries:
-        for found in entries:
-            if found.is_dir() and not found.name.startswith("."):
-                yield Path(found.path)
+            entries.append(entry(root, folder))
+    with atomic_file(root / INDEX) as path, output_errors(path), open(path, "w", encoding="utf-8") as file:
+        file.writelines(json.dumps(line, sort_keys=True) + "\n" for line in sorted(entries, key=itemgetter("path")))
+    return len(entries)
 
 
 class _Line(BaseModel):

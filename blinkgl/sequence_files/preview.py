@@ -4,7 +4,7 @@ sequence is being generated."""
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from typing import TypeVar
 
 import cv2
@@ -12,7 +12,6 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from blinkgl.io.colour import count_events, event_colour, flow_colour, flow_wheel
-from blinkgl.io.overlays import Curves, TrackLines, with_tracks
 from blinkgl.io.video import VideoWriter
 from blinkgl.srgb import to_srgb8, tone_mapped
 from blinkgl.timeline.sampling import Ticks
@@ -23,7 +22,6 @@ _BAR = 30
 _GAP = 4
 _BACK, _TEXT, _DIM = (22, 24, 28), (235, 238, 242), (150, 156, 166)
 _MAX_PANEL_HEIGHT = 360
-_STRIP = 64
 _LEGEND = 27
 
 
@@ -32,8 +30,6 @@ class Panels:
     at ``fps``, i.e. slowed by ``rate_hz / fps``.
 
     height, width : sensor size, px.   t0_us : start.   flow : False leaves the flow panel out.   label : of the frame.
-    tracks : points that are drawn over the frame, with tails.   curves : of an inertial unit, given the strip's width
-    and height; they stand below.
     canvas : (h, w, 3) uint8, all as it is shown."""
 
     def __init__(
@@ -46,8 +42,6 @@ class Panels:
         rate_hz: float = 40,
         fps: float = 20,
         label: str = "frame",
-        tracks: TrackLines | None = None,
-        curves: Callable[[int, int], Curves] | None = None,
     ):
         self._counts = np.zeros((2, height, width), np.uint16)
         self._pending = 0
@@ -60,9 +54,7 @@ class Panels:
         self._slow = rate_hz / fps
         self._names = [label, "events", "optical flow"][: 3 if flow else 2]
         w, h = self._panel
-        whole, below = len(self._names) * (w + _GAP) - _GAP, 0 if curves is None else _STRIP
-        self._tracks, self._curves = tracks, None if curves is None else curves(whole, below)
-        self._canvas = np.empty((h + _BAR + below, whole, 3), np.uint8)
+        self._canvas = np.empty((h + _BAR, len(self._names) * (w + _GAP) - _GAP, 3), np.uint8)
         self._canvas[:] = _BACK
         self._flow_max, self._brightest = 0.0, 1.0
         self._has_flow = flow
@@ -101,22 +93,15 @@ class Panels:
         """Whether :meth:`frame` at this time would be shown."""
         return self._ticks.due(t_us)
 
-    def compose(self, t_us: int, image: np.ndarray, over: Iterable[Callable[[np.ndarray], np.ndarray]] = ()) -> int:
+    def compose(self, t_us: int, image: np.ndarray) -> int:
         """Draws :attr:`canvas`; for how many periods it is shown: those that have passed, 0 where none has.
-        image : (H, W[, 3]) float linear light, whose highlights are compressed where they exceed 1, or uint8 sRGB.
-        over : (h, w, 3) uint8 picture, of the panel's size -> the same with something drawn over it."""
+        image : (H, W[, 3]) float linear light, whose highlights are compressed where they exceed 1, or uint8 sRGB."""
         if not self.due(t_us):
             return 0
         small = self._fit(image)  # first: cheaper, and averages linear light where it is given
         small = self._toned(small) if small.dtype.kind == "f" else small
         shown = np.repeat(small[..., None], 3, axis=2) if small.ndim == 2 else small
-        if self._tracks is not None:
-            shown = with_tracks(shown, self._tracks, t_us)
-        for drawn_over in over:
-            shown = drawn_over(shown)
         self._panel_view(0)[:] = shown
-        if self._curves is not None:
-            self._canvas[-_STRIP:] = self._curves.at(t_us)
         self._panel_view(1)[:] = self._fit(event_colour(self._counts))
         self._caption(0, f"{(t_us - self._t0_us) / 1000:.1f} ms   slowed {self._slow:g}x")
         share = "" if self._noise is None else f"   {100 * self._noise / max(self._pending, 1):.0f} % noise"
@@ -231,13 +216,11 @@ class RigPreviewWriter(_Streamed):
         height, width = self._canvas.shape[:2]
         self._video = VideoWriter(path, height, width, fps, preset="superfast", crf=22)
 
-    def frame(
-        self, number: int, t_us: int, image: np.ndarray, over: Iterable[Callable[[np.ndarray], np.ndarray]] = ()
-    ) -> None:
+    def frame(self, number: int, t_us: int, image: np.ndarray) -> None:
         """The picture of the camera of this number, as of :meth:`Panels.compose`. When the last one's is there all are
         encoded."""
         one, top = self.panels[number], self._tops[number]
-        count = one.compose(t_us, image, over)
+        count = one.compose(t_us, image)
         if count:
             height, width = one.canvas.shape[:2]
             self._canvas[top : top + height, :width] = one.canvas

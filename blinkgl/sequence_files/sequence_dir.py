@@ -6,7 +6,7 @@
       images/%06d.png                sRGB frames at label times;        images/timestamps.txt   one µs per line
       flow/forward/%06d.png          DSEC 16-bit flow;                  flow/forward_timestamps.txt   from_us,to_us
       flow/forward_npy/%06d.npy      float32 (H, W, 3) = u, v, valid    (as BlinkFlow's; on request)
-      flow/forward_flo/%06d.flo, flow/forward.h5                        (on request)
+      flow/forward_flo/%06d.flo                                         (on request)
       flow/backward…                 the same, from > to
       flow/intervals/%06d.h5         flow over intervals of one's own; occlusion/intervals/   (on request)
       occlusion/{forward,backward}/%06d.png   255 where the point is hidden at the other end
@@ -33,7 +33,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-import h5py
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
@@ -53,7 +52,6 @@ from blinkgl.io.frame_camera import (
     picture_file,
     stamps_txt,
 )
-from blinkgl.io.hdf5 import blosc_dataset, write_rows
 from blinkgl.io.records import InsidePath, entries_below, open_regular, parse, read_text, shown
 from blinkgl.labels import Form, Label, label_of
 from blinkgl.types.events import Events
@@ -127,7 +125,6 @@ class SequenceWriter:
         self._files: dict[str, dict[str, Any]] = {}
         self._promised = {name for name, on in (("events.h5", events), (EVENT_LABELS, truth)) if on}
         self._timestamps: dict[str, list[str]] = {}
-        self._row_files: dict[str, h5py.File] = {}
         self._exposures: list[ExposureLine] = []
         self._failure: list[BaseException] = []
 
@@ -191,10 +188,7 @@ class SequenceWriter:
         elif label.stamps is not None:
             self._stamp(label.stamps, f"{int(t_us)}, {int(to_us)}", "# from_timestamp_us, to_timestamp_us")
         for form in label.forms[:1] if self.labels is None else label.written(self.labels):
-            if form.rows is None:
-                self._write(form.file(index), partial(self._encoded, label, form, value))
-            else:
-                self._submit(partial(self._append_rows, form, value))
+            self._write(form.file(index), partial(self._encoded, label, form, value))
 
     def poses(self, **arrays: np.ndarray) -> None:
         """``poses.npz``: named numeric arrays (camera and object poses, times, intrinsics)."""
@@ -291,19 +285,6 @@ class SequenceWriter:
         if self._failure:
             raise self._failure[0]
 
-    def _append_rows(self, form: Form, value: Any) -> None:
-        name, rows = form.file(0), form.rows(value)
-        path = self.path(name)
-        with output_errors(path):
-            if name not in self._row_files:
-                self._promised.add(name)
-                file = self._row_files[name] = h5py.File(path, "w", rdcc_nbytes=0)
-                for key, array in rows.items():
-                    blosc_dataset(file, key, (0, *array.shape), array.dtype, (1, *array.shape))
-            file = self._row_files[name]
-            for key, array in rows.items():
-                write_rows(file[key], len(file[key]), array[None])
-
     def _finish(self) -> None:
         self._check()
         for name, lines in self._timestamps.items():
@@ -319,8 +300,6 @@ class SequenceWriter:
         self._pool.shutdown(wait=True)
         self._check()
         with output_errors(self.final):
-            for file in self._row_files.values():
-                file.close()
             self._check_untouched()
             for path in sorted(self._tmp.rglob("*")):
                 name = path.relative_to(self._tmp).as_posix()
@@ -374,11 +353,6 @@ class SequenceWriter:
             self._events.abort()
         if self._truth is not None:
             self._truth.abort()
-        for file in self._row_files.values():
-            try:
-                file.close()
-            except Exception:  # noqa: BLE001 - a full disk refuses the flush; the file is deleted anyway
-                pass
         shutil.rmtree(self._tmp, ignore_errors=True)
 
 
@@ -395,50 +369,41 @@ class _File(BaseModel):
     sha256: str = Field(pattern="^[0-9a-f]{64}$")
 
 
-class Manifest(BaseModel):
+class _Common(BaseModel):
     """What a manifest must look like, wherever it comes from. Further keys are welcome; a
     key that its maker left out is None."""
 
     model_config = ConfigDict(strict=True, extra="allow")
-    format: Literal["blinkgl-sequence"]
     format_version: Literal[1]
+    events: int = Field(ge=0, le=_LARGEST)
+    t_offset_us: int = Field(ge=-_LARGEST, le=_LARGEST)
+    duration_us: int | None = Field(None, ge=0, le=_LARGEST)
+    seed: int | None = Field(None, ge=0, lt=2**63)
+    sequence: int | None = Field(None, ge=0, le=_LARGEST)
+    split: str | None = Field(None, max_length=255)
+    blinkgl: str | None = Field(None, max_length=255)
+    labels: int | None = Field(None, ge=0, le=_LARGEST)
+    frames: int | None = Field(None, ge=0, le=_LARGEST)
+    opengl: dict[str, str] | None = None
+    versions: dict[str, str] | None = None
+    files: dict[InsidePath, _File]
+
+
+class Manifest(_Common):
+    """Of one camera's sequence."""
+
+    format: Literal["blinkgl-sequence"]
     height: int = Field(ge=1, le=65536)
     width: int = Field(ge=1, le=65536)
-    events: int = Field(ge=0, le=_LARGEST)
-    t_offset_us: int = Field(ge=-_LARGEST, le=_LARGEST)
-    duration_us: int | None = Field(None, ge=0, le=_LARGEST)
-    seed: int | None = Field(None, ge=0, lt=2**63)
-    sequence: int | None = Field(None, ge=0, le=_LARGEST)
-    split: str | None = Field(None, max_length=255)
     emulator: str | None = Field(None, max_length=255)
-    blinkgl: str | None = Field(None, max_length=255)
-    labels: int | None = Field(None, ge=0, le=_LARGEST)
-    frames: int | None = Field(None, ge=0, le=_LARGEST)
-    opengl: dict[str, str] | None = None
-    versions: dict[str, str] | None = None
-    files: dict[InsidePath, _File]
 
 
-class RigManifest(BaseModel):
+class RigManifest(_Common):
     """The same of a rig's sequence (rig_dir.py), whose ``files`` are those of all sensors."""
 
-    model_config = ConfigDict(strict=True, extra="allow")
     format: Literal["blinkgl-rig"]
-    format_version: Literal[1]
-    events: int = Field(ge=0, le=_LARGEST)
-    t_offset_us: int = Field(ge=-_LARGEST, le=_LARGEST)
-    duration_us: int | None = Field(None, ge=0, le=_LARGEST)
-    seed: int | None = Field(None, ge=0, lt=2**63)
-    sequence: int | None = Field(None, ge=0, le=_LARGEST)
-    split: str | None = Field(None, max_length=255)
-    blinkgl: str | None = Field(None, max_length=255)
-    labels: int | None = Field(None, ge=0, le=_LARGEST)
-    frames: int | None = Field(None, ge=0, le=_LARGEST)
-    opengl: dict[str, str] | None = None
-    versions: dict[str, str] | None = None
     sensors: list[InsidePath]
     cameras: list[InsidePath]
-    files: dict[InsidePath, _File]
 
 
 _MODEL, _RIG_MODEL = TypeAdapter(Manifest), TypeAdapter(RigManifest)

@@ -13,7 +13,6 @@ from typing import Any
 from blinkgl.config.run import RunTemplate
 from blinkgl.config.scene import RandomSceneConfig
 from blinkgl.errors import ConfigError
-from blinkgl.events import emulator_of
 from blinkgl.gl import create_context
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.machine.bench import machine_line
@@ -77,10 +76,7 @@ def trade(
     started = time.perf_counter()
     options = options or (QUICK if quick else Options())
     base = template.sequence(options.sequence)
-    follows = emulator_of(base.events).noiseless(base.events).reconstructions
-    settings = tuple(
-        s for s in settings or design(quick, isinstance(base.scene, RandomSceneConfig)) if s.reconstruction in follows
-    )
+    settings = settings or design(quick, isinstance(base.scene, RandomSceneConfig))
     settings = chosen(settings, only or [], skip or [])
     rows: list[dict] = []
     sizes: dict[str, dict] = {}

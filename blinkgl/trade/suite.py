@@ -133,7 +133,7 @@ def _measured(
     best = {r["name"] for r in pareto_front([r for r in rows if r["trusted"]], cost, "voxel")}
     for row in rows:
         row["on_front"] = row["name"] in best
-        for key in ("sampling", "reconstruction", "antialiasing", "other", "size", "overrides", "width", "height"):
+        for key in ("sampling", "antialiasing", "other", "size", "overrides", "width", "height"):
             row.pop(key, None)
     return {
         "what": scene.what,

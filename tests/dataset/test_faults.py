@@ -2,12 +2,9 @@
 second drivers, links, refusals."""
 
 import fcntl
-import json
 import os
 import re
-import select
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -27,8 +24,6 @@ from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError, EventDataError, GLError, OutputError, may_pass
 from blinkgl.io import atomic
-from blinkgl.sequence_files import index as index_module
-from blinkgl.sequence_files.index import read_index, write_index
 from runs import RECIPE, recipe_file, start, temporaries, tree
 
 FLY = {"fly": {**RECIPE["groups"]["fly"], "output": {"sequences": 3}}}
@@ -262,7 +257,7 @@ def test_memory_does_not_grow_with_the_number_of_sequences(tmp_path):
                 return [{"environment": {}, "assets": work.digest(self._maker.plan.check_assets())}]
 
             def poll(self, timeout_s):
-                return [{"kind": "silent", "task": self._next[0], "error": "stop here"}]
+                return [{"kind": "progress", "task": self._next[0], "error": "stop here"}]
 
         def act():
             with pytest.raises(Enough):
@@ -270,7 +265,7 @@ def test_memory_does_not_grow_with_the_number_of_sequences(tmp_path):
                     template(tmp_path, groups={"fly": {"output": {"sequences": sequences}}}),
                     tmp_path / f"{sequences}",
                     Nothing(),
-                    listener=When("silent", stop),
+                    listener=When("progress", stop),
                 )
 
         return act
@@ -278,70 +273,6 @@ def test_memory_does_not_grow_with_the_number_of_sequences(tmp_path):
     begin(3)()
     small, large = peak_of(begin(10)), peak_of(begin(10_000_000))
     assert large < 1.5 * small + 1e6, f"{small} and {large} bytes"
-
-
-def test_the_index_is_sorted_in_parts(reference, tmp_path, monkeypatch):
-    monkeypatch.setattr(index_module, "_PART", 7)
-    manifest = json.loads((reference / NAMES[0] / "manifest.json").read_text())
-
-    def data_set(count: int) -> Path:
-        root = tmp_path / f"of{count}"
-        for k in range(count):
-            folder = root / ("train", "test")[k % 2] / f"s_{k * 7919 % count:06d}"
-            folder.mkdir(parents=True)
-            (folder / "manifest.json").write_text(json.dumps({**manifest, "sequence": k}))
-        return root
-
-    few, many = data_set(20), data_set(400)
-    write_index(few)
-    small, large = peak_of(lambda: write_index(few)), peak_of(lambda: write_index(many))
-    paths = [line["path"] for line in read_index(many)]
-    assert len(paths) == 400 and paths == sorted(paths)
-    # A part in memory, and a file's buffer for each part on the disk.
-    assert large < small + 58 * 40_000, f"{small} and {large} bytes"
-    assert sorted(p.name for p in many.iterdir()) == ["index.jsonl", "test", "train"]
-
-
-# ---- stopped workers -------------------------------------------------------------------------------------------------
-
-
-def test_a_stopped_worker_is_named_and_waited_for(reference, tmp_path, monkeypatch):
-    """SIGSTOP: said in one line after a while; the work goes on when the worker does, and nothing is tried twice."""
-    monkeypatch.setattr(executor_module, "_SILENT_S", 2.5)
-    executor = Local(1)
-
-    def stop(name, message):
-        os.kill(executor._processes[0].popen.pid, signal.SIGSTOP)
-
-    class Display(When):
-        def message(self, name, message):
-            super().message(name, message)
-            if message["kind"] == "silent":
-                os.kill(message["pid"], signal.SIGCONT)
-
-    display = Display("progress", stop)
-    outcome = run_dataset(template(tmp_path), tmp_path / "out", executor, listener=display)
-    ((name, silent),) = [(n, m) for n, m in display.messages if m["kind"] == "silent"]
-    assert (
-        f"worker 0 (pid {silent['pid']}) is stopped: no word from it for" in silent["error"]
-        and "--time-limit" in silent["error"]
-    )
-    assert len(outcome.made) == 3 and not any(m["kind"] == "failed" for _, m in display.messages)
-    assert "is stopped" in (tmp_path / "out/.run/logs" / f"{name}.log").read_text()
-    assert_same(tmp_path / "out", reference)
-
-
-def test_a_worker_says_that_it_lives_whatever_it_does(tmp_path):
-    """Here: waits for its first order."""
-    process = executor_module._Process(0, tmp_path / "log", dict(os.environ))
-    try:
-        assert select.select([process.channel], [], [], 60)[0], "no word in a minute"
-        assert process.read() == ([{"kind": "alive"}], False)
-        assert process.silence() is None, "nothing was asked of it"
-    finally:
-        process.popen.kill()
-        process.popen.wait()
-        process.close()
 
 
 # ---- files deleted under a run ---------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.shards import export_shards
 from blinkgl.dataset.verify import verify_dataset
-from blinkgl.dataset.verify.again import differences
+from blinkgl.dataset.verify.reproduce import differences
 from blinkgl.errors import AssetError
 from blinkgl.imaging import CameraImage
 from blinkgl.io.frame_camera import encode_codes, read_codes, read_exposures

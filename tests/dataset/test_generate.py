@@ -266,10 +266,7 @@ def test_a_still_camera_saves_work_and_changes_nothing(tmp_path, monkeypatch):
         (
             {"kind": "uniform", "fps": 200},
             {"kind": "displacement", "max_px": 0.3},
-            {"kind": "uniform", "fps": 200, "reconstruction": "hermite"},
-            {"kind": "displacement", "max_px": 0.5, "reconstruction": "pchip"},
-            {"kind": "brightness", "reconstruction": "hermite"},
-            {"kind": "budget", "max_time_error_us": 300, "reconstruction": "pchip"},
+            {"kind": "brightness"},
         )
     ):
         quick = generate(tmp_path, out=f"quick {k}", scene=scene, timeline=timeline)[0]
@@ -312,7 +309,7 @@ def test_only_requested_labels_are_written(tmp_path):
 def test_preview_shows_the_sequence(tmp_path):
     import imageio.v3 as iio
 
-    folder = generate(tmp_path, preview={"enabled": True, "rate": 40, "slowdown": 4})[0]
+    folder = generate(tmp_path, preview={"enabled": True, "rate": 40})[0]
     video = iio.imread(folder / "preview.mp4")
     assert len(video) == 11 and video.shape[2] > 3 * 64 and video.std() > 10
 

@@ -15,7 +15,7 @@ from blinkgl.config.run import load_run
 from blinkgl.dataset.executor import Inline, Local
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import verify_dataset
-from blinkgl.dataset.verify.again import differences
+from blinkgl.dataset.verify.reproduce import differences
 from blinkgl.errors import ConfigError, OutputError
 from blinkgl.gl import create_context
 from blinkgl.io.imu import read_imu

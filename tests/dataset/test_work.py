@@ -198,7 +198,7 @@ def test_the_preview_is_fed_and_ended(monkeypatch, rate, recorded, fails):
     velocity = np.full((3, 4, 2), 40, np.float32)
     try:
         folder = SimpleNamespace(path=lambda name: name)
-        with PreviewRecorder(PreviewConfig(slowdown=4), [sequence], folder) as recorder:
+        with PreviewRecorder(PreviewConfig(), [sequence], folder) as recorder:
             recorder.take(sequence, EventChunk(7_000_000, "events"))
             recorder.take(sequence, Picture(7_999_999, "image", None if recorded else velocity))
             if fails:
@@ -212,15 +212,13 @@ def test_the_preview_is_fed_and_ended(monkeypatch, rate, recorded, fails):
         "t0_us": 2500,
         "flow": not recorded,
         "rate_hz": 50.0,
-        "fps": 12.5,
+        "fps": 25.0,
         "label": "frame",
-        "tracks": None,
-        "curves": None,
     }
-    assert calls[0] == ("made", "preview.mp4", (3, 4, about), 12.5)
+    assert calls[0] == ("made", "preview.mp4", (3, 4, about), 25.0)
     names = [name for name, *_ in calls[1:]]
     assert names == ["add_events", *([] if recorded else ["set_flow"]), "frame", "abort" if fails else "close"]
-    assert calls[-2][1:] == (0, 7999, "image", []) and sequence.clock.seconds["preview"] >= 0
+    assert calls[-2][1:] == (0, 7999, "image") and sequence.clock.seconds["preview"] >= 0
     if not recorded:
         assert (calls[2][1] == 2).all(), "px in a label interval"
 
@@ -247,7 +245,7 @@ EXPLAINED = {
         ({"timeline": {"kind": "uniform", "fps": 100}}, 26, 1, {"event frames": 8}),
         (
             {
-                "timeline": {"kind": "uniform", "fps": 100, "reconstruction": "hermite"},
+                "timeline": {"kind": "uniform", "fps": 100},
                 "render": {"antialiasing": "ssaa2"},
             },
             26,

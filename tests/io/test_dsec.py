@@ -101,7 +101,7 @@ def test_slices_agree_with_the_independent_slicer(tmp_path, monkeypatch):
 def test_bytes_do_not_depend_on_chunking_threads_or_time(tmp_path):
     events = random_events(400_000, 300_000)
     for i in range(3):
-        write(tmp_path / f"{i}.h5", events, chunk_sizes(i), background=i < 2)
+        write(tmp_path / f"{i}.h5", events, chunk_sizes(i))
     contents = [(tmp_path / f"{i}.h5").read_bytes() for i in range(3)]
     assert contents[0] == contents[1] == contents[2]
 

@@ -17,7 +17,6 @@ from pydantic import TypeAdapter, ValidationError
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io import atomic
 from blinkgl.io.records import InsidePath, entries_below, open_regular, parse, read_text, shown
-from blinkgl.sequence_files import index
 from blinkgl.sequence_files.index import INDEX, read_index, sequence_folders, write_index
 from blinkgl.sequence_files.sequence_dir import Manifest, refuse_existing, verify_sequence
 
@@ -260,13 +259,6 @@ def test_the_index_lists_what_is_whole(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == [".hidden", "alone", INDEX, "test", "train"]
     assert write_index(tmp_path / "alone") == 1 and read_index(tmp_path / "alone")[0]["path"] == "."
     assert list(sequence_folders(tmp_path / "alone")) == [tmp_path / "alone"]
-
-
-def test_parts_of_the_index_are_merged(tmp_path, monkeypatch):
-    monkeypatch.setattr(index, "_PART", 2)
-    for name in "edcba":
-        sequence(tmp_path / name)
-    assert write_index(tmp_path) == 5 and [line["path"] for line in read_index(tmp_path)] == list("abcde")
 
 
 @pytest.mark.parametrize(

@@ -302,7 +302,7 @@ def test_known_noise_comes_back(tmp_path, seed):
 def test_one_line_and_nothing_written(tmp_path, capsys, what, said):
     camera, file = files(tmp_path)
     extra = {"no frames": [], "unknown key": ["--set", "speed=3"],
-             "ratio": ["--set", "threshold_ratio=1.1"], "interpolation": ["--interpolate", "cubic"],
+             "ratio": ["--set", "threshold_ratio=1.1"], "interpolation": ["--interpolate", "linear"],
              "still and frames": ["--still"]}.get(what, [])  # fmt: skip
     stored = dict(np.load(file))
     if what == "other size":

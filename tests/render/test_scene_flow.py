@@ -99,5 +99,3 @@ def test_the_reference_says_the_same(gl):
     off = ref.hit & ~reference.silhouette_band(ref.instance, ref.depth)
     row = LABELS["scene_flow"]
     np.testing.assert_allclose(frame.scene_flow[off], row.reference(what, ref)[off], atol=3e-6)
-    assert row.agrees(frame.scene_flow, frame.scene_flow) and not row.agrees(frame.scene_flow, frame.scene_flow + 0.1)
-    assert row.problem(frame.scene_flow) is None and "finite" in row.problem(frame.scene_flow * np.nan)

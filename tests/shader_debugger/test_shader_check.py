@@ -37,7 +37,7 @@ def test_everything_compiles(shader):
         "colour.glsl": 138,
         "debug.glsl": 14,
         "downsample.glsl": 2,
-        "edges.glsl": 3,
+        "edges.glsl": 2,
         "gather.glsl": 3,
         "label.glsl": 140,
         "luminance.glsl": 410,
@@ -65,10 +65,10 @@ def test_the_table_of_variants_is_what_the_renderer_asks_for(gl, config, monkeyp
     with Renderer(gl, world, RenderConfig(antialiasing="ssaa2", image_antialiasing="ssaa4")) as renderer:
         renderer.luminance(t), renderer.colour(t), renderer.velocity(t), renderer.velocity(t, 4)
         with Renderer(gl, world, RenderConfig(antialiasing="taps4")) as tapped:
-            tapped.luminance(t, rate=True)
+            tapped.luminance(t)
         with Renderer(gl, world, RenderConfig(antialiasing="edges")) as edged:
-            edged.luminance(t, rate=True)
-        renderer.luminance(t, rate=True)
+            edged.luminance(t)
+        renderer.brightness(t)
         renderer.brightness(t, 4)
         for names in (*([name] for name in fields), fields):
             renderer.labels(t, LabelRequest(*names), t + 10**8, t - 10**8)

@@ -250,24 +250,21 @@ def test_mip_chain_keeps_the_mean_and_level_0_is_the_reference():
 # ------------------------------------------------------------------------------------------------- edges
 
 
-ALL_EDGED = (
-    *("--set", "timeline.reconstruction=hermite"),
-    *("--set", "render.image_antialiasing=edges"),
-)
-ALL_THREE = ("--pass", "luminance_edges", "--pass", "rate_edges", "--pass", "colour_edges")
+ALL_EDGED = ("--set", "render.image_antialiasing=edges")
+BOTH = ("--pass", "luminance_edges", "--pass", "colour_edges")
 
 
 def test_what_edges_puts_together_is_what_its_twin_does(shader, config, tmp_path):
-    """In luminance, its rate and colour, at all pixels, silhouettes first of all."""
+    """In luminance and colour, at all pixels, silhouettes first of all."""
     out = tmp_path / "d"
-    status, text, _ = shader("diff", config, *ALL_EDGED, *ALL_THREE, "--time", 0.1, "--json", "--out", out)
+    status, text, _ = shader("diff", config, *ALL_EDGED, *BOTH, "--time", 0.1, "--json", "--out", out)
     reports = json.loads(text)["buffers"]
     assert status == 0 and [r["buffer"] for r in reports] == list(silhouettes.EDGED)
     for report in reports:
         assert report["passed"] and report["value"] < 1e-5 and report["tolerance"] == 1e-4
         assert report["off_silhouettes"]["pixels"] == WIDTH * HEIGHT
-    assert np.load(out / "rate_edges_error.npy").shape == (HEIGHT, WIDTH) and (out / "diff.png").exists()
-    status, text, _ = shader("diff", config, *ALL_THREE[:2], "--tolerance", "0")
+    assert np.load(out / "luminance_edges_error.npy").shape == (HEIGHT, WIDTH) and (out / "diff.png").exists()
+    status, text, _ = shader("diff", config, *BOTH[:2], "--tolerance", "0")
     assert status == 1 and "FAIL luminance_edges" in text  # float32
 
 
@@ -276,7 +273,6 @@ def test_pictures_of_edges_are_there_where_the_configuration_filters_so(shader, 
     assert there() == ("luminance_edges",)
     assert there("render.antialiasing=taps4") == there("quality=null") == ()
     assert there("render.antialiasing=taps4", "render.image_antialiasing=edges") == ("colour_edges",)
-    assert there("timeline.reconstruction=hermite") == ("luminance_edges", "rate_edges")
     status, _, error = shader("diff", config, "--set", "render.antialiasing=taps4", "--pass", "luminance_edges")
     assert status == 2 and "unknown pass (got 'luminance_edges')" in error
 

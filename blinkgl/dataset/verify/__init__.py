@@ -1,13 +1,13 @@
-"""Is a data set whole and right? Files against manifests, names and manifests against configurations, contents against
-the formats, and a sample against itself made anew.
+"""Is a data set whole and right? Files against manifests, names and manifests against configurations, and a sample
+against itself made anew, bit by bit.
 
 A sequence's problems are lines of text; none means none found. What could not be looked at is counted and said: nothing
 is passed over in silence. Whatever stands in a record, looking at it ends, and ends with a line.
 
 In:    a folder of sequences, or one sequence.
 Out:   a ``Verification``.
-Start: sequence.py looks at one folder: asked.py says what its configuration asks for, contents.py looks into its files;
-between.py at what lies between folders; again.py makes some anew.
+Start: sequence.py looks at one folder: config_checks.py says what its configuration asks for; cross_checks.py at what
+lies between folders; reproduce.py makes some anew.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from blinkgl.dataset.verify.again import made_again
-from blinkgl.dataset.verify.between import against_run, index, strangers, twins
-from blinkgl.dataset.verify.found import Known, Verification, guarded
+from blinkgl.dataset.verify.cross_checks import against_run, index, strangers, twins
+from blinkgl.dataset.verify.problems import Known, Verification, guarded
+from blinkgl.dataset.verify.reproduce import made_again
 from blinkgl.dataset.verify.sequence import look
 from blinkgl.dataset.work import RUN_FOLDER
 from blinkgl.errors import AssetError

@@ -7,9 +7,8 @@ from typing import Any
 
 from blinkgl.config.run import load_run
 from blinkgl.config.sequence import SequenceConfig
-from blinkgl.dataset.verify.asked import bound, files_of_rig, misnamed, not_asked_for, said_of, times_of, unlike
-from blinkgl.dataset.verify.contents import check_imu, contents
-from blinkgl.dataset.verify.found import Known, guarded
+from blinkgl.dataset.verify.config_checks import bound, files_of_rig, misnamed, not_asked_for, said_of, times_of, unlike
+from blinkgl.dataset.verify.problems import Known, guarded
 from blinkgl.io.records import shown
 from blinkgl.sequence_files.sequence_dir import MANIFEST, read_manifest, verify_sequence
 
@@ -38,9 +37,9 @@ def look(folder: Path, name: str) -> tuple[list[str], Known | None]:
         if manifest["format"] == "blinkgl-rig":
             problems = look_at_rig(folder, name, manifest, config)
         elif config.sensors is not None:
-            problems = look_at_sensor(folder, manifest, config)
+            problems = look_at_sensor(manifest, config)
         else:
-            problems = bound(name, manifest, config) or contents(folder, manifest, config)
+            problems = bound(name, manifest, config)
         if not problems:
             found.append(Known(folder, manifest, config))
         return problems
@@ -59,21 +58,16 @@ def look_at_rig(folder: Path, name: str, manifest: dict[str, Any], config: Seque
         return problems
     for one in config.sensors:
         if one.sees:
-            inside = guarded(
-                lambda one=one: look_at_sensor(folder / one.name, read_manifest(folder / one.name), config)
-            )
-            problems += [f"{one.name}/{line}" for line in inside]
-        elif one.imu is not None:
-            inside = guarded(lambda one=one: check_imu(folder / one.name, config.model_copy(update={"imu": one.imu})))
+            inside = guarded(lambda one=one: look_at_sensor(read_manifest(folder / one.name), config))
             problems += [f"{one.name}/{line}" for line in inside]
     total = sum(read_manifest(folder / one.name)["events"] for one in config.sensors if one.sees)
     return problems or unlike(manifest, [("events", total)])
 
 
-def look_at_sensor(folder: Path, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
+def look_at_sensor(manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
     """Problems of the folder of one camera of a rig, whose configuration is the rig's."""
     number = {one.name: k for k, one in enumerate(config.sensors or ()) if one.sees}.get(str(manifest.get("sensor")))
     if number is None or config.sensors is None:
         return [f"{MANIFEST}: sensor is {shown(manifest.get('sensor'))}, of which config.yaml says nothing"]
     own, events = config.of_sensor(number), config.sensors[number].events is not None
-    return bound(".", manifest, own, events) or contents(folder, manifest, own)
+    return bound(".", manifest, own, events)

@@ -61,7 +61,6 @@ def load_asset(
     keep_materials: bool = True,
     max_texture: int = 2048,
     source_hash: str | None = None,
-    project_uvs: bool = False,
     uv_size: float | None = None,
     up: str = "auto",
     animation: AnimationConfig | None = None,
@@ -78,12 +77,12 @@ def load_asset(
         and z for the others, which say nothing.
     keep_materials : parts with the file's materials; else one part, white, with texture coordinates that can carry any
         texture (projected where the file has none or degenerate ones).
-    project_uvs : replace the file's texture coordinates; ``uv_size`` is the edge of one repeat.
+    uv_size : edge of one repeat of texture coordinates that are projected.
     Raises AssetError naming the file: missing, corrupt, NaN, no faces, more than ``max_faces`` triangles or
     ``max_bytes`` bytes, references outside its folder, an extension required that is not drawn.
     """
     with reading("mesh", str(path)):
-        given = Path(path), max_faces, max_bytes, keep_materials, max_texture, source_hash, project_uvs, uv_size, up
+        given = Path(path), max_faces, max_bytes, keep_materials, max_texture, source_hash, uv_size, up
         asset = _load(*given, animation, Path(base), where)
     again = partial(
         load_asset,
@@ -93,7 +92,6 @@ def load_asset(
         keep_materials=keep_materials,
         max_texture=max_texture,
         source_hash=source_hash,
-        project_uvs=project_uvs,
         uv_size=uv_size,
         up=up,
         base=base,
@@ -109,7 +107,6 @@ def _load(
     keep_materials: bool,
     max_texture: int,
     source_hash: str | None,
-    project_uvs: bool,
     uv_size: float | None,
     up: str,
     animation: AnimationConfig | None,
@@ -170,7 +167,7 @@ def _load(
             piece.vertices,
             piece.faces,
             normals=piece.normals,
-            uvs=None if project_uvs else piece.uvs,
+            uvs=piece.uvs,
             name=path.stem,
             source_hash=digest,
             where=where,

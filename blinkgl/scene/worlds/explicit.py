@@ -300,9 +300,8 @@ def _asset(
     return load_asset(
         path,
         max_faces=max_faces,
-        keep_materials=own_materials,
-        project_uvs=config.project_uvs,
         uv_size=config.uv_size,
+        keep_materials=own_materials,
         up=config.up,
         animation=animation,
         base=base,

@@ -125,14 +125,14 @@ def test_the_camera_follows_a_moving_target():
 
 def test_shake_adds_high_frequencies_only_to_the_rotation():
     calm = CameraMotion(speed=1.0, rotation_rate=20.0)
-    shaky = calm.model_copy(update={"shake": 1.0, "shake_rate": 30.0})
+    shaky = calm.model_copy(update={"shake": 1.0})
     a, b = (random_camera_path(rng(5), 0, SECOND, c, SPACE, 0.1, TARGET) for c in (calm, shaky))
     times = np.linspace(0, SECOND, 400).astype(np.int64)
     A, B = a.poses(times), b.poses(times)
     assert np.abs(A[:, :3, 3] - B[:, :3, 3]).max() < 1e-9  # the curve is the same
     angle = Rotation.from_matrix(A[:, :3, :3].transpose(0, 2, 1) @ B[:, :3, :3]).magnitude()
     assert 0.5 < np.degrees(np.sqrt((angle**2).mean())) < 3.5
-    assert statistics(b, 0, SECOND).mean_rate > 2 * statistics(a, 0, SECOND).mean_rate
+    assert statistics(b, 0, SECOND).mean_rate > 1.3 * statistics(a, 0, SECOND).mean_rate
 
 
 def test_the_same_generator_gives_the_same_path_and_another_a_different_one():

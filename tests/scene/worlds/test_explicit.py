@@ -140,7 +140,7 @@ def test_materials_meshes_and_scale(tmp_path):
         tmp_path,
         meshes={
             "box": {"primitive": "cuboid", "parameters": {"extents": [1, 2, 3]}},
-            "ball": {"file": "ball.stl", "uv_size": 0.25},
+            "ball": {"file": "ball.stl"},
             "floor": {"primitive": "grid", "parameters": {"width": 20, "subdivisions": 8}},
         },
         materials={

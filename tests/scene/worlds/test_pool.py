@@ -374,11 +374,12 @@ def test_corrupt_image_in_a_folder_is_named_or_skipped(tmp_path):
     assert "50 textures drawn in a row are unusable" in config_error(lambda: pool.draw(rng, "train"))
 
 
-def test_a_file_too_large_to_look_at_is_named_or_skipped(tmp_path):
+def test_a_file_too_large_to_look_at_is_named_or_skipped(tmp_path, monkeypatch):
     """Files are read once for their content's hash; what is refused there is as bad an asset
     as what cannot be decoded."""
     (tmp_path / "large.obj").write_text("v 0 0 0\n" * 1000)
     (tmp_path / "small.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    settings = dict(primitives=(), folders=(str(tmp_path),), test_fraction=0, max_file_mb=0.001)
+    settings = dict(primitives=(), folders=(str(tmp_path),), test_fraction=0)
+    monkeypatch.setattr(PoolConfig, "max_file_mb", 0.001)
     assert config_error(lambda: object_pool(PoolConfig(**settings), ".")).startswith(str(tmp_path / "large.obj"))
     assert [e.name for e in object_pool(PoolConfig(**settings, bad_assets="skip"), ".").entries] == ["small.obj"]

@@ -13,7 +13,7 @@ from blinkgl.config.run import RunTemplate, load_run
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.run_folder import RunFolder
-from blinkgl.dataset.verify.found import Known, Verification, guarded
+from blinkgl.dataset.verify.problems import Known, Verification, guarded
 from blinkgl.dataset.work import RUN_FOLDER
 from blinkgl.errors import BlinkGLError
 from blinkgl.io.records import open_regular, shown

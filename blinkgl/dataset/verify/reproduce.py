@@ -9,17 +9,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from blinkgl.config.run import load_run
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.dataset.run_folder import RunFolder
-from blinkgl.dataset.verify.between import comparable, first_difference, made_with
-from blinkgl.dataset.verify.found import Known, Verification, guarded
+from blinkgl.dataset.verify.cross_checks import made_with
+from blinkgl.dataset.verify.problems import Known, Verification, guarded
 from blinkgl.errors import BlinkGLError
 from blinkgl.gl import GLContext, create_context
 from blinkgl.io.records import shown
-from blinkgl.labels import LABELS
 from blinkgl.sequence_files.sequence_dir import MANIFEST, read_manifest
 
 _SAME_ANYWHERE = (
@@ -36,10 +32,6 @@ _SAME_ANYWHERE = (
     "source",
 )
 """Of a manifest: what no renderer and no library has a say in."""
-
-
-_ENGINES = ("mujoco",)
-"""Among the versions of a manifest: what computed the poses of falling bodies."""
 
 
 def made_again(
@@ -93,22 +85,7 @@ def _compared(name: str, one: Known, made: Path, result: Verification) -> list[s
         f"made again, {MANIFEST}: {key} differs" for key in _SAME_ANYWHERE if one.manifest.get(key) != manifest.get(key)
     ]
     problems += [f"made again, {line}" for line in lines if line.endswith("only in one of them")]
-    depend = []
-    for file in sorted(set(one.manifest["files"]) & set(manifest["files"])):
-        if one.manifest["files"][file]["sha256"] != manifest["files"][file]["sha256"]:
-            inside = next((camera for camera in manifest.get("cameras", ()) if file.startswith(camera + "/")), None)
-            below, name_ = ("", file) if inside is None else (inside, file.removeprefix(inside + "/"))
-            if (_moved_otherwise(one.manifest, manifest) and _follows_poses(name_)) or _agrees(
-                name_, one.folder / below, made / below
-            ):
-                depend.append(file)
-            else:
-                problems.append(f"made again, {file}: differs by more than a renderer can")
-    result.notes.append(
-        f"{shown(name)}: {apart}; of {len(depend)} files that may depend on it the bytes were not compared: "
-        + ", ".join(depend[:4])
-        + (" …" if len(depend) > 4 else "")
-    )
+    result.notes.append(f"{shown(name)}: {apart}; the bytes of its files were not compared")
     return problems
 
 
@@ -119,46 +96,6 @@ def _apart(one: dict[str, Any], other: dict[str, Any]) -> str:
     return "; ".join(
         f"made with {k} {shown(mine.get(k))}, this machine has {shown(here.get(k))}" for k in sorted(different)
     )
-
-
-def _moved_otherwise(one: dict[str, Any], other: dict[str, Any]) -> bool:
-    """Whether another engine, or another version of it, computed the poses of one of the two."""
-    return any(made_with(one).get(name) != made_with(other).get(name) for name in _ENGINES)
-
-
-def _follows_poses(file: str) -> bool:
-    """Whether what the file says hangs on where things are, not only on what was asked for."""
-    return file != "config.yaml" and not file.endswith(".txt")
-
-
-def _agrees(file: str, one: Path, other: Path) -> bool:
-    """Whether two machines' files of one name say the same, as far as machines can agree. True for what a renderer, a
-    codec or a library may change in every byte."""
-    a, b = one / file, other / file
-    if file == "config.yaml":
-        mine, here = (load_run(path) for path in (a, b))
-        said = [comparable(run.sequence(run.check().output.first_index)) for run in (mine, here)]
-        return not first_difference(said[0], said[1])
-    if any(form.holds(file) for label in LABELS.values() for form in label.forms[1:]):
-        return True  # says again what the first form does
-    if file.endswith(".txt"):
-        return False
-    if file == "poses.npz":
-        with np.load(a, allow_pickle=False) as p, np.load(b, allow_pickle=False) as q:
-            return set(p.files) == set(q.files) and all(
-                p[k].shape == q[k].shape
-                and (
-                    np.allclose(p[k], q[k], rtol=1e-9, atol=1e-9)
-                    if p[k].dtype.kind == "f"
-                    else np.array_equal(p[k], q[k])
-                )
-                for k in p.files
-            )
-    for label in LABELS.values():
-        form = label.forms[0]
-        if form.holds(file) and form.read is not None:
-            return label.agrees(form.read(a), form.read(b))
-    return True
 
 
 def differences(a: Path, b: Path) -> list[str]:

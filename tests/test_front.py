@@ -416,16 +416,6 @@ def test_what_lives_is_what_yaml_makes_of_it(tmp_path):
     assert paint.material.tree["color"] == [1, 0, 0]
 
 
-def test_triangles_can_deform():
-    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1]], float)
-    sheet = blinkgl.Mesh(vertices=corners, faces=[[0, 1, 2], [0, 2, 3]], deform=blinkgl.Deform("flag", amplitude=0.3))
-    scene = blinkgl.Scene(blinkgl.Camera(32, 24, pose=(0.5, -3, 0.5)), [sheet])
-    built = scene.build(scene.template().sequence(0))
-    mesh = built.objects[0].parts[0].mesh
-    assert built.objects[0].deforms and len(mesh.faces) > 500
-    assert np.ptp(mesh.deformer.positions(mesh, 10**8)[:, 1]) > 0.1
-
-
 # --- what falls -------------------------------------------------------------------------------------------------------
 
 

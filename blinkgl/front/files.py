@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from blinkgl.io.formats import EventFile
 from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from blinkgl.recordings.calibration import Calibration
     from blinkgl.recordings.comparison import Comparison
     from blinkgl.recordings.simulation import SimulationReport
@@ -248,17 +250,20 @@ def calibrate(
     )
 
 
+class FrameOptions(TypedDict, total=False):
+    """How frames become events, as :func:`blinkgl.simulate` says it."""
+
+    fps: float | None
+    emulator: EmulatorSettings
+    gamma: str | float | None
+    interpolate: str
+    max_px: float
+    seed: int
+    sensor: str | None
+
+
 def simulate(
-    frames: Iterable,
-    *,
-    fps: float | None = None,
-    emulator: EmulatorSettings = "esim",
-    gamma: str | float | None = None,
-    interpolate: str = "linear",
-    max_px: float = 1.0,
-    seed: int = 0,
-    sensor: str | None = None,
-    report: SimulationReport | None = None,
+    frames: Iterable, *, report: SimulationReport | None = None, **frame_options: Unpack[FrameOptions]
 ) -> Iterator[Events]:
     """:class:`Events` of any stream of frames, a chunk per step, t in µs; nothing but the current frames is kept.
 
@@ -276,17 +281,39 @@ def simulate(
         raise ConfigError("not frames", where="frames", value=frames, accepted="an iterable of arrays")
     return simulation.frames_to_events(
         _frames(frames),
-        fps=_fps(fps),
-        gamma=gamma,
-        interpolate=interpolate,
         report=report,
-        **_options(emulator, sensor, max_px, seed),
+        **_options(**frame_options),
     )
 
 
 def simulate_file(
     source: str | os.PathLike,
     target: str | os.PathLike,
+    *,
+    timestamps: str | os.PathLike | None = None,
+    preview: str | os.PathLike | None = None,
+    overwrite: bool = True,
+    **frames: Unpack[FrameOptions],
+) -> SimulationReport:
+    """A video, a folder of images or .npy frames (N, H, W[, 3]) to an event file, as
+    ``blinkgl simulate``; files appear whole or not at all.
+
+    timestamps : file of times, one a frame.   preview : a video of frames and events to write.
+    frames : fps, emulator, gamma, interpolate, max_px, seed, sensor as of :func:`simulate`.
+    Returns a report: frames, steps, events, lost … Raises AssetError, OutputError, EventDataError, ConfigError."""
+    from blinkgl.recordings import simulation
+
+    return simulation.file_to_events(
+        check.path(source, "source"),
+        check.path(target, "target"),
+        timestamps=None if timestamps is None else check.path(timestamps, "timestamps"),
+        preview=None if preview is None else check.path(preview, "preview"),
+        overwrite=overwrite,
+        **_options(**frames),
+    )
+
+
+def _options(
     *,
     fps: float | None = None,
     emulator: EmulatorSettings = "esim",
@@ -295,32 +322,7 @@ def simulate_file(
     max_px: float = 1.0,
     seed: int = 0,
     sensor: str | None = None,
-    timestamps: str | os.PathLike | None = None,
-    preview: str | os.PathLike | None = None,
-    overwrite: bool = True,
-) -> SimulationReport:
-    """A video, a folder of images or .npy frames (N, H, W[, 3]) to an event file, as
-    ``blinkgl simulate``; files appear whole or not at all.
-
-    timestamps : file of times, one a frame.   preview : a video of frames and events to write.
-    The rest: as of :func:`simulate`.
-    Returns a report: frames, steps, events, lost … Raises AssetError, OutputError, EventDataError, ConfigError."""
-    from blinkgl.recordings import simulation
-
-    return simulation.file_to_events(
-        check.path(source, "source"),
-        check.path(target, "target"),
-        fps=_fps(fps),
-        gamma=gamma,
-        interpolate=interpolate,
-        timestamps=None if timestamps is None else check.path(timestamps, "timestamps"),
-        preview=None if preview is None else check.path(preview, "preview"),
-        overwrite=overwrite,
-        **_options(emulator, sensor, max_px, seed),
-    )
-
-
-def _options(emulator: EmulatorSettings, sensor: str | None, max_px: float, seed: int) -> dict[str, Any]:
+) -> dict[str, Any]:
     from blinkgl.config.sensor import load_sensor
     from blinkgl.recordings import simulation
 
@@ -329,6 +331,9 @@ def _options(emulator: EmulatorSettings, sensor: str | None, max_px: float, seed
     if camera is not None:
         tree = {**camera.values(tree.get("emulator", "esim")), **tree}
     return dict(
+        fps=_fps(fps),
+        gamma=gamma,
+        interpolate=interpolate,
         emulator=simulation.emulator_config(tree),
         seed=check.seed(seed),
         max_px=check.number(max_px, "max_px", above=0, most=1e4),

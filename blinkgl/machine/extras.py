@@ -22,7 +22,6 @@ EXTRAS = {  # extra of setup.cfg -> (distributions, what they are for)
         ("faery", "aedat"),
         "aedat: AEDAT4 files; faery: checks of EVT2 and EVT3, which need nothing",
     ),
-    "exchange": (("mlcroissant",), "checks of a data set's Croissant metadata"),
     "viz": (("rerun-sdk",), "3D viewer"),
     "urdf": (("pybullet",), "its random meshes as an object pool"),
     "docs": (("zensical", "mkdocstrings", "towncrier"), "the documentation as a site"),

@@ -68,12 +68,10 @@ def trade(
     cost: str = "wall_s",
     settings: tuple[Setting, ...] | None = None,
     say: Callable[[str], None] = lambda _: None,
-    look: Callable[[Bench], None] = lambda _: None,
 ) -> dict[str, Any]:
     """The whole measurement as plain data (what trade.json holds).
 
-    cost : "wall_s" or "cpu_s", what the front is drawn over. settings : instead of the designed set. look : called
-    with every bench before it measures.
+    cost : "wall_s" or "cpu_s", what the front is drawn over. settings : instead of the designed set.
     Raises BlinkGLError: what generating the sequence would raise, or no setting of that name."""
     started = time.perf_counter()
     options = options or (QUICK if quick else Options())
@@ -88,7 +86,6 @@ def trade(
             if not mine:
                 continue
             bench = Bench(gl, template, options, size, say)
-            look(bench)
             say(
                 f"{bench.width}x{bench.height}, {bench.duration_s:g} s of sequence {options.sequence}, {len(mine)} "
                 "settings"

@@ -25,7 +25,6 @@ from blinkgl.config.run import RunTemplate, load_run
 from blinkgl.config.sequence import LabelsConfig, SequenceConfig
 from blinkgl.dataset.explain import explain
 from blinkgl.dataset.generate import generate_run
-from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import ConfigError
 from blinkgl.events import Emulator, Esim, Events, emulator_of, make_emulator, register
 from blinkgl.events.response import Response
@@ -462,19 +461,6 @@ def test_the_preview_of_a_toy_emulator_beside_a_toy_label(toy, position, tmp_pat
         pictures += 1
     assert pictures == 8, "50 a second, of 0.1 s and the 0.05 s before the first label"
     assert made.events > 1.5 * silent.events
-
-
-def test_what_verify_says_of_a_toy_label(position, made, monkeypatch):
-    (_folder,) = (made / "train").iterdir()
-    assert verify_dataset(made).clean
-    monkeypatch.setattr(Position, "problem", lambda self, value: "below the floor" if value.min() < 99 else None)
-    assert verify_dataset(made).problems == {
-        "train/sequence_000000": [f"position/{k:06d}.npy: below the floor" for k in range(2)]
-    }
-    monkeypatch.undo()
-    monkeypatch.setattr(Position, "channels", 2)
-    (line, _) = verify_dataset(made).problems["train/sequence_000000"]
-    assert line == "position/000000.npy: (48, 64, 3) float32 and not (48, 64, 2) float32"
 
 
 def test_a_toy_label_in_shards(position, made, tmp_path, monkeypatch):

@@ -295,14 +295,14 @@ def test_known_noise_comes_back(tmp_path, seed):
         ("two frames", "fewer than two intervals"),
         ("unknown key", "speed"),
         ("ratio", "fitted one by one"),
-        ("interpolation", "interpolate: cannot be calibrated with"),
+        ("interpolation", "interpolate: unknown interpolation"),
         ("still and frames", "a still scene needs no frames"),
     ],
 )
 def test_one_line_and_nothing_written(tmp_path, capsys, what, said):
     camera, file = files(tmp_path)
     extra = {"no frames": [], "unknown key": ["--set", "speed=3"],
-             "ratio": ["--set", "threshold_ratio=1.1"], "interpolation": ["--interpolate", "linear"],
+             "ratio": ["--set", "threshold_ratio=1.1"], "interpolation": ["--interpolate", "cubic"],
              "still and frames": ["--still"]}.get(what, [])  # fmt: skip
     stored = dict(np.load(file))
     if what == "other size":

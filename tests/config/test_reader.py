@@ -4,7 +4,6 @@ import subprocess
 import sys
 import time
 from importlib import resources
-from pathlib import Path
 
 import pytest
 import yaml
@@ -13,7 +12,6 @@ from blinkgl.config.reader import MAX_DEPTH, MAX_VALUES, parse_yaml, read_table,
 from blinkgl.config.run import load_run
 from blinkgl.errors import ConfigError
 
-ROOT = Path(__file__).parents[2]
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{b}: &{b} [{', '.join(['*' + a] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi")
 )
@@ -132,15 +130,3 @@ def test_without_libyaml_the_same():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert "aliases expanded" in done.stdout, done.stderr
-
-
-def test_nobody_else_knows_yaml():
-    """One reader: what holds for it holds for every file that is read."""
-    own = {"blinkgl/config/reader.py"}
-    sources = [p for room in ("blinkgl", "eflow", "tools") for p in (ROOT / room).rglob("*.py")]
-    found = {
-        str(p.relative_to(ROOT))
-        for p in sources
-        if any(line.split()[:2] in (["import", "yaml"], ["from", "yaml"]) for line in p.read_text().splitlines())
-    }
-    assert found == own

@@ -7,10 +7,9 @@ from importlib import resources
 import numpy as np
 import pytest
 
-from blinkgl.config.problems import validate
 from blinkgl.config.reader import parse_yaml
 from blinkgl.config.recipes import load_recipe, recipe_names
-from blinkgl.config.rig import PlaceConfig, rig_names
+from blinkgl.config.rig import PlaceConfig
 from blinkgl.config.run import RunTemplate, load_run
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.dataset.report import config_yaml
@@ -26,13 +25,6 @@ def refusal(text: str) -> str:
         read(text)
     assert "\n" not in str(caught.value)
     return str(caught.value)
-
-
-@pytest.mark.parametrize("name", rig_names())
-def test_every_preset_is_a_rig(name):
-    config = read(f"rig: {name}")
-    assert config.sensors and any(one.events for one in config.sensors)
-    assert validate(SequenceConfig, {"rig": name}).rig == name, "the schema knows the names of the files"
 
 
 def test_presets_say_what_their_data_sets_have():
@@ -71,15 +63,6 @@ def test_data_sheets_fill_in_each_sensor_by_itself():
     assert (one.camera.width, other.camera.width) == (346, 240) and one.readout != other.readout
 
 
-def test_what_is_drawn_at_the_top_is_drawn_once_and_beside_it_each():
-    text = (
-        "{seed: 3, events: {contrast_threshold: {uniform: [0.1, 0.5]}}, sensors: [{name: a}, {name: b},"
-        " {name: c, events: {contrast_threshold: {uniform: [0.1, 0.5]}}}]}"
-    )
-    a, b, c = (s.events.contrast_threshold for s in read(text).sensors)
-    assert a == b != c
-
-
 def test_presets_are_laid_under_what_is_said_by_name():
     left, right, imu = read(
         "{rig: stereo, sensors: [{name: imu, imu: {}}, {name: right, place: {position: [0.25, 0, 0]}}]}"
@@ -92,10 +75,6 @@ def test_presets_are_laid_under_what_is_said_by_name():
 def test_a_sequences_own_configuration_says_it_again(name):
     config = read(f"{{rig: {name}, labels: {{depth: true}}}}")
     assert read(config_yaml(config, 0)) == config
-
-
-def test_a_single_camera_says_nothing_of_rigs():
-    assert "sensors" not in (text := config_yaml(read("{}"), 0)) and "rig" not in parse_yaml(text, "test")
 
 
 def test_files_of_sensors_are_found_beside_the_run(tmp_path):

@@ -153,21 +153,6 @@ def test_what_no_file_can_hold_is_known_when_it_is_read(tmp_path, time, message)
     assert str(caught.value).startswith(message)
 
 
-def test_the_limit_is_the_writers():
-    from blinkgl.config.frames import MAX_SPAN_S
-    from blinkgl.io.dsec import _MAX_RELATIVE_US
-
-    assert MAX_SPAN_S == _MAX_RELATIVE_US * 1e-6
-    longest = TimeConfig(duration=MAX_SPAN_S - 0.1001, label_rate=10)
-    assert (longest.t1_ns - longest.t0_ns) // 1000 <= _MAX_RELATIVE_US
-
-
-def test_label_times_cost_nothing_to_have():
-    time = TimeConfig(duration=4000, label_rate=240, start=3.5)
-    assert isinstance(time.label_times_ns, range) and len(time.label_times_ns) == time.label_count + 1 == 960_001
-    assert time.label_times_ns[-1] == time.t1_ns and time.label_times_ns[0] == time.t0_ns + time.interval_ns
-
-
 def test_a_resolved_explicit_scene_reads_again(tmp_path):
     from blinkgl.dataset.report import config_yaml
 

@@ -117,16 +117,6 @@ def test_passes_of_the_other_timelines(tmp_path):
     assert ("rates of change in the event frames", "timeline.reconstruction: linear") in budget.left_out
 
 
-def test_what_a_frame_takes_is_counted_in_samples(tmp_path):
-    """Four bytes of light and four of depth; eight of velocity in every n-th pixel."""
-    for filtered, samples in (("none", 1), ("ssaa2", 4)):
-        told = explain(template(tmp_path, render={"antialiasing": filtered}))
-        size = {p.name: p.bytes for p in told.passes}
-        every = load_run(tmp_path / "run.yaml").sequence(0).timeline.sample_every
-        assert size["event frames"] == 64 * 48 * samples * (4 + 4)
-        assert size["velocity"] == 64 * 48 // every**2 * (8 + 4)
-
-
 def test_recorded_frames_are_what_is_explained(tmp_path):
     """Nothing is rendered, so no scene is described, no OpenGL is opened and no pass is a drawing."""
     (tmp_path / "P0/image_left").mkdir(parents=True)

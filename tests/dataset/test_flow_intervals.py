@@ -74,12 +74,6 @@ def test_continuous_flow_is_as_many_labels_of_their_own(made):
         assert file["to_us"][()].tolist() == [80_000, 110_000, 150_000, 200_000]
 
 
-def test_labels_and_images_have_rates_of_their_own(made):
-    folder = folder_of(made)
-    assert len(list((folder / "frame_camera/images").glob("*.png"))) == 10  # 40 Hz over 0.25 s
-    assert len(list((folder / "flow/forward").glob("*.png"))) == 4 and not (folder / "images").exists()
-
-
 def test_damaged_files_are_one_line(made, tmp_path):
     assert verify_dataset(made / "out", deep=1).problems == {}
     folder = tmp_path / "s"

@@ -200,33 +200,6 @@ def test_logs_of_workers_that_began_nothing(tmp_path):
     assert [p.name for p in (out / ".run/logs").iterdir()] == ["worker-1.log"], "an earlier run's stay"
 
 
-def test_costs_are_the_last_of_each_sequence_and_a_line_cut_short_is_left_out(tmp_path):
-    folder = begun(tmp_path)
-    report = {
-        "name": "n",
-        "seconds": {"render": 1.0},
-        "total_s": 2.0,
-        "simulated_s": 0.5,
-        "frames": 7,
-        "path": "/x",
-        "index": 3,
-    }
-    for seconds, attempt in ((2.0, 1), (3.0, 2)):
-        message = {"report": {**report, "total_s": seconds}, "bytes": 100, "cpu_s": 1.5, "peak_rss_kib": 900}
-        folder.add_cost(SimpleNamespace(name="train/a_000000", group="g"), message, attempt)
-    with open(tmp_path / ".run/costs.jsonl", "a") as file:
-        file.write('{"name": "train/a_000')
-    [line] = folder.costs()
-    assert (
-        line["attempts"] == 2
-        and line["total_s"] == 3.0
-        and line["bytes"] == 100
-        and line["group"] == "g"
-        and "path" not in line
-        and "index" not in line
-    )
-
-
 COST = {
     "name": "a", "seconds": {"render": 0.0}, "total_s": 0, "simulated_s": 1e18, "frames": 1, "bytes": 1, "cpu_s": 1,
     "peak_rss_kib": 1, "attempts": 1,
@@ -267,22 +240,3 @@ def test_limits_of_a_run_s_records(model, whole, changes, fine):
     else:
         with pytest.raises(ValidationError):
             adapter.validate_python({**whole, **changes})
-
-
-def test_what_is_put_away_lies_beside_what_was_put_away_before(tmp_path):
-    """Under the next number that is free, whatever has it: a link to nowhere, too."""
-    folder = begun(tmp_path / "out")
-    away = tmp_path / "out/.run/damaged/train"
-    for number in (0, 1, 3):
-        if number == 3:
-            (away / "a-2").symlink_to("nowhere")
-        (tmp_path / "out/train").mkdir(exist_ok=True)
-        (tmp_path / "out/train/a").write_text(str(number))
-        assert folder.state("train/a") == "not a folder"
-        folder.put_away("train/a")
-        assert (away / f"a-{number}").read_text() == str(number) and folder.state("train/a") is None
-    assert not folder.occupied("train/a")
-    (tmp_path / "out/train/a").mkdir()
-    assert not folder.occupied("train/a") and folder.state("train/a") is None
-    (tmp_path / "out/train/a/x").touch()
-    assert folder.occupied("train/a") and "no manifest" in folder.state("train/a")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import h5py
 import numpy as np
 import pytest
@@ -195,15 +193,6 @@ def test_blinkflow_and_mvsec(tmp_path):
     assert same(open_events(tmp_path / "dsec.h5").read(), events)
 
 
-def test_convert_chain_returns_the_same_events(tmp_path):
-    events = random_events(4000, t0=77_000_000)
-    write_events(tmp_path / "0.npz", events, H, W)
-    names = ["0.npz", "1.h5", "2.raw", "3.csv", "4.h5", "5.txt", "6.npy"]
-    for a, b in itertools.pairwise(names):
-        convert(tmp_path / a, tmp_path / b, size=(H, W))
-    assert same(open_events(tmp_path / "6.npy").read(), events)
-
-
 def test_zero_time(tmp_path):
     events = random_events(1000, t0=1_506_117_887_000_000)
     write_events(tmp_path / "a.npz", events, H, W)
@@ -231,15 +220,6 @@ def test_text_dialects(tmp_path, text, expected):
     e = file.read()
     assert list(zip(e.t.tolist(), e.x.tolist(), e.y.tolist(), e.p.tolist())) == expected
     assert (file.height, file.width) == ((480, 640) if text.startswith("640") else (None, None))
-
-
-def test_text_blocks_of_any_size(tmp_path):
-    events = random_events(500)
-    write_events(tmp_path / "e.txt", events, H, W)
-    from blinkgl.io.text import TextReader
-
-    for size in (50, 97, 4096):
-        assert same(Events.concatenate(list(TextReader(tmp_path / "e.txt").chunks(size))), events)
 
 
 @pytest.mark.parametrize(

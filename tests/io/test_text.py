@@ -86,12 +86,6 @@ def test_what_is_no_number(tmp_path, text):
         read(tmp_path / "e.txt", f"0 1 2 1\n{text} 1 2 1\n")
 
 
-@pytest.mark.parametrize("column", ["3", "3.0", "30e-1", "0.3e1", "0.03E+2", "3.", "+3", "3.000000000000000000000"])
-def test_coordinates_may_be_written_as_decimals(tmp_path, column):
-    events = read(tmp_path / "e.txt", f"5 {column} {column} 1\n")
-    assert (events.x.tolist(), events.y.tolist()) == ([3], [3])
-
-
 @pytest.mark.parametrize(
     "line",
     [
@@ -147,22 +141,6 @@ def test_separators_comments_and_empty_lines(tmp_path):
         [3, 4],
         [1, 0],
     ]
-
-
-def test_a_size_is_taken_once_and_only_before_the_first_event(tmp_path):
-    (tmp_path / "e.txt").write_text("640 480\n1 2 3 1\n")
-    reader = TextReader(tmp_path / "e.txt")
-    assert (reader.width, reader.height) == (640, 480)
-    (tmp_path / "e.txt").write_text("# c\n640,480\nt x y p\n1 2 3 1\n")
-    reader = TextReader(tmp_path / "e.txt")
-    assert (reader.width, reader.height) == (640, 480) and len(next(reader.chunks())) == 1
-    for text, line in (
-        ("640 480\n640 480\n1 2 3 1\n", 2),
-        ("1 2 3 1\n640 480\n", 2),
-        ("t x y p\nt x y p\n1 2 3 1\n", 2),
-    ):
-        with pytest.raises(AssetError, match=f"line {line} is not an event"):
-            read(tmp_path / "f.txt", text)
 
 
 @pytest.mark.parametrize(

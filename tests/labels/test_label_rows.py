@@ -41,11 +41,6 @@ def parts(value) -> list[np.ndarray]:
     return [v for v in vars(value).values() if isinstance(v, np.ndarray)] if isinstance(value, several) else [value]
 
 
-def test_what_is_asked_for_when_nothing_is_said():
-    assert list(asked_for(LabelsConfig())) == ["images", "flow_forward", "occlusion_forward"]
-    assert not asked_for(LabelsConfig(flow=(), images=False)) and asked_for(LabelsConfig())
-
-
 def test_each_is_asked_for_by_its_own_name_in_python():
     """And asks for no other, but for what it cannot be without."""
     for name, label in LABELS.items():
@@ -182,14 +177,6 @@ def test_what_is_kept_is_a_copy(name):
     own = LABELS[name].own(value)
     for a, b in zip(parts(own), parts(value), strict=True):
         assert np.array_equal(a, b) and a.dtype == b.dtype and not np.shares_memory(a, b)
-
-
-def test_double_precision_is_kept_as_it_is_written():
-    assert (
-        LABELS["depth"].own(np.ones((H, W))).dtype == np.float32
-        and LABELS["images"].own(np.ones((H, W))).dtype == float
-    )
-    assert LABELS["ids"].own(np.ones((H, W), np.int64)).dtype == np.int64
 
 
 def buffers(**raw):

@@ -18,7 +18,13 @@ SIZE = {
     "cy": 48.5,
     "near": 0.1,
 }  # nothing about it is symmetric
-CAMERAS = [model(**SIZE, **getattr(model, "sample", {})) for model in CAMERA_MODELS.values()]
+SAMPLES = {
+    "pinhole": {},
+    "radtan": {"k1": -0.3, "k2": 0.1, "p1": 0.002, "p2": -0.001, "k3": 0.02},
+    "equidistant": {"k1": -0.02, "k2": 0.005, "k3": -0.003, "k4": 0.0005},
+}
+"""Values of each model's own parameters: a new model gives its own."""
+CAMERAS = [model(**SIZE, **SAMPLES[kind]) for kind, model in CAMERA_MODELS.items()]
 CAMERAS += [
     Radtan(**SIZE),
     Radtan(**SIZE, k1=0.4, k2=-0.02, p1=-0.01, p2=0.004),

@@ -18,8 +18,7 @@ from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError, EventDataError, GLError, OutputError, may_pass
-from blinkgl.io import atomic
-from runs import RECIPE, recipe_file, start, temporaries, tree
+from runs import RECIPE, recipe_file, temporaries, tree
 
 FLY = {"fly": {**RECIPE["groups"]["fly"], "output": {"sequences": 3}}}
 NAMES = [f"train/fly_{i:06d}" for i in range(3)]
@@ -282,21 +281,6 @@ def test_temporaries_of_other_machines_go_when_a_run_saw_them_lie_for_an_hour(tm
 # ---- others at work --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-def test_two_drivers_at_once(reference, tmp_path):
-    """Real processes, started together, on a folder that does not exist yet: one makes
-    everything, the other says one line."""
-    recipe, out = recipe_file(tmp_path, groups=FLY), tmp_path / "deep/out"
-    drivers = [start(recipe, "--out", out, "--resume", "--workers", 1) for _ in range(2)]
-    said = [driver.communicate(timeout=120)[0] for driver in drivers]
-    states = sorted(driver.returncode for driver in drivers)
-    assert states in ([0, 0], [0, 2]), said
-    if states == [0, 2]:  # else the second came when the first was done
-        line = next(text for text, driver in zip(said, drivers, strict=True) if driver.returncode)
-        assert "another run is at work in this folder; " in line and line.count("\n") == 1
-    assert_same(out, reference)
-
-
 def test_a_driver_that_meets_another_takes_nothing_of_it_away(tmp_path):
     """The loser made no folder, and the winner's empty one is not its to remove; a lock on
     a folder that is gone is none."""
@@ -329,16 +313,3 @@ def test_a_folder_that_goes_before_it_is_locked_is_made_again(tmp_path, monkeypa
         with pytest.raises(OutputError, match="another run is at work"), RunFolder(out).locked():
             raise AssertionError
     assert len(calls) == 3
-
-
-def test_a_live_temporary_of_another_user_stays(tmp_path, monkeypatch):
-    """Signal 0 to a process of another user: not permitted, and so it lives."""
-    path = tmp_path / f".x.blinkgl-tmp-{atomic.machine_token()}-4242-0"
-    path.mkdir()
-
-    def kill(pid, number):
-        assert (pid, number) == (4242, 0)
-        raise PermissionError(1, "Operation not permitted")
-
-    monkeypatch.setattr(os, "kill", kill)
-    assert atomic.remove_stale(tmp_path) == [] and path.is_dir()

@@ -1,7 +1,6 @@
 """A frame camera from the configuration to the files and those who read them."""
 
 import json
-import os
 import tarfile
 from pathlib import Path
 
@@ -118,22 +117,6 @@ def test_events_and_labels_are_what_they_are_without_it(made, tmp_path):
     for name in ("events.h5", "flow/forward/000001.png", "poses.npz"):
         assert (plain.path / name).read_bytes() == (report.path / name).read_bytes(), name
     assert not (plain.path / "frame_camera").exists()
-
-
-@pytest.mark.parametrize(
-    ("damage", "said"),
-    [
-        (lambda f: (f / "images/000000.png").write_bytes(b"x"), "bytes, manifest says"),
-        (lambda f: os.remove(f / "clean/000003.png"), "missing"),
-    ],
-)
-def test_what_is_damaged_is_found(made, tmp_path, damage, said):
-    import shutil
-
-    shutil.copytree(made[1], tmp_path / "out")
-    damage(tmp_path / "out/train/sequence_000000/frame_camera")
-    found = verify_dataset(tmp_path / "out")
-    assert not found.clean and said in str(found.problems)
 
 
 @pytest.mark.parametrize("old, new", [("start_us", "begin_us"), ("500000.000", "nan")])

@@ -2,8 +2,6 @@
 
 import hashlib
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -285,11 +283,6 @@ def test_existing_output_is_refused_before_any_work(tmp_path, capsys, monkeypatc
     assert digests(folder) == before
 
 
-def test_only_requested_labels_are_written(tmp_path):
-    folder = generate(tmp_path, labels={"images": False, "flow": [], "occlusion": False})[0]
-    assert {p.name for p in folder.iterdir()} == {"events.h5", "poses.npz", "config.yaml", "manifest.json"}
-
-
 # ---- the command line --------------------------------------------------------------------------------------------
 
 
@@ -376,31 +369,3 @@ def test_flying_objects_from_real_meshes_and_photographs(tmp_path):
     assert len(names) >= 8
     with h5py.File(folder / "events.h5") as file:
         assert len(dsec_slice(file, 100_000, 300_000)["t"]) > 1000
-
-
-_PEAK = """
-import resource, sys
-from blinkgl.cli import run
-assert run(sys.argv[1:]) == 0
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
-"""
-
-
-def test_peak_memory_does_not_grow_with_the_sequence(tmp_path):
-    """1 s against 20 s (2,000 frames, 20x the events), each in a process of its own."""
-    peaks = {}
-    for seconds in (1, 20):
-        path = config_file(
-            tmp_path,
-            time={"duration": seconds, "label_rate": 5},
-            timeline={"kind": "uniform", "fps": 100},
-            labels={"flow": ["forward"]},
-        )
-        done = subprocess.run(
-            [sys.executable, "-c", _PEAK, "generate", str(path), "--out", str(tmp_path / str(seconds)), "--quiet"],
-            check=True,
-            capture_output=True,
-            text=True,
-        )
-        peaks[seconds] = int(done.stdout.split()[-1])
-    assert peaks[20] < 1.05 * peaks[1] + 8_000, f"peak resident memory, KiB: {peaks}"

@@ -289,18 +289,6 @@ def test_another_installation_is_refused(tmp_path):
         run_dataset(recipe, tmp_path / "out", num=2, resume=True)
 
 
-def test_one_run_at_a_time(tmp_path):
-    recipe = load_run(recipe_file(tmp_path))
-
-    def second(name, message):
-        with pytest.raises(OutputError, match="another run is at work in this folder"):
-            run_dataset(recipe, tmp_path / "out", resume=True)
-        second.tried = True
-
-    run_dataset(recipe, tmp_path / "out", num=1, listener=Sabotage(second))
-    assert second.tried
-
-
 def test_damaged_sequence_is_put_away_and_made_again(reference, tmp_path):
     recipe = load_run(recipe_file(tmp_path))
     run_dataset(recipe, tmp_path / "out")

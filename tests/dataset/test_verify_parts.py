@@ -11,15 +11,8 @@ import pytest
 
 from blinkgl.dataset.verify import cross_checks as between, reproduce as again
 from blinkgl.dataset.verify.problems import Known, Verification, guarded
-from blinkgl.dataset.verify.reproduce import differences
 
 # --- two machines -----------------------------------------------------------------------------------------------------
-
-
-def pair(tmp_path, name: str) -> tuple[Path, Path]:
-    for side in "ab":
-        (tmp_path / side / name).parent.mkdir(parents=True, exist_ok=True)
-    return tmp_path / "a", tmp_path / "b"
 
 
 def test_what_sets_two_machines_apart():
@@ -34,16 +27,6 @@ def test_what_sets_two_machines_apart():
         "made with numba 3, this machine has None; made with numpy 1, this machine has 2"
     )
     assert between.made_with({"versions": None, "opengl": None}) == {}
-
-
-def test_files_in_which_folders_differ(tmp_path):
-    a, b = pair(tmp_path, "x/file")
-    for root in (a, b):
-        (root / "x/same").write_text("1")
-        (root / "x/file").write_text(root.name)
-    (a / "left").write_text(""), (b / "x/right").write_text("")
-    assert differences(a, b) == ["left: only in one of them", "x/right: only in one of them", "x/file: differs"]
-    assert differences(a, a) == []
 
 
 @pytest.mark.parametrize(

@@ -204,25 +204,6 @@ def test_zero_time(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text, expected",
-    [
-        ("0.000001 1 2 0\n0.0000025 3 4 1\n", [(1, 1, 2, 0), (3, 3, 4, 1)]),
-        ("# comment\n\n5 1 2 -1\n6\t3\t4\t1", [(5, 1, 2, 0), (6, 3, 4, 1)]),
-        ("t,x,y,p\r\n1.5,1,2,0\r\n", [(1_500_000, 1, 2, 0)]),
-        ("640 480\n1e-3 1 2 1\n1.25E-3 1.0 2.000 1.0\n", [(1000, 1, 2, 1), (1250, 1, 2, 1)]),
-        ("1506117887.123456789 7 8 1\n", [(1506117887123457, 7, 8, 1)]),
-        ("1.000000000000000000e+00 1.000000000000000000e+00 2.0 1.0\n", [(10**6, 1, 2, 1)]),
-    ],
-)
-def test_text_dialects(tmp_path, text, expected):
-    (tmp_path / "e.txt").write_bytes(text.encode())
-    file = open_events(tmp_path / "e.txt")
-    e = file.read()
-    assert list(zip(e.t.tolist(), e.x.tolist(), e.y.tolist(), e.p.tolist())) == expected
-    assert (file.height, file.width) == ((480, 640) if text.startswith("640") else (None, None))
-
-
-@pytest.mark.parametrize(
     "line",
     [
         "0.1 1 2",

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import AssetError, BlinkGLError
-from blinkgl.io.dsec import DsecEventReader, identity_rectify_map, write_rectify_map
-from blinkgl.io.formats import open_events, write_events
+from blinkgl.io.dsec import identity_rectify_map, write_rectify_map
+from blinkgl.io.formats import open_events
 from blinkgl.io.hdf5 import blosc_dataset, dataset, open_hdf5, write_rows
 from eflow.data.sources import FolderSource
 from tests.io.test_columns import GOOD, dsec, mvsec
@@ -216,14 +216,3 @@ def test_the_environment_is_left_alone_and_does_not_change_the_bytes(tmp_path):
         for extra in ({}, {"BLOSC_NTHREADS": "3"})
     }
     assert len(digests) == 1
-
-
-def test_hdf5plugin_is_all_that_h5py_needs(tmp_path):
-    """What the documentation tells readers to import."""
-    write_events(tmp_path / "e.h5", open_events(dsec(tmp_path / "d.h5")).read(), 10, 10)
-    with h5py.File(tmp_path / "e.h5") as file:
-        assert file["events/x"][()].tolist() == GOOD["x"] and hdf5plugin.Blosc.filter_id in [
-            int(k) for k in file["events/x"]._filters
-        ]
-    with DsecEventReader(tmp_path / "e.h5") as reader:
-        assert reader.count == 3

@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blinkgl.io.colour import INVALID, count_events, event_colour, flow_colour
+from blinkgl.io.colour import INVALID, flow_colour
 from blinkgl.sequence_files import preview as module
 from blinkgl.sequence_files.preview import PreviewWriter
-from blinkgl.srgb import to_srgb8
-from blinkgl.types.events import Events
 
 
 class Film:
@@ -32,50 +30,6 @@ class Film:
 @pytest.fixture(autouse=True)
 def film(monkeypatch):
     monkeypatch.setattr(module, "VideoWriter", Film)
-
-
-def some_events(count: int, height: int, width: int) -> Events:
-    dice = np.random.default_rng(0)
-    return Events(
-        dice.integers(0, width, count).astype(np.uint16),
-        dice.integers(0, height, count).astype(np.uint16),
-        np.zeros(count, np.int64),
-        dice.integers(0, 2, count).astype(np.uint8),
-    )
-
-
-def test_highlights_are_compressed_and_do_not_clip():
-    """Light above 1 keeps its order; where the light has gone the curve comes back slowly."""
-    made = PreviewWriter("p.mp4", 48, 64, flow=False)
-    steps = np.repeat(np.linspace(0.1, 3.0, 64, dtype=np.float32)[None], 48, axis=0)
-    for k in range(200):
-        made.frame(25_000 * k, steps if k == 0 else np.full((48, 64), 0.9, np.float32))
-    first = made._video.pictures[0][30, :128:2, 0].astype(int)
-    assert first.max() == 255 and (np.diff(first) >= 0).all() and len(set(first)) > 30
-    assert (first == 255).sum() <= 8, "clipped it would be two thirds"
-    later = [int(picture[40, 10, 0]) for picture in made._video.pictures]
-    assert later[1] < later[20] < later[-1] == to_srgb8(np.float32([0.9]))[0]
-
-
-def test_captions(monkeypatch):
-    said = []
-    monkeypatch.setattr(
-        PreviewWriter, "_caption", lambda self, panel, detail: said.append((panel, self._names[panel], detail))
-    )
-    made = PreviewWriter("p.mp4", 48, 64, t0_us=1_000, rate_hz=100, fps=40, label="camera")
-    made.add_events(some_events(1234, 48, 64))
-    made.add_events(some_events(6, 48, 64))
-    made.frame(13_345, np.zeros((48, 64), np.float32))
-    made.frame(24_000, np.zeros((48, 64), np.float32))
-    made.set_flow(np.full((48, 64, 2), 3.0, np.float32))
-    assert said == [
-        (2, "optical flow", ""),
-        (0, "camera", "12.3 ms   slowed 2.5x"),
-        (1, "events", "ON blue, OFF red   1,240"),
-        (0, "camera", "23.0 ms   slowed 2.5x"),
-        (1, "events", "ON blue, OFF red   0"),
-        (2, "optical flow", "full colour = 4.24 px"),
-    ]
 
 
 def test_full_colour_follows_speed_up_at_once_and_down_slowly():
@@ -147,20 +101,3 @@ def test_full_saturation():
     assert rgb[0, 1].tolist() == rgb[0, 2].tolist() == [255, 0, 0] and rgb[1, 2].tolist() == [255, 255, 255]
     assert (rgb[1, :2] == INVALID).all()
     assert (flow_colour(np.zeros((2, 2, 2))) == 255).all()
-
-
-def test_event_counts_saturate_and_darken():
-    counts = np.zeros((2, 3, 4), np.uint16)
-    x, y, p = np.uint16([0, 0, 3, 3]), np.uint16([0, 0, 2, 2]), np.uint8([0, 0, 1, 0])
-    count_events(x, y, p, counts)
-    assert counts[0, 0, 0] == 2 and counts[1, 2, 3] == counts[0, 2, 3] == 1 and counts.sum() == 4
-    counts[1, 1, 1] = 65_534
-    for _ in range(3):
-        count_events(np.uint16([1]), np.uint16([1]), np.uint8([1]), counts)
-    assert counts[1, 1, 1] == 65_535
-    shade = np.rint(255 * (1 - np.exp(-0.9 * np.arange(9)))).astype(int)
-    for off in (0, 1, 3, 8, 500):
-        for on in (0, 2, 9):
-            rgb = event_colour(np.array([[[off]], [[on]]], np.uint16))[0, 0].tolist()
-            a, b = shade[min(off, 8)], shade[min(on, 8)]
-            assert rgb == [255 - b, 255 - max(a, b), 255 - a]

@@ -13,7 +13,6 @@ from blinkgl.config.run import load_run
 from blinkgl.dataset import executor as executor_module, run_folder as run_folder_module, work
 from blinkgl.dataset.executor import Inline, Local
 from blinkgl.dataset.generate import generate_run
-from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.verify import verify_dataset
@@ -247,35 +246,6 @@ def test_a_record_that_is_deleted_is_written_again(reference, tmp_path):
 
 
 # ---- clocks ----------------------------------------------------------------------------------------------------------
-
-
-def foreign_temporary(out: Path) -> Path:
-    """What another machine on a shared disk is writing."""
-    path = out / f"train/.fly_000001.blinkgl-tmp-{'0' * 12}-1-0"
-    path.mkdir(parents=True)
-    (path / "events.h5").write_text("half")
-    return path
-
-
-def test_temporaries_of_other_machines_go_when_a_run_saw_them_lie_for_an_hour(tmp_path, monkeypatch):
-    out, clock = tmp_path / "out", [1000.0]
-    monkeypatch.setattr(run_folder_module.time, "monotonic", lambda: clock[0])
-    plan = Plan.of(template(tmp_path))
-    dead, other = foreign_temporary(out), out / f"train/.not_ours_000001.blinkgl-tmp-{'0' * 12}-1-0"
-    other.mkdir()
-    folder = RunFolder(out)
-    folder.sweep(plan)
-    clock[0] += 3500
-    folder.sweep(plan)
-    (dead / "events.h5").write_text("more")  # it lived
-    clock[0] += 3500
-    folder.sweep(plan)
-    clock[0] += 3500
-    folder.sweep(plan)
-    assert dead.is_dir()
-    clock[0] += 200
-    folder.sweep(plan)
-    assert not dead.exists() and other.is_dir()
 
 
 # ---- others at work --------------------------------------------------------------------------------------------------

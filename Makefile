@@ -82,7 +82,6 @@ setup: .venv/.installed-dev opengl
 	@$(INSTALL) -e '.[onnx]' || echo "ONNX could not be installed: the tests of eflow export will be skipped"
 	@$(INSTALL) -e '.[cluster]' || echo "Ray could not be installed: the tests of the Ray executor will be skipped"
 	@$(INSTALL) -e '.[physics]' || echo "MuJoCo could not be installed: the tests of falling bodies will be skipped"
-	@$(INSTALL) -e '.[exchange]' || echo "Croissant could not be installed: their tests will be skipped"
 	@$(INSTALL) --no-deps pyrender PyOpenGL==3.1.10 freetype-py pyglet six \
 		|| echo "pyrender could not be installed: the comparisons with it will be skipped"
 	@touch $@

@@ -178,9 +178,7 @@ def trade(
         list[str] | None,
         typer.Option("--scene", metavar="TEXT", help="--suite: only scenes whose name contains this; may be repeated."),
     ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="--suite: keep the scenes that --out holds already.")
-    ] = False,
+    resume: Annotated[bool | None, typer.Option("--resume", hidden=True)] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="Fewer settings, fewer pixels, a shorter clip: minutes.")
     ] = False,
@@ -229,6 +227,7 @@ def trade(
     from blinkgl.show import trade as command
 
     _gone("scenes are no longer path-traced", "--reference-set", **{"--reference": reference})
+    _gone("a suite is measured in one go", "--scene for some of its scenes", **{"--resume": resume})
     if suite:
         from blinkgl.show import suite as suite_command
 
@@ -239,23 +238,22 @@ def trade(
             only=only or [],
             skip=skip or [],
             scenes=scene or [],
-            resume=resume,
             limit_ms=limit_ms,
             rounds=rounds,
-            minutes=minutes,
             cost=cost or "cpu",
             others={
                 "--quick": quick,
                 "--seed": seed is not None,
                 "--sequence": sequence is not None,
                 "--clip": clip is not None,
+                "--minutes": minutes is not None,
                 "--reference-set": bool(reference_set),
             },
         )
     return command.run(
         config,
         out,
-        suite_options=[name for name, given in (("--scene", scene), ("--resume", resume)) if given],
+        suite_options=["--scene"] if scene else [],
         overrides=overrides or [],
         quick=quick,
         only=only or [],
@@ -276,7 +274,7 @@ def report(
     folder: Annotated[str, typer.Argument(metavar="DIR", help="Data set.")],
     out: Annotated[str | None, typer.Option("--out", "-o", help="The page (default: DIR/report.html).")] = None,
     examples: Annotated[int, typer.Option(min=0, max=100, help="Sequences shown in pictures.")] = 6,
-    card: Annotated[bool, typer.Option("--card", help="Also DIR/README.md and croissant.json, for data hubs.")] = False,
+    card: Annotated[bool, typer.Option("--card", help="Also DIR/README.md, for data hubs.")] = False,
     licence: Annotated[str | None, typer.Option("--license", help="On the card, e.g. cc-by-4.0.")] = None,
     url: Annotated[str | None, typer.Option("--url", help="On the card: where the data set is found.")] = None,
 ) -> int:
@@ -347,11 +345,8 @@ def simulate(
         str | None,
         typer.Option(help="srgb, linear or an exponent (default: srgb for integer pixels, linear for floats)."),
     ] = None,
-    interpolate: Annotated[
-        str, typer.Option(help="Between frames: linear, cubic, or motion (dense-flow warp).")
-    ] = "linear",
+    interpolate: Annotated[str, typer.Option(help="Between frames: linear, or motion (dense-flow warp).")] = "linear",
     max_px: Annotated[float, typer.Option(min=0.01, help="motion: largest displacement per step, px.")] = 1.0,
-    factor: Annotated[int, typer.Option(min=1, max=1000, help="cubic: steps per given frame.")] = 4,
     seed: Annotated[int, typer.Option(help="Seed of the emulator.")] = 0,
     preview: Annotated[str | None, typer.Option(help="Also write a video of frames and events, .mp4.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
@@ -373,7 +368,6 @@ def simulate(
         gamma=gamma,
         interpolate=interpolate,
         max_px=max_px,
-        factor=factor,
         seed=seed,
         preview=preview,
         overwrite=overwrite,

@@ -97,8 +97,8 @@ def train(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
     """Train a network. SIGINT and SIGTERM write a checkpoint and exit 0."""
-    from eflow.bench import PRESETS, preset
     from eflow.config import load_train_config
+    from eflow.models import preset
     from eflow.train import as_yaml, train as run_training
 
     said = overrides or []
@@ -106,9 +106,7 @@ def train(
         raise ConfigError("no network to train", accepted="a YAML file, or --model, e.g. ev_flownet-tiny, and --data")
     if config is None and not (data or any(o.startswith("data.train") for o in said)):
         raise ConfigError("nothing to train on", accepted="a YAML file, or --data, a folder or a recipe")
-    if model is not None:
-        preset(model)
-    tree = None if model is None else PRESETS[model]
+    tree = None if model is None else preset(model)
     whole = load_train_config(config, said, model=tree, data=data or (), minutes=minutes)
     if print_config:
         typer.echo(as_yaml(whole), nl=False)
@@ -173,9 +171,6 @@ def evaluate(
         ),
     ],
     out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for results.json and pictures.")] = None,
-    by_density: Annotated[
-        bool, typer.Option("--by-density", help="How long the flow is where events are few, and where they are many.")
-    ] = False,
     window_ms: WindowMs = None,
     format: Annotated[str, typer.Option(help="auto, blinkgl, dsec, mvsec, blinkflow or windows.")] = "auto",
     dt: Annotated[int, typer.Option(help="MVSEC: 1 or 4 images.")] = 1,
@@ -191,10 +186,6 @@ def evaluate(
     ] = None,
     pictures: Annotated[int, typer.Option(min=0, help="Number of pictures.")] = 12,
     iterations: Annotated[int | None, typer.Option(min=1, help="GRU iterations, where the network has them.")] = None,
-    confidence: Annotated[
-        bool,
-        typer.Option("--confidence", help="Also whether predict's --confidence knows where the errors are; slow."),
-    ] = False,
     empty: Annotated[str, typer.Option(help="Windows without events: error or skip.")] = "error",
     limit: Annotated[int | None, typer.Option(min=1, help="Score only so many samples, evenly spaced.")] = None,
     raw: Annotated[bool, typer.Option("--raw", help="The last weights instead of the averaged ones.")] = False,
@@ -229,10 +220,9 @@ def evaluate(
             empty=empty,
             precision=precision,
             limit=limit,
-            confidence=confidence,
             progress=lambda i, n, aee: status.update(f"{i}/{n} samples, AEE {aee:.3f} px"),
         )
-    show(result, by_density=by_density)
+    show(result)
     if out:
         typer.echo(f"written: {out}/results.json")
 
@@ -258,17 +248,7 @@ def predict(
     ] = None,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Sensor size, where the file does not say.")] = None,
     npy: Annotated[bool, typer.Option("--npy", help="Also float32 .npy.")] = False,
-    flo: Annotated[bool, typer.Option("--flo", help="Also Middlebury's .flo.")] = False,
-    h5: Annotated[bool, typer.Option("--h5", help="Also all of it in one flow.h5, float32.")] = False,
     video: Annotated[str | None, typer.Option(help="Also a video of events and flow, .mp4.")] = None,
-    confidence: Annotated[
-        bool,
-        typer.Option(
-            "--confidence",
-            help="Also by how much, px, mirrored and thinned views of the same events disagree, pixel by pixel; five "
-            "times the work.",
-        ),
-    ] = False,
     warm_start: Annotated[
         bool, typer.Option("--warm-start", help="Start each window's refinement from the last flow.")
     ] = False,
@@ -288,7 +268,6 @@ def predict(
 
     from blinkgl.types.events import Events
     from eflow import infer
-    from eflow.confidence import disagreement
     from eflow.doubts import doubts
     from eflow.methods.iwe import flow_warp_loss
     from eflow.metrics import frame_metrics
@@ -304,12 +283,11 @@ def predict(
     gt = infer.read_truth(truth, file.height, file.width) if truth else None
     precision = precision if model is None else _precision(model, precision)
 
-    def predicting(empty: str, warm_start: bool):
-        if method is not None:
-            return infer.MethodPredictor(method, file.height, file.width, empty=empty)
-        return infer.Predictor(model, file.height, file.width, warm_start=warm_start, precision=precision, empty=empty)
-
-    predictor, of_views = predicting(empty, warm_start), predicting("zero", False)
+    size_of_file = (file.height, file.width)
+    if method is not None:
+        predictor = infer.MethodPredictor(method, *size_of_file, empty=empty)
+    else:
+        predictor = infer.Predictor(model, *size_of_file, warm_start=warm_start, precision=precision, empty=empty)
     if whole:
         window, factor = infer.whole_file(file, ("old", "new") if model is None else model.reads)
         stream, span = [window], window.new.t1 - window.old.t0
@@ -324,23 +302,19 @@ def predict(
         stream = infer.windows(file, span, start_us=at(start_ms), end_us=at(end_ms))
     count = began = 0
     with contextlib.ExitStack() as opened:
-        files = [name for name, wanted in zip(infer.FILES, (npy, flo, h5), strict=True) if wanted]
-        writer = opened.enter_context(infer.FlowWriter(out, files=files)) if out else None
-        shown = FlowVideo(video, file.height, file.width, _fps(span), doubts=confidence) if video else None
+        writer = opened.enter_context(infer.FlowWriter(out, npy=npy)) if out else None
+        shown = FlowVideo(video, file.height, file.width, _fps(span)) if video else None
         if shown:
             opened.enter_context(shown)
         for window in stream:
             flow, tensor = predictor(window)
             sharper = flow_warp_loss(window.new, flow)
-            doubt = disagreement(of_views, window, flow) * np.float32(factor) if confidence else None
             flow = flow * np.float32(factor)
             count += 1
             line = (
                 f"t {window.t_us} us  {len(window.old) + len(window.new)} events  mean speed "
                 f"{np.hypot(*np.moveaxis(flow, -1, 0)).mean():.3f} px  FWL {sharper:.3f}"
             )
-            if doubt is not None:
-                line += f"  disagreement {np.median(doubt):.3f} px (median)"
             if gt is not None:
                 valid = np.isfinite(gt).all(-1)
                 hit = np.zeros_like(valid)
@@ -355,12 +329,12 @@ def predict(
                         )
             typer.echo(line)
             if writer:
-                writer.add(window, flow, tensor, gt, doubt)
+                writer.add(window, flow, tensor, gt)
             if shown:
                 began = window.new.t0 if count == 1 else began
                 # Recordings may count from 1970: the video begins at 0.
                 caption = f"{(window.new.t1 - window.new.t0) / 1000:g} ms at {(window.t_us - began) / 1e6:.3f} s"
-                shown.add(caption, events_of(tensor), flow, doubt)
+                shown.add(caption, events_of(tensor), flow)
         if not count:
             raise BlinkGLError(
                 f"shorter than two windows of {span / 1000:g} ms",
@@ -418,11 +392,8 @@ def submit(
 
 @app.command("import")
 def import_(
-    checkpoint: Annotated[str, typer.Argument(help="E-RAFT's dsec.tar, mvsec_20.tar …, or RAFT's .pth.")],
+    checkpoint: Annotated[str, typer.Argument(help="E-RAFT's dsec.tar, mvsec_20.tar ….")],
     out: Annotated[str, typer.Option("--out", "-o", help="New .safetensors file.")],
-    bins: Annotated[
-        int | None, typer.Option(min=2, max=64, help="RAFT: time bins that its three colours are spread over.")
-    ] = None,
 ) -> None:
     """Make a published checkpoint a file that predict, evaluate, submit and train (init_from) take.
 
@@ -430,7 +401,7 @@ def import_(
     from eflow.models import parameters_of
     from eflow.published import import_published
 
-    model = import_published(checkpoint, out, bins=bins)
+    model = import_published(checkpoint, out)
     typer.echo(f"written: {out}, {parameters_of(model) / 1e6:.2f} M parameters")
 
 
@@ -463,16 +434,14 @@ def pack(
     name: Annotated[str, typer.Option(help="What it will be called by.")],
     card: Annotated[str, typer.Option(help="YAML: about, data, training, scores, limits, commands (docs/eflow.md).")],
     out: Annotated[str, typer.Option("--out", "-o", help="Folder that its folder is made in; eflow/weights ships it.")],
-    store: Annotated[str, typer.Option(help="fp32, or fp16: half the size; it computes in fp32.")] = "fp32",
     raw: Annotated[bool, typer.Option("--raw", help="The last weights instead of the averaged ones.")] = False,
 ) -> None:
     """Make a training a network that can come with the package: weights and a card, 5 MB at most.
 
-    They are read back and compared before the folder appears."""
+    They are read back before the folder appears."""
     from eflow import shipped
 
-    _one_of("--store", store, ("fp32", "fp16"))
-    folder, full = shipped.pack(checkpoint, name, card, out, stored=store, averaged=not raw)
+    folder, full = shipped.pack(checkpoint, name, card, out, averaged=not raw)
     typer.echo(f"written: {folder}")
     for line in shipped.lines(full):
         typer.echo(line)
@@ -497,77 +466,6 @@ def export(
     wanted = _size(size)
     told = export_onnx(_model(checkpoint, "cpu", raw, "fp32", iterations), out, size=wanted)
     typer.echo(f"written: {out}, opset {OPSET}, sizes: {told['sizes']}; onnxruntime agrees with torch")
-
-
-@app.command()
-def bench(
-    model: Annotated[
-        list[str] | None,
-        typer.Option("--model", "-m", help="May be repeated, e.g. eraft-tiny; default: every network as published."),
-    ] = None,
-    size: Annotated[
-        list[str] | None, typer.Option("--size", metavar="WxH", help="May be repeated; default 640x480.")
-    ] = None,
-    repeats: Annotated[int, typer.Option(min=1)] = 5,
-    training: Annotated[bool, typer.Option("--training/--no-training", help="Also a training step.")] = True,
-    plain: Annotated[
-        bool, typer.Option("--plain", help="Also the RAFT-style slow twin of lookup and upsampling.")
-    ] = False,
-    json_out: Annotated[str | None, typer.Option("--json", help="Also write the rows to this file.")] = None,
-    precision: Precision = "fp32",
-) -> None:
-    """Milliseconds, GMACs and peak memory per model and resolution; each measured in a process of its own."""
-    from rich.table import Table
-
-    from blinkgl.machine.terminal import plain_console
-    from eflow import bench as benchmark
-    from eflow.evaluate import write_json
-
-    _one_of("--precision", precision, ("fp32", "bf16"))
-    names = model or [name for name, tree in benchmark.PRESETS.items() if tree.get("size") == "base"]
-    for name in names:
-        benchmark.preset(name)
-    sizes = [_size(s) for s in size or ["640x480"]]
-    rows = []
-    for name in names:
-        for height, width in sizes:
-            modes = (
-                [(False, False)]
-                + ([(False, True)] if plain and "flownet" not in name else [])
-                + ([(True, False)] if training else [])
-            )
-            for train_mode, slow in modes:
-                rows.append(
-                    benchmark.isolated(
-                        name=name,
-                        height=height,
-                        width=width,
-                        training=train_mode,
-                        plain=slow,
-                        repeats=repeats,
-                        precision=precision,
-                    )
-                )
-    table = Table(title=benchmark.machine())
-    for c in ("model", "size", "mode", "ms", "GMACs", "M param", "peak MiB"):
-        table.add_column(c, justify="left" if c in ("model", "mode") else "right")
-    for r in rows:
-        mode = (
-            "training step"
-            if r.get("training") or r.get("mode") == "train"
-            else "forward, plain"
-            if r.get("plain")
-            else "forward"
-        )
-        cells = (
-            [r["error"], "", "", ""]
-            if "error" in r
-            else [f"{r['ms']:.0f}", f"{r['gmacs']:.1f}", f"{r['parameters'] / 1e6:.2f}", f"{r['peak_mib']:.0f}"]
-        )
-        table.add_row(r["model"], f"{r['width']}x{r['height']}", mode, *cells)
-    plain_console().print(table)
-    if json_out:
-        write_json(Path(json_out), {"rows": rows})
 
 
 def _method(name: str, focal: float | None, **network: object):

@@ -272,10 +272,6 @@ class LossConfig(Config):
 
     l1: float = Field(1.0, ge=0, le=1e6, description="weight of the components' absolute errors, px")
     epe: float = Field(0.0, ge=0, le=1e6, description="weight of the end-point error, px")
-    relative: float = Field(
-        0.0, ge=0, le=1e6, description="weight of the end-point error as a share of the true length (and knee)"
-    )
-    log: float = Field(0.0, ge=0, le=1e6, description="weight of the end-point error compressed by a logarithm, px")
     length: float = Field(
         0.0, ge=0, le=1e6, description="weight of the logarithm of predicted over true length (with knee), either way"
     )
@@ -283,13 +279,13 @@ class LossConfig(Config):
         1.0,
         gt=0,
         le=1e3,
-        description="px: shorter flow counts as so long, larger errors are compressed",
+        description="px that both lengths have more of in the logarithm",
     )
 
-    @rule("l1", "epe", "relative", "log")
-    def _something(l1, epe, relative, log):
-        if not l1 + epe + relative + log:  # length alone has no direction
-            raise Refused("no term has a weight", where="l1", value=0, accepted="l1, epe, relative or log above 0")
+    @rule("l1", "epe")
+    def _something(l1, epe):
+        if not l1 + epe:  # length alone has no direction
+            raise Refused("no term has a weight", where="l1", value=0, accepted="l1 or epe above 0")
 
 
 class OptimConfig(Config):
@@ -304,12 +300,6 @@ class OptimConfig(Config):
         "whichever is nearer its end (counted over resumed parts; such a run does not repeat bit for bit); null: "
         "by steps alone",
     )
-    clock: Literal["wall", "processor"] = Field(
-        "wall",
-        description="what `minutes` are of: the time on the wall, or the processor time that this process uses, which "
-        "makes trainings equal on a machine that does other things, too (data must then be loaded by the process "
-        "itself)",
-    )
     lr: float = Field(2e-4, gt=0, le=1, description="peak learning rate")
     warmup: float = Field(0.05, ge=0, lt=1, description="share of the training that the rate rises over")
     cooldown: float = Field(0.4, ge=0, le=1, description="share of the training, its last, that the rate falls over")
@@ -317,7 +307,6 @@ class OptimConfig(Config):
     clip: float = Field(1.0, gt=0, description="largest gradient norm")
     loss: LossConfig = Field(LossConfig(), description="what is made small")
     gamma: float = Field(0.8, gt=0, le=1, description="decay of the loss towards early iterations")
-    scale_gamma: float = Field(1.0, gt=0, le=1, description="decay of the loss towards coarse decoder scales")
     match_weight: float = Field(
         0.5, ge=0, description="weight of the matching layer's term of the loss, where the last iteration's is 1"
     )
@@ -368,19 +357,6 @@ class TrainConfig(Config):
         description="checkpoint whose weights training starts from (fine-tuning), or the name of a network that comes "
         "with the package",
     )
-
-    @rule("optim.clock", "data.workers", "data.train.*.workers", "data.train.*.online")
-    def _whose_time(clock, loaders, rendering, online):
-        if clock == "wall":
-            return
-        others = {"data.workers": loaders} | {
-            f"data.train.{k}.workers": n for k, (n, live) in enumerate(zip(rendering, online, strict=True)) if live
-        }
-        for where, n in others.items():
-            if n > 0:  # a child's time is known when it has ended
-                raise Refused(
-                    "optim.clock: processor knows this process's time alone", where=where, value=n, accepted="0"
-                )
 
 
 def load_train_config(

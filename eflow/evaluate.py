@@ -18,19 +18,15 @@ from blinkgl.errors import AssetError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.machine.terminal import plain_console
 from blinkgl.sequence_files.sequence_dir import refuse_existing
-from eflow.confidence import SHARES, area, disagreement, sparsification
 from eflow.data.dataset import FlowDataset, collate
 from eflow.data.sources import Source
-from eflow.density import LengthByDensity
-from eflow.infer import PICTURED, MethodPredictor, Predictor, StreamWindow, predict
+from eflow.infer import PICTURED, predict
 from eflow.methods import Method
 from eflow.metrics import NAMES, Tally, frame_metrics
 from eflow.models import FlowModel, parameters_of
 from eflow.pictures import comparison, events_of, write_picture
 
 MEDIAN_FRAMES = 64
-JUDGED = 1000
-"""Pixels of a sample, evenly spaced, that a confidence is judged by over a set."""
 BASELINES = ("zero flow", "median of the set", "median of the frame", "affine of the frame")
 """Zero; one constant flow, the component-wise median of the set's own ground truth; and, frame by frame, the median of
 that frame's ground truth and the affine field nearest to it: the best an answer could be that saw only the global
@@ -46,19 +42,15 @@ def evaluate(
     empty: str = "error",
     precision: str = "fp32",
     limit: int | None = None,
-    confidence: bool = False,
     progress: Callable[[int, int, float], None] | None = None,
 ) -> dict[str, Any]:
     """Scores ``model``, or a method that needs no training, on every labelled sample of ``source``.
 
     out : new folder for ``results.json`` and ``pictures/`` (evenly spaced samples: events, truth, prediction, error
     map); None: nothing is written. limit : score only so many samples, evenly spaced.
-    confidence : judge :func:`~eflow.confidence.disagreement`, too, by leaving out the pixels that it doubts.
     progress : called with (done, of, AEE so far).
-    Returns {"methods": {name: {"total": …, "scenes": …}}, "lengths": rows of :class:`~eflow.density.LengthByDensity`,
-    "ms", "samples", "skipped", "model", "parameters"}; metrics as in :mod:`eflow.metrics`. "confidence", where asked
-    for: {"area": :func:`~eflow.confidence.area` over pixels of all samples, "area_in_a_sample": the mean of each one's
-    own, "left_out": shares, and the AEE of the rest by "doubt", at "best", by "chance"}.
+    Returns {"methods": {name: {"total": …, "scenes": …}}, "ms", "samples", "skipped", "model", "parameters"}; metrics
+    as in :mod:`eflow.metrics`.
 
     Raises AssetError: no ground truth, unreadable files. EventDataError: a window without events
     (unless ``empty="skip"``)."""
@@ -77,9 +69,7 @@ def evaluate(
     )
     median = _set_median(dataset, indices)
     tallies = {name: Tally() for name in ("network", *BASELINES)}
-    lengths = LengthByDensity()
     spent, sum_aee, scored = 0.0, 0.0, 0
-    areas, errors, doubted = [], [], []
     for done, i in enumerate(indices, 1):
         batch = collate([dataset[i]])
         raw = batch["raw"][0]
@@ -99,20 +89,6 @@ def evaluate(
             strict=True,
         ):
             tallies[name].add(scene, frame_metrics(np.broadcast_to(constant, truth.shape), truth, valid))
-        lengths.add(flow, truth, valid, len(raw.new), raw.hit)
-        if confidence:
-            where = (raw.height, raw.width)
-            views = (
-                Predictor(model, *where, precision=precision, empty="zero")
-                if method is None
-                else MethodPredictor(method, *where, empty="zero")
-            )
-            doubt = disagreement(views, StreamWindow(raw.new.t0, raw.old, raw.new), flow)
-            error = np.hypot(*np.moveaxis(flow - truth, -1, 0))
-            if curves := sparsification(error, doubt, valid):
-                areas.append(area(curves))
-                for kept, field in ((errors, error), (doubted, doubt)):
-                    kept.append(field[valid][:: -(-int(valid.sum()) // JUDGED)])
         if metrics:
             sum_aee, scored = sum_aee + metrics["AEE"], scored + 1
         if progress is not None:
@@ -132,49 +108,10 @@ def evaluate(
         "ms": 1000 * spent / len(indices),
         "device": _device_name(model) if method is None else "cpu",
         "methods": {name: {"total": t.total(), "scenes": t.scenes()} for name, t in tallies.items()},
-        "lengths": lengths.rows(),
     }
-    if confidence:
-        error, doubt = np.concatenate(errors), np.concatenate(doubted)
-        curves = sparsification(error, doubt, np.ones(error.shape, bool))
-        result["confidence"] = {
-            "area": area(curves),
-            "area_in_a_sample": float(np.nanmean(areas)),
-            "left_out": SHARES.tolist(),
-            **{k: v.tolist() for k, v in curves.items()},
-        }
     if out is not None:
         write_json(out / "results.json", result)
     return result
-
-
-def _lengths(rows: list[dict[str, Any]]) -> Table:
-    table = Table(title="predicted / true length, median of the samples")
-    for name in ("events per px of flow", "samples", "all pixels", "at events", "quartiles"):
-        table.add_column(name, justify="right")
-    for row in rows:
-        above = row["to"] is None
-        table.add_row(
-            f"above {row['from']:g}" if above else f"{row['from']:g} to {row['to']:g}",
-            str(row["samples"]),
-            f"{row['all']:.2f}",
-            f"{row['events']:.2f}",
-            "{:.2f} to {:.2f}".format(*row["quartiles"]),
-        )
-    return table
-
-
-def _confidence(judged: dict[str, Any]) -> Table:
-    table = Table(
-        title=f"confidence: {judged['area']:.2f} of the area of chance over all samples, "
-        f"{judged['area_in_a_sample']:.2f} within one (0 is perfect, 1 says nothing)"
-    )
-    for name in ("most doubtful left out", "AEE of the rest, px", "at best", "by chance"):
-        table.add_column(name, justify="right")
-    for share, *values in zip(*(judged[k] for k in ("left_out", "doubt", "best", "chance")), strict=True):
-        if round(100 * share) % 25 == 0 or share == judged["left_out"][-1]:
-            table.add_row(f"{100 * share:.0f} %", *(f"{v:.3f}" for v in values))
-    return table
 
 
 def _from_truth(truth: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -211,9 +148,9 @@ def write_json(path: Path, tree: dict) -> None:
         Path(temporary).write_text(json.dumps(tree, indent=1) + "\n", encoding="utf-8")
 
 
-def show(result: dict[str, Any], console: Console | None = None, by_density: bool = False) -> None:
-    """Two tables: all metrics of the network and the baselines; the network scene by scene, or (``by_density``) how
-    long its flow is where events are few and many. Fits 80 columns."""
+def show(result: dict[str, Any], console: Console | None = None) -> None:
+    """Two tables: all metrics of the network and the baselines; the network scene by scene. Fits 80
+    columns."""
     console = console or plain_console()
     units = {"AEE": "px", "cosine": "", "AE2D": "deg", "AE3D": "deg"}
     table = Table(
@@ -230,9 +167,7 @@ def show(result: dict[str, Any], console: Console | None = None, by_density: boo
         )
     console.print(table)
     scenes = result["methods"]["network"]["scenes"]
-    if by_density:
-        console.print(_lengths(result["lengths"]))
-    elif len(scenes) > 1:
+    if len(scenes) > 1:
         columns = ("AEE", "outlier", "3PE", "AE2D")
         table = Table(title="by scene")
         for name in ("", "frames", *columns):
@@ -240,7 +175,5 @@ def show(result: dict[str, Any], console: Console | None = None, by_density: boo
         for scene, scores in scenes.items():
             table.add_row(scene, str(scores["frames"]), *(f"{scores[c]:.3f}" for c in columns))
         console.print(table)
-    if "confidence" in result:
-        console.print(_confidence(result["confidence"]))
     if result["skipped"]:
         console.print(f"{result['skipped']} samples without a valid pixel were left out")

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import numpy as np
 import torch
 import torch.nn.functional as F
 
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors, remove_stale, temporary_beside
-from blinkgl.io.flo import encode_flo
 from blinkgl.io.flow_png import write_flow_png
 from blinkgl.io.formats import EventFile, open_events
 from blinkgl.io.images import encode_npy
@@ -261,22 +259,15 @@ def read_truth(path: str | os.PathLike, height: int, width: int) -> np.ndarray:
     return flow
 
 
-FILES = ("npy", "flo", "h5")
-"""What :class:`FlowWriter` makes besides."""
-
-
 class FlowWriter:
     """A folder of flow that appears whole or not at all: ``%06d.png`` (DSEC's 16 bits), ``pictures/%06d.png``, and
     ``timestamps.txt`` (from_us, to_us). Existing folders are refused.
 
-    files : besides, exact: "npy" ``npy/%06d.npy``, "flo" ``flo/%06d.flo`` (Middlebury's), "h5" ``flow.h5`` with
-    ``flow`` (N, H, W, 2) float32 px, ``from_us`` and ``to_us`` (N,) int64, and ``disagreement`` (N, H, W) float32 px
-    where it is given. Disagreements are ``disagreement/%06d.npy`` besides."""
+    npy : besides, exact, ``npy/%06d.npy`` (H, W, 2) float32."""
 
-    def __init__(self, final: str | os.PathLike, *, files: Sequence[str] = (), pictures: bool = True):
-        self.final, self.files, self.pictures, self.count = Path(final), files, pictures, 0
+    def __init__(self, final: str | os.PathLike, *, npy: bool = False, pictures: bool = True):
+        self.final, self.npy, self.pictures, self.count = Path(final), npy, pictures, 0
         self._lines = ["# from_timestamp_us, to_timestamp_us"]
-        self._h5: h5py.File | None = None
 
     def __enter__(self) -> FlowWriter:
         refuse_existing(self.final)
@@ -293,23 +284,16 @@ class FlowWriter:
         flow: np.ndarray,
         tensor: np.ndarray,
         truth: np.ndarray | None = None,
-        doubt: np.ndarray | None = None,
     ) -> None:
-        """flow (H, W, 2) px; tensor : the new window's events, as a predictor gives them; doubt (H, W) px."""
+        """flow (H, W, 2) px; tensor : the new window's events, as a predictor gives them."""
         name, valid, flow = f"{self.count:06d}", np.isfinite(flow).all(-1), flow.astype(np.float32, copy=False)
         write_flow_png(self._tmp / f"{name}.png", flow, valid)
         with output_errors(self.final):
-            if "npy" in self.files:
+            if self.npy:
                 self._part("npy", f"{name}.npy").write_bytes(encode_npy(flow))
-            if "flo" in self.files:
-                self._part("flo", f"{name}.flo").write_bytes(encode_flo(flow, valid))
-            if doubt is not None:
-                self._part("disagreement", f"{name}.npy").write_bytes(encode_npy(doubt))
-            if "h5" in self.files:
-                self._append(flow=flow, from_us=window.new.t0, to_us=window.new.t1, disagreement=doubt)
             if self.pictures:
                 where = None if truth is None else np.isfinite(truth).all(-1)
-                strip = comparison(events_of(tensor), flow, truth, where, doubt=doubt)
+                strip = comparison(events_of(tensor), flow, truth, where)
                 write_picture(self._part("pictures", f"{name}.png"), strip)
         self._lines.append(f"{window.new.t0}, {window.new.t1}")
         self.count += 1
@@ -318,32 +302,9 @@ class FlowWriter:
         (self._tmp / folder).mkdir(exist_ok=True)
         return self._tmp / folder / name
 
-    def _append(self, **columns: np.ndarray | int | None) -> None:
-        if self._h5 is None:
-            self._h5 = h5py.File(self._tmp / "flow.h5", "w")
-            self._h5.attrs["unit"] = "px from from_us to to_us, at the pixels of from_us; +x right, +y down"
-        for name, value in columns.items():
-            if value is None:
-                continue
-            row = np.asarray(value)
-            if name not in self._h5:
-                shape, packed = row.shape, {"compression": "gzip", "shuffle": True} if row.ndim else {}
-                self._h5.create_dataset(
-                    name,
-                    (0, *shape),
-                    row.dtype,
-                    maxshape=(None, *shape),
-                    chunks=(1 if shape else 1024, *shape),
-                    **packed,
-                )
-            self._h5[name].resize(self.count + 1, 0)
-            self._h5[name][self.count] = row
-
     def __exit__(self, kind, *_) -> None:
         try:
             with output_errors(self.final):
-                if self._h5 is not None:
-                    self._h5.close()
                 if kind is None:
                     (self._tmp / "timestamps.txt").write_text("\n".join(self._lines) + "\n", encoding="utf-8")
                     refuse_existing(self.final)

@@ -18,7 +18,6 @@ def sequence_loss(
     *,
     loss: LossConfig = L1,
     gamma: float = 0.8,
-    scale_gamma: float = 1.0,
     match_weight: float = 0.5,
     count: Tensor | None = None,
 ) -> Tensor:
@@ -27,7 +26,7 @@ def sequence_loss(
     flow : (N, 2, H, W) px. valid : (N, H, W) bool; what lies outside (|gt| >= 400 included) may hold anything, NaN too.
     w_i = gamma^(N - i) for refinements 1 … N of one field, and ``match_weight`` for the matching layer's, which would
     have gamma^N in the BlinkFlow paper (whose exponent N - 1 is a misprint), 1.45 % of the whole at N = 12.
-    For decoder scales w_i is in proportion to scale_gamma^(N - i), sum 1: coarse ones count less.
+    Decoder scales weigh the same, sum 1.
     count : number to divide by instead of the batch's valid pixels (data-parallel training: the mean over ranks).
 
     The mean is over *valid* pixels, so that sparse ground truth has the gradient scale of dense. No valid pixel: 0.
@@ -38,7 +37,7 @@ def sequence_loss(
     sum_ = flow.new_zeros(())
     for i, predicted in enumerate(prediction.flows):
         if prediction.kind == "scales":
-            weight = scale_gamma ** (last - i) / sum(scale_gamma**k for k in range(last + 1))
+            weight = 1 / (last + 1)
         else:
             weight = match_weight if prediction.has_match and i == 0 else gamma ** (last - i)
         error = pixel_error(predicted.float(), target, loss)
@@ -50,8 +49,7 @@ def pixel_error(predicted: Tensor, target: Tensor, loss: LossConfig) -> Tensor:
     """(N, 2, H, W) px, twice -> (N, H, W): the sum of ``loss``'s terms, each times its weight. With e the end-point
     error and k = ``loss.knee`` px:
 
-    l1: |du| + |dv|.   epe: e.   relative: e / (|true flow| + k).
-    log: k log(1 + e / k), which is e where that is small and hardly grows where it is large.
+    l1: |du| + |dv|.   epe: e.
     length: |log((|flow| + k) / (|true flow| + k))|. What is uncertain is best left short by the other terms (their
     minimum is the median of each component); this one is smallest at the median of the length, whatever the direction.
     """
@@ -59,15 +57,8 @@ def pixel_error(predicted: Tensor, target: Tensor, loss: LossConfig) -> Tensor:
     total = predicted.new_zeros(predicted.shape[0], *predicted.shape[2:])
     if loss.l1:
         total = total + loss.l1 * difference.abs().sum(1)
-    if loss.epe or loss.relative or loss.log:
-        # A root whose slope is finite at 0.
-        error = ((difference**2).sum(1) + 1e-6).sqrt()
-        if loss.epe:
-            total = total + loss.epe * error
-        if loss.relative:
-            total = total + loss.relative * error / (target.norm(dim=1) + loss.knee)
-        if loss.log:
-            total = total + loss.log * loss.knee * torch.log1p(error / loss.knee)
+    if loss.epe:
+        total = total + loss.epe * ((difference**2).sum(1) + 1e-6).sqrt()  # a root whose slope is finite at 0
     if loss.length:
         length = ((predicted**2).sum(1) + 1e-6).sqrt()
         total = total + loss.length * (torch.log(length + loss.knee) - torch.log(target.norm(dim=1) + loss.knee)).abs()

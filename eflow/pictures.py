@@ -43,15 +43,13 @@ def comparison(
     truth: np.ndarray | None = None,
     valid: np.ndarray | None = None,
     *,
-    doubt: np.ndarray | None = None,
     largest: float | None = None,
     caption: str = "events",
 ) -> np.ndarray:
     """One RGB strip: events | ground truth | prediction | error (without truth: events | prediction), with a bar of
     :data:`BAR` px above that says what is shown and at what length a colour is full. Flow panels share
     one scale: ``largest`` px, or the 99th percentile of the true speed (of the predicted one without truth).
-    events : (H, W, 3) uint8; flows (H, W, 2) px. doubt : (H, W) px of :func:`eflow.confidence.disagreement`, a further
-    panel in the error's scale. caption : of the events."""
+    events : (H, W, 3) uint8; flows (H, W, 2) px. caption : of the events."""
     panels = [(caption, events)]
     if truth is None or valid is None or not valid.any():
         largest = largest or full_colour(predicted)
@@ -64,9 +62,6 @@ def comparison(
             ("predicted", flow_colour(predicted, largest)),
             (f"error, pale {pale:.3g} px", error_colour(error, pale, valid)),
         ]
-    if doubt is not None:
-        pale = max(3.0, largest / 2)
-        panels.append((f"disagreement, pale {pale:.3g} px", error_colour(doubt, pale, np.isfinite(doubt))))
     height, width = events.shape[:2]
     strip = np.full((height + BAR, len(panels) * (width + _GAP) - _GAP, 3), 255, np.uint8)
     font = ImageFont.load_default(11)
@@ -89,12 +84,12 @@ class FlowVideo:
     """Events and flow of successive windows as a video that appears whole or not at all. Its scale grows at once and
     falls slowly, so that colours do not flicker; each panel is captioned. Small sensors are shown twice as large.
 
-    fps : windows a second of video.   doubts : a panel for them, too.   Raises OutputError: it cannot be written."""
+    fps : windows a second of video.   Raises OutputError: it cannot be written."""
 
-    def __init__(self, path: str | os.PathLike, height: int, width: int, fps: float, *, doubts: bool = False):
+    def __init__(self, path: str | os.PathLike, height: int, width: int, fps: float):
         self._path, self._fps, self._factor, self._largest = path, fps, 2 if height < 200 else 1, 0.0
         still = np.zeros((height, width, 2), np.float32)
-        blank = comparison(np.zeros((height, width, 3), np.uint8), still, doubt=still[..., 0] if doubts else None)
+        blank = comparison(np.zeros((height, width, 3), np.uint8), still)
         self._shape = self._fit(blank).shape
 
     def __enter__(self) -> FlowVideo:
@@ -104,10 +99,10 @@ class FlowVideo:
             self._opened = opened.pop_all()
         return self
 
-    def add(self, caption: str, events: np.ndarray, flow: np.ndarray, doubt: np.ndarray | None = None) -> None:
-        """caption : above the events, e.g. their time. events (H, W, 3) uint8; flow (H, W, 2) px; doubt (H, W) px."""
+    def add(self, caption: str, events: np.ndarray, flow: np.ndarray) -> None:
+        """caption : above the events, e.g. their time. events (H, W, 3) uint8; flow (H, W, 2) px."""
         self._largest = max(_STEADY * self._largest, full_colour(flow))
-        self._video.write(self._fit(comparison(events, flow, doubt=doubt, largest=self._largest, caption=caption)))
+        self._video.write(self._fit(comparison(events, flow, largest=self._largest, caption=caption)))
 
     def _fit(self, strip: np.ndarray) -> np.ndarray:
         """Enlarged, and of even height and width as the codec wants."""

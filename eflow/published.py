@@ -1,5 +1,5 @@
-"""Weights that others have published: the checkpoints of E-RAFT (``dsec.tar``, ``mvsec_20.tar``, …) and of RAFT, which
-have one layout, to a safetensors file of :class:`~eflow.models.eraft.Eraft`.
+"""Weights that others have published: checkpoints of E-RAFT (``dsec.tar``, ``mvsec_20.tar``, …) as safetensors files of
+:class:`~eflow.models.eraft.Eraft`.
 
 Such files are pickles. Tensors and plain containers are all that is taken from them, by torch's restricted reader,
 which executes nothing. Names are others here, the gates of the GRU are joined, and the taps of a look-up stand in
@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from blinkgl.errors import AssetError, ConfigError
+from blinkgl.errors import AssetError
 from blinkgl.io.atomic import atomic_file
 from eflow.checkpoint import load_weights, metadata_of, write_tensors
 from eflow.models import FlowModel, build_model, model_config
@@ -27,15 +27,13 @@ _IGNORED = ("norm3.", "num_batches_tracked")
 """Parts of published names that say nothing new: a shortcut's norm stands there twice, and counters of batches."""
 
 
-def import_published(path: str | os.PathLike, out: str | os.PathLike, *, bins: int | None = None) -> FlowModel:
+def import_published(path: str | os.PathLike, out: str | os.PathLike) -> FlowModel:
     """Writes the weights in ``path`` to the new safetensors file ``out``; returns the network.
 
-    bins : only for RAFT's, which see images: time bins that the first layers' three colours are spread over, as a start
-    for training (they know no events).
-    Raises AssetError: not a checkpoint of this layout, truncated, anything but tensors. ConfigError: ``bins``.
+    Raises AssetError: not a checkpoint of this layout, truncated, anything but tensors.
     OutputError: ``out`` exists or cannot be written."""
     path = Path(path)
-    model = from_published(read_published(path), str(path), bins=bins)
+    model = from_published(read_published(path), str(path))
     with atomic_file(out, overwrite=False) as temporary:
         write_tensors(temporary, model.state_dict(), metadata_of(model))
     return model
@@ -65,7 +63,7 @@ def read_published(path: Path) -> dict[str, Tensor]:
         if isinstance(tree, dict) and isinstance(tree.get(key), dict):
             tree = tree[key]
     if not isinstance(tree, dict) or not tree or not all(isinstance(k, str) for k in tree):
-        raise AssetError("holds no tensors by name", where=str(path), accepted="E-RAFT's or RAFT's checkpoint")
+        raise AssetError("holds no tensors by name", where=str(path), accepted="E-RAFT's checkpoint")
     tensors = {k.removeprefix("module."): v for k, v in tree.items()}
     for name, value in tensors.items():
         if not isinstance(value, Tensor):
@@ -73,21 +71,15 @@ def read_published(path: Path) -> dict[str, Tensor]:
     return tensors
 
 
-def from_published(tensors: dict[str, Tensor], where: str, *, bins: int | None = None) -> FlowModel:
-    """The network that published tensors are of. Raises AssetError, ConfigError, as :func:`import_published`."""
+def from_published(tensors: dict[str, Tensor], where: str) -> FlowModel:
+    """The network that published tensors are of. Raises AssetError, as :func:`import_published`."""
     first = _tensor(tensors, "fnet.conv1.weight", where)
     channels = first.shape[1] if first.ndim == 4 else 0
-    if channels == COLOURS and bins is None:
-        raise ConfigError(
-            "RAFT sees images of three colours",
-            where="--bins",
-            accepted="time bins to spread them over, as a start for training (--bins 15)",
-        )
-    if channels != COLOURS and bins not in (None, channels):
-        raise ConfigError("the network has its own", where="--bins", value=bins, accepted=str(channels))
+    if channels == COLOURS:
+        raise AssetError("RAFT's own weights see images and no events", where=where, accepted="E-RAFT's checkpoint")
     if not 2 <= channels <= 64:
         raise AssetError("tensor 'fnet.conv1.weight' has another shape", where=where, value=tuple(first.shape))
-    events = {"bins": bins or channels, "normalise": "nonzero", "bounds": "events"}
+    events = {"bins": channels, "normalise": "nonzero", "bounds": "events"}
     config: dict[str, Any] = {"name": "eraft", "input": events, "border": "zero", "padding": "start"}
     model = build_model(model_config(config))
     ours = model.state_dict()
@@ -99,8 +91,6 @@ def from_published(tensors: dict[str, Tensor], where: str, *, bins: int | None =
         sources = published_names(name)
         parts = [_tensor(tensors, source, where) for source in sources]
         value = torch.cat(parts) if all(p.ndim for p in parts) else parts[0]
-        if name in ("features.0.weight", "context.0.weight") and channels == COLOURS:
-            value = value.mean(1, keepdim=True).expand(-1, events["bins"], -1, -1) * (COLOURS / events["bins"])
         if value.shape != wanted.shape or not value.is_floating_point():
             raise AssetError(
                 f"tensor '{' and '.join(sources)}' has another shape or type",
@@ -112,9 +102,7 @@ def from_published(tensors: dict[str, Tensor], where: str, *, bins: int | None =
     used = {source for name in ours for source in published_names(name)}
     left = [k for k in sorted(set(tensors) - used) if not any(part in k for part in _IGNORED)]
     if left:
-        raise AssetError(
-            f"holds a tensor '{left[0]}' that E-RAFT has not", where=where, accepted="E-RAFT's or RAFT's checkpoint"
-        )
+        raise AssetError(f"holds a tensor '{left[0]}' that E-RAFT has not", where=where, accepted="E-RAFT's checkpoint")
     load_weights(model, found, where)
     return model.eval()
 
@@ -155,5 +143,5 @@ def _reordered(weight: Tensor) -> Tensor:
 
 def _tensor(tensors: dict[str, Tensor], name: str, where: str) -> Tensor:
     if name not in tensors:
-        raise AssetError(f"lacks the tensor '{name}'", where=where, accepted="E-RAFT's or RAFT's checkpoint")
+        raise AssetError(f"lacks the tensor '{name}'", where=where, accepted="E-RAFT's checkpoint")
     return tensors[name]

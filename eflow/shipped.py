@@ -131,7 +131,6 @@ def lines(card: Card, whole: bool = True) -> Iterator[str]:
             yield f"  {'' if k else title:10}{entry}"
     if whole:
         yield f"  file      sha256 {card.sha256}; packed by version {card.version}"
-        yield f"            {card.stored} changes a flow by {card.rounding_px:.2g} px at most, on random events"
 
 
 def pack(
@@ -140,17 +139,14 @@ def pack(
     card: str | os.PathLike,
     out: str | os.PathLike,
     *,
-    stored: str = "fp32",
     averaged: bool = True,
 ) -> tuple[Path, Card]:
     """Writes the new folder ``out/name`` of a checkpoint's weights and a person's card (a YAML file of
     :class:`CardText`); returns it with its card. The folder appears whole or not at all, after its weights have been
-    read back and their flow compared.
+    read back.
 
-    stored : "fp32", or "fp16" at half the size.   averaged : the averaged weights, where there are any.
-    Raises ConfigError: name, card. AssetError: checkpoint; weights that fp16 cannot hold, or too large. OutputError."""
-    import torch
-
+    averaged : the averaged weights, where there are any.
+    Raises ConfigError: name, card. AssetError: checkpoint; weights that are too large. OutputError."""
     from eflow.checkpoint import load_model, metadata_of, write_tensors
     from eflow.models import NETWORKS, parameters_of
 
@@ -166,25 +162,18 @@ def pack(
     refuse_existing(final)
     model = load_model(checkpoint, averaged=averaged)
     tensors = model.state_dict()
-    if stored == "fp16":
-        tensors = {k: v.half() if v.is_floating_point() else v for k, v in tensors.items()}
-        for key, value in tensors.items():
-            if not torch.isfinite(value).all():
-                raise AssetError(
-                    f"tensor '{key}' is too large for fp16", where=str(checkpoint), accepted="--store fp32"
-                )
     size = sum(v.numel() * v.element_size() for v in tensors.values())
     if size > LARGEST:
         raise AssetError(
             "too large to come with the package",
             where=str(checkpoint),
             value=f"{size / 1e6:.1f} MB",
-            accepted=f"at most {LARGEST / 1e6:g} MB" + (": --store fp16" if size / 2 <= LARGEST else ""),
+            accepted=f"at most {LARGEST / 1e6:g} MB",
         )
     with atomic_folder(final) as folder:
         write_tensors(folder / WEIGHTS, tensors, metadata_of(model))
         (folder / WEIGHTS).chmod(0o644)  # of an installation that others use
-        again = load_model(folder / WEIGHTS, expected=model.config)
+        load_model(folder / WEIGHTS, expected=model.config)  # it can be read
         read = (folder / WEIGHTS).read_bytes()
         full = Card(
             **text.model_dump(),
@@ -192,8 +181,8 @@ def pack(
             network=model.config.name,
             size=model.config.size,
             parameters=parameters_of(model),
-            stored=stored,
-            rounding_px=_difference(model, again),
+            stored="fp32",
+            rounding_px=0.0,
             bytes=len(read),
             sha256=hashlib.sha256(read).hexdigest(),
             version=__version__,
@@ -201,21 +190,3 @@ def pack(
         with output_errors(folder):
             (folder / CARD).write_text(to_yaml(full.model_dump(mode="json")), encoding="utf-8")
     return final, full
-
-
-def _difference(a, b) -> float:
-    """Largest difference of two networks' flow, px, on events at random."""
-    import numpy as np
-    import torch
-
-    from eflow.data.window import Window
-    from eflow.infer import predict
-
-    rng, (height, width), count = np.random.default_rng(0), (128, 160), 6000
-    batch = {}
-    for key, t0 in (("old", 0), ("new", 20_000)):
-        columns = (rng.integers(0, width, count), rng.integers(0, height, count))
-        t, p = np.sort(rng.integers(t0, t0 + 20_000, count)), rng.integers(0, 2, count).astype(np.uint8)
-        window = Window(*(c.astype(np.uint16) for c in columns), t, p, t0, t0 + 20_000)
-        batch[key] = torch.from_numpy(a.representation(window, height, width))[None]
-    return float((predict(a, batch).flow - predict(b, batch).flow).abs().max())

@@ -63,10 +63,6 @@ class TrainResult:
     loss: float
 
 
-CLOCKS = {"wall": time.monotonic, "processor": time.process_time}
-"""What ``optim.minutes`` are counted on, s, by ``optim.clock``."""
-
-
 def learning_rate(done: float, peak: float, warmup: float, cooldown: float) -> float:
     """The rate when a share ``done`` (0 … 1) of the training is over: linear from peak / 25 up to ``peak`` over its
     first ``warmup``, then ``peak``, and linear down to peak / 25e4 over its last ``cooldown``."""
@@ -118,15 +114,13 @@ def train(
     resume: bool = False,
     stop_after: int | None = None,
     quiet: bool = False,
-    clock: Callable[[], float] | None = None,
+    clock: Callable[[], float] = time.monotonic,
 ) -> TrainResult:
     """Trains to the end of ``config.optim.steps`` or ``minutes``. ``stop_after``: leave after this many steps of this
-    call, as a signal would. clock : seconds, of ``optim.minutes``; None: the one that ``optim.clock`` names.
+    call, as a signal would. clock : seconds, of ``optim.minutes``.
 
     Raises ConfigError, AssetError, EventDataError (data), OutputError (run folder exists), TrainingError (loss not
     finite: the batch's sample names are in ``nan_batch.json``)."""
-    if clock is None:
-        clock = CLOCKS[config.optim.clock]
     with contextlib.ExitStack() as stack:  # of what renders while it is trained on
         return _train(config, Path(out), stack, resume=resume, stop_after=stop_after, quiet=quiet, clock=clock)
 
@@ -204,7 +198,7 @@ def _train(
         _write_config(out, config)
     step, reason, began = start, None, time.monotonic()
     read = Readings(out)
-    course, own = Course(config.optim, clock(), spent, clock), config.optim.clock == "processor"
+    course = Course(config.optim, clock(), spent, clock)
     done = course.done(step, device, world)
     if done >= 1:
         sampler = StepSampler(mixture, config.data.batch, start, start, rank, world)
@@ -228,9 +222,8 @@ def _train(
             start,
             config.data.batch,
             enabled=lead and not quiet,
-            where=f"{device.type}, {precision}" + (", by processor time" if own else ""),
-            minutes=course.minutes_left(None if own else config.run.time_limit),  # a limit is the wall's
-            clock=CLOCKS[config.optim.clock],
+            where=f"{device.type}, {precision}",
+            minutes=course.minutes_left(config.run.time_limit),
         ) as progress,
     ):
         waiting = Waiting(batches(dataset, sampler, config.data.workers, pin=device.type == "cuda"))
@@ -342,7 +335,6 @@ def _forward(net, batch: dict, config: TrainConfig, world: int) -> tuple[Tensor,
         batch["valid"],
         loss=config.optim.loss,
         gamma=config.optim.gamma,
-        scale_gamma=config.optim.scale_gamma,
         match_weight=config.optim.match_weight,
         count=count,
     )
@@ -474,6 +466,8 @@ def _check_sizes(dataset: FlowDataset, model: FlowModel, crop: tuple[int, int] |
 
 _FREE = {"run"}
 """Parts of the configuration that may change between a run and its resumption (how it runs, not what it computes)."""
+_GONE = {"optim.clock": "wall", "optim.scale_gamma": 1.0, "optim.loss.relative": 0.0, "optim.loss.log": 0.0}
+"""Keys that earlier versions had, and their defaults: what they compute today."""
 
 
 def _resume(out: Path, config: TrainConfig, model: FlowModel, optimizer, ema) -> tuple[int, float]:
@@ -482,18 +476,16 @@ def _resume(out: Path, config: TrainConfig, model: FlowModel, optimizer, ema) ->
     if folder is None:
         raise AssetError("no checkpoint to resume from", where=str(out), accepted="a run folder of eflow train")
     state = ckpt.read_state(folder)
-    saved, now = state.get("config", {}), json.loads(config.model_dump_json())
-    for path in sorted(set(_leaves(saved)) | set(_leaves(now))):
-        if (
-            path.split(".")[0] not in _FREE
-            and not re.fullmatch(r"data\.(train\.\d+\.)?workers", path)
-            and _leaves(saved).get(path) != _leaves(now).get(path)
-        ):
+    saved, now = _leaves(state.get("config", {})), {**_GONE, **_leaves(json.loads(config.model_dump_json()))}
+    saved = {**_GONE, **saved}
+    for path in sorted({*saved, *now}):
+        free = path.split(".")[0] in _FREE or re.fullmatch(r"data\.(train\.\d+\.)?workers", path)
+        if not free and saved.get(path) != now.get(path):
             raise ConfigError(
                 "differs from the run that is resumed",
                 where=path,
-                value=_leaves(now).get(path),
-                accepted=f"{_leaves(saved).get(path)!r}, or a new run with init_from",
+                value=now.get(path),
+                accepted=f"{saved.get(path)!r}, or a new run with init_from",
             )
     weights, _ = ckpt.read_tensors(folder / "weights.safetensors")
     averaged = ckpt.read_tensors(folder / "ema.safetensors")[0] if ema is not None else {}

@@ -14,15 +14,12 @@
 // Which lines cross which pixels, and with what share, is known before (contours.py). Here is one vertex, and one point,
 // for each pixel that has any: the pixels around it are looked at once, whatever the number of lines.
 //
-// LIGHT: the type of what a pixel shows, OF: its components in the picture; FLOOR: the least that the sum may be, since
-// what lines of different surfaces do not know of each other may take more away than there is.
+// LIGHT: the type of what a pixel shows, OF: its components in the picture. The sum is held to 0, since what
+// lines of different surfaces do not know of each other may take more away than there is.
 
 #ifndef LIGHT
 #define LIGHT vec4
 #define OF rgba
-#endif
-#ifndef FLOOR
-#define FLOOR LIGHT(0.0)
 #endif
 
 #ifdef VERTEX_SHADER
@@ -223,7 +220,7 @@ void main()
         if (weights > 0.0)
             result += min(abs(creases), 1.0) * (others / weights - plain);
     }
-    result = max(result, min(FLOOR, plain));
+    result = max(result, min(LIGHT(0.0), plain));
     light = vec4(0.0);
     light.OF = result;
 }

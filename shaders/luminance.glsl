@@ -154,15 +154,7 @@ void main()
 #ifdef CHANGES
     vec2 motion = velocity(rate, local, image_size);
 #ifdef TEXTURED
-#ifdef TAPS4
-    // One mip level finer is what every second pixel would see.
-    change = 0.25 * (texture_rate(albedo, uv - right - down, motion, 2.0)
-                   + texture_rate(albedo, uv + right - down, motion, 2.0)
-                   + texture_rate(albedo, uv - right + down, motion, 2.0)
-                   + texture_rate(albedo, uv + right + down, motion, 2.0));
-#else
     change = texture_rate(albedo, uv, motion, every);
-#endif
 #endif
 #endif
 // The product rule on albedo and tint.

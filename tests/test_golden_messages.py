@@ -154,7 +154,7 @@ EFLOW_COMMANDS = [
     "predict nowhere broken.h5 --out flow",
     "submit nowhere nowhere --out submission.zip",
     "models nowhere",
-    "pack nowhere --name planes --card missing.yaml --out packed",
+    "pack nowhere --name contrast-affine --card missing.yaml --out packed",
     "pack nowhere --name good --card missing.yaml --out packed",
     "",
 ][1:-1]

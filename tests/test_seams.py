@@ -60,7 +60,6 @@ class Toy(Emulator):
     class Config(EmulatorConfig):
         """A toy: an ideal threshold with a fixed dead time."""
 
-        reconstructions = ("linear",)
         emulator: Literal["toy"] = "toy"
         contrast_threshold: float = Field(0.2, ge=0.01, le=10, description="ln units.")
         dead_us: float = Field(1000.0, ge=0, le=1e9, description="Dead time of a pixel after an event, microseconds.")
@@ -71,8 +70,8 @@ class Toy(Emulator):
 
     _state = ("_level", "_free_ns")
 
-    def __init__(self, height, width, config, seed=0, reconstruction="linear"):
-        super().__init__(height, width, seed, reconstruction)
+    def __init__(self, height, width, config, seed=0):
+        super().__init__(height, width, seed)
         self.config, self._level, self._free_ns = (
             config,
             np.zeros(height * width, np.float32),
@@ -87,11 +86,11 @@ class Toy(Emulator):
     def noiseless(cls, config):
         return config
 
-    def _start(self, frame, t_ns, rate):
+    def _start(self, frame, t_ns):
         self._level[:], self._free_ns[:] = self._signal(frame), t_ns
         return Events.empty()
 
-    def _advance(self, frame, t_ns, rate):
+    def _advance(self, frame, t_ns):
         moved = self._signal(frame) - self._level
         fires = np.flatnonzero((np.abs(moved) >= self.config.contrast_threshold) & (self._free_ns <= t_ns))
         self._level[fires] += moved[fires]
@@ -193,11 +192,9 @@ def test_a_sensor_sets_a_toy_emulator(toy, tmp_path):
 
 def test_a_toy_emulator_is_traded(toy, tmp_path):
     options = Options(clip_s=0.02, tiles=(2, 2, 16, 12), levels=((2, 0.5),), rounds=1)
-    settings = (Setting("displacement 2 px"), Setting("displacement 2 px", "pchip"))
+    settings = (Setting("displacement 2 px"),)
     result = trade(load_run(written(tmp_path)), options=options, settings=settings)
-    assert [s["name"] for s in result["settings"]] == ["displacement 2 px, linear, none"], (
-        "the toy follows straight lines alone"
-    )
+    assert [s["name"] for s in result["settings"]] == ["displacement 2 px, none"]
     assert (
         result["sizes"]["full"]["emulator"]["emulator"] == "toy" and result["sizes"]["full"]["levels"][0]["events"] > 0
     )
@@ -219,12 +216,6 @@ def test_the_configuration_knows_a_toy_emulator_while_it_is_registered(tmp_path)
             load_run(written(tmp_path, **tree))
         with pytest.raises(ConfigError, match="events.dead: unknown key; expected 'dead_us' .nearest"):
             load_run(written(tmp_path, events={"emulator": "toy", "dead": 1}))
-        with pytest.raises(
-            ConfigError,
-            match="toy follows straight lines alone .got 'pchip'.; expected linear, or events.emulator: esim",
-        ):
-            load_run(written(tmp_path), ["timeline.reconstruction=pchip"])
-        assert load_run(written(tmp_path), ["quality=fast"]).sequence(0).timeline.reconstruction == "linear"
         assert "## `events` with `emulator: toy`" in page()
         assert "toy" in SequenceConfig.model_json_schema()["properties"]["events"]["discriminator"]["mapping"]
     finally:
@@ -322,7 +313,6 @@ def refused(emulator, match):
     [
         "Config",
         "Config.emulator",
-        "Config.reconstructions",
         "Config.from_sensor",
         "response",
         "noiseless",
@@ -344,12 +334,6 @@ FREE = "@classmethod\ndef {}(cls, _): return {}"
         ("Config", "Config = dict", "emulator Toy: `Config` is <class 'dict'> and not an EmulatorConfig of its own"),
         ("Config.emulator", "emulator: str = 'toy'", "emulator Toy: `Config.emulator` is not of the form"),
         ("Config.dead_us", "dead_us: float", "`Config` has keys without a default: dead_us"),
-        (
-            "Config.reconstructions",
-            "reconstructions = 'linear'",
-            "`Config.reconstructions` is 'linear' and not a tuple",
-        ),
-        ("Config.reconstructions", "reconstructions = ('pchip',)", "not a tuple of 'linear' and"),
         ("Config.from_sensor", FREE.format("from_sensor", "3"), "`Config.from_sensor` gives 3 and not a table of keys"),
         (
             "Config.from_sensor",
@@ -574,10 +558,7 @@ def test_shader_diff_judges_a_toy_label(position, tmp_path, capsys, monkeypatch)
 def test_every_variant_of_a_toy_label_compiles(position, capsys):
     assert shader("check", "label.glsl", "--json") == 0
     result = json.loads(capsys.readouterr().out)
-    assert result["errors"] == [] and result["unused"] == [] and result["programs"]["label.glsl"] == 154
-    assert shader("show", "label.glsl", "-D", "OUT_POSITION=0", "--stage", "fragment", "--active") == 0
-    said = capsys.readouterr().out
-    assert "label_position()" in said and "label_depth()" not in said
+    assert result["errors"] == [] and result["programs"]["label.glsl"] == 154
 
 
 def test_only_what_is_asked_for_is_compiled(position, drawing):

@@ -123,7 +123,7 @@ def build(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
 
 
 def passes(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
-    """A luminance frame of the configuration, drawn and read, by antialiasing; with rates."""
+    """A luminance frame of the configuration, drawn and read, by antialiasing."""
     from blinkgl.gl import create_context
     from blinkgl.render.renderer import Renderer
 
@@ -136,12 +136,9 @@ def passes(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
         return stack.enter_context(Renderer(gl, scene, render))
 
     drawn = {kind: renderer(kind) for kind in ("none", "edges", "ssaa2")}
-    rows: Rows = {
+    return {
         kind: lambda one=one: [one.luminance(next(times)).read() for _ in range(4)] and 4 for kind, one in drawn.items()
     }
-    plain = drawn["none"]
-    rows["none, rates"] = lambda: plain.luminance(next(times), rate=True).read() is None
-    return rows
 
 
 def labels(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
@@ -237,7 +234,7 @@ def online(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
 
 
 def voxels(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
-    """Voxel grids of a million events, 15 bins, 640x480 (`eflow bench` times the networks)."""
+    """Voxel grids of a million events, 15 bins, 640x480."""
     from eflow.ops.voxel import voxel_grid
 
     rng, count = np.random.default_rng(0), 1_000_000
@@ -250,7 +247,24 @@ def voxels(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
     return {"integer pixels": lambda: row(np.uint16), "rectified": lambda: row(np.float32)}
 
 
-WHATS = {f.__name__: f for f in (events, generate, build, passes, labels, formats, start, online, voxels)}
+def networks(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
+    """Forward passes of the five networks as published, 640x480, on the processor or a card."""
+    import torch
+
+    from eflow.infer import predict
+    from eflow.models import NETWORKS, build_model, model_config
+
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+    def row(name: str) -> Row:
+        model = build_model(model_config({"name": name})).to(device).eval()
+        grids = {key: torch.randn(1, model.representation.channels, HEIGHT, WIDTH) for key in ("old", "new")}
+        return lambda: predict(model, grids).flow.cpu() is None or None
+
+    return {name: row(name) for name in NETWORKS}
+
+
+WHATS = {f.__name__: f for f in (events, generate, build, passes, labels, formats, start, online, voxels, networks)}
 
 
 def probe_scene(kind: str, width: int, height: int) -> Scene:

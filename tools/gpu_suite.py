@@ -57,7 +57,7 @@ VARIANTS = {
     "defaults": EsimConfig(),
     "one threshold": EsimConfig(threshold_sigma=0.0),
     "two thresholds": EsimConfig(threshold_sigma=0.0, contrast_threshold_off=0.3),
-    "spread": EsimConfig(threshold_sigma=0.1, threshold_correlation=0.5, causes=True),
+    "spread": EsimConfig(threshold_sigma=0.1, causes=True),
     "refractory": EsimConfig(refractory_us=300.0),
     "jitter": EsimConfig(threshold_jitter=0.03),
     "jitter, refractory": EsimConfig(threshold_jitter=0.03, refractory_us=100.0),
@@ -65,7 +65,7 @@ VARIANTS = {
     "v2e clean": V2eConfig(preset="clean"),
     "v2e": V2eConfig(),
     "v2e, all": V2eConfig(**_ALL_OF_V2E),
-    "v2e, photoreceptor noise": V2eConfig(**_ALL_OF_V2E, photoreceptor_noise=True, second_cutoff_hz=1000.0),
+    "v2e, photoreceptor noise": V2eConfig(**_ALL_OF_V2E, photoreceptor_noise=True),
     "v2e noisy": V2eConfig(preset="noisy", causes=True),
 }
 

@@ -98,8 +98,6 @@ class EmulatorConfig(Family):
         def emulator(self) -> str:
             """The name."""
 
-    reconstructions: ClassVar[tuple[str, ...]]
-    """Paths between frames that the emulator can follow; "linear" is one of them."""
     fitted: ClassVar[Mapping[str, Fitted]] = MappingProxyType({})
     """Keys that `blinkgl calibrate` finds from a recording."""
     one_threshold: ClassVar[bool] = False
@@ -109,11 +107,6 @@ class EmulatorConfig(Family):
     @abstractmethod
     def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:
         """Values of those of its keys of which a camera's data sheet says something; None where this one does not."""
-
-
-def followers(reconstruction: str) -> list[str]:
-    """Names of the emulators that can follow this path between frames."""
-    return [kind for kind, model in EmulatorConfig.members.models.items() if reconstruction in model.reconstructions]
 
 
 def _with_both_thresholds(data: dict[str, Any], default: float) -> dict[str, Any]:
@@ -160,11 +153,14 @@ class _TwoThresholds:
             )
 
 
+_NO_CORRELATION = {"threshold_correlation": Removed("the key left out", lambda value: value == 0)}
+
+
 class EsimConfig(_TwoThresholds, EmulatorConfig):
     """ESIM (Rebecq, Gehrig, Scaramuzza, CoRL 2018): log intensity against per-pixel levels, linear in time."""
 
-    reconstructions = ("linear", "pchip", "hermite")
     fitted = _ESIM_FITTED
+    removed = _NO_CORRELATION
     emulator: Literal["esim"] = "esim"
     contrast_threshold: float = Field(
         0.2,
@@ -188,13 +184,6 @@ class EsimConfig(_TwoThresholds, EmulatorConfig):
         description="Standard deviation of C+ and C- over the pixels, in ln "
         "units (rpg_esim's default 0.021), drawn once per pixel; each threshold stays >= 0.01 "
         "(or >= half of a smaller nominal one).",
-    )
-    threshold_correlation: float = Field(
-        0.0,
-        ge=-1,
-        le=1,
-        description="Correlation over the pixels of the ON with the OFF threshold. 1: a pixel's gain is what differs; "
-        "-1: the place of its reference.",
     )
     threshold_jitter: float = Field(
         0.0,
@@ -253,15 +242,15 @@ _NO_COMPAT = {
         lambda value: value == "none",
     )
 }
+_NO_SECOND_CORNER = {"second_cutoff_hz": Removed("the key left out, and a lower cutoff_hz", lambda value: value == 0)}
 
 
 class V2eConfig(_TwoThresholds, EmulatorConfig):
     """V2E (Hu, Liu, Delbruck, CVPRW 2021): finite bandwidth, mismatch, leak, shot noise, refractory period."""
 
-    reconstructions = ("linear",)
     presets = V2E_PRESETS
     fitted = _V2E_FITTED
-    removed = _NO_COMPAT
+    removed: ClassVar = {**_NO_COMPAT, **_NO_CORRELATION, **_NO_SECOND_CORNER}
     emulator: Literal["v2e"] = "v2e"
     preset: Literal["default", "clean", "noisy"] = Field(
         "default", description="v2e's command-line defaults, or its `clean` and `noisy` parameter sets."
@@ -281,13 +270,6 @@ class V2eConfig(_TwoThresholds, EmulatorConfig):
         le=5,
         description="Spread of the thresholds over the pixels, ln units (v2e: 0.03); each threshold stays >= 0.01.",
     )
-    threshold_correlation: float = Field(
-        0.0,
-        ge=-1,
-        le=1,
-        description="Correlation over the pixels of the ON with the OFF threshold. 1: a pixel's gain is what differs; "
-        "-1: the place of its reference.",
-    )
     full_scale: float = Field(
         255.0,
         gt=0,
@@ -300,13 +282,6 @@ class V2eConfig(_TwoThresholds, EmulatorConfig):
         le=1e7,
         description="Photoreceptor cut-off at full scale, Hz (v2e: 300), scaled by "
         "(I + 20)/275; 0: infinite bandwidth.",
-    )
-    second_cutoff_hz: float = Field(
-        0.0,
-        ge=0,
-        le=1e7,
-        description="Corner of a second low-pass, Hz, the same at any light (a pixel's source follower, set by its "
-        "bias): the response falls by 40 dB a decade beyond both. Needs cutoff_hz > 0; 0: none.",
     )
     leak_rate_hz: float = Field(0.01, ge=0, le=1e4, description="Leak events per second and pixel, ON (v2e: 0.01).")
     leak_jitter: float = Field(
@@ -349,16 +324,6 @@ class V2eConfig(_TwoThresholds, EmulatorConfig):
     causes: bool = _CAUSES
     device: Device = _DEVICE
 
-    @rule("second_cutoff_hz", "cutoff_hz")
-    def _a_second_needs_a_first(second_cutoff_hz, cutoff_hz):
-        if second_cutoff_hz and cutoff_hz == 0:
-            raise Refused(
-                "a second low-pass needs a first",
-                where="second_cutoff_hz",
-                value=second_cutoff_hz,
-                accepted="0, or a cutoff_hz > 0 beside it",
-            )
-
     @rule("photoreceptor_noise", "cutoff_hz")
     def _noise_needs_bandwidth(noise, cutoff_hz):
         if noise and cutoff_hz == 0:
@@ -384,7 +349,6 @@ VOLTMETER_PRESETS = {
 class VoltmeterConfig(EmulatorConfig):
     """DVS-Voltmeter (Lin et al., ECCV 2022): Brownian motion with drift between two absorbing thresholds."""
 
-    reconstructions = ("linear",)
     presets = VOLTMETER_PRESETS
     fitted = _VOLTMETER_FITTED
     removed = _NO_COMPAT

@@ -37,11 +37,10 @@ class FramesConfig(Config):
     first: int = Field(0, ge=0, description="frames left out at the beginning")
     count: int | None = Field(None, ge=3, description="frames used; null: all")
     gamma: Literal["srgb", "linear"] = Field("srgb", description="transfer curve of the images")
-    interpolate: Literal["linear", "cubic", "motion"] = Field(
+    interpolate: Literal["linear", "motion"] = Field(
         "motion", description="between frames: as `blinkgl simulate --interpolate`"
     )
     max_px: float = Field(1.0, gt=0, le=1e3, description="motion: largest displacement per step, px")
-    factor: int = Field(4, ge=1, le=1000, description="cubic: steps per given frame")
     max_displacement: float | None = Field(
         17.0,
         gt=0,
@@ -51,6 +50,7 @@ class FramesConfig(Config):
     )
     removed: ClassVar = {
         "qualify": Removed("max_displacement", lambda value: value is None or isinstance(value, dict)),
+        "factor": Removed("no factor: it was of interpolate: cubic, which is gone", lambda value: value == 4),
         "backward": Removed("no flow back: nothing reads it", lambda value: value is None),
     }
 

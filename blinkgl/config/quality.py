@@ -7,7 +7,6 @@ from functools import lru_cache
 from importlib import resources
 from typing import Any, Literal
 
-from blinkgl.config.events import EmulatorConfig, followers
 from blinkgl.config.reader import parse_yaml
 
 Quality = Literal["fast", "balanced", "accurate", "reference", "auto"]
@@ -38,22 +37,11 @@ def _shipped(name: str) -> dict[str, Any]:
     )
 
 
-def fill_quality(quality: Any, kind: Any, emulator: Any, frames: Any, reconstruction: Any = None) -> dict[str, Any]:
-    """The preset's values for a configuration with this timeline.kind, events.emulator, frames and
-    timeline.reconstruction (None: not said); none where ``quality`` names no known one.
-
-    A timeline of another kind than the preset's takes the preset's reconstruction alone: the other values mean nothing
-    to it. A first look is at straight lines, and none is taken with others. Emulators that cannot follow the preset's
-    reconstruction take everything but that."""
+def fill_quality(quality: Any, kind: Any) -> dict[str, Any]:
+    """The preset's values for a configuration with this timeline.kind (None: not said); none where ``quality`` names
+    no known one. To a timeline of another kind than the preset's its values mean nothing."""
     if quality not in (*QUALITIES, "auto"):
         return {}
     preset = load_quality(quality)
-    given = preset["timeline"]
-    if reconstruction not in (None, "linear"):
-        given.pop("first_look", None)
-    if kind not in (None, given["kind"]):
-        given = {key: value for key, value in given.items() if key == "reconstruction"}
-    able = followers(given.get("reconstruction", "linear"))
-    if (EmulatorConfig.members.default if emulator is None else emulator) not in able and frames is None:
-        given = {key: value for key, value in given.items() if key != "reconstruction"}
-    return {"timeline": given, "render": preset["render"]}
+    same = kind in (None, preset["timeline"]["kind"])
+    return {"timeline": preset["timeline"] if same else {}, "render": preset["render"]}

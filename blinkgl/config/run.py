@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 FILLS = (
-    Fill(("quality", "timeline.kind", "events.emulator", "frames", "timeline.reconstruction"), fill_quality),
+    Fill(("quality", "timeline.kind"), fill_quality),
     Fill(("sensor", "events.emulator"), fill_sensor),
     Fill(("labels.events", "events.emulator"), fill_causes),
     Fill(("images",), lambda images: {} if images is None else {"labels": {"images": False}}),

@@ -14,7 +14,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from blinkgl.config.base import Config, Refused, Removed, rule
 from blinkgl.config.camera import CameraConfig, camera_radius
-from blinkgl.config.events import EmulatorConfig, EsimConfig, followers
+from blinkgl.config.events import EmulatorConfig, EsimConfig
 from blinkgl.config.frames import MAX_SPAN_S, FramesConfig
 from blinkgl.config.gl import GLConfig
 from blinkgl.config.images import ImagesConfig, check_images, readout_us
@@ -272,40 +272,6 @@ class SequenceConfig(Config):
                 where="scene.intrinsics",
                 value=intrinsics,
                 accepted="config, or camera.lens: pinhole",
-            )
-
-    @rule("timeline.reconstruction", "events.emulator", "?frames")
-    def _the_emulator_follows(path: str, emulator: str, frames: bool):
-        able = followers(path)
-        if emulator not in able and not frames:
-            own = EmulatorConfig.members.models[emulator].reconstructions
-            raise Refused(
-                f"{emulator} follows straight lines alone"
-                if own == ("linear",)
-                else f"{emulator} cannot follow this path",
-                where="timeline.reconstruction",
-                value=path,
-                accepted=f"{', '.join(own)}, or events.emulator: {' or '.join(able)}",
-            )
-
-    @rule("timeline.first_look", "timeline.reconstruction", "?frames")
-    def _looks_at_straight_lines(looks: bool | None, path: str, frames: bool):
-        if looks and path != "linear" and not frames:
-            raise Refused(
-                "a first look judges straight lines between frames",
-                where="timeline.first_look",
-                value=looks,
-                accepted="false, or reconstruction: linear",
-            )
-
-    @rule("timeline.reconstruction", "events.device", "?frames")
-    def _the_card_follows(path: str, device: str | None, frames: bool):
-        if device == "cuda" and path != "linear" and not frames:
-            raise Refused(
-                "events on a card follow straight lines between frames alone",
-                where="timeline.reconstruction",
-                value=path,
-                accepted="linear, or events.device: auto or cpu",
             )
 
     @rule("time.duration", "time.label_rate", "readout.events_per_second", "readout.row_ns", "readout.queue_events")

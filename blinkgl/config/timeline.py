@@ -1,23 +1,21 @@
-"""When event frames are drawn, and what the signal does between them."""
+"""When event frames are drawn."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from blinkgl.config.base import Config, Refused, one_of, rule
-from blinkgl.config.events import followers
+from blinkgl.config.base import Config, Refused, Removed, one_of, rule
 
 
 class _Timeline(Config):
-    reconstruction: Literal["linear", "pchip", "hermite"] = Field(
-        "linear",
-        description="log intensity between two frames. linear: straight lines. pchip: monotone cubics over the "
-        "neighbouring frames, free of rendering. hermite: monotone cubics with dL/dt from the "
-        "shader, which makes frames dearer and fewer enough. The cubics are for `events.emulator: "
-        f"{' or '.join(followers('pchip'))}`",
-    )
+    removed: ClassVar = {
+        "reconstruction": Removed(
+            "the key left out (events are timed on straight lines between frames; a smaller max_px makes better times)",
+            lambda value: value == "linear",
+        )
+    }
 
 
 class UniformTimeline(_Timeline):
@@ -88,25 +86,4 @@ class BrightnessTimeline(_AdaptiveTimeline):
     )
 
 
-class BudgetTimeline(_AdaptiveTimeline):
-    """Event frames so far apart that event times are as wrong as is allowed: the error of the reconstruction in use is
-    measured while frames are drawn, and the achieved estimate goes into the manifest."""
-
-    kind: Literal["budget"] = "budget"
-    max_time_error_us: float | None = Field(
-        None, gt=0, le=1e9, description="error of event times, µs; give this or max_time_error_px"
-    )
-    max_time_error_px: float | None = Field(
-        None, gt=0, le=1e4, description="the same times the image speed: how far an edge is from where it should be, px"
-    )
-    percentile: float = Field(75.0, gt=0, le=99.9, description="of the events' errors, which keeps to the budget")
-
-    @rule("max_time_error_us", "max_time_error_px")
-    def _one_of(us, px):
-        if (us is None) == (px is None):
-            raise Refused("give max_time_error_us or max_time_error_px, one of the two")
-
-
-TimelineConfig = one_of(
-    "kind", UniformTimeline, DisplacementTimeline, BrightnessTimeline, BudgetTimeline, default="displacement"
-)
+TimelineConfig = one_of("kind", UniformTimeline, DisplacementTimeline, BrightnessTimeline, default="displacement")

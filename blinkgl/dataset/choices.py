@@ -11,13 +11,10 @@ from blinkgl.config.timeline import DisplacementTimeline
 COMPARED = {
     "timeline": (
         "kind",
-        "reconstruction",
         "fps",
         "max_px",
         "percentile",
         "max_fraction_of_threshold",
-        "max_time_error_us",
-        "max_time_error_px",
     ),
     "render": ("antialiasing", "mip_bias", "anisotropy"),
 }

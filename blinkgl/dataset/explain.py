@@ -120,7 +120,6 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
     result = Explanation(machine=platform.processor() or platform.machine(), seconds=0.0)
     between = {
         "linear": "no frames in between",
-        "cubic": f"{frames.factor - 1} frames in between, monotone cubics",
         "motion": f"at most {frames.max_px:g} px per step, dense-flow warp",
     }[frames.interpolate]
     result.scene = {
@@ -238,16 +237,9 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
     times = [int(t) for t in np.linspace(scene.t0_ns, scene.t1_ns, PROBES)]
     probe = simulate_sequence(config, index, labels=False, scene=scene, renderer=renderer)
     seen = [chunk.t_ns for chunk in islice(probe.chunks(), 2 * PROBES)]  # a short stretch of it, as it will be
-    rates = config.timeline.reconstruction == "hermite"
-
-    def drawn(t: int) -> tuple[np.ndarray, np.ndarray | None]:
-        frame = renderer.luminance(t, rate=rates)
-        return frame.view(), frame.view("rate") if rates else None
-
-    event_s = _timed(drawn, times)
+    event_s = _timed(lambda t: renderer.luminance(t).view(), times)
     result.frames = _event_frames(config, probe, times, (scene.t1_ns - scene.t0_ns) * 1e-9)
-    kind = f"timeline: {config.timeline.kind}, {config.timeline.reconstruction} in between"
-    result.add("event frames" + (" with rates" if rates else ""), kind, result.frames, event_s)
+    result.add("event frames", f"timeline: {config.timeline.kind}", result.frames, event_s)
     if config.timeline.kind != "uniform":
         name = "brightness" if config.timeline.kind == "brightness" else "velocity"
         count = int(1.1 * result.frames)  # a step is cut again now and then
@@ -402,13 +394,11 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
         add("fog", "scene.fog: null")
     if config.timeline.kind == "uniform":
         add("velocity pass", "timeline: uniform does not look at motion")
-    if config.timeline.reconstruction != "hermite":
-        add("rates of change in the event frames", f"timeline.reconstruction: {config.timeline.reconstruction}")
     for name, value in config.events.model_dump().items():
         if value in (0, 0.0, False) and name != "seed":
             add(f"{config.events.emulator}: {name}", f"events.{name}: {value}".lower())
     if config.scene.light.shadows == "off":
         add("shadows", "scene.light.shadows: off")
-    elif config.timeline.kind in ("brightness", "budget") or config.timeline.reconstruction == "hermite":
+    elif config.timeline.kind == "brightness":
         add("the motion of shadows in rates of change", "dL/dt is that of the lit share of a surface: no edge is in it")
     add("inter-reflection", "BlinkGL does not model it")

@@ -1,8 +1,7 @@
 """An event camera, emulator and what is behind it together, and the one loop that frames go through it in.
 
 Whoever turns frames into events does it here: a generated sequence, converted frames, a video, a reference, a
-benchmark. So what stands between an emulator and the outside (the read-out, a path between frames that is one frame
-late) is never left out by one of them.
+benchmark. So what stands between an emulator and the outside, the read-out, is never left out by one of them.
 """
 
 from __future__ import annotations
@@ -11,8 +10,6 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
-
-import numpy as np
 
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.readout import ReadoutConfig
@@ -34,13 +31,12 @@ class EventFrame(NamedTuple):
     that a source may reuse its arrays.
 
     luminance : (H, W) float32, linear, or uint8 codes; or a tensor on the camera's
-    :attr:`~EventCamera.tensor_device`.   rate : (H, W) float32, d(luminance)/dt per second, or None.
+    :attr:`~EventCamera.tensor_device`.
     rows : (y0, y1): outside these rows the frame is the one before; None: it may differ anywhere.
     As of ``Emulator.step``. surfaces : what the pixels show, of a camera that says what made its events."""
 
     t_ns: int
     luminance: Any
-    rate: np.ndarray | None = None
     rows: tuple[int, int] | None = None
     surfaces: Surfaces | None = None
 
@@ -50,10 +46,10 @@ class EventCamera:
 
     Events go from the emulator through the pixels' defects, their latency, the bus with its clock, as
     far as the configuration has them. readout : None: none of it.   seed : of the draws.
-    reconstruction : the path between frames, see :class:`Emulator`.   emulator : the :class:`Emulator` itself.
+    emulator : the :class:`Emulator` itself.
     truth : says what made each event, of frames that come with their ``surfaces``; None: nobody asks.
     make : of the emulator: that on the processor, or on the device that is asked for (``tensors/choice.py``).
-    Raises EventDataError: size, or a path that the emulator cannot follow."""
+    Raises EventDataError: a size out of range."""
 
     def __init__(
         self,
@@ -62,14 +58,12 @@ class EventCamera:
         height: int,
         width: int,
         seed: int,
-        reconstruction: str = "linear",
         truth: SurfaceTruth | None = None,
         make: Callable[..., Emulator] = make_emulator,
     ):
         self._truth = truth
-        self.emulator = make(config, height, width, seed, reconstruction)
+        self.emulator = make(config, height, width, seed)
         self._pixels, self._latency, self._readout = None, None, None
-        self._luminance: np.ndarray | None = None
         if readout is not None:
             if readout.pixels is not None:
                 self._pixels = PixelNoise(readout.pixels, height, width, seed, self.emulator.causes)
@@ -94,11 +88,6 @@ class EventCamera:
         return self.emulator.frames
 
     @property
-    def done_ns(self) -> int | None:
-        """All events before this time's microsecond have been given; None before the first frame."""
-        return self.emulator.done_ns
-
-    @property
     def saturated(self) -> int:
         """Events cut by the emulator's ``max_events_per_step`` so far."""
         return self.emulator.saturated
@@ -114,36 +103,25 @@ class EventCamera:
         return sum(stage.late for stage in (self._latency, self._readout) if stage is not None)
 
     def step(self, frame: EventFrame) -> Events:
-        """The events that are out by :attr:`done_ns` and were not before. Raises EventDataError as ``Emulator.step``;
+        """The events that are out by the frame's time and were not before. Raises EventDataError as ``Emulator.step``;
         ``t_ns`` is then the frame's."""
         try:
-            events = self.emulator.step(frame.luminance, frame.t_ns, frame.rows, frame.rate)
+            events = self.emulator.step(frame.luminance, frame.t_ns, frame.rows)
         except EventDataError as error:
             error.t_ns = frame.t_ns if error.t_ns is None else error.t_ns
             raise
         if self._truth is not None and frame.surfaces is not None:
             memory_s = self.emulator.memory_s(self.emulator.decoded(frame.luminance))
             self._truth.see(frame.t_ns, frame.surfaces, memory_s)
-        return self._read_out(events, frame.luminance)
-
-    def flush(self) -> Events:
-        """What a path that lags holds back after the last frame; empty for the others."""
-        return self._read_out(self.emulator.flush(), self._luminance)
-
-    def _read_out(self, events: Events, luminance: np.ndarray | None) -> Events:
-        if self.done_ns is None:
-            return events
-        until_us = self.done_ns // 1000
+        until_us = frame.t_ns // 1000
         if self._pixels is not None:
             events = self._pixels.step(events, until_us)
         if self._truth is not None:  # what is behind the pixels carries it along, whenever it lets an event go
-            events = replace(events, truth=self._truth.of(events, self.done_ns))
+            events = replace(events, truth=self._truth.of(events, frame.t_ns))
         if self._readout is None:
             return events
-        if self._latency is not None and luminance is not None:
-            if self.emulator.lags:  # for flush, which has no frame
-                self._luminance = luminance.copy()
-            events = self._latency.step(events, self.emulator.decoded(luminance), until_us)
+        if self._latency is not None:
+            events = self._latency.step(events, self.emulator.decoded(frame.luminance), until_us)
         return self._readout.step(events, until_us)
 
 
@@ -159,8 +137,4 @@ def emulate(
     for frame in frames:
         with clock("events"):
             events = camera.step(frame)
-        yield camera.done_ns, events
-    if camera.emulator.lags and camera.frames:
-        with clock("events"):
-            events = camera.flush()
-        yield camera.done_ns, events
+        yield frame.t_ns, events

@@ -27,7 +27,7 @@ INTENSITY_LIMIT_BITS = np.uint32(np.float32(LOG_MAX_INPUT).view(np.uint32))
 are all larger, so one running maximum per frame checks everything at once."""
 MAX_SIDE = 2**16
 NEVER_NS = -(2**62)
-NO_FRAME, NO_CODES, NO_LOG = np.empty(0, np.float32), np.empty(0, np.uint8), np.empty(0, np.int32)
+NO_FRAME, NO_CODES = np.empty(0, np.float32), np.empty(0, np.uint8)
 """Stand for the kind of frame that was not given."""
 
 
@@ -51,10 +51,6 @@ class Emulator(ABC):
     event at the very end of an interval belongs to it and is stamped with its end, so in half-open windows
     [t0, t1) it is the first of the next window.
 
-    reconstruction : the path of log intensity between two frames. ``linear``; ``pchip``, a monotone cubic over the
-    neighbouring frames: step k then returns the events of the interval *before* the last, and :meth:`flush` the rest;
-    ``hermite``, a monotone cubic with the slopes that every ``step`` is given as ``rate``.
-
     The events depend on the configuration, the seed and the frames, and on nothing else: not on the number of
     threads (``numba.set_num_threads``), not on saving and restoring between steps.
 
@@ -65,7 +61,7 @@ class Emulator(ABC):
     config: Any
     """The configuration it was made with, of its own ``Config``."""
     Config: ClassVar[type[EmulatorConfig]]
-    """Its configuration: name, keys, the paths between frames that it can follow, and what a sensor sets."""
+    """Its configuration: name, keys, and what a sensor sets."""
     device: ClassVar[str] = "cpu"
     """Where events are made: "cpu" or "cuda"."""
     tensor_device: Any = None
@@ -86,15 +82,7 @@ class Emulator(ABC):
         """What is left of it when noise and bandwidth are taken away: of this or another
         emulator, whose events `trade` judges by."""
 
-    def __init__(self, height: int, width: int, seed: int, reconstruction: str = "linear"):
-        if reconstruction not in self.Config.reconstructions:
-            raise EventDataError(
-                f"{type(self).__name__} cannot follow this path between frames",
-                where="timeline.reconstruction",
-                value=reconstruction,
-                accepted=", ".join(self.Config.reconstructions),
-            )
-        self.reconstruction = reconstruction
+    def __init__(self, height: int, width: int, seed: int):
         if not (1 <= height < MAX_SIDE and 1 <= width < MAX_SIDE and height * width < 2**31):
             raise EventDataError(
                 "frame size out of range", value=(height, width), accepted=f"1 to {MAX_SIDE - 1} rows and columns"
@@ -107,7 +95,6 @@ class Emulator(ABC):
         """Frames taken so far."""
         self.saturated = 0
         """Events cut by ``max_events_per_step`` so far."""
-        self._rows_before: tuple[int, int] | None = None  # of the last step; None: unknown
         self._decode = np.arange(256, dtype=np.float32) / np.float32(255.0)
         self._buffer = PackedBuffer()
         self._blocks = -(-self.height * self.width // BLOCK)
@@ -141,32 +128,12 @@ class Emulator(ABC):
         """Whether events say what caused them, ``config.causes``."""
         return bool(getattr(self.config, "causes", False))
 
-    @property
-    def needs_rate(self) -> bool:
-        """Whether ``step`` wants dI/dt beside every frame."""
-        return self.reconstruction == "hermite"
-
-    @property
-    def lags(self) -> bool:
-        """Whether events come one frame late, the last of them from :meth:`flush`."""
-        return self.reconstruction == "pchip"
-
-    @property
-    def done_ns(self) -> int | None:
-        """Time up to which events have been returned; None before the first frame."""
-        return self.t_ns
-
-    def step(
-        self, luminance: np.ndarray, t_ns: int, rows: tuple[int, int] | None = None, rate: np.ndarray | None = None
-    ) -> Events:
+    def step(self, luminance: np.ndarray, t_ns: int, rows: tuple[int, int] | None = None) -> Events:
         """Events since the last frame; see the class.
 
-        rows : the caller's word that rows outside [y0, y1) are the same as in the frame before (None: any may differ)
-        and, with ``rate``, that the rates there are 0, whatever they were in the frame before. Emulators whose still
-        pixels do nothing skip those rows and do not look at them, neither for events nor for values that cannot be
-        used; the events are the same.
-        rate : (H, W) float32, d(luminance)/dt per second at the frame's time (of ``decode[code]`` for uint8). Only
-        ``hermite`` looks at it; a value that is not finite counts as 0."""
+        rows : the caller's word that rows outside [y0, y1) are the same as in the frame before (None: any may differ).
+        Emulators whose still pixels do nothing skip those rows and do not look at them, neither for events nor for
+        values that cannot be used; the events are the same."""
         frame = self._checked_frame(luminance)
         t_ns = self._checked_time(t_ns)
         if self.t_ns is None and self.causes and self.height > MAX_CAUSE_ROWS:
@@ -176,19 +143,11 @@ class Emulator(ABC):
                 value=self.height,
                 accepted=f"at most {MAX_CAUSE_ROWS} rows, or events without causes",
             )
-        rate = self._checked_rate(rate) if self.needs_rate else None
-        whole = (0, self.height)
-        here = whole if rows is None or self.t_ns is None else (max(0, rows[0]), min(self.height, rows[1]))
-        first, stop = here
-        # Where there was a rate in the frame before there is none now: slopes are part of the state.
-        if self.needs_rate:
-            before = self._rows_before or whole
-            if before[0] < before[1]:
-                first, stop = (min(first, before[0]), max(stop, before[1])) if first < stop else before
-        self._changed = (first * self.width, stop * self.width)
+        first, stop = (0, self.height) if rows is None or self.t_ns is None else rows
+        self._changed = (max(0, first) * self.width, min(self.height, stop) * self.width)
         self._check_intensity(frame)
-        events = self._start(frame, t_ns, rate) if self.t_ns is None else self._advance(frame, t_ns, rate)
-        self.t_ns, self._rows_before = t_ns, here
+        events = self._start(frame, t_ns) if self.t_ns is None else self._advance(frame, t_ns)
+        self.t_ns = t_ns
         self.frames += 1
         return events
 
@@ -209,22 +168,6 @@ class Emulator(ABC):
                 accepted="float32 linear luminance or uint8",
             )
         return _flat(frame)
-
-    def _checked_rate(self, rate: np.ndarray | None) -> np.ndarray:
-        shape, dtype = (None, None) if rate is None else (np.shape(rate), np.asarray(rate).dtype)
-        if rate is None or shape != (self.height, self.width) or dtype != np.float32:
-            raise EventDataError(
-                "hermite wants the rate of change of every pixel",
-                where=f"frame {self.frames}",
-                value=(shape, str(dtype)),
-                accepted=f"({self.height}, {self.width}) float32",
-            )
-        return _flat(rate)
-
-    def flush(self) -> Events:
-        """Events that are still held back; call it after the last frame. Empty for everything but ``pchip``, which then
-        takes its slope at the last frame from the frames before it. Further frames may follow."""
-        return Events.empty()
 
     def _checked_time(self, t_ns: int) -> int:
         try:
@@ -271,10 +214,10 @@ class Emulator(ABC):
             raise error
 
     @abstractmethod
-    def _start(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events: ...
+    def _start(self, frame: np.ndarray, t_ns: int) -> Events: ...
 
     @abstractmethod
-    def _advance(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events: ...
+    def _advance(self, frame: np.ndarray, t_ns: int) -> Events: ...
 
     # -- running the kernels --------------------------------------------------------------------------------
     def _run(self, kernel, arguments: tuple, base_us: int, span_us: int) -> Events:
@@ -330,10 +273,4 @@ class Emulator(ABC):
                 )
             mine[...] = theirs
         started, t_ns, self.frames, self.saturated = (int(v) for v in state["clock"])
-        self.t_ns, self._rows_before = t_ns if started else None, None
-
-    @property
-    def state_bytes_per_pixel(self) -> float:
-        """Memory that is kept from step to step, bytes per pixel."""
-        arrays = [getattr(self, name) for name in self._state]
-        return sum(a.nbytes for a in arrays if a is not None) / (self.height * self.width)
+        self.t_ns = t_ns if started else None

@@ -3,9 +3,7 @@
 Rebecq, Gehrig, Scaramuzza, "ESIM: an Open Event Camera Simulator", CoRL 2018, section 3. With L = ln(I + eps) and
 the last level passed L_ref, a pixel fires ON at every L_ref + j C+ and OFF at every L_ref - j C- that L reaches in
 the interval (t_prev, t], at the time where the straight line from L_prev to L meets the level, floored to the
-microsecond. A level passed in the refractory period is lost (L_ref moves all the same). Instead of the straight line
-it may be a monotone cubic (:mod:`~blinkgl.events.curve`): the same levels at better times.
-Only the pixels that fire solve it.
+microsecond. A level passed in the refractory period is lost (L_ref moves all the same).
 
 C+ and C- belong to the pixel and are drawn once; with jitter each *event* draws the next ones, once. (Thresholds
 redrawn at every frame lose events, the more the higher the frame rate.) Everything is integer arithmetic: logs in
@@ -19,7 +17,7 @@ on the data. ``tests/events/reference.py`` is the slow twin.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numba
 import numpy as np
@@ -28,8 +26,7 @@ from numba.extending import register_jitable
 from blinkgl.config.events import EsimConfig
 from blinkgl.events.arith import Q_ONE, log_q25
 from blinkgl.events.blocks import compact_flags, copy_block, lookup_block
-from blinkgl.events.curve import Curve, curve_time, end_slopes, limited, slope_block
-from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, NO_LOG, Emulator
+from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
 from blinkgl.events.packing import JIT, T_SHIFT
 from blinkgl.events.philox import Stream, normal2, pixel_counters
 from blinkgl.events.response import Response, smallest_threshold
@@ -58,7 +55,6 @@ class Levels(NamedTuple):
     off: np.ndarray
     fired: np.ndarray  # int32 number of levels passed, for the jitter's draws
     last_ns: np.ndarray  # int64 time of the last event, for the refractory period
-    slope: np.ndarray  # float32, 2^-25 per ns: that of the log intensity at the frame before; hermite alone
 
 
 class Interval(NamedTuple):
@@ -113,13 +109,9 @@ def crossing_ns(part: float, whole: float, dt_ns: int) -> int:
 
 
 @numba.njit(**JIT)
-def _emit_block(active, count, first, now, p, v, cap, packed, begin, curve, slope):
+def _emit_block(active, count, first, now, p, v, cap, packed, begin):
     """Write the events of the listed pixels of one block to ``packed[begin:]``, in raster order, and move their
-    levels.
-
-    curve : None for the straight line (the branches on it are then not compiled).   slope : of the block, at the
-    interval's end; [] where the curve takes its slopes from other frames.
-    Returns (end of the events, events cut by ``cap``)."""
+    levels. Return (end of the events, events cut by ``cap``)."""
     out, cut = begin, 0
     # The listed pixels are in raster order, so the row is counted along instead of divided out.
     # ``row_end`` is the number of the first pixel behind row y.
@@ -149,25 +141,9 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin, curve, slop
         up, down = step_on, step_off
         step = down + polarity * (up - down)
         emitted = 0
-        if curve is not None:
-            # Slopes in units of the secant: a falling path becomes a rising one, and both are solved alike.
-            before, s = np.int64(p.log[i]), 0.0
-            if slope.size:
-                secant = (level - before) / v.dt_ns
-                alpha, beta = limited(p.slope[i] / secant), limited(slope[i - first] / secant)
-            else:
-                older = np.int64(curve.older[i]) if curve.older_ns > 0.0 else before
-                newer = np.int64(curve.newer[i]) if curve.newer_ns > 0.0 else level
-                alpha, beta = end_slopes(
-                    older, before, level, newer, np.float64(v.dt_ns), curve.older_ns, curve.newer_ns
-                )
-        # One turn per level passed. All are of one polarity, since neither a line nor a monotone cubic turns back.
+        # One turn per level passed. All are of one polarity, since a line does not turn back.
         while gap >= 0:
-            if curve is None:
-                after_ns = start_ns + crossing_ns(whole - gap, whole, v.dt_ns)
-            else:
-                s = curve_time((whole - gap) / whole, alpha, beta, s)
-                after_ns = start_ns + np.int64(s * v.dt_ns)
+            after_ns = start_ns + crossing_ns(whole - gap, whole, v.dt_ns)
             # In the refractory period the event is lost, but the reference moves all the same.
             alive = True
             if p.last_ns.size:
@@ -231,7 +207,7 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
             # back to it.
             if filled + count * cap > packed.size:
                 return block, filled, cut
-            filled, cut_here = _emit_block(active, count, s, now, p, v, cap, packed, filled, None, None)
+            filled, cut_here = _emit_block(active, count, s, now, p, v, cap, packed, filled)
             cut += cut_here
         # The copy comes last, because p.log is the previous frame until here.
         copy_block(now[:n], p.log[s:e])
@@ -252,108 +228,21 @@ def _bands(taken, start, edges, progress, share, packed, frame, codes, table, p,
         b = take_part(taken, start)
 
 
-@numba.njit(**JIT)
-def _band_curve(
-    first_block, stop_block, share, packed, filled, frame, codes, table, rate, decode, log_now, curve, p, v
-):
-    """Process a band with cubics instead of straight lines. With slopes (``rate`` given, per second): the interval
-    up to ``frame``. Without: the interval up to ``log_now``; the frame that lies after it only goes into
-    ``curve.newer``."""
-    cut, pixels = 0, p.log.size
-    flags, scratch = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64)
-    active, fresh = np.empty(BLOCK + 8, np.int32), np.empty(BLOCK, np.int32)
-    intensity, slopes = np.empty(BLOCK, np.float32), np.empty(BLOCK if rate.size else 0, np.float32)
-    for block in range(first_block, stop_block):
-        s = block * BLOCK
-        e = min(s + BLOCK, pixels)
-        n = e - s
-        if n < BLOCK:
-            # As in _band: compact_flags reads whole words of eight flags.
-            flags[:] = 0
-        if codes.size:
-            lookup_block(codes[s:e], table, fresh[:n])
-        elif frame.size:
-            log_block(frame[s:e], v.eps, fresh[:n])
-        now = fresh
-        # hermite: the slope of the log intensity at the interval's end, from the rendered rate of
-        # change.
-        if rate.size:
-            if codes.size:
-                lookup_block(codes[s:e], decode, intensity[:n])
-                slope_block(rate[s:e], intensity[:n], v.eps, slopes[:n])
-            else:
-                slope_block(rate[s:e], frame[s:e], v.eps, slopes[:n])
-        else:
-            # pchip: the frame just read lies one interval ahead and only gives a slope. The interval
-            # ends at the logarithm that was taken one step before.
-            if curve.newer_ns > 0.0:
-                copy_block(fresh[:n], curve.newer[s:e])
-            now = log_now[s:e]
-        farthest = _flag_block(now[:n], p.upper[s:e], p.lower[s:e], flags)
-        if farthest >= 0:
-            count = compact_flags(flags, scratch, s, active)
-            # The same room as in _band.
-            cap = min(np.int64(farthest * v.inverse_threshold) + 2, v.bound_per_pixel)
-            if count * cap > share:
-                cap = max(1, share // count)
-            if filled + count * cap > packed.size:
-                return block, filled, cut
-            filled, cut_here = _emit_block(active, count, s, now, p, v, cap, packed, filled, curve, slopes)
-            cut += cut_here
-        # With hermite the end of this interval is the start of the next one. With pchip the ring of
-        # frames already holds it.
-        if rate.size:
-            copy_block(now[:n], p.log[s:e])
-            copy_block(slopes[:n], p.slope[s:e])
-    return stop_block, filled, cut
-
-
-@numba.njit(**JIT)
-def _bands_curve(taken, start, edges, progress, share, packed, frame, codes, table, rate, decode, log_now, curve, p, v):
-    b = take_part(taken, start)
-    while b >= 0:
-        block, filled, cut = _band_curve(
-            progress[b, 0],
-            edges[b + 1],
-            share,
-            packed[b],
-            progress[b, 1],
-            frame,
-            codes,
-            table,
-            rate,
-            decode,
-            log_now,
-            curve,
-            p,
-            v,
-        )
-        progress[b, 0], progress[b, 1] = block, filled
-        progress[b, 2] += cut
-        b = take_part(taken, start)
-
-
 def to_q25(value: float | np.ndarray) -> np.ndarray:
     """Log intensity in ln units as fixed point (int64)."""
     return np.floor(np.asarray(value, np.float64) * Q_ONE + 0.5).astype(np.int64)
 
 
-def correlated(a: np.ndarray, b: np.ndarray, correlation: float) -> np.ndarray:
-    """Of independent standard normals a and b a normal that has this correlation with a; b itself for 0."""
-    return correlation * a + np.sqrt(1.0 - correlation * correlation) * b if correlation else b
-
-
 def draw_thresholds(
-    height: int, width: int, on: float, off: float, sigma: float, seed: np.uint64, correlation: float = 0.0
+    height: int, width: int, on: float, off: float, sigma: float, seed: np.uint64
 ) -> tuple[np.ndarray, np.ndarray]:
     """Per-pixel (C+, C-), float64 (H*W,): normal around the nominal values, kept >= 0.01 and <= 10.
 
-    For nominal thresholds under 0.02 the floor is half the nominal one.   correlation : of C+ with C-.
+    For nominal thresholds under 0.02 the floor is half the nominal one.
     """
     # Draw 0 of the stream, one pair of normals per pixel: thresholds are fixed for the life of the
     # sensor.
     a, b = normal2(seed, pixel_counters(height, width), np.uint64(Stream.THRESHOLD), np.uint64(0))
-    b = correlated(a, b, correlation)
     clip = lambda c, n: np.clip(c + sigma * n, min(MIN_THRESHOLD, c / 2), 10.0)
     return clip(on, a), clip(off, b)
 
@@ -361,16 +250,11 @@ def draw_thresholds(
 @register
 class Esim(Emulator):
     """See the module and :class:`~blinkgl.events.emulator.Emulator`. State: 12 bytes per pixel; spread thresholds
-    (constant) and the refractory period add 8 each, jitter and the slopes of ``hermite``
-    4, the neighbours of ``pchip`` 12."""
+    (constant) and the refractory period add 8 each, jitter 4."""
 
     Config = EsimConfig
     _still_pixels_sleep = True
-
-    @property
-    def _looks_around(self) -> bool:
-        """Return whether slopes come from the neighbouring frames, so that the last frames are kept."""
-        return self.reconstruction == "pchip"
+    _state: ClassVar[tuple[str, ...]] = ("_upper", "_lower", "_fired", "_last_ns", "_log")
 
     @classmethod
     def response(cls, config: EsimConfig) -> Response:
@@ -382,21 +266,10 @@ class Esim(Emulator):
             contrast_threshold=config.contrast_threshold,
             contrast_threshold_off=config.contrast_threshold_off,
             threshold_sigma=config.threshold_sigma,
-            threshold_correlation=config.threshold_correlation,
         )
 
-    def __init__(
-        self, height: int, width: int, config: EsimConfig | None = None, seed: int = 0, reconstruction: str = "linear"
-    ):
-        super().__init__(height, width, seed, reconstruction)
-        self._state = (
-            "_upper",
-            "_lower",
-            "_fired",
-            "_last_ns",
-            *(("_ring", "_ring_ns", "_ring_rows", "_passed") if self._looks_around else ("_log",)),
-            *(("_slope",) if self.needs_rate else ()),
-        )
+    def __init__(self, height: int, width: int, config: EsimConfig | None = None, seed: int = 0):
+        super().__init__(height, width, seed)
         self.config = config = config or EsimConfig()
         pixels = self.height * self.width
         on, off = config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold
@@ -408,9 +281,7 @@ class Esim(Emulator):
         if config.threshold_sigma:
             self._on, self._off = (
                 to_q25(c).astype(np.int32)
-                for c in draw_thresholds(
-                    height, width, on, off, config.threshold_sigma, self.seed, config.threshold_correlation
-                )
+                for c in draw_thresholds(height, width, on, off, config.threshold_sigma, self.seed)
             )
             smallest = int(min(self._on.min(), self._off.min()))
         self._floor_on, self._floor_off = (int(to_q25(min(MIN_THRESHOLD, c / 2))) for c in (on, off))
@@ -423,33 +294,18 @@ class Esim(Emulator):
         self._refractory_ns = round(config.refractory_us * 1000)
         self._last_ns = np.full(pixels if self._refractory_ns else 0, NEVER_NS, np.int64)
         self._upper, self._lower = (np.zeros(pixels, np.int32) for _ in range(2))
-        if self._looks_around:
-            # The last four frames, frame k in row k mod 4: their logs, times, and the pixels [first, stop) in which
-            # each differs from the one before it.
-            self._ring, self._ring_ns, self._ring_rows = (
-                np.zeros((4, pixels), np.int32),
-                np.zeros(4, np.int64),
-                np.zeros((4, 2), np.int64),
-            )
-            self._passed = np.zeros(1, np.int64)  # number of the frame up to which events have been returned
-        else:
-            self._log = np.zeros(pixels, np.int32)
-        self._slope = np.zeros(pixels if self.needs_rate else 0, np.float32)
+        self._log = np.zeros(pixels, np.int32)
         self._tables_changed()
 
     def _tables_changed(self) -> None:
         self._table = log_q25(self._decode + np.float32(self.config.log_eps))
 
-    def _start(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
-        log, eps = self._ring[0] if self._looks_around else self._log, np.float32(self.config.log_eps)
+    def _start(self, frame: np.ndarray, t_ns: int) -> Events:
+        log = self._log
         if frame.dtype == np.uint8:
             lookup_block(frame, self._table, log)
         else:
-            log_block(frame, eps, log)
-        if self._looks_around:
-            self._ring_ns[0], self._ring_rows[0], self._passed[0] = t_ns, (0, log.size), 0
-        if self.needs_rate:
-            slope_block(rate, self._decode[frame] if frame.dtype == np.uint8 else frame, eps, self._slope)
+            log_block(frame, np.float32(self.config.log_eps), log)
         up, down = (self._on, self._off) if self._on.size else (self._on_all, self._off_all)
         if self._fired.size:
             jitter = self.config.threshold_jitter * Q_ONE
@@ -462,88 +318,14 @@ class Esim(Emulator):
         self._lower[...] = log - down
         return Events.empty()
 
-    def _advance(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
+    def _advance(self, frame: np.ndarray, t_ns: int) -> Events:
         source = (NO_FRAME, frame, self._table) if frame.dtype == np.uint8 else (frame, NO_CODES, self._table)
-        if self._looks_around:
-            return self._advance_late(source, t_ns)
         levels, interval = self._levels(self._log), self._interval(self.t_ns, t_ns)
         base_us = self.t_ns // 1000
-        if self.needs_rate:
-            curve = Curve(NO_LOG, NO_LOG, 0.0, 0.0)
-            return self._run(
-                _bands_curve,
-                (*source, rate, self._decode, NO_LOG, curve, levels, interval),
-                base_us,
-                t_ns // 1000 - base_us,
-            )
         return self._run(_bands, (*source, levels, interval), base_us, t_ns // 1000 - base_us)
 
-    def _advance_late(self, source: tuple, t_ns: int) -> Events:
-        """Take the logarithm of frame k = ``frames`` and return the events between the two frames before it."""
-        k = self.frames
-        # The usual case: frame k gives the slope at the end of the interval from k - 2 to k - 1, which
-        # is emitted now.
-        if self._passed[0] < k - 1:
-            self._ring_ns[k % 4] = t_ns
-            return self._pass_interval(k - 1, source)
-        # The interval before is done: only the first frame, and after flush.
-        log, first, stop = (self._ring[k % 4], *self._stale(k))
-        frame, codes, table = (a[first:stop] if j < 2 else a for j, a in enumerate(source))
-        if first < stop:
-            lookup_block(codes, table, log[first:stop]) if codes.size else log_block(
-                frame, np.float32(self.config.log_eps), log[first:stop]
-            )
-        self._ring_ns[k % 4] = t_ns
-        return Events.empty()
-
-    def _stale(self, k: int) -> tuple[int, int]:
-        """Return the pixels in which row k mod 4 differs from frame k: those that changed since frame k - 4 was
-        written there."""
-        self._ring_rows[k % 4] = self._changed
-        rows = self._ring_rows[[j % 4 for j in range(max(0, k - 3), k + 1)]]
-        rows = rows[rows[:, 0] < rows[:, 1]]
-        return (int(rows[:, 0].min()), int(rows[:, 1].max())) if len(rows) else (0, 0)
-
-    def _pass_interval(self, k: int, source: tuple | None) -> Events:
-        """Return the events between frames k - 1 and k. ``source`` is frame k + 1, None when there is none yet."""
-        # Row and time of frame j in the ring of four.
-        ring, ns = (lambda j: self._ring[j % 4]), (lambda j: int(self._ring_ns[j % 4]))
-        curve = Curve(
-            ring(k - 2) if k >= 2 else NO_LOG,
-            ring(k + 1) if source else NO_LOG,
-            float(ns(k - 1) - ns(k - 2)) if k >= 2 else 0.0,
-            float(ns(k + 1) - ns(k)) if source else 0.0,
-        )
-        if source:
-            self._changed = self._stale(k + 1)
-        else:
-            # Without a next frame nothing is read, and only pixels that changed in frame k can have passed
-            # a level.
-            self._changed = tuple(self._ring_rows[k % 4].tolist())
-        self._passed[0] = k
-        base_us = ns(k - 1) // 1000
-        arguments = (
-            *(source or (NO_FRAME, NO_CODES, self._table)),
-            NO_FRAME,
-            self._decode,
-            ring(k),
-            curve,
-            self._levels(ring(k - 1)),
-            self._interval(ns(k - 1), ns(k)),
-        )
-        return self._run(_bands_curve, arguments, base_us, ns(k) // 1000 - base_us)
-
-    @property
-    def done_ns(self) -> int | None:
-        return int(self._ring_ns[self._passed[0] % 4]) if self._looks_around and self.t_ns is not None else self.t_ns
-
-    def flush(self) -> Events:
-        if not self._looks_around or self.t_ns is None or self._passed[0] >= self.frames - 1:
-            return Events.empty()
-        return self._pass_interval(self.frames - 1, None)
-
     def _levels(self, log: np.ndarray) -> Levels:
-        return Levels(log, self._upper, self._lower, self._on, self._off, self._fired, self._last_ns, self._slope)
+        return Levels(log, self._upper, self._lower, self._on, self._off, self._fired, self._last_ns)
 
     def _interval(self, t0_ns: int, t1_ns: int) -> Interval:
         dt_ns = t1_ns - t0_ns

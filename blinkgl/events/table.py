@@ -2,11 +2,11 @@
 
     @register
     class Mine(Emulator):
-        class Config(EmulatorConfig): ...      # name, keys, reconstructions, from_sensor
+        class Config(EmulatorConfig): ...      # name, keys, from_sensor
         def response(cls, config): ...         # the signal that timelines watch
         def noiseless(cls, config): ...        # whose events `trade` judges by
-        def _start(self, frame, t_ns, rate): ...
-        def _advance(self, frame, t_ns, rate): ...
+        def _start(self, frame, t_ns): ...
+        def _advance(self, frame, t_ns): ...
 
 docs/extending.md has the whole of one. What configuration needs is in ``Config``, which a class hands to
 :class:`~blinkgl.config.events.EmulatorConfig` when it is registered, so that configuration never looks up the stream.
@@ -74,12 +74,9 @@ def emulator_of(config: EmulatorConfig) -> type[Emulator]:
     raise TypeError(f"no emulator for {type(config).__name__}")
 
 
-def make_emulator(
-    config: EmulatorConfig, height: int, width: int, seed: int = 0, reconstruction: str = "linear"
-) -> Emulator:
-    """The emulator a config asks for, on the processor; ``reconstruction``: its path between frames, see
-    :class:`Emulator`. Raises EventDataError: a size or a path that it cannot follow."""
-    return emulator_of(config)(height, width, config, seed, reconstruction)
+def make_emulator(config: EmulatorConfig, height: int, width: int, seed: int = 0) -> Emulator:
+    """The emulator a config asks for, on the processor. Raises EventDataError: a size out of range."""
+    return emulator_of(config)(height, width, config, seed)
 
 
 def _checked(emulator: Any) -> str:
@@ -115,13 +112,6 @@ def _checked(emulator: Any) -> str:
     name = f"'{kind}'"
     required = [key for key, info in model.model_fields.items() if info.is_required()]
     unless(not required, "Config", f"has keys without a default: {', '.join(required)}")
-    paths = getattr(model, "reconstructions", None)
-    unless(paths is not None, "Config.reconstructions", "is missing")
-    unless(
-        isinstance(paths, tuple) and "linear" in paths and set(paths) <= {"linear", "pchip", "hermite"},
-        "Config.reconstructions",
-        f"is {paths!r} and not a tuple of 'linear' and, where it can, 'pchip' and 'hermite'",
-    )
     for part in sorted(model.__abstractmethods__):
         unless(False, f"Config.{part}", "is missing")
     for sensor in _SOME_SENSORS:

@@ -6,9 +6,6 @@ continuous time, so that nothing but the accuracy of the interpolation depends o
 * The photoreceptor follows the lin-log intensity x, linear in time between frames, through a first-order low-pass
   with k = 2 pi f_c dt (I + 20)/275 time constants per interval. With the lag D = y - x the exact solution over an
   interval is D' = D e^-k - dx (1 - e^-k)/k: stable for every k, second order in the frame spacing.
-* ``second_cutoff_hz`` puts a second low-pass, of a corner that does not move with the light, before the first, which
-  then follows its output, exact at the frames, on straight lines between them. (In the pixel the buffer comes after the
-  photoreceptor; which of two low-passes comes first makes a difference while the corner of one moves, and no other.)
 * The comparator sees z = y + leak (t - epoch) and fires where z, on its exact curve, meets the level (Newton's
   method), not on frame times.
 * After any event the reference is z at the end of the dead time: with no refractory period the level just passed,
@@ -45,14 +42,12 @@ from blinkgl.events.v2e_blocks import (
     lin_log_block,
     noise_block,
     relax_block,
-    second_block,
     shot_block,
 )
 from blinkgl.events.v2e_emit import emit
 from blinkgl.events.v2e_model import (
     DARKEST,
     REBASE,
-    decay,
     draw_hot,
     draw_leaks,
     draw_start,
@@ -76,7 +71,7 @@ class Pixels(NamedTuple):
     """Per-pixel arrays, flat; size 0 when the feature is off. What the photoreceptor holds is of the frame before."""
 
     intensity: np.ndarray  # float32 DN; [] when neither low-pass nor shot noise asks for it
-    x: np.ndarray  # float32 lin-log, behind the second low-pass where there is one
+    x: np.ndarray  # float32 lin-log
     lag: np.ndarray  # float32 y - x; [] without low-pass
     noise: np.ndarray  # float32 photoreceptor noise, ln units; []
     noise_sizes: np.ndarray  # see noise.noise_table, for this frame spacing; []
@@ -91,8 +86,6 @@ class Pixels(NamedTuple):
     since_ns: np.ndarray  # int64: when the reference was taken; [] unless causes are asked for
     noise_then: np.ndarray  # float32: the photoreceptor noise in it; []
     hot: np.ndarray  # uint8: whether leak is that of a hot pixel; []
-    before_second: np.ndarray  # float32 lin-log before the second low-pass; [] without one
-    second_lag: np.ndarray  # float32 x - before_second; []
 
 
 class Interval(NamedTuple):
@@ -113,8 +106,6 @@ class Interval(NamedTuple):
     shot_unit_per_ns: float  # rate of a dark pixel with nominal threshold, one polarity
     inverse_threshold: float
     bound_per_pixel: int
-    second_keep: np.float32  # of the second low-pass, see v2e_model.decay
-    second_ramp: np.float32
 
 
 @numba.njit(**JIT)
@@ -123,7 +114,7 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
     cut, pixels = 0, p.x.size
     # Scratch memory of one block. compact_flags writes eight numbers at a time.
     flags, scratch, active = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64), np.empty(BLOCK + 8, np.int32)
-    now, second_now, normals = np.empty((5, BLOCK), _F), np.empty((2, BLOCK), _F), np.empty(BLOCK, _F)
+    now, normals = np.empty((5, BLOCK), _F), np.empty(BLOCK, _F)
     keys, draws = np.empty(BLOCK, np.int64), (np.empty(DRAWS, np.int64), np.empty(DRAWS), np.empty(DRAWS))
     clock_ns, clock_index = np.int64(0), np.int64(0)
     for block in range(first_block, stop_block):
@@ -141,12 +132,6 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
         else:
             scale_block(frame[s:e], v.scale, intensity)
             lin_log_block(intensity, x)
-        # The second low-pass comes first, see the module. It replaces x by its output.
-        if p.second_lag.size:
-            second_block(
-                p.second_lag[s:e], p.before_second[s:e], x, v.second_keep, v.second_ramp,
-                second_now[0, :n], second_now[1, :n],
-            )  # fmt: skip
         # The low-pass of the photoreceptor.
         if p.lag.size:
             relax_block(p.lag[s:e], p.x[s:e], x, p.intensity[s:e], intensity, _F(v.kappa), lag, z)
@@ -191,9 +176,6 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
         copy_block(x, p.x[s:e])
         if p.lag.size:
             copy_block(lag, p.lag[s:e])
-        if p.second_lag.size:
-            copy_block(second_now[0, :n], p.before_second[s:e])
-            copy_block(second_now[1, :n], p.second_lag[s:e])
         if p.noise.size:
             copy_block(noise, p.noise[s:e])
         if p.clock_ns.size:
@@ -224,7 +206,7 @@ class V2e(Emulator):
     """See the module and :class:`~blinkgl.events.emulator.Emulator`. Luminance 1.0 is ``config.full_scale`` DN.
 
     State: 12 bytes per pixel; 4 more each with the low-pass, leak, photoreceptor noise, and intensity where the first
-    or shot noise asks for it, 8 each with the second low-pass and the dead time, 12 with causes. Constants: 16
+    or shot noise asks for it, 8 with the dead time, 12 with causes. Constants: 16
     bytes per pixel, 8 more with shot noise."""
 
     Config = V2eConfig
@@ -242,8 +224,6 @@ class V2e(Emulator):
         "_epoch_ns",
         "_since_ns",
         "_noise_then",
-        "_before_second",
-        "_second_lag",
     )
 
     @classmethod
@@ -259,29 +239,22 @@ class V2e(Emulator):
             contrast_threshold=config.contrast_threshold,
             contrast_threshold_off=config.contrast_threshold_off,
             threshold_sigma=config.threshold_sigma,
-            threshold_correlation=config.threshold_correlation,
         )
 
-    def __init__(
-        self, height: int, width: int, config: V2eConfig | None = None, seed: int = 0, reconstruction: str = "linear"
-    ):
-        super().__init__(height, width, seed, reconstruction)
+    def __init__(self, height: int, width: int, config: V2eConfig | None = None, seed: int = 0):
+        super().__init__(height, width, seed)
         self.config = config = config or V2eConfig()
         pixels = self.height * self.width
         # Arrays of features that are off have size 0, which the kernels test.
         frame = lambda wanted=True: np.zeros(pixels if wanted else 0, np.float32)
         on, off = config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold
         self._on, self._off = (
-            c.astype(np.float32)
-            for c in draw_thresholds(
-                height, width, on, off, config.threshold_sigma, self.seed, config.threshold_correlation
-            )
+            c.astype(np.float32) for c in draw_thresholds(height, width, on, off, config.threshold_sigma, self.seed)
         )
         self._x, self._upper, self._lower = (frame() for _ in range(3))
         self._intensity = frame(config.cutoff_hz > 0 or config.shot_noise_rate_hz > 0)
         noisy = config.photoreceptor_noise and config.shot_noise_rate_hz > 0
         self._lag, self._noise = frame(config.cutoff_hz > 0), frame(noisy)
-        self._before_second, self._second_lag = (frame(config.second_cutoff_hz > 0) for _ in range(2))
         self._noise_sizes, self._sizes_dt_ns = np.empty(0, np.float32), -1
 
         self._leak = draw_leaks(height, width, config, self._on, self.seed)
@@ -324,14 +297,11 @@ class V2e(Emulator):
             return None
         # The corner frequency of the first low-pass, f_c (I + 20)/275, as in v2e_model.relax.
         corner = self.config.cutoff_hz * (luminance.astype(np.float64) * self.config.full_scale + 20.0) / 275.0
-        second = self.config.second_cutoff_hz
-        return _TAIL / (2 * np.pi * corner) + (_TAIL / (2 * np.pi * second) if second else 0.0)
+        return _TAIL / (2 * np.pi * corner)
 
-    def _start(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
+    def _start(self, frame: np.ndarray, t_ns: int) -> Events:
         intensity = self._table[frame] if frame.dtype == np.uint8 else frame * self._scale
         self._x[...] = lin_log(intensity)
-        if self._before_second.size:
-            self._before_second[...] = self._x
         if self._intensity.size:
             self._intensity[...] = intensity
         reference = self._x
@@ -358,7 +328,7 @@ class V2e(Emulator):
         self._epoch_ns[0] = t_ns
         return Events.empty()
 
-    def _advance(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
+    def _advance(self, frame: np.ndarray, t_ns: int) -> Events:
         dt_ns = t_ns - self.t_ns
         self._refuse_shots(dt_ns)
         self._make_noise_sizes(dt_ns)
@@ -379,8 +349,6 @@ class V2e(Emulator):
             self._since_ns,
             self._noise_then,
             self._hot,
-            self._before_second,
-            self._second_lag,
         )
         interval = self._interval(t_ns)
         base_us = interval.base_us
@@ -416,8 +384,6 @@ class V2e(Emulator):
         config, (epoch,), (start_ns, dt_ns) = self.config, self._epoch_ns.tolist(), (self.t_ns, t_ns - self.t_ns)
         # 275 DN is 255 + 20, full scale in v2e's formula for the corner frequency.
         kappa = 2 * np.pi * config.cutoff_hz * dt_ns * 1e-9 / 275.0
-        second = config.second_cutoff_hz
-        second_keep, second_ramp = decay(_F(2 * np.pi * second * dt_ns * 1e-9)) if second else (_ZERO, _ZERO)
         # In the order of the fields of Interval.
         return Interval(
             start_ns,
@@ -435,8 +401,6 @@ class V2e(Emulator):
             self._shot_unit,
             self._inverse_threshold,
             dt_ns // self._refractory_ns + 2 if self._refractory_ns else 2**31,
-            _F(second_keep),
-            _F(second_ramp),
         )
 
     def _begin_leaks_anew(self, t_ns: int) -> None:

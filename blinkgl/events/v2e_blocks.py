@@ -19,7 +19,6 @@ from blinkgl.events.v2e_model import (
     next_noise,
     noise_place,
     relax,
-    settled,
     shot_draw,
     shot_factor,
 )
@@ -59,19 +58,6 @@ def relax_block(
         lag_now = relax(lag[i], before[i], now[i], intensity_before[i], intensity_now[i], kappa)
         out[i] = lag_now
         z[i] = now[i] + lag_now
-
-
-@numba.njit(**JIT)
-def second_block(
-    lag: np.ndarray, before: np.ndarray, x: np.ndarray, keep: float, ramp: float, now: np.ndarray, lag_now: np.ndarray
-) -> None:
-    """``x`` through the second low-pass; what it was into ``now``."""
-    # keep = e^-k and ramp = (1 - e^-k)/k are the same at all pixels: this corner does not move with the
-    # light.
-    for i in range(x.size):
-        now[i] = x[i]
-        lag_now[i] = settled(lag[i] * keep - (x[i] - before[i]) * ramp)
-        x[i] = x[i] + lag_now[i]
 
 
 @numba.njit(**JIT)

@@ -104,13 +104,6 @@ def near_threshold(v: float, v_end: float, variance: float, here: float) -> bool
 
 
 @register_jitable
-def in_reach(v: float, drift: float, noise: float) -> bool:
-    """:func:`near_threshold` for the rest of an interval, float64, V in thresholds."""
-    reach = _FAR_64 * noise
-    return max(v, v + drift) + reach >= 1.0 or min(v, v + drift) - reach <= -1.0
-
-
-@register_jitable
 def one_minus_exp(x: float) -> float:
     """1 - e^-x for x >= 0, to 1e-11 relative."""
     return select(x < 1e-4, x * (1.0 - x * (0.5 - x * (1.0 / 6.0))), 1.0 - exp_f64(-x))
@@ -521,9 +514,8 @@ class DvsVoltmeter(Emulator):
         width: int,
         config: VoltmeterConfig | None = None,
         seed: int = 0,
-        reconstruction: str = "linear",
     ):
-        super().__init__(height, width, seed, reconstruction)
+        super().__init__(height, width, seed)
         self.config = config = config or VoltmeterConfig()
         pixels = self.height * self.width
         # Arrays of features that are off have size 0, which the kernels test.
@@ -538,7 +530,7 @@ class DvsVoltmeter(Emulator):
     def _tables_changed(self) -> None:
         self._table = self._decode * self._scale
 
-    def _start(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
+    def _start(self, frame: np.ndarray, t_ns: int) -> Events:
         self._intensity[...] = self._table[frame] if frame.dtype == np.uint8 else frame * self._scale
         if self.config.start == "stationary":
             self._v[...], left_us = start_voltage(self._intensity, self.config, self.seed)
@@ -549,7 +541,7 @@ class DvsVoltmeter(Emulator):
                 self._by_leak[...] = start_by_leak(self._v, self._intensity, self.config)
         return Events.empty()
 
-    def _advance(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
+    def _advance(self, frame: np.ndarray, t_ns: int) -> Events:
         c, dt_ns, base_us = self.config, t_ns - self.t_ns, self.t_ns // 1000
         pixels = Pixels(self._intensity, self._v, self._unspent, self._release, self._by_light, self._by_leak)
         # In the order of the fields of Interval. The last bound: at most one event per dead time, and

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from blinkgl.io.formats import EventFile
 from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from blinkgl.recordings.calibration import Calibration
     from blinkgl.recordings.comparison import Comparison
     from blinkgl.recordings.simulation import SimulationReport
@@ -248,18 +250,20 @@ def calibrate(
     )
 
 
+class FrameOptions(TypedDict, total=False):
+    """How frames become events, as :func:`blinkgl.simulate` says it."""
+
+    fps: float | None
+    emulator: EmulatorSettings
+    gamma: str | float | None
+    interpolate: str
+    max_px: float
+    seed: int
+    sensor: str | None
+
+
 def simulate(
-    frames: Iterable,
-    *,
-    fps: float | None = None,
-    emulator: EmulatorSettings = "esim",
-    gamma: str | float | None = None,
-    interpolate: str = "linear",
-    factor: int = 4,
-    max_px: float = 1.0,
-    seed: int = 0,
-    sensor: str | None = None,
-    report: SimulationReport | None = None,
+    frames: Iterable, *, report: SimulationReport | None = None, **frame_options: Unpack[FrameOptions]
 ) -> Iterator[Events]:
     """:class:`Events` of any stream of frames, a chunk per step, t in µs; nothing but the current frames is kept.
 
@@ -268,8 +272,7 @@ def simulate(
     emulator : as of :func:`record`.
     sensor : the read-out limit of that camera, and with an emulator's name its values.
     gamma : "srgb", "linear" or an exponent; default: srgb for integers, linear for floats.
-    interpolate : "linear"; "cubic": ``factor - 1`` frames in between; "motion": dense
-    flow, at most ``max_px`` px a step.
+    interpolate : "linear"; "motion": dense flow, at most ``max_px`` px a step.
     report : a SimulationReport to be filled.
     Raises ConfigError at once; EventDataError as frames come, naming the frame."""
     from blinkgl.recordings import simulation
@@ -278,11 +281,8 @@ def simulate(
         raise ConfigError("not frames", where="frames", value=frames, accepted="an iterable of arrays")
     return simulation.frames_to_events(
         _frames(frames),
-        fps=_fps(fps),
-        gamma=gamma,
-        interpolate=interpolate,
         report=report,
-        **_options(emulator, sensor, factor, max_px, seed),
+        **_options(**frame_options),
     )
 
 
@@ -290,40 +290,39 @@ def simulate_file(
     source: str | os.PathLike,
     target: str | os.PathLike,
     *,
-    fps: float | None = None,
-    emulator: EmulatorSettings = "esim",
-    gamma: str | float | None = None,
-    interpolate: str = "linear",
-    factor: int = 4,
-    max_px: float = 1.0,
-    seed: int = 0,
-    sensor: str | None = None,
     timestamps: str | os.PathLike | None = None,
     preview: str | os.PathLike | None = None,
     overwrite: bool = True,
+    **frames: Unpack[FrameOptions],
 ) -> SimulationReport:
     """A video, a folder of images or .npy frames (N, H, W[, 3]) to an event file, as
     ``blinkgl simulate``; files appear whole or not at all.
 
     timestamps : file of times, one a frame.   preview : a video of frames and events to write.
-    The rest: as of :func:`simulate`.
+    frames : fps, emulator, gamma, interpolate, max_px, seed, sensor as of :func:`simulate`.
     Returns a report: frames, steps, events, lost … Raises AssetError, OutputError, EventDataError, ConfigError."""
     from blinkgl.recordings import simulation
 
     return simulation.file_to_events(
         check.path(source, "source"),
         check.path(target, "target"),
-        fps=_fps(fps),
-        gamma=gamma,
-        interpolate=interpolate,
         timestamps=None if timestamps is None else check.path(timestamps, "timestamps"),
         preview=None if preview is None else check.path(preview, "preview"),
         overwrite=overwrite,
-        **_options(emulator, sensor, factor, max_px, seed),
+        **_options(**frames),
     )
 
 
-def _options(emulator: EmulatorSettings, sensor: str | None, factor: int, max_px: float, seed: int) -> dict[str, Any]:
+def _options(
+    *,
+    fps: float | None = None,
+    emulator: EmulatorSettings = "esim",
+    gamma: str | float | None = None,
+    interpolate: str = "linear",
+    max_px: float = 1.0,
+    seed: int = 0,
+    sensor: str | None = None,
+) -> dict[str, Any]:
     from blinkgl.config.sensor import load_sensor
     from blinkgl.recordings import simulation
 
@@ -332,8 +331,10 @@ def _options(emulator: EmulatorSettings, sensor: str | None, factor: int, max_px
     if camera is not None:
         tree = {**camera.values(tree.get("emulator", "esim")), **tree}
     return dict(
+        fps=_fps(fps),
+        gamma=gamma,
+        interpolate=interpolate,
         emulator=simulation.emulator_config(tree),
-        factor=check.whole(factor, "factor", 1, 1000),
         seed=check.seed(seed),
         max_px=check.number(max_px, "max_px", above=0, most=1e4),
         readout=None if camera is None else camera.readout,

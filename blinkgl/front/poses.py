@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import os
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, TypeVar, get_origin
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,6 +17,7 @@ from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 
 Vector = Sequence[float] | np.ndarray
+P = TypeVar("P")
 
 
 class Piece:
@@ -38,6 +40,30 @@ class Piece:
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({', '.join(f'{k}={v!r}' for k, v in self.tree.items())})"
+
+
+def signed_by(model: type[Config], **called: str) -> Callable[[type[P]], type[P]]:
+    """Gives a class whose constructor takes ``**keys`` of a model a signature that shows them, for help() and editors.
+
+    called : what keys of the model are called as arguments."""
+
+    def sign(kind: type[P]) -> type[P]:
+        own = [p for p in inspect.signature(kind.__init__).parameters.values() if p.name not in ("self", "keys")]
+        there = {parameter.name for parameter in own}
+        more = [
+            inspect.Parameter(
+                called.get(key, key),
+                inspect.Parameter.KEYWORD_ONLY,
+                default=field.get_default(call_default_factory=True),
+                annotation=Vector if get_origin(field.annotation) is tuple else field.annotation,
+            )
+            for key, field in model.model_fields.items()
+            if called.get(key, key) not in there
+        ]
+        kind.__signature__ = inspect.Signature([*own, *more])  # ty: ignore
+        return kind
+
+    return sign
 
 
 class Pose(Piece):

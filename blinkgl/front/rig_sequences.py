@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,24 +12,18 @@ from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.front.rigs import Rig
-from blinkgl.front.runs import MAX_INDEX, Source, Timeline, configured, scene_of
-from blinkgl.front.sections import EmulatorSettings
+from blinkgl.front.runs import MAX_INDEX, Settings, Source, configured, scene_of
 from blinkgl.front.sequences import Gathered, Recording
 from blinkgl.sequence import rig as core
 from blinkgl.sequence.inertial import Inertial
 from blinkgl.sequence.rig import RigSequence
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
 
 def simulate_rig(
-    source: Source,
-    rig: Rig | str | None = None,
-    *,
-    index: int = 0,
-    emulator: EmulatorSettings | None = None,
-    sensor: str | None = None,
-    timeline: Timeline | None = None,
-    quality: str | None = None,
-    labels: Sequence[str | float] | None = None,
+    source: Source, rig: Rig | str | None = None, *, index: int = 0, **settings: Unpack[Settings]
 ) -> RigSequence:
     """What happens at the sensors of one rig, in the order of time; nothing is written and nothing kept:
 
@@ -37,13 +32,12 @@ def simulate_rig(
 
     source : :class:`Scene`, whose camera's pose is the rig's, or what :func:`load` gave.
     rig : :class:`Rig`, or a preset's name; None: the source's.   index : number of the sequence.
-    emulator, sensor, timeline, quality, labels : of all its cameras that say nothing else, as of :func:`record`.
+    settings : emulator, sensor, timeline, quality, labels of all its cameras that say nothing else, as of
+    :func:`record`.
     The iterator has ``config``, ``scene``, ``t0_ns``, ``t1_ns`` and ``members``, one of each camera, as
     :func:`simulate_sequence` gives them; ``inertial_units()`` is what the other sensors measured. Iterate over it once,
     or use it in ``with``. Raises ConfigError, AssetError, GLError and, as it goes, EventDataError."""
-    template = configured(
-        source, emulator=emulator, sensor=sensor, timeline=timeline, quality=quality, labels=labels, rig=rig
-    )
+    template = configured(source, rig, **settings)
     config = template.sequence(check.whole(index, "index", 0, MAX_INDEX))
     if config.sensors is None:
         raise ConfigError(
@@ -77,21 +71,12 @@ class RigRecording:
 
 
 def record_rig(
-    source: Source,
-    rig: Rig | str | None = None,
-    *,
-    index: int = 0,
-    emulator: EmulatorSettings | None = None,
-    sensor: str | None = None,
-    timeline: Timeline | None = None,
-    quality: str | None = None,
-    labels: Sequence[str | float] | None = None,
+    source: Source, rig: Rig | str | None = None, *, index: int = 0, **settings: Unpack[Settings]
 ) -> RigRecording:
     """What all sensors of a rig record of one sequence, as arrays: what :func:`generate` writes, held in memory.
 
     Arguments as of :func:`simulate_rig`. Raises ConfigError, AssetError, GLError, EventDataError."""
-    wanted = dict(emulator=emulator, sensor=sensor, timeline=timeline, quality=quality, labels=labels)
-    with simulate_rig(source, rig, index=index, **wanted) as sequence:
+    with simulate_rig(source, rig, index=index, **settings) as sequence:
         gathered = {member.name: Gathered() for member in sequence.members}
         for member, item in sequence:
             gathered[member.name].take(item)

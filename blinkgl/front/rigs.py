@@ -32,10 +32,8 @@ from blinkgl.front.sections import (
     ImuSettings,
     TrackSettings,
     events_tree,
-    images_tree,
-    imu_tree,
     labels_tree,
-    tracks_tree,
+    section_tree,
 )
 
 
@@ -93,12 +91,9 @@ class RigSensor(Piece):
             tree["readout"] = self._checked(ReadoutConfig, check.given(**given))
         if labels is not None:
             tree["labels"] = labels_tree(labels)
-        if images is not None:
-            tree["images"] = images_tree(images)
-        if imu is not None:
-            tree["imu"] = imu_tree(imu)
-        if tracks is not None:
-            tree["tracks"] = tracks_tree(tracks)
+        for key, given in (("images", images), ("imu", imu), ("tracks", tracks)):
+            if given is not None:
+                tree[key] = section_tree(key, given)
         said = {key: value for key, value in tree.items() if key not in ("events", "sensor", "camera")}
         self._checked(RigSensorConfig, said)  # those three are whole when the run's are laid under them
         self.tree = tree

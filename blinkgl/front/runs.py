@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from blinkgl.config.draw import middle
 from blinkgl.config.problems import validate_field
@@ -18,18 +19,19 @@ from blinkgl.front import arguments as check
 from blinkgl.front.rigs import Rig, rig_of
 from blinkgl.front.scenes import Scene
 from blinkgl.front.sections import (
+    NAMED,
     EmulatorSettings,
     ImageSettings,
     ImuSettings,
     TrackSettings,
     events_tree,
-    images_tree,
-    imu_tree,
     labels_tree,
-    tracks_tree,
+    section_tree,
 )
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from blinkgl.dataset.run import Outcome
     from blinkgl.dataset.verify import Verification
     from blinkgl.scene.types import Scene as SceneData
@@ -41,9 +43,8 @@ Source = Scene | RunTemplate
 class Timeline:
     """When frames are drawn for the emulator: ``Timeline("displacement", max_px=0.5)``.
 
-    kind : "uniform" (fps, Hz), "displacement" (max_px, px), "brightness" (max_fraction_of_threshold) or "budget"
-    (max_time_error_us or max_time_error_px). values : keys of that kind, and ``reconstruction``;
-    see ``timeline:`` in docs/configuration.md.
+    kind : "uniform" (fps, Hz), "displacement" (max_px, px) or "brightness" (max_fraction_of_threshold).
+    values : keys of that kind, see ``timeline:`` in docs/configuration.md.
     Raises ConfigError."""
 
     def __init__(self, kind: str = "displacement", **values: Any):
@@ -70,6 +71,19 @@ def load(path: str | os.PathLike, overrides: Sequence[str] = (), *, seed: int | 
     return load_run(check.path(path, "path"), overrides, seed=None if seed is None else check.seed(seed))
 
 
+class Settings(TypedDict, total=False):
+    """What is laid over the source of a run, as :func:`blinkgl.record` says it; what is None is the source's."""
+
+    emulator: EmulatorSettings | None
+    sensor: str | None
+    timeline: Timeline | None
+    quality: str | None
+    labels: Sequence[str | float] | None
+    images: ImageSettings | None
+    imu: ImuSettings | None
+    tracks: TrackSettings | None
+
+
 def generate(
     source: Source,
     out: str | os.PathLike,
@@ -77,40 +91,22 @@ def generate(
     num: int | None = None,
     workers: int = 1,
     resume: bool = False,
-    emulator: EmulatorSettings | None = None,
-    sensor: str | None = None,
-    timeline: Timeline | None = None,
-    quality: str | None = None,
-    labels: Sequence[str | float] | None = None,
-    images: ImageSettings | None = None,
-    imu: ImuSettings | None = None,
-    tracks: TrackSettings | None = None,
     rig: Rig | str | None = None,
+    **settings: Unpack[Settings],
 ) -> Outcome:
     """Makes a data set below the folder ``out``, as ``blinkgl generate`` does: the same files, bit for bit.
 
     source : :class:`Scene` or what :func:`load` gave.   num : how many sequences (of each group at
     most).   workers : processes; 1: this one.
-    resume : go on where ``out`` holds sequences of this run.   emulator, sensor, timeline,
-    quality, labels, images, imu, tracks : as of :func:`record`.   rig : as of :func:`record_rig`.
+    resume : go on where ``out`` holds sequences of this run.   settings : emulator, sensor, timeline, quality, labels,
+    images, imu, tracks as of :func:`record`, rig as of :func:`record_rig`.
     Returns what was made (``made.events``, ``made.labels`` …) and what was set aside.
     Raises BlinkGLError: ConfigError (also a scene with arrays in it: save them to files
     first), AssetError, GLError, OutputError."""
     from blinkgl.dataset.executor import Inline, Local
     from blinkgl.dataset.run import run_dataset
 
-    template = configured(
-        source,
-        emulator=emulator,
-        sensor=sensor,
-        timeline=timeline,
-        quality=quality,
-        labels=labels,
-        images=images,
-        imu=imu,
-        tracks=tracks,
-        rig=rig,
-    )
+    template = configured(source, rig, **settings)
     if isinstance(source, Scene) and not source.on_disk:
         raise ConfigError(
             "the scene holds arrays, which the data set could not be made from again",
@@ -133,35 +129,27 @@ def verify(folder: str | os.PathLike, *, deep: int = 0, seed: int = 0) -> Verifi
     return verify_dataset(check.path(folder, "folder"), deep=check.whole(deep, "deep", 0, 2**31), seed=check.seed(seed))
 
 
-def configured(
-    source: Source,
-    *,
-    emulator: EmulatorSettings | None = None,
-    sensor: str | None = None,
-    timeline: Timeline | None = None,
-    quality: str | None = None,
-    labels: Sequence[str | float] | None = None,
-    images: ImageSettings | None = None,
-    imu: ImuSettings | None = None,
-    tracks: TrackSettings | None = None,
-    rig: Rig | str | None = None,
-) -> RunTemplate:
+_SECTIONS: dict[str, tuple[str, Callable[[Any], Any]]] = {
+    "emulator": ("events", events_tree),
+    "labels": ("labels", labels_tree),
+    **{key: (key, partial(section_tree, key)) for key in NAMED},
+    "timeline": ("timeline", lambda given: check.one_of(given, "timeline", Timeline, "a Timeline").tree),
+    "sensor": ("sensor", check.plain),
+    "quality": ("quality", check.plain),
+}
+"""Argument -> key of the configuration, and what reads it."""
+
+
+def configured(source: Source, rig: Rig | str | None = None, **settings: Unpack[Settings]) -> RunTemplate:
     """``source`` as a run, with what is given here laid over it. Raises ConfigError."""
     check.one_of(source, "source", (Scene, RunTemplate), "a Scene, or what load() gives")
+    if strange := [name for name in settings if name not in _SECTIONS]:
+        raise ConfigError("unknown argument", where=strange[0], accepted=", ".join(_SECTIONS))
     template = source.template() if isinstance(source, Scene) else source
-    own: dict[str, Any] = check.given(sensor=sensor, quality=quality)
-    if emulator is not None:
-        own["events"] = events_tree(emulator)
-    if timeline is not None:
-        own["timeline"] = check.one_of(timeline, "timeline", Timeline, "a Timeline").tree
-    if labels is not None:
-        own["labels"] = labels_tree(labels)
-    if images is not None:
-        own["images"] = images_tree(images)
-    if imu is not None:
-        own["imu"] = imu_tree(imu)
-    if tracks is not None:
-        own["tracks"] = tracks_tree(tracks)
+    own: dict[str, Any] = {}
+    for name, (key, read) in _SECTIONS.items():
+        if (value := settings.get(name)) is not None:
+            own[key] = read(value)
     if rig is not None:
         own |= rig_of(rig).tree
     own = with_recipes(with_sensors(own, Path.cwd()))

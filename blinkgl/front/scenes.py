@@ -29,7 +29,7 @@ from blinkgl.config.scene import ExplicitSceneConfig, MeshConfig, ObjectConfig
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.front import arguments as check
-from blinkgl.front.poses import Keyframes, Piece, Pose, Trajectory, Vector, motion_tree
+from blinkgl.front.poses import Keyframes, Piece, Pose, Trajectory, Vector, motion_tree, signed_by
 from blinkgl.front.surfaces import Light, Material
 from blinkgl.scene import types as data
 from blinkgl.scene.geometry.meshes import make_mesh
@@ -38,6 +38,7 @@ from blinkgl.scene.surfaces.images import content_hash
 from blinkgl.scene.worlds.explicit import InMemory, explicit_scene, primitive_mesh
 
 
+@signed_by(CameraConfig)
 class Camera(Piece):
     """A camera, its lens and its motion.
 
@@ -57,30 +58,20 @@ class Camera(Piece):
         width: int | None = None,
         height: int | None = None,
         *,
-        fov: float | None = None,
-        focal: float | None = None,
-        fx: float | None = None,
-        fy: float | None = None,
-        cx: float | None = None,
-        cy: float | None = None,
-        near: float = 0.05,
-        lens: Literal["pinhole", "radtan", "equidistant"] | None = None,
-        distortion: Sequence[float] | None = None,
         calibration: str | os.PathLike | None = None,
-        calibration_name: str | None = None,
         pose: Pose | Keyframes | Trajectory | Vector = (0.0, 0.0, 0.0),
+        **keys: Any,
     ):
-        given = check.given(width=width, height=height, fov=fov, focal=focal, fx=fx, fy=fy, cx=cx, cy=cy, near=near)
-        given |= check.given(lens=lens, distortion=None if distortion is None else [*distortion])
+        given = {"near": 0.05, **check.given(width=width, height=height, **keys)}
         if calibration is None:
-            given = {"width": 346, "height": 260, **given, **check.given(calibration_name=calibration_name)}
+            given = {"width": 346, "height": 260, **given}
         else:
-            source = {"calibration": os.fspath(calibration), "calibration_name": calibration_name}
-            given = calibrated(given | source, Path.cwd())
+            given = calibrated({"calibration_name": None, **given, "calibration": os.fspath(calibration)}, Path.cwd())
         self.tree = self._checked(CameraConfig, given)
         self.motion = motion_tree(pose, "Camera.pose")
 
 
+@signed_by(BodyConfig)
 class Body(Piece):
     """What falls, or is fallen on: ``Primitive("cuboid", body=Body(velocity=(1, 0, 2)))`` (docs/scenes.md, "Dynamics").
 
@@ -91,31 +82,8 @@ class Body(Piece):
     velocity : (3,) m/s, of the centre of mass at the start.   spin : (3,) degrees/s about the world's axes.
     Raises ConfigError; no MuJoCo, and bodies inside each other, are found when the scene is built."""
 
-    def __init__(
-        self,
-        kind: Literal["dynamic", "fixed", "none"] = "dynamic",
-        *,
-        shape: Literal["auto", "hull", "box", "sphere"] = "auto",
-        mass: float | None = None,
-        density: float | None = None,
-        friction: float = 0.5,
-        rolling: float = 0.01,
-        restitution: float = 0.5,
-        velocity: Vector = (0.0, 0.0, 0.0),
-        spin: Vector = (0.0, 0.0, 0.0),
-    ):
-        tree = check.given(
-            kind=kind,
-            shape=shape,
-            mass=mass,
-            density=density,
-            friction=friction,
-            rolling=rolling,
-            restitution=restitution,
-            velocity=velocity,
-            spin=spin,
-        )
-        self.tree = self._checked(BodyConfig, tree)
+    def __init__(self, kind: Literal["dynamic", "fixed", "none"] = "dynamic", **keys: Any):
+        self.tree = self._checked(BodyConfig, check.given(kind=kind, **keys))
 
 
 class Deform(Piece):
@@ -378,11 +346,25 @@ class Scene(Piece):
             },
         }
         self._checked(SequenceConfig, self._run, time="")
-        # A scene without bodies is refused where it is used: `scene + body` begins with one.
-        named, meshes, materials = [], {}, {}
         self._memory = InMemory()
-        taken: set[str] = set()
         falls = any(body.tree.get("physics", {}).get("kind") == "dynamic" for body in self.objects)
+        foggy = {} if self.fog is None else {"fog": dict(zip(("density", "radiance"), check.plain(self.fog)))}
+        self.tree = {
+            "kind": "explicit",
+            **self._listed(falls),
+            "camera": self.camera.motion,
+            "light": self.light.tree,
+            **self._plain,
+            **foggy,
+            **({"physics": self._gravity} if falls else {}),
+        }
+        if self.objects:  # a scene without bodies is refused where it is used: `scene + body` begins with one
+            self._checked(ExplicitSceneConfig, self.tree)
+
+    def _listed(self, falls: bool) -> dict[str, Any]:
+        """Meshes, materials and objects by name; what is made of arrays goes into memory. falls : something does."""
+        named, meshes, materials = [], {}, {}
+        taken: set[str] = set()
         for k, body in enumerate(self.objects):
             item = {**body.tree, "mesh": f"mesh{k}"}
             if not falls:
@@ -400,23 +382,7 @@ class Scene(Piece):
                 if body.material.image is not None:
                     self._memory.textures[f"material{k}"] = body.material.image
             named.append(item)
-        self.tree = {
-            "kind": "explicit",
-            "meshes": meshes,
-            "materials": materials,
-            "objects": named,
-            "camera": self.camera.motion,
-            "light": self.light.tree,
-            **self._plain,
-            **(
-                {}
-                if self.fog is None
-                else {"fog": {"density": check.plain(self.fog[0]), "radiance": check.plain(self.fog[1])}}
-            ),
-            **({"physics": self._gravity} if falls else {}),
-        }
-        if named:
-            self._checked(ExplicitSceneConfig, self.tree)
+        return {"meshes": meshes, "materials": materials, "objects": named}
 
     def __add__(self, body: Primitive | Mesh) -> Scene:
         check.one_of(body, "Scene + …", _Object, "a Primitive or a Mesh")

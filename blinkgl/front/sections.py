@@ -40,41 +40,27 @@ def events_tree(emulator: EmulatorSettings) -> dict[str, Any]:
     return tree
 
 
-def images_tree(images: ImageSettings) -> dict[str, Any]:
-    """``images:`` of a preset's name, a table, or a configuration. Raises ConfigError."""
-    return section_tree(
-        "images",
-        images,
+NAMED = {
+    "images": (
         "preset",
         "a frame camera",
         "a preset's name, or a table such as {'exposure_us': 10000, 'photon_noise': True}",
-    )
+    ),
+    "imu": ("preset", "an inertial unit", "a preset's name, or a table such as {'rate': 400}"),
+    "tracks": ("choose", "point tracks", "grid, random, surface, or a table such as {'points': 100}"),
+}
+"""Sections of a configuration: the key that a text is, what it is, what is accepted."""
 
 
-def imu_tree(imu: ImuSettings) -> dict[str, Any]:
-    """``imu:`` of a preset's name, a table, or a configuration. Raises ConfigError."""
-    return section_tree("imu", imu, "preset", "an inertial unit", "a preset's name, or a table such as {'rate': 400}")
-
-
-def tracks_tree(tracks: TrackSettings) -> dict[str, Any]:
-    """``tracks:`` of a way to choose points, a table, or a configuration. Raises ConfigError."""
-    return section_tree(
-        "tracks", tracks, "choose", "point tracks", "grid, random, surface, or a table such as {'points': 100}"
-    )
-
-
-def section_tree(key: str, given: Any, named: str, what: str, accepted: str) -> dict[str, Any]:
-    """A section of a configuration of a table, a configuration, or a text, which is its key ``named``.
-    Raises ConfigError."""
+def section_tree(key: str, given: Any) -> dict[str, Any]:
+    """A section of :data:`NAMED`, of a name, a table, or a configuration. Raises ConfigError."""
+    named, what, accepted = NAMED[key]
     if not isinstance(given, (str, Mapping, Config)):
         raise ConfigError(f"not {what}", where=key, value=given, accepted=accepted)
-    tree = (
-        given.model_dump(exclude_unset=True)
-        if isinstance(given, Config)
-        else {named: given}
-        if isinstance(given, str)
-        else check.plain(given)
-    )
+    if isinstance(given, Config):
+        tree = given.model_dump(exclude_unset=True)
+    else:
+        tree = {named: given} if isinstance(given, str) else check.plain(given)
     validate_field(SequenceConfig, key, tree)
     return tree
 

@@ -15,7 +15,6 @@ _STEP = """
 
     height, width : px.   seed : of its noise.   sensor : a camera whose values are the defaults, such as "davis346",
     or a sensor file.
-    reconstruction : log intensity between frames, "linear", or for Esim "pchip" and "hermite".
     values : keys of ``events:`` (docs/configuration.md).
 
     Returns an emulator: ``emulator.step(luminance, t_ns)`` takes (H, W) float32 linear luminance, or uint8, at
@@ -23,27 +22,23 @@ _STEP = """
     Raises ConfigError and, from ``step``, EventDataError."""
 
 
-def _made(
-    kind: str, height: int, width: int, seed: int, sensor: str | None, reconstruction: str, values: dict[str, Any]
-) -> Emulator:
+def _made(kind: str, height: int, width: int, seed: int, sensor: str | None, values: dict[str, Any]) -> Emulator:
     height, width = check.whole(height, "height", 1, MAX_SIDE - 1), check.whole(width, "width", 1, MAX_SIDE - 1)
     defaults = load_sensor(sensor).values(kind) if sensor is not None else {}
     config = emulator_config({"emulator": kind, **defaults, **check.plain(values)})
-    return make_on_device(config, height, width, check.seed(seed), reconstruction)
+    return make_on_device(config, height, width, check.seed(seed))
 
 
-def Esim(
-    height: int, width: int, *, seed: int = 0, sensor: str | None = None, reconstruction: str = "linear", **values: Any
-) -> Emulator:
-    return _made("esim", height, width, seed, sensor, reconstruction, values)
+def Esim(height: int, width: int, *, seed: int = 0, sensor: str | None = None, **values: Any) -> Emulator:
+    return _made("esim", height, width, seed, sensor, values)
 
 
 def V2e(height: int, width: int, *, seed: int = 0, sensor: str | None = None, **values: Any) -> Emulator:
-    return _made("v2e", height, width, seed, sensor, "linear", values)
+    return _made("v2e", height, width, seed, sensor, values)
 
 
 def DvsVoltmeter(height: int, width: int, *, seed: int = 0, sensor: str | None = None, **values: Any) -> Emulator:
-    return _made("voltmeter", height, width, seed, sensor, "linear", values)
+    return _made("voltmeter", height, width, seed, sensor, values)
 
 
 Esim.__doc__ = (

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,12 +12,11 @@ from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.front.runs import (
     MAX_INDEX,
+    Settings,
     Source,
-    Timeline,
     configured,
 )
 from blinkgl.front.scenes import Scene
-from blinkgl.front.sections import EmulatorSettings, ImageSettings, ImuSettings, TrackSettings
 from blinkgl.labels import Flow, LabelFrame
 from blinkgl.render.tracks import Tracks
 from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Item, Simulation, simulate as core
@@ -25,21 +24,17 @@ from blinkgl.sequence.inertial import Inertial
 from blinkgl.srgb import to_srgb8
 from blinkgl.types.events import Events
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
 
 def simulate_sequence(
     source: Source,
     *,
     index: int = 0,
-    emulator: EmulatorSettings | None = None,
-    sensor: str | None = None,
-    timeline: Timeline | None = None,
-    quality: str | None = None,
-    labels: Sequence[str | float] | None = None,
-    images: ImageSettings | None = None,
-    imu: ImuSettings | None = None,
-    tracks: TrackSettings | None = None,
     events: bool = True,
     pictures_hz: float | None = None,
+    **settings: Unpack[Settings],
 ) -> Simulation:
     """What happens in one sequence, in the order of time; nothing is written and nothing kept:
 
@@ -54,33 +49,22 @@ def simulate_sequence(
 
     source : :class:`Scene` or what :func:`load` gave, recorded frames (``frames:``)
     included.   index : number of the sequence.
-    emulator, sensor, timeline, quality, labels, images, imu, tracks : as of :func:`record`; what ``labels`` does not
-    name is not drawn; ``imu()`` and ``tracks()`` of the iterator give the last two.
+    settings : emulator, sensor, timeline, quality, labels, images, imu, tracks as of :func:`record`; what ``labels``
+    does not name is not drawn; ``imu()`` and ``tracks()`` of the iterator give the last two.
     events : False leaves them out.
     pictures_hz : gives a :class:`Picture` so many times per second of simulated time, at event frames.
     The iterator has ``config``, ``height``, ``width``, ``t0_ns``, ``t1_ns``, and counts ``frames``, ``events``,
     ``labels``. Iterate over it once, or use it in ``with`` where it may never be. Raises ConfigError, AssetError,
     GLError and, as it goes, EventDataError."""
-    config = _configured(
-        source,
-        index,
-        emulator=emulator,
-        sensor=sensor,
-        timeline=timeline,
-        quality=quality,
-        labels=labels,
-        images=images,
-        imu=imu,
-        tracks=tracks,
-    )
+    config = _configured(source, index, settings)
     check.one_of(events, "events", bool, "True or False")
     if pictures_hz is not None:
         pictures_hz = check.number(pictures_hz, "pictures_hz", above=0, most=1e4)
     return _simulation(source, config, index, events=events, pictures_hz=pictures_hz)
 
 
-def _configured(source: Source, index: int, **sections) -> SequenceConfig:
-    return configured(source, **sections).sequence(check.whole(index, "index", 0, MAX_INDEX))
+def _configured(source: Source, index: int, settings: Settings) -> SequenceConfig:
+    return configured(source, **settings).sequence(check.whole(index, "index", 0, MAX_INDEX))
 
 
 def _simulation(source: Source, config: SequenceConfig, index: int, **wanted) -> Simulation:
@@ -137,19 +121,7 @@ class Recording:
         return flows
 
 
-def record(
-    source: Source,
-    *,
-    index: int = 0,
-    emulator: EmulatorSettings | None = None,
-    sensor: str | None = None,
-    timeline: Timeline | None = None,
-    quality: str | None = None,
-    labels: Sequence[str | float] | None = None,
-    images: ImageSettings | None = None,
-    imu: ImuSettings | None = None,
-    tracks: TrackSettings | None = None,
-) -> Recording:
+def record(source: Source, *, index: int = 0, **settings: Unpack[Settings]) -> Recording:
     """Events, images and ground truth of one sequence as arrays: what :func:`generate` writes, held in memory.
 
     source : :class:`Scene` or what :func:`load` gave.   index : number of the sequence.
@@ -164,18 +136,7 @@ def record(
     imu : an inertial unit: the name of a preset, "adis16448", or a table of ``imu:``, ``{"rate": 400}``.
     tracks : points on surfaces, followed: "grid", "random", "surface", or a table of ``tracks:``, ``{"points": 100}``.
     Raises ConfigError, AssetError, GLError, EventDataError."""
-    config = _configured(
-        source,
-        index,
-        emulator=emulator,
-        sensor=sensor,
-        timeline=timeline,
-        quality=quality,
-        labels=labels,
-        images=images,
-        imu=imu,
-        tracks=tracks,
-    )
+    config = _configured(source, index, settings)
     gathered = Gathered()
     with _simulation(source, config, index) as sequence:
         for item in sequence:

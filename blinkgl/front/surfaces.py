@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -12,11 +12,14 @@ from blinkgl.config.lights import LightConfig
 from blinkgl.config.materials import MaterialConfig
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
-from blinkgl.front.poses import Piece, Vector
+from blinkgl.front.poses import Piece, signed_by
 from blinkgl.scene import types as data
 from blinkgl.scene.surfaces.images import content_hash
 
+MAPS = ("metallic_roughness_map", "normal_map", "emission_map", "mask")
 
+
+@signed_by(LightConfig, sun_elevation="elevation", sun_azimuth="azimuth")
 class Light(Piece):
     """A sun and a sky: a white surface with normal n has radiance sun * max(0, n . s) + sky * (0.5 + 0.5 n_z); and
     lights beside them.
@@ -35,30 +38,13 @@ class Light(Piece):
         sun: float = 0.9,
         sky: float = 0.6,
         *,
-        elevation: float | None = None,
-        azimuth: float | None = None,
-        sun_color: Vector | None = None,
-        sky_color: Vector | None = None,
         lights: Sequence[Mapping[str, Any]] = (),
         environment: Mapping[str, Any] | None = None,
-        shadows: Literal["off", "hard", "soft"] = "off",
-        sun_size: float = 0.53,
-        shadow_size: int = 1024,
-        unlit: bool = False,
+        **keys: Any,
     ):
         check.one_of(lights, "Light.lights", (list, tuple), "a list of tables")
-        tree = check.given(
-            sun=sun,
-            sky=sky,
-            sun_elevation=elevation,
-            sun_azimuth=azimuth,
-            sun_color=sun_color,
-            sky_color=sky_color,
-            shadows=shadows,
-            sun_size=sun_size,
-            shadow_size=shadow_size,
-            unlit=unlit,
-        )
+        renamed = {"elevation": "sun_elevation", "azimuth": "sun_azimuth"}
+        tree = check.given(sun=sun, sky=sky, **{renamed.get(key, key): value for key, value in keys.items()})
         if environment is not None:
             tree["environment"] = check.given(**check.one_of(environment, "Light.environment", Mapping, "a table"))
         if lights:
@@ -68,6 +54,7 @@ class Light(Piece):
         self.tree = self._checked(LightConfig, tree, sun_elevation="elevation", sun_azimuth="azimuth")
 
 
+@signed_by(MaterialConfig, texture="image")
 class Material(Piece):
     """A surface: ``color`` times at most one texture, matt or with a gloss, and light of its own.
 
@@ -84,58 +71,15 @@ class Material(Piece):
     Maps are files, or arrays (h, w, 3) uint8, of the mask (h, w) uint8.
     Raises ConfigError; a missing file is found when the scene is built."""
 
-    def __init__(
-        self,
-        image: str | os.PathLike | np.ndarray | None = None,
-        *,
-        color: Vector = (1.0, 1.0, 1.0),
-        procedural: str | None = None,
-        seed: int = 0,
-        photograph: str | None = None,
-        uv_scale: Vector = (1.0, 1.0),
-        max_size: int = 2048,
-        unlit: bool = False,
-        double_sided: bool = False,
-        metallic: float = 0.0,
-        roughness: float = 1.0,
-        emission: Vector = (0.0, 0.0, 0.0),
-        metallic_roughness_map: str | os.PathLike | np.ndarray | None = None,
-        normal_map: str | os.PathLike | np.ndarray | None = None,
-        normal_scale: float = 1.0,
-        emission_map: str | os.PathLike | np.ndarray | None = None,
-        mask: str | os.PathLike | np.ndarray | None = None,
-        cutoff: float = 0.5,
-    ):
-        given = {
-            "metallic_roughness_map": metallic_roughness_map,
-            "normal_map": normal_map,
-            "emission_map": emission_map,
-            "mask": mask,
-        }
-        self.maps = {key: _map(map_, key) for key, map_ in given.items() if map_ is not None and not _is_file(map_)}
-        files = {key: map_ if _is_file(map_) or map_ is None else f"<{key}>" for key, map_ in given.items()}
+    def __init__(self, image: str | os.PathLike | np.ndarray | None = None, **keys: Any):
+        maps = {key: keys[key] for key in MAPS if keys.get(key) is not None}
+        self.maps = {key: _map(map_, key) for key, map_ in maps.items() if not _is_file(map_)}
         self.image: data.Texture | None = None
-        if image is not None and not isinstance(image, (str, os.PathLike)):
+        if image is not None and not _is_file(image):
             self.image, image = _texture(image), None
-            if procedural is not None or photograph is not None:
+            if keys.get("procedural") is not None or keys.get("photograph") is not None:
                 raise ConfigError("only one of image, procedural, photograph may be given", where="Material.image")
-        tree = check.given(
-            texture=image,
-            procedural=procedural,
-            seed=seed,
-            photograph=photograph,
-            max_size=max_size,
-            color=color,
-            uv_scale=uv_scale,
-            unlit=unlit,
-            double_sided=double_sided,
-            metallic=metallic,
-            roughness=roughness,
-            emission=emission,
-            normal_scale=normal_scale,
-            cutoff=cutoff,
-            **files,
-        )
+        tree = check.given(**{**keys, "texture": image, **{key: f"<{key}>" for key in self.maps}})
         self.tree = self._checked(MaterialConfig, tree, texture="image")
 
 

@@ -1,4 +1,4 @@
-"""AEDAT4 recordings of iniVation's cameras, read by the optional package aedat."""
+"""AEDAT4 recordings of iniVation's cameras, read by the package aedat."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import numpy as np
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.columns import check_size, events_of
 from blinkgl.io.davis import CameraFrame, G, ImuSamples
-from blinkgl.machine.extras import install
 from blinkgl.types.events import Events
 
 _ABSENT = {"events": "no events", "frame": "no frames", "imus": "no samples of an inertial unit"}
@@ -91,14 +90,9 @@ class Aedat4Reader:
 
 
 def _decoder(path: Path) -> Any:
-    try:
-        import aedat
-    except ImportError:
-        raise AssetError(
-            "AEDAT4 needs the package aedat, which is not installed",
-            where=str(path),
-            accepted=f"run {install('aedat')}",
-        ) from None
+    # Here: few programs read such files.
+    import aedat
+
     return aedat.Decoder(os.fspath(path))
 
 

@@ -18,11 +18,7 @@ EXTRAS = {  # extra of setup.cfg -> (distributions, what they are for)
     "onnx": (("onnx", "onnxscript", "onnxruntime"), "networks for programs without torch: eflow export"),
     "cluster": (("ray",), "many machines"),
     "physics": (("mujoco",), "scenes in which things fall"),
-    "formats": (
-        ("faery", "aedat"),
-        "aedat: AEDAT4 files; faery: checks of EVT2 and EVT3, which need nothing",
-    ),
-    "exchange": (("mlcroissant",), "checks of a data set's Croissant metadata"),
+    "formats": (("faery",), "checks of EVT2 and EVT3, which need nothing"),
     "viz": (("rerun-sdk",), "3D viewer"),
     "urdf": (("pybullet",), "its random meshes as an object pool"),
     "docs": (("zensical", "mkdocstrings", "towncrier"), "the documentation as a site"),

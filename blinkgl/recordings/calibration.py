@@ -206,9 +206,9 @@ def calibrate_events(
     middles of exposures."""
     base = emulator_config(emulator)
     keys = _keys(base, fixed)
-    if interpolate not in INTERPOLATIONS[::2]:
+    if interpolate not in INTERPOLATIONS:
         raise ConfigError(
-            "cannot be calibrated with", where="interpolate", value=interpolate, accepted="motion, linear"
+            "unknown interpolation", where="interpolate", value=interpolate, accepted=", ".join(INTERPOLATIONS)
         )
     say = progress or (lambda *_: None)
     start, untold = None, {}

@@ -33,7 +33,7 @@ from blinkgl.tensors.choice import make_on_device
 from blinkgl.timeline import interpolate as between
 from blinkgl.types.events import Events, count_causes, named_causes
 
-INTERPOLATIONS = ("linear", "cubic", "motion")
+INTERPOLATIONS = ("linear", "motion")
 _LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
 """ITU-R BT.709, on linear light."""
 
@@ -73,7 +73,6 @@ def frames_to_events(
     emulator: str | EmulatorConfig = EmulatorConfig.members.default,
     gamma: str | float | None = None,
     interpolate: str = "linear",
-    factor: int = 4,
     max_px: float = 1.0,
     seed: int = 0,
     readout: ReadoutConfig | None = None,
@@ -88,9 +87,8 @@ def frames_to_events(
         1.0) or float (1.0 is white, more is fine).
     emulator : name of one ("esim", "v2e", "voltmeter"), or a config of one.
     gamma : "srgb", "linear", or an exponent N (luminance = code^N). Default: srgb for integers, linear for floats.
-    interpolate : "linear": the given frames, between which the emulators are linear themselves; "cubic": ``factor - 1``
-        frames in between by monotone cubics; "motion": dense-flow warp with at most ``max_px`` per step (see
-        :mod:`blinkgl.timeline.interpolate`).
+    interpolate : "linear": the given frames, between which the emulators are linear themselves; "motion":
+        dense-flow warp with at most ``max_px`` per step (see :mod:`blinkgl.timeline.interpolate`).
     seed : of the emulator. readout : what is behind the pixels (``load_sensor(name).readout``); None:
     nothing. report : filled as it goes.
 
@@ -107,7 +105,6 @@ def frames_to_events(
         emulator=emulator,
         gamma=gamma,
         interpolate=interpolate,
-        factor=factor,
         max_px=max_px,
         seed=seed,
         readout=readout,
@@ -133,7 +130,6 @@ def simulated_steps(
     emulator: str | EmulatorConfig = EmulatorConfig.members.default,
     gamma: str | float | None = None,
     interpolate: str = "linear",
-    factor: int = 4,
     max_px: float = 1.0,
     seed: int = 0,
     readout: ReadoutConfig | None = None,
@@ -144,10 +140,10 @@ def simulated_steps(
         raise ConfigError(
             "unknown interpolation", where="interpolate", value=interpolate, accepted=", ".join(INTERPOLATIONS)
         )
-    return _run(timed(frames, fps), config, _checked_gamma(gamma), interpolate, factor, max_px, seed, readout, report)
+    return _run(timed(frames, fps), config, _checked_gamma(gamma), interpolate, max_px, seed, readout, report)
 
 
-def _run(frames, config, gamma, interpolate, factor, max_px, seed, readout, report) -> Iterator[Step]:
+def _run(frames, config, gamma, interpolate, max_px, seed, readout, report) -> Iterator[Step]:
     first = next(frames, None)
     if first is None:
         raise EventDataError("events need at least two frames", value="0 frames")
@@ -157,7 +153,6 @@ def _run(frames, config, gamma, interpolate, factor, max_px, seed, readout, repo
         camera,
         gamma=gamma,
         interpolate=interpolate,
-        factor=factor,
         max_px=max_px,
         report=report,
     )
@@ -169,7 +164,6 @@ def stepped(
     *,
     gamma: str | float | None,
     interpolate: str,
-    factor: int,
     max_px: float,
     report: SimulationReport | None = None,
 ) -> Iterator[Step]:
@@ -201,9 +195,7 @@ def stepped(
             raise EventDataError("events need at least two frames", where=name, value="1 frame")
 
     stream = luminances()
-    if interpolate == "cubic":
-        stream = between.cubic(stream, factor)
-    elif interpolate == "motion":
+    if interpolate == "motion":
         report.displacement = between.Displacement()
         stream = between.motion(stream, max_px, displacement=report.displacement)
     seen: list[np.ndarray] = [first[0]]

@@ -47,7 +47,7 @@ class Frame:
 
     @property
     def names(self) -> tuple[str, ...]:
-        return tuple(self._canvas.planes)
+        return tuple(output.name for output in self._canvas.outputs)
 
     @property
     def width(self) -> int:
@@ -138,16 +138,7 @@ class Canvas:
         self.pass_, self.painter, self.number = pass_, painter, 0
         self.outputs = pass_.outputs
         self.target = self.make_target(width, height)
-        # A format with several components may hold several pictures, such as luminance and rate.
-        self.planes: dict[str, tuple[int, int | None]] = {}
-        """Name of each picture -> attachment, and component where it is one of several."""
-        for i, output in enumerate(self.outputs):
-            self.planes |= (
-                {name: (i, k) for k, name in enumerate(output.planes)} if output.planes else {output.name: (i, None)}
-            )
-        self._held: dict[
-            int, tuple[int, dict[str, np.ndarray]]
-        ] = {}  # attachment -> number of the frame held, and its pictures
+        self._held: dict[int, tuple[int, np.ndarray]] = {}  # attachment -> number of the frame held, and its picture
         self._readers: dict[tuple[int, str], TextureReader] = {}  # by attachment and device
         self._used: dict[str, Frame] = {}  # inputs of the last frame
 
@@ -187,38 +178,47 @@ class Canvas:
 
     def attachment(self, output: str) -> int:
         """Number of an output (default: the first). Raises GLError."""
-        return self._known([o.name for o in self.outputs], output)[0]
+        names = [o.name for o in self.outputs]
+        if not names or (output and output not in names):
+            raise GLError(
+                "the pass has no such output",
+                where=type(self.pass_).__name__,
+                value=output,
+                accepted=", ".join(names) or "none",
+            )
+        return names.index(output) if output else 0
 
     def read(self, name: str, out: np.ndarray | None) -> np.ndarray:
-        i, component = self._place(name)
+        i = self.attachment(name)
         # Another context may have been made current in this thread since.
         self.painter.gl.resume()
         self.painter.finish()
         started = working_clock()
-        if component is None and not self.outputs[i].components:
+        if not self.outputs[i].components:
             out = self.target.read(i, out=out)
         else:
-            picture = self._given_out(i, self.target.read(i), component)
+            picture = self._given_out(i, self.target.read(i))
             out = checked_array(out, picture.shape, picture.dtype)
             out[...] = picture
         self.painter.stats.readback_s += working_clock() - started
         return out
 
     def view(self, name: str, frame: Frame) -> np.ndarray:
-        i, _ = self._place(name)
+        i = self.attachment(name)
         self.painter.gl.resume()
-        number, pictures = self._held.get(i, (0, {}))
-        if number != self.number:
+        number, picture = self._held.get(i, (0, None))
+        if picture is None or number != self.number:
             # Only a picture of the frame right before this one is right outside of what changed.
             stale = frame.changed if number == self.number - 1 and number > 0 else None
-            self._held[i] = self.number, self._update(i, pictures, stale)
-        seen = self._held[i][1][name or next(iter(self.planes))].view()
+            picture = self._update(i, picture, stale)
+            self._held[i] = self.number, picture
+        seen = picture.view()
         seen.flags.writeable = False
         return seen
 
     def reader(self, device: Any, name: str) -> TextureReader:
         """What reads a picture's attachment into tensors of a device; made when it is first asked for."""
-        i, _ = self._place(name)
+        i = self.attachment(name)
         if (i, str(device)) not in self._readers:
             self.painter.gl.resume()
             self.painter.finish()
@@ -227,59 +227,35 @@ class Canvas:
 
     def tensor(self, device: Any, name: str) -> Any:
         """A tensor of the caller's own."""
-        i, component = self._place(name)
+        components = self.outputs[self.attachment(name)].components
         reader = self.reader(device, name)
         self.painter.finish()
         started = working_clock()
         picture = reader.read()
-        if component is not None:
-            picture = picture[..., component].contiguous()
-        elif self.outputs[i].components:
-            picture = picture[..., : self.outputs[i].components]
+        if components:
+            picture = picture[..., :components]
         self.painter.stats.readback_s += working_clock() - started
         return picture
 
-    def _update(self, i: int, pictures: dict[str, np.ndarray], stale: list[Rectangle] | None) -> dict[str, np.ndarray]:
-        """The pictures of attachment ``i`` as they are now, where they were right but for ``stale``."""
+    def _update(self, i: int, picture: np.ndarray | None, stale: list[Rectangle] | None) -> np.ndarray:
+        """The picture of attachment ``i`` as it is now, where it was right but for ``stale``."""
         self.painter.finish()
         started = working_clock()
-        planes = {name: component for name, (attachment, component) in self.planes.items() if attachment == i}
-        for r in [None] if stale is None else stale:
-            # A picture that is the whole attachment is read straight into the memory held for it.
-            if r is None and not self.outputs[i].components and len(planes) == 1:
-                (name,) = planes
-                pictures = {name: self.target.read(i, out=pictures.get(name))}
-                continue
-            part = self.target.read(i, region=None if r is None else (r.x0, r.y0, r.x1 - r.x0, r.y1 - r.y0))
-            for name, component in planes.items():
-                given_out = self._given_out(i, part, component)
-                if r is not None:
-                    pictures[name][r.y0 : r.y1, r.x0 : r.x1] = given_out
-                elif name in pictures:
-                    pictures[name][...] = given_out
-                else:
-                    pictures[name] = np.ascontiguousarray(given_out)
+        if picture is None or stale is None:
+            if self.outputs[i].components:
+                picture = np.ascontiguousarray(self._given_out(i, self.target.read(i)))
+            else:
+                # Read straight into the memory held for it.
+                picture = self.target.read(i, out=picture)
+        else:
+            for r in stale:
+                part = self.target.read(i, region=(r.x0, r.y0, r.x1 - r.x0, r.y1 - r.y0))
+                picture[r.y0 : r.y1, r.x0 : r.x1] = self._given_out(i, part)
         self.painter.stats.readback_s += working_clock() - started
-        return pictures
+        return picture
 
-    def _given_out(self, i: int, array: np.ndarray, component: int | None) -> np.ndarray:
-        if component is not None:
-            return array[..., component]
+    def _given_out(self, i: int, array: np.ndarray) -> np.ndarray:
         return array[..., : self.outputs[i].components or None]
-
-    def _place(self, name: str) -> tuple[int, int | None]:
-        return self.planes[self._known(list(self.planes), name)[1]]
-
-    def _known(self, names: list[str], name: str) -> tuple[int, str]:
-        """(number, name) of ``name``, "" standing for the first."""
-        if not names or (name and name not in names):
-            raise GLError(
-                "the pass has no such output",
-                where=type(self.pass_).__name__,
-                value=name,
-                accepted=", ".join(names) or "none",
-            )
-        return (names.index(name), name) if name else (0, names[0])
 
     def release(self) -> None:
         self.number = -1

@@ -217,10 +217,9 @@ class Renderer:
 
     # ---- frames --------------------------------------------------------------------------------------------------
 
-    def luminance(self, t_ns: int, rate: bool = False) -> Frame:
-        """Linear luminance at t_ns, (H, W) float32; with ``rate`` beside it "rate", d(luminance)/dt per second of each
-        pixel, as the surface it shows moves (edges that pass are not in it)."""
-        return self.draw(self.seen(Luminance(rate, self._samples, self._shadows), smooth=True), t_ns)
+    def luminance(self, t_ns: int) -> Frame:
+        """Linear luminance at t_ns, (H, W) float32."""
+        return self.draw(self.seen(Luminance(self._samples, self._shadows), smooth=True), t_ns)
 
     def brightness(self, t_ns: int, every: int = 1) -> Frame:
         """Luminance and d(luminance)/dt per second, (h, w, 2) float32, on every n-th pixel in x and y, textures

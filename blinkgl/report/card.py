@@ -1,14 +1,10 @@
-"""A data set described for those who find it: ``README.md`` with the card of a data hub, and ``croissant.json``,
-MLCommons' metadata (Croissant 1.0), which search engines and mlcroissant read. Both are made from the files alone."""
+"""A data set described for those who find it: ``README.md`` with the card of a data hub, made from the files alone."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,28 +14,11 @@ from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.labels import LABELS
 from blinkgl.report.charts import number, size
 from blinkgl.report.collect import Collected, collect
-from blinkgl.sequence_files.index import INDEX, write_index
+from blinkgl.sequence_files.index import write_index
 from blinkgl.sequence_files.sequence_dir import read_manifest
 
-CARD, CROISSANT = "README.md", "croissant.json"
+CARD = "README.md"
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
-_INTEGERS = (
-    "sequence", "seed", "events", "labels", "frames", "height", "width", "t_offset_us", "duration_us", "bytes",
-)  # fmt: skip
-_TEXTS = ("path", "name", "split", "emulator", "blinkgl")
-_TERMS = {
-    "cr": "http://mlcommons.org/croissant/",
-    "rai": "http://mlcommons.org/croissant/RAI/",
-    "dct": "http://purl.org/dc/terms/",
-    "sc": "https://schema.org/",
-}
-_OF_CROISSANT = (
-    "citeAs column equivalentProperty extract field fileProperty fileObject fileSet format includes isLiveDataset "
-    "jsonPath key md5 parentField path recordSet references regex repeated replace samplingRate separator source "
-    "subField transform"
-).split()
-
-
 _REMARK = (
     "`events.h5` is packed with Blosc: `import hdf5plugin` before h5py opens it. Times are µs on one clock; windows "
     "are half open. `config.yaml` of a sequence makes it again (`blinkgl generate`), `manifest.json` has its checksums."
@@ -55,9 +34,9 @@ class Fact:
     unit: str
 
 
-def write_card(root: str | Path, *, licence: str | None = None, url: str | None = None) -> tuple[Path, Path]:
-    """Writes both files and ``index.jsonl`` into the data set and returns their paths. licence : an SPDX name, such as
-    "cc-by-4.0"; url : where the data set is to be found.
+def write_card(root: str | Path, *, licence: str | None = None, url: str | None = None) -> Path:
+    """Writes the card and ``index.jsonl`` into the data set and returns the card's path. licence : an SPDX name, such
+    as "cc-by-4.0"; url : where the data set is to be found.
 
     Raises AssetError: no data set, or a README.md that is not ours; OutputError."""
     root = Path(root)
@@ -66,13 +45,9 @@ def write_card(root: str | Path, *, licence: str | None = None, url: str | None 
     if card.exists() and "blinkgl" not in _head(card):
         raise AssetError("a page that BlinkGL did not write", where=str(card), accepted="it under another name")
     write_index(root)
-    facts = facts_of(found)
-    text = card_of(found, facts, licence, url)
-    described = croissant_of(found, facts, licence, url)
-    for path, content in ((card, text), (root / CROISSANT, json.dumps(described, indent=1) + "\n")):
-        with atomic_file(path) as temporary, output_errors(path):
-            temporary.write_text(content, encoding="utf-8")
-    return card, root / CROISSANT
+    with atomic_file(card) as temporary, output_errors(card):
+        temporary.write_text(card_of(found, facts_of(found), licence, url), encoding="utf-8")
+    return card
 
 
 def facts_of(found: Collected) -> list[Fact]:
@@ -144,7 +119,7 @@ def card_of(found: Collected, facts: list[Fact], licence: str | None, url: str |
     lines += [f"| {f.name} | {number(f.value)} | {f.unit} |" for f in facts]
     lines += ["", f"On disk {size(sum(s['bytes'] for s in found.sequences))}. " + _licence(licence), "", "## Files", ""]
     lines += ["| below each sequence | what |", "|---|---|"]
-    lines += [f"| `{pattern}` | {what} |" for _, pattern, what, _ in _files(found)]
+    lines += [f"| `{pattern}` | {what} |" for pattern, what in _files(found)]
     lines += [
         "",
         _REMARK,
@@ -162,115 +137,28 @@ def card_of(found: Collected, facts: list[Fact], licence: str | None, url: str |
     return "\n".join(lines) + "\n"
 
 
-def croissant_of(found: Collected, facts: list[Fact], licence: str | None, url: str | None) -> dict[str, Any]:
-    """The JSON-LD: the index as a file and a table, each kind of file as a set, the facts as what was measured."""
-    index = found.root / INDEX
-    source = {"fileObject": {"@id": INDEX}}
-    fields = [
-        {
-            "@type": "cr:Field",
-            "@id": f"sequences/{name}",
-            "name": name,
-            "dataType": kind,
-            "source": {**source, "extract": {"column": name}},
-        }
-        for names, kind in ((_TEXTS, "sc:Text"), (_INTEGERS, "sc:Integer"))
-        for name in names
-    ]
-    name = found.root.resolve().name
-    return {
-        "@context": _context(),
-        "@type": "sc:Dataset",
-        "conformsTo": "http://mlcommons.org/croissant/1.0",
-        "name": name,
-        "description": f"Events of simulated cameras with exact ground truth, rendered by BlinkGL: {name}.",
-        "version": "1.0.0",
-        **({} if licence is None else {"license": licence}),
-        **({} if url is None else {"url": url}),
-        "keywords": ["event camera", "optical flow", "synthetic"],
-        "variableMeasured": [
-            {"@type": "sc:PropertyValue", "name": f.name, "value": f.value, **({"unitText": f.unit} if f.unit else {})}
-            for f in facts
-        ],
-        "distribution": [
-            {
-                "@type": "cr:FileObject",
-                "@id": INDEX,
-                "name": INDEX,
-                "description": "a line per sequence",
-                "contentUrl": INDEX,
-                "encodingFormat": "application/jsonlines",
-                "sha256": hashlib.sha256(index.read_bytes()).hexdigest(),
-            },
-            *(
-                {
-                    "@type": "cr:FileSet",
-                    "@id": kind,
-                    "name": kind,
-                    "description": what,
-                    "encodingFormat": encoding,
-                    "includes": _glob(found, pattern),
-                }
-                for kind, pattern, what, encoding in _files(found)
-            ),
-        ],
-        "recordSet": [
-            {
-                "@type": "cr:RecordSet",
-                "@id": "sequences",
-                "name": "sequences",
-                "key": {"@id": "sequences/path"},
-                "field": fields,
-            }
-        ],
-    }
-
-
-def _context() -> dict[str, Any]:
-    """Croissant's own, key for key: readers compare."""
-    context: dict[str, Any] = {"@language": "en", "@vocab": "https://schema.org/", **_TERMS}
-    context.update({key: f"cr:{key}" for key in _OF_CROISSANT})
-    context["conformsTo"] = "dct:conformsTo"
-    context["data"] = {"@id": "cr:data", "@type": "@json"}
-    context["examples"] = {"@id": "cr:examples", "@type": "@json"}
-    context["dataType"] = {"@id": "cr:dataType", "@type": "@vocab"}
-    return context
-
-
-_ENCODINGS = {
-    "h5": "application/x-hdf5", "png": "image/png", "npy": "application/x-npy", "npz": "application/x-npz",
-    "flo": "application/octet-stream", "csv": "text/csv", "yaml": "application/yaml", "json": "application/json",
-    "mp4": "video/mp4", "txt": "text/plain",
-}  # fmt: skip
 _OTHERS = {
-    "events.h5": ("events", "events/{x,y,p,t}, t µs relative to t_offset; ms_to_idx; Blosc (`import hdf5plugin`)"),
-    "event_labels.h5": ("event_labels", "what made each event; Blosc (`import hdf5plugin`)"),
-    "poses.npz": ("poses", "poses of camera and objects, intrinsics"),
-    "tracks.npz": ("tracks", "points on surfaces, followed (TAP-Vid's arrays)"),
-    "imu/imu.csv": ("imu", "an inertial unit, EuRoC's columns"),
-    "manifest.json": ("manifests", "checksums, versions, seed"),
-    "config.yaml": ("configurations", "every value as drawn"),
+    "events.h5": "events/{x,y,p,t}, t µs relative to t_offset; ms_to_idx; Blosc (`import hdf5plugin`)",
+    "event_labels.h5": "what made each event; Blosc (`import hdf5plugin`)",
+    "poses.npz": "poses of camera and objects, intrinsics",
+    "tracks.npz": "points on surfaces, followed (TAP-Vid's arrays)",
+    "imu/imu.csv": "an inertial unit, EuRoC's columns",
+    "manifest.json": "checksums, versions, seed",
+    "config.yaml": "every value as drawn",
 }
 
 
-def _files(found: Collected) -> list[tuple[str, str, str, str]]:
-    """(name, pattern below a sequence, what it is, encoding) of the kinds of files that the sequences have."""
+def _files(found: Collected) -> list[tuple[str, str]]:
+    """(pattern below a sequence, what it is) of the kinds of files that the sequences have."""
     names: set[str] = {"manifest.json"}
     for line in found.sequences:
         names |= set(read_manifest(found.root / line["path"])["files"])
-    kinds = [(kind, file, what) for file, (kind, what) in _OTHERS.items() if file in names]
+    kinds = [(file, what) for file, what in _OTHERS.items() if file in names]
     for label in LABELS.values():
         for form in label.forms:
             if any(form.holds(name) for name in names):
-                pattern = f"{form.folder}/*.{form.ending}"
-                kinds.append((pattern.replace("/*", "").replace("/", "_"), pattern, label.about))
-    return [(kind, file, what, _ENCODINGS[file.rpartition(".")[2]]) for kind, file, what in kinds]
-
-
-def _glob(found: Collected, pattern: str) -> str:
-    """The pattern from the data set's folder on."""
-    depth = {line["path"].count("/") + (line["path"] != ".") for line in found.sequences}
-    return "/".join(["*"] * max(depth, default=0) + [pattern])
+                kinds.append((f"{form.folder}/*.{form.ending}", label.about))
+    return kinds
 
 
 def _first(found: Collected) -> str:

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import io
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from blinkgl.report.markup import data_uri, render
+from blinkgl.report.markup import render
 
 if TYPE_CHECKING:
     from blinkgl.recordings.pixel_noise import PixelFit
-
-_COLOURS = {"recorded": "#222222", "fitted": "#1764ab"}
 
 
 def page(result: PixelFit, sensor_text: str) -> str:
@@ -23,7 +18,6 @@ def page(result: PixelFit, sensor_text: str) -> str:
         result=result,
         rows=rows(result),
         parameters=parameters(result),
-        picture=data_uri(picture(result)),
         sensor=sensor_text,
     )
 
@@ -50,32 +44,3 @@ def parameters(result: PixelFit) -> list[tuple[str, str, str]]:
             text = f"{value:.4g}" + (f" ± {spread:.2g}" if spread is not None else "")
             found.append((f"readout.pixels.{key}", text, field.description or ""))
     return found
-
-
-def picture(result: PixelFit) -> bytes:
-    """PNG: how many events pixels made, and the intervals between them."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import FuncFormatter, NullFormatter
-
-    figure = Figure(figsize=(12, 4.2), layout="constrained")
-    FigureCanvasAgg(figure)
-    left, right = figure.subplots(1, 2)
-    for (name, colour), counts, gaps in zip(_COLOURS.items(), result.counts, result.intervals):
-        ordered = np.sort(counts)
-        left.step(ordered, 1 - np.arange(len(ordered)) / len(ordered), where="pre", color=colour, label=name)
-        if len(gaps):
-            right.plot(np.sort(gaps) / 1000, np.arange(1, len(gaps) + 1) / len(gaps), color=colour)
-    left.set(title="pixels that fired: at least so many events", xlabel="events", ylabel="share", xscale="log")
-    left.set_yscale("log")
-    left.legend(frameon=False, fontsize=9)
-    right.set(title="interval between a pixel's events", xlabel="ms", ylabel="share below", xscale="log", ylim=(0, 1))
-    for ax in (left, right):
-        ax.spines[["top", "right"]].set_visible(False)
-        ax.grid(alpha=0.25)
-    for axis in (left.xaxis, left.yaxis, right.xaxis):  # without mathematical fonts
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.set_minor_formatter(NullFormatter())
-    file = io.BytesIO()
-    figure.savefig(file, dpi=100, format="png", metadata={"Software": None})
-    return file.getvalue()

@@ -100,7 +100,6 @@ class RecordedSequence(Simulation):
             self.camera,
             gamma=frames.gamma,
             interpolate=frames.interpolate,
-            factor=frames.factor,
             max_px=frames.max_px,
         )
         while True:

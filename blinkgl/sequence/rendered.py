@@ -43,24 +43,15 @@ SURFACES = LabelRequest("ids", "depth", "velocity")
 """Labels that say what made an event."""
 
 
-def drawn(
-    renderer: Renderer, times: Iterable[int], rates: bool = False, surfaces: bool = False, device: Any = None
-) -> Iterator[EventFrame]:
-    """The frames of the event pass at ``times``, ns; a :class:`Timeline` is told every one.
-    rates : with d(luminance)/dt.   surfaces : with what every pixel shows.   device : torch's, on which frames are
-    tensors, where the timeline does not look at them; without rates then."""
-    observe, frame = times.observe if isinstance(times, Timeline) else None, None
-    tensors = device is not None and not rates and not (isinstance(times, Timeline) and times.looks_at_frames)
+def drawn(renderer: Renderer, times: Iterable[int], surfaces: bool = False, device: Any = None) -> Iterator[EventFrame]:
+    """The frames of the event pass at ``times``, ns.
+    surfaces : with what every pixel shows.   device : torch's, on which frames are tensors; None: they are arrays."""
+    frame = None
     for t_ns in times:
-        before, frame = frame, renderer.luminance(t_ns, rate=rates)
+        before, frame = frame, renderer.luminance(t_ns)
         rows = frame.rows_changed_since(before)
-        if tensors:
-            yield EventFrame(t_ns, frame.tensor(device), None, rows, surfaces_at(renderer, t_ns) if surfaces else None)
-            continue
-        luminance, rate = frame.view(), frame.view("rate") if rates else None
-        if observe is not None:
-            observe(t_ns, luminance, rate)
-        yield EventFrame(t_ns, luminance, rate, rows, surfaces_at(renderer, t_ns) if surfaces else None)
+        luminance = frame.view() if device is None else frame.tensor(device)
+        yield EventFrame(t_ns, luminance, rows, surfaces_at(renderer, t_ns) if surfaces else None)
 
 
 def _truth_of(sensor: Sensor, config: SequenceConfig) -> SurfaceTruth | None:
@@ -145,13 +136,11 @@ class RenderedSequence(Simulation):
             if events:
                 emulator, readout = self.sensor.emulator, self.sensor.readout
                 seed = kernel_seed(config.seed, index, Role.EVENTS, number)
-                path = config.timeline.reconstruction
                 camera = EventCamera(
                     emulator,
                     readout,
                     *size,
                     seed,
-                    path,
                     _truth_of(self.sensor, config),
                     partial(make_on_device, gl=renderer.gl),
                 )
@@ -182,8 +171,7 @@ class RenderedSequence(Simulation):
 
     def _frames(self) -> Iterator[EventFrame]:
         """Of the event pass."""
-        rates, tells = self.camera.emulator.needs_rate, self.camera.tells
-        return drawn(self.renderer, self.timeline, rates, tells, self.camera.tensor_device)
+        return drawn(self.renderer, self.timeline, self.camera.tells, self.camera.tensor_device)
 
     def _in_order(self) -> Iterator[Item]:
         yield from super()._in_order()
@@ -305,7 +293,7 @@ class RenderedSequence(Simulation):
         gl, scene, timeline = self.renderer.gl, self.renderer.scene, self.config.timeline
         return {
             "opengl": {"renderer": gl.renderer, "version": gl.version, "vendor": gl.vendor, "backend": gl.backend},
-            "timeline": {"kind": timeline.kind, "reconstruction": timeline.reconstruction, **self.achieved},
+            "timeline": {"kind": timeline.kind, **self.achieved},
             "triangles": self.triangles,
             "objects": [_described(o) for o in scene.objects],
             **self._facts_of_labels(),

@@ -72,7 +72,6 @@ _SHADED = (
     *_lookups("colour", LOOKUP_PASSES["colour"].program),
     Pass("colour", "colour", "linear radiance", "light", "colour.glsl"),
     Pass("luminance_edges", "luminance, edges", "linear", "scalar", "edges.glsl"),
-    Pass("rate_edges", "rate of luminance, edges", "1/s", "signed", "edges.glsl"),
     Pass("colour_edges", "colour, edges", "linear radiance", "light", "edges.glsl"),
     Pass("log_luminance", "log luminance", "ln(L + log_eps)", "scalar", "luminance.glsl, then the logarithm"),
     Pass("dL_dt", "dL/dt", "1/s", "signed", "luminance.glsl at two times, difference quotient"),

@@ -17,24 +17,22 @@ from blinkgl.shader_debugger.edges_twin import filtered
 if TYPE_CHECKING:
     from blinkgl.shader_debugger.session import DebugRenderer
 
-EDGED = ("luminance_edges", "rate_edges", "colour_edges")
+EDGED = ("luminance_edges", "colour_edges")
 _SAMPLES = samples_of("edges")
-_NO_FLOOR = -3.4e38
 
 
 def edged_of(config: SequenceConfig) -> tuple[str, ...]:
     """Those of :data:`EDGED` that a generation run of this configuration draws: with ``edges2`` on a finer grid, of
     which the image's own pixels are looked at here."""
-    frames, images = (samples_of(name).edges for name in (config.render.antialiasing, config.render.image_antialiasing))
-    there = (frames, frames and config.timeline.reconstruction == "hermite", images)
-    return tuple(name for name, is_there in zip(EDGED, there, strict=True) if is_there)
+    drawn = (config.render.antialiasing, config.render.image_antialiasing)
+    return tuple(name for name, kind in zip(EDGED, drawn, strict=True) if samples_of(kind).edges)
 
 
 def _filtered(renderer: DebugRenderer, name: str) -> tuple[str, Pass]:
     """(what is filtered, the pass that draws it unfiltered)"""
     what = name.partition("_")[0]
     maps = renderer.maps
-    return what, Colour(_SAMPLES, maps) if what == "colour" else Luminance(what == "rate", _SAMPLES, maps)
+    return what, Colour(_SAMPLES, maps) if what == "colour" else Luminance(_SAMPLES, maps)
 
 
 def edged(renderer: DebugRenderer, name: str, t_ns: int) -> np.ndarray:
@@ -51,5 +49,4 @@ def twin_of(renderer: DebugRenderer, name: str, t_ns: int) -> tuple[np.ndarray, 
     items = [item for item in moment.visible if item.layer != SKY]
     pixels, crossings = Lines().in_pixels(moment, items, frame.width, frame.height)
     pixel = 2 / (frame.width * abs(moment.view.projection[0, 0]))
-    # Light is not negative; its rate may be anything.
-    return plain, filtered(plain, depths, pixels, crossings, pixel, _NO_FLOOR if what == "rate" else 0.0)
+    return plain, filtered(plain, depths, pixels, crossings, pixel)

@@ -64,18 +64,10 @@ def run(
         )
     text = to_short_yaml(result.sensor())
     _write(target, text, page(result, text), overwrite)
-    judged = Table(title=f"{result.config.emulator} beside {Path(recording).name}", title_justify="left")
-    for head in ("", "recorded", "before", "fitted", "recorded, other half", "before", "fitted"):
-        judged.add_column(head)
-    for quantity, cells in rows(result):
-        judged.add_row(quantity, *cells)
-    console.print(judged, highlight=False)
-    found = Table(title="parameters", title_justify="left")
-    for head in ("key", "before", "fitted", ""):
-        found.add_column(head)
-    for row in parameters(result):
-        found.add_row(*row)
-    console.print(found, highlight=False)
+    heads = ("", "recorded", "before", "fitted", "recorded, other half", "before", "fitted")
+    judged = [(quantity, *cells) for quantity, cells in rows(result)]
+    _table(console, f"{result.config.emulator} beside {Path(recording).name}", heads, judged)
+    _table(console, "parameters", ("key", "before", "fitted", ""), parameters(result))
     for note in result.notes:
         say(console, note)
     for warning in result.warnings:
@@ -109,20 +101,20 @@ def _pixels(
         result = fit_pixels(recording, seed=options["seed"], progress=progress)
     text = to_short_yaml(result.sensor())
     _write(target, text, pixel_noise.page(result, text), overwrite)
-    judged = Table(title=f"noise of single pixels beside {Path(recording).name}, other half", title_justify="left")
-    for head in ("", "recorded", "fitted"):
-        judged.add_column(head)
-    for row in pixel_noise.rows(result):
-        judged.add_row(*row)
-    console.print(judged, highlight=False)
-    found = Table(title="parameters", title_justify="left")
-    for head in ("key", "fitted", ""):
-        found.add_column(head)
-    for row in pixel_noise.parameters(result):
-        found.add_row(*row)
-    console.print(found, highlight=False)
+    title = f"noise of single pixels beside {Path(recording).name}, other half"
+    _table(console, title, ("", "recorded", "fitted"), pixel_noise.rows(result))
+    _table(console, "parameters", ("key", "fitted", ""), pixel_noise.parameters(result))
     say(console, f"written: {target}, {target.with_suffix('.html')}")
     return 0
+
+
+def _table(console: Console, title: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    table = Table(title=title, title_justify="left")
+    for head in heads:
+        table.add_column(head)
+    for row in rows:
+        table.add_row(*row)
+    console.print(table, highlight=False)
 
 
 def _bar(console: Console, quiet: bool) -> Progress:

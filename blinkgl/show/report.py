@@ -24,7 +24,6 @@ def run(
             raise ConfigError("is said on the card", where=name, value=value, accepted="it with --card")
     console = plain_console()
     if card:
-        for path in write_card(folder, licence=licence, url=url):
-            say(console, f"written to {path}")
+        say(console, f"written to {write_card(folder, licence=licence, url=url)}")
     say(console, f"written to {write_report(folder, out, examples=examples)}")
     return 0

@@ -16,7 +16,6 @@ def make_on_device(
     height: int,
     width: int,
     seed: int = 0,
-    reconstruction: str = "linear",
     gl: GLContext | None = None,
 ) -> Emulator:
     """Return the emulator that a configuration asks for, on the device that it asks for.
@@ -26,7 +25,7 @@ def make_on_device(
     Raises EventDataError: ``events.device: cuda`` for what torch does not make, or without a card."""
     device = getattr(config, "device", "cpu")
     if device == "cpu" or (device == "auto" and (gl is None or gl.is_software)):
-        return make_emulator(config, height, width, seed, reconstruction)
+        return make_emulator(config, height, width, seed)
     from blinkgl.tensors.emulator import emulator_on
 
-    return emulator_on(emulator_of(config), config, height, width, seed, reconstruction)
+    return emulator_on(emulator_of(config), config, height, width, seed)

@@ -37,10 +37,10 @@ class _OnDevice(Emulator):
         self._batch: Batch = self._batch_kind(height, width, self.config, device=device, seed=seed)
         self.tensor_device = self._batch.device
 
-    def step(self, luminance: Any, t_ns: int, rows: Any = None, rate: Any = None) -> Events:
+    def step(self, luminance: Any, t_ns: int, rows: Any = None) -> Events:
         # Arrays take the checks of the emulator on the processor, which then calls _start or _advance.
         if not isinstance(luminance, Tensor):
-            return super().step(luminance, t_ns, rows, rate)
+            return super().step(luminance, t_ns, rows)
         # A frame that lies on the device: the batch checks it there.
         t_ns = self._checked_time(t_ns)
         events = self._made(luminance[None] if luminance.ndim == 2 else luminance, t_ns)
@@ -64,10 +64,10 @@ class _OnDevice(Emulator):
         light = np.ascontiguousarray(self.decoded(frame)).reshape(1, self.height, self.width)
         return self._made(torch.from_numpy(light).to(self._batch.device), t_ns)
 
-    def _start(self, frame: np.ndarray, t_ns: int, rate: Any) -> Events:
+    def _start(self, frame: np.ndarray, t_ns: int) -> Events:
         return self._of_array(frame, t_ns)
 
-    def _advance(self, frame: np.ndarray, t_ns: int, rate: Any) -> Events:
+    def _advance(self, frame: np.ndarray, t_ns: int) -> Events:
         return self._of_array(frame, t_ns)
 
     def decoded(self, frame: Any) -> Any:
@@ -131,30 +131,23 @@ KINDS: dict[Any, type[_OnDevice]] = {Esim: DeviceEsim, V2e: DeviceV2e}
 """The classes for a device, by those for the processor."""
 
 
-def emulator_on(kind: Any, config: Any, height: int, width: int, seed: int, reconstruction: str) -> Emulator:
+def emulator_on(kind: Any, config: Any, height: int, width: int, seed: int) -> Emulator:
     """The emulator ``kind`` on :data:`DEVICE`; for ``events.device: auto`` that on the processor where it does not go.
 
     Raises EventDataError, naming the key, where the card is asked for and cannot do it."""
-    problem = _problem(kind, config, reconstruction, DEVICE)
+    problem = _problem(kind, config, DEVICE)
     if problem is None:
         return KINDS[kind](height, width, config, seed, DEVICE)
     if config.device == "auto":
-        return kind(height, width, config, seed, reconstruction)
+        return kind(height, width, config, seed)
     raise problem
 
 
-def _problem(kind: Any, config: Any, reconstruction: str, device: Any) -> EventDataError | None:
+def _problem(kind: Any, config: Any, device: Any) -> EventDataError | None:
     """Why this device does not make these events; None: it does."""
     if kind not in KINDS:
         return EventDataError(
             "not made on tensors", where="events.device", value=config.device, accepted="cpu, or auto"
-        )
-    if reconstruction != "linear":
-        return EventDataError(
-            "events on a card follow straight lines between frames alone",
-            where="timeline.reconstruction",
-            value=reconstruction,
-            accepted="linear, or events.device: cpu",
         )
     if torch.device(device).type == "cuda" and not torch.cuda.is_available():
         return EventDataError(

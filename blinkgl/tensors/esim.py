@@ -133,9 +133,7 @@ class TensorEsim(Batch):
     def _draw(self, k: int, on: float, off: float) -> int:
         """Draw the thresholds of environment k, which stay fixed, and return the smallest."""
         c, here = self.config, self._rows(k)
-        drawn = draw_thresholds(
-            self.height, self.width, on, off, c.threshold_sigma, np.uint64(self.seeds[k]), c.threshold_correlation
-        )
+        drawn = draw_thresholds(self.height, self.width, on, off, c.threshold_sigma, np.uint64(self.seeds[k]))
         for tensor, values in zip((self._on, self._off), map(to_q25, drawn)):
             tensor[here] = torch.from_numpy(values.astype(np.int32)).to(self.device)
         return int(min(to_q25(one.min()) for one in drawn))

@@ -62,23 +62,15 @@ def decay(k: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(gentle, 1.0 - small * p, e), torch.where(gentle, p, (1.0 - e) / large)
 
 
-def _decay_of(k: float) -> tuple[float, float]:
-    """Return :func:`decay` of one number, rounded to float32 first."""
-    keep, ramp = model.decay(np.array(k, np.float32))  # type: ignore[arg-type]
-    return float(keep), float(ramp)
-
-
 class Numbers(NamedTuple):
     """Of a step: one number where all environments have the same, else a tensor.
 
-    step : (environments,) where it is a tensor.   kappa_32, since_32, second_keep, second_ramp : float32, columns
+    step : (environments,) where it is a tensor.   kappa_32, since_32 : float32, columns
     (environments, 1) likewise.   lengths_ns : of the intervals."""
 
     step: Step
     kappa_32: Any
     since_32: Any
-    second_keep: Any
-    second_ramp: Any
     lengths_ns: list[int]
 
 
@@ -153,8 +145,6 @@ class TensorV2e(Batch):
             "_intensity": (float32, pixels, memory),
             "_lag": (float32, pixels, self._has.low_pass),
             "_noise": (float32, pixels, self._noisy),
-            "_before_second": (float32, pixels, config.second_cutoff_hz > 0),
-            "_second_lag": (float32, pixels, config.second_cutoff_hz > 0),
             "_leak": (float32, pixels, self._leaky),
             "_release": (int64, pixels, self._has.refractory_ns > 0),
             "_since_ns": (int64, pixels, config.causes),
@@ -177,10 +167,7 @@ class TensorV2e(Batch):
         """Draws what is frozen in the sensor of environment k."""
         seed, size = np.uint64(self.seeds[k]), (self.height, self.width)
         theta = c.contrast_threshold, c.contrast_threshold_off or c.contrast_threshold
-        on, off = (
-            one.astype(np.float32)
-            for one in draw_thresholds(*size, *theta, c.threshold_sigma, seed, c.threshold_correlation)
-        )
+        on, off = (one.astype(np.float32) for one in draw_thresholds(*size, *theta, c.threshold_sigma, seed))
         leak = model.draw_leaks(*size, c, on, seed)
         drawn = {"_on": on, "_off": off, "_mean_leak": leak}
         if leak.size and leak.max() > 0:
@@ -248,11 +235,7 @@ class TensorV2e(Batch):
         kappa = given([2 * np.pi * config.cutoff_hz * dt * 1e-9 / 275.0 for dt in lengths])
         dt, since = given([dt * 1e-9 for dt in lengths]), given(since_1)
         step = Step(v.t0_ns, v.t0_ns - 1000 * v.base_us, v.dt_ns, dt, given(since_0), since, kappa, None, None)
-        second: list[Any] = [0.0, 0.0]
-        if config.second_cutoff_hz:
-            decays = [_decay_of(2 * np.pi * config.second_cutoff_hz * dt * 1e-9) for dt in lengths]
-            second = [column(given([pair[c] for pair in decays])) for c in range(2)]
-        return Numbers(step, column(kappa), column(since), second[0], second[1], lengths)
+        return Numbers(step, column(kappa), column(since), lengths)
 
     def _refuse_noise(self, interval: Interval) -> None:
         """Raises EventDataError: more shot noise in an interval than a step may emit."""
@@ -272,11 +255,6 @@ class TensorV2e(Batch):
         intensity = frames * self.config.full_scale
         x = lin_log(intensity)
         now = {"_intensity": intensity} if "_intensity" in self._state else {}
-        if self.config.second_cutoff_hz:
-            # Second low-pass: lag e^-k - dx (1 - e^-k)/k, the same k at all pixels.
-            lag = settled(before("_second_lag") * each.second_keep - (x - before("_before_second")) * each.second_ramp)
-            now["_before_second"], now["_second_lag"] = x, lag
-            x = x + lag
         now["_x"] = signal = x
         k = None
         if self._has.low_pass:

@@ -2,7 +2,7 @@
 
 In:    a configuration, small pictures of image velocity or luminance.
 Out:   frame times, int64 ns, increasing.
-Start: strategy.py (``make_timeline``); sampling.py has the arithmetic, budget.py measures the error,
+Start: strategy.py (``make_timeline``); sampling.py has the arithmetic,
 interpolate.py invents frames of a video.
 """
 

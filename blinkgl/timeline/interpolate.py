@@ -1,5 +1,5 @@
-"""Frames between frames, for sources too slow for their motion. Both generators pass the given frames on unchanged and
-add frames in between; they need one frame (cubic: two) of look-ahead and keep nothing else.
+"""Frames between frames, for sources too slow for their motion. The generator passes the given frames on unchanged and
+adds frames in between; it needs one frame of look-ahead and keeps nothing else.
 
 Input and output: iterators of (luminance, t_ns), luminance (H, W) float32 linear light.
 """
@@ -18,69 +18,6 @@ from blinkgl.srgb import to_srgb8
 
 Timed = tuple[np.ndarray, int]
 _EPS = np.float32(1e-3)
-
-
-def cubic(frames: Iterable[Timed], factor: int = 4) -> Iterator[Timed]:
-    """``factor - 1`` frames between any two by monotone piecewise-cubic interpolation of ln(1e-3 + I) over four
-    neighbours (Fritsch and Butland 1984: no over-shoot, hence no invented events; unequal
-    spacing is respected; linear at both ends)."""
-    # The last two nodes: (frame, log, t).
-    a = b = None
-    # Slope at a, secant from a to b; per ms: float32 products of slopes per ns would underflow.
-    slope_a = secant = None
-    for frame, t in frames:
-        c = (frame, np.log(frame + _EPS), t)
-        if b is not None:
-            # The secant behind b is known only now, and with it the slope at b.
-            following = (c[1] - b[1]) / np.float32((t - b[2]) * 1e-6)
-            if a is not None:
-                slope_b = np.empty_like(secant)
-                _monotone(secant.ravel(), following.ravel(), b[2] - a[2], t - b[2], slope_b.reshape(-1))
-                yield from _segment(a, b, slope_a, slope_b, factor)
-                slope_a = slope_b
-            else:
-                slope_a = following
-            yield b[0], b[2]
-            secant = following
-        a, b = b, c
-    if a is not None:
-        yield from _segment(a, b, slope_a, secant, factor)
-    if b is not None:
-        yield b[0], b[2]
-
-
-def _segment(a, b, slope_a: np.ndarray, slope_b: np.ndarray, factor: int) -> Iterator[Timed]:
-    h = (b[2] - a[2]) * 1e-6
-    for k in range(1, factor):
-        t = a[2] + (b[2] - a[2]) * k // factor
-        if t == a[2]:
-            continue
-        s = (t - a[2]) * 1e-6 / h
-        # Hermite's basis: values and slopes at both ends.
-        weights = map(
-            np.float32, ((1 + 2 * s) * (1 - s) ** 2, s * s * (3 - 2 * s), h * s * (1 - s) ** 2, h * s * s * (s - 1))
-        )
-        frame = np.empty_like(a[1])
-        _combine(a[1].ravel(), b[1].ravel(), slope_a.ravel(), slope_b.ravel(), *weights, frame.reshape(-1))
-        np.exp(frame, out=frame)
-        frame -= _EPS
-        yield np.maximum(frame, 0, out=frame), t
-
-
-@numba.njit(cache=True, nogil=True)
-def _monotone(d0, d1, h0, h1, out):
-    """Compute the slope at a node: the weighted harmonic mean of the secants beside it, 0 at an extremum."""
-    # Fritsch and Butland's weights for unequal spacings.
-    share = np.float32((2 * h1 + h0) / (3 * (h0 + h1)))
-    for i in range(len(out)):
-        product = d0[i] * d1[i]
-        out[i] = product / (share * d1[i] + (1 - share) * d0[i]) if product > 0 else np.float32(0)
-
-
-@numba.njit(cache=True, nogil=True)
-def _combine(a, b, m0, m1, w0, w1, w2, w3, out):
-    for i in range(len(out)):
-        out[i] = w0 * a[i] + w1 * b[i] + w2 * m0[i] + w3 * m1[i]
 
 
 @dataclass

@@ -3,7 +3,6 @@
 timeline = make_timeline(config.timeline, t0_ns, t1_ns, renderer,
 emulator_of(config.events).response(config.events)) for t_ns in timeline:
     luminance = ...                              # the frame at t_ns
-    timeline.observe(t_ns, luminance, rate)
 timeline.info()                                  # what was achieved, for the manifest
 """
 
@@ -12,11 +11,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any, Protocol
 
-import numpy as np
-
 from blinkgl.config.timeline import TimelineConfig
 from blinkgl.events.response import Response
-from blinkgl.timeline.budget import TimeError, contraharmonic_mean
 from blinkgl.timeline.reductions import Drawn, changes, speeds
 from blinkgl.timeline.sampling import bounded_times, uniform_times
 
@@ -34,9 +30,6 @@ class SmallPictures(Protocol):
 class Timeline:
     """Iterates over frame times, int64 ns, from t0 to t1, both included, strictly increasing;
     each is decided when asked for. ``stops_ns``: times of impacts, that adaptive kinds do not step over."""
-
-    looks_at_frames = False
-    """Whether :meth:`observe` looks at what it is given: frames may stay on the card where not."""
 
     def __init__(
         self,
@@ -70,9 +63,6 @@ class Timeline:
         self.looks += 1
         return max([self.pace(t_ns), *(other.pace(t_ns) for other in self.others)])
 
-    def observe(self, t_ns: int, luminance: np.ndarray, rate: np.ndarray | None = None) -> None:
-        """To be told every frame that was drawn, in order."""
-
     def info(self) -> dict[str, Any]:
         """What was achieved: plain values for the manifest."""
         return dict(self.seen)
@@ -104,60 +94,7 @@ class Brightness(Timeline):
         return seen.percentile / (c.max_fraction_of_threshold * self.response.threshold)
 
 
-class Budget(Timeline):
-    """The step whose estimated error is what was asked for: :mod:`blinkgl.timeline.budget`."""
-
-    looks_at_frames = True
-
-    def __init__(self, config: TimelineConfig, *others: Any):
-        super().__init__(config, *others)
-        in_px = config.max_time_error_px is not None
-        self.error = TimeError(
-            config.reconstruction,
-            config.max_time_error_px if in_px else config.max_time_error_us * 1e-6,
-            in_px,
-            config.percentile,
-        )
-        self._speeds: dict[int, np.ndarray] = {}
-
-    def __iter__(self) -> Iterator[int]:
-        last = None
-        for k, t in enumerate(super().__iter__()):
-            if last is not None and k % PROBE_EVERY == 0 and t - last >= 2 * self.config.min_step_us * 1000:
-                # This step in two halves: its own error is then measured, not extrapolated.
-                yield (last + (t - last) // 2)
-            yield t
-            last = t
-
-    def pace(self, t_ns: int) -> float:
-        speed = np.linalg.norm(self.pictures.velocity_of_movers(t_ns, self.config.sample_every).read(), axis=-1)
-        # The last eight speeds are kept: frames come a little after their pace was asked for.
-        self._speeds = {**dict(list(self._speeds.items())[-7:]), t_ns: speed}
-        return self.error.pace(contraharmonic_mean(speed))
-
-    def observe(self, t_ns: int, luminance: np.ndarray, rate: np.ndarray | None = None) -> None:
-        # The first frame is drawn before anything is asked about it.
-        if not self._speeds:
-            self.pace(t_ns)
-        # The frame may lie between two times whose speeds are known.
-        nearest = min(self._speeds, key=lambda t: abs(t - t_ns))
-        speed = self._speeds[nearest]
-        # Pixels at the centres of the small picture's, which covers the whole image even where that is no multiple of
-        # the stride or smaller than the stride.
-        rows, columns = (
-            ((np.arange(few) + 0.5) * many / few).astype(np.intp) for few, many in zip(speed.shape, luminance.shape)
-        )
-        pick = lambda a: a[np.ix_(rows, columns)]
-        small = pick(luminance)
-        slope = self.response.change(small, pick(rate)) if rate is not None else None
-        self.error.observe(t_ns, self.response.signal(small), slope, speed)
-
-    def info(self) -> dict[str, Any]:
-        return self.error.info()
-
-
-PROBE_EVERY = 12
-_KINDS = {"uniform": Uniform, "displacement": Displacement, "brightness": Brightness, "budget": Budget}
+_KINDS = {"uniform": Uniform, "displacement": Displacement, "brightness": Brightness}
 
 
 def make_timeline(

@@ -6,25 +6,18 @@ import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import numpy as np
-
 from blinkgl.timeline.strategy import Timeline
 
 
 class Shared(Timeline):
-    """One of several timelines, with the times of all: it observes its own camera's frames and says what was achieved
-    there."""
+    """One of several timelines, with the times of all; it says what was achieved for its own camera."""
 
     def __init__(self, own: Timeline, times: Iterator[int]):
         self.own, self._times = own, times
         super().__init__(own.config, own.t0_ns, own.t1_ns, own.pictures, own.response, own.stops_ns)
-        self.looks_at_frames = own.looks_at_frames
 
     def __iter__(self) -> Iterator[int]:
         return self._times
-
-    def observe(self, t_ns: int, luminance: np.ndarray, rate: np.ndarray | None = None) -> None:
-        self.own.observe(t_ns, luminance, rate)
 
     def info(self) -> dict[str, Any]:
         return self.own.info()

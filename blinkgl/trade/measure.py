@@ -128,7 +128,6 @@ class Measured:
         return {
             "name": s.name,
             "sampling": s.sampling,
-            "reconstruction": s.reconstruction,
             "antialiasing": s.antialiasing,
             "other": s.other,
             "size": s.size,

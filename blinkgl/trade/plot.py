@@ -15,7 +15,6 @@ COLOURS = {
     "ssaa2": "#3d6bd6",
     "ssaa4": "#2a9d8f",
 }
-MARKERS = {"linear": "o", "pchip": "^", "hermite": "s"}
 COSTS = {"wall_s": "seconds of computing per simulated second", "cpu_s": "processor seconds per simulated second"}
 PANELS = (
     ("voxel", "", 100.0, "%"),
@@ -74,7 +73,7 @@ def _panel(ax, rows: list[dict], cost: str, key: str, factor: float, unit: str, 
         ax.plot(
             r[cost],
             r[key] * factor,
-            MARKERS.get(r["reconstruction"], "D"),
+            "o",
             color=COLOURS.get(r["antialiasing"], "0.5"),
             ms=(11 if best else 7) * (1 if large else 0.7),
             mec="black" if best else "white",
@@ -105,12 +104,6 @@ def _legend(ax, rows: list[dict]) -> None:
     used = {r["antialiasing"] for r in rows}
     handles = [
         Line2D([], [], marker="o", ls="", color=c, label=f"anti-aliasing: {n}") for n, c in COLOURS.items() if n in used
-    ]
-    used = {r["reconstruction"] for r in rows}
-    handles += [
-        Line2D([], [], marker=m, ls="", color="0.4", label=f"between frames: {n}")
-        for n, m in MARKERS.items()
-        if n in used
     ]
     handles.append(
         Line2D(

@@ -13,7 +13,6 @@ from typing import Any
 from blinkgl.config.run import RunTemplate
 from blinkgl.config.scene import RandomSceneConfig
 from blinkgl.errors import ConfigError
-from blinkgl.events import emulator_of
 from blinkgl.gl import create_context
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.machine.bench import machine_line
@@ -69,20 +68,15 @@ def trade(
     cost: str = "wall_s",
     settings: tuple[Setting, ...] | None = None,
     say: Callable[[str], None] = lambda _: None,
-    look: Callable[[Bench], None] = lambda _: None,
 ) -> dict[str, Any]:
     """The whole measurement as plain data (what trade.json holds).
 
-    cost : "wall_s" or "cpu_s", what the front is drawn over. settings : instead of the designed set. look : called
-    with every bench before it measures.
+    cost : "wall_s" or "cpu_s", what the front is drawn over. settings : instead of the designed set.
     Raises BlinkGLError: what generating the sequence would raise, or no setting of that name."""
     started = time.perf_counter()
     options = options or (QUICK if quick else Options())
     base = template.sequence(options.sequence)
-    follows = emulator_of(base.events).noiseless(base.events).reconstructions
-    settings = tuple(
-        s for s in settings or design(quick, isinstance(base.scene, RandomSceneConfig)) if s.reconstruction in follows
-    )
+    settings = settings or design(quick, isinstance(base.scene, RandomSceneConfig))
     settings = chosen(settings, only or [], skip or [])
     rows: list[dict] = []
     sizes: dict[str, dict] = {}
@@ -92,7 +86,6 @@ def trade(
             if not mine:
                 continue
             bench = Bench(gl, template, options, size, say)
-            look(bench)
             say(
                 f"{bench.width}x{bench.height}, {bench.duration_s:g} s of sequence {options.sequence}, {len(mine)} "
                 "settings"

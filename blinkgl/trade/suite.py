@@ -14,7 +14,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -24,9 +24,7 @@ from blinkgl.config.run import RunTemplate, apply_overrides, load_run
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.io.atomic import atomic_file, output_errors
-from blinkgl.render.renderer import Renderer
-from blinkgl.srgb import to_srgb8
-from blinkgl.trade.measure import Bench, Density, Options
+from blinkgl.trade.measure import Density, Options
 from blinkgl.trade.pareto import excess, pareto_front
 from blinkgl.trade.run import chosen, convergence_line, plain, trade
 from blinkgl.trade.settings import Setting, suite_design
@@ -93,42 +91,28 @@ def run_suite(
     only: Sequence[str] = (),
     skip: Sequence[str] = (),
     overrides: Sequence[str] = (),
-    minutes: float | None = None,
     cost: str = "cpu_s",
-    resume: bool = False,
     say: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Measures every scene and writes suite.json, suite.csv and a picture of each scene to the folder ``out``, after
-    each scene anew; returns what the first holds.
+    """Measures every scene and writes suite.json and suite.csv to the folder ``out``, after each scene anew; returns
+    what the first holds.
 
-    minutes : for all of it, shared out evenly over what is left to do; scenes for which none is left are named as
-    missing. resume : scenes of a file that is there, measured with the same settings, are kept.
     A scene that cannot be measured has a line that says why. Raises BlinkGLError when none can."""
     out = Path(out)
     settings = chosen(settings or suite_design(), list(only), list(skip))
     asked = {"settings": [s.name for s in settings], "overrides": list(overrides), "cost": cost}
-    done: dict[str, dict] = _kept(out / FILE, asked) if resume else {}
+    done: dict[str, dict] = {}
     began, failed = time.perf_counter(), []
-    for k, scene in enumerate(scenes):
-        if scene.name in done and "settings" in done[scene.name]:
-            continue
-        mine = options
-        if minutes is not None:
-            left = (60 * minutes - (time.perf_counter() - began)) / (len(scenes) - k)
-            if left <= 0:
-                say(f"{scene.name}: not measured, the time is up")
-                continue
-            mine = replace(options, rounds_s=0.4 * left, reference_s=0.6 * left)
+    for scene in scenes:
         say(f"{scene.name}: {scene.what}")
         try:
-            done[scene.name] = _measured(scene, mine, settings, overrides, cost, out, say)
+            done[scene.name] = _measured(scene, options, settings, overrides, cost, say)
         except BlinkGLError as error:
             failed.append(error)
             done[scene.name] = {"what": scene.what, "error": str(error)}
             say(f"{scene.name}: not measured: {error}")
-        result = _whole(done, scenes, asked, time.perf_counter() - began)
-        write(result, out)
-    if failed and not any("settings" in scene for scene in done.values()):
+        write(_whole(done, scenes, asked, time.perf_counter() - began), out)
+    if len(failed) == len(done):
         raise failed[0]
     return _whole(done, scenes, asked, time.perf_counter() - began)
 
@@ -139,22 +123,17 @@ def _measured(
     settings: tuple[Setting, ...],
     overrides: Sequence[str],
     cost: str,
-    out: Path,
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    def look(bench: Bench) -> None:
-        with Renderer(bench.gl, bench.scene, bench.base.render) as renderer:
-            _picture(renderer.colour((bench.t0_ns + bench.t1_ns) // 2).read(), out / f"{scene.name}.png")
-
     # What generates the scene usually is no business of the measurement: labels, previews, read-outs are left out.
     template = load_run(scene.path, list(overrides))
-    result = trade(template, options=options, cost=cost, settings=settings, say=say, look=look)
+    result = trade(template, options=options, cost=cost, settings=settings, say=say)
     size = result["sizes"]["full"]
     rows = result["settings"]
     best = {r["name"] for r in pareto_front([r for r in rows if r["trusted"]], cost, "voxel")}
     for row in rows:
         row["on_front"] = row["name"] in best
-        for key in ("sampling", "reconstruction", "antialiasing", "other", "size", "overrides", "width", "height"):
+        for key in ("sampling", "antialiasing", "other", "size", "overrides", "width", "height"):
             row.pop(key, None)
     return {
         "what": scene.what,
@@ -167,37 +146,6 @@ def _measured(
         "settings": rows,
         "front": [r["name"] for r in sorted(rows, key=lambda r: r[cost]) if r["on_front"]],
     }
-
-
-def _picture(colour: Any, path: Path) -> None:
-    import cv2
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    done, data = cv2.imencode(".png", to_srgb8(colour)[..., ::-1])
-    assert done
-    with atomic_file(path) as file, output_errors(path):
-        file.write_bytes(data.tobytes())
-
-
-def _kept(path: Path, asked: dict[str, Any]) -> dict[str, dict]:
-    """Scenes of a file of the same question; none where there is no such file. Raises ConfigError where it is of
-    another question, or no such file at all."""
-    if not path.exists():
-        return {}
-    try:
-        old = json.loads(path.read_text(encoding="utf-8"))
-        same = old["asked"] == asked
-        scenes = {str(name): dict(scene) for name, scene in old["scenes"].items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        raise ConfigError("not a file of blinkgl trade --suite", where=str(path)) from None
-    if not same:
-        raise ConfigError(
-            "was measured with other settings",
-            where=str(path),
-            value="other settings",
-            accepted="the same --only, --skip, --set and --cost, or another --out",
-        )
-    return scenes
 
 
 def _whole(done: dict[str, dict], scenes: Sequence[Trial], asked: dict[str, Any], seconds: float) -> dict[str, Any]:

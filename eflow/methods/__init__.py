@@ -2,7 +2,7 @@
 
 In:    the events of two windows.
 Out:   flow.
-Start: table.py; contrast.py is contrast maximisation, planes.py plane fitting.
+Start: table.py; contrast.py is contrast maximisation.
 """
 
 from __future__ import annotations

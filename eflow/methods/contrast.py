@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage, optimize, sparse
+from scipy import ndimage, optimize
 
 from blinkgl.errors import EventDataError
 from eflow.data.window import Window
@@ -35,11 +35,6 @@ FARTHEST = 0.4
 MOST_GROWTH = 0.7
 """Largest change of the flow per px over both windows. A field that grows by 2 carries all events of the last time into
 one point, the sharpest image that there is and no motion (event collapse)."""
-TILES = ((4, 3), (8, 6), (16, 12))
-"""Nodes of the tiled field across and down, coarse to fine."""
-SMOOTHNESS = 0.03
-"""Price of the mean squared difference (px², nodes 16 px apart) of neighbouring nodes' flow, less that of the field for
-the whole image: what turns or grows evenly is free."""
 
 
 @dataclass
@@ -75,10 +70,10 @@ class _Cloud:
 class _Field:
     """A flow field that is linear in its parameters.
 
-    basis : two (N, k) matrices, dense or sparse: flow of N points in px over the span is basis[0] @ p, basis[1] @ p.
-    limits : (k,) largest absolute value of each parameter, None: any."""
+    basis : two (N, k) matrices: flow of N points in px over the span is basis[0] @ p, basis[1] @ p.
+    limits : (k,) largest absolute value of each parameter."""
 
-    def __init__(self, basis: tuple, limits: np.ndarray | None = None):
+    def __init__(self, basis: tuple, limits: np.ndarray):
         self.basis, self.limits = basis, limits
 
     def at(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -120,23 +115,6 @@ def rotation_field(x: np.ndarray, y: np.ndarray, height: int, width: int, focal:
     )
 
 
-def tile_field(x: np.ndarray, y: np.ndarray, height: int, width: int, nodes: tuple[int, int]) -> _Field:
-    """Flow at nodes over the image, bilinear between them. Parameters: (rows, columns, 2), flattened."""
-    columns, rows = nodes
-    at = np.clip(x / (width - 1), 0, 1) * (columns - 1), np.clip(y / (height - 1), 0, 1) * (rows - 1)
-    c, r = np.minimum(at[0].astype(int), columns - 2), np.minimum(at[1].astype(int), rows - 2)
-    a, b = at[0] - c, at[1] - r
-    corner = lambda dr, dc: (r + dr) * columns + c + dc
-    index = np.stack([corner(0, 0), corner(0, 1), corner(1, 0), corner(1, 1)], axis=1)
-    weight = np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b], axis=1)
-    n = len(x)
-    ends = np.arange(0, 4 * n + 1, 4)
-    matrix = lambda component: sparse.csr_matrix(
-        (weight.ravel(), (2 * index + component).ravel(), ends), shape=(n, 2 * rows * columns)
-    )
-    return _Field((matrix(0), matrix(1)))
-
-
 def sharpness(cloud: _Cloud, flow: tuple[np.ndarray, np.ndarray], blur: float) -> tuple[float, np.ndarray]:
     """Mean squared gradient of the images of warped events over :data:`TIMES`, and its (N, 2) derivative by each
     event's flow. flow : px over the span."""
@@ -168,26 +146,17 @@ def _climb(
     start: np.ndarray,
     blur: float,
     steps: int,
-    price: sparse.spmatrix | None = None,
-    free: np.ndarray | None = None,
 ) -> tuple[np.ndarray, float]:
-    """(parameters, relative sharpness less the price) at the top reached from ``start``.
-    price : quadratic form of what the parameters are beyond ``free``."""
+    """(parameters, relative sharpness) at the top reached from ``start``."""
     none = (np.zeros_like(cloud.x),) * 2
     scale = sharpness(cloud, none, blur)[0] or 1.0
 
     def loss(p: np.ndarray) -> tuple[float, np.ndarray]:
         value, slope = sharpness(cloud, field.at(p), blur)
-        value, slope = -value / scale, -field.pulled(slope) / scale
-        if price is not None:
-            beyond = price @ (p - free)
-            value, slope = value + (p - free) @ beyond, slope + 2 * beyond
-        return value, slope
+        return -value / scale, -field.pulled(slope) / scale
 
-    bounds = None
-    if field.limits is not None:
-        bounds = list(zip(-field.limits, field.limits, strict=True))
-        start = np.clip(start, -field.limits, field.limits)
+    bounds = list(zip(-field.limits, field.limits, strict=True))
+    start = np.clip(start, -field.limits, field.limits)
     found = optimize.minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": steps})
     return found.x, -float(found.fun)
 
@@ -213,25 +182,8 @@ def _best_translation(cloud: _Cloud, keep: np.ndarray, most: float) -> np.ndarra
     return best
 
 
-def _smooth(nodes: tuple[int, int]) -> sparse.spmatrix:
-    """Quadratic form of the squared differences between neighbouring nodes, their mean."""
-    columns, rows = nodes
-    number = np.arange(rows * columns).reshape(rows, columns)
-    pairs = np.concatenate(
-        [
-            np.stack([number[:, 1:].ravel(), number[:, :-1].ravel()], 1),
-            np.stack([number[1:].ravel(), number[:-1].ravel()], 1),
-        ]
-    )
-    n, rows_of = len(pairs), np.arange(len(pairs))
-    difference = sparse.csr_matrix(
-        (np.tile([1.0, -1.0], n), (np.repeat(rows_of, 2), pairs.ravel())), shape=(n, rows * columns)
-    )
-    return sparse.kron(difference.T @ difference, sparse.identity(2), format="csr") / n
-
-
 class ContrastMaximisation:
-    """field : "translation" | "affine" | "rotation" | "tiles".   focal : px, for rotation.
+    """field : "translation" | "affine" | "rotation".   focal : px, for rotation.
 
     The field stands still over both windows, so a motion that changes within them is averaged."""
 
@@ -252,8 +204,6 @@ class ContrastMaximisation:
         grid = np.mgrid[:height, :width].reshape(2, -1).astype(np.float64)
         rows, columns = grid
         flow = np.stack(make(columns, rows).at(p), axis=1)
-        if self.field == "tiles":
-            flow = self._tiled(cloud, flow.reshape(height, width, 2))
         return (flow.reshape(height, width, 2) / span).astype(np.float32)
 
     def _family(self, height: int, width: int):
@@ -294,23 +244,3 @@ class ContrastMaximisation:
         for blur in BLURS_PX:
             p, value = _climb(cloud, field, p, blur, 30)
         return p, value
-
-    @staticmethod
-    def _tiled(cloud: _Cloud, flow: np.ndarray) -> np.ndarray:
-        """(H, W, 2) px over the span: refined node by node from a field for the whole image."""
-        height, width = cloud.height, cloud.width
-        rows, columns = np.mgrid[:height, :width].reshape(2, -1).astype(np.float64)
-        whole = flow
-        for nodes, blur in zip(TILES, BLURS_PX, strict=True):
-            field = tile_field(cloud.x, cloud.y, height, width, nodes)
-            at = np.linspace(0, height - 1, nodes[1]), np.linspace(0, width - 1, nodes[0])
-            places = np.meshgrid(*at, indexing="ij")
-            start, free = (
-                np.stack([ndimage.map_coordinates(f[..., k], places, order=1) for k in (0, 1)], axis=-1).ravel()
-                for f in (flow, whole)
-            )
-            spacing = width / (nodes[0] - 1)
-            price = SMOOTHNESS * (16 / spacing) ** 2 * _smooth(nodes)
-            p, _ = _climb(cloud, field, start, blur, 40, price, free)
-            flow = np.stack(tile_field(columns, rows, height, width, nodes).at(p), axis=1).reshape(height, width, 2)
-        return flow

@@ -32,18 +32,10 @@ def _contrast(field: str):
     return make
 
 
-def _planes(focal: float | None) -> Method:
-    from eflow.methods.planes import PlaneFitting
-
-    return PlaneFitting()
-
-
 METHODS = {
     "contrast-translation": _contrast("translation"),
     "contrast-affine": _contrast("affine"),
     "contrast-rotation": _contrast("rotation"),
-    "contrast-tiles": _contrast("tiles"),
-    "planes": _planes,
 }
 """name -> what makes it, given the focal length in px (only rotation needs it)."""
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from blinkgl.config.base import Config, tag_of
 from blinkgl.config.problems import validate
+from blinkgl.errors import ConfigError
 from eflow.config import ModelConfig
 from eflow.models.contract import FlowModel, FlowPrediction, parameters_of
 from eflow.models.eflowformer import EFlowFormer
@@ -25,7 +26,29 @@ NETWORKS: dict[str, type[FlowModel]] = {
 """By the key ``name`` of their configuration; nothing else lists networks."""
 SIZES = ("base", "small", "tiny")
 
-__all__ = ["NETWORKS", "SIZES", "FlowModel", "FlowPrediction", "build_model", "model_config", "parameters_of"]
+PRESETS: dict[str, dict] = {
+    name if size == "base" else f"{name}-{size}": {"name": name, "size": size} for name in NETWORKS for size in SIZES
+} | {"eflowformer-twins": {"name": "eflowformer", "layers": 2, "attention": "twins"}}
+"""Names that ``eflow train --model`` takes: every network in every size."""
+
+__all__ = [
+    "NETWORKS",
+    "PRESETS",
+    "SIZES",
+    "FlowModel",
+    "FlowPrediction",
+    "build_model",
+    "model_config",
+    "parameters_of",
+    "preset",
+]
+
+
+def preset(name: str) -> dict:
+    """Plain data of a model by its name in :data:`PRESETS`. Raises ConfigError."""
+    if name not in PRESETS:
+        raise ConfigError("unknown model", where="--model", value=name, accepted="one of " + ", ".join(PRESETS))
+    return PRESETS[name]
 
 
 def build_model(config: Any) -> FlowModel:

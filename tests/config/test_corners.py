@@ -37,29 +37,7 @@ MIXED = [
         {"scene": {"objects": {"size": [1, {"uniform": [2, 40]}]}, "sky": {"size": {"uniform": [50, 120]}}}},
         "scene.sky.size: must be at least 110",
     ),
-    (
-        {
-            "timeline": {"choice": [{"kind": "uniform"}, {"reconstruction": "pchip"}]},
-            "events": {"choice": [{"emulator": "v2e"}, {"emulator": "esim"}]},
-        },
-        "timeline.reconstruction: v2e follows straight lines alone",
-    ),
-    (
-        {"timeline": {"reconstruction": {"choice": ["linear", "pchip"]}}, "events": {"weighted": {"x": 1}}},
-        "events: not a table",
-    ),
-    (
-        {
-            "timeline": {"reconstruction": {"choice": ["linear", "pchip"]}},
-            "events": {
-                "shares": [
-                    {"share": 0.5, "value": {"emulator": "esim"}},
-                    {"share": 0.5, "value": {"emulator": "voltmeter"}},
-                ]
-            },
-        },
-        "timeline.reconstruction: voltmeter follows",
-    ),
+    ({"events": {"weighted": {"x": 1}}}, "events: not a table"),
     (
         {
             "events": {
@@ -266,7 +244,6 @@ def _random_recipe(rng: random.Random) -> dict:
         "timeline": {
             "min_step_us": some(10, 3000),
             "max_step_us": some(500, 20000),
-            "reconstruction": rng.choice(["linear", {"choice": ["linear", "pchip"]}]),
         },
         "camera": {"width": some(8, 700, True), "near": some(0.01, 4), "fov": some(20, 150)},
         "events": rng.choice(
@@ -311,7 +288,7 @@ def test_what_is_accepted_is_never_refused_when_it_is_drawn():
         accepted += 1
         for index in range(30):
             template.sequence(index)
-    assert accepted > 10 and refused_by_a_mixture < 100, (accepted, refused_by_a_mixture)
+    assert accepted >= 10 and refused_by_a_mixture < 100, (accepted, refused_by_a_mixture)
 
 
 # --- what was looked at before ----------------------------------------------------------------------------------------

@@ -72,7 +72,7 @@ SEEDS = {
         {"scene": {"kind": "file", "path": "x"}},
         {"frames": {}},
         {"readout": {"events_per_second": 1e6}},
-        *({"timeline": {"kind": k}} for k in ("uniform", "brightness", "budget")),
+        *({"timeline": {"kind": k}} for k in ("uniform", "brightness")),
         *({"events": {"emulator": e}} for e in ("v2e", "voltmeter")),
     ],
     TrainConfig: [
@@ -181,16 +181,13 @@ def test_every_error_of_every_key_is_plain(monkeypatch):
             "timeline: {fps: 100}",
             (
                 "timeline.fps: unknown key; expected one of: first_look, kind, max_px, max_px_peak, max_step_us, "
-                "min_step_us, percentile, reconstruction, sample_every; it is a key of kind: uniform"
+                "min_step_us, percentile, sample_every; it is a key of kind: uniform"
             ),
         ),
         ("events: {k1: 3}", "events.k1: unknown key; expected one of: causes, contrast_threshold"),
         (
             "timeline: {kind: regular}",
-            (
-                "timeline.kind: unknown choice (got 'regular'); expected one of 'uniform', 'displacement', "
-                "'brightness', 'budget'"
-            ),
+            ("timeline.kind: unknown choice (got 'regular'); expected one of 'uniform', 'displacement', 'brightness'"),
         ),
         (
             "events: {emulator: [esim]}",

@@ -42,29 +42,16 @@ def test_what_is_said_wins(tmp_path):
     assert config.render.antialiasing == preset["render"]["antialiasing"]
 
 
-def test_emulators_that_follow_straight_lines(tmp_path):
-    assert sequence(tmp_path, {"quality": "accurate"}).timeline.reconstruction != "linear", "or this test shows nothing"
-    config = sequence(tmp_path, {"quality": "accurate", "events": {"emulator": "v2e"}})
-    assert (
-        config.timeline.reconstruction == "linear"
-        and config.render.antialiasing == load_quality("accurate")["render"]["antialiasing"]
-    )
-
-
 def test_auto_is_the_default_with_a_first_look(tmp_path):
     config, usual = sequence(tmp_path, {"quality": "auto"}), sequence(tmp_path, {})
     assert config.timeline.first_look and not usual.timeline.first_look
     assert config.timeline.model_copy(update={"first_look": False}) == usual.timeline and config.render == usual.render
     assert not sequence(tmp_path, {"quality": "auto", "timeline": {"first_look": False}}).timeline.first_look
     assert sequence(tmp_path, {"quality": "auto"}, "timeline={kind: uniform, fps: 77}").timeline.fps == 77
-    curved = sequence(tmp_path, {"quality": "auto", "timeline": {"reconstruction": "pchip"}}).timeline
-    assert (curved.reconstruction, curved.first_look, curved.max_px) == ("pchip", False, usual.timeline.max_px)
-    with pytest.raises(ConfigError, match="timeline.first_look: a first look judges straight lines"):
-        sequence(tmp_path, {"timeline": {"reconstruction": "pchip", "first_look": True}})
 
 
 def test_null_leaves_every_key_its_own_default(tmp_path):
-    assert fill_quality(None, "uniform", None, None) == {} == fill_quality("best", None, None, None)
+    assert fill_quality(None, "uniform") == {} == fill_quality("best", None)
     config = sequence(tmp_path, {"quality": None})
     assert (config.timeline, config.render) == (DisplacementTimeline(), RenderConfig())
     (tmp_path / "again.yaml").write_text(config_yaml(config, 0))

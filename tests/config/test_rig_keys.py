@@ -88,10 +88,6 @@ def test_places():
         ("sensors: [{name: rig.yaml}]", "sensors.0.name: not a name for folders"),
         ("sensors: [{name: a, timeline: {kind: uniform}}]", "sensors.0.timeline: the sensors of a rig share one clock"),
         ("sensors: [{name: a, time: {start: 3}}]", "sensors.0.time: the sensors of a rig share one clock"),
-        (
-            "{timeline: {reconstruction: pchip}, sensors: [{name: a}, {name: b, events: {emulator: v2e}}]}",
-            "timeline.reconstruction: v2e follows straight lines alone (of sensor 'b')",
-        ),
         ("sensors: [{name: a, images: {times: [7]}}]", "sensors.0.images.times: "),
         ("sensors: [{name: a, images: {rate: 10, times: [0.7]}}]", "sensors.0.images.rate: "),
         ("sensors: [{name: a, camera: {width: 0}}]", "sensors.0.camera.width: too small"),

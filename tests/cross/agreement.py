@@ -248,24 +248,18 @@ def of_explanation(told: Explanation, config: SequenceConfig, report: SequenceRe
     )
     found.same("emulator", explain=passes["event kernel"].why.split(";")[0], manifest=manifest["emulator"])
     found.same("timeline", explain=events.why.split()[1].strip(","), manifest=manifest["timeline"]["kind"])
-    found.same(
-        "rates",
-        explain="event frames with rates" in passes,
-        manifest=manifest["timeline"]["reconstruction"] == "hermite",
-    )
     if config.timeline.kind == "uniform":
         found.same("event frames", explain=told.frames, manifest=manifest["frames"])
     else:
-        # An estimate, from the pace at a few moments of a clip of 40 ms; of a budget a prior until it has measured.
+        # An estimate, from the pace at a few moments of a clip of 40 ms.
         low, high = sorted((told.frames, manifest["frames"]))
         found.expect(
-            high <= 10 + (14 if config.timeline.kind == "budget" else 6) * low,
+            high <= 10 + 6 * low,
             f"event frames: explain {told.frames}, made {manifest['frames']}",
         )
     for what, off in (
         ("anisotropic filtering", config.render.anisotropy == 1),
         ("anti-aliasing of event frames", config.render.antialiasing == "none"),
-        ("rates of change in the event frames", config.timeline.reconstruction != "hermite"),
     ):
         found.expect((what in out) == off, f"explain: {what}")
     return found

@@ -129,7 +129,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "explicit, alive": {"scene": _ALIVE},
         "frames, motion": _frames(interpolate="motion", max_px=0.5),
         "frames, linear": _frames(interpolate="linear", flow="flow_flo", gamma="linear"),
-        "frames, cubic": _frames(interpolate="cubic", flow=None, first=1, count=4),
+        "frames, part": _frames(interpolate="linear", flow=None, first=1, count=4),
     },
     "emulator": {
         "esim": {"events": {"emulator": "esim"}},
@@ -157,13 +157,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "displacement": {"timeline": {"kind": "displacement", "max_px": 1}},
         "displacement, after a look": {"timeline": {"kind": "displacement", "max_px": 1, "first_look": True}},
         "brightness": {"timeline": {"kind": "brightness"}},
-        "budget": {"timeline": {"kind": "budget", "max_time_error_us": 300}},
         "unsaid": NOTHING,
-    },
-    "between frames": {
-        "unsaid": NOTHING,
-        "pchip": {"timeline": {"reconstruction": "pchip"}},
-        "hermite": {"timeline": {"reconstruction": "hermite"}},
     },
     "quality": {"unsaid": NOTHING, **{name: {"quality": name} for name in (*QUALITIES, "auto")}},
     "sensor": {
@@ -306,20 +300,7 @@ RUN_LEVEL = {
 """Top-level keys that are no feature of a sequence."""
 
 Kind = tuple[str, str]
-_STRAIGHT_ONLY = [("emulator", kind) for kind in FEATURES["emulator"] if not kind.startswith("esim")]
 REFUSED: dict[tuple[Kind, Kind], str] = {
-    **{
-        ((("between frames", curve)), emulator): "timeline.reconstruction: "
-        + emulator[1].split(",")[0]
-        + " follows straight lines alone"
-        for curve in ("pchip", "hermite")
-        for emulator in _STRAIGHT_ONLY
-    },
-    **{
-        (("timeline", "displacement, after a look"), ("between frames", curve)): "timeline.first_look: a first look "
-        "judges straight lines"
-        for curve in ("pchip", "hermite")
-    },
     **{
         (("source", source), ("frame camera", camera)): "images: recorded frames are images already"
         for source in FEATURES["source"]

@@ -133,14 +133,13 @@ EXPLAINED = {
 }
 
 
-@pytest.mark.parametrize("reconstruction, name", [("linear", "event frames"), ("hermite", "event frames with rates")])
-def test_how_often_each_pass_is_drawn(tmp_path, reconstruction, name):
+def test_how_often_each_pass_is_drawn(tmp_path):
     path = tmp_path / "run.yaml"
-    tree = {**EXPLAINED, "timeline": {"kind": "uniform", "fps": 100, "reconstruction": reconstruction}}
+    tree = {**EXPLAINED, "timeline": {"kind": "uniform", "fps": 100}}
     path.write_text(yaml.safe_dump({**tree, "render": {"image_antialiasing": "none", "antialiasing": "none"}}))
     told = explain(load_run(path))
     assert told.frames == 26 and {p.name: p.count for p in told.passes} == {
-        name: 26,
+        "event frames": 26,
         "colour": 5,
         "labels": 4,
         "preview": int(0.25 * 30) + 1,

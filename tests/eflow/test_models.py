@@ -2,19 +2,32 @@
 
 import math
 
-import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
 
+from torch.utils.flop_counter import FlopCounterMode  # noqa: E402
+
 from blinkgl.errors import BlinkGLError  # noqa: E402
 from eflow.config import LossConfig  # noqa: E402
-from eflow.counting import count  # noqa: E402
 from eflow.infer import predict  # noqa: E402
 from eflow.losses import pixel_error, sequence_loss  # noqa: E402
 from eflow.models import NETWORKS, SIZES, FlowPrediction, build_model, model_config, parameters_of  # noqa: E402
 from eflow.models.unets import Consensus  # noqa: E402
-from eflow.train import learning_rate  # noqa: E402
+
+
+def count(config) -> tuple[int, float]:
+    """(parameters, GMACs of one forward pass at 640x480): convolutions and matrix products, attention's included. The
+    paper's arithmetic: the mask head in every iteration, nothing hoisted."""
+    with torch.device("meta"):
+        model = build_model(config).eval()
+        batch = {k: torch.zeros(1, model.representation.channels, 480, 640) for k in ("old", "new")}
+    if hasattr(model, "plain"):
+        model.plain = True
+    counter = FlopCounterMode(display=False)
+    with torch.inference_mode(), counter:
+        model(batch)
+    return parameters_of(model), counter.get_total_flops() / 2e9
 
 
 def build(seed: int = 0, **tree):
@@ -276,57 +289,6 @@ def test_iterations_that_nothing_was_trained_for_come_to_rest():
     assert [flows[0.5, n] for n in (3, 12, 60)] == pytest.approx([3, 4, 4], abs=0.01)
 
 
-def moves(n: int, seed: int) -> tuple[dict, torch.Tensor]:
-    """Tensors in which a constant flow is written down, in noise, and that flow: soon learnt."""
-    generator = torch.Generator().manual_seed(seed)
-    flow = torch.empty(n, 2, 1, 1).uniform_(-8, 8, generator=generator).expand(n, 2, 32, 32)
-    noise = 0.1 * torch.randn(n, 3, 32, 32, generator=generator)
-    new = torch.cat([flow / 8, torch.ones(n, 1, 32, 32)], 1) + noise
-    return {"old": torch.randn(n, 3, 32, 32, generator=generator), "new": new}, flow
-
-
-def errors_after(burn_in: int, steps: int, iterations: tuple[int, ...]) -> list[float]:
-    """End-point errors of a network with three trained iterations, without damping, after so many iterations."""
-    model = build(
-        name="eraft",
-        trunk=[16, 24, 32],
-        features=32,
-        hidden=24,
-        levels=1,
-        radius=2,
-        input={"bins": 3},
-        train_iterations=3,
-        iterations=12,
-        burn_in=burn_in,
-        damping=1.0,
-    ).train()
-    optimizer = torch.optim.AdamW(model.parameters(), 1e-3)
-    valid = torch.ones(4, 32, 32, dtype=torch.bool)
-    for step in range(steps):
-        for group in optimizer.param_groups:
-            group["lr"] = learning_rate(step / steps, 2e-3, 0.05, 0.4)
-        batch, flow = moves(4, step)
-        optimizer.zero_grad()
-        sequence_loss(model(batch), flow, valid).backward()
-        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-        optimizer.step()
-    batch, flow = moves(16, 10_000)
-    found = []
-    for count_ in iterations:
-        model.config = model.config.model_copy(update={"iterations": count_})
-        found.append(float((predict(model, batch).flow - flow).norm(dim=1).mean()))
-    return found
-
-
-@pytest.mark.slow
-def test_more_iterations_than_trained_are_not_worse():
-    """Burnt in, 6 and 12 iterations are as good as the three that gradients passed through; without, 12 are far off."""
-    three, six, twelve = errors_after(9, 500, (3, 6, 12))
-    assert three < 3 and six < 1.1 * three and twelve < 1.2 * three, (three, six, twelve)
-    three, twelve = errors_after(0, 150, (3, 12))
-    assert twelve > 2 * three, (three, twelve)
-
-
 def test_burn_in_draws_from_the_saved_generator_and_half_of_the_steps_have_none():
     model = build(name="eraft", size="tiny", trunk=[8, 8, 8], features=16, hidden=16, iterations=5, train_iterations=1)
     model.train()
@@ -380,8 +342,6 @@ def test_loss_by_hand():
     assert loss.item() == pytest.approx(3 * errors[0] + 0.8 * errors[1])
     scales = FlowPrediction(flows, kind="scales")
     assert sequence_loss(scales, target, valid).item() == pytest.approx(sum(errors) / 3)
-    halved = sequence_loss(scales, target, valid, scale_gamma=0.5)
-    assert halved.item() == pytest.approx((0.25 * errors[0] + 0.5 * errors[1]) / 1.75)
     doubled = sequence_loss(FlowPrediction(flows), target.repeat(2, 1, 1, 1), torch.cat([valid, valid & False]))
     assert doubled.item() == pytest.approx(0.64 * errors[0] + 0.8 * errors[1])  # more invalid pixels do not dilute it
     assert sequence_loss(FlowPrediction(flows), target, valid & False).item() == 0
@@ -391,9 +351,7 @@ def test_loss_by_hand():
     "terms, expected",
     [
         ({"l1": 0, "epe": 2}, 2 * (5 + 0) / 2),
-        ({"l1": 0, "relative": 1, "knee": 3}, (5 / (5 + 3) + 0) / 2),
-        ({"l1": 0, "log": 1, "knee": 2}, 2 * np.log(1 + 5 / 2) / 2),
-        ({"l1": 1, "relative": 4, "knee": 5}, (7 + 4 * 5 / 10) / 2),
+        ({"l1": 1, "epe": 4}, (7 + 4 * 5) / 2),
     ],
 )
 def test_terms_of_the_loss_by_hand(terms, expected):

@@ -5,7 +5,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from eflow.ops import attention, correlation  # noqa: E402
+from eflow.ops import attention  # noqa: E402
 from eflow.ops.correlation import (  # noqa: E402
     DenseCorrelation,
     OnDemandCorrelation,
@@ -70,19 +70,6 @@ def test_diverging_coordinates_do_not_read_out_of_bounds(maps):
         assert dense.lookup(torch.full((2, 2, H, W), float("nan"))).isnan().all()
 
 
-def test_matching_finds_a_shift():
-    """Features of the target are the source's, shifted by (3, -2), and loud: the softmax is sharp."""
-    torch.manual_seed(2)
-    f1 = 8 * torch.randn(1, 64, 16, 24)
-    f2 = torch.roll(f1, (-2, 3), (2, 3))
-    dense = DenseCorrelation(f1, f2)
-    inner = (slice(None), slice(None), slice(3, -3), slice(4, -4))
-    expected = torch.tensor([3.0, -2.0])[None, :, None, None]
-    for correlator in (dense, OnDemandCorrelation(f1, f2)):
-        assert (correlator.match()[inner] - expected).abs().max() < 1e-3
-        assert (correlator.match_backward()[inner] + expected).abs().max() < 1e-3
-
-
 def test_matching_dense_equals_on_demand_equals_the_definition(maps):
     h, w = H, W
     dense, on_demand = DenseCorrelation(*maps), OnDemandCorrelation(*maps)
@@ -102,15 +89,6 @@ def test_convex_upsampling_equals_its_twin_and_keeps_constants():
     for upsample in (convex_upsample, convex_upsample_slow):
         assert torch.allclose(upsample(constant, mask[:1]), torch.tensor(24.0))  # edges and corners too
     assert torch.allclose(bilinear_upsample(constant), torch.tensor(24.0))
-
-
-def test_convex_upsampling_places_sub_pixels():
-    """A mask that picks the centre neighbour repeats each value over its 8x8 block."""
-    flow = torch.arange(12.0).view(1, 1, 3, 4).repeat(1, 2, 1, 1)
-    mask = torch.full((1, 9, 64, 3, 4), -100.0)
-    mask[:, 4] = 100
-    out = convex_upsample(flow, mask.view(1, 576, 3, 4))
-    assert torch.equal(out[0, 0], 8 * flow[0, 0].repeat_interleave(8, 0).repeat_interleave(8, 1))
 
 
 def test_upsampling_is_fp32_under_autocast():
@@ -153,13 +131,6 @@ def test_global_attention_sees_no_token_of_padding_alone():
     assert seen == [6 * 5, 300]
 
 
-def test_position_code_does_not_depend_on_the_size():
-    small, large = (attention.sine_position(h, w, 64, torch.zeros(1)) for h, w in ((8, 9), (30, 40)))
-    assert small.shape == (1, 64, 8, 9) and torch.equal(small, large[:, :, :8, :9])
-    flat = large[0].flatten(1)
-    assert torch.unique((flat * 1e4).round(), dim=1).shape[1] == 1200  # every position its own code
-
-
 def test_local_correlation_and_warping():
     torch.manual_seed(6)
     f1 = torch.randn(1, 16, 12, 14)
@@ -181,9 +152,3 @@ def test_forward_warp_carries_flow_along():
     assert moved[0, :, 4, 5].tolist() == [0.0, 0.0]
     constant = torch.tensor([1.5, 0.25])[None, :, None, None].expand(1, 2, 10, 12)
     assert torch.allclose(forward_warp(constant)[..., 2:, 3:], constant[..., 2:, 3:], atol=1e-6)
-
-
-def test_patch_index_shares_one_fraction():
-    index, inside, fraction = correlation.patch_index(torch.tensor([[2.25, 3.5]]), 30, 40)
-    assert torch.allclose(fraction, torch.tensor([[0.25, 0.5]]))
-    assert int(index[0, 4, 4]) == 3 * 40 + 2 and bool(inside[0, 4, 4]) and not bool(inside[0, 0, 0])

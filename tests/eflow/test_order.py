@@ -47,26 +47,8 @@ def test_weights_are_shares_and_small_sets_are_gone_through_evenly():
     assert counts.tolist() == [10] * 4
 
 
-def test_steps_resume_and_ranks_partition():
-    mixture = Mixture([11], [1], seed=1)
-    whole = list(StepSampler(mixture, 4, 0, 9))
-    assert list(StepSampler(mixture, 4, 5, 9)) == whole[5:]
-    ranks = [list(StepSampler(mixture, 4, 0, 9, r, 2)) for r in range(2)]
-    for step, batch in enumerate(whole):
-        assert sorted(ranks[0][step] + ranks[1][step], key=lambda k: (k.epoch, k.position)) == batch
-
-
 def equal(a: dict, b: dict) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) if torch.is_tensor(a[k]) else a[k] == b[k] for k in a)
-
-
-def test_a_sample_is_a_function_of_its_key(source):
-    make = lambda seed=0: FlowDataset([source], VoxelGrid(), seed=seed, augment=STRONG, crop=(96, 112))
-    key = Key(2, 5, 0, 3)
-    a = make()[key]
-    assert a["new"].shape == (15, 96, 112) and a["flow"].shape == (2, 96, 112) and a["valid"].dtype == torch.bool
-    assert equal(a, make()[key])
-    assert not equal(a, make(1)[key]) and not equal(a, make()[Key(3, 5, 0, 3)])  # a new epoch, new augmentation
 
 
 def test_workers_change_nothing(source):

@@ -10,12 +10,12 @@ torch = pytest.importorskip("torch")
 
 import torch.nn.functional as F  # noqa: E402
 
-from blinkgl.errors import AssetError, ConfigError  # noqa: E402
+from blinkgl.errors import AssetError  # noqa: E402
 from blinkgl.io.formats import write_events  # noqa: E402
 from eflow.checkpoint import load_model  # noqa: E402
 from eflow.cli import run  # noqa: E402
 from eflow.infer import predict  # noqa: E402
-from eflow.published import import_published, published_names  # noqa: E402
+from eflow.published import import_published  # noqa: E402
 from flow_data import SPAN, moving_events  # noqa: E402
 
 
@@ -155,33 +155,6 @@ def test_an_imported_network_gives_the_published_flow(tmp_path, entry):
     assert (flow - expected).abs().max() < 1e-3 * expected.abs().max()
 
 
-def test_every_switch_is_needed_for_that(tmp_path):
-    """Without the border, the padding or the order of the taps it would be another flow."""
-    weights = published()
-    torch.save({"model": weights}, tmp_path / "dsec.tar")
-    model = import_published(tmp_path / "dsec.tar", tmp_path / "eraft.safetensors")
-    torch.manual_seed(4)
-    batch = dict(zip(("old", "new"), torch.randn(2, 1, 15, 130, 136), strict=True))
-    model.config = model.config.model_copy(update={"iterations": 1})
-    right = predict(model, batch).flow
-    model.config = model.config.model_copy(update={"border": "replicate"})
-    assert (predict(model, batch).flow - right).abs().max() > 0.1
-    model.config = model.config.model_copy(update={"border": "zero"})
-    model.pad_start = False
-    assert (predict(model, batch).flow - right).abs().max() > 0.1
-    model.pad_start = True
-    model.update.motion.corr1.weight.data.copy_(weights["update_block.encoder.convc1.weight"])
-    assert (predict(model, batch).flow - right).abs().max() > 0.1
-
-
-def test_every_tensor_has_its_place():
-    from eflow.models import build_model, model_config
-
-    ours = build_model(model_config({"name": "eraft"})).state_dict()
-    named = [name for k in ours for name in published_names(k)]
-    assert len(named) == len(set(named)) and set(named) == {k for k in published() if "norm3" not in k}
-
-
 def test_predict_takes_what_import_makes(tmp_path, capsys):
     torch.save({"model": published()}, tmp_path / "mvsec_20.tar")
     out = tmp_path / "e.safetensors"
@@ -194,18 +167,10 @@ def test_predict_takes_what_import_makes(tmp_path, capsys):
     assert "output file exists" in capsys.readouterr().err
 
 
-def test_rafts_colours_are_spread_over_bins(tmp_path):
+def test_rafts_own_weights_are_refused(tmp_path):
     torch.save(published(channels=3, prefix="module."), tmp_path / "raft-things.pth")
-    with pytest.raises(ConfigError, match="--bins: RAFT sees images of three colours; expected time bins"):
+    with pytest.raises(AssetError, match="RAFT's own weights see images and no events; expected E-RAFT's checkpoint"):
         import_published(tmp_path / "raft-things.pth", tmp_path / "r.safetensors")
-    model = import_published(tmp_path / "raft-things.pth", tmp_path / "r.safetensors", bins=5)
-    weight = published(channels=3)["fnet.conv1.weight"]
-    grey = torch.randn(1, 1, 32, 32)
-    wide = F.conv2d(grey.expand(-1, 5, -1, -1), model.features[0].weight)
-    assert torch.allclose(wide, F.conv2d(grey.expand(-1, 3, -1, -1), weight), atol=1e-4)
-    torch.save(published(), tmp_path / "dsec.tar")
-    with pytest.raises(ConfigError, match=r"--bins: the network has its own \(got 5\); expected 15"):
-        import_published(tmp_path / "dsec.tar", tmp_path / "x.safetensors", bins=5)
 
 
 class Trap:

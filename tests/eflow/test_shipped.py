@@ -17,7 +17,6 @@ from blinkgl.tools import real_recordings as rr  # noqa: E402
 from eflow import checkpoint as ckpt, shipped  # noqa: E402
 from eflow.cli import run  # noqa: E402
 from eflow.config import load_train_config  # noqa: E402
-from eflow.infer import predict  # noqa: E402
 from eflow.methods.iwe import flow_warp_loss  # noqa: E402
 from eflow.models import build_model, model_config  # noqa: E402
 from flow_data import SPAN, blinkgl_set, moving_events  # noqa: E402
@@ -93,17 +92,6 @@ def test_pack_then_call_by_name(source, list_of, tmp_path, capsys, monkeypatch):
     assert run(["models", "--json"]) == 0 and json.loads(capsys.readouterr().out)[0]["sha256"] == card.sha256
 
 
-def test_half_precision_halves_the_file_and_says_what_it_costs(source, list_of, capsys):
-    assert packed(source, list_of) == 0 and packed(source, list_of, "--store", "fp16", name="half") == 0
-    whole, half = shipped.card_of("toy_net"), shipped.card_of("half")
-    assert half.stored == "fp16" and half.bytes < 0.55 * whole.bytes and 0 < half.rounding_px < 0.05
-    model = ckpt.load_model("half")
-    assert all(p.dtype == torch.float32 for p in model.parameters())
-    batch = {k: torch.randn(1, model.representation.channels, 64, 64) for k in ("old", "new")}
-    a, b = (predict(m, batch).flow for m in (model, ckpt.load_model("toy_net")))
-    assert 0 < (a - b).abs().max() < 0.05
-
-
 def test_a_file_of_that_name_goes_first(source, list_of, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     packed(source, list_of)
@@ -157,7 +145,7 @@ def test_weights_that_are_not_the_cards(source, list_of):
     "name, change, message",
     [
         ("Toy Net", {}, "--name: not a name"),
-        ("planes", {}, "--name: not a name"),
+        ("contrast-affine", {}, "--name: not a name"),
         ("eraft", {}, "--name: not a name"),
         ("toy", {"scores": {}}, "card.yaml.*scores"),
         ("toy", {"commands": None}, "card.yaml.*commands"),
@@ -172,13 +160,9 @@ def test_what_cannot_be_packed(source, tmp_path, name, change, message):
     assert not (tmp_path / "out").exists()
 
 
-def test_too_large_or_beyond_fp16(source, tmp_path):
+def test_too_large(source, tmp_path):
     with pytest.raises(AssetError, match=r"too large to come with the package .*14\.\d MB.*at most 5 MB$"):
         shipped.pack(weights(tmp_path / "l.safetensors", width=32), "l", source / "card.yaml", tmp_path / "out")
-    with pytest.raises(AssetError, match="too large for fp16; expected --store fp32"):
-        shipped.pack(
-            weights(tmp_path / "b.safetensors", 1e6), "b", source / "card.yaml", tmp_path / "out", stored="fp16"
-        )
     shipped.pack(source / "run", "twice", source / "card.yaml", tmp_path / "ok")
     with pytest.raises(OutputError, match="exists"):
         shipped.pack(source / "run", "twice", source / "card.yaml", tmp_path / "ok")

@@ -7,7 +7,7 @@ import pytest
 
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 from eflow.data import mvsec
-from eflow.data.mvsec import HOOD_ROW, MvsecSource, NpzRows, propagate
+from eflow.data.mvsec import MvsecSource, NpzRows, propagate
 from eflow.data.sources import detect_format, open_source, read_flow
 from flow_data import SPAN, blinkflow_set, blinkgl_set, constant_flow, dsec_set, moving_events, mvsec_set
 
@@ -100,10 +100,6 @@ def test_mvsec(tmp_path, dt, compressed):
     hits = np.zeros_like(s.mask)
     hits[s.new.y, s.new.x] = True
     assert not (s.mask & ~hits).any()
-
-
-def test_mvsec_hood(tmp_path):
-    assert not open_source(mvsec_set(tmp_path, "outdoor_day1"), "mvsec")[0].mask[HOOD_ROW:].any()
 
 
 def outdoor(root, fields=7):

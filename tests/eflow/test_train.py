@@ -19,7 +19,7 @@ from blinkgl.errors import BlinkGLError, ConfigError, OutputError  # noqa: E402
 from eflow import checkpoint as ckpt  # noqa: E402
 from eflow.cli import run  # noqa: E402
 from eflow.config import load_train_config  # noqa: E402
-from eflow.train import CLOCKS, TrainingError, learning_rate, train  # noqa: E402
+from eflow.train import TrainingError, learning_rate, train  # noqa: E402
 from flow_data import blinkgl_set  # noqa: E402
 
 FAST = {"name": "ev_flownet", "input": "voxel", "bins": 5, "width": 8}
@@ -259,27 +259,6 @@ def test_a_training_as_long_as_the_clock_says(tmp_path, data):
     assert (second.reason, second.step) == ("finished", 3)
     again = ticking(tmp_path / "parts", resume=True)
     assert (again.reason, again.step, again.checkpoint) == ("finished", 3, second.checkpoint), "nothing is left to do"
-
-
-def test_a_training_as_long_as_the_processor_works(tmp_path, data, monkeypatch):
-    """A minute of a processor that works fifteen seconds for every step, while the wall's clock stands still."""
-    path = config_file(tmp_path, data, steps=1000, optim__minutes=1.0, optim__clock="processor")
-    worked, step = [0.0], torch.optim.AdamW.step
-
-    def works(*a, **k):
-        worked[0] += 15
-        return step(*a, **k)
-
-    monkeypatch.setattr(torch.optim.AdamW, "step", works)
-    monkeypatch.setitem(CLOCKS, "processor", lambda: worked[0])
-    monkeypatch.setitem(CLOCKS, "wall", lambda: 0.0)
-    result = train(load_train_config(path), tmp_path / "run", quiet=True)
-    assert (result.reason, result.step) == ("finished", 4)
-    with pytest.raises(ConfigError, match=r"data\.workers.*this process's time alone.*expected 0"):
-        load_train_config(path, ["data.workers=1"])
-    recipe = {"recipe": "r.yaml", "online": True, "workers": 1}
-    with pytest.raises(ConfigError, match=r"data\.train\.0\.workers.*this process's time alone"):
-        load_train_config(path, [f"data.train=[{json.dumps(recipe)}]"])
 
 
 @pytest.mark.slow

@@ -28,23 +28,6 @@ def test_voxel_equals_its_slow_twin(rectified, normalise):
     np.testing.assert_allclose(fast, slow, atol=2e-5)
 
 
-def test_voxel_conserves_signed_events_and_their_mean_time():
-    w = window(5000)
-    grid = voxel.voxel_grid(w.x, w.y, w.t, w.p, w.t0, w.t1, 15, H, W, normalise="none").astype(float)
-    sign = 2.0 * w.p - 1
-    assert grid.sum() == pytest.approx(sign.sum(), abs=1e-2)
-    moment = (grid.sum((1, 2)) * np.arange(15)).sum()
-    assert moment == pytest.approx((sign * 14 * (w.t - w.t0) / (w.t1 - w.t0)).sum(), abs=0.1)
-
-
-def test_normalised_over_nonzero_cells():
-    grid = VoxelGrid()(window(), H, W)
-    cells = grid[grid != 0]
-    assert abs(cells.mean()) < 1e-5 and cells.std(ddof=1) == pytest.approx(1, abs=1e-5)
-    every = VoxelGrid(normalise="all")(window(), H, W)
-    assert abs(every.mean()) < 1e-5 and every.std(ddof=1) == pytest.approx(1, abs=1e-5)
-
-
 def test_times_far_beyond_float32_are_subtracted_as_integers():
     here, far = window(t0=0), window(t0=2**52)
     np.testing.assert_array_equal(VoxelGrid()(here, H, W), VoxelGrid()(far, H, W))

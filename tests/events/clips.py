@@ -28,13 +28,6 @@ def run(emulator, clip, times) -> Events:
     return Events.concatenate([emulator.step(f, int(t)) for f, t in zip(clip, times)])
 
 
-def run_cubic(emulator, clip, times, rates) -> Events:
-    """Of the slow twin, too."""
-    hermite = emulator.reconstruction == "hermite"
-    chunks = [emulator.step(f, int(t), **({"rate": r} if hermite else {})) for f, t, r in zip(clip, times, rates)]
-    return Events.concatenate([*chunks, emulator.flush()])
-
-
 def assert_same(a: Events, b: Events) -> None:
     assert len(a) == len(b)
     assert a.columns == b.columns

@@ -15,7 +15,6 @@ import numpy as np
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.events import v2e_model as v2e, voltmeter
 from blinkgl.events.arith import Q_ONE, log_q25
-from blinkgl.events.esim import correlated
 from blinkgl.events.noise import noise_table
 from blinkgl.events.philox import (
     Stream,
@@ -48,23 +47,16 @@ def as_luminance(frame: np.ndarray) -> np.ndarray:
 
 
 class ReferenceEsim:
-    """Rebecq et al. 2018, section 3, in exact integer arithmetic (log intensity in 2^-25, time in ns); the cubics in
-    float64, from Hermite's basis functions and by bisection."""
+    """Rebecq et al. 2018, section 3, in exact integer arithmetic (log intensity in 2^-25, time in ns)."""
 
-    def __init__(self, height: int, width: int, config: EsimConfig, seed: int = 0, reconstruction: str = "linear"):
-        self.shape, self.config, self.seed, self.reconstruction = (
-            (height, width),
-            config,
-            np.uint64(seed),
-            reconstruction,
-        )
-        self.levels, self.times, self.slopes, self.passed = [], [], [], 0
+    def __init__(self, height: int, width: int, config: EsimConfig, seed: int = 0):
+        self.shape, self.config, self.seed = (height, width), config, np.uint64(seed)
+        self.levels, self.times = [], []
         q = lambda c: math.floor(c * Q_ONE + 0.5)
         nominal = [config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold]
         floor = [min(0.01, c / 2) for c in nominal]
         pixels = pixel_counters(height, width)
         spread = normal2(self.seed, pixels, np.uint64(Stream.THRESHOLD), np.uint64(0))
-        spread = spread[0], correlated(*spread, config.threshold_correlation)
         self.threshold = [
             [q(min(max(c + config.threshold_sigma * n, f), 10.0)) for n in normals]
             for c, f, normals in zip(nominal, floor, spread)
@@ -89,64 +81,18 @@ class ReferenceEsim:
             on, off = (max(f, c + math.floor(scale * n[0] + 0.5)) for f, c, n in zip(self.floor, (on, off), draws))
         return off, on
 
-    def step(self, luminance: np.ndarray, t_ns: int, rate: np.ndarray | None = None) -> Events:
+    def step(self, luminance: np.ndarray, t_ns: int) -> Events:
         intensity = as_luminance(luminance) + np.float32(self.config.log_eps)
         self.levels.append([int(v) for v in log_q25(intensity).ravel()])
         self.times.append(t_ns)
-        if self.reconstruction == "hermite":
-            slope = (rate / intensity).astype(np.float32) * np.float32(Q_ONE * 1e-9)
-            self.slopes.append([float(v) for v in slope.ravel()])
         if len(self.times) == 1:
             self.reference = list(self.levels[0])
             self.next = [self.next_thresholds(i) for i in range(len(self.reference))]
-        return self.events_up_to(len(self.times) - (2 if self.reconstruction == "pchip" else 1))
-
-    def flush(self) -> Events:
-        return self.events_up_to(len(self.times) - 1)
-
-    def events_up_to(self, last: int) -> Events:
-        """Of the intervals that end at the frames after the last one passed, up to frame ``last``."""
         rows = []
-        while self.passed < last:
-            self.passed += 1
-            for i in range(len(self.reference)):
-                rows += self.pixel(
-                    i,
-                    self.levels[self.passed - 1][i],
-                    self.levels[self.passed][i],
-                    *self.times[self.passed - 1 : self.passed + 1],
-                )
+        for i in range(len(self.reference) if len(self.times) > 1 else 0):
+            before, now = (levels[i] for levels in self.levels[-2:])
+            rows += self.pixel(i, before, now, *self.times[-2:])
         return sorted_events(rows, self.config.causes)
-
-    def end_slopes(self, i: int) -> tuple[float, float]:
-        """(alpha, beta) of pixel i in the interval that is being passed, unlimited, in units of its secant."""
-        k, t = self.passed, self.times
-        secant = lambda j: (self.levels[j][i] - self.levels[j - 1][i]) / (t[j] - t[j - 1])  # into frame j
-        if self.reconstruction == "hermite":
-            return self.slopes[k - 1][i] / secant(k), self.slopes[k][i] / secant(k)
-
-        def slope(j: int) -> float:  # at frame j: that of the parabola through three frames around it or next to it
-            m = min(max(j, 1), len(t) - 2)
-            if m < 1:
-                return secant(k)
-            curvature = (secant(m + 1) - secant(m)) / (t[m + 1] - t[m - 1])
-            return secant(m) + curvature * ((t[j] - t[m - 1]) + (t[j] - t[m]))
-
-        return slope(k - 1) / secant(k), slope(k) / secant(k)
-
-    def crossing(self, i: int, level: int, before: int, now: int, t0: int, t1: int) -> int:
-        """ns at which pixel i passes ``level``."""
-        if self.reconstruction == "linear":
-            return t0 + (level - before) * (t1 - t0) // (now - before)
-        alpha, beta = (min(max(slope, 0.0), 3.0) for slope in self.end_slopes(i))
-        y, low, high = (level - before) / (now - before), 0.0, 1.0
-        if y == 1.0:
-            return t1
-        for _ in range(70):
-            s = (low + high) / 2
-            value = alpha * s * (1 - s) ** 2 + s * s * (3 - 2 * s) - beta * s * s * (1 - s)
-            low, high = (s, high) if value < y else (low, s)
-        return t0 + int((low + high) / 2 * (t1 - t0))
 
     def pixel(self, i: int, before: int, now: int, t0: int, t1: int) -> list[tuple[int, int, int, int]]:
         y, x = divmod(i, self.shape[1])
@@ -161,7 +107,7 @@ class ReferenceEsim:
                 p = 0
             else:
                 return rows
-            t = self.crossing(i, self.reference[i], before, now, t0, t1)
+            t = t0 + (self.reference[i] - before) * (t1 - t0) // (now - before)
             self.events_so_far[i] += 1
             self.next[i] = self.next_thresholds(i)
             if self.last_ns[i] is None or t - self.last_ns[i] >= round(self.config.refractory_us * 1000):
@@ -177,7 +123,7 @@ class ReferenceV2e:
         self.pixels = height * width
         nominal = config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold
         a, b = normal2(self.seed, pixel_counters(height, width), np.uint64(Stream.THRESHOLD), np.uint64(0))
-        normals = a, correlated(a, b, config.threshold_correlation)
+        normals = a, b
         self.on, self.off = (
             np.clip(c + config.threshold_sigma * n, min(0.01, c / 2), 10.0).astype(np.float32)
             for c, n in zip(nominal, normals)
@@ -209,10 +155,9 @@ class ReferenceV2e:
 
     def step(self, luminance: np.ndarray, t_ns: int) -> Events:
         intensity = (as_luminance(luminance) * np.float32(self.config.full_scale)).ravel()
-        x = before_second = v2e.lin_log(intensity)
+        x = v2e.lin_log(intensity)
         rows = []
         if self.t_ns is None:
-            self.second_lag = np.zeros(self.pixels, np.float32)
             self.t_ns = self.epoch = t_ns
             self.hum = np.zeros(0, np.float32)
             if self.hums:
@@ -236,11 +181,6 @@ class ReferenceV2e:
         else:
             kappa = 2 * np.pi * self.config.cutoff_hz * (t_ns - self.t_ns) * 1e-9 / 275.0
             lag = self.lag
-            if self.config.second_cutoff_hz:
-                k = np.float32(2 * np.pi * self.config.second_cutoff_hz * (t_ns - self.t_ns) * 1e-9)
-                keep, ramp = (np.float32(part) for part in v2e.decay(k))
-                self.second_lag = self.second_lag * keep - (x - self.before_second) * ramp
-                x = x + self.second_lag
             if self.config.cutoff_hz:
                 lag = v2e.relax(self.lag, self.x, x, self.intensity, intensity, np.float32(kappa))
             noise, hum = self.noise(intensity, t_ns), np.zeros(self.pixels, np.float32)
@@ -250,7 +190,7 @@ class ReferenceV2e:
                 rows += self.pixel(i, x, lag, intensity, kappa, t_ns, noise[i], hum[i])
             self.hum = hum
         self.frame = getattr(self, "frame", 0) + 1
-        self.x, self.before_second, self.intensity, self.lag, self.t_ns = x, before_second, intensity, lag, t_ns
+        self.x, self.intensity, self.lag, self.t_ns = x, intensity, lag, t_ns
         if t_ns - self.epoch >= self.rebase_ns:
             gone = self.leak * np.float32((t_ns - self.epoch) * 1e-9)
             self.upper, self.lower, self.epoch = self.upper - gone, self.lower - gone, t_ns

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from blinkgl.config.events import EsimConfig, V2eConfig
+from blinkgl.config.events import EsimConfig
 from blinkgl.errors import EventDataError
-from blinkgl.events import Esim, Events, V2e
-from tests.events.clips import assert_same, random_clip, run, run_cubic
+from blinkgl.events import Esim, Events
+from tests.events.clips import assert_same, random_clip, run
 from tests.events.reference import ReferenceEsim
 
 PLAIN = dict(threshold_sigma=0.0)
@@ -43,19 +43,6 @@ def twin(variant, dtype):
     return run(ReferenceEsim(37, 45, EsimConfig(**VARIANTS[variant]), seed=9), clip, times)
 
 
-def steep(variant, dtype):
-    """Slopes of both signs, too large and too small: all that the limiter meets."""
-    clip, times = random_clip(1, dtype=dtype)
-    rates = np.random.default_rng(2).normal(0, 30, clip.shape).astype(np.float32)
-    return clip, times, rates, EsimConfig(**VARIANTS[variant])
-
-
-@cache
-def cubic_twin(reconstruction, variant, dtype):
-    clip, times, rates, config = steep(variant, dtype)
-    return run_cubic(ReferenceEsim(37, 45, config, 9, reconstruction), clip, times, rates)
-
-
 @pytest.mark.parametrize("dtype", [np.float32, np.uint8])
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_equals_slow_twin(variant, dtype, threads):
@@ -64,86 +51,6 @@ def test_equals_slow_twin(variant, dtype, threads):
     fast = run(Esim(37, 45, config, seed=9), clip, times)
     assert len(fast) > 2000
     assert_same(fast, twin(variant, dtype))
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.uint8])
-@pytest.mark.parametrize("variant", ["plain", "spread", "refractory", "jitter"])
-@pytest.mark.parametrize("reconstruction", ["pchip", "hermite"])
-def test_cubics_equal_slow_twin(reconstruction, variant, dtype, threads):
-    clip, times, rates, config = steep(variant, dtype)
-    fast = run_cubic(Esim(37, 45, config, 9, reconstruction), clip, times, rates)
-    assert len(fast) > 2000
-    assert_same(fast, cubic_twin(reconstruction, variant, dtype))
-
-
-@pytest.mark.parametrize("reconstruction", ["pchip", "hermite"])
-def test_cubics_pass_the_levels_of_the_straight_line(reconstruction):
-    """The same events per pixel in the same order; only the times differ, and stay inside their interval."""
-    clip, times = random_clip(5, frames=12)
-    rates = np.random.default_rng(2).normal(0, 30, clip.shape).astype(np.float32)
-    config = EsimConfig(threshold_sigma=0.03, threshold_jitter=0.05)
-    straight = run(Esim(37, 45, config, 9), clip, times)
-    cubic = run_cubic(Esim(37, 45, config, 9, reconstruction), clip, times, rates)
-    a, b = (np.lexsort((np.arange(len(e)), e.x, e.y)) for e in (straight, cubic))
-    for name in "xyp":
-        np.testing.assert_array_equal(getattr(straight, name)[a], getattr(cubic, name)[b])
-    np.testing.assert_array_equal(
-        np.searchsorted(times // 1000, straight.t[a]), np.searchsorted(times // 1000, cubic.t[b])
-    )
-    assert (straight.t[a] != cubic.t[b]).mean() > 0.5 and (np.diff(cubic.t) >= 0).all()
-
-
-@pytest.mark.parametrize("reconstruction", ["pchip", "hermite"])
-@pytest.mark.parametrize("cut", [1, 2, 3, 6])
-def test_cubics_resume_bit_identically(reconstruction, cut):
-    clip, times = random_clip(2, frames=9)
-    rates = np.random.default_rng(3).normal(0, 30, clip.shape).astype(np.float32)
-    config = EsimConfig(**VARIANTS["jitter"])
-    whole = run_cubic(Esim(37, 45, config, 3, reconstruction), clip, times, rates)
-    first, second = (Esim(37, 45, config, 3, reconstruction) for _ in range(2))
-    head = [first.step(f, int(t), None, r) for f, t, r in zip(clip[:cut], times, rates)]
-    second.load_state_dict(first.state_dict())
-    assert_same(whole, Events.concatenate([*head, run_cubic(second, clip[cut:], times[cut:], rates[cut:])]))
-
-
-def test_pchip_is_one_frame_late_and_goes_on_after_a_flush():
-    clip, times = random_clip(7, frames=10)
-    esim = Esim(37, 45, EsimConfig(**PLAIN), 3, "pchip")
-    chunks = []
-    for k, (frame, t) in enumerate(zip(clip, times)):
-        chunks.append(esim.step(frame, int(t)))
-        assert esim.done_ns == times[max(k - 1, 0)] and (
-            len(chunks[-1]) == 0 or chunks[-1].t.max() <= esim.done_ns // 1000
-        )
-        if k in (4, 5):
-            chunks.append(esim.flush())
-            assert esim.done_ns == t and len(esim.flush()) == 0
-    events = Events.concatenate([*chunks, esim.flush()])
-    assert len(events) == len(run(Esim(37, 45, EsimConfig(**PLAIN), 3), clip, times)) and (np.diff(events.t) >= 0).all()
-
-
-def test_hermite_without_rates_and_unknown_paths_are_refused():
-    esim, frame = Esim(4, 5, EsimConfig(), 1, "hermite"), np.ones((4, 5), np.float32)
-    for rate in (None, np.ones((4, 4), np.float32), np.ones((4, 5))):
-        with pytest.raises(EventDataError, match="frame 0: hermite wants the rate"):
-            esim.step(frame, 0, None, rate)
-    with pytest.raises(EventDataError, match="timeline.reconstruction"):
-        Esim(4, 5, EsimConfig(), 1, "spline")
-    with pytest.raises(EventDataError, match="timeline.reconstruction"):
-        V2e(4, 5, V2eConfig(), 1, "pchip")
-
-
-def test_rates_that_are_not_finite_count_as_zero():
-    esim, twin = (Esim(2, 3, EsimConfig(**PLAIN), 1, "hermite") for _ in range(2))
-    frames = [np.full((2, 3), v, np.float32) for v in (0.1, 5.0)]
-    bad = np.array([[np.nan, np.inf, -np.inf], [0, 0, 0]], np.float32)
-    a, b = (
-        Events.concatenate([e.step(f, 10**6 * k, None, r) for k, f in enumerate(frames)])
-        for e, r in ((esim, bad), (twin, np.zeros((2, 3), np.float32)))
-    )
-    keep = a.x != 1  # +inf is a slope beyond the limit
-    np.testing.assert_array_equal(a.t[keep], b.t[b.x != 1])
-    assert len(a) == len(b)
 
 
 @pytest.mark.parametrize("variant", ["plain", "jitter"])
@@ -353,31 +260,3 @@ def test_seed_zero_is_a_seed():
     a, b, c = (run(Esim(37, 45, EsimConfig(threshold_sigma=0.05), s), clip, times) for s in (0, 0, 1))
     assert_same(a, b)
     assert len(a) != len(c) or (a.t != c.t).any()
-
-
-@pytest.mark.parametrize("reconstruction, order, intervals", [("pchip", 3, (12, 24, 48)), ("hermite", 4, (2, 3, 4, 6))])
-def test_cubics_converge_faster_than_the_straight_line(reconstruction, order, intervals):
-    """A smooth log intensity, away from its turning points (where any monotone curve is of second order in time), and
-    in so few intervals that the errors stay far above float32's rounding of the frames."""
-    c, period = 0.02, 2000.0  # seconds; so long that 1 us is far below the errors
-    signal = lambda s: np.sin(2 * np.pi * s - 1.0)  # steep from 0 to 0.3
-    slope = lambda s: 2 * np.pi * np.cos(2 * np.pi * s - 1.0)
-    end = 0.3
-    spacings, errors = [], []
-    truth = (np.arcsin(np.sin(-1.0) + c * np.arange(1, 200).clip(max=int((signal(end) - signal(0)) / c))) + 1.0) / (
-        2 * np.pi
-    )
-    truth = np.unique(truth)
-    for n in intervals:
-        s = np.linspace(0, end, n + 1)
-        emulator = Esim(1, 1, EsimConfig(contrast_threshold=c, threshold_sigma=0, log_eps=1e-9), 1, reconstruction)
-        frames = [np.full((1, 1), np.exp(signal(u)), np.float32) for u in s]
-        rates = [f * np.float32(slope(u) / period) for f, u in zip(frames, s)]
-        events = run_cubic(emulator, frames, [round(u * period * 1e9) for u in s], rates)
-        assert len(events) == len(truth)
-        # pchip's outer intervals have one neighbour only.
-        inner = (truth > end / 6) & (truth < end * 5 / 6) | (reconstruction == "hermite")
-        spacings.append(end / n)
-        errors.append(np.sqrt(np.mean((events.t * 1e-6 / period - truth)[inner] ** 2)))
-    found = np.polyfit(np.log(spacings), np.log(errors), 1)[0]
-    assert abs(found - order) < 0.35, (found, errors)

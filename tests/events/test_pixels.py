@@ -8,18 +8,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from blinkgl.config.events import EsimConfig, V2eConfig
+from blinkgl.config.events import EsimConfig
 from blinkgl.config.problems import validate
 from blinkgl.config.readout import LatencyConfig, PixelsConfig, ReadoutConfig
 from blinkgl.errors import ConfigError
-from blinkgl.events import Events, make_emulator
+from blinkgl.events import Events
 from blinkgl.events.camera import EventCamera, EventFrame
-from blinkgl.events.esim import draw_thresholds
 from blinkgl.events.pixels import Latency, PixelNoise
 from blinkgl.events.readout import Readout
 from blinkgl.types.events import Cause
-from tests.events.clips import assert_same, run
-from tests.events.reference import ReferenceEsim, ReferenceV2e
+from tests.events.clips import assert_same
 
 H, W = 60, 80
 NOISY = PixelsConfig(hot_fraction=0.02, hot_rate_hz=200.0, hot_spread_decades=0.3, rate_hz=2.0, spread_decades=0.5,
@@ -237,25 +235,6 @@ def test_clock_is_the_last_tick_that_has_passed():
     free = Readout(ReadoutConfig())
     assert_same(free.step(events), events)
     assert free.dropped == free.late == 0, "without a rate there is no bus"
-
-
-def test_thresholds_of_a_pixel_are_correlated_as_asked():
-    for rho in (-0.8, 0.0, 0.5, 1.0):
-        on, off = draw_thresholds(200, 200, 0.3, 0.4, 0.03, np.uint64(1), rho)
-        assert abs(np.corrcoef(on, off)[0, 1] - rho) < 0.02
-        assert abs(off.mean() - 0.4) < 1e-3 and abs(off.std() / 0.03 - 1) < 0.02
-    one = make_emulator(V2eConfig(threshold_sigma=0.03, threshold_correlation=-1.0), 20, 30, 4)
-    assert np.allclose(one._on + one._off, 0.4, atol=1e-6) and one._on.std() > 0.02
-
-
-@pytest.mark.parametrize("config", [EsimConfig, V2eConfig])
-def test_correlated_thresholds_equal_the_slow_twin(config):
-    made = config(threshold_sigma=0.05, threshold_correlation=0.7)
-    rng = np.random.default_rng(2)
-    frames = [rng.random((9, 11)).astype(np.float32) for _ in range(6)]
-    times = np.arange(6) * 3_000_000
-    slow = {EsimConfig: ReferenceEsim, V2eConfig: ReferenceV2e}[config](9, 11, made, 3)
-    assert_same(run(make_emulator(made, 9, 11, 3), frames, times), run(slow, frames, times))
 
 
 def test_a_camera_with_all_of_it():

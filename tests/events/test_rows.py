@@ -54,25 +54,6 @@ def test_same_events_and_state(config):
         np.testing.assert_array_equal(told.state_dict()[name], value)
 
 
-@pytest.mark.parametrize("reconstruction", ["pchip", "hermite"])
-@pytest.mark.parametrize("config", [EsimConfig(), EsimConfig(threshold_jitter=0.05, refractory_us=300.0)])
-def test_same_events_on_cubics(config, reconstruction):
-    frames, rows = clip()
-    told, untold = (make_emulator(config, H, W, 9, reconstruction) for _ in range(2))
-    chunks, rng = [], np.random.default_rng(1)
-    for k, (frame, changed) in enumerate(zip(frames, rows)):
-        rate = rng.normal(0, 500, (H, W)).astype(np.float32)
-        first, stop = changed or (0, H)
-        # That is all the contract asks for: what moved in the frame before may stand still in this one.
-        rate[:first], rate[stop:] = (0, 0)
-        chunks.append((told.step(frame, k * 1_000_000, changed, rate), untold.step(frame, k * 1_000_000, None, rate)))
-    chunks.append((told.flush(), untold.flush()))
-    for a, b in chunks:
-        for name in "xytp":
-            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
-    assert sum(len(a) for a, _ in chunks) > 500
-
-
 def test_bad_values_in_the_changed_rows_are_still_found():
     emulator = make_emulator(EsimConfig(), H, W, seed=1)
     frame = np.ones((H, W), np.float32)

@@ -189,7 +189,6 @@ def test_one_key_switches_the_noise_of_single_pixels_off(tmp_path):
 
 def test_a_still_scene_is_as_noisy_as_the_recorded_one():
     """Rates and hot pixels of dvxplorer.yaml against the recording; its first half was fitted, so the second judges."""
-    pytest.importorskip("aedat", reason="optional extra [formats]")
     events, (_, width) = read_recording(shared("data/events/noise/dvxplorer_constant_light.aedat4"), least=1000)
     begin, end = (int(events.t[0]) + int(events.t[-1])) // 2, int(events.t[-1])
     made = still(load_sensor("dvxplorer"), "esim", end - begin)

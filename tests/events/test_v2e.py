@@ -28,7 +28,6 @@ VARIANTS = {
     "long dead time, noise, hot pixels": dict(
         shot_noise_rate_hz=50.0, leak_rate_hz=3.0, hot_pixel_fraction=0.05, refractory_us=20_000.0
     ),
-    "two low-passes": dict(preset="noisy", second_cutoff_hz=60.0, contrast_threshold=0.1),
     "photoreceptor noise": dict(shot_noise_rate_hz=20.0, photoreceptor_noise=True, leak_rate_hz=0.0, cutoff_hz=30.0),
     "photoreceptor noise, leak": dict(preset="noisy", shot_noise_rate_hz=30.0, photoreceptor_noise=True),
     "balanced": dict(start="balanced", leak_rate_hz=5.0, shot_noise_rate_hz=20.0),
@@ -123,37 +122,6 @@ def test_amplitude_and_phase_response(ratio):
     )
     assert abs(abs(response) - 1 / np.hypot(1, ratio)) < 0.01
     assert abs(np.angle(response) + np.arctan(ratio)) < 0.02
-
-
-@pytest.mark.parametrize("ratio", [0.3, 3.0])
-def test_amplitude_and_phase_of_two_low_passes(ratio):
-    """The product of both responses, the second's corner twice the first's."""
-    intensity, cutoff = 100.0, 50.0
-    corner = cutoff * (intensity + 20) / 275
-    f, n, amplitude, y = ratio * corner, 400, 0.02, []
-    emulator = V2e(1, 1, V2eConfig(**QUIET, cutoff_hz=cutoff, second_cutoff_hz=2 * corner))
-    t = np.arange(8 * n) / (f * n)
-    for at, s in zip(t, amplitude * np.sin(2 * np.pi * f * t)):
-        emulator.step(np.full((1, 1), intensity / 255 * np.exp(s), np.float32), round(at * 1e9))
-        y.append(float(emulator._x[0]) + float(emulator._lag[0]))
-    last = slice(-3 * n, None)
-    turned = (np.array(y)[last] - np.log(intensity)) * np.exp(-2j * np.pi * f * t[last])
-    law = 1 / ((1 + 1j * ratio) * (1 + 0.5j * ratio))
-    assert abs(2j * np.mean(turned) / amplitude - law) < 0.015 * max(abs(law), 0.5)
-
-
-def test_two_low_passes_at_any_frame_spacing():
-    """A bright step: where the levels are passed, against the response in closed form; frames 0.1 to 4 ms apart."""
-    bright, theta, fast, slow = 120.0, 0.15, 80.0, 20.0
-    config = V2eConfig(**QUIET, cutoff_hz=slow * 275 / (bright + 20), second_cutoff_hz=fast, contrast_threshold=theta)
-    a, b = 2 * np.pi * slow, 2 * np.pi * fast
-    law = lambda t: np.log(2) * (1 - (b * np.exp(-a * t) - a * np.exp(-b * t)) / (b - a))
-    for every_us, within in ((100, 10), (1000, 100), (4000, 900)):
-        frames = [60.0] + [bright] * (100_000 // every_us)
-        times = [0, 1000] + [1000 + k * every_us * 1000 for k in range(1, len(frames) - 1)]
-        events = run(V2e(1, 1, config), [np.full((1, 1), v / 255, np.float32) for v in frames], times)
-        expected = [brentq(lambda t, j=j: law(t) - j * theta, 0, 1) * 1e6 for j in range(1, 5)]
-        assert len(events) == 4 and np.abs(events.t - expected).max() < within, (every_us, events.t, expected)
 
 
 def test_stable_however_long_the_step():

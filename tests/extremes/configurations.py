@@ -69,14 +69,9 @@ def timelines(interval: float):
         magnitude(1e-3, 100),
         percentile,
     )
-    budget = st.builds(
-        lambda unit, most: {"kind": "budget", f"max_time_error_{unit}": most},
-        st.sampled_from(["us", "px"]),
-        magnitude(1e-3, 1e4),
-    )
     adaptive = st.builds(
         lambda way, how, longest: {**way, **longest, **how},
-        displacement | brightness | budget,
+        displacement | brightness,
         some(sample_every=st.sampled_from([1, 4, 64])),
         steps,
     )
@@ -257,14 +252,11 @@ voltmeter = some(
 def runs(draw, emulators=esim):
     time = draw(times)
     interval = 1.0 / time["label_rate"]
-    reconstructions = st.sampled_from(
-        ["linear", "pchip", "hermite"] if emulators is esim else ["linear"] * 9 + ["pchip", "hermite"]
-    )
     return {
         "seed": draw(st.integers(0, 2**63 - 1)),
         "camera": draw(cameras),
         "time": time,
-        "timeline": {**draw(timelines(interval)), "reconstruction": draw(reconstructions)},
+        "timeline": draw(timelines(interval)),
         "scene": draw(explicit_scenes(interval, time["start"]) | random_scenes()),
         "events": {**draw(emulators), "max_events_per_step": draw(most)},
         "render": draw(

@@ -95,12 +95,10 @@ def nasty() -> np.ndarray:
 def raw_buffers(renderer) -> dict[str, np.ndarray]:
     """Everything that every pass writes at 0, as it leaves the fragment shaders."""
     buffers = renderer.draw(RAW, 0, {"forward": 100 * MS, "backward": -100 * MS})
-    both = renderer.luminance(0, rate=True)
     return {
         **{name: buffers.read(name) for name in buffers.names},
         "luminance": renderer.luminance(0).read(),
-        "with rate": both.read(),
-        "rate": both.read("rate"),
+        "with rate": renderer.brightness(0).read(),
         "colour": renderer.colour(0).read(),
         "brightness": renderer.brightness(0, 3).read(),
         "motion": renderer.velocity(0, 3).read(),

@@ -51,11 +51,6 @@ def same(a: Events, b: Events) -> bool:
     return all(np.array_equal(getattr(a, k), getattr(b, k)) for k in "xytp")
 
 
-def need(kind):
-    if kind == "aedat4":
-        pytest.importorskip("aedat", reason="optional extra [formats]")
-
-
 @pytest.mark.parametrize("kind", FILES)
 def test_write_then_read_is_exact(tmp_path, kind):
     events = random_events()
@@ -115,7 +110,6 @@ def test_we_read_what_faery_writes(tmp_path, version):
 )
 def test_real_recordings(tmp_path, name, kind, size, count):
     path = shared(f"data/events/{name}")
-    need(kind)
     file = open_events(path).sized()
     assert (file.format, file.height, file.width) == (kind, *size)
     events = file.read()
@@ -288,7 +282,6 @@ def test_random_damage_never_ends_in_a_traceback(tmp_path, name):
 
 def test_truncated_recordings(tmp_path):
     source = shared("data/events/aedat4/davis346_events_frames_imu.aedat4")
-    need("aedat4")
     for keep in (200, 100_000):
         with pytest.raises(AssetError, match="AEDAT4"):
             open_events(_bad(tmp_path, "e.aedat4", source.read_bytes()[:keep])).read()

@@ -264,7 +264,7 @@ def test_known_noise_comes_back(tmp_path, seed):
         ("two frames", "fewer than two intervals"),
         ("unknown key", "speed"),
         ("ratio", "fitted one by one"),
-        ("interpolation", "interpolate: cannot be calibrated with"),
+        ("interpolation", "interpolate: unknown interpolation"),
         ("still and frames", "a still scene needs no frames"),
     ],
 )

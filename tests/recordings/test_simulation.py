@@ -78,7 +78,7 @@ def test_luminance_of_colour_and_gamma():
 
 
 @pytest.mark.parametrize("emulator", ["esim", "v2e", "voltmeter"])
-@pytest.mark.parametrize("interpolate", ["linear", "cubic", "motion"])
+@pytest.mark.parametrize("interpolate", ["linear", "motion"])
 def test_interpolations_run_and_order_events(emulator, interpolate):
     report = SimulationReport()
     texture = cv2.GaussianBlur(np.random.default_rng(0).random((80, 160)) * 255, (0, 0), 3)
@@ -101,7 +101,7 @@ def test_interpolations_run_and_order_events(emulator, interpolate):
         (np.ones((H, W), np.int32), "unsupported pixel type|unsupported frame type"),
     ],
 )
-@pytest.mark.parametrize("interpolate", ["linear", "cubic", "motion"])
+@pytest.mark.parametrize("interpolate", ["linear", "motion"])
 def test_bad_frames_are_named(frame, message, interpolate):
     good = np.ones((H, W), np.float32)
     with pytest.raises(EventDataError, match=message):

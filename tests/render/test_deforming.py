@@ -127,8 +127,7 @@ def test_rate_of_luminance_is_that_of_the_frames(gl, kind, textured):
     ref = reference.render(what, T0)
     with Renderer(gl, what, RenderConfig(antialiasing="none"), whole=True) as renderer:
         before, after = (renderer.luminance(T0 + dt).read().astype(np.float64) for dt in (-h, h))
-        frame = renderer.luminance(T0, rate=True)
-        rate = frame.read("rate").astype(np.float64)
+        rate = renderer.brightness(T0).read()[..., 1].astype(np.float64)
     off = ref.hit & (ref.instance == 3) & ~reference.silhouette_band(ref.instance, ref.depth, width=3)
     true = (after - before) / (2e-9 * h)
     error = np.abs(rate - true)[off]
@@ -227,7 +226,7 @@ def test_rate_of_luminance_of_a_skin(gl, figure):
     ref = reference.render(what, T0)
     with Renderer(gl, what, RenderConfig(antialiasing="none"), whole=True) as renderer:
         before, after = (renderer.luminance(T0 + dt).read().astype(np.float64) for dt in (-MS, MS))
-        rate = renderer.luminance(T0, rate=True).read("rate").astype(np.float64)
+        rate = renderer.brightness(T0).read()[..., 1].astype(np.float64)
     off = ref.hit & (ref.instance == 3) & ~reference.silhouette_band(ref.instance, ref.depth, width=3)
     true = (after - before) / 2e-3
     assert np.abs(true[off]).max() > 0.1

@@ -204,18 +204,6 @@ def test_taps_of_a_linear_texture_are_one(gl):
     )
 
 
-def test_rates_are_shared_out_as_luminance_is(gl):
-    """d(luminance)/dt is that of the surfaces in a pixel, by their areas, of either sign; luminance is what it is
-    without."""
-    world = mixed_scene()
-    with Renderer(gl, world, EDGES) as edged, Renderer(gl, world, RenderConfig(antialiasing="taps4")) as plain:
-        both, alone = edged.luminance(SECOND // 5, rate=True), edged.luminance(SECOND // 5)
-        np.testing.assert_array_equal(both.read("luminance"), alone.read())
-        rate, unfiltered = both.read("rate"), plain.luminance(SECOND // 5, rate=True).read("rate")
-    assert np.isfinite(rate).all() and (rate < 0).any() and (rate > 0).any()
-    assert np.median(np.abs(rate - unfiltered)) < 0.05 * np.abs(unfiltered).mean()
-
-
 def test_light_is_never_negative(gl):
     """Small bright things in front of each other, more lines than pixels."""
     rng = np.random.default_rng(1)
@@ -475,7 +463,7 @@ WORLDS = {
 def filtered_twice(gl, world, t_ns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(unfiltered, filtered by the program, by its slow twin from the same picture, depths and lines)."""
     with Renderer(gl, world, EDGES) as renderer:
-        plain = renderer.draw(Luminance(False, samples_of("edges")), t_ns)
+        plain = renderer.draw(Luminance(samples_of("edges")), t_ns)
         picture, depths = read_both(plain)
         moment = renderer.moment(t_ns)
         pixels, crossings = Lines().in_pixels(moment, moment.visible, renderer.width, renderer.height)
@@ -500,7 +488,7 @@ def test_nothing_to_draw(gl):
 def test_the_pass_is_the_unfiltered_one_with_its_depth_kept():
     from blinkgl.render.passes import Edged
 
-    pass_ = filtered(Luminance(False, samples_of("edges")))
+    pass_ = filtered(Luminance(samples_of("edges")))
     assert isinstance(pass_, Edged) and pass_.of.depth == "texture" and Luminance().depth is True
 
 
@@ -568,17 +556,16 @@ def test_seams_of_textures(gl):
     assert error["edges"] < 0.5 * error["taps4"]
 
 
-@pytest.mark.parametrize("rate", [False, True])
-def test_a_finer_grid_is_the_mean_of_a_larger_picture(gl, rate):
+def test_a_finer_grid_is_the_mean_of_a_larger_picture(gl):
     """edges2: lines, taps and shares of a picture of twice the size, then the mean of four."""
     world, factor = mixed_scene(81, 61), 2
     camera = world.camera
     larger = world.with_camera(camera.resized(factor * camera.width, factor * camera.height))
-    name, t_ns = "rate" if rate else "", 100_000_000
+    t_ns = 100_000_000
     with Renderer(gl, larger, RenderConfig(antialiasing="edges")) as renderer:
-        fine = renderer.luminance(t_ns, rate=rate).read(name).astype(np.float64)
+        fine = renderer.luminance(t_ns).read().astype(np.float64)
     with Renderer(gl, world, RenderConfig(antialiasing=f"edges{factor}")) as renderer:
-        found = renderer.luminance(t_ns, rate=rate).read(name)
+        found = renderer.luminance(t_ns).read()
     expected = fine.reshape(camera.height, factor, camera.width, factor).mean(axis=(1, 3))
     np.testing.assert_allclose(found, expected, atol=2e-5 * np.abs(expected).max())
 

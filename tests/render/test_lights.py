@@ -136,7 +136,7 @@ def test_light_of_a_panorama_is_the_references(gl, finer):
     with Renderer(gl, world, RenderConfig(image_antialiasing="none"), whole=True) as renderer:
         seen, colour = renderer.luminance(t).read(), renderer.colour(t).read()
         before, after = (renderer.luminance(t + dt).read().astype(np.float64) for dt in (-h, h))
-        rate = renderer.luminance(t, rate=True).read("rate").astype(np.float64)
+        rate = renderer.brightness(t).read()[..., 1].astype(np.float64)
     ambients = {dict(defines).get("AMBIENT") for program, defines in gl.shaders.compiled if program == "luminance.glsl"}
     assert ("3" if finer else "2") in ambients
     off = ref.hit & ~reference.silhouette_band(ref.instance, ref.depth, width=3) & (ref.instance > 2)
@@ -171,7 +171,7 @@ def test_flat_facets_are_lit_at_their_corners(gl, monkeypatch, finer):
     with Renderer(gl, world, unfiltered) as renderer:
         assert [item.kind.faceted for item in sorted(renderer.items, key=lambda i: i.object_index)] == [1, 0, 1, 1]
         flat = renderer.luminance(0).read(), renderer.colour(0).read()
-        beside_rates = renderer.luminance(0, rate=True).read("luminance")
+        beside_rates = renderer.brightness(0).read()[..., 0]
     programs = [dict(defines) for _, defines in gl.shaders.compiled]
     assert any("FACETED" in one and one.get("AMBIENT") == ("3" if finer else "2") for one in programs)
     monkeypatch.setattr(resources, "_Facets", lambda _: SimpleNamespace(flat=lambda _: False))
@@ -195,7 +195,7 @@ def test_one_channel_does_where_a_surface_has_one_colour(gl):
         gl.shaders.clear()
         with Renderer(gl, world, RenderConfig(image_antialiasing="none")) as renderer:
             seen, colour = renderer.luminance(0).read(), renderer.colour(0).read()
-            rates = renderer.luminance(0, rate=True).read()
+            rates = renderer.brightness(0).read()[..., 0]
         hued = {dict(defines).get("HUED") for program, defines in gl.shaders.compiled if program == "luminance.glsl"}
         assert hued == ({"1"} if name == "of several colours" else {None}), name
         np.testing.assert_allclose(seen, colour @ LUMA, rtol=1e-5, atol=1e-6)
@@ -217,7 +217,7 @@ def test_white_light_is_the_same_through_either_program(gl):
 def test_who_asks_for_no_lights_gets_the_programs_without(gl):
     gl.shaders.clear()
     with Renderer(gl, mixed_scene(), PLAIN) as renderer:
-        renderer.luminance(0), renderer.luminance(0, rate=True), renderer.colour(0), renderer.brightness(0, 4)
+        renderer.luminance(0), renderer.brightness(0), renderer.colour(0), renderer.brightness(0, 4)
     for _, defines in gl.shaders.compiled:
         assert not {"LIGHTS", "HUED", "SUNS", "LAMPS", "AMBIENT"} & {name for name, _ in defines}
 
@@ -246,7 +246,7 @@ def test_rate_of_luminance_under_a_lamp(gl, lamp, shape):
     ref = reference.render(world, t)
     with Renderer(gl, world, PLAIN, whole=True) as renderer:
         before, after = (renderer.luminance(t + dt).read().astype(np.float64) for dt in (-h, h))
-        rate = renderer.luminance(t, rate=True).read("rate").astype(np.float64)
+        rate = renderer.brightness(t).read()[..., 1].astype(np.float64)
     off = ref.hit & ~reference.silhouette_band(ref.instance, ref.depth, width=3)
     true = (after - before) / (2e-9 * h)
     error = np.abs(rate - true)[off]

@@ -101,7 +101,7 @@ def test_rates(gl, name):
     """dL/dt against the difference of two frames, under lamps, moving and turning."""
     made, step = moving(*MATERIALS[name], LAMPS), 1_000_000
     with Renderer(gl, made, PLAIN) as renderer:
-        rate = renderer.luminance(T, rate=True).read("rate")
+        rate = renderer.brightness(T).read()[..., 1]
         after, before = (renderer.luminance(T + s).read().astype(np.float64) for s in (step, -step))
     known = reference.render(made, T)
     inside = known.hit & ~reference.silhouette_band(known.instance, known.depth, 3)

@@ -98,21 +98,6 @@ def test_skipped_rows_do_not_depend_on_the_threads_share():
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
-@pytest.mark.parametrize("antialiasing", ["none", "edges", "edges2", "ssaa2"])
-def test_rates_are_identical_to_the_full_redraw(gl, antialiasing):
-    config = SimpleNamespace(**{**vars(PLAIN), "antialiasing": antialiasing})
-    world = mixed_scene(camera_moves=False)
-    with Renderer(gl, world, config) as quick, full_redraw(gl, world, config) as slow:
-        for k, t in enumerate(range(0, SECOND, SECOND // 17)):
-            frame, true = quick.luminance(t, rate=True), slow.luminance(t, rate=True)
-            for name in ("luminance", "rate"):
-                np.testing.assert_array_equal(frame.view(name), true.read(name))
-                np.testing.assert_array_equal(frame.read(name), true.read(name))
-            assert (frame.view("rate") != 0).any()
-            if k % 5 == 4:
-                quick.luminance(t).view()  # another kind of frame in between
-
-
 def test_other_passes_in_between_do_not_disturb(gl):
     world = mixed_scene(camera_moves=False)
     with Renderer(gl, world, PLAIN) as quick, full_redraw(gl, world) as slow:
@@ -125,17 +110,16 @@ def test_other_passes_in_between_do_not_disturb(gl):
 @pytest.mark.parametrize("antialiasing", ["none", "edges", "edges2", "ssaa2"])
 @pytest.mark.parametrize("seed", range(3))
 def test_any_order_of_kinds_and_of_looking(gl, seed, antialiasing):
-    """Frames with and without rates, at times that go back and forth, viewed, read, or not looked at at all; drawn
+    """Frames at times that go back and forth, viewed, read, or not looked at at all; drawn
     finer by somebody else in between. What is viewed is right, and so is what is said to
     have changed since any frame."""
     rng, world = np.random.default_rng(seed), mixed_scene(48, 36, camera_moves=False)
     config = PLAIN.model_copy(update={"antialiasing": antialiasing})
-    fine = Luminance(False, samples_of(antialiasing))
+    fine = Luminance(samples_of(antialiasing))
     drawn = []
     with Renderer(gl, world, config) as quick, full_redraw(gl, world, config) as slow:
         for t in rng.integers(0, SECOND, 60).tolist():
-            rate = bool(rng.integers(2))
-            frame, true = quick.luminance(t, rate), slow.luminance(t, rate)
+            frame, true = quick.luminance(t), slow.luminance(t)
             truth = true.read()
             for before, image in drawn[-3:]:
                 where = frame.changed_since(before)
@@ -147,8 +131,6 @@ def test_any_order_of_kinds_and_of_looking(gl, seed, antialiasing):
             drawn.append((frame, truth))
             if rng.integers(3):
                 np.testing.assert_array_equal(frame.view(), truth)
-            for name in frame.names[int(rng.integers(2)) :]:
-                np.testing.assert_array_equal(frame.view(name), true.read(name))
             if not rng.integers(4):
                 np.testing.assert_array_equal(frame.read(), truth)
             if not rng.integers(6):
@@ -161,14 +143,12 @@ def test_the_memory_of_a_view_is_the_renderers(gl):
     memory, wherever it is asked for."""
     world = mixed_scene(48, 36, camera_moves=False)
     with Renderer(gl, world, PLAIN) as renderer:
-        frame = renderer.luminance(0, rate=True)
+        frame = renderer.luminance(0)
         seen, copied = frame.view(), frame.read()
         with pytest.raises(ValueError, match="read-only"):
             seen[0, 0] = 1
-        with pytest.raises(ValueError, match="read-only"):
-            frame.view("rate").fill(0)
         copied[...] = -1
-        np.testing.assert_array_equal(renderer.luminance(SECOND // 7, rate=True).view(), seen)
+        np.testing.assert_array_equal(renderer.luminance(SECOND // 7).view(), seen)
         assert (seen >= 0).all() and not np.array_equal(seen, copied)
 
 

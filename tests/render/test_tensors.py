@@ -20,7 +20,7 @@ def test_a_frame_as_a_tensor_is_what_is_read(gl):
     with Renderer(gl, mixed_scene(48, 36), RenderConfig()) as renderer:
         for frame, names in (
             (renderer.luminance(0), ("",)),
-            (renderer.luminance(0, rate=True), ("luminance", "rate")),
+            (renderer.brightness(0), ("",)),
             (renderer.colour(0), ("",)),
         ):
             for name in names:

@@ -1,7 +1,4 @@
-"""The card of a data set, and its Croissant metadata, which mlcroissant checks and reads."""
-
-import hashlib
-import json
+"""The card of a data set."""
 
 import numpy as np
 import pytest
@@ -12,7 +9,8 @@ from blinkgl.config.run import load_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.errors import AssetError
 from blinkgl.io.flow_png import read_flow_png
-from blinkgl.report.card import write_card
+from blinkgl.report.card import facts_of, write_card
+from blinkgl.report.collect import collect
 from blinkgl.sequence_files.index import read_index
 
 RECIPE = {
@@ -40,12 +38,8 @@ def data(tmp_path_factory):
     return folder / "tiny"
 
 
-def described(data):
-    return json.loads((data / "croissant.json").read_text())
-
-
 def test_its_figures_are_those_of_the_files(data):
-    facts = {f["name"]: f["value"] for f in described(data)["variableMeasured"]}
+    facts = {fact.name: fact.value for fact in facts_of(collect(data, examples=0))}
     lines = read_index(data)
     seconds = sum(line["duration_us"] for line in lines) / 1e6
     events = sum(line["events"] for line in lines)
@@ -72,33 +66,11 @@ def test_the_card_says_it_in_words(data):
         assert said in text
 
 
-def test_every_set_of_files_is_there(data):
-    """Without mlcroissant: what Croissant 1.0 demands of a description."""
-    tree = described(data)
-    assert tree["@type"] == "sc:Dataset" and tree["conformsTo"] == "http://mlcommons.org/croissant/1.0"
-    index, *sets = tree["distribution"]
-    assert index["sha256"] == hashlib.sha256((data / index["contentUrl"]).read_bytes()).hexdigest()
-    found = {one["@id"]: list(data.glob(one["includes"])) for one in sets}
-    assert all(found.values()) and len(found["events"]) == 2 and len(found["flow_forward.png"]) == 4
-    assert {"depth.npy", "poses", "manifests"} <= set(found)
-    columns = {f["source"]["extract"]["column"] for f in tree["recordSet"][0]["field"]}
-    assert columns <= set(read_index(data)[0])
-
-
-def test_mlcroissant_accepts_and_reads_it(data):
-    croissant = pytest.importorskip("mlcroissant", reason="optional extra [exchange]")
-    found = croissant.Dataset(jsonld=str(data / "croissant.json"))
-    assert not found.metadata.issues.errors
-    rows = list(found.records("sequences"))
-    for row, line in zip(rows, read_index(data), strict=True):
-        assert row["sequences/path"].decode() == line["path"] and row["sequences/events"] == line["events"]
-
-
 def test_somebody_elses_page_is_left_alone(data, tmp_path, capsys):
     (tmp_path / "train").symlink_to(data / "train")
     (tmp_path / "README.md").write_text("# My notes\n")
     with pytest.raises(AssetError, match="did not write"):
         write_card(tmp_path)
-    assert (tmp_path / "README.md").read_text() == "# My notes\n" and not (tmp_path / "croissant.json").exists()
+    assert (tmp_path / "README.md").read_text() == "# My notes\n"
     assert run(["report", str(data), "--license", "mit"]) == 2
     assert "--card" in capsys.readouterr().err

@@ -4,15 +4,13 @@ import json
 
 import numpy as np
 import pytest
-import trimesh
 from PIL import Image
 
 from blinkgl.config.camera import CameraConfig
 from blinkgl.config.scene import PoolConfig
 from blinkgl.errors import AssetError
 from blinkgl.scene.importing.mesh_files import load_asset
-from blinkgl.scene.motion.paths import StaticPath
-from blinkgl.scene.worlds.from_file import from_gltf, from_trimesh
+from blinkgl.scene.worlds.from_file import from_gltf
 from blinkgl.scene.worlds.pool import object_pool
 from tests.scene.gltf_files import GltfBuilder, triangle
 
@@ -243,12 +241,6 @@ def test_a_pool_and_a_trimesh_scene_say_it_too(tmp_path):
         assert pool.draw(np.random.default_rng(0), "train").omissions == (
             "a.glb asks for what is not drawn: alpha BLEND (drawn opaque)",
         )
-    box = trimesh.creation.box()
-    box.visual.face_colors = np.arange(48).reshape(12, 4).astype(np.uint8)
-    scene = from_trimesh(trimesh.Scene(box), CAMERA, camera_path=StaticPath(np.eye(4)))
-    assert scene.omissions == (
-        "the trimesh scene asks for what is not drawn: face colours (drawn in the most frequent one)",
-    )
 
 
 def test_draco_beside_plain_geometry_is_ignored(tmp_path):

@@ -75,12 +75,11 @@ def test_events_carry_the_object_that_made_them(emulator):
     "more",
     [
         {"timeline": {"kind": "uniform", "fps": 150}},  # five pixels from frame to frame
-        {"timeline": {"kind": "displacement", "reconstruction": "pchip"}},  # events one frame late
         {"render": {"antialiasing": "ssaa2"}},  # edges that cover a part of a pixel
         {"render": {"antialiasing": "edges"}},
         {"readout": {"latency": {"fixed_us": 4000}, "events_per_second": 5e5}},  # long after it happened
     ],
-    ids=["far apart", "one frame late", "ssaa2", "edges", "late"],
+    ids=["far apart", "ssaa2", "edges", "late"],
 )
 def test_it_is_theirs_whatever_stands_between(more):
     events = made(before_a_wall(), **more)

@@ -155,19 +155,6 @@ def test_a_mistake_is_named_by_its_term(judge, shaders, mistake):
     assert wrong and wrong[0] == term, wrong
 
 
-def test_diff_says_so(shader, lit, shaders):
-    edit(shaders / LIGHTS, "facing *= shadow_share[i];", "")
-    status, out, _ = shader("diff", lit, "--shaders", shaders)
-    assert status == 1 and out.startswith("The first that is wrong: shadow factor of luminance (")
-
-
-def test_no_shadow_at_all_is_called_so(looked_at):
-    gpu, right, *_ = looked_at
-    none = moments.GpuMoment(gpu.renderer, gpu.when, gpu.log_eps)
-    none._made |= gpu._made | {"luminance_shadow": np.ones_like(gpu["luminance_shadow"])}
-    assert right.of(none).report("luminance_shadow").suspicions[0].startswith("no shadow falls (")
-
-
 def test_a_map_that_is_drawn_from_the_front_is_found_in_itself(shader, lit, monkeypatch):
     """Without what turns the culling round: the sides that face the light."""
     monkeypatch.setattr(session.WholeShadowMap, "paint", ScenePass.paint)

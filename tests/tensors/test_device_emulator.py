@@ -33,12 +33,12 @@ def card(monkeypatch):
     monkeypatch.setattr(devices, "DEVICE", "cpu")
 
 
-def made(gl, reconstruction="linear", config=EsimConfig, **values):
-    return make_on_device(config(**values), 16, 24, 1, reconstruction, gl).device
+def made(gl, config=EsimConfig, **values):
+    return make_on_device(config(**values), 16, 24, 1, gl).device
 
 
 def test_auto_takes_a_card_that_can_do_it(card, monkeypatch):
-    assert made(SOFTWARE) == "cpu" == made(None) == made(CARD, device="cpu") == made(CARD, "pchip")
+    assert made(SOFTWARE) == "cpu" == made(None) == made(CARD, device="cpu")
     assert made(CARD) == "cuda" == made(None, device="cuda") == made(CARD, config=V2eConfig)
     assert made(CARD, config=VoltmeterConfig) == "cpu"
     monkeypatch.setattr(devices, "_trials", {})
@@ -49,14 +49,8 @@ def test_auto_takes_a_card_that_can_do_it(card, monkeypatch):
 
 
 def test_what_is_refused(card, tmp_path):
-    with pytest.raises(EventDataError, match=r"^timeline\.reconstruction.*linear, or events\.device: cpu"):
-        made(CARD, "pchip", device="cuda")
     with pytest.raises(ConfigError, match=r"device.*'gl'.*cuda"):
         blinkgl.Esim(4, 4, device="gl")
-    path = tmp_path / "run.yaml"
-    path.write_text(yaml.safe_dump({**TINY, "events": {"device": "cuda"}, "timeline": {"reconstruction": "hermite"}}))
-    with pytest.raises(ConfigError, match=r"timeline\.reconstruction.*straight lines"):
-        load_run(path)
 
 
 def test_a_step_that_the_processor_would_cut_is_refused(card):
@@ -141,15 +135,8 @@ def test_files_are_the_same_and_the_manifest_says_which(card, gl, tmp_path, monk
         assert result.clean and len(result.deep) == 1
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"timeline": {"kind": "budget", "max_time_error_px": 0.2}},  # a timeline that looks at the frames
-        {"readout": {"latency": {"dark_us": 500}}},  # as slow as pixels are bright
-    ],
-    ids=["budget", "latency"],
-)
-def test_who_looks_at_frames_gets_arrays(card, gl, tmp_path, changes):
+def test_who_looks_at_frames_gets_arrays(card, gl, tmp_path):
+    changes = {"readout": {"latency": {"dark_us": 500}}}  # as slow as pixels are bright
     sums = []
     for device in ("cpu", "cuda"):
         recipe = tmp_path / f"{device}.yaml"

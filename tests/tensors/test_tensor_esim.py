@@ -15,7 +15,7 @@ OPTIONS = {
     "defaults": {},
     "one threshold": {"threshold_sigma": 0},
     "two thresholds": {"threshold_sigma": 0, "contrast_threshold_off": 0.3},
-    "spread, causes": {"threshold_sigma": 0.1, "threshold_correlation": 0.5, "causes": True},
+    "spread, causes": {"threshold_sigma": 0.1, "causes": True},
     "refractory": {"refractory_us": 700},
     "jitter": {"threshold_jitter": 0.05},
     "jitter, refractory": {"threshold_jitter": 0.05, "refractory_us": 300, "threshold_sigma": 0},

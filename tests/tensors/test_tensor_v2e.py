@@ -14,7 +14,6 @@ _NOISY = {"causes": True, "shot_noise_rate_hz": 20.0, "leak_rate_hz": 5.0, "hot_
 OPTIONS = {
     "clean": _CLEAN,
     "low-pass": {**_CLEAN, "cutoff_hz": 200},
-    "two low-passes": {**_CLEAN, "cutoff_hz": 100, "second_cutoff_hz": 300},
     "dead time": {**_CLEAN, "refractory_us": 500},
     "leak": {**_CLEAN, "leak_rate_hz": 50},
     "leak, jitter, dead time": {"shot_noise_rate_hz": 0, "leak_jitter": 0.3, "leak_rate_hz": 50},

@@ -7,67 +7,10 @@ import itertools
 import cv2
 import numpy as np
 import pytest
-from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 from skimage import data
 
 from blinkgl.errors import EventDataError
 from blinkgl.timeline import interpolate
-
-
-def test_cubic_is_pchip_in_log_luminance():
-    rng = np.random.default_rng(0)
-    times = np.array([0, 7, 20, 22, 40, 61]) * 1_000_000 + 10**15
-    frames = rng.random((6, 5, 7)).astype(np.float32)
-    frames[3, 0] = frames[2, 0]  # flat pieces, too
-    out = list(interpolate.cubic(zip(frames, times.tolist()), 5))
-    assert [t for _, t in out[::5]] == times.tolist() and all(
-        np.array_equal(a, b) for (a, _), b in zip(out[::5], frames)
-    )
-    reference = PchipInterpolator((times - times[0]) * 1e-6, np.log(frames.astype(np.float64) + 1e-3), axis=0)
-    inner = [
-        (f, t) for f, t in out if times[1] <= t <= times[-2]
-    ]  # the ends have one neighbour only: linear here, quadratic there
-    assert len(inner) == 16
-    for frame, t in inner:
-        assert np.abs(np.log(frame + 1e-3) - reference((t - times[0]) * 1e-6)).max() < 2e-4
-    first = [f for f, t in out if times[0] < t < times[1]]
-    assert all(
-        ((f >= np.minimum(frames[0], frames[1]) - 1e-5) & (f <= np.maximum(frames[0], frames[1]) + 1e-5)).all()
-        for f in first
-    )
-
-
-@pytest.mark.parametrize("factor", [2, 3, 7])
-def test_cubic_is_the_hermite_spline_of_pchips_slopes_and_of_the_outer_secants(factor):
-    """At every time, the ends included: there the slope is that of the straight line to the only neighbour."""
-    times = np.array([0, 4, 14, 15, 35]) * 1_000_000 + 10**15
-    frames = np.random.default_rng(3).random((5, 3, 4)).astype(np.float32)
-    frames[2, 0] = frames[1, 0] * 1.5  # a level after a rise: slope 0 on both sides of it
-    frames[3, 0] = frames[2, 0]
-    ms, logs = (times - times[0]) * 1e-6, np.log(frames.astype(np.float64) + 1e-3)
-    slopes = PchipInterpolator(ms, logs, axis=0).derivative()(ms)
-    slopes[0], slopes[-1] = (logs[1] - logs[0]) / (ms[1] - ms[0]), (logs[-1] - logs[-2]) / (ms[-1] - ms[-2])
-    exact = CubicHermiteSpline(ms, logs, slopes)
-    out = list(interpolate.cubic(zip(frames, times.tolist()), factor))
-    assert [t for _, t in out] == [
-        int(a + (b - a) * k // factor) for a, b in itertools.pairwise(times) for k in range(factor)
-    ] + [int(times[-1])]
-    for frame, t in out:
-        assert frame.dtype == np.float32 and frame.min() >= 0
-        assert np.abs(np.log(frame + 1e-3) - exact((t - times[0]) * 1e-6)).max() < 2e-4
-
-
-def test_cubic_never_goes_below_black():
-    dark = [np.zeros((2, 2), np.float32), np.full((2, 2), 1e-9, np.float32), np.zeros((2, 2), np.float32)]
-    assert all((frame >= 0).all() for frame, _ in interpolate.cubic(zip(dark, (0, 1000, 2000)), 5))
-
-
-def test_cubic_of_two_frames_and_of_tiny_gaps():
-    a, b = np.full((2, 2), 0.1, np.float32), np.full((2, 2), 0.4, np.float32)
-    out = list(interpolate.cubic([(a, 0), (b, 1000)], 2))
-    assert [t for _, t in out] == [0, 500, 1000] and np.allclose(out[1][0] + 1e-3, np.sqrt(0.101 * 0.401), rtol=1e-5)
-    assert [t for _, t in interpolate.cubic([(a, 0), (b, 1), (a, 2)], 4)] == [0, 1, 2], "times stay distinct"
-    assert list(interpolate.cubic([], 4)) == [] and len(list(interpolate.cubic([(a, 0)], 4))) == 1
 
 
 def scene(moved_px: float) -> np.ndarray:

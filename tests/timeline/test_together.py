@@ -47,17 +47,13 @@ def test_whoever_asks_first_decides_and_the_other_gets_the_same():
     assert [first[0], first[1], *b] == rest
 
 
-def test_each_is_told_its_own_frames():
-    told = []
-    timelines = [made(Seen(100, 100, 0)), made(Seen(200, 200, 0))]
-    for name, one in zip("ab", timelines):
-        one.observe = lambda *given, name=name: told.append((name, *given))  # type: ignore[method-assign]
-        one.info = lambda name=name: {"who": name}  # type: ignore[method-assign]
-    a, b = together(timelines)
-    b.observe(5, "picture", "rate")  # type: ignore[arg-type]
-    assert told == [("b", 5, "picture", "rate")] and (a.info(), b.info()) == ({"who": "a"}, {"who": "b"})
-
-
 def test_one_alone_stays_as_it_is():
     alone = made(Seen(1, 1, 0), UniformTimeline(fps=100))
     assert together([alone])[0] is alone and not alone.others
+
+
+def test_each_says_what_was_achieved_for_its_own_camera():
+    timelines = [made(Seen(100, 100, 0)), made(Seen(200, 200, 0))]
+    for name, one in zip("ab", timelines):
+        one.info = lambda name=name: {"who": name}  # type: ignore[method-assign]
+    assert [one.info() for one in together(timelines)] == [{"who": "a"}, {"who": "b"}]

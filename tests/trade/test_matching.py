@@ -48,13 +48,6 @@ def errors(a: Events, b: Events, limit_us: int = 1000, **options):
     return event_errors(a, b, SPEED, 0, 100_000, limit_us=limit_us, **options)
 
 
-def test_equal_streams_have_no_error():
-    a = random_stream(5000, 100_000, 0)
-    e = errors(a, a)
-    assert (e.time_median_us, e.time_p95_us, e.shift_p95_px, e.missed, e.extra, e.voxel, e.count) == (0,) * 7
-    assert e.events == e.reference_events == len(a)
-
-
 def test_a_shift_is_the_error_in_us_and_px():
     a = train(*range(100, 90_000, 400))
     b = Events(a.x, a.y, a.t + 7, a.p)
@@ -77,18 +70,6 @@ def test_pixel_and_polarity_are_not_mixed():
     a = train(1000)
     for other in (train(1000, p=0), train(1000, x=2), train(1000, y=1)):
         assert pairs(a, other, 500) == []
-
-
-def test_by_hand():
-    # The neighbour in time is not the partner when that would leave another one alone ...
-    assert pairs(train(100, 200), train(170, 270), 150) == [(100, 170), (200, 270)]
-    # ... but losing one and inventing one (150) is cheaper than moving three by 100 each.
-    assert pairs(train(100, 200, 300), train(200, 300, 400), 150) == [(200, 200), (300, 300)]
-    # The limit itself still matches, one more does not; each event has one partner.
-    assert pairs(train(0), train(150), 150) == [(0, 150)]
-    assert pairs(train(0), train(151), 150) == []
-    assert pairs(train(100, 101, 102), train(101), 50) == [(101, 101)]
-    assert pairs(train(), train(5), 50) == pairs(train(5), train(), 50) == []
 
 
 def cost_of(a: list[int], b: list[int], limit: int) -> float:

@@ -172,7 +172,7 @@ def test_a_noisy_emulators_settings_are_its_twins(gl, config):
         OPTIONS,
     )
     assert (
-        bench.config(Setting("displacement 2 px", "pchip").overrides).events
+        bench.config(Setting("displacement 2 px").overrides).events
         == bench.emulator
         == EsimConfig(contrast_threshold=0.3, threshold_sigma=0.03)
     )
@@ -182,8 +182,8 @@ def test_design():
     for quick in (True, False):
         settings = design(quick)
         assert len(set(settings)) == len(settings) and len({s.name for s in settings}) == len(settings)
-        assert {s.antialiasing for s in settings} == {"none", "taps4", "edges", "edges2", "ssaa2", "ssaa4"}
-    assert len(design(True)) < 30 < len(design(False))
+        assert {s.antialiasing for s in settings} >= {"none", "edges", "edges2", "ssaa2"}
+    assert len(design(True)) < 20 < len(design(False))
     assert not any("textures" in s.other for s in design(False, random_scene=False))
 
 
@@ -220,9 +220,9 @@ def result(config, tmp_path_factory):
             "--rounds",
             "1",
             "--only",
-            "1 px, linear, ssaa2",
+            "1 px, edges2",
             "--only",
-            "2 px, linear, none",
+            "2 px, none",
             "--minutes",
             "0.1",
             "-o",
@@ -237,7 +237,7 @@ def test_files_of_the_command(result):
     data = json.loads((result / "trade.json").read_text())
     assert "NaN" not in (result / "trade.json").read_text()
     names = [s["name"] for s in data["settings"]]
-    assert data["front"] and set(data["front"]) <= set(names) and len(names) == 3
+    assert data["front"] and set(data["front"]) <= set(names) and len(names) == 2
     rows = list(csv.DictReader((result / "trade.csv").open()))
     assert [r["name"] for r in rows] == names and float(rows[0]["wall_s"]) > 0 and rows[0]["flow_median_px"]
     assert (result / "pareto.png").read_bytes()[:4] == b"\x89PNG"
@@ -276,6 +276,4 @@ def test_an_unchecked_reference_is_called_that():
 
 def test_without_the_command(config):
     result = trade(load_run(config), settings=(Setting("displacement 1 px"),), options=OPTIONS, cost="cpu_s")
-    assert result["front"] == ["displacement 1 px, linear, none"] and result["sizes"]["full"][
-        "clip_s"
-    ] == pytest.approx(0.02)
+    assert result["front"] == ["displacement 1 px, none"] and result["sizes"]["full"]["clip_s"] == pytest.approx(0.02)

@@ -22,13 +22,11 @@ class Output(NamedTuple):
     """An attachment: ``layout(location = i)`` of the fragment stage for the i-th output of a pass.
 
     format : key of :data:`blinkgl.gl.FORMATS`.
-    components : how many of its format's are given out, the first ones; 0: all.
-    planes : names of its components where each is a picture of its own; they are then read by these names."""
+    components : how many of its format's are given out, the first ones; 0: all."""
 
     name: str
     format: str
     components: int = 0
-    planes: tuple[str, ...] = ()
 
 
 class Input(NamedTuple):

@@ -64,11 +64,7 @@ class Edged(Pass):
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
         channels = _CHANNELS.get(self.outputs[0].format, 4)
-        # Light is not negative; its rate may be anything.
-        rates = [k for k, name in enumerate(self.outputs[0].planes) if name == "rate"]
-        floor = ", ".join("-3.4e38" if k in rates else "0.0" for k in range(channels))
-        light = "float" if channels == 1 else f"vec{channels}"
-        return {"LIGHT": light, "OF": "rgba"[:channels], "FLOOR": f"{light}({floor})"}
+        return {"LIGHT": "float" if channels == 1 else f"vec{channels}", "OF": "rgba"[:channels]}
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
         # Pixels without an edge keep their value.
@@ -94,7 +90,7 @@ class Edged(Pass):
         from blinkgl.render.passes.luminance import Luminance
 
         edges = Samples(taps=4, edges=True)
-        return (cls(of) for of in (Luminance(False, edges), Luminance(True, edges), Colour(edges)))
+        return (cls(of) for of in (Luminance(edges), Colour(edges)))
 
 
 def filtered(pass_: Pass) -> Pass:

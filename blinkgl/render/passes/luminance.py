@@ -1,4 +1,4 @@
-"""Event frames: linear luminance, with its rate of change where somebody needs it; and the small pictures of both."""
+"""Event frames: linear luminance; and small pictures of it with its rate of change."""
 
 from __future__ import annotations
 
@@ -49,10 +49,8 @@ class _Luminance(Shaded):
 
 @dataclass(frozen=True)
 class Luminance(_Luminance):
-    """Output "luminance" and, with ``rate``, "rate": d(luminance)/dt per second of each pixel as the surface it shows
-    moves (edges that pass are not in it), by a shader variant of its own. float32, (H, W) each, at ``samples``."""
+    """Output "luminance", (H, W) float32, at ``samples``."""
 
-    rate: bool = False
     samples: Samples = Samples()
     shadows: tuple[ShadowMap, ...] = ()
     still: ClassVar[bool] = True
@@ -61,22 +59,16 @@ class Luminance(_Luminance):
     def depth(self) -> bool | str:
         return "texture" if self.samples.edges else True
 
-    @property
-    def outputs(self) -> tuple[Output, ...]:
-        return (
-            Output("luminance", "RG32F", planes=("luminance", "rate")) if self.rate else Output("luminance", "R32F"),
-        )
+    outputs: ClassVar[tuple[Output, ...]] = (Output("luminance", "R32F"),)
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
         # Taps are for textures; an even colour needs none.
         taps = {"TAPS4": 1} if self.samples.taps == 4 and kind.textured else {}
-        return ({"RATE": 1} if self.rate else {}) | taps | ({"STRETCHED": 1} if taps and self.samples.edges else {})
+        return taps | ({"STRETCHED": 1} if taps and self.samples.edges else {})
 
     @classmethod
     def every_kind(cls) -> Iterator[Pass]:
-        # What a rate and taps are to each other is the same for both kinds of taps.
-        plain, taps, edges = Samples(), Samples(taps=4), Samples(taps=4, edges=True)
-        return (cls(rate, one) for rate, one in ((False, plain), (True, plain), (True, taps), (True, edges)))
+        return (cls(one) for one in (Samples(), Samples(taps=4), Samples(taps=4, edges=True)))
 
 
 @dataclass(frozen=True)

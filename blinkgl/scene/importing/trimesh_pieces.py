@@ -1,4 +1,4 @@
-"""obj, ply and stl files, and what was loaded with trimesh elsewhere, as pieces of raw triangles."""
+"""obj, ply and stl files as pieces of raw triangles."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from PIL import Image
 from blinkgl.errors import AssetError
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.omissions import Omissions
-from blinkgl.scene.reading import contents, reading
-from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash, decode_image, shrink
+from blinkgl.scene.reading import contents
+from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash, decode_image
 from blinkgl.scene.types import Material, Texture
 from blinkgl.srgb import linear_from_srgb
 
@@ -48,11 +48,7 @@ def read_pieces(
     if max_texture is not None and resolver.refused is not None:
         raise resolver.refused
     pieces = [
-        piece_of_trimesh(
-            g, max_texture=max_texture, where=where, file_normals=True, omissions=omissions, resolver=resolver
-        )
-        for g in loaded.geometry.values()
-        if isinstance(g, trimesh.Trimesh)
+        _piece(g, max_texture, omissions, resolver) for g in loaded.geometry.values() if isinstance(g, trimesh.Trimesh)
     ]
     if not pieces:
         raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
@@ -61,22 +57,12 @@ def read_pieces(
     return pieces
 
 
-def piece_of_trimesh(
-    mesh: trimesh.Trimesh,
-    *,
-    max_texture: int | None,
-    where: str,
-    file_normals: bool,
-    omissions: Omissions,
-    resolver: FolderResolver | None = None,
+def _piece(
+    mesh: trimesh.Trimesh, max_texture: int | None, omissions: Omissions, resolver: FolderResolver
 ) -> gltf.Piece:
-    """Raw triangles and material of a ``trimesh.Trimesh``.
-
-    file_normals : use normals that came with the mesh; trimesh's own smooth ones would round off a cuboid.
-    max_texture : None leaves the material out.   resolver : what the mesh was loaded with; it knows the images.
-    """
+    """Return raw triangles and material. max_texture : None leaves the material out."""
     # mesh.vertex_normals would make up what the file does not have.
-    normals = mesh._cache.cache.get("vertex_normals") if file_normals else None  # noqa: SLF001
+    normals = mesh._cache.cache.get("vertex_normals")  # noqa: SLF001
     uvs = getattr(mesh.visual, "uv", None)
     if uvs is not None and len(uvs) == len(mesh.vertices):
         uvs = np.asarray(uvs, np.float64)[:, :2] * [1, -1] + [0, 1]  # trimesh has v upwards
@@ -84,7 +70,7 @@ def piece_of_trimesh(
         uvs = None
     material, colours = None, None
     if max_texture is not None:
-        material = _material(mesh.visual, max_texture, where, omissions, resolver)
+        material = _material(mesh.visual, max_texture, omissions, resolver)
         if getattr(mesh.visual, "kind", None) == "vertex":
             colours = linear_from_srgb(np.asarray(mesh.visual.vertex_colors, float)[:, :3] / 255)
             if (colours == colours[0]).all():
@@ -96,9 +82,7 @@ def piece_of_trimesh(
     )
 
 
-def _material(
-    visual, max_texture: int, where: str, omissions: Omissions, resolver: FolderResolver | None
-) -> Material | None:
+def _material(visual, max_texture: int, omissions: Omissions, resolver: FolderResolver) -> Material | None:
     material = getattr(visual, "material", None)
     if material is None:
         kind = getattr(visual, "kind", None)
@@ -108,39 +92,13 @@ def _material(
         if kind == "face" and not (colours == colours[0]).all():
             omissions.add(f"{kind} colours (drawn in the most frequent one)")
         return Material(base_color=gltf.to_linear(np.asarray(visual.main_color, float)[:3] / 255))
-    image = getattr(material, "baseColorTexture", None)
-    factor = getattr(material, "baseColorFactor", None)
-    if isinstance(material, trimesh.visual.material.SimpleMaterial):
-        image = material.image
-        diffuse = material.diffuse
-        # An untouched default is no material; a texture is not darkened by the usual grey diffuse default.
-        if (
-            image is None
-            and material.name is None
-            and np.array_equal(diffuse[:3], trimesh.visual.color.DEFAULT_COLOR[:3])
-        ):
-            return None
-        colour = (1.0, 1.0, 1.0) if image is not None else gltf.to_linear(np.asarray(diffuse, float)[:3] / 255)
-    else:
-        factor = np.ones(3) if factor is None else np.asarray(factor)[:3]
-        # glTF factors are linear.
-        colour = tuple(float(c) for c in (factor / 255 if factor.dtype.kind in "iu" else factor))
-        if getattr(material, "alphaMode", None) not in (None, "OPAQUE"):
-            omissions.add(f"alpha {material.alphaMode} (drawn opaque)")
-        if np.any(getattr(material, "emissiveFactor", None)):
-            omissions.add("emissive light")
-    texture = None
-    if image is not None:
-        opened = resolver is None  # by whoever made the mesh
-        texture = texture_of(image, max_texture, where) if opened else resolver.texture(image, max_texture)
-    return Material(texture=texture, base_color=colour, double_sided=bool(getattr(material, "doubleSided", False)))
-
-
-def texture_of(image: Image.Image, max_texture: int, where: str) -> Texture:
-    """A Pillow image that somebody else opened, as a texture. AssetError when its file turns out to be broken."""
-    with reading("image", where):
-        pixels = np.ascontiguousarray(np.asarray(image.convert("RGB")))
-        return Texture(shrink(pixels, max_texture), "texture", content_hash(pixels.tobytes()))
+    image, diffuse = material.image, material.diffuse
+    # An untouched default is no material; a texture is not darkened by the usual grey diffuse default.
+    if image is None and material.name is None and np.array_equal(diffuse[:3], trimesh.visual.color.DEFAULT_COLOR[:3]):
+        return None
+    if image is None:
+        return Material(base_color=gltf.to_linear(np.asarray(diffuse, float)[:3] / 255))
+    return Material(texture=resolver.texture(image, max_texture))
 
 
 class FolderResolver(trimesh.resolvers.Resolver):

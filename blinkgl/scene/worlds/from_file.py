@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -34,14 +34,14 @@ from blinkgl.scene.omissions import Omissions
 from blinkgl.scene.reading import reading
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.shapes.deformer import Deformer
-from blinkgl.scene.surfaces.images import content_hash, shrink
-from blinkgl.scene.types import Light, Material, Part, PosePath, Scene, SceneObject, Texture
+from blinkgl.scene.surfaces.images import content_hash
+from blinkgl.scene.types import Light, Material, Part, PosePath, Scene, SceneObject
 from blinkgl.scene.worlds.explicit import motion_path
 from blinkgl.scene.worlds.pool import resolve
 from blinkgl.scene.worlds.sky import with_environment
 
 if TYPE_CHECKING:
-    import trimesh
+    pass
 
 CV_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])  # its own inverse
 _ANIMATION_STEP = 1 / 60  # s between the samples that a spline is laid through
@@ -187,129 +187,6 @@ def _from_document(
     )
 
 
-def from_trimesh(
-    scene: trimesh.Scene | trimesh.Trimesh,
-    camera: CameraModel | None = None,
-    t0_ns: int = 0,
-    t1_ns: int = 1_000_000_000,
-    *,
-    camera_path: PosePath | None = None,
-    up: str = "z",
-    near: float = 0.05,
-    light: Light = Light(),
-    background: float = 0.2,
-    max_faces: int = 5_000_000,
-    max_texture: int = 2048,
-) -> Scene:
-    """A ``trimesh.Scene``.
-
-    camera : intrinsics; None takes the scene's own camera (resolution, K).
-    camera_path : None takes the scene's camera transform.
-    up : "y" turns the world z up. Normals are made anew (crease angle), because trimesh's round off every edge.
-    """
-    from blinkgl.scene.importing.trimesh_pieces import piece_of_trimesh
-
-    turn = _turn(up)
-    log, omissions = [], Omissions("the trimesh scene")
-    objects = []
-    for name in sorted(scene.graph.nodes_geometry):
-        matrix, geometry = scene.graph[name]
-        mesh = scene.geometry[geometry]
-        if not hasattr(mesh, "faces") or not len(mesh.faces):
-            omissions.add("points and lines")
-            continue
-        where = f"trimesh geometry '{geometry}'"
-        if len(mesh.faces) > max_faces:
-            raise AssetError(
-                "the mesh has too many faces", where=where, value=len(mesh.faces), accepted=f"at most {max_faces}"
-            )
-        rigid, baked = split_rigid(turn @ matrix)
-        piece = piece_of_trimesh(mesh, max_texture=max_texture, where=where, file_normals=False, omissions=omissions)
-        objects.append((str(name), _parts([piece], baked, str(name), where, log), StaticPath(rigid, t0_ns, t1_ns)))
-    if (camera is None or camera_path is None) and not scene.has_camera:
-        raise ConfigError(
-            "the trimesh scene has no camera",
-            where="from_trimesh",
-            accepted="camera and camera_path, or scene.set_camera()",
-        )
-    if camera_path is None:
-        camera_path = StaticPath(split_rigid(turn @ scene.camera_transform)[0] @ CV_FROM_GL, t0_ns, t1_ns)
-    if camera is None:
-        (width, height), (fx, fy) = (int(v) for v in scene.camera.resolution), scene.camera.focal
-        camera = PinHole.centred(width, height, float(fx), float(fy), near)
-    if not objects:
-        raise AssetError("the scene has no faces", where="from_trimesh", accepted="a scene with a mesh")
-    return _scene(objects, Rig.alone(camera, camera_path), t0_ns, t1_ns, light, background, log, omissions)
-
-
-def from_pyrender(
-    scene: Any,
-    camera: CameraModel,
-    t0_ns: int = 0,
-    t1_ns: int = 1_000_000_000,
-    *,
-    camera_path: PosePath | None = None,
-    intrinsics: str = "file",
-    up: str = "z",
-    light: Light | None = None,
-    background: float | None = None,
-    max_texture: int = 2048,
-) -> Scene:
-    """A ``pyrender.Scene`` (pyrender itself is not imported here).
-
-    camera : width, height and, with intrinsics="config", the rest; "file" takes the main
-    camera's yfov or fx, fy, cx, cy.
-    light : None takes the direction of the first directional light, if there is one; strengths are BlinkGL's.
-    background : None takes the mean of ``scene.bg_color``.
-    """
-    turn = _turn(up)
-    log, omissions = [], Omissions("the pyrender scene")
-    objects = []
-    # pyrender keeps nodes in a set: order them by what they are.
-    order = sorted(
-        scene.mesh_nodes,
-        key=lambda n: (
-            str(n.name or n.mesh.name or ""),
-            np.asarray(scene.get_pose(n)).tobytes(),
-            [np.asarray(p.positions).tobytes() for p in n.mesh.primitives],
-        ),
-    )
-    for number, node in enumerate(order):
-        name = str(node.name or node.mesh.name or f"mesh-{number}")
-        pieces = [_pyrender_piece(p, max_texture, name) for p in node.mesh.primitives if getattr(p, "mode", 4) == 4]
-        if len(pieces) < len(node.mesh.primitives):
-            omissions.add("points and lines")
-        if not pieces:
-            continue
-        _pyrender_omissions(node.mesh.primitives, omissions)
-        rigid, baked = split_rigid(turn @ scene.get_pose(node))
-        objects.append(
-            (name, _parts(pieces, baked, name, f"pyrender mesh '{name}'", log), StaticPath(rigid, t0_ns, t1_ns))
-        )
-    if not objects:
-        raise AssetError("the scene has no faces", where="from_pyrender", accepted="a scene with a mesh")
-    node = scene.main_camera_node
-    if node is None and (camera_path is None or intrinsics == "file"):
-        raise ConfigError(
-            "the pyrender scene has no camera",
-            where="from_pyrender",
-            accepted="a camera node, or camera_path and intrinsics='config'",
-        )
-    if camera_path is None:
-        camera_path = StaticPath(split_rigid(turn @ scene.get_pose(node))[0] @ CV_FROM_GL, t0_ns, t1_ns)
-    if intrinsics == "file":
-        camera = _pyrender_intrinsics(node.camera, camera)
-    if light is None:
-        suns = sorted(getattr(scene, "directional_light_nodes", ()), key=lambda n: str(n.name or ""))
-        light = Light()
-        if suns:  # it shines along its -z axis
-            T, _ = split_rigid(turn @ scene.get_pose(suns[0]))
-            light = replace(light, sun_direction=tuple(float(v) for v in T[:3, 2]))
-    if background is None:
-        background = float(np.mean(np.asarray(scene.bg_color, float)[:3]))
-    return _scene(objects, Rig.alone(camera, camera_path), t0_ns, t1_ns, light, background, log, omissions)
-
-
 def unlit(scene: Scene) -> Scene:
     """The scene with radiance = albedo everywhere."""
 
@@ -375,12 +252,6 @@ def _parts(
     if closed_together(tuple(p.mesh for p in parts)):
         parts = [Part(replace(p.mesh, closed=True), p.material) for p in parts]
     return tuple(parts)
-
-
-def _turn(up: str) -> np.ndarray:
-    if up not in ("y", "z"):
-        raise ConfigError("unknown up axis", value=up, accepted="y or z")
-    return gltf.Z_UP if up == "y" else np.eye(4)
 
 
 # ---- glTF
@@ -502,70 +373,4 @@ def _gltf_intrinsics(document: gltf.Document, node: int, camera: CameraModel) ->
         camera.height,
         focal_length(camera.height, yfov),
         near=float(znear) if 1e-9 <= znear <= 1e9 else camera.near,
-    )
-
-
-# ---- pyrender
-def _pyrender_omissions(primitives, omissions: Omissions) -> None:
-    for primitive in primitives:
-        if getattr(primitive, "color_0", None) is not None:
-            omissions.add("vertex colours (left out)")
-        material = primitive.material
-        if getattr(material, "alphaMode", None) not in (None, "OPAQUE"):
-            omissions.add(f"alpha {material.alphaMode} (drawn opaque)")
-        if np.any(getattr(material, "emissiveFactor", None)):
-            omissions.add("emissive light")
-        if getattr(material, "normalTexture", None) is not None:
-            omissions.add("normal maps")
-
-
-def _pyrender_piece(primitive, max_texture: int, name: str) -> gltf.Piece:
-    positions = np.asarray(primitive.positions, np.float64)
-    faces = (
-        np.arange(len(positions)).reshape(-1, 3)
-        if primitive.indices is None
-        else np.asarray(primitive.indices).reshape(-1, 3)
-    )
-    uvs = (
-        None if primitive.texcoord_0 is None else np.asarray(primitive.texcoord_0, np.float64)[:, :2] * [1, -1] + [0, 1]
-    )
-    source = primitive.material
-    material = None
-    if source is not None:
-        factor = getattr(source, "baseColorFactor", None)
-        texture = getattr(getattr(source, "baseColorTexture", None), "source", None)
-        if texture is not None:
-            image = np.asarray(texture.convert("RGB") if hasattr(texture, "convert") else texture)
-            image = np.round(image * 255).astype(np.uint8) if image.dtype.kind == "f" else image
-            image = image[..., None] if image.ndim == 2 else image
-            image = image[..., :3] if image.shape[2] >= 3 else np.repeat(image[..., :1], 3, axis=2)
-            texture = Texture(
-                shrink(np.ascontiguousarray(image), max_texture), f"{name} texture", content_hash(image.tobytes())
-            )
-        colour = (1.0, 1.0, 1.0) if factor is None else tuple(float(c) for c in np.asarray(factor, float)[:3])
-        material = Material(texture, colour, double_sided=bool(getattr(source, "doubleSided", False)))
-    normals = None if primitive.normals is None else np.asarray(primitive.normals, np.float64)
-    return gltf.Piece(positions, faces, normals, uvs, material)
-
-
-def _pyrender_intrinsics(source, camera: CameraModel) -> PinHole:
-    near = float(getattr(source, "znear", None) or camera.near)
-    if hasattr(source, "yfov"):
-        focal = focal_length(camera.height, source.yfov)
-        # pyrender scales x by the aspect ratio: the viewport's, unless the camera states one.
-        aspect = getattr(source, "aspectRatio", None) or camera.width / camera.height
-        return PinHole.centred(camera.width, camera.height, focal * camera.width / camera.height / aspect, focal, near)
-    if hasattr(source, "fx"):
-        # pyrender counts from the image's corner, we from the first pixel's centre.
-        return PinHole(
-            camera.width,
-            camera.height,
-            float(source.fx),
-            float(source.fy),
-            float(source.cx) - 0.5,
-            float(source.cy) - 0.5,
-            near,
-        )
-    raise ConfigError(
-        "only perspective and intrinsics cameras are supported", where="from_pyrender", value=type(source).__name__
     )

@@ -8,7 +8,7 @@ import pytest
 from blinkgl.errors import ConfigError, EventDataError
 from eflow.data.window import Window
 from eflow.methods import METHODS, make_method
-from eflow.methods.contrast import MOST_EVENTS, _Cloud, affine_field, rotation_field, sharpness, tile_field
+from eflow.methods.contrast import MOST_EVENTS, _Cloud, affine_field, rotation_field, sharpness
 from eflow.methods.iwe import flow_warp_loss, slope_at, vote, warped
 
 H, W = 96, 128
@@ -69,7 +69,6 @@ def length(field):
         ("affine", "zoom", 0.2),
         ("affine", "roll", 0.2),
         ("affine", "affine", 0.2),
-        ("tiles", "affine", 0.4),
     ],
 )
 def test_known_motions_are_found(field, motion, limit):
@@ -92,18 +91,11 @@ def test_a_rotating_camera():
     assert length(flow - truth(motion)).mean() < 0.15 < 0.04 * length(truth(motion)).mean()
 
 
-def test_tiles_follow_two_motions_where_one_field_cannot():
-    two = lambda p: np.where(p[:, :1] < W / 2, [[5.0, 0.0]], [[-3.0, 2.0]])
-    old, new = pictured(two)
-    error = {f: length(make_method(f"contrast-{f}")(old, new, H, W) - truth(two)).mean() for f in ("affine", "tiles")}
-    assert error["tiles"] < 0.75 * error["affine"]
-
-
 def test_the_derivative_of_the_sharpness():
     cloud = _Cloud.of(list(pictured(MOTIONS["affine"])), H, W)
     rng = np.random.default_rng(1)
     for blur in (1.0, 4.0):
-        for field in (affine_field(cloud.x, cloud.y, H, W), tile_field(cloud.x, cloud.y, H, W, (5, 4))):
+        for field in (affine_field(cloud.x, cloud.y, H, W), rotation_field(cloud.x, cloud.y, H, W, 150.0)):
             p, way = (rng.normal(0, 3, field.basis[0].shape[1]) for _ in range(2))
             slope = field.pulled(sharpness(cloud, field.at(p), blur)[1]) @ way
             h = 1e-5
@@ -134,9 +126,6 @@ def test_fields_by_hand():
     assert u == pytest.approx([1 - 63.5, 1 + 63.5, 1]) and v == pytest.approx([2 - 47.5, 2 + 47.5, 2])
     u, v = rotation_field(x, y, H, W, 100.0).at(np.array([0.0, 0.0, 1.0]))
     assert u == pytest.approx([-0.475, 0.475, 0]) and v == pytest.approx([0.635, -0.635, 0])
-    nodes = np.arange(4 * 3 * 2, dtype=float)
-    u, v = tile_field(x, y, H, W, (4, 3)).at(nodes)
-    assert u == pytest.approx([0, 22, 11]) and v == pytest.approx([1, 23, 12])
 
 
 def test_flow_warp_loss():

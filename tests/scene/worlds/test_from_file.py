@@ -1,7 +1,6 @@
-"""glTF, trimesh and pyrender scenes against hand-made ones and against trimesh's own reader."""
+"""glTF scenes against hand-made ones and against trimesh's own reader."""
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,8 +14,7 @@ from blinkgl.config.scene import FileSceneConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.importing import gltf
-from blinkgl.scene.motion.paths import StaticPath
-from blinkgl.scene.worlds.from_file import from_gltf, from_pyrender, from_trimesh, split_rigid
+from blinkgl.scene.worlds.from_file import from_gltf, split_rigid
 from tests.scene.gltf_files import GltfBuilder, triangle
 from tests.shared_data import shared
 
@@ -475,116 +473,3 @@ def test_our_reader_agrees_with_trimesh_on_real_files():
         assert ours.shape == corners.shape, path.name
         order = lambda a: a[np.lexsort(np.round(a, 4).T)]
         np.testing.assert_allclose(order(ours), order(corners), atol=2e-4, err_msg=path.name)
-
-
-def test_from_trimesh():
-    box = BOX.copy()
-    textured = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False)
-    image = Image.fromarray(np.full((4, 4, 3), 90, np.uint8))
-    textured.visual = trimesh.visual.TextureVisuals(
-        uv=[[0, 0], [1, 0], [0, 1]],
-        material=trimesh.visual.material.PBRMaterial(baseColorTexture=image, baseColorFactor=[128, 255, 255, 255]),
-    )
-    source = trimesh.Scene()
-    place = trimesh.transformations.rotation_matrix(0.3, [1, 2, 3], [0.5, 0, 0]) @ np.diag([2, 1, 1, 1.0])
-    source.add_geometry(box, node_name="box", transform=place)
-    source.add_geometry(textured, node_name="card")
-    view = trimesh.transformations.rotation_matrix(0.7, [1, 0, 0]) @ trimesh.transformations.translation_matrix(
-        [0, 0, 9]
-    )
-    source.camera = trimesh.scene.Camera(resolution=(80, 60), fov=(60, 45))
-    source.camera_transform = view
-    scene = from_trimesh(source)
-    by_name = {o.name: o for o in scene.objects}
-    expected = trimesh.transform_points(box.vertices, place)
-    np.testing.assert_allclose(bounds(world(by_name["box"])), bounds(expected), atol=1e-9)
-    assert by_name["box"].parts[0].mesh.closed and len(by_name["box"].parts[0].mesh.vertices) == 24  # flat-shaded
-    card = by_name["card"].parts[0]
-    assert card.material.base_color == pytest.approx((128 / 255, 1, 1)) and (card.material.texture.image == 90).all()
-    np.testing.assert_allclose(sorted(card.mesh.uvs.tolist()), sorted([[0, 1], [1, 1], [0, 0]]))  # v turned down
-    X = np.linalg.inv(scene.camera_path.pose(0)) @ view @ [1, 2, -5, 1]  # right, up, ahead for trimesh
-    np.testing.assert_allclose(X[:3], [1, -2, 5], atol=1e-12)
-    assert (scene.camera.width, scene.camera.height) == (80, 60) and scene.camera.fx == pytest.approx(
-        40 / math.tan(math.radians(30))
-    )
-    other = from_trimesh(source, CAMERA, camera_path=StaticPath(np.eye(4)), up="y")
-    np.testing.assert_allclose(
-        bounds(world({o.name: o for o in other.objects}["box"])),
-        bounds(trimesh.transform_points(expected, gltf.Z_UP)),
-        atol=1e-9,
-    )
-    assert other.camera.fx == pytest.approx(CAMERA.fx)
-
-
-def test_from_trimesh_refuses():
-    with pytest.raises(ConfigError, match="has no camera"):
-        from_trimesh(trimesh.Scene(BOX), CAMERA)
-    with pytest.raises(AssetError, match="too many faces"):
-        from_trimesh(trimesh.Scene(BOX), CAMERA, camera_path=StaticPath(np.eye(4)), max_faces=3)
-    with pytest.raises(AssetError, match="no faces"):
-        from_trimesh(trimesh.Scene(), CAMERA, camera_path=StaticPath(np.eye(4)))
-
-
-def pyrender_like(camera, pose, indices=True):
-    """What from_pyrender reads of a pyrender.Scene."""
-    corners = BOX.vertices[BOX.faces].reshape(-1, 3)
-    primitive = SimpleNamespace(
-        mode=4,
-        positions=BOX.vertices if indices else corners,
-        indices=BOX.faces if indices else None,
-        normals=None,
-        texcoord_0=np.tile([0.25, 0.75], (len(BOX.vertices if indices else corners), 1)),
-        material=SimpleNamespace(
-            baseColorFactor=np.array([0.5, 0.6, 0.7, 1]),
-            baseColorTexture=SimpleNamespace(source=Image.new("RGB", (4, 2), (9, 8, 7))),
-            doubleSided=False,
-        ),
-    )
-    node = SimpleNamespace(name=None, mesh=SimpleNamespace(name="box", primitives=[primitive]))
-    eye, sun = SimpleNamespace(name="eye", camera=camera), SimpleNamespace(name="sun")
-    poses = {
-        id(node): trimesh.transformations.translation_matrix([1, 2, 3]),
-        id(eye): pose,
-        id(sun): trimesh.transformations.rotation_matrix(0.5, [1, 0, 0]),
-    }
-    return SimpleNamespace(
-        mesh_nodes={node.name: node}.values(),
-        main_camera_node=eye,
-        directional_light_nodes=[sun],
-        bg_color=[0.2, 0.4, 0.6, 1],
-        get_pose=lambda n: poses[id(n)],
-    )
-
-
-@pytest.mark.parametrize("indices", [True, False])
-def test_from_pyrender(indices):
-    pose = trimesh.transformations.translation_matrix([0, 0, 9])
-    scene = from_pyrender(pyrender_like(SimpleNamespace(yfov=0.9, aspectRatio=None, znear=0.1), pose, indices), CAMERA)
-    (box,) = scene.objects
-    np.testing.assert_allclose(bounds(world(box)), [[0.5, 1, 1.5], [1.5, 3, 4.5]], atol=1e-9)
-    assert box.name == "box" and box.parts[0].mesh.closed and box.parts[0].material.base_color == (0.5, 0.6, 0.7)
-    np.testing.assert_allclose(box.parts[0].mesh.uvs, np.tile([0.25, 0.25], (24, 1)))
-    assert box.parts[0].material.texture.image.shape == (2, 4, 3)
-    assert (
-        scene.camera.fy == pytest.approx(24 / math.tan(0.45))
-        and scene.camera.fx == pytest.approx(scene.camera.fy)
-        and scene.camera.near == 0.1
-    )
-    np.testing.assert_allclose(scene.camera_path.pose(0), pose @ np.diag([1, -1, -1, 1.0]), atol=1e-12)
-    assert scene.light.sun_direction == pytest.approx(
-        (0, -math.sin(0.5), math.cos(0.5))
-    ) and scene.background == pytest.approx(0.4)
-    scene = from_pyrender(pyrender_like(SimpleNamespace(fx=50.0, fy=60.0, cx=32.0, cy=24.0, znear=0.05), pose), CAMERA)
-    assert (scene.camera.fx, scene.camera.fy, scene.camera.cx, scene.camera.cy) == (50, 60, 31.5, 23.5)
-
-
-def test_from_real_pyrender():
-    pyrender = pytest.importorskip("pyrender", reason="pyrender is not installed")
-    source = pyrender.Scene(bg_color=[0.1, 0.1, 0.1, 1])
-    source.add(
-        pyrender.Mesh.from_trimesh(BOX, smooth=False), pose=trimesh.transformations.translation_matrix([0, 0, -5])
-    )
-    source.add(pyrender.IntrinsicsCamera(fx=50, fy=50, cx=32, cy=24), pose=np.eye(4))
-    scene = from_pyrender(source, CAMERA)
-    np.testing.assert_allclose(bounds(world(scene.objects[0])), [[-0.5, -1, -6.5], [0.5, 1, -3.5]], atol=1e-6)
-    assert scene.objects[0].parts[0].mesh.closed and scene.camera.cx == 31.5

@@ -127,12 +127,6 @@ def known(
             ["b: the same events as a, as their configurations have it"],
         ),
         (
-            known("a", 1, 0, kind="explicit", threshold_sigma=0.1),
-            known("b", 1, 1, kind="explicit", threshold_sigma=0.1),
-            {"b": ["events.h5: the same as in a, a sequence of another draw"]},
-            [],
-        ),
-        (
             known("a", 1, 0, frames="film"),
             known("b", 1, 1, frames="film"),
             {},
@@ -143,22 +137,6 @@ def known(
 def test_twins(first, second, problems, notes):
     result = Verification()
     assert between.twins(dict([first, second]), result) == problems and result.notes == notes
-
-
-@pytest.mark.parametrize(
-    "key",
-    ["threshold_sigma", "threshold_jitter", "leak_rate_hz", "shot_noise_rate_hz", "hot_pixel_fraction", "k3", "k6"],
-)
-def test_what_makes_two_seeds_differ(key):
-    of = lambda **keys: SimpleNamespace(events=SimpleNamespace(**keys), readout=None, sensors=None)
-    assert between._noisy(of(**{key: 0.1}))
-    assert not between._noisy(of(**{key: 0.0})) and not between._noisy(of())
-
-
-@pytest.mark.parametrize(("key", "differ"), [("pixels", True), ("latency", True), ("clock", False)])
-def test_a_read_out_may_make_two_seeds_differ(key, differ):
-    readout = SimpleNamespace(**{"pixels": None, "latency": None, key: object()})
-    assert between._noisy(SimpleNamespace(events=SimpleNamespace(), readout=readout, sensors=None)) is differ
 
 
 def test_a_check_that_stops_is_a_line():

@@ -18,7 +18,10 @@ from blinkgl.machine.interrupts import interruptible
 from eflow.methods.table import METHODS, make_method
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from eflow.config import SourceConfig
+    from eflow.infer import StreamWindow
 
 app = typer.Typer(name="eflow", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -270,7 +273,6 @@ def predict(
     from eflow import infer
     from eflow.doubts import doubts
     from eflow.methods.iwe import flow_warp_loss
-    from eflow.metrics import frame_metrics
     from eflow.pictures import FlowVideo, events_of
 
     _one_of("--empty", empty, ("error", "zero"))
@@ -316,17 +318,7 @@ def predict(
                 f"{np.hypot(*np.moveaxis(flow, -1, 0)).mean():.3f} px  FWL {sharper:.3f}"
             )
             if gt is not None:
-                valid = np.isfinite(gt).all(-1)
-                hit = np.zeros_like(valid)
-                hit[window.new.y, window.new.x] = True
-                hit[window.old.y, window.old.x] = True
-                for name, mask in (("all pixels", valid), ("pixels with events", valid & hit)):
-                    m, zero = frame_metrics(flow, gt, mask), frame_metrics(np.zeros_like(flow), gt, mask)
-                    if m:
-                        line += (
-                            f"\n  {name}: AEE {m['AEE']:.3f} px, cosine {m['cosine']:.4f}; zero flow AEE "
-                            f"{zero['AEE']:.3f} px"
-                        )
+                line += _beside_truth(flow, gt, window)
             typer.echo(line)
             if writer:
                 writer.add(window, flow, tensor, gt)
@@ -343,6 +335,22 @@ def predict(
             )
     for path in filter(None, (out, video)):
         typer.echo(f"written: {path}")
+
+
+def _beside_truth(flow: np.ndarray, truth: np.ndarray, window: StreamWindow) -> str:
+    """Two lines: errors over all pixels with truth, and over those with events."""
+    import numpy as np
+
+    from eflow.metrics import frame_metrics
+
+    valid, hit, lines = np.isfinite(truth).all(-1), np.zeros(truth.shape[:2], bool), ""
+    for part in (window.new, window.old):
+        hit[part.y, part.x] = True
+    for name, mask in (("all pixels", valid), ("pixels with events", valid & hit)):
+        m, zero = frame_metrics(flow, truth, mask), frame_metrics(np.zeros_like(flow), truth, mask)
+        if m:
+            lines += f"\n  {name}: AEE {m['AEE']:.3f} px, cosine {m['cosine']:.4f}; zero flow AEE {zero['AEE']:.3f} px"
+    return lines
 
 
 def _fps(span_us: int) -> float:

@@ -61,12 +61,8 @@ def evaluate(
     representation = model.representation if method is None else PICTURED
     reads = model.reads if method is None else ("old", "new")
     dataset = FlowDataset([source], representation, empty=empty, raw=True, reads=reads)
-    indices = [int(i) for i in np.linspace(0, len(dataset) - 1, min(limit or len(dataset), len(dataset))).round()]
-    shown = (
-        {indices[int(i)] for i in np.linspace(0, len(indices) - 1, min(pictures, len(indices))).round()}
-        if pictures
-        else set()
-    )
+    indices = _evenly(len(dataset), limit or len(dataset))
+    shown = {indices[k] for k in _evenly(len(indices), pictures)}
     median = _set_median(dataset, indices)
     tallies = {name: Tally() for name in ("network", *BASELINES)}
     spent, sum_aee, scored = 0.0, 0.0, 0
@@ -83,11 +79,7 @@ def evaluate(
         scene = batch["scene"][0]
         metrics = frame_metrics(flow, truth, valid)
         tallies["network"].add(scene, metrics)
-        for name, constant in zip(
-            BASELINES,
-            (np.zeros(2), median, *_from_truth(truth, valid)),
-            strict=True,
-        ):
+        for name, constant in zip(BASELINES, (np.zeros(2), median, *_from_truth(truth, valid)), strict=True):
             tallies[name].add(scene, frame_metrics(np.broadcast_to(constant, truth.shape), truth, valid))
         if metrics:
             sum_aee, scored = sum_aee + metrics["AEE"], scored + 1
@@ -101,17 +93,31 @@ def evaluate(
     if not scored:
         raise AssetError("no sample has a valid ground-truth pixel", accepted="a labelled data set")
     result = {
-        "model": json.loads(model.config.model_dump_json()) if method is None else {"name": method.name},
-        "parameters": parameters_of(model) if method is None else 0,
+        **_of_the_model(model),
         "samples": len(indices),
         "skipped": tallies["network"].skipped,
         "ms": 1000 * spent / len(indices),
-        "device": _device_name(model) if method is None else "cpu",
         "methods": {name: {"total": t.total(), "scenes": t.scenes()} for name, t in tallies.items()},
     }
     if out is not None:
         write_json(out / "results.json", result)
     return result
+
+
+def _evenly(of: int, count: int) -> list[int]:
+    """``count`` whole numbers below ``of``, evenly spaced from the first to the last."""
+    return [int(k) for k in np.linspace(0, of - 1, min(count, of)).round()]
+
+
+def _of_the_model(model: FlowModel | Method) -> dict[str, Any]:
+    """Its configuration, size and device, as plain data."""
+    if not isinstance(model, FlowModel):
+        return {"model": {"name": model.name}, "parameters": 0, "device": "cpu"}
+    device = next(model.parameters()).device
+    cpu = f"cpu, {torch.get_num_threads()} threads"
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else cpu
+    config = json.loads(model.config.model_dump_json())
+    return {"model": config, "parameters": parameters_of(model), "device": name}
 
 
 def _from_truth(truth: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -135,11 +141,6 @@ def _set_median(dataset: FlowDataset, indices: list[int]) -> np.ndarray:
         rows.append(sample["flow"][:, ::8, ::8][:, keep].numpy())
     values = np.concatenate(rows, axis=1)
     return np.median(values, axis=1) if values.size else np.zeros(2)
-
-
-def _device_name(model: FlowModel) -> str:
-    device = next(model.parameters()).device
-    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"cpu, {torch.get_num_threads()} threads"
 
 
 def write_json(path: Path, tree: dict) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -76,7 +76,6 @@ def picture(result: Calibration) -> bytes:
     """PNG: rates over time, intervals, counts, and polarity sums of one interval that was not fitted."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
-    from matplotlib.ticker import FuncFormatter, NullFormatter
 
     clip, last = result.clip, result.halves[1][1]
     streams = {"recorded": clip.events, "before": result.simulated_before, "fitted": result.simulated}
@@ -124,12 +123,19 @@ def picture(result: Calibration) -> bytes:
     for ax, (name, image) in zip(axes[1], images.items()):
         ax.imshow(image, cmap="RdBu_r", vmin=-top, vmax=top)
         ax.set(title=f"{name}: ON - OFF, {edges[k]:.3f} to {edges[k + 1]:.3f} s", xticks=[], yticks=[])
-    for ax in axes[0]:
-        ax.spines[["top", "right"]].set_visible(False)
-        ax.grid(alpha=0.25)
-    for axis in (axes[0, 1].xaxis, axes[0, 2].yaxis):  # without mathematical fonts
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.set_minor_formatter(NullFormatter())
+    _plain(axes[0])
     file = io.BytesIO()
     figure.savefig(file, dpi=100, format="png", metadata={"Software": None})
     return file.getvalue()
+
+
+def _plain(axes: Any) -> None:
+    """Plots without frames, and numbers without mathematical fonts."""
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
+    for ax in axes:
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.grid(alpha=0.25)
+    for axis in (axes[1].xaxis, axes[2].yaxis):
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(NullFormatter())

@@ -4,6 +4,7 @@ error maps. matplotlib draws with Agg."""
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from blinkgl.io.atomic import atomic_file, output_errors
-from blinkgl.io.pictures import map_scalar
+from blinkgl.io.pictures import picture
 from blinkgl.shader_debugger.moments import PASSES, Pass
 
 ERROR_MAP = "inferno"
@@ -84,10 +85,10 @@ def _save(figure: Figure, path: Path, palette: bool = False) -> None:
         image.save(temporary, "PNG", optimize=palette)
 
 
-def _title(figure: Figure, ends: tuple[float, float], y: float, texts: tuple[str, str], colour: str = MUTED) -> None:
+def _title(figure: Figure, ends: tuple[float, float], y: float, texts: tuple[str, str]) -> None:
     """A line above a picture: what it is at the left end, its unit at the right one (figure fractions)."""
     figure.text(ends[0], y, texts[0], fontsize=8.5, color=INK, va="center", weight="bold")
-    figure.text(ends[1], y, texts[1], fontsize=7, color=colour, va="center", ha="right")
+    figure.text(ends[1], y, texts[1], fontsize=7, color=MUTED, va="center", ha="right")
 
 
 def save_labelled(path: Path, info: Pass, rgb: np.ndarray, legend: dict, caption: str) -> None:
@@ -127,35 +128,13 @@ def save_contact_sheet(path: Path, tiles: list[tuple[Pass, np.ndarray, dict]], c
 
 
 def save_errors(path: Path, reports: list, caption: str) -> None:
-    """Error map (log scale, silhouette band in grey) and histogram of each compared buffer."""
-    columns = 4
-    height, width = reports[0].errors.shape
-    w, gap, head, below, top = 300, 22, 20, 92, 44
-    h = round(w * height / width)
-    rows = -(-len(reports) // columns)
-    W, H = columns * (w + gap) + gap, top + rows * (h + head + below) + 6
-    figure = Figure(figsize=(W / 100, H / 100))
-    figure.text(gap / W, 1 - 22 / H, caption, fontsize=10, color=INK, va="center", weight="bold")
-    for k, report in enumerate(reports):
-        x = gap + (k % columns) * (w + gap)
-        y = H - top - (k // columns) * (h + head + below) - head - h
-        errors = np.where(report.errors > 0, report.errors, 1e-12)
-        decades = np.log10(np.minimum(errors, 1e12))
-        rgb = map_scalar(np.clip(decades, -9, 2), ERROR_MAP, -9, 2)
+    """The error of each compared buffer on a logarithmic scale; what is not graded is greyed."""
+    tiles = []
+    for report in reports:
+        errors = np.clip(np.where(report.errors > 0, report.errors, 1e-9), 1e-9, 1e2)
+        rgb, legend = picture("depth", errors, which="length", colours=ERROR_MAP, low=1e-9, high=1e2)
         rgb[~report.graded] = (rgb[~report.graded] * 0.35 + 255 * 0.3).astype(np.uint8)
-        axes = figure.add_axes((x / W, y / H, w / W, h / H))
-        axes.imshow(rgb, interpolation="antialiased", aspect="auto"), _style(axes)
-        verdict, colour = ("ok", "#15803d") if report.passed else ("over tolerance", "#b91c1c")
-        said = f"{report.quantity.statistic} {report.value:.2g} {report.quantity.unit}: {verdict}"
-        _title(figure, (x / W, (x + w) / W), (y + h + 9) / H, (PASSES[report.quantity.name].title, said), colour)
-        bars = figure.add_axes((x / W, (y - 62) / H, w / W, 56 / H))
-        inside = np.clip(decades[report.graded], -9, 2)
-        bars.hist(inside, bins=np.linspace(-9, 2, 56), color="#3b6ea5")
-        if report.tolerance > 0:
-            bars.axvline(np.clip(np.log10(report.tolerance), -9, 2), color="#b91c1c", linewidth=1)
-        bars.set_xlim(-9, 2), bars.set_yscale("log"), bars.set_yticks([]), bars.minorticks_off()
-        bars.set_xticks([-9, -6, -3, 0], ["≤1e-9", "1e-6", "1e-3", "1"])
-        bars.tick_params(labelsize=6, colors=MUTED, length=2, pad=1)
-        for spine in bars.spines.values():
-            spine.set_color("#cbd5e1")
-    _save(figure, path, palette=True)
+        verdict = "ok" if report.passed else "over tolerance"
+        unit = f"{report.quantity.statistic} {report.value:.2g} {report.quantity.unit}: {verdict}"
+        tiles.append((replace(PASSES[report.quantity.name], unit=unit), rgb, legend))
+    save_contact_sheet(path, tiles, caption, columns=4)

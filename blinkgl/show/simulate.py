@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from rich.console import Console
 from rich.progress import BarColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
 from blinkgl.config.draw import middle
@@ -13,6 +14,9 @@ from blinkgl.config.reader import parse_yaml, read_table
 from blinkgl.config.recipes import with_recipes
 from blinkgl.errors import ConfigError
 from blinkgl.machine.terminal import causes_line, plain_column, plain_console, say
+
+if TYPE_CHECKING:
+    from blinkgl.recordings.simulation import SimulationReport
 
 
 def emulator_options(
@@ -53,7 +57,6 @@ def run(
     **options: Any,
 ) -> int:
     """``options``: of :func:`~blinkgl.recordings.simulation.file_to_events`."""
-    from blinkgl.machine.compiling import compiled_s, compiling_line
     from blinkgl.recordings.simulation import file_to_events
 
     console = plain_console(quiet=quiet)
@@ -81,6 +84,14 @@ def run(
         report = file_to_events(
             source, target, progress=progress, **emulator_options(emulator, config, overrides, sensor), **options
         )
+    _told(console, target, report)
+    return 0
+
+
+def _told(console: Console, target: str, report: SimulationReport) -> None:
+    """What was made and what was lost, a line each."""
+    from blinkgl.machine.compiling import compiled_s, compiling_line
+
     rate = report.events / report.duration_s if report.duration_s else 0.0
     say(
         console,
@@ -102,4 +113,3 @@ def run(
         say(console, f"{report.late:,} events had not left the sensor's read-out when the frames ended")
     if report.saturated:
         say(console, f"warning: {report.saturated:,} events were cut by max_events_per_step")
-    return 0

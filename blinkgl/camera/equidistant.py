@@ -27,7 +27,6 @@ class Equidistant(DistortedModel):
 
     kind: ClassVar[str] = "equidistant"
     shader: ClassVar[str] = "EQUIDISTANT"
-    sample: ClassVar[dict[str, float]] = {"k1": -0.02, "k2": 0.005, "k3": -0.003, "k4": 0.0005}
     coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4")
 
     k1: float = 0.0

@@ -27,7 +27,6 @@ class Radtan(DistortedModel):
 
     kind: ClassVar[str] = "radtan"
     shader: ClassVar[str] = "RADTAN"
-    sample: ClassVar[dict[str, float]] = {"k1": -0.3, "k2": 0.1, "p1": 0.002, "p2": -0.001, "k3": 0.02}
     coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "p1", "p2", "k3")
 
     k1: float = 0.0

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -110,71 +111,63 @@ def _number(x: Any) -> float:
     return value
 
 
+def _is_choice(spec: Any) -> bool:
+    return isinstance(spec, list) and bool(spec)
+
+
+def _is_weighted(spec: Any) -> bool:
+    weights = [_number(weight) for weight in spec.values()]
+    return min(weights) >= 0 and sum(weights) > 0
+
+
+def _is_shares(spec: Any) -> bool:
+    shares = [_number(part["share"]) for part in spec]
+    alike = all(set(part) == {"share", "value"} for part in spec)
+    return alike and min(shares) >= 0 and abs(math.fsum(shares) - 1) <= 1e-9
+
+
+def _is_normal(spec: Any) -> bool:
+    mean, deviation, low, high = (_number(x) for x in spec)
+    return low <= mean <= high and deviation > 0 and math.isfinite(high - low)
+
+
+def _is_range(spec: Any) -> bool:
+    low, high = (_number(x) for x in spec)
+    return low <= high and math.isfinite(high - low)
+
+
+def _is_log_range(spec: Any) -> bool:
+    return _is_range(spec) and _number(spec[0]) > 0
+
+
+def _is_integers(spec: Any) -> bool:
+    return _is_range(spec) and all(_number(x).is_integer() and abs(_number(x)) < 2**63 for x in spec)
+
+
+_RULES: dict[str, tuple[Callable[[Any], bool], str, str]] = {
+    "choice": (_is_choice, "a list of choices", "a non-empty list"),
+    "weighted": (_is_weighted, "a table of weights", "{value: weight, …} with weights >= 0 and a positive sum"),
+    "shares": (_is_shares, "a list of shares", "[{share: 0.8, value: …}, …] with shares that sum to 1"),
+    "normal": (
+        _is_normal,
+        "a normal distribution",
+        "[mean, standard deviation > 0, lowest, highest], the mean between the last two",
+    ),
+    "uniform": (_is_range, "a range", "[low, high], two finite numbers, low <= high"),
+    "log_uniform": (_is_log_range, "a logarithmic range", "[low, high], 0 < low <= high"),
+    "integer": (_is_integers, "a range of whole numbers", "[low, high], two integers, low <= high"),
+}
+"""Kind -> whether its parameters are right, what they are, and what is accepted."""
+
+
 def _check(path: tuple[str, ...], kind: str, spec: Any) -> None:
-    where = ".".join((*path, kind))
-    if kind == "choice":
-        if not isinstance(spec, list) or not spec:
-            raise ConfigError("not a list of choices", where=where, value=spec, accepted="a non-empty list")
-        return
-    if kind == "weighted":
-        try:
-            ok = isinstance(spec, dict) and spec and all(_number(w) >= 0 for w in spec.values())
-            ok = ok and sum(_number(w) for w in spec.values()) > 0
-        except ValueError:
-            ok = False
-        if not ok:
-            raise ConfigError(
-                "not a table of weights",
-                where=where,
-                value=spec,
-                accepted="{value: weight, …} with weights >= 0 and a positive sum",
-            )
-        return
-    if kind == "shares":
-        try:
-            ok = (
-                isinstance(spec, list)
-                and spec
-                and all(set(part) == {"share", "value"} and _number(part["share"]) >= 0 for part in spec)
-            )
-        except (TypeError, ValueError):
-            ok = False
-        if not ok:
-            raise ConfigError("not a list of shares", where=where, value=spec, accepted="[{share: 0.8, value: …}, …]")
-        total = math.fsum(_number(part["share"]) for part in spec)
-        if abs(total - 1) > 1e-9:
-            raise ConfigError("the shares do not sum to 1", where=where, value=total, accepted="shares that sum to 1")
-        return
-    if kind == "normal":
-        try:
-            mean, deviation, low, high = (_number(x) for x in spec)
-            ok = low <= mean <= high and deviation > 0 and math.isfinite(high - low)
-        except (TypeError, ValueError):
-            ok = False
-        if not ok:
-            raise ConfigError(
-                "not a normal distribution",
-                where=where,
-                value=spec,
-                accepted="[mean, standard deviation > 0, lowest, highest], the mean between the last two",
-            )
-        return
+    right, what, accepted = _RULES[kind]
     try:
-        low, high = (_number(x) for x in spec)
-    except (TypeError, ValueError):
-        raise ConfigError("not a range", where=where, value=spec, accepted="[low, high], two finite numbers") from None
-    if not math.isfinite(high - low) or (kind == "integer" and max(abs(low), abs(high)) >= 2**63):
-        raise ConfigError(
-            "the range is too wide", where=where, value=spec, accepted="ends whose difference is a number"
-        )
-    if low > high:
-        raise ConfigError("the range is empty", where=where, value=spec, accepted="low <= high")
-    if kind == "log_uniform" and low <= 0:
-        raise ConfigError(
-            "a logarithmic range needs positive ends", where=where, value=spec, accepted="0 < low <= high"
-        )
-    if kind == "integer" and not (low.is_integer() and high.is_integer()):
-        raise ConfigError("not whole numbers", where=where, value=spec, accepted="[low, high], two integers")
+        ok = right(spec)
+    except (TypeError, ValueError, KeyError, AttributeError, IndexError):
+        ok = False
+    if not ok:
+        raise ConfigError(f"not {what}", where=".".join((*path, kind)), value=spec, accepted=accepted)
 
 
 def _draw_one(path: tuple[str, ...], kind: str, spec: Any, seed: int, sequence: int) -> Any:

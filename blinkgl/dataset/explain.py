@@ -10,11 +10,10 @@ import math
 import platform
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -24,34 +23,28 @@ from blinkgl.config.run import RunTemplate
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.config.tracks import TracksConfig, track_times
 from blinkgl.dataset.choices import quality_in_words
-from blinkgl.gl import GLContext, create_context
+from blinkgl.gl import create_context
 from blinkgl.imaging import FrameCamera
 from blinkgl.labels import LABELS, LabelRequest, asked_for
-from blinkgl.labels.label import BUFFERS
-from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.tracks import track_points
 from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.lights import is_coloured, lamps_of
-from blinkgl.scene.shapes.table import DEFORMERS
 from blinkgl.scene.types import Light, Scene
-from blinkgl.sequence import simulate_sequence
+from blinkgl.sequence import Simulation, simulate_sequence
 from blinkgl.sequence.inertial import measured
 from blinkgl.sequence.recorded import RECORDED
-from blinkgl.sequence.rendered import SURFACES, surfaces_at
+from blinkgl.sequence.rendered import surfaces_at
 
 PROBES = 12
-DEPTH_BYTES = 4
 
 
 @dataclass(frozen=True)
 class Pass:
-    """One kind of drawing. ``bytes`` per frame of its targets, depth included; ``count`` in the whole sequence."""
+    """One kind of drawing; ``count`` and ``seconds`` in the whole sequence."""
 
     name: str
     why: str
-    variants: tuple[str, ...]
-    bytes: int
     count: int
     seconds: float
 
@@ -68,6 +61,10 @@ class Explanation:
     seconds_per_simulated_second: float = 0.0
     machine: str = ""
 
+    def add(self, name: str, why: str, count: int, each_s: float) -> None:
+        """One more pass, from the time of one of it."""
+        self.passes.append(Pass(name, why, count, each_s * count))
+
 
 def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
     """Explains one sequence (default: the first). Raises what generating it would raise."""
@@ -82,7 +79,7 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
             with Renderer(gl, seen, config.render) as renderer:
                 one = Explanation(scene=_describe(renderer.scene, renderer, config))
                 if events:
-                    _passes(own, index, seen, renderer, gl, one)
+                    _passes(own, index, seen, renderer, one)
                 elif own.images is not None:
                     one.passes.append(_frame_camera(own.images, renderer, seen))
                 _left_out(own, seen, one)
@@ -139,16 +136,9 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
             break
     each, rate = (time.perf_counter() - started) / count, probe.events / (1e-9 * until_ns)
     result.frames = 1 + round((steps - 1) * (len(files) - 1) / count)
-    result.passes.append(
-        Pass(
-            "frames and event kernel",
-            f"{between}; {config.events.emulator}; about {rate / 1e6:.1f} M events per simulated second",
-            (config.events.emulator,),
-            0,
-            result.frames,
-            each * (len(files) - 1),
-        )
-    )
+    said = f"{between}; {config.events.emulator}; about {rate / 1e6:.1f} M events per simulated second"
+    seconds = each * (len(files) - 1)
+    result.passes.append(Pass("frames and event kernel", said, result.frames, seconds))
     request = asked_for(config.labels)
     for name, on, why in (
         ("images", "images" in request, "labels.images: false"),
@@ -170,13 +160,6 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
     result.seconds = sum(p.seconds for p in result.passes)
     result.seconds_per_simulated_second = result.seconds / duration
     return result
-
-
-def _variant(defines: Iterable[tuple[str, Any]]) -> str:
-    """What tells a shader's variants apart, in words; not which outputs it has, nor the sizes of a shape's numbers."""
-    sizes = {"DEFORM", "SHAPE_ROWS"}.union(*(sizes for shape in DEFORMERS.values() for sizes in shape.examples))
-    names = [name for name, _ in defines if name not in sizes and not name.startswith("OUT_")]
-    return "+".join(name.removeprefix("DEFORM_") for name in names) or "plain"
 
 
 def _living(scene: Scene) -> dict[str, str]:
@@ -249,115 +232,73 @@ def _timed(run, times) -> float:
     return (time.perf_counter() - started) / len(times)
 
 
-def _passes(
-    config: SequenceConfig, index: int, scene: Scene, renderer: Renderer, gl: GLContext, result: Explanation
-) -> None:
-    t0, t1 = scene.t0_ns, scene.t1_ns
-    duration = (t1 - t0) * 1e-9
-    pixels = renderer.width * renderer.height
-    times = [int(t) for t in np.linspace(t0, t1, PROBES)]
-    labels = config.time.label_count
-
-    def variants(name: str) -> tuple[str, ...]:
-        return tuple(sorted({_variant(defines) for program, defines in gl.shaders.compiled if program == name}))
-
-    timeline, rejected = config.timeline, 1.0
-    event_s = _timed(lambda t: renderer.luminance(t).view(), times)
-    fine = samples_of(config.render.antialiasing).stored
+def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer, result: Explanation) -> None:
+    """Adds every kind of drawing, a few of each timed."""
+    times = [int(t) for t in np.linspace(scene.t0_ns, scene.t1_ns, PROBES)]
     probe = simulate_sequence(config, index, labels=False, scene=scene, renderer=renderer)
     seen = [chunk.t_ns for chunk in islice(probe.chunks(), 2 * PROBES)]  # a short stretch of it, as it will be
+    event_s = _timed(lambda t: renderer.luminance(t).view(), times)
+    result.frames = _event_frames(config, probe, times, (scene.t1_ns - scene.t0_ns) * 1e-9)
+    result.add("event frames", f"timeline: {config.timeline.kind}", result.frames, event_s)
+    if config.timeline.kind != "uniform":
+        name = "brightness" if config.timeline.kind == "brightness" else "velocity"
+        count = int(1.1 * result.frames)  # a step is cut again now and then
+        why = f"decides the step; every {config.timeline.sample_every}. pixel"
+        result.add(name, why, count, _timed(probe.timeline.pace, times))
+    _pictures(config, renderer, times[:3], (scene.t1_ns - scene.t0_ns) * 1e-9, result)
+    _over_time(config, scene, renderer, result)
+    if config.images is not None:
+        result.passes.append(_frame_camera(config.images, renderer, scene))
+    each, rate = probe.clock.seconds["events"] / probe.frames, probe.events / max(1e-9 * (seen[-1] - scene.t0_ns), 1e-9)
+    said = f"{config.events.emulator}; about {rate / 1e6:.1f} M events per simulated second"
+    result.add("event kernel", said, result.frames, each)
+
+
+def _event_frames(config: SequenceConfig, probe: Simulation, times: list[int], duration: float) -> int:
+    """How many event frames there will be, from the pace at a few times."""
+    timeline = config.timeline
     if timeline.kind == "uniform":
-        result.frames = math.ceil(duration * timeline.fps - 1e-6) + 1  # one at the end, whatever the rate
-    else:
-        steps = np.clip(
-            [1 / max(probe.timeline.pace(t), 1e-12) for t in times],
-            timeline.min_step_us * 1e-6,
-            timeline.max_step_us * 1e-6,
-        )
-        result.frames = int(duration * np.mean(1 / steps)) + 1
-        rejected = 1.1  # a step is cut again now and then
-    result.passes.append(
-        Pass(
-            "event frames",
-            f"timeline: {timeline.kind}",
-            variants("luminance.glsl"),
-            pixels * fine * (4 + DEPTH_BYTES),
-            result.frames,
-            event_s * result.frames,
-        )
+        return math.ceil(duration * timeline.fps - 1e-6) + 1  # one at the end, whatever the rate
+    steps = np.clip(
+        [1 / max(probe.timeline.pace(t), 1e-12) for t in times],
+        timeline.min_step_us * 1e-6,
+        timeline.max_step_us * 1e-6,
     )
-    if timeline.kind != "uniform":
-        small_s, count = _timed(probe.timeline.pace, times), int(result.frames * rejected)
-        name = "brightness" if timeline.kind == "brightness" else "velocity"
-        result.passes.append(
-            Pass(
-                name,
-                f"decides the step; every {timeline.sample_every}. pixel",
-                (name,),
-                pixels // timeline.sample_every**2 * (8 + DEPTH_BYTES),
-                count,
-                small_s * count,
-            )
-        )
-    if "images" in asked_for(config.labels):
-        result.passes.append(
-            Pass(
-                "colour",
-                f"images at {config.time.label_rate:g} Hz, anti-aliasing {config.render.image_antialiasing}",
-                ("colour",),
-                pixels * samples_of(config.render.image_antialiasing).stored * (16 + DEPTH_BYTES),
-                labels + 1,
-                _timed(lambda t: renderer.colour(t).read(), times[:3]) * (labels + 1),
-            )
-        )
-    request = asked_for(config.labels)
+    return int(duration * np.mean(1 / steps)) + 1
+
+
+def _pictures(
+    config: SequenceConfig, renderer: Renderer, times: list[int], duration: float, result: Explanation
+) -> None:
+    """Images, labels, the truth of events and the preview."""
+    request, labels = asked_for(config.labels), config.time.label_count
+    if "images" in request:
+        why = f"images at {config.time.label_rate:g} Hz, anti-aliasing {config.render.image_antialiasing}"
+        result.add("colour", why, labels + 1, _timed(lambda t: renderer.colour(t).read(), times))
     request = request.without(*(name for name in request if LABELS[name].anti_aliased))
     if request:
         interval = config.time.interval_ns
         each = _timed(lambda t: renderer.labels(t, request, t + interval, t - interval), config.time.label_times_ns[:3])
-        result.passes.append(
-            Pass(
-                "labels",
-                ", ".join(request) + _over_intervals(request, config),
-                ("geometry",),
-                pixels * (sum(BUFFERS[LABELS[name].buffer].bytes for name in request.buffers) + DEPTH_BYTES),
-                labels,
-                each * labels,
-            )
-        )
+        result.add("labels", ", ".join(request) + _over_intervals(request, config), labels, each)
     if config.labels.events:
-        result.passes.append(
-            Pass(
-                "what made each event",
-                "surfaces at every event frame (labels.events)",
-                ("geometry",),
-                pixels * (sum(BUFFERS[LABELS[name].buffer].bytes for name in SURFACES.buffers) + DEPTH_BYTES),
-                result.frames,
-                _timed(lambda t: surfaces_at(renderer, t), times[:3]) * result.frames,
-            )
-        )
+        each = _timed(lambda t: surfaces_at(renderer, t), times)
+        result.add("what made each event", "surfaces at every event frame (labels.events)", result.frames, each)
     if config.preview.enabled:
+        each = _timed(lambda t: (renderer.colour(t, antialiasing="none").read(), renderer.velocity(t).read()), times)
         pictures = int(duration * config.preview.rate) + 1
-        each = _timed(
-            lambda t: (renderer.colour(t, antialiasing="none").read(), renderer.velocity(t).read()), times[:3]
-        )
-        result.passes.append(
-            Pass(
-                "preview",
-                f"{config.preview.rate:g} pictures per simulated second",
-                ("colour", "velocity"),
-                pixels * (16 + 8 + DEPTH_BYTES),
-                pictures,
-                each * pictures,
-            )
-        )
+        result.add("preview", f"{config.preview.rate:g} pictures per simulated second", pictures, each)
+
+
+def _over_time(config: SequenceConfig, scene: Scene, renderer: Renderer, result: Explanation) -> None:
+    """The inertial unit and the point tracks."""
+    t0, t1 = scene.t0_ns, scene.t1_ns
     if config.imu is not None:
         count = imu_count(config.imu.rate, t0, t1)
         started = time.perf_counter()
         measured(scene.camera_path, config.imu, t0, min(t1, t0 + (t1 - t0) // 8), np.random.default_rng(0))
-        each = 8 * (time.perf_counter() - started)
+        each = 8 * (time.perf_counter() - started) / count
         said = f"{count} measurements at {config.imu.rate:g} Hz, {'noisy and ' if config.imu.noisy else ''}ideal"
-        result.passes.append(Pass("inertial unit", said, (), 0, count, each))
+        result.add("inertial unit", said, count, each)
     if config.tracks is not None:
         ends = config.time.label_times_ns[0], config.time.t1_ns, config.time.interval_ns
         moments, few = track_times(config.tracks.rate, *ends), TracksConfig(points=64)
@@ -365,20 +306,7 @@ def _passes(
         track_points(renderer.scene, few, moments[:2], np.random.default_rng(0))
         each = (time.perf_counter() - started) / 2
         said = f"at most {config.tracks.points} points ({config.tracks.choose}) at {len(moments)} times, float64"
-        result.passes.append(Pass("point tracks", said, (), 0, len(moments), each * len(moments)))
-    if config.images is not None:
-        result.passes.append(_frame_camera(config.images, renderer, scene))
-    each, rate = probe.clock.seconds["events"] / probe.frames, probe.events / max(1e-9 * (seen[-1] - t0), 1e-9)
-    result.passes.append(
-        Pass(
-            "event kernel",
-            f"{config.events.emulator}; about {rate / 1e6:.1f} M events per simulated second",
-            (config.events.emulator,),
-            0,
-            result.frames,
-            each * result.frames,
-        )
-    )
+        result.add("point tracks", said, len(moments), each)
 
 
 def _over_intervals(request: LabelRequest, config: SequenceConfig) -> str:
@@ -419,15 +347,7 @@ def _frame_camera(images: ImagesConfig, renderer: Renderer, scene: Scene) -> Pas
         )
         if on
     ]
-    samples = samples_of(renderer.config.image_antialiasing, "render.image_antialiasing").stored
-    return Pass(
-        "frame camera",
-        ", ".join(said),
-        ("colour",),
-        renderer.width * renderer.height * samples * (16 + DEPTH_BYTES),
-        len(camera),
-        each * len(camera),
-    )
+    return Pass("frame camera", ", ".join(said), len(camera), each * len(camera))
 
 
 def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None:

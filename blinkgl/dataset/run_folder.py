@@ -16,7 +16,6 @@ import contextlib
 import fcntl
 import json
 import os
-import re
 import shutil
 import time
 from collections.abc import Iterator
@@ -33,8 +32,6 @@ from blinkgl.io.records import parse, read_text
 from blinkgl.sequence_files.sequence_dir import verify_sequence
 
 FORMAT = "blinkgl-run"
-_FORSAKEN_S = 3600.0
-_TEMPORARY = re.compile(r"^\.(.+)\.blinkgl-tmp-")
 
 
 class _Run(BaseModel):
@@ -80,9 +77,6 @@ class RunFolder:
         self.out, self.path = out, out / RUN_FOLDER
         self.begun = False
         self.environment: dict[str, str] = {}
-        self._foreign: dict[
-            Path, tuple[tuple[int, ...], float]
-        ] = {}  # temporary of another machine -> its state, seen since
 
     # ---- may this run go on here? ---------------------------------------------------------------------------------
 
@@ -236,23 +230,11 @@ class RunFolder:
             return True
 
     def sweep(self, plan: Plan) -> None:
-        """Removes what dead writers of this run left. Those of another machine or an earlier boot cannot be asked
-        whether they live: theirs go when this run has seen nothing in them change for an hour of
-        its own, by a clock that nobody can set."""
-        now = time.monotonic()
+        """Removes what dead writers of this machine left. Those of another machine, or of before a start of this one,
+        cannot be asked whether they live: theirs stay, and `verify` names them."""
         for folder in [*(self.out / split for split in plan.tasks.splits), self.out, self.path]:
             with contextlib.suppress(OSError):
                 remove_stale(folder)
-                for path in folder.iterdir() if folder.is_dir() else ():
-                    match = _TEMPORARY.match(path.name)
-                    if not match or path.is_symlink() or plan.tasks.number(f"{folder.name}/{match.group(1)}") is None:
-                        continue
-                    state = _fingerprint(path)
-                    before, since = self._foreign.get(path, (None, now))
-                    if state != before:
-                        self._foreign[path] = (state, now)
-                    elif now - since > _FORSAKEN_S:
-                        shutil.rmtree(path, ignore_errors=True)
 
     # ---- records --------------------------------------------------------------------------------------------------
 
@@ -346,12 +328,6 @@ class RunFolder:
     def _write(self, name: str, data: dict[str, Any]) -> None:
         with atomic_file(self.path / name) as path, output_errors(path):
             path.write_text(json.dumps(data, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-
-
-def _fingerprint(path: Path) -> tuple[int, ...]:
-    """Changes when anything is written below ``path``; the values are compared, never taken for times."""
-    stats = [p.lstat() for p in (path, *path.rglob("*"))]
-    return len(stats), sum(s.st_size for s in stats), max(s.st_mtime_ns for s in stats)
 
 
 def _same(path: Path, handle: int) -> bool:

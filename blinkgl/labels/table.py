@@ -6,13 +6,13 @@ register(Position())        # a Label: docs/extending.md has the whole of one
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
 from blinkgl.config.labels import LabelsConfig
-from blinkgl.labels.files import Form
 from blinkgl.labels.label import BUFFERS, KINDS, VARYINGS, Label
 
 if TYPE_CHECKING:
@@ -71,93 +71,45 @@ def asked_for(labels: LabelsConfig) -> LabelRequest:
 
 def _checked(label: Any) -> None:
     """Raises TypeError as :func:`register`."""
-    if not isinstance(label, Label):
-        raise TypeError(
-            f"{label!r} is not a Label"
-            + (": register an instance of it" if isinstance(label, type) and issubclass(label, Label) else "")
-        )
-    called = type(label).__name__
+    name = getattr(label, "name", None)
 
     def unless(right: Any, part: str, problem: str) -> None:
         if not right:
-            raise TypeError(f"label {called}: `{part}` {problem}")
+            raise TypeError(f"label {name!r}: `{part}` {problem}")
 
-    name = getattr(label, "name", None)
-    unless(name is not None, "name", "is missing")
+    unless(isinstance(label, Label), "label", "is no instance of Label")
     unless(
         isinstance(name, str) and re.fullmatch(r"[a-z](_?[a-z0-9])*", name),
         "name",
-        f"is {name!r} and not a word of a-z, 0-9 and single _",
+        "is not a word of a-z, 0-9 and single _",
     )
-    called = f"'{name}'"
     unless(name not in LABELS, "name", "is taken: there is such a label already")
     if _has_own_key(label):
         unless(name not in LabelsConfig.settings, "name", "is taken: `labels:` has such a key for something else")
         unless(name in LabelsConfig.model_fields or bool(label.about), "about", "is missing")
     unless(label.kind in KINDS, "kind", f"is {label.kind!r} and none of {', '.join(KINDS)}")
-
-    unless(
-        label.buffer is None or label.buffer in BUFFERS,
-        "buffer",
-        f"is {label.buffer!r} and none of {', '.join(BUFFERS)}",
-    )
-    made = type(label).finish is not Label.finish or label.anti_aliased
-    unless(label.buffer or made, "buffer", "is missing, and so is `finish`: nothing makes the label")
-    unless(label.buffer or label.glsl is None, "buffer", "is missing: `glsl` has nowhere to write to")
-    if label.buffer and label.glsl is None:
-        unless(
-            resources.files("blinkgl.shaders").joinpath(f"include/labels/{name}.glsl").is_file(),
-            "glsl",
-            f"is missing, and so is the file shaders/include/labels/{name}.glsl",
-        )
-    if label.glsl is not None:
-        head = f"{BUFFERS[label.buffer].glsl} label_{name}()"
-        unless(isinstance(label.glsl, str), "glsl", f"is {label.glsl!r} and not text")
-        unless(
-            re.search(re.escape(head).replace(r"\ ", r"\s+").replace(r"\(\)", r"\s*\(\s*(void)?\s*\)"), label.glsl),
-            "glsl",
-            f"does not define {head}",
-        )
-    for part, known in (("varyings", VARYINGS), ("needs", LABELS), ("there", LABELS), ("each", LABELS)):
-        there = getattr(label, part)
-        unless(
-            isinstance(there, tuple) and set(there) <= {*known},
-            part,
-            f"is {there!r} and not a tuple of some of {', '.join(known)}",
-        )
-    unless(
-        label.towards in (None, "forward", "backward"),
-        "towards",
-        f"is {label.towards!r} and neither 'forward', 'backward' nor None",
-    )
-    unless(label.towards or not label.there, "there", "is said, but not `towards` where the label leads")
-    unless(all(LABELS[other].buffer for other in label.there), "there", "names a label without a `buffer`")
-
-    forms = label.forms
-    unless(
-        isinstance(forms, tuple) and forms and all(isinstance(form, Form) for form in forms),
-        "forms",
-        f"is {forms!r} and not a tuple of one Form or more",
-    )
-    unless(
-        forms[0].encode and forms[0].read,
-        "forms",
-        "cannot both be written and read: the first lacks `encode` or `read`",
-    )
+    _check_drawing(label, unless)
     taken = {form.folder + "." + form.ending: other.name for other in LABELS.values() for form in other.forms}
-    for form in forms:
-        unless(
-            form.folder + "." + form.ending not in taken,
-            "forms",
-            f"writes where label '{taken.get(form.folder + '.' + form.ending)}' does: {form.file(0)}",
-        )
-
+    for form in label.forms:
+        at = form.folder + "." + form.ending
+        unless(at not in taken, "forms", f"writes where label '{taken.get(at)}' does: {form.file(0)}")
     if type(label).views is Label.views:
         unless(type(label).reference is not Label.reference, "reference", "is missing")
-        tolerance = getattr(label, "tolerance", None)
-        unless(tolerance is not None, "tolerance", "is missing")
-        unless(
-            isinstance(tolerance, (int, float)) and tolerance >= 0,
-            "tolerance",
-            f"is {tolerance!r} and not a number >= 0",
-        )
+        unless(getattr(label, "tolerance", None) is not None, "tolerance", "is missing")
+
+
+def _check_drawing(label: Label, unless: Callable[[Any, str, str], None]) -> None:
+    """What the label shader needs to know, and which other labels."""
+    buffers = (None, *BUFFERS)
+    unless(label.buffer in buffers, "buffer", f"is {label.buffer!r} and none of {', '.join(BUFFERS)}")
+    made = type(label).finish is not Label.finish or label.anti_aliased
+    unless(label.buffer or made, "buffer", "is missing, and so is `finish`: nothing makes the label")
+    file = f"include/labels/{label.name}.glsl"
+    if label.buffer and label.glsl is None:
+        there = resources.files("blinkgl.shaders").joinpath(file).is_file()
+        unless(there, "glsl", f"is missing, and so is the file shaders/{file}")
+    if label.glsl is not None:
+        unless(f" label_{label.name}(" in label.glsl, "glsl", f"does not define label_{label.name}()")
+    for part, known in (("varyings", VARYINGS), ("needs", LABELS), ("there", LABELS), ("each", LABELS)):
+        unless({*getattr(label, part)} <= {*known}, part, f"names others than {', '.join(known)}")
+    unless(label.towards or not label.there, "there", "is said, but not `towards` where the label leads")

@@ -28,21 +28,12 @@ def show(result: Explanation, console: Console) -> None:
     for column, side in (
         ("pass", "left"),
         ("why", "left"),
-        ("variants", "left"),
-        ("MB/frame", "right"),
         ("times", "right"),
         ("seconds", "right"),
     ):
         passes.add_column(column, justify=side)
     for p in result.passes:
-        passes.add_row(
-            p.name,
-            p.why,
-            ", ".join(p.variants),
-            f"{p.bytes / 1e6:.2f}" if p.bytes else "–",
-            f"{p.count:,}",
-            f"{p.seconds:.2f}",
-        )
+        passes.add_row(p.name, p.why, f"{p.count:,}", f"{p.seconds:.2f}")
     console.print(passes)
     left = Table(title="what is left out", title_justify="left", show_header=False)
     for what, why in result.left_out:

@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from blinkgl.camera import CAMERA_MODELS, Equidistant, PinHole, Radtan, focal_length
-from blinkgl.camera.distorted import _extremes
+from blinkgl.camera import CAMERA_MODELS, Equidistant, PinHole, Radtan
 from blinkgl.errors import ConfigError
 
 SIZE = {
@@ -19,7 +18,13 @@ SIZE = {
     "cy": 48.5,
     "near": 0.1,
 }  # nothing about it is symmetric
-CAMERAS = [model(**SIZE, **getattr(model, "sample", {})) for model in CAMERA_MODELS.values()]
+SAMPLES = {
+    "pinhole": {},
+    "radtan": {"k1": -0.3, "k2": 0.1, "p1": 0.002, "p2": -0.001, "k3": 0.02},
+    "equidistant": {"k1": -0.02, "k2": 0.005, "k3": -0.003, "k4": 0.0005},
+}
+"""Values of each model's own parameters: a new model gives its own."""
+CAMERAS = [model(**SIZE, **SAMPLES[kind]) for kind, model in CAMERA_MODELS.items()]
 CAMERAS += [
     Radtan(**SIZE),
     Radtan(**SIZE, k1=0.4, k2=-0.02, p1=-0.01, p2=0.004),
@@ -64,20 +69,6 @@ def test_jacobians_are_the_derivatives(camera):
     R = camera.ray_jacobian(xy)
     np.testing.assert_allclose(R, differences(camera.rays, xy, 1e-4), rtol=1e-5, atol=1e-7)
     np.testing.assert_allclose(camera.jacobian(camera.rays(xy)) @ R, np.tile(np.eye(2), (300, 1, 1)), atol=1e-9)
-
-
-@every
-def test_on_the_axis(camera):
-    np.testing.assert_allclose(camera.project(np.array([0.0, 0.0, 2.0])), [camera.cx, camera.cy], atol=1e-12)
-    np.testing.assert_allclose(
-        camera.jacobian(np.array([0.0, 0.0, 2.0])), [[camera.fx / 2, 0, 0], [0, camera.fy / 2, 0]], atol=1e-12
-    )
-    np.testing.assert_allclose(camera.rays(np.array([camera.cx, camera.cy])), [0, 0, 1], atol=1e-15)
-    np.testing.assert_allclose(
-        camera.ray_jacobian(np.array([camera.cx, camera.cy])),
-        [[1 / camera.fx, 0], [0, 1 / camera.fy], [0, 0]],
-        atol=1e-15,
-    )
 
 
 @every
@@ -172,11 +163,6 @@ def test_a_part_and_another_size_see_the_same(camera):
     )
 
 
-@every
-def test_K(camera):
-    np.testing.assert_array_equal(camera.K, [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-
-
 @pytest.mark.parametrize(
     "changes, message",
     [
@@ -212,22 +198,6 @@ def test_pin_hole_by_hand():
     assert camera.magnification == pytest.approx(1.5 * 1.5)
 
 
-def test_pin_hole_displacement_subtracts_no_projections():
-    """A point that moves along its own ray stays where it is, to the last bits; so does one that hardly moves."""
-    rays, depth = PIN_HOLE.rays(pixels(PIN_HOLE, 100)), np.full(100, 3.0)
-    assert np.abs(PIN_HOLE.displacement(rays, depth, 0.7 * rays)).max() < 1e-14
-    tiny = np.tile([1e-14, 0, 0], (100, 1))
-    np.testing.assert_allclose(PIN_HOLE.displacement(rays, depth, tiny), np.tile([95e-14 / 3, 0], (100, 1)), rtol=1e-12)
-    assert np.isnan(PIN_HOLE.displacement(rays[:1], depth[:1], np.array([[0, 0, -3.0]]))).all()  # behind the camera
-
-
-def test_pin_hole_of_a_field_of_view():
-    assert focal_length(640, math.radians(90)) == pytest.approx(320)
-    camera = PinHole.centred(640, 480, focal_length(640, math.radians(60)))
-    assert (camera.cx, camera.cy, camera.fy) == (319.5, 239.5, camera.fx)
-    assert 2 * math.atan(camera.rays(np.array([639.5, 0.0]))[0]) == pytest.approx(math.radians(60))
-
-
 @pytest.mark.parametrize("camera", [c for c in CAMERAS if c.kind != "pinhole"], ids=lambda c: c.kind)
 def test_only_a_pin_hole_camera_is_drawn(camera):
     with pytest.raises(
@@ -235,14 +205,6 @@ def test_only_a_pin_hole_camera_is_drawn(camera):
         match=rf"camera: this camera model cannot be drawn \(got '{camera.kind}'\); expected a pin-hole camera",
     ):
         camera.clip_from_cam()
-
-
-@pytest.mark.parametrize("points", [4, 9, 65])
-def test_extremes_between_samples_are_not_missed(points):
-    """Arcs whose farthest points lie between two samples of them."""
-    angles = np.linspace(0.1, 2.9, points) + math.pi / 2 * np.arange(4)[:, None]
-    low, high = _extremes(np.stack([np.cos(angles), np.sin(angles)], axis=-1))
-    assert (low <= -1).all() and (high >= 1).all() and np.abs([low, high]).max() < 1 + 20 / points**2
 
 
 # ---- no wider than the picture -------------------------------------------------------------------------------------
@@ -275,20 +237,6 @@ def test_planes_touch_the_picture(camera):
         rays = camera.rays(side)
         nearest = (rays @ plane).min() / np.linalg.norm(rays, axis=1).max()
         assert abs(nearest) < 1e-12 if exact else -1e-12 < nearest < 0.1 / camera.fx
-
-
-@pytest.mark.parametrize("camera", LOPSIDED, ids=lambda c: f"{c.cx:g}-{c.cy:g}")
-def test_a_pin_hole_s_bounds_are_those_of_its_farthest_corner(camera):
-    rays = camera.rays(corners(camera))
-    length = np.linalg.norm(rays, axis=1).max()
-    assert camera.half_angle == pytest.approx(math.acos(1 / length), rel=1e-12)
-    assert camera.near_corner == pytest.approx(0.5 * length, rel=1e-12)
-    assert camera.magnification == pytest.approx(35.0 * length, rel=1e-12)
-    clip = camera.clip_from_cam()
-    xy = pixels(camera, 50)
-    at = np.concatenate([7.0 * camera.rays(xy), np.ones((50, 1))], axis=1) @ clip.T
-    np.testing.assert_allclose(at[:, :2] / at[:, 3:], (xy + 0.5) / [20, 15] - 1, atol=1e-12)
-    np.testing.assert_allclose(at[:, 2:], np.tile([0.5, 7.0], (50, 1)))
 
 
 def points_at(camera, xy, z=2.0):
@@ -326,21 +274,3 @@ def test_bounds_are_tight_to_a_pixel(camera, low, high, expected):
     assert camera.bounds(np.array([[0, 0, -1.0], [0, 0, camera.near]])) is None
     ahead = np.array([[0, 0, 1.01 * camera.near]] * 2)
     assert camera.bounds(ahead) != whole and camera.bounds(ahead) is not None
-
-
-@every
-def test_the_smallest_cameras(camera):
-    """One pixel is a picture; sizes may be NumPy's; what is no whole number, or no number, is refused."""
-    tiny = replace(camera, width=np.int64(1), height=1, cx=0.0, cy=0.0)
-    assert tiny.rays(np.zeros(2)).tolist() == [0, 0, 1] and tiny.summary == f"1x1, fx {camera.fx:.0f} px"
-    assert tiny.half_angle < 0.02 and tiny.near_corner == pytest.approx(camera.near, rel=1e-3)
-    for name, value in (
-        ("width", -1),
-        ("width", "9"),
-        ("cx", math.inf),
-        ("near", math.nan),
-        ("near", -1.0),
-        ("fx", 0.0),
-    ):
-        with pytest.raises(ConfigError, match=rf"\.{name}: not a") if value != "9" else pytest.raises(ConfigError):
-            replace(camera, **{name: value})

@@ -6,10 +6,8 @@ import random
 import pytest
 from pydantic import Field
 
-from blinkgl.config.base import Config, Refused, remembering, rule
+from blinkgl.config.base import Config, rule
 from blinkgl.config.corners import corners, sites
-from blinkgl.config.problems import validate
-from blinkgl.config.recipe import all_groups
 from blinkgl.config.run import RunTemplate
 from blinkgl.errors import ConfigError
 
@@ -293,54 +291,7 @@ def test_what_is_accepted_is_never_refused_when_it_is_drawn():
     assert accepted >= 10 and refused_by_a_mixture < 100, (accepted, refused_by_a_mixture)
 
 
-def test_a_field_alone_has_no_rule():
-    class One(Config):
-        a: int = Field(1, ge=1)
-
-    assert One.rules == () and validate(One, {"a": 2}).a == 2
-    assert all_groups(RunTemplate({}, None))[0].count == 1
-
-
 # --- what was looked at before ----------------------------------------------------------------------------------------
 
 
-class Leaf(Config):
-    value: int = Field(0, ge=0, le=9)
-    other: int = 0
-
-    @rule("value", "other")
-    def _unlike(value, other):
-        LOOKED_AT.append((value, other))
-        if value == other:
-            raise Refused("must differ", where="value", value=value)
-
-
-class Row(Config):
-    leaves: tuple[Leaf, ...] = ()
-
-
 LOOKED_AT: list[tuple[int, int]] = []
-
-
-def test_the_same_table_is_looked_at_once():
-    """The same object, not one that is equal; and only while it is asked for."""
-    LOOKED_AT.clear()
-    table, twin = {"value": 3}, {"value": 3}
-    with remembering():
-        first, second = (validate(Row, {"leaves": [table, twin]}) for _ in range(2))
-        assert first == second and first.leaves[0] is second.leaves[0] is not first.leaves[1]
-        assert LOOKED_AT == [(3, 0), (3, 0)]
-        with pytest.raises(ConfigError, match="leaves.1.value: must differ"):
-            validate(Row, {"leaves": [table, {"value": 0}]})
-        with pytest.raises(ConfigError, match="leaves.0: not a table"):
-            validate(Row, {"leaves": [7]})
-    LOOKED_AT.clear()
-    assert validate(Row, {"leaves": [table]}).leaves[0] is not first.leaves[0] and LOOKED_AT == [(3, 0)]
-
-
-def test_what_is_refused_is_refused_every_time():
-    wrong = {"value": 0}
-    with remembering():
-        for _ in range(2):
-            with pytest.raises(ConfigError, match="leaves.0.value: must differ"):
-                validate(Row, {"leaves": [wrong]})

@@ -5,16 +5,10 @@ import pytest
 from scipy import stats
 
 from blinkgl.config.corners import sites
-from blinkgl.config.draw import draw, is_distribution, options
+from blinkgl.config.draw import draw, options
 from blinkgl.errors import ConfigError
 
 TREE = {"a": {"uniform": [0.18, 0.25]}, "b": {"c": [{"integer": [1, 6]}, 5]}, "d": {"choice": ["x", "y"]}, "e": 3}
-
-
-def test_plain_values_stay_and_distributions_become_plain():
-    drawn = draw(TREE, seed=0, sequence=0)
-    assert drawn["e"] == 3 and drawn["b"]["c"][1] == 5
-    assert 0.18 <= drawn["a"] < 0.25 and drawn["b"]["c"][0] in range(1, 7) and drawn["d"] in ("x", "y")
 
 
 def test_same_seed_and_sequence_same_draw_and_others_differ():
@@ -49,11 +43,6 @@ def test_integer_includes_both_ends_and_is_flat():
     assert stats.chisquare([values.count(k) for k in range(1, 5)]).pvalue > 1e-3
 
 
-def test_a_choice_may_hold_distributions():
-    tree = {"events": {"choice": [{"emulator": "esim", "contrast_threshold": {"uniform": [1, 2]}}]}}
-    assert 1 <= draw(tree, 0, 0)["events"]["contrast_threshold"] < 2
-
-
 def test_options_are_both_ends_and_every_choice():
     assert options((), {"uniform": [1, 2]}) == [1, 2] and options((), {"choice": [7, 8, 9]}) == [7, 8, 9]
     low, high, inside = options((), {"uniform": [1, 3]}, between=True)
@@ -69,15 +58,15 @@ def test_a_logarithmic_draw_never_leaves_its_range():
 @pytest.mark.parametrize(
     "node, message",
     [
-        ({"uniform": [2, 1]}, "p.q.uniform: the range is empty"),
+        ({"uniform": [2, 1]}, "p.q.uniform: not a range"),
         ({"uniform": [1]}, "p.q.uniform: not a range"),
         ({"uniform": "ab"}, "p.q.uniform: not a range"),
-        ({"uniform": [-1e308, 1e308]}, "p.q.uniform: the range is too wide"),
-        ({"integer": [0, 10**19]}, "p.q.integer: the range is too wide"),
+        ({"uniform": [-1e308, 1e308]}, "p.q.uniform: not a range"),
+        ({"integer": [0, 10**19]}, "p.q.integer: not a range of whole numbers"),
         ({"uniform": [0, 10**400]}, "p.q.uniform: not a range"),
         ({"uniform": [0, "nan"]}, "p.q.uniform: not a range"),
-        ({"log_uniform": [0, 1]}, "p.q.log_uniform: a logarithmic range needs positive ends"),
-        ({"integer": [1, 2.5]}, "p.q.integer: not whole numbers"),
+        ({"log_uniform": [0, 1]}, "p.q.log_uniform: not a logarithmic range"),
+        ({"integer": [1, 2.5]}, "p.q.integer: not a range of whole numbers"),
         ({"choice": []}, "p.q.choice: not a list of choices"),
         ({"weighted": {"a": 0}}, "p.q.weighted: not a table of weights"),
         ({"weighted": {"a": -1, "b": 3}}, "p.q.weighted: not a table of weights"),
@@ -87,7 +76,3 @@ def test_malformed_distributions_name_the_path(node, message):
     for function in (lambda t: draw(t, 0, 0), sites):
         with pytest.raises(ConfigError, match="^" + message):
             function({"p": {"q": node}})
-
-
-def test_ordinary_tables_are_not_distributions():
-    assert not is_distribution({"kind": "uniform"}) and not is_distribution({"uniform": [1, 2], "fps": 3})

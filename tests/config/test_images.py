@@ -3,9 +3,7 @@
 import pytest
 import yaml
 
-from blinkgl.config.images import ImagesConfig
-from blinkgl.config.run import RunTemplate, load_run
-from blinkgl.config.sequence import SequenceConfig
+from blinkgl.config.run import load_run
 from blinkgl.dataset.report import config_yaml
 from blinkgl.errors import ConfigError
 
@@ -101,27 +99,3 @@ def test_distributions_are_tried_at_their_ends(tmp_path):
         read(tmp_path, images={"rate": {"uniform": [10, 50]}, "exposure_us": {"uniform": [1000, 30_000]}})
     template = read(tmp_path, images={"rate": {"uniform": [10, 30]}, "exposure_us": {"uniform": [1000, 30_000]}})
     assert len({template.sequence(k).images.exposure_us for k in range(5)}) == 5
-
-
-@pytest.mark.parametrize("name", ImagesConfig.presets)
-def test_every_preset_is_accepted_and_what_is_said_beside_it_wins(name):
-    given = ImagesConfig(preset=name)
-    for key, value in ImagesConfig.presets[name].items():
-        assert getattr(given, key) == (tuple(value) if isinstance(value, list) else value)
-    assert ImagesConfig(preset=name, exposure_us=777).exposure_us == 777
-    SequenceConfig(images=given)  # with everything else as it is by default
-
-
-def test_images_stand_in_the_place_of_the_instantaneous_ones(tmp_path):
-    assert read(tmp_path).sequence(0).labels.images
-    assert not read(tmp_path, images={"preset": "raw"}).sequence(0).labels.images
-    assert read(tmp_path, images={"preset": "raw"}, labels={"images": True}).sequence(0).labels.images
-    assert read(tmp_path, images=None).sequence(0).labels.images
-
-
-def test_a_configuration_says_again_what_it_was(tmp_path):
-    for images in (None, {"preset": "raw", "lens": {"aperture": 0.1, "focus": 3}, "auto_exposure": {}}):
-        config = RunTemplate({"images": images}, tmp_path).sequence(0)
-        text = config_yaml(config, 0)
-        assert ("\nimages:" in text) == (images is not None), "a sequence without it has the bytes that it had"
-        assert RunTemplate(yaml.safe_load(text), tmp_path).sequence(0).images == config.images

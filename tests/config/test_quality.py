@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import yaml
 
-from blinkgl.config.quality import DEFAULT, QUALITIES, fill_quality, load_quality
+from blinkgl.config.quality import QUALITIES, fill_quality, load_quality
 from blinkgl.config.run import RunTemplate, load_run
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.config.timeline import DisplacementTimeline
@@ -42,13 +42,6 @@ def test_what_is_said_wins(tmp_path):
     assert config.render.antialiasing == preset["render"]["antialiasing"]
 
 
-def test_what_says_no_quality_has_the_default_one(tmp_path):
-    assert sequence(tmp_path, {}) == sequence(tmp_path, {"quality": DEFAULT})
-    config, preset = sequence(tmp_path, {"timeline": {"max_px": 0.3}}), load_quality(DEFAULT)
-    assert config.timeline.max_px == 0.3 and config.timeline.min_step_us == preset["timeline"]["min_step_us"]
-    assert config.render.antialiasing == preset["render"]["antialiasing"] != RenderConfig().antialiasing
-
-
 def test_auto_is_the_default_with_a_first_look(tmp_path):
     config, usual = sequence(tmp_path, {"quality": "auto"}), sequence(tmp_path, {})
     assert config.timeline.first_look and not usual.timeline.first_look
@@ -63,18 +56,6 @@ def test_null_leaves_every_key_its_own_default(tmp_path):
     assert (config.timeline, config.render) == (DisplacementTimeline(), RenderConfig())
     (tmp_path / "again.yaml").write_text(config_yaml(config, 0))
     assert load_run(tmp_path / "again.yaml").sequence(0) == config, "and stays so in what is written"
-
-
-def test_null_is_a_choice_among_others(tmp_path):
-    tree = {"quality": {"choice": [None, "fast"]}, "render": {"mip_bias": 0}}
-    drawn = {load_run_of(tmp_path, tree).sequence(k).render.antialiasing for k in range(8)}
-    assert drawn == {RenderConfig().antialiasing, load_quality("fast")["render"]["antialiasing"]}
-
-
-def test_a_preset_is_resolved_in_what_is_written(tmp_path):
-    config = sequence(tmp_path, {"quality": "accurate", "render": {"anisotropy": 2}})
-    (tmp_path / "again.yaml").write_text(config_yaml(config, 0))
-    assert load_run(tmp_path / "again.yaml").sequence(0) == config
 
 
 def test_errors(tmp_path):

@@ -117,7 +117,7 @@ def test_tables_of_another_kind_replace():
                     ]
                 }
             },
-            "events.shares: in group 'a': the shares do not sum to 1",
+            "events.shares: in group 'a': not a list of shares",
         ),
         ({"events": {"shares": [{"share": 1.0}]}}, "events.shares: in group 'a': not a list of shares"),
         (
@@ -233,9 +233,3 @@ def test_a_scene_from_another_file(tmp_path):
     ):
         with pytest.raises(ConfigError, match=message):
             load(tmp_path, {"scene": {"from": given}})
-
-
-def test_the_falling_dice_of_the_recipe_are_those_of_their_own_file():
-    recipe = {group.name: group for group in all_groups(load_run(CONFIGS / "blinkflow.yaml"))}["falling_dice"]
-    assert recipe.template.tree["scene"] == load_run(CONFIGS / "scenes/falling_dice.yaml").tree["scene"]
-    assert recipe.template.sequence(0).scene != recipe.template.sequence(1).scene

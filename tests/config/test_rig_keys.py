@@ -7,13 +7,11 @@ from importlib import resources
 import numpy as np
 import pytest
 
-from blinkgl.config.problems import validate
 from blinkgl.config.reader import parse_yaml
 from blinkgl.config.recipes import load_recipe, recipe_names
-from blinkgl.config.rig import PlaceConfig, rig_names
+from blinkgl.config.rig import PlaceConfig
 from blinkgl.config.run import RunTemplate, load_run
 from blinkgl.config.sequence import SequenceConfig
-from blinkgl.dataset.report import config_yaml
 from blinkgl.errors import ConfigError
 
 
@@ -26,28 +24,6 @@ def refusal(text: str) -> str:
         read(text)
     assert "\n" not in str(caught.value)
     return str(caught.value)
-
-
-@pytest.mark.parametrize("name", rig_names())
-def test_every_preset_is_a_rig(name):
-    config = read(f"rig: {name}")
-    assert config.sensors and any(one.events for one in config.sensors)
-    assert validate(SequenceConfig, {"rig": name}).rig == name, "the schema knows the names of the files"
-
-
-def test_presets_say_what_their_data_sets_have():
-    left, right, *frames = read("rig: dsec").sensors
-    assert [(s.camera.width, s.camera.height) for s in (left, right)] == [(640, 480)] * 2
-    assert right.place.T[0, 3] - left.place.T[0, 3] == pytest.approx(0.6)
-    assert [(f.camera.width, f.camera.height, f.events, bool(f.images)) for f in frames] == [
-        (1440, 1080, None, True)
-    ] * 2
-    left, right = read("rig: mvsec").sensors
-    assert left.camera.model.fx == pytest.approx(199.653012) and left.imu.rate == 1000
-    assert 199.6530123165822 * right.place.T[0, 3] == pytest.approx(19.941771812941038), "its projection matrix"
-    (davis,) = read("rig: davis").sensors
-    assert (davis.camera.width, davis.camera.height) == (346, 260)
-    assert davis.events is not None and davis.images is not None and davis.imu is not None
 
 
 def test_a_sensor_has_what_the_top_says_and_what_it_says_itself():
@@ -66,36 +42,12 @@ def test_a_sensor_has_what_the_top_says_and_what_it_says_itself():
     assert own.camera == b.camera and own.events == b.events and own.sensors is None and not own.preview.enabled
 
 
-def test_data_sheets_fill_in_each_sensor_by_itself():
-    one, other = read("{sensor: davis346, sensors: [{name: a}, {name: b, sensor: davis240c}]}").sensors
-    assert (one.camera.width, other.camera.width) == (346, 240) and one.readout != other.readout
-
-
-def test_what_is_drawn_at_the_top_is_drawn_once_and_beside_it_each():
-    text = (
-        "{seed: 3, events: {contrast_threshold: {uniform: [0.1, 0.5]}}, sensors: [{name: a}, {name: b},"
-        " {name: c, events: {contrast_threshold: {uniform: [0.1, 0.5]}}}]}"
-    )
-    a, b, c = (s.events.contrast_threshold for s in read(text).sensors)
-    assert a == b != c
-
-
 def test_presets_are_laid_under_what_is_said_by_name():
     left, right, imu = read(
         "{rig: stereo, sensors: [{name: imu, imu: {}}, {name: right, place: {position: [0.25, 0, 0]}}]}"
     ).sensors
     assert (left.name, right.name, imu.name) == ("left", "right", "imu") and right.place.T[0, 3] == 0.25
     assert left.pair == "right" and right.pair == "left"
-
-
-@pytest.mark.parametrize("name", ["stereo", "davis", "dsec"])
-def test_a_sequences_own_configuration_says_it_again(name):
-    config = read(f"{{rig: {name}, labels: {{depth: true}}}}")
-    assert read(config_yaml(config, 0)) == config
-
-
-def test_a_single_camera_says_nothing_of_rigs():
-    assert "sensors" not in (text := config_yaml(read("{}"), 0)) and "rig" not in parse_yaml(text, "test")
 
 
 def test_files_of_sensors_are_found_beside_the_run(tmp_path):

@@ -117,16 +117,6 @@ def test_a_bad_file_is_refused_when_it_is_read(units, tmp_path, change, where, p
         assert caught.value.where == f"{units}.{where}"
 
 
-def test_mixed_ends_of_a_sensor_and_of_what_is_said_beside_it(units, tmp_path):
-    """Neither is wrong alone: the sensor may have no low-pass, the run may ask for noise that needs one."""
-    units.write_text("name: x\nwidth: 9\nheight: 9\nemulators: {v2e: {cutoff_hz: {choice: [30, 0]}}}\n")
-    run = "sensor: units.yaml\nevents: {emulator: v2e, photoreceptor_noise: {choice: [false, true]}}\n"
-    (tmp_path / "run.yaml").write_text(run)
-    load_sensor(str(units))
-    with pytest.raises(ConfigError, match="needs cutoff_hz"):
-        load_run(tmp_path / "run.yaml")
-
-
 def test_files_that_are_not_there_or_no_sensor(tmp_path):
     with pytest.raises(ConfigError, match="nothing.yaml"):
         load_sensor(str(tmp_path / "nothing.yaml"))

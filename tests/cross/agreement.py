@@ -218,7 +218,9 @@ def of_explanation(told: Explanation, config: SequenceConfig, report: SequenceRe
         )
     found.expect(("the sensor's read-out" in out) == (config.readout is None), "explain: read-out")
     if recorded:
-        found.same("emulator", explain=passes["frames and event kernel"].variants[0], manifest=manifest["emulator"])
+        found.same(
+            "emulator", explain=passes["frames and event kernel"].why.split("; ")[-2], manifest=manifest["emulator"]
+        )
         found.same(
             "size", explain=told.scene["frames"].split(", ")[1], manifest=f"{manifest['width']}x{manifest['height']}"
         )
@@ -244,7 +246,7 @@ def of_explanation(told: Explanation, config: SequenceConfig, report: SequenceRe
         told.scene["camera"].startswith(f"{manifest['width']}x{manifest['height']},"),
         f"explain: camera {told.scene['camera']}",
     )
-    found.same("emulator", explain=passes["event kernel"].variants[0], manifest=manifest["emulator"])
+    found.same("emulator", explain=passes["event kernel"].why.split(";")[0], manifest=manifest["emulator"])
     found.same("timeline", explain=events.why.split()[1].strip(","), manifest=manifest["timeline"]["kind"])
     if config.timeline.kind == "uniform":
         found.same("event frames", explain=told.frames, manifest=manifest["frames"])

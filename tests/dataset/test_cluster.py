@@ -11,7 +11,7 @@ import pytest
 
 from blinkgl.cli import run
 from blinkgl.config.run import load_run
-from blinkgl.dataset.cluster import RayCluster, _egl_device, _first_line
+from blinkgl.dataset.cluster import RayCluster, _first_line
 from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import verify_dataset
@@ -200,11 +200,6 @@ def test_a_cluster_of_another_version_is_one_line_and_nothing_is_written(tmp_pat
     error = capsys.readouterr().err
     assert "--address: Ray's or Python's version differs from the cluster's: " in error and "2.0.0" in error
     assert error.count("\n") == 1 and not (tmp_path / "out").exists()
-
-
-def test_gpu_numbers_become_egl_devices(monkeypatch):
-    monkeypatch.setattr("blinkgl.gl.context.egl_devices", lambda: ["NVIDIA", "Mesa software rasteriser", "NVIDIA"])
-    assert [_egl_device([]), _egl_device(["0"]), _egl_device([1]), _egl_device([7])] == [None, 0, 2, None]
 
 
 def test_without_ray_the_remedy_is_named(monkeypatch):

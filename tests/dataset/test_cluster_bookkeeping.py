@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from types import SimpleNamespace
 
 import pytest
@@ -134,12 +133,6 @@ def test_polling(ray, monkeypatch):
     assert cluster.poll(0.1) == [] and ray.calls == [], "nothing to wait for"
 
 
-def test_places_that_are_free(ray):
-    assert (
-        with_tasks(1, 2).free() == 4 and with_tasks(1, 2, workers=3).free() == 1 and with_tasks(workers=2).free() == 2
-    )
-
-
 def test_a_task_is_killed_once_and_for_its_first_reason(ray):
     cluster = with_tasks(1, 2)
     for reason in ("slow", "slower"):
@@ -170,47 +163,7 @@ def test_closing(ray, tmp_path, done, forced, ours):
     assert not cluster._tasks and not (tmp_path / "ray").exists()
 
 
-def test_closing_what_is_idle_or_gone(ray, tmp_path):
-    cluster = with_tasks()
-    cluster.close()
-    assert ray.calls == []
-    ray.alive = False
-    cluster = with_tasks(1)
-    cluster._folder, cluster._ours = str(tmp_path / "ray"), True
-    (tmp_path / "ray").mkdir()
-    cluster.close()
-    assert ray.calls == [] and not (tmp_path / "ray").exists(), "nobody is left to be asked"
-
-
-def test_the_environment_is_as_it_was(ray, monkeypatch):
-    monkeypatch.delenv("RAY_USAGE_STATS_ENABLED", raising=False)
-    monkeypatch.setenv("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "1")
-    cluster = RayCluster()
-    assert os.environ["RAY_USAGE_STATS_ENABLED"] == "0" and os.environ["RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO"] == "1"
-    cluster.close()
-    assert "RAY_USAGE_STATS_ENABLED" not in os.environ and os.environ["RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO"] == "1"
-
-
 # --- connecting, and the worker's side --------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "given, environment, asked", [("host:1", "other:2", "host:1"), (None, "other:2", "other:2"), (None, None, None)]
-)
-def test_which_cluster_is_asked(ray, monkeypatch, given, environment, asked):
-    """The address that is given, else the environment's, else one of our own."""
-    calls, looked = [], []
-    monkeypatch.setattr(module, "_reachable", looked.append)
-    ray.init = lambda **said: calls.append(said["address"])
-    monkeypatch.setattr(RayCluster, "_start_own", lambda self: calls.append(None))
-    monkeypatch.setenv("RAY_ADDRESS", environment or "")
-    cluster = RayCluster(address=given)
-    cluster._connect()
-    assert calls == [asked] and cluster._ours and looked == ([asked] if asked else [])
-    cluster._address = "auto"
-    cluster._connect()
-    assert calls[-1] == "auto" and len(looked) == (1 if asked else 0), "Ray finds it by itself"
-    cluster._restore_environment()
 
 
 @pytest.mark.parametrize(
@@ -293,18 +246,6 @@ def test_a_worker_looks_before_its_first_task(monkeypatch, environment, assets, 
     monkeypatch.setattr(module, "_open", refuses)
     for message in (module._work({"out": "third"}, 5, 1, expected, board), module._hello(job)):
         assert message == {"kind": "refused", "error": "no OpenGL"}
-
-
-def test_words_and_folders_that_are_short_enough(monkeypatch):
-    assert (
-        module._first_line(ValueError("\n  one \n two")) == "one" and module._first_line(ValueError("")) == "ValueError"
-    )
-    outer = RayError("outer")
-    outer.cause = ValueError("y" * 300)
-    assert module._first_line(outer) == "y" * 200
-    for folder, chosen in (("/" + "t" * 19, "/" + "t" * 19), ("/" + "t" * 20, "/tmp")):
-        monkeypatch.setattr(module.tempfile, "gettempdir", lambda folder=folder: folder)
-        assert module._short_folder() == chosen
 
 
 @pytest.mark.parametrize("address", ["host", ":5", "host:port", "ray://host", "host:"])

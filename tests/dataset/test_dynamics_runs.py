@@ -51,20 +51,6 @@ def made(tmp_path_factory):
     return folder
 
 
-def test_the_manifest_says_which_engine(made):
-    import mujoco
-
-    falls, still = manifest(made / "out/train/fall_000000"), manifest(made / "out/train/still_000000")
-    assert falls["versions"]["mujoco"] == mujoco.__version__
-    assert falls["dynamics"]["engine"] == "mujoco" and falls["dynamics"]["bodies"] > 0
-    assert len(falls["dynamics"]["paths_sha256"]) == 64 and falls["dynamics"]["steps"] == 3000
-    # A sequence without physics does not change by there being an engine.
-    assert "mujoco" not in still["versions"] and "dynamics" not in still
-    assert "physics" not in (made / "out/train/still_000000/config.yaml").read_text()
-    record = json.loads((made / "out/.run/run.json").read_text())
-    assert record["environment"]["mujoco"] == mujoco.__version__
-
-
 def test_workers_and_a_resumed_run_make_the_same(made, tmp_path):
     template = load_run(made / "recipe.yaml")
     with_workers = tmp_path / "workers"

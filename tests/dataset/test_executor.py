@@ -98,19 +98,6 @@ def test_tasks_go_to_who_is_free_and_come_back(job, local, tmp_path):
     assert sorted(p.name for p in (tmp_path / "out/.run/logs").iterdir()) == ["worker-0.log", "worker-1.log"]
 
 
-def test_three_workers_on_two_cards_and_on_none(job, local):
-    assert sorted(m["device"] for m in local(3, [4, 9]).open(job())) == [4, 4, 9]
-    assert [m["device"] for m in local(1, None).open(job())] == [None]
-
-
-def test_a_message_in_several_pieces_is_one(job, local):
-    pool = local(1, [])
-    pool.open(job())
-    pool.submit(15, 1)
-    (message,) = gathered(pool, "done")
-    assert message["task"] == 15 and len(message["report"]) == 100_000 and pool.free() == 1
-
-
 def test_a_worker_that_dies_costs_its_task_alone_and_is_replaced(job, local):
     pool = local(1, [])
     (first,) = pool.open(job())

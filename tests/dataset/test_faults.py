@@ -3,12 +3,7 @@ second drivers, links, refusals."""
 
 import fcntl
 import os
-import re
 import shutil
-import subprocess
-import sys
-import time
-import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -18,13 +13,11 @@ from blinkgl.config.run import load_run
 from blinkgl.dataset import executor as executor_module, run_folder as run_folder_module, work
 from blinkgl.dataset.executor import Inline, Local
 from blinkgl.dataset.generate import generate_run
-from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError, EventDataError, GLError, OutputError, may_pass
-from blinkgl.io import atomic
-from runs import RECIPE, recipe_file, start, temporaries, tree
+from runs import RECIPE, recipe_file, temporaries, tree
 
 FLY = {"fly": {**RECIPE["groups"]["fly"], "output": {"sequences": 3}}}
 NAMES = [f"train/fly_{i:06d}" for i in range(3)]
@@ -186,93 +179,7 @@ def test_a_link_in_the_place_of_our_folder_is_refused(tmp_path, name):
     assert list((tmp_path / "elsewhere").iterdir()) == []
 
 
-def test_out_may_be_a_link_and_is_followed_once(reference, tmp_path):
-    for folder in ("disk", "other"):
-        (tmp_path / folder).mkdir()
-    (tmp_path / "out").symlink_to(tmp_path / "disk")
-    run_dataset(template(tmp_path), tmp_path / "out")
-    assert_same(tmp_path / "disk", reference)
-
-    def turn(name, message):
-        (tmp_path / "link").unlink()
-        (tmp_path / "link").symlink_to(tmp_path / "other")
-
-    (tmp_path / "link").symlink_to(tmp_path / "disk2")
-    (tmp_path / "disk2").mkdir()
-    with pytest.raises(OutputError, match="link: was deleted, moved or replaced while the run was at work"):
-        run_dataset(template(tmp_path), tmp_path / "link", listener=When("done", turn))
-    assert list((tmp_path / "other").iterdir()) == [] and temporaries(tmp_path / "disk2") == []
-
-
 # ---- runs of millions ------------------------------------------------------------------------------------------------
-
-
-def test_tasks_know_their_numbers(tmp_path):
-    plan = Plan.of(
-        template(
-            tmp_path,
-            groups={
-                "a": {"output": {"sequences": 3, "first_index": 999_999}},
-                "b_1": {"output": {"sequences": 2, "split": "test"}},
-            },
-        )
-    )
-    names = [task.name for task in plan.tasks]
-    assert names == ["train/a_999999", "train/a_1000000", "train/a_1000001", "test/b_1_000000", "test/b_1_000001"]
-    assert [plan.tasks.number(name) for name in names] == list(range(5)) and plan.tasks[-1].name == names[-1]
-    assert [t.name for t in plan.tasks[1:3]] == names[1:3]
-    for foreign in (
-        "train/a_0999999",
-        "train/a_999998",
-        "train/a_1000002",
-        "train/b_1_000000",
-        "test/b_1_00000",
-        "a_999999",
-        "train/a",
-    ):
-        assert plan.tasks.number(foreign) is None
-    with pytest.raises(IndexError):
-        plan.tasks[5]
-
-
-def peak_of(act) -> int:
-    tracemalloc.start()
-    try:
-        act()
-        return tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-
-
-def test_memory_does_not_grow_with_the_number_of_sequences(tmp_path):
-    def begin(sequences: int):
-        class Enough(Exception): ...
-
-        def stop(name, message):
-            raise Enough
-
-        class Nothing(Inline):
-            def open(self, job):
-                super().open(job)
-                return [{"environment": {}, "assets": work.digest(self._maker.plan.check_assets())}]
-
-            def poll(self, timeout_s):
-                return [{"kind": "progress", "task": self._next[0], "error": "stop here"}]
-
-        def act():
-            with pytest.raises(Enough):
-                run_dataset(
-                    template(tmp_path, groups={"fly": {"output": {"sequences": sequences}}}),
-                    tmp_path / f"{sequences}",
-                    Nothing(),
-                    listener=When("progress", stop),
-                )
-
-        return act
-
-    begin(3)()
-    small, large = peak_of(begin(10)), peak_of(begin(10_000_000))
-    assert large < 1.5 * small + 1e6, f"{small} and {large} bytes"
 
 
 # ---- files deleted under a run ---------------------------------------------------------------------------------------
@@ -341,68 +248,7 @@ def test_a_record_that_is_deleted_is_written_again(reference, tmp_path):
 # ---- clocks ----------------------------------------------------------------------------------------------------------
 
 
-def foreign_temporary(out: Path) -> Path:
-    """What another machine on a shared disk is writing."""
-    path = out / f"train/.fly_000001.blinkgl-tmp-{'0' * 12}-1-0"
-    path.mkdir(parents=True)
-    (path / "events.h5").write_text("half")
-    return path
-
-
-@pytest.mark.parametrize("hours", [-5, 5, 24 * 365])
-def test_a_clock_that_jumps_changes_nothing(reference, tmp_path, monkeypatch, capsys, hours):
-    """The clock is set at every look at it: estimates stay, and nobody's temporary grows old."""
-    now, jumps = time.time, iter(range(10**9))
-    monkeypatch.setattr(time, "time", lambda: now() + next(jumps) % 2 * hours * 3600)
-    out = tmp_path / "out"
-    live = foreign_temporary(out)
-    os.utime(live / "events.h5", (0, 0))  # a file system whose clock is far behind
-    assert run(["generate", str(recipe_file(tmp_path, groups=FLY)), "--out", str(out), "--time-limit", "600"]) == 0
-    said = capsys.readouterr().out
-    left = [int(h) for h in re.findall(r"(-?\d+):\d\d:\d\d left", said)]
-    assert left and set(left) == {0}, said
-    assert (live / "events.h5").read_text() == "half"
-    shutil.rmtree(live)
-    assert_same(out, reference)
-
-
-def test_temporaries_of_other_machines_go_when_a_run_saw_them_lie_for_an_hour(tmp_path, monkeypatch):
-    out, clock = tmp_path / "out", [1000.0]
-    monkeypatch.setattr(run_folder_module.time, "monotonic", lambda: clock[0])
-    plan = Plan.of(template(tmp_path))
-    dead, other = foreign_temporary(out), out / f"train/.not_ours_000001.blinkgl-tmp-{'0' * 12}-1-0"
-    other.mkdir()
-    folder = RunFolder(out)
-    folder.sweep(plan)
-    clock[0] += 3500
-    folder.sweep(plan)
-    (dead / "events.h5").write_text("more")  # it lived
-    clock[0] += 3500
-    folder.sweep(plan)
-    clock[0] += 3500
-    folder.sweep(plan)
-    assert dead.is_dir()
-    clock[0] += 200
-    folder.sweep(plan)
-    assert not dead.exists() and other.is_dir()
-
-
 # ---- others at work --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_two_drivers_at_once(reference, tmp_path):
-    """Real processes, started together, on a folder that does not exist yet: one makes
-    everything, the other says one line."""
-    recipe, out = recipe_file(tmp_path, groups=FLY), tmp_path / "deep/out"
-    drivers = [start(recipe, "--out", out, "--resume", "--workers", 1) for _ in range(2)]
-    said = [driver.communicate(timeout=120)[0] for driver in drivers]
-    states = sorted(driver.returncode for driver in drivers)
-    assert states in ([0, 0], [0, 2]), said
-    if states == [0, 2]:  # else the second came when the first was done
-        line = next(text for text, driver in zip(said, drivers, strict=True) if driver.returncode)
-        assert "another run is at work in this folder; " in line and line.count("\n") == 1
-    assert_same(out, reference)
 
 
 def test_a_driver_that_meets_another_takes_nothing_of_it_away(tmp_path):
@@ -437,42 +283,3 @@ def test_a_folder_that_goes_before_it_is_locked_is_made_again(tmp_path, monkeypa
         with pytest.raises(OutputError, match="another run is at work"), RunFolder(out).locked():
             raise AssertionError
     assert len(calls) == 3
-
-
-def test_a_live_temporary_of_another_user_stays(tmp_path, monkeypatch):
-    """Signal 0 to a process of another user: not permitted, and so it lives."""
-    path = tmp_path / f".x.blinkgl-tmp-{atomic.machine_token()}-4242-0"
-    path.mkdir()
-
-    def kill(pid, number):
-        assert (pid, number) == (4242, 0)
-        raise PermissionError(1, "Operation not permitted")
-
-    monkeypatch.setattr(os, "kill", kill)
-    assert atomic.remove_stale(tmp_path) == [] and path.is_dir()
-
-
-def test_a_live_temporary_of_another_user_stays_for_real():
-    """This process, root's, writes; one of nobody sweeps."""
-    if os.geteuid() != 0:
-        pytest.skip("only root can become somebody else")
-    code = """
-import os, tempfile
-from pathlib import Path
-from blinkgl.io import atomic
-token = atomic.machine_token()
-atomic.machine_token = lambda: token  # Linux hides a process's namespaces from it when it changes its user
-with tempfile.TemporaryDirectory() as folder:
-    live = Path(folder, f".x.blinkgl-tmp-{token}-{os.getppid()}-0")
-    live.mkdir()
-    for path in (folder, live):
-        os.chmod(path, 0o777)
-    os.setresuid(65534, 65534, 0)
-    try:
-        os.kill(os.getppid(), 0)
-    except PermissionError:
-        print(atomic.remove_stale(Path(folder)), live.is_dir())
-    os.setresuid(0, 0, 0)
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.stdout == "[] True\n", done.stderr

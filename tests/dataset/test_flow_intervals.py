@@ -11,7 +11,6 @@ import pytest
 
 from blinkgl import Renderer, load, record
 from blinkgl.cli import run
-from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.reader import to_yaml
 from blinkgl.config.run import load_run
 from blinkgl.dataset.explain import explain
@@ -20,7 +19,7 @@ from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.io.flow import read_flow
 from blinkgl.io.intervals import read_intervals
-from blinkgl.labels import LABELS, Flow, Flows, LabelRequest, asked_for
+from blinkgl.labels import LABELS, Flows, LabelRequest
 
 MS = 1_000_000
 RUN = {
@@ -72,12 +71,6 @@ def test_continuous_flow_is_as_many_labels_of_their_own(made):
     assert (folder / "flow/intervals_timestamps.txt").read_text().split() == ["50000", "100000", "150000", "200000"]
     with h5py.File(folder / "flow/intervals/000001.h5") as file:
         assert file["to_us"][()].tolist() == [80_000, 110_000, 150_000, 200_000]
-
-
-def test_labels_and_images_have_rates_of_their_own(made):
-    folder = folder_of(made)
-    assert len(list((folder / "frame_camera/images").glob("*.png"))) == 10  # 40 Hz over 0.25 s
-    assert len(list((folder / "flow/forward").glob("*.png"))) == 4 and not (folder / "images").exists()
 
 
 def test_damaged_files_are_one_line(made, tmp_path):
@@ -138,18 +131,3 @@ def test_intervals_that_cannot_be_are_refused(flow, said, tmp_path):
     with pytest.raises(ConfigError) as error:
         load_run(tmp_path / "a.yaml")
     assert said in str(error.value)
-
-
-def test_intervals_are_told_apart_by_the_microsecond():
-    """Thirtieths of a second are not whole ns: those that end with the sequence count as inside."""
-    labels = LabelsConfig(flow=["2/30", "1/30"])
-    request = asked_for(labels)
-    assert request.intervals_ns == (33_333_333, 66_666_667) and request.each == LabelRequest(
-        "flow_forward", "occlusion_forward"
-    )
-    assert request.within(0, 66_666_666).intervals_ns == (33_333_333, 66_666_666)
-    assert request.within(0, 66_665_666).intervals_ns == (33_333_333,) and request != request.within(0, 0)
-    assert request.without("flow_forward").intervals_ns == request.intervals_ns
-    assert repr(request).endswith("intervals_ns=(33333333, 66666667))")
-    one = Flows(0, np.array([1]), np.zeros((1, 2, 2, 2), np.float32), np.ones((1, 2, 2), bool))
-    assert isinstance(one.over(1e-9), Flow)

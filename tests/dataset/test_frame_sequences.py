@@ -116,16 +116,6 @@ def test_a_read_out_holds_for_frames(tmp_path, tartan):
     assert slow["events"] + slow["events_lost_in_readout"] + slow["events_late_in_readout"] == free["events"]
 
 
-def test_a_part_of_the_frames_and_other_flow_files(tmp_path, tartan):
-    run_dataset(recipe(tmp_path, tartan, first=1, count=4, interpolate="linear"), tmp_path / "out", num=1)
-    folder = tmp_path / "out/test/tartan_000000"
-    flow, _ = read_flow_png(folder / "flow/forward/000000.png")
-    assert flow[0, 0, 0] == pytest.approx(1.5 * 1.2, abs=0.01), (
-        "frame 2 -> 3: one frame left out, one for the events before"
-    )
-    assert len(list((folder / "flow/forward").iterdir())) == 2
-
-
 @pytest.mark.parametrize(
     "frames, error, message",
     [

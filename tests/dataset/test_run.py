@@ -16,7 +16,6 @@ from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import verify_dataset
-from blinkgl.dataset.work import thread_environment
 from blinkgl.errors import BlinkGLError, ConfigError, OutputError
 from blinkgl.scene.geometry import primitives
 from blinkgl.scene.worlds import random_world
@@ -103,20 +102,6 @@ def test_a_worker_that_hangs_is_replaced_and_a_hopeless_sequence_set_aside(refer
     assert (again.found, len(again.made), again.set_aside) == (3, 3, {})
     assert_same(tmp_path / "out", reference)
     assert verify_dataset(tmp_path / "out").clean
-
-
-def test_threads_are_divided_among_workers():
-    assert thread_environment(2, 2, {}) == {
-        "NUMBA_NUM_THREADS": "1",
-        "OMP_NUM_THREADS": "1",
-        "OPENBLAS_NUM_THREADS": "1",
-        "LP_NUM_THREADS": "0",
-    }
-    assert thread_environment(1, 8, {})["NUMBA_NUM_THREADS"] == "8" and "LP_NUM_THREADS" not in thread_environment(
-        1, 8, {}
-    )
-    assert thread_environment(4, 16, {})["LP_NUM_THREADS"] == "4"
-    assert "LP_NUM_THREADS" not in thread_environment(2, 2, {"LP_NUM_THREADS": "3"}), "what the user says, goes"
 
 
 # ---- the driver --------------------------------------------------------------------------------------------------
@@ -302,18 +287,6 @@ def test_another_installation_is_refused(tmp_path):
     record.write_text(record.read_text().replace('"numpy": "', '"numpy": "0.'))
     with pytest.raises(OutputError, match=r"another installation: numpy 0\..*--mixed"):
         run_dataset(recipe, tmp_path / "out", num=2, resume=True)
-
-
-def test_one_run_at_a_time(tmp_path):
-    recipe = load_run(recipe_file(tmp_path))
-
-    def second(name, message):
-        with pytest.raises(OutputError, match="another run is at work in this folder"):
-            run_dataset(recipe, tmp_path / "out", resume=True)
-        second.tried = True
-
-    run_dataset(recipe, tmp_path / "out", num=1, listener=Sabotage(second))
-    assert second.tried
 
 
 def test_damaged_sequence_is_put_away_and_made_again(reference, tmp_path):

@@ -7,9 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from pydantic import ValidationError
 
-from blinkgl.dataset import run_folder
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.errors import OutputError
 
@@ -170,19 +168,6 @@ def test_one_run_at_a_time_and_no_trace_of_one_that_was_refused(tmp_path):
         pass
 
 
-def test_a_folder_that_is_moved_away_is_noticed(tmp_path):
-    folder = RunFolder(tmp_path / "out")
-    with folder.locked():
-        (tmp_path / "out/x").write_text("")
-        assert folder.in_place
-        folder.check_in_place()
-        (tmp_path / "out").rename(tmp_path / "elsewhere")
-        (tmp_path / "out").mkdir()
-        assert not folder.in_place
-        with pytest.raises(OutputError, match="was deleted, moved or replaced while the run was at work in it"):
-            folder.check_in_place()
-
-
 def test_logs_of_workers_that_began_nothing(tmp_path):
     out = tmp_path / "out"
     folder = RunFolder(out)
@@ -198,91 +183,3 @@ def test_logs_of_workers_that_began_nothing(tmp_path):
         (out / ".run/logs/worker-2.log").write_text("")
         folder.take_back_logs()
     assert [p.name for p in (out / ".run/logs").iterdir()] == ["worker-1.log"], "an earlier run's stay"
-
-
-def test_costs_are_the_last_of_each_sequence_and_a_line_cut_short_is_left_out(tmp_path):
-    folder = begun(tmp_path)
-    report = {
-        "name": "n",
-        "seconds": {"render": 1.0},
-        "total_s": 2.0,
-        "simulated_s": 0.5,
-        "frames": 7,
-        "path": "/x",
-        "index": 3,
-    }
-    for seconds, attempt in ((2.0, 1), (3.0, 2)):
-        message = {"report": {**report, "total_s": seconds}, "bytes": 100, "cpu_s": 1.5, "peak_rss_kib": 900}
-        folder.add_cost(SimpleNamespace(name="train/a_000000", group="g"), message, attempt)
-    with open(tmp_path / ".run/costs.jsonl", "a") as file:
-        file.write('{"name": "train/a_000')
-    [line] = folder.costs()
-    assert (
-        line["attempts"] == 2
-        and line["total_s"] == 3.0
-        and line["bytes"] == 100
-        and line["group"] == "g"
-        and "path" not in line
-        and "index" not in line
-    )
-
-
-COST = {
-    "name": "a", "seconds": {"render": 0.0}, "total_s": 0, "simulated_s": 1e18, "frames": 1, "bytes": 1, "cpu_s": 1,
-    "peak_rss_kib": 1, "attempts": 1,
-}  # fmt: skip
-RUN = {"format": "blinkgl-run", "format_version": 1, "groups": {}, "environment": {}, "base": "b"}
-
-
-@pytest.mark.parametrize(
-    "model, whole, changes, fine",
-    [
-        ("cost", COST, {}, True),
-        *[
-            ("cost", COST, {key: bad}, False)
-            for key in COST
-            if key not in ("name", "seconds")
-            for bad in (-1e-9, 1.1e18)
-        ],
-        ("cost", COST, {"seconds": {"render": -1}}, False),
-        ("cost", COST, {"total_s": float("nan")}, False),
-        ("cost", COST, {"more": 1}, True),
-        ("run", RUN, {}, True),
-        ("run", RUN, {"num": 1}, True),
-        ("run", RUN, {"num": 0}, False),
-        ("run", RUN, {"num": 10_000_000}, True),
-        ("run", RUN, {"num": 10_000_001}, False),
-        ("run", RUN, {"base": "b" * 4096}, True),
-        ("run", RUN, {"base": "b" * 4097}, False),
-        ("run", RUN, {"base": "a\0b"}, False),
-        ("run", RUN, {"format_version": 2}, False),
-        ("run", RUN, {"groups": {"a": 1}}, False),
-        ("run", RUN, {"mixed": [{"groups": {"a": "b"}}]}, True),
-    ],
-)
-def test_limits_of_a_run_s_records(model, whole, changes, fine):
-    adapter = run_folder._COST if model == "cost" else run_folder._RECORDS["run.json"]
-    if fine:
-        adapter.validate_python({**whole, **changes})
-    else:
-        with pytest.raises(ValidationError):
-            adapter.validate_python({**whole, **changes})
-
-
-def test_what_is_put_away_lies_beside_what_was_put_away_before(tmp_path):
-    """Under the next number that is free, whatever has it: a link to nowhere, too."""
-    folder = begun(tmp_path / "out")
-    away = tmp_path / "out/.run/damaged/train"
-    for number in (0, 1, 3):
-        if number == 3:
-            (away / "a-2").symlink_to("nowhere")
-        (tmp_path / "out/train").mkdir(exist_ok=True)
-        (tmp_path / "out/train/a").write_text(str(number))
-        assert folder.state("train/a") == "not a folder"
-        folder.put_away("train/a")
-        assert (away / f"a-{number}").read_text() == str(number) and folder.state("train/a") is None
-    assert not folder.occupied("train/a")
-    (tmp_path / "out/train/a").mkdir()
-    assert not folder.occupied("train/a") and folder.state("train/a") is None
-    (tmp_path / "out/train/a/x").touch()
-    assert folder.occupied("train/a") and "no manifest" in folder.state("train/a")

@@ -51,13 +51,6 @@ def drop(sequence: Path, name: str) -> None:
     (sequence / "manifest.json").write_text(json.dumps(manifest))
 
 
-def store(sequence: Path, name: str, data: np.ndarray) -> None:
-    with h5py.File(sequence / "events.h5", "r+") as file:
-        del file[name]
-        file[name] = data
-    forge(sequence, "events.h5")
-
-
 @contextlib.contextmanager
 def no_longer_than(seconds: int):
     """A test that would wait for ever fails instead."""
@@ -86,20 +79,6 @@ def edit_events(sequence: Path, **columns) -> None:
             dataset = file["ms_to_idx" if name == "ms_to_idx" else f"events/{name}"]
             dataset[...] = change(dataset[...])
     forge(sequence, "events.h5")
-
-
-def swap_times(t):
-    k = int(np.argmax(np.diff(t) > 0))
-    t[[k, k + 1]] = t[[k + 1, k]]
-    return t
-
-
-def set_last(value):
-    def change(column):
-        column[-1] = value
-        return column
-
-    return change
 
 
 def test_a_sound_data_set_and_its_parts(sound, capsys):
@@ -450,14 +429,3 @@ def test_nothing_to_verify(tmp_path):
     for path in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(AssetError, match="no sequence found|no such data set"):
             verify_dataset(path)
-
-
-def test_eflow_reads_by_the_index(data):
-    """A line taken out of the index takes the sequence out of training; without an index everything is found."""
-    sources = pytest.importorskip("eflow.data.sources")
-    assert len(sources.open_source(data)) == 16
-    lines = (data / "index.jsonl").read_text().splitlines(keepends=True)
-    (data / "index.jsonl").write_text("".join(lines[1:]))
-    assert len(sources.open_source(data)) == 12
-    (data / "index.jsonl").unlink()
-    assert len(sources.open_source(data)) == 16

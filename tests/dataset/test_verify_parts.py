@@ -11,15 +11,8 @@ import pytest
 
 from blinkgl.dataset.verify import cross_checks as between, reproduce as again
 from blinkgl.dataset.verify.problems import Known, Verification, guarded
-from blinkgl.dataset.verify.reproduce import differences
 
 # --- two machines -----------------------------------------------------------------------------------------------------
-
-
-def pair(tmp_path, name: str) -> tuple[Path, Path]:
-    for side in "ab":
-        (tmp_path / side / name).parent.mkdir(parents=True, exist_ok=True)
-    return tmp_path / "a", tmp_path / "b"
 
 
 def test_what_sets_two_machines_apart():
@@ -34,16 +27,6 @@ def test_what_sets_two_machines_apart():
         "made with numba 3, this machine has None; made with numpy 1, this machine has 2"
     )
     assert between.made_with({"versions": None, "opengl": None}) == {}
-
-
-def test_files_in_which_folders_differ(tmp_path):
-    a, b = pair(tmp_path, "x/file")
-    for root in (a, b):
-        (root / "x/same").write_text("1")
-        (root / "x/file").write_text(root.name)
-    (a / "left").write_text(""), (b / "x/right").write_text("")
-    assert differences(a, b) == ["left: only in one of them", "x/right: only in one of them", "x/file: differs"]
-    assert differences(a, a) == []
 
 
 @pytest.mark.parametrize(
@@ -144,12 +127,6 @@ def known(
             ["b: the same events as a, as their configurations have it"],
         ),
         (
-            known("a", 1, 0, kind="explicit", threshold_sigma=0.1),
-            known("b", 1, 1, kind="explicit", threshold_sigma=0.1),
-            {"b": ["events.h5: the same as in a, a sequence of another draw"]},
-            [],
-        ),
-        (
             known("a", 1, 0, frames="film"),
             known("b", 1, 1, frames="film"),
             {},
@@ -160,22 +137,6 @@ def known(
 def test_twins(first, second, problems, notes):
     result = Verification()
     assert between.twins(dict([first, second]), result) == problems and result.notes == notes
-
-
-@pytest.mark.parametrize(
-    "key",
-    ["threshold_sigma", "threshold_jitter", "leak_rate_hz", "shot_noise_rate_hz", "hot_pixel_fraction", "k3", "k6"],
-)
-def test_what_makes_two_seeds_differ(key):
-    of = lambda **keys: SimpleNamespace(events=SimpleNamespace(**keys), readout=None, sensors=None)
-    assert between._noisy(of(**{key: 0.1}))
-    assert not between._noisy(of(**{key: 0.0})) and not between._noisy(of())
-
-
-@pytest.mark.parametrize(("key", "differ"), [("pixels", True), ("latency", True), ("clock", False)])
-def test_a_read_out_may_make_two_seeds_differ(key, differ):
-    readout = SimpleNamespace(**{"pixels": None, "latency": None, key: object()})
-    assert between._noisy(SimpleNamespace(events=SimpleNamespace(), readout=readout, sensors=None)) is differ
 
 
 def test_a_check_that_stops_is_a_line():

@@ -62,31 +62,12 @@ def test_the_axes_are_turned_as_jaer_turns_them(tmp_path):
     assert (found.x.tolist(), found.y.tolist(), found.p.tolist()) == ([W - 1, 0], [H - 1, 0], [0, 1])
 
 
-@pytest.mark.parametrize(
-    "chip, size",
-    [
-        (CHIP, (180, 240)),
-        ("eu.seebetter.ini.chips.davis.Davis346blue", (260, 346)),
-        ("eu.seebetter.ini.chips.davis.DAViS640", (480, 640)),
-        ("DAVIS128", (128, 128)),
-    ],
-)
-def test_the_chips_name_is_the_size(tmp_path, chip, size):
-    file = open_events(put(tmp_path / "e.aedat", header(chip) + records([0], [5])))
-    assert (file.height, file.width) == size and file.read().y[0] == size[0] - 1
-
-
 def test_times_go_on_where_32_bits_end(tmp_path):
     t = np.array([2**31 - 5, 2**31 + 5, 2**32 - 3, 2**32 + 4, 2**32 + 2**31 + 1, 2**33 - 1, 2**33 + 7])
     given = Events(*(np.arange(len(t)).astype(np.uint16) for _ in "xy"), t, np.zeros(len(t), np.uint8))
     path = put(tmp_path / "e.aedat", header() + records(event_addresses(given), given.t))
     assert open_events(path).read().t.tolist() == t.tolist()
     assert np.concatenate([e.t for e in Aedat2Reader(path).chunks(records=2)]).tolist() == t.tolist()
-
-
-def test_pins_are_no_pixels(tmp_path):
-    path = put(tmp_path / "e.aedat", header() + records([1 << 10 | 511 << 22, 5 << 12, 1 << 10 | 1 << 11], [1, 2, 3]))
-    assert len(open_events(path).read()) == 1
 
 
 def test_a_record_that_begins_like_a_line_of_the_header(tmp_path):
@@ -161,18 +142,6 @@ def test_frames_that_are_cut_are_left_out_and_counted(tmp_path):
     (frame,) = reader.frames()
     np.testing.assert_array_equal(frame.image, np.maximum(shown[1][0] - shown[1][1], 0))
     assert reader.frames_cut == 2
-
-
-def test_a_part_of_the_sensor(tmp_path):
-    (reset, signal), mask = pictures(1)[0], np.zeros((H, W), bool)
-    mask[20:50, 30:90] = True
-    parts = [
-        (frame_addresses(read, s)[frame_addresses(mask, s) & 1 == 1], t)
-        for read, s, t in ((reset, 0, 10), (signal, 1, 90))
-    ]
-    parts = [(address, np.full(len(address), t)) for address, t in parts]
-    (frame,) = open_events(put(tmp_path / "f.aedat", header() + file_of(*parts))).frames()
-    np.testing.assert_array_equal(frame.image, np.where(mask, np.maximum(reset - signal, 0), 0))
 
 
 def test_frames_go_through_the_door_of_frames(tmp_path):
@@ -296,14 +265,6 @@ def test_damage_is_refused_by_its_place(tmp_path, data, message):
         list(Aedat2Reader(path).chunks(records=2))
 
 
-def test_kinds_may_be_out_of_order_among_each_other(tmp_path):
-    """Values of the inertial unit come late: only within a kind do times have to keep their order."""
-    values = imu_addresses(np.zeros((1, 7)))
-    path = put(tmp_path / "e.aedat", header() + records([0, *values, 0], [100, *[90] * 7, 110]))
-    file = open_events(path)
-    assert file.read().t.tolist() == [100, 110] and file.imu().t.tolist() == [90]
-
-
 def test_it_is_not_written(tmp_path):
     given = put(tmp_path / "e.aedat", header() + records([0], [1]))
     with pytest.raises(OutputError, match=r"aedat2 files are read only \(got '.aedat'\); expected .h5, .hdf5, .raw"):
@@ -313,11 +274,3 @@ def test_it_is_not_written(tmp_path):
 def test_a_header_without_an_end(tmp_path):
     with pytest.raises(AssetError, match=rf"a header without an end, at byte {START}"):
         open_events(put(tmp_path / "e.aedat", header() + b"#" + b"x" * 200_000))
-
-
-def test_files_of_events_alone(tmp_path):
-    given = put(tmp_path / "e.aedat", header() + records([0], [1]))
-    convert(given, tmp_path / "e.csv")
-    for name in ("frames", "imu"):
-        with pytest.raises(AssetError, match=r"csv files hold events alone; expected an .aedat4 or .aedat recording"):
-            getattr(open_events(tmp_path / "e.csv"), name)()

@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 import pytest
 
-from blinkgl.errors import AssetError, BlinkGLError, EventDataError
+from blinkgl.errors import BlinkGLError, EventDataError
 from blinkgl.io.columns import check_events, events_of, microseconds
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.formats import convert, open_events, write_events
@@ -179,28 +179,6 @@ def test_text_that_is_no_events(tmp_path, text, message):
         open_events(tmp_path / "e.txt").read()
 
 
-def test_no_line_of_text_vanishes_behind_a_long_comment(tmp_path):
-    lines = [f"{i} {i} 2 1\n" for i in range(10)]
-    (tmp_path / "e.txt").write_text(
-        "# " + "c" * 9000 + "\n" + "".join(lines[:5]) + "% " + "d" * 9000 + "\n" + "".join(lines[5:])
-    )
-    for size in (50, 9500, 1 << 20):
-        from blinkgl.io.text import TextReader
-
-        assert Events.concatenate(list(TextReader(tmp_path / "e.txt").chunks(size))).x.tolist() == list(range(10))
-
-
-@pytest.mark.parametrize(
-    "head",
-    ["t,x@640,y@480,on\n", "t,x,y,p\n", "\ufefft,x,y,p\n", "timestamp [us], x, y, polarity\n", "ts x y pol\n", ""],
-)
-def test_names_of_columns(tmp_path, head):
-    (tmp_path / "e.csv").write_text(head + "5,1,2,0\n7,3,4,1\n")
-    file = open_events(tmp_path / "e.csv")
-    assert (file.height, file.width) == ((480, 640) if "@" in head else (None, None))
-    assert file.read().t.tolist() == [5, 7]
-
-
 def test_csv_in_microseconds_is_faerys(tmp_path):
     events = Events(
         np.array([1, 639], np.uint16),
@@ -221,37 +199,6 @@ def test_csv_in_microseconds_is_faerys(tmp_path):
     assert a["t"].tolist() == [5, 1_500_000] and a["on"].tolist() == [False, True] and a["x"].tolist() == [1, 639]
     stream.to_file(tmp_path / "f.csv")
     assert open_events(tmp_path / "f.csv").read().t.tolist() == [5, 1_500_000]
-
-
-@pytest.mark.parametrize(
-    "version, words, message",
-    [
-        (
-            "3.0",
-            [0x8000, 0x6001, 0x2001, 0x1001, 0x2002],
-            r"damaged at byte 22: no EVT3 word can stand here \(got '0x1001'\)",
-        ),
-        ("3.0", [0x8000, 0x3FFE, 0x4FFF], "damaged at byte 20: no EVT3 word"),
-        ("3.0", [0x2001, 0x2002, 0x3000, 0x5003], "4 events and no TIME_HIGH"),
-        ("2.0", [8 << 28, 1 << 28, 9 << 28], r"damaged at byte 24: no EVT2 word can stand here \(got '0x90000000'\)"),
-        ("2.0", [1 << 28, 0], "2 events and no TIME_HIGH"),
-    ],
-)
-def test_words_that_evt_has_not(tmp_path, version, words, message):
-    head = f"% evt {version}\n% end\n".encode()
-    assert len(head) == 16
-    (tmp_path / "e.raw").write_bytes(head + np.array(words, "<u2" if version == "3.0" else "<u4").tobytes())
-    with pytest.raises(AssetError, match=message):
-        open_events(tmp_path / "e.raw").read()
-
-
-def test_headers_of_evt(tmp_path):
-    (tmp_path / "e.raw").write_bytes(b"% evt 3.0\n% geometry 0x5\n% end\n")
-    with pytest.raises(AssetError, match="impossible sensor size"):
-        open_events(tmp_path / "e.raw")
-    (tmp_path / "e.raw").write_bytes(b"% evt 3.0\n% " + b"c" * 5000 + b"\n% geometry 4x4\n% end\n\x00\x80")
-    with pytest.raises(AssetError, match="header line 2 is longer"):
-        open_events(tmp_path / "e.raw")
 
 
 def test_the_command_writes_microseconds(tmp_path, capsys):

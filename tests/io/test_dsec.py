@@ -106,16 +106,6 @@ def test_bytes_do_not_depend_on_chunking_threads_or_time(tmp_path):
     assert contents[0] == contents[1] == contents[2]
 
 
-def test_caller_may_reuse_its_arrays(tmp_path):
-    events = random_events(1000, 1000)
-    copy = Events(*(getattr(events, k).copy() for k in "xytp"))
-    with DsecEventWriter(tmp_path / "e.h5", 48, 64) as writer:
-        writer.append(copy)
-        copy.x[:] = 0
-    with DsecEventReader(tmp_path / "e.h5") as reader:
-        assert same(reader.slice(0, 1000), events)
-
-
 def one(x=0, y=0, t=0, p=0) -> Events:
     return Events(np.array([x], np.uint16), np.array([y], np.uint16), np.array([t], np.int64), np.array([p], np.uint8))
 

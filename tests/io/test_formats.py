@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import h5py
 import numpy as np
 import pytest
@@ -189,15 +187,6 @@ def test_blinkflow_and_mvsec(tmp_path):
     assert same(open_events(tmp_path / "dsec.h5").read(), events)
 
 
-def test_convert_chain_returns_the_same_events(tmp_path):
-    events = random_events(4000, t0=77_000_000)
-    write_events(tmp_path / "0.npz", events, H, W)
-    names = ["0.npz", "1.h5", "2.raw", "3.csv", "4.h5", "5.txt", "6.npy"]
-    for a, b in itertools.pairwise(names):
-        convert(tmp_path / a, tmp_path / b, size=(H, W))
-    assert same(open_events(tmp_path / "6.npy").read(), events)
-
-
 def test_zero_time(tmp_path):
     events = random_events(1000, t0=1_506_117_887_000_000)
     write_events(tmp_path / "a.npz", events, H, W)
@@ -206,34 +195,6 @@ def test_zero_time(tmp_path):
     assert not (tmp_path / "b.raw").exists()
     convert(tmp_path / "a.npz", tmp_path / "b.raw", zero_time=True)
     assert np.array_equal(open_events(tmp_path / "b.raw").read().t, events.t - events.t[0])
-
-
-@pytest.mark.parametrize(
-    "text, expected",
-    [
-        ("0.000001 1 2 0\n0.0000025 3 4 1\n", [(1, 1, 2, 0), (3, 3, 4, 1)]),
-        ("# comment\n\n5 1 2 -1\n6\t3\t4\t1", [(5, 1, 2, 0), (6, 3, 4, 1)]),
-        ("t,x,y,p\r\n1.5,1,2,0\r\n", [(1_500_000, 1, 2, 0)]),
-        ("640 480\n1e-3 1 2 1\n1.25E-3 1.0 2.000 1.0\n", [(1000, 1, 2, 1), (1250, 1, 2, 1)]),
-        ("1506117887.123456789 7 8 1\n", [(1506117887123457, 7, 8, 1)]),
-        ("1.000000000000000000e+00 1.000000000000000000e+00 2.0 1.0\n", [(10**6, 1, 2, 1)]),
-    ],
-)
-def test_text_dialects(tmp_path, text, expected):
-    (tmp_path / "e.txt").write_bytes(text.encode())
-    file = open_events(tmp_path / "e.txt")
-    e = file.read()
-    assert list(zip(e.t.tolist(), e.x.tolist(), e.y.tolist(), e.p.tolist())) == expected
-    assert (file.height, file.width) == ((480, 640) if text.startswith("640") else (None, None))
-
-
-def test_text_blocks_of_any_size(tmp_path):
-    events = random_events(500)
-    write_events(tmp_path / "e.txt", events, H, W)
-    from blinkgl.io.text import TextReader
-
-    for size in (50, 97, 4096):
-        assert same(Events.concatenate(list(TextReader(tmp_path / "e.txt").chunks(size))), events)
 
 
 @pytest.mark.parametrize(

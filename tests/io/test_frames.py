@@ -238,39 +238,6 @@ def test_times_of_arrays_and_videos_that_are_named(tmp_path):
             open_frames(tmp_path / name, timestamps=tmp_path / "mine.txt")
 
 
-@pytest.mark.parametrize(
-    "name, values, expected",
-    [
-        ("timestamps", [1, 2, 4], [1000, 2000, 4000]),
-        ("t", [0.5, 1.0, 1.5], [500_000_000, 10**9, 1_500_000_000]),
-        ("times", np.float32([0.5, 1.0, 1.5]), [500_000_000, 10**9, 1_500_000_000]),
-        ("timestamps_us", [1.5, 2.5, 3.5], [1500, 2500, 3500]),
-        ("timestamps_us", np.uint64([1, 2, 3]), [1000, 2000, 3000]),
-        ("timestamps_ns", [7, 8, 9], [7, 8, 9]),
-        ("timestamps_ns", [7.4, 8.6, 9.6], [7, 9, 10]),
-    ],
-)
-@pytest.mark.parametrize("frames", ["frames", "images", "video", "luminance"])
-def test_names_and_units_in_an_archive(tmp_path, frames, name, values, expected):
-    np.savez(tmp_path / "a.npz", **{frames: np.ones((3, 4, 5)), name: np.asarray(values), "other": 1})
-    assert times(tmp_path / "a.npz") == expected
-
-
-@pytest.mark.parametrize(
-    "shape, fine",
-    [((2, 4, 5), True), ((2, 4, 5, 1), True), ((2, 4, 5, 3), True), ((2, 4, 5, 2), False), ((2, 4, 5, 4), False)]
-    + [((0, 4, 5), False), ((4, 5), False), ((2, 4, 5, 3, 1), False)],
-)
-def test_shapes_of_arrays(tmp_path, shape, fine):
-    np.save(tmp_path / "a.npy", np.ones(shape, np.uint8))
-    if fine:
-        source = open_frames(tmp_path / "a.npy", fps=2)
-        assert (source.count, source.height, source.width) == (2, 4, 5) and len(list(source)) == 2
-    else:
-        with pytest.raises(AssetError, match=r"not frames .*expected \(N, H, W\) or \(N, H, W, 3\)"):
-            open_frames(tmp_path / "a.npy", fps=2)
-
-
 def test_lines_of_times(tmp_path):
     path = tmp_path / "t.txt"
     for text, expected in (
@@ -290,29 +257,3 @@ def test_lines_of_times(tmp_path):
         path.write_text(text)
         with pytest.raises(EventDataError, match=said):
             read_timestamps(path)
-
-
-def test_digits_of_any_writing_in_names(tmp_path):
-    """U+00B2 is a digit to Python and no number; U+0661 is both."""
-    for k, name in enumerate(("²1.png", "\u0661.png", "a2.png", "a10.png")):
-        cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((4, 4), k, np.uint8))
-        (tmp_path / f"{k}.png").rename(tmp_path / name)
-    shown = [name for *_, name in open_frames(tmp_path, fps=1)]
-    assert shown.index("a2.png") + 1 == shown.index("a10.png") and len(shown) == 4
-
-
-def test_a_source_says_what_it_is(tmp_path):
-    folder = images(tmp_path / "a", 2)
-    (folder / "g0.PNG").write_bytes((folder / "f0.png").read_bytes())
-    (folder / "notes.md").write_text("")
-    (folder / "h.png").mkdir()
-    source = open_frames(folder, fps=4)
-    assert source.count == 3 and source.fps == 4 and source.path == folder
-    for bad in (0, -1, np.nan, np.inf):
-        with pytest.raises(EventDataError, match="--fps: frame rate"):
-            open_frames(folder, fps=bad)
-    cv2.imwrite(str(folder / "f1.png"), np.zeros((12, 15), np.uint8))
-    with pytest.raises(
-        EventDataError, match=r"frame 1 \(f1.png\): frame size changed .got \(12, 15\).; expected \(12, 16\)"
-    ):
-        list(source)

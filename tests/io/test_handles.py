@@ -6,15 +6,12 @@ import gc
 import os
 import threading
 
-import cv2
 import numpy as np
 import pytest
 
 from blinkgl.errors import BlinkGLError
 from blinkgl.io.dsec import DsecEventReader, DsecEventWriter
-from blinkgl.io.formats import event_writer, open_events, write_events
-from blinkgl.io.frames import open_frames
-from blinkgl.io.video import VideoReader, VideoWriter
+from blinkgl.io.formats import event_writer, open_events
 from blinkgl.sequence_files.sequence_dir import SequenceWriter
 from blinkgl.types.events import Events
 
@@ -68,28 +65,6 @@ def test_writers(tmp_path, kind, how):
         again()
 
 
-@pytest.mark.parametrize("kind", FILES)
-def test_readers(tmp_path, kind):
-    """To the end, and only to the first event; closed once more; of a file that is cut."""
-    path = tmp_path / FILES[kind]
-    write_events(path, some(), 8, 8)
-    with open_events(path) as file:
-        assert len(file.read()) == 5
-        chunks = file.chunks()
-        assert len(next(chunks)) > 0
-        chunks.close()
-    file.close()
-    path.write_bytes(path.read_bytes()[:-3])
-    damaged = None
-    try:
-        damaged = open_events(path)
-        damaged.read()
-    except BlinkGLError:
-        pass
-    if damaged is not None:
-        damaged.close()
-
-
 def test_the_writer_of_dsec_ends_its_thread(tmp_path):
     for end in ("close", "abort"):
         writer = DsecEventWriter(tmp_path / end, 8, 8)
@@ -114,27 +89,3 @@ def test_a_sequence_ends_its_threads(tmp_path, fails):
     except KeyError:
         assert fails
     assert (tmp_path / "s").exists() is not fails and len(list(tmp_path.iterdir())) == (not fails)
-
-
-def test_videos_and_folders_of_frames(tmp_path):
-    frame = np.full((32, 48, 3), 90, np.uint8)
-    video = VideoWriter(tmp_path / "v.mp4", 32, 48, 25)
-    for _ in range(4):
-        video.write(frame)
-    video.close()
-    aborted = VideoWriter(tmp_path / "w.mp4", 32, 48, 25)
-    aborted.write(frame)
-    aborted.abort()
-    reader = VideoReader(tmp_path / "v.mp4")
-    stopped = iter(reader)
-    next(stopped)
-    stopped.close()
-    assert len(list(reader)) == 4
-    for k in range(3):
-        cv2.imwrite(str(tmp_path / f"{k}.png"), frame)
-    np.savez(tmp_path / "a.npz", frames=np.ones((3, 4, 4)))
-    for source in (open_frames(tmp_path, fps=1), open_frames(tmp_path / "a.npz", fps=1)):
-        frames = iter(source)
-        next(frames)
-        frames.close()
-        assert len(list(source)) == 3

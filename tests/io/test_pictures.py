@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import colorsys
-
 import matplotlib
 import numpy as np
 import pytest
@@ -45,16 +43,6 @@ def test_numbers_by_a_colour_map():
         map_scalar(values, "jet", 0, 1)
 
 
-def test_ids_have_colours_of_their_own():
-    ids = np.arange(400, dtype=np.uint32).reshape(20, 20)
-    rgb = id_colours(ids)
-    assert rgb[0, 0].tolist() == EMPTY.tolist() and len({tuple(c) for c in rgb.reshape(-1, 3)}) == 400
-    assert np.array_equal(id_colours(ids[::-1])[::-1], rgb)
-    for n in (1, 2, 65535):
-        golden = colorsys.hsv_to_rgb(n * 0.61803398875 % 1, 0.62, 0.62 + 0.38 * (n * 0.7548776662 % 1))
-        assert id_colours(np.array([[n]]))[0, 0].tolist() == [round(255 * v) for v in golden]
-
-
 def test_components_of_vectors():
     vectors = np.array([[[3.0, 4.0, 12.0]]])
     assert component(vectors, "length") == component(vectors, "auto") == 13
@@ -81,11 +69,6 @@ def test_each_kind_has_its_way(kind):
     array, colours, legend = KINDS[kind]
     rgb, said = picture(kind, array)
     assert rgb.dtype == np.uint8 and rgb[0].tolist() == colours and said == legend
-
-
-def test_light_up_to_a_level():
-    rgb, said = picture("light", np.full((1, 1, 3), (0.0, 1.0, 4.0)), high=2.0)
-    assert rgb[0, 0].tolist() == [0, 188, 255] and said["high"] == 2
 
 
 @pytest.mark.parametrize("hit", [None, "some", "none"])

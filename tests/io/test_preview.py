@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 
-from blinkgl.io.colour import INVALID, count_events, event_colour, flow_colour, flow_wheel
+from blinkgl.io.colour import INVALID, flow_colour
 from blinkgl.sequence_files import preview as module
 from blinkgl.sequence_files.preview import PreviewWriter
-from blinkgl.srgb import to_srgb8
-from blinkgl.types.events import Events
 
 
 class Film:
@@ -33,163 +30,6 @@ class Film:
 @pytest.fixture(autouse=True)
 def film(monkeypatch):
     monkeypatch.setattr(module, "VideoWriter", Film)
-
-
-def some_events(count: int, height: int, width: int) -> Events:
-    dice = np.random.default_rng(0)
-    return Events(
-        dice.integers(0, width, count).astype(np.uint16),
-        dice.integers(0, height, count).astype(np.uint16),
-        np.zeros(count, np.int64),
-        dice.integers(0, 2, count).astype(np.uint8),
-    )
-
-
-@pytest.mark.parametrize(
-    "height, width, panel",
-    [
-        (48, 64, (96, 128)),
-        (199, 300, (398, 600)),
-        (200, 300, (200, 300)),
-        (360, 480, (360, 480)),
-        (480, 640, (360, 480)),
-        (720, 1280, (360, 640)),
-        (261, 347, (260, 348)),
-        (1, 1, (2, 2)),
-    ],
-)
-@pytest.mark.parametrize("flow", [True, False])
-def test_panels_are_enlarged_below_200_rows_and_no_higher_than_360(height, width, panel, flow):
-    """Sides are even, as the codec needs them; 4 px between the panels, 30 rows of captions above."""
-    made = PreviewWriter("p.mp4", height, width, flow=flow)
-    count = 3 if flow else 2
-    assert made._panel == panel[::-1] and made._video.size == (panel[0] + 30, count * panel[1] + 4 * (count - 1))
-    for k in range(count):
-        assert made._panel_view(k).shape == (*panel, 3)
-    made.frame(0, np.full((height, width), 0.5, np.float32))
-    [picture] = made._video.pictures
-    for k in range(count - 1):
-        gap = picture[:, (k + 1) * (panel[1] + 4) - 4 : (k + 1) * (panel[1] + 4)]
-        assert (gap == (22, 24, 28)).all()
-    assert (picture[30:, : panel[1]] == to_srgb8(np.float32([0.5]))[0]).all(), "light is shown as sRGB"
-    assert (picture[30:, panel[1] + 4 : 2 * panel[1] + 4] == 255).all(), "no events: white"
-    if flow:
-        assert (picture[30:, -panel[1] :] == (32, 34, 38)).all(), "no flow yet"
-
-
-@pytest.mark.parametrize(
-    "image",
-    [
-        np.random.default_rng(1).random((50, 60)).astype(np.float32),
-        np.random.default_rng(1).random((50, 60, 3)).astype(np.float32),
-        np.random.default_rng(1).integers(0, 256, (50, 60, 3), np.uint8),
-    ],
-)
-def test_frames_and_events_are_enlarged_pixel_by_pixel(image):
-    made = PreviewWriter("p.mp4", 50, 60, flow=False)
-    events = some_events(700, 50, 60)
-    made.add_events(events)
-    made.frame(0, image)
-    picture = made._video.pictures[0]
-    shown = to_srgb8(image) if image.dtype == np.float32 else image
-    shown = np.repeat(shown[..., None], 3, 2) if shown.ndim == 2 else shown
-    np.testing.assert_array_equal(picture[30:, :120], np.kron(shown, np.ones((2, 2, 1), np.uint8)))
-    counts = np.zeros((2, 50, 60), np.uint16)
-    np.add.at(counts, (events.p, events.y, events.x), 1)
-    np.testing.assert_array_equal(picture[30:, 124:], np.kron(event_colour(counts), np.ones((2, 2, 1), np.uint8)))
-    made.frame(25_000, image)
-    assert (made._video.pictures[1][30:, 124:] == 255).all(), "events are shown once"
-
-
-def test_highlights_are_compressed_and_do_not_clip():
-    """Light above 1 keeps its order; where the light has gone the curve comes back slowly."""
-    made = PreviewWriter("p.mp4", 48, 64, flow=False)
-    steps = np.repeat(np.linspace(0.1, 3.0, 64, dtype=np.float32)[None], 48, axis=0)
-    for k in range(200):
-        made.frame(25_000 * k, steps if k == 0 else np.full((48, 64), 0.9, np.float32))
-    first = made._video.pictures[0][30, :128:2, 0].astype(int)
-    assert first.max() == 255 and (np.diff(first) >= 0).all() and len(set(first)) > 30
-    assert (first == 255).sum() <= 8, "clipped it would be two thirds"
-    later = [int(picture[40, 10, 0]) for picture in made._video.pictures]
-    assert later[1] < later[20] < later[-1] == to_srgb8(np.float32([0.9]))[0]
-
-
-def test_large_frames_are_averaged_in_linear_light():
-    made = PreviewWriter("p.mp4", 720, 40, flow=False)
-    stripes = np.zeros((720, 40), np.float32)
-    stripes[::2] = 1.0
-    made.frame(0, stripes)
-    assert (made._video.pictures[0][30:, :20] == to_srgb8(np.float32([0.5]))[0]).all()
-
-
-def test_a_panel_of_as_many_rows_but_fewer_columns_is_averaged():
-    made = PreviewWriter("p.mp4", 200, 301, flow=False)
-    image = np.random.default_rng(2).random((200, 301)).astype(np.float32)
-    made.frame(0, image)
-    shown = to_srgb8(cv2.resize(image, (300, 200), interpolation=cv2.INTER_AREA))
-    np.testing.assert_array_equal(made._video.pictures[0][30:, :300, 0], shown)
-
-
-def test_the_clock():
-    """40 pictures per second of the sequence, played at 20: slowed twice. Late frames are
-    shown as often as they are late."""
-    made = PreviewWriter("p.mp4", 48, 64, t0_us=5_000, flow=False)
-    black = np.zeros((48, 64), np.float32)
-    assert made._video.fps == 20 and made._slow == 2
-    assert not made.due(4_999) and made.due(5_000)
-    made.frame(4_999, black)
-    assert not made._video.pictures
-    made.frame(5_000, black)
-    assert len(made._video.pictures) == 1 and not made.due(29_999) and made.due(30_000)
-    made.frame(30_000, black)
-    made.frame(54_000, black)
-    assert len(made._video.pictures) == 2
-    made.frame(130_000, black)
-    assert len(made._video.pictures) == 6 and not made.due(154_999) and made.due(155_000)
-    with made:
-        pass
-    assert made._video.ended == "closed"
-    with pytest.raises(ZeroDivisionError), PreviewWriter("p.mp4", 48, 64) as other:
-        raise ZeroDivisionError
-    assert other._video.ended == "aborted"
-
-
-def test_captions(monkeypatch):
-    said = []
-    monkeypatch.setattr(
-        PreviewWriter, "_caption", lambda self, panel, detail: said.append((panel, self._names[panel], detail))
-    )
-    made = PreviewWriter("p.mp4", 48, 64, t0_us=1_000, rate_hz=100, fps=40, label="camera")
-    made.add_events(some_events(1234, 48, 64))
-    made.add_events(some_events(6, 48, 64))
-    made.frame(13_345, np.zeros((48, 64), np.float32))
-    made.frame(24_000, np.zeros((48, 64), np.float32))
-    made.set_flow(np.full((48, 64, 2), 3.0, np.float32))
-    assert said == [
-        (2, "optical flow", ""),
-        (0, "camera", "12.3 ms   slowed 2.5x"),
-        (1, "events", "ON blue, OFF red   1,240"),
-        (0, "camera", "23.0 ms   slowed 2.5x"),
-        (1, "events", "ON blue, OFF red   0"),
-        (2, "optical flow", "full colour = 4.24 px"),
-    ]
-
-
-def test_captions_are_written_above_their_panel():
-    made = PreviewWriter("p.mp4", 48, 64, flow=True)
-    back = np.array([22, 24, 28])
-    before = made._canvas.copy()
-    made._caption(1, "details")
-    changed = (made._canvas != before).any(axis=2)
-    rows, columns = np.nonzero(changed)
-    assert rows.min() >= 0 and rows.max() < 30 and columns.min() >= 132 and columns.max() < 260
-    strip = made._canvas[:30, 132:260]
-    dark = (np.abs(strip.astype(int) - back).max(axis=2) > 20).any(axis=0)
-    assert 6 <= np.flatnonzero(dark)[0] <= 10 and 128 - 11 <= np.flatnonzero(dark)[-1] <= 128 - 7, (
-        "name at the left edge, detail at the right one"
-    )
-    lit = (np.abs(strip.astype(int) - back).max(axis=2) > 20).any(axis=1)
-    assert abs(np.flatnonzero(lit).mean() - 15) < 4
 
 
 def test_full_colour_follows_speed_up_at_once_and_down_slowly():
@@ -218,27 +58,6 @@ def test_flow_is_shown_by_its_colour_and_what_is_invalid_is_grey():
     made = PreviewWriter("p.mp4", 30, 40, flow=False)
     made.set_flow(flow, valid)
     assert made._canvas.shape == (90, 164, 3), "no panel for it"
-
-
-def test_the_legend_is_the_wheel_in_the_lower_right_corner():
-    made = PreviewWriter("p.mp4", 220, 230)
-    made.set_flow(np.zeros((220, 230, 2), np.float32))
-    view = made._panel_view(2)
-    y, x = np.mgrid[:220, :230]
-    far = np.hypot(y - (220 - 6 - 28), x - (230 - 6 - 28))  # its centre
-    assert (view[far > 29] == 255).all()
-    wheel = cv2.resize(flow_wheel(), (55, 55), interpolation=cv2.INTER_AREA)
-    box = view[220 - 61 : 220 - 6, 230 - 61 : 230 - 6]
-    inner = far[220 - 61 : 220 - 6, 230 - 61 : 230 - 6] < 25
-    assert np.abs(box[inner].astype(int) - wheel[inner]).max() <= 1
-    rim = np.abs(far - 27) < 0.4
-    assert np.abs(view[rim].astype(int) - 60).max() <= 1
-    small = PreviewWriter("p.mp4", 82, 300)
-    small.set_flow(np.zeros((82, 300, 2), np.float32))
-    assert (small._panel_view(2) == 255).all(), "164 rows are too few for it"
-    enough = PreviewWriter("p.mp4", 83, 300)
-    enough.set_flow(np.zeros((83, 300, 2), np.float32))
-    assert not (enough._panel_view(2) == 255).all()
 
 
 # --- colours ----------------------------------------------------------------------------------------------------------
@@ -282,20 +101,3 @@ def test_full_saturation():
     assert rgb[0, 1].tolist() == rgb[0, 2].tolist() == [255, 0, 0] and rgb[1, 2].tolist() == [255, 255, 255]
     assert (rgb[1, :2] == INVALID).all()
     assert (flow_colour(np.zeros((2, 2, 2))) == 255).all()
-
-
-def test_event_counts_saturate_and_darken():
-    counts = np.zeros((2, 3, 4), np.uint16)
-    x, y, p = np.uint16([0, 0, 3, 3]), np.uint16([0, 0, 2, 2]), np.uint8([0, 0, 1, 0])
-    count_events(x, y, p, counts)
-    assert counts[0, 0, 0] == 2 and counts[1, 2, 3] == counts[0, 2, 3] == 1 and counts.sum() == 4
-    counts[1, 1, 1] = 65_534
-    for _ in range(3):
-        count_events(np.uint16([1]), np.uint16([1]), np.uint8([1]), counts)
-    assert counts[1, 1, 1] == 65_535
-    shade = np.rint(255 * (1 - np.exp(-0.9 * np.arange(9)))).astype(int)
-    for off in (0, 1, 3, 8, 500):
-        for on in (0, 2, 9):
-            rgb = event_colour(np.array([[[off]], [[on]]], np.uint16))[0, 0].tolist()
-            a, b = shade[min(off, 8)], shade[min(on, 8)]
-            assert rgb == [255 - b, 255 - max(a, b), 255 - a]

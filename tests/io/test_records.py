@@ -16,7 +16,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io import atomic
-from blinkgl.io.records import InsidePath, entries_below, open_regular, parse, read_text, shown
+from blinkgl.io.records import InsidePath, open_regular, read_text
 from blinkgl.sequence_files.index import INDEX, read_index, sequence_folders, write_index
 from blinkgl.sequence_files.sequence_dir import Manifest, refuse_existing, verify_sequence
 
@@ -57,32 +57,6 @@ def test_pipes_and_devices_are_not_waited_for(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text, said",
-    [
-        ('{"a": 1}', None),
-        ("[" * 100_000, "nested too deeply"),
-        ('{"a": 1, "a": 1}', "a key is given twice"),
-        ('{\n"a":\n}', "not JSON: expecting value at line 3"),
-        ('{"a": "x"}', "a: input should be a valid integer"),
-        ("[]", "input should be a valid dictionary"),
-    ],
-)
-def test_json_of_a_shape(text, said):
-    model = TypeAdapter(dict[str, int])
-    if said is None:
-        assert parse(text, model) == {"a": 1} == parse(text)
-    else:
-        with pytest.raises(ValueError, match=f"^{said}"):
-            parse(text, model)
-
-
-def test_names_are_shown_in_one_line():
-    assert shown("ä b") == "ä b" and shown("a\nb\x1b") == "a\\nb\\x1b" and shown(3) == "3"
-    assert shown("a" * 160) == "a" * 160 and shown("a" * 161) == "a" * 159 + "…" and len(shown("\n" * 100)) == 160
-    assert shown("abcd", 3) == "ab…"
-
-
-@pytest.mark.parametrize(
     "name, fine",
     [
         ("a", True),
@@ -112,18 +86,6 @@ def test_paths_that_stay_inside(name, fine):
     else:
         with pytest.raises(ValidationError):
             model.validate_python(name)
-
-
-def test_everything_below_a_folder(tmp_path):
-    (tmp_path / "a/b").mkdir(parents=True)
-    (tmp_path / "a/c").write_bytes(b"123")
-    (tmp_path / "link").symlink_to("a")
-    os.mkfifo(tmp_path / "a/pipe")
-    found = {name: (kind, size) for name, kind, size in entries_below(tmp_path)}
-    assert found.pop("link")[0] == "symbolic link"
-    assert found == {"a/b": ("empty folder", 0), "a/c": ("file", 3), "a/pipe": ("special file", 0)}
-    (tmp_path / "empty").mkdir()
-    assert list(entries_below(tmp_path / "empty")) == []
 
 
 # --- what a manifest says ---------------------------------------------------------------------------------------------

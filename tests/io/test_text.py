@@ -63,33 +63,12 @@ def test_times_are_the_nearest_microsecond(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text, value",
-    [
-        ("12", 12),
-        ("+12", 12),
-        ("012", 12),
-        ("1234567890123456", 1234567890123456),
-        ("-7", -7),
-        ("12345678901234567", 12345678901234567),
-    ],
-)
-def test_integers_are_microseconds(tmp_path, text, value):
-    assert read(tmp_path / "e.txt", f"{text} 1 2 1\n").t.tolist() == [value]
-
-
-@pytest.mark.parametrize(
     "text",
     ["123456789012345678", "1e", "1e+", "1ex", ".", "+", "-", "--1", "1-", "1.2.3", "0x10", "e5", "1e99999999999"],
 )
 def test_what_is_no_number(tmp_path, text):
     with pytest.raises(AssetError, match="line 2 is not an event"):
         read(tmp_path / "e.txt", f"0 1 2 1\n{text} 1 2 1\n")
-
-
-@pytest.mark.parametrize("column", ["3", "3.0", "30e-1", "0.3e1", "0.03E+2", "3.", "+3", "3.000000000000000000000"])
-def test_coordinates_may_be_written_as_decimals(tmp_path, column):
-    events = read(tmp_path / "e.txt", f"5 {column} {column} 1\n")
-    assert (events.x.tolist(), events.y.tolist()) == ([3], [3])
 
 
 @pytest.mark.parametrize(
@@ -110,11 +89,6 @@ def test_coordinates_may_be_written_as_decimals(tmp_path, column):
 def test_coordinates_and_polarities_that_are_none(tmp_path, line):
     with pytest.raises(AssetError, match="line 3 is not an event"):
         read(tmp_path / "e.txt", f"% width height\n4 1 1 1\n{line}\n")
-
-
-def test_corners_of_what_is_held(tmp_path):
-    events = read(tmp_path / "e.txt", "5 65535 0 0\n5 0 65535 -1\n6 0 0 1")
-    assert (events.x.tolist(), events.y.tolist(), events.p.tolist()) == ([65535, 0, 0], [0, 65535, 0], [0, 0, 1])
 
 
 @pytest.mark.parametrize(
@@ -147,22 +121,6 @@ def test_separators_comments_and_empty_lines(tmp_path):
         [3, 4],
         [1, 0],
     ]
-
-
-def test_a_size_is_taken_once_and_only_before_the_first_event(tmp_path):
-    (tmp_path / "e.txt").write_text("640 480\n1 2 3 1\n")
-    reader = TextReader(tmp_path / "e.txt")
-    assert (reader.width, reader.height) == (640, 480)
-    (tmp_path / "e.txt").write_text("# c\n640,480\nt x y p\n1 2 3 1\n")
-    reader = TextReader(tmp_path / "e.txt")
-    assert (reader.width, reader.height) == (640, 480) and len(next(reader.chunks())) == 1
-    for text, line in (
-        ("640 480\n640 480\n1 2 3 1\n", 2),
-        ("1 2 3 1\n640 480\n", 2),
-        ("t x y p\nt x y p\n1 2 3 1\n", 2),
-    ):
-        with pytest.raises(AssetError, match=f"line {line} is not an event"):
-            read(tmp_path / "f.txt", text)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import AssetError, OutputError
-from blinkgl.io.colour import INVALID, event_colour, flow_colour
 from blinkgl.io.video import VideoReader, VideoWriter
 from blinkgl.sequence_files.preview import PreviewWriter
 from blinkgl.types.events import Events
@@ -142,33 +141,3 @@ def test_preview(tmp_path, height, width, flow):
     reader = VideoReader(tmp_path / "p.mp4")
     assert len(list(reader)) == 6 and reader.fps == 20
     assert reader.width > (2.5 if flow else 1.5) * width
-
-
-def test_preview_keeps_pace_when_frames_are_late(tmp_path):
-    with PreviewWriter(tmp_path / "p.mp4", 48, 64, rate_hz=100) as preview:
-        preview.frame(0, np.zeros((48, 64), np.uint8))
-        preview.frame(95_000, np.zeros((48, 64), np.uint8))
-    assert len(list(VideoReader(tmp_path / "p.mp4"))) == 10
-
-
-def test_flow_colour():
-    flow = np.array([[[0, 0], [10, 0], [-10, 0], [0, 10], [0, -10], [20, 0], [np.nan, 0], [5, 0]]], np.float32)
-    valid = np.ones((1, 8), bool)
-    valid[0, 7] = False
-    rgb = flow_colour(flow, 10, valid)[0]
-    assert rgb[0].tolist() == [255, 255, 255] and rgb[1].tolist() == [255, 0, 0] and rgb[5].tolist() == [255, 0, 0]
-    assert rgb[2][0] == 0 and rgb[2][2] == 255, "left is cyan-blue"
-    assert rgb[3][2] == 0 and rgb[3][0] > 200 and rgb[3][1] > 200, "down is yellow"
-    assert rgb[4][2] == 255 and rgb[4][1] < 60, "up is violet"
-    assert rgb[6].tolist() == rgb[7].tolist() == INVALID.tolist()
-    angle = np.linspace(0, 2 * np.pi, 2000)
-    ring = flow_colour(np.stack([np.cos(angle), np.sin(angle)], -1)[None], 1)[0].astype(int)
-    assert np.abs(np.diff(ring, axis=0)).max() <= 25, "the wheel is closed and continuous"
-
-
-def test_event_colour():
-    counts = np.zeros((2, 1, 4), np.uint16)
-    counts[1, 0, 1], counts[0, 0, 2], counts[:, 0, 3] = 1, 65535, 65535
-    rgb = event_colour(counts)[0].astype(int)
-    assert rgb[0].tolist() == [255, 255, 255]
-    assert rgb[1][2] == 255 and rgb[1][0] < 120 and rgb[2].tolist() == [255, 0, 0] and rgb[3].tolist() == [0, 0, 0]

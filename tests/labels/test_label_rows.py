@@ -35,17 +35,6 @@ def whole(name: str):
 # --- configuration ----------------------------------------------------------------------------------------------------
 
 
-def parts(value) -> list[np.ndarray]:
-    """The arrays of a value."""
-    several = (Boxes, Flow, Flows, Occlusions)
-    return [v for v in vars(value).values() if isinstance(v, np.ndarray)] if isinstance(value, several) else [value]
-
-
-def test_what_is_asked_for_when_nothing_is_said():
-    assert list(asked_for(LabelsConfig())) == ["images", "flow_forward", "occlusion_forward"]
-    assert not asked_for(LabelsConfig(flow=(), images=False)) and asked_for(LabelsConfig())
-
-
 def test_each_is_asked_for_by_its_own_name_in_python():
     """And asks for no other, but for what it cannot be without."""
     for name, label in LABELS.items():
@@ -135,13 +124,6 @@ def test_where_labels_lie():
     }
 
 
-@pytest.mark.parametrize("endings", [(), ("npy",), ("npy", "flo")])
-def test_float_flow_lies_beside_the_png(endings):
-    labels = LabelsConfig(flow=["forward"], float_flow=endings)
-    assert [form.ending for form in LABELS["flow_forward"].written(labels)] == ["png", *endings]
-    assert [form.file(0) for form in LABELS["depth"].written(labels)] == ["depth/000000.npy"]
-
-
 def test_a_form_knows_its_own_files():
     each = Form("flow/forward", "png")
     assert list(each.files(2)) == ["flow/forward/000000.png", "flow/forward/000001.png"] and list(each.files(0)) == []
@@ -174,22 +156,6 @@ def test_a_value_of_another_shape_or_kind_is_refused(name):
         assert label.wrong(value > 0, H, W).endswith(" float32") and label.wrong(value.astype(np.float64), H, W) is None
     if name == "images":
         assert label.wrong(value[..., 0], H, W) is None and label.wrong(value[..., :2], H, W)
-
-
-@pytest.mark.parametrize("name", LABELS)
-def test_what_is_kept_is_a_copy(name):
-    value = whole(name)
-    own = LABELS[name].own(value)
-    for a, b in zip(parts(own), parts(value), strict=True):
-        assert np.array_equal(a, b) and a.dtype == b.dtype and not np.shares_memory(a, b)
-
-
-def test_double_precision_is_kept_as_it_is_written():
-    assert (
-        LABELS["depth"].own(np.ones((H, W))).dtype == np.float32
-        and LABELS["images"].own(np.ones((H, W))).dtype == float
-    )
-    assert LABELS["ids"].own(np.ones((H, W), np.int64)).dtype == np.int64
 
 
 def buffers(**raw):

@@ -1,10 +1,8 @@
 """OnlineSequences: the same samples whoever renders and whoever takes them; two kinds; batches for torch."""
 
-import ast
 import itertools
 import os
 import signal
-import subprocess
 import sys
 from itertools import islice, pairwise
 from pathlib import Path
@@ -93,39 +91,6 @@ def test_ranks_deal_one_stream_out_between_them(recipe):
     assert taken(0, rank=0, world=2) == (whole[0], 2), "and no slot of the other's is rendered"
     assert taken(0, rank=1, world=2)[0] == taken(0, rank=1, world=3)[0] == whole[1]
     assert taken(MIX, rank=0, world=2)[0] == whole[2], "resumed"
-
-
-_RANK = """import sys
-import torch.distributed as dist
-from blinkgl import OnlineSequences
-from itertools import islice
-dist.init_process_group("gloo")  # that these are processes of one training
-with OnlineSequences(sys.argv[1], workers=0, per_sequence=1) as sequences:
-    names = [sample.name for sample in islice(sequences, 3)]
-everybodys = [None] * dist.get_world_size()
-dist.all_gather_object(everybodys, names)
-if dist.get_rank() == 0:
-    print("NAMES", everybodys)
-dist.destroy_process_group()
-"""
-
-
-@pytest.mark.slow
-def test_torchrun_needs_no_more_than_its_own_variables(recipe, tmp_path):
-    """Two real processes, told nothing: theirs are disjoint, and together the blocks of one stream."""
-    pytest.importorskip("torch.distributed.run")
-    (tmp_path / "rank.py").write_text(_RANK)
-    command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node=2", "--rdzv-backend=c10d"]
-    command += ["--rdzv-endpoint=127.0.0.1:0", str(tmp_path / "rank.py"), str(recipe)]
-    environment = {**os.environ, "GLOO_SOCKET_IFNAME": "lo", "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment, check=False)
-    assert done.returncode == 0, done.stderr[-3000:]
-    (line,) = (line for line in done.stdout.splitlines() if line.startswith("NAMES"))
-    first, second = ast.literal_eval(line.removeprefix("NAMES "))
-    assert len(set(first) | set(second)) == 6
-    for rank, names in enumerate((first, second)):
-        with OnlineSequences(recipe, workers=0, per_sequence=1, rank=0, world=1, first=rank * MIX) as whole:
-            assert [sample.name for sample in islice(whole, 3)] == names
 
 
 def test_what_others_say_of_a_process(recipe, monkeypatch):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from blinkgl.recordings.bursts import frame_bursts, inside_any
 from blinkgl.recordings.clip import clip_of_frames, read_recording
@@ -39,19 +38,6 @@ def test_bursts_at_the_frames_interval():
     assert 1900 <= within.sum() - 40 * np.diff(spans).sum() / 1000 <= 2150
     assert np.array_equal(within, np.any([(events.t >= begin) & (events.t < end) for begin, end in spans], axis=0))
     assert not inside_any(events.t, spans[:0]).any()
-
-
-@pytest.mark.parametrize(
-    "at, polarity",
-    [
-        ([112_300], 0.97),  # a flash
-        ([52_300, 75_000, 130_000, 221_000], 0.97),  # flashes
-        ([12_300 + FRAME_US * k for k in range(7)], 0.6),  # many events of both polarities: something moves
-        ([], 1.0),
-    ],
-)
-def test_what_is_none(at, polarity):
-    assert not len(frame_bursts(stream(at, polarity), FRAME_US))
 
 
 def test_no_interval_begins_or_ends_in_a_burst():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import re
 
@@ -17,7 +16,7 @@ from blinkgl.io.formats import write_events
 from blinkgl.recordings.calibration import _Search, calibrate, calibrate_events
 from blinkgl.recordings.clip import Clip, clip_of_frames, clip_of_still, clock_offset
 from blinkgl.recordings.simulation import emulator_config
-from blinkgl.recordings.statistics import numbers, sums, target
+from blinkgl.recordings.statistics import sums
 from blinkgl.types.events import Events
 from tests.shared_data import shared
 
@@ -84,20 +83,6 @@ def test_numbers_of_a_stream_against_counting_one_by_one():
     assert s.still_counts[:, 0].sum() == np.count_nonzero(whole[clip.still.ravel()] == 0)
 
 
-def test_a_stream_beside_itself_is_off_by_nothing_and_beside_another_by_chance():
-    clip = scene()
-    config = emulator_config({"emulator": "esim", **TRUE})
-    recorded, again = (sums(clip.simulate(config, seed), clip, 0, 3) for seed in (1, 2))
-    goal = target(recorded)
-    assert not goal.residual(recorded).any()
-    other = sums(clip.simulate(config, 2), clip, 0, 3, recorded.polarity)
-    near = goal.beside(other, floor="lowest")
-    off = (numbers(other, goal.probes)[0] - goal.values) / np.maximum(near.chance, 1e-4)
-    assert 0.3 < np.sqrt(np.mean(off[goal.block == "rate"] ** 2)) < 3, "the jackknife knows how large chance is"
-    assert (near.error < goal.error).mean() > 0.8
-    assert again.rates.sum() == other.rates.sum()
-
-
 def test_the_clock_is_found():
     """Up to the emulator's own lag: levels are passed after the light has begun to change."""
     clip = scene()
@@ -153,22 +138,6 @@ def test_tiles_of_a_large_sensor_have_the_same_events(monkeypatch):
     assert len(again) == len(part.events) > 1000
     a, b = (sums(e, part, 0, part.intervals).polarity for e in (again, part.events))
     assert np.array_equal(a, b)
-
-
-def test_a_number_that_chance_does_not_move_says_nothing_of_the_misfit():
-    """It made ± of a threshold of 0.24 5,000 (cuke_davis346)."""
-    clip, config = scene(), emulator_config({"emulator": "esim", **TRUE})
-    recorded = sums(clip.simulate(config, 1), clip, 0, 3)
-    search = _Search(clip.with_events(clip.simulate(config, 1)), config, 3, 0, lambda _: None)
-    search.target = target(recorded).beside(sums(clip.simulate(config, 2), clip, 0, 3, recorded.polarity), floor="seen")
-    search._keys, search._at = ["contrast_threshold"], np.log([0.25])
-    search._residual = np.ones(len(search.target.values))
-    search._jacobian = np.ones((len(search._residual), 1)) * 10
-    before = search.uncertainty()["contrast_threshold"]
-    chance = search.target.chance.copy()
-    chance[5] = 1e-15
-    search.target = dataclasses.replace(search.target, chance=chance)
-    assert search.uncertainty()["contrast_threshold"] == pytest.approx(before, rel=0.2)
 
 
 # --- the fit ----------------------------------------------------------------------------------------------------------

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from types import SimpleNamespace
 
 import cv2
@@ -14,7 +13,7 @@ from blinkgl.cli import run
 from blinkgl.errors import EventDataError
 from blinkgl.io.formats import write_events
 from blinkgl.recordings import comparison
-from blinkgl.recordings.comparison import IEI_EDGES_US, compare, plot
+from blinkgl.recordings.comparison import compare, plot
 from blinkgl.types.events import Events
 from tests.shared_data import shared
 
@@ -33,28 +32,6 @@ def poisson(rate_hz: float, on_share: float, seconds=4.0, seed=0, t0=0, pixels=N
         t0 + np.sort(rng.integers(0, round(seconds * 1e6), n)),
         (rng.random(n) < on_share).astype(np.uint8),
     )
-
-
-def test_counts_rates_and_intervals(tmp_path):
-    a, b = poisson(20, 0.5), poisson(40, 0.8, seed=1)
-    write_events(tmp_path / "a.h5", a, H, W)
-    write_events(tmp_path / "b.raw", b, H, W)
-    result = compare(tmp_path / "a.h5", tmp_path / "b.raw", interval_ms=500)
-    inside = lambda e: e.window(int(result.edges_us[0]), int(result.edges_us[-1]))
-    assert len(result.edges_us) == 9 and result.a.count == len(inside(a)) and result.b.count == len(inside(b))
-    assert result.a.count == pytest.approx(len(a), abs=3)
-    assert np.allclose(result.a.rate_hz, 20 * H * W, rtol=0.05) and np.nanmean(result.rate_ratio) == pytest.approx(
-        2, rel=0.03
-    )
-    assert result.a.on_off_ratio == pytest.approx(1, rel=0.03) and result.b.on_off_ratio == pytest.approx(4, rel=0.05)
-    assert abs(result.pixel_correlation) < 0.1, "independent"
-    # The interval of a Poisson process is exponential: median ln 2 / rate (bins of a tenth of a decade).
-    assert result.a.median_iei_us == pytest.approx(np.log(2) / 20 * 1e6, rel=0.2)
-    cdf = lambda rate: 1 - np.exp(-rate * IEI_EDGES_US * 1e-6)
-    assert result.iei_distance == pytest.approx(np.abs(cdf(20) - cdf(40)).max(), abs=0.05)
-    measured = np.cumsum(result.a.iei) / result.a.iei.sum()
-    assert np.abs(measured - cdf(20)[1:]).max() < 0.05
-    assert len(json.dumps(result.to_dict())) > 100 and "NaN" not in json.dumps(result.to_dict())
 
 
 def test_recording_with_itself_and_shifted(tmp_path):
@@ -109,23 +86,6 @@ def test_slider_depth_gives_the_figures_on_its_page():
     assert len(result.a.frame_correlation) == 4
     assert result.a.frame_correlation.min() > 0.80 and result.a.frame_correlation.max() < 0.90
     assert np.all((result.a.implied_threshold > 0.48) & (result.a.implied_threshold < 0.62))
-
-
-def test_recordings_of_different_sizes_stand_side_by_side(tmp_path, capsys):
-    """What needs the same pixels in both is left out; all else is what each says of itself."""
-    a, b = poisson(20, 0.5), poisson(20, 0.8, seed=1)
-    write_events(tmp_path / "a.h5", a, H, W)
-    write_events(tmp_path / "b.h5", Events(b.x * 3, b.y * 2, b.t, b.p), 2 * H, 3 * W)
-    result = compare(tmp_path / "a.h5", tmp_path / "b.h5", interval_ms=500)
-    assert (result.a.size, result.b.size) == ("50x40", "150x80") and not result.same_size
-    assert result.pixel_correlation is None and result.polarity_correlation is None
-    assert result.b.counts.shape == (2 * H, 3 * W) and result.b.on_off_ratio == pytest.approx(4, rel=0.05)
-    assert np.nanmean(result.rate_ratio) == pytest.approx(1, rel=0.05) and result.iei_distance < 0.05
-    assert json.loads(json.dumps(result.to_dict()))["pixel_correlation"] is None
-    assert run(["compare", str(tmp_path / "a.h5"), str(tmp_path / "b.h5"), "-o", str(tmp_path / "out")]) == 0
-    out = capsys.readouterr().out
-    assert "150x80" in out and "KS distance" in out and "polarity sums A : B" not in out
-    assert (tmp_path / "out/compare.png").stat().st_size > 10_000
 
 
 def test_one_recording_is_described(tmp_path, capsys):
@@ -214,58 +174,3 @@ def test_windows_of_any_chunks(cuts):
     ]
     windows = list(comparison._windows(SimpleNamespace(chunks=lambda: iter(chunks)), np.arange(20, 101, 20), 5))
     assert [w.t.tolist() for w in windows] == [[15, 34], [35], [66], [75]]
-
-
-@pytest.mark.parametrize("first, begin", [(2500, 0), (2501, 10_000)])
-@pytest.mark.parametrize("last, end", [(37_499, 40_000), (37_498, 30_000)])
-def test_frames_may_reach_a_quarter_of_an_interval_beyond_the_events(tmp_path, first, begin, last, end):
-    """A recording ends one past its last event."""
-    write_events(tmp_path / "e.npz", listed((0, 0, first, 1), (1, 1, last, 0)), 3, 4)
-    np.savez(tmp_path / "f.npz", frames=np.random.default_rng(0).random((5, 3, 4)), timestamps_us=np.arange(5) * 10_000)
-    edges = compare(tmp_path / "e.npz", tmp_path / "f.npz").edges_us
-    assert edges.tolist() == list(range(begin, end + 1, 10_000))
-    assert compare(tmp_path / "e.npz", tmp_path / "f.npz", frame_delay_ms=2.4).edges_us[0] == 2400
-
-
-def test_the_picture_shows_the_figures(tmp_path, monkeypatch):
-    """What is drawn is read back from the axes: seconds, millions, milliseconds, and only what there is."""
-    from matplotlib.figure import Figure
-
-    a, b = (poisson(rate, 0.7, seconds=1.0, seed=seed) for rate, seed in ((10, 0), (20, 1)))
-    write_events(tmp_path / "a.npz", a, H, W)
-    write_events(tmp_path / "b.npz", b, H, W)
-    shown = []
-    monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: (shown.append(self), path.write_bytes(b"")))
-    both = compare(tmp_path / "a.npz", tmp_path / "b.npz", interval_ms=250)
-    plot(both, tmp_path / "p.png")
-    plot(compare(tmp_path / "a.npz", interval_ms=250), tmp_path / "p.png")
-    rate, map_a, map_b, intervals, correlation, joint = shown[0].axes[:6]
-    for line, side in zip(rate.get_lines(), (both.a, both.b), strict=True):
-        assert np.allclose(line.get_xdata(), both.edges_us / 1e6)
-        assert np.allclose(line.get_ydata() * 1e6, [*side.rate_hz, side.rate_hz[-1]])
-    assert rate.get_ylim()[0] == 0 and [t.get_text() for t in rate.get_legend().get_texts()] == ["A", "B"]
-    top = max(np.percentile(s.counts, 99.5) for s in (both.a, both.b))
-    for ax, side in ((map_a, both.a), (map_b, both.b)):
-        assert np.array_equal(ax.images[0].get_array(), side.counts) and ax.images[0].get_clim() == (0, top)
-    used = np.flatnonzero(both.a.iei + both.b.iei)
-    assert np.allclose(intervals.get_xlim(), [IEI_EDGES_US[used[0]] / 1e3, IEI_EDGES_US[used[-1] + 1] / 1e3])
-    assert intervals.get_xscale() == "log" and intervals.get_ylim()[0] == 0
-    assert [sum(line.get_ydata()[:-1]) for line in intervals.get_lines()] == pytest.approx([1, 1])
-    (line,) = correlation.get_lines()
-    assert np.allclose(line.get_xdata(), (both.edges_us[:-1] + both.edges_us[1:]) / 2e6)
-    assert np.allclose(line.get_ydata(), both.polarity_correlation)
-    assert correlation.get_ylim()[0] <= 0 and correlation.get_ylim()[1] == 1
-    seen = np.asarray(joint.images[0].get_array())
-    limit = int(top) + 1
-    assert limit < 50 and seen.shape == (limit + 1, limit + 1), "a cell for each count"
-    assert (10 ** seen[both.b.counts[0, 0], both.a.counts[0, 0]] - 1).round() >= 1, "A to the right, B upwards"
-    assert (10**seen - 1).sum() == pytest.approx(H * W) and joint.images[0].get_extent() == [0, limit + 1] * 2
-    for ax in (rate, intervals, correlation):
-        assert [ax.spines[side].get_visible() for side in ("top", "right", "left", "bottom")] == [
-            False,
-            False,
-            True,
-            True,
-        ]
-    assert [ax.axison for ax in shown[0].axes[:6]] == [True] * 6
-    assert [ax.axison for ax in shown[1].axes[:6]] == [True, True, False, True, False, False]

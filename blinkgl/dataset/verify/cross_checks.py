@@ -68,9 +68,8 @@ def index(root: Path, folders: list[Path]) -> list[str]:
 
 
 def twins(known: dict[str, Known], result: Verification) -> dict[str, list[str]]:
-    """Sequences with the events or the poses of another one, although they are different draws. Where nothing is drawn
-    at all (a scene of one's own or recorded frames, thresholds that are all alike) twins
-    are what was asked for, and a note."""
+    """Sequences of random worlds with the events or the poses of another draw. Of a scene of one's own and of recorded
+    frames twins may be what was asked for: a note."""
     seen: dict[tuple[str, str], str] = {}
     problems: dict[str, list[str]] = {}
     for name, one in known.items():
@@ -86,7 +85,7 @@ def twins(known: dict[str, Known], result: Verification) -> dict[str, list[str]]
             if other == name:
                 continue
             numbers = [(known[n].config.seed, known[n].manifest["sequence"]) for n in (name, other)]
-            if numbers[0] != numbers[1] and (random_scene or _noisy(config)):
+            if numbers[0] != numbers[1] and random_scene:
                 problems.setdefault(name, []).append(
                     f"{file}: the same as in {shown(other)}, a sequence of another draw"
                 )
@@ -103,24 +102,6 @@ def _files_of_first(manifest: dict[str, Any]) -> dict[str, Any]:
         return manifest["files"]
     own = manifest["cameras"][0] + "/"
     return {name.removeprefix(own): file for name, file in manifest["files"].items() if name.startswith(own)}
-
-
-def _noisy(config: SequenceConfig) -> bool:
-    """Whether two seeds give two pixel arrays."""
-    if config.sensors is not None:
-        return any(_noisy(config.of_sensor(k)) for k, one in enumerate(config.sensors) if one.events is not None)
-    drawn = (
-        "threshold_sigma",
-        "threshold_jitter",
-        "leak_rate_hz",
-        "shot_noise_rate_hz",
-        "hot_pixel_fraction",
-        "k3",
-        "k6",
-    )
-    readout = config.readout
-    behind = readout is not None and (readout.pixels is not None or readout.latency is not None)
-    return behind or any(getattr(config.events, key, 0) > 0 for key in drawn)
 
 
 def against_run(root: Path, folders: list[Path], known: dict[str, Known], result: Verification) -> list[str]:

@@ -116,5 +116,6 @@ def distorts(config: SequenceConfig) -> bool:
 
 
 def exposures_of(config: SequenceConfig) -> list[int]:
-    """When the frame camera's exposures begin, ns."""
+    """When the frame camera's exposures begin, ns; of a configuration with ``images``."""
+    assert config.images is not None
     return exposure_starts(config.images, config.time.t0_ns, config.time.t1_ns, config.camera.height)

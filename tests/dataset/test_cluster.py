@@ -29,7 +29,8 @@ def reference(tmp_path_factory) -> Path:
     return folder / "out"
 
 
-LONG = {"time": {"duration": 2.0, "label_rate": 10}, "groups": {"fly": RECIPE["groups"]["fly"]}}
+# Long enough that a node is lost while it is at work.
+LONG = {"time": {"duration": 5.0, "label_rate": 10}, "groups": {"fly": RECIPE["groups"]["fly"]}}
 
 
 class Once:

@@ -323,6 +323,7 @@ WRONG = [
     ("fps", lambda d: b.simulate([grey], fps="fast")),
     ("frames[1]", lambda d: list(b.simulate([grey, ["a", [1]]], fps=10))),
     ("frames[0]", lambda d: list(b.simulate([(grey, "noon"), (grey, "one")]))),
+    ("fpz", lambda d: b.simulate([grey], fpz=3)),
     ("gamma", lambda d: b.simulate([grey], fps=10, gamma=[])),
     ("interpolate", lambda d: b.simulate([grey], fps=10, interpolate=["linear"])),
     ("source", lambda d: b.simulate_file(None, d / "a.h5")),

@@ -269,10 +269,10 @@ def simulate(
 
     frames : iterable, a generator included, of (H, W) or (H, W, 3) RGB arrays with ``fps``, Hz, or of pairs (array,
     t_ns). uint8, uint16, or float (1.0 is white).
-    emulator : as of :func:`record`.
+    emulator : as of :func:`record`, "esim" if not said.   seed : of its noise, 0 if not said.
     sensor : the read-out limit of that camera, and with an emulator's name its values.
     gamma : "srgb", "linear" or an exponent; default: srgb for integers, linear for floats.
-    interpolate : "linear"; "motion": dense flow, at most ``max_px`` px a step.
+    interpolate : "linear", the default; "motion": dense flow, at most ``max_px`` (1) px a step.
     report : a SimulationReport to be filled.
     Raises ConfigError at once; EventDataError as frames come, naming the frame."""
     from blinkgl.recordings import simulation
@@ -322,7 +322,10 @@ def _options(
     max_px: float = 1.0,
     seed: int = 0,
     sensor: str | None = None,
+    **unknown: Any,
 ) -> dict[str, Any]:
+    for name in unknown:
+        raise ConfigError("unknown argument", where=name, accepted=", ".join(FrameOptions.__annotations__))
     from blinkgl.config.sensor import load_sensor
     from blinkgl.recordings import simulation
 

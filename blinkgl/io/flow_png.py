@@ -21,7 +21,7 @@ from PIL import Image
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.atomic import output_errors
 
-DSEC_SCALE, KITTI_SCALE = 128.0, 64.0
+DSEC_SCALE = 128.0
 _ZERO = 1 << 15
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _MAX_PIXELS = 1 << 28

@@ -22,11 +22,6 @@ def seconds_of(labels: LabelsConfig) -> tuple[float, ...]:
     return tuple(one for one in labels.flow if isinstance(one, float))
 
 
-_PX, _SHARE = 2 / 128, 0.95
-"""Flow drawn by two renderers: agrees to two quanta of the PNG in so large a share of the
-pixels. Silhouettes may fall on either side."""
-
-
 class FlowTo(Label):
     """:class:`Flow` to the next label's time or to the one before; valid pixels beyond DSEC's ±256 px become invalid in
     the PNG, not in the float forms."""

@@ -8,36 +8,27 @@ filtered(picture, depths, pixels, crossings, 1 / focal)
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from blinkgl.render.canvas import Frame
 
 GAP, COVER, SAME, NEARER, DIAGONAL, ALONG, SNAP, FEW, MANY = 3.0, 6.0, 0.25, 0.001, 0.25, 12, 1 / 128, 1.4, 2.0
 _AROUND = [(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
 
 
-def read_both(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) float32 each: the picture and the depth buffer (near / Z) of a pass that keeps it as a texture."""
-    return frame.read(), frame.target.read_depth()
-
-
 def filtered(
-    picture: np.ndarray, depths: np.ndarray, pixels: np.ndarray, crossings: np.ndarray, pixel: float, floor: float = 0.0
+    picture: np.ndarray, depths: np.ndarray, pixels: np.ndarray, crossings: np.ndarray, pixel: float
 ) -> np.ndarray:
     """(H, W) or (H, W, C) float64: the picture with its silhouettes and creases by area.
 
     picture : (H, W) or (H, W, C) float32.   depths : (H, W) float32, near / Z.   pixels, crossings : of
-    :meth:`~blinkgl.render.contours.Lines.in_pixels`.   pixel : 1 / focal length, px.   floor : the least."""
+    :meth:`~blinkgl.render.contours.Lines.in_pixels`.   pixel : 1 / focal length, px."""
     if picture.ndim == 3:
-        each = (filtered(picture[..., k], depths, pixels, crossings, pixel, floor) for k in range(picture.shape[2]))
+        each = (filtered(picture[..., k], depths, pixels, crossings, pixel) for k in range(picture.shape[2]))
         return np.stack(list(each), axis=-1)
     out = picture.astype(np.float64)
     of = _Pixel(out.copy(), depths.astype(np.float64), pixel)
     for x, y, first, end in pixels.tolist():
-        out[y, x] = of.mean(x, y, crossings[first:end].astype(np.float64), floor)
+        out[y, x] = of.mean(x, y, crossings[first:end].astype(np.float64))
     return out
 
 
@@ -59,7 +50,7 @@ class _Pixel:
         x, y = self._inside(x, y)
         return float(self.depths[y, x])
 
-    def mean(self, x: int, y: int, crossings: np.ndarray, floor: float) -> float:
+    def mean(self, x: int, y: int, crossings: np.ndarray) -> float:
         plain, own = self._light(x, y), self._depth(x, y)
         change, shares, sizes = 0.0, 0.0, 0.0
         creases, bent, towards = 0.0, 0.0, np.zeros(2)
@@ -101,7 +92,7 @@ class _Pixel:
                     others += weight * self._light(x + dx, y + dy)
             if weights > 0:
                 result += min(abs(creases), 1.0) * (others / weights - plain)
-        return max(result, min(floor, plain))
+        return max(result, min(0.0, plain))
 
     def _sides(
         self, x: int, y: int, own: float, room: float, depth: float, left: np.ndarray, further: float, back_again: bool

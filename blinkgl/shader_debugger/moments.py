@@ -41,7 +41,6 @@ class Pass:
 LOOKUPS = ("uv", "level", "albedo", "direct", "shadow", "around", "light", "mirrored", "emission")
 """What a pass that is lit shows of its way to the result, in the order in which it happens: albedo · light + mirrored +
 emission, where the light of what is matt is direct · shadow + around."""
-TERMS = LOOKUPS[3:6]
 MAPS = tuple(f"shadow_map_{k}" for k in range(MAX_SHADOWS))
 """Buffers that are a lamp's picture, not the camera's."""
 

@@ -171,27 +171,3 @@ def _latest(x, y, t, p, t0, span, out):
         out[p[i], y[i], x[i]] += np.float32(1)
         out[2 + p[i], y[i], x[i]] = np.float32(d / span)
     return outside
-
-
-# ---- slow twins ------------------------------------------------------------------------------------------------------
-
-
-def voxel_grid_slow(x, y, t, p, t0, t1, bins, height, width, *, normalise="nonzero") -> np.ndarray:
-    """:func:`voxel_grid` event by event in Python: every cell of the grid asks the tent kernel for its weight."""
-    # The definition itself: weight max(0, 1 - |distance|) in t, x and y.
-    grid = np.zeros((bins, height, width), np.float64)
-    for xi, yi, ti, pi in zip(x.astype(float), y.astype(float), t.tolist(), p.tolist(), strict=True):
-        c = (bins - 1) * (ti - t0) / (t1 - t0)
-        for b in range(bins):
-            wt = max(0.0, 1 - abs(b - c))
-            for yy in range(int(np.floor(yi)), int(np.floor(yi)) + 2):
-                for xx in range(int(np.floor(xi)), int(np.floor(xi)) + 2):
-                    if 0 <= yy < height and 0 <= xx < width:
-                        grid[b, yy, xx] += (2 * pi - 1) * wt * max(0.0, 1 - abs(xx - xi)) * max(0.0, 1 - abs(yy - yi))
-    grid = grid.astype(np.float32)
-    cells = grid != 0 if normalise == "nonzero" else np.full(grid.shape, normalise == "all")
-    if cells.any():
-        values = grid[cells].astype(np.float64)
-        std = values.std(ddof=1) if len(values) > 1 else 0.0
-        grid[cells] = (values - values.mean()) / (std if std > 0 else 1.0)
-    return grid

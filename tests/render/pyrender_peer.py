@@ -63,9 +63,7 @@ def render(scene: Scene, times_ns, near: float | None = None) -> dict[str, np.nd
 def export(scene: Scene, times_ns, near: float | None = None, double: bool = True, **more) -> dict[str, np.ndarray]:
     """The scene as plain arrays: geometry once, poses for each time. double : two faces for
     one of a two-sided surface."""
-    from blinkgl.scene.shapes.deformer import all_rigid  # not at the top: the worker's interpreter needs no BlinkGL
-
-    all_rigid(scene, "pyrender")
+    assert not any(thing.deforms for thing in scene.objects), "pyrender draws rigid bodies"
     camera, arrays = scene.camera, {}
     parts = [(thing, part) for thing in scene.objects for part in thing.parts]
     for k, (_, part) in enumerate(parts):

@@ -18,7 +18,7 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.shapes.closed_forms import Wave
 from blinkgl.scene.types import Light, Material, Texture
-from blinkgl.shader_debugger.edges_twin import filtered as filtered_slowly, read_both
+from blinkgl.shader_debugger.edges_twin import filtered as filtered_slowly
 from render_scenes import (
     LEVEL,
     SECOND,
@@ -464,7 +464,7 @@ def filtered_twice(gl, world, t_ns: int) -> tuple[np.ndarray, np.ndarray, np.nda
     """(unfiltered, filtered by the program, by its slow twin from the same picture, depths and lines)."""
     with Renderer(gl, world, EDGES) as renderer:
         plain = renderer.draw(Luminance(samples_of("edges")), t_ns)
-        picture, depths = read_both(plain)
+        picture, depths = plain.read(), plain.target.read_depth()
         moment = renderer.moment(t_ns)
         pixels, crossings = Lines().in_pixels(moment, moment.visible, renderer.width, renderer.height)
         focal = 0.5 * renderer.width * abs(moment.view.projection[0, 0])

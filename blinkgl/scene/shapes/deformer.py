@@ -26,11 +26,9 @@ import numpy as np
 from numba import njit
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
-from blinkgl.errors import ConfigError
-
 if TYPE_CHECKING:
     from blinkgl.config.deform import DeformConfig
-    from blinkgl.scene.types import Mesh, Scene
+    from blinkgl.scene.types import Mesh
 
 _SAMPLES = 32
 """Times at which a shape is looked at to find what it sweeps, at least."""
@@ -255,17 +253,6 @@ def filled(mesh: Mesh) -> tuple[np.ndarray, float]:
         return mesh.vertices[np.unique(mesh.faces)], 0.0
     sweep = mesh.deformer.sweep(mesh, 0, mesh.deformer.span_ns)
     return sweep.hull[0], sweep.margin
-
-
-def all_rigid(scene: Scene, who: str) -> None:
-    """ConfigError for a scene with a shape that changes, which ``who`` does not draw."""
-    for thing in scene.objects:
-        if thing.deforms:
-            raise ConfigError(
-                f"{who} draws rigid bodies, and this one changes its shape",
-                where=thing.name,
-                accepted="a scene without deform and animation",
-            )
 
 
 def normals_at(mesh: Mesh, t_ns: int) -> np.ndarray:

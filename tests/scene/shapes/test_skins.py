@@ -181,16 +181,3 @@ def test_what_cannot_be_drawn_is_refused(said, make):
 
 def skin_of(bones=(0, 1), inverse_bind=BIND, joints=((0, 1), (0, 1)), weights=((0.5, 0.5), (1, 0))):
     return Skin(Skeleton([-1, 0], Swinging()), bones, inverse_bind, joints, weights, where="somebody.glb")
-
-
-def test_other_renderers_refuse_what_changes_its_shape():
-    from blinkgl.errors import ConfigError
-    from blinkgl.scene.motion.paths import StaticPath
-    from blinkgl.scene.shapes.deformer import all_rigid
-    from blinkgl.scene.types import Material, Part, SceneObject
-
-    class One:
-        objects = (SceneObject("arm", 1, (Part(arm(), Material()),), StaticPath()),)
-
-    with pytest.raises(ConfigError, match="arm: the path tracer draws rigid bodies"):
-        all_rigid(One, "the path tracer")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from blinkgl.recordings.clip import polarity_sums
+from blinkgl.recordings.clip import TILE_PX, polarity_sums
 from blinkgl.recordings.comparison import BLUR_PX
 from blinkgl.recordings.statistics import COUNTS, ISI_BINS, ISI_PER_DECADE, sums
 from blinkgl.report.markup import data_uri, render
@@ -121,12 +121,27 @@ def picture(result: Calibration) -> bytes:
     }
     top = max(float(np.percentile(np.abs(images["recorded"]), 99.5)), 0.1)
     for ax, (name, image) in zip(axes[1], images.items()):
-        ax.imshow(image, cmap="RdBu_r", vmin=-top, vmax=top)
+        ax.imshow(mosaic(image), cmap="RdBu_r", vmin=-top, vmax=top)
         ax.set(title=f"{name}: ON - OFF, {edges[k]:.3f} to {edges[k + 1]:.3f} s", xticks=[], yticks=[])
+        ax.set_xlabel("" if clip.share == 1 else f"squares of {TILE_PX} px, drawn at random over the sensor")
     _plain(axes[0])
     file = io.BytesIO()
     figure.savefig(file, dpi=100, format="png", metadata={"Software": None})
     return file.getvalue()
+
+
+def mosaic(image: np.ndarray) -> np.ndarray:
+    """The tiles of a clip in rows, a picture about as wide as high; one of a whole sensor is itself.
+
+    image : (n TILE_PX, TILE_PX), tiles stacked on one another.   Returns (r TILE_PX, c TILE_PX), 0 where no tile is."""
+    count = len(image) // TILE_PX
+    if image.shape[1] != TILE_PX or count < 2:
+        return image
+    columns = int(np.ceil(np.sqrt(count)))
+    rows = -(-count // columns)
+    tiles = np.zeros((rows * columns, TILE_PX, TILE_PX), image.dtype)
+    tiles[:count] = image[: count * TILE_PX].reshape(count, TILE_PX, TILE_PX)
+    return tiles.reshape(rows, columns, TILE_PX, TILE_PX).swapaxes(1, 2).reshape(rows * TILE_PX, columns * TILE_PX)
 
 
 def _plain(axes: Any) -> None:

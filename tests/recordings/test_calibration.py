@@ -14,9 +14,10 @@ from blinkgl.cli import run
 from blinkgl.errors import BlinkGLError, ConfigError, EventDataError
 from blinkgl.io.formats import write_events
 from blinkgl.recordings.calibration import _Search, calibrate, calibrate_events
-from blinkgl.recordings.clip import Clip, clip_of_frames, clip_of_still, clock_offset
+from blinkgl.recordings.clip import TILE_PX, Clip, clip_of_frames, clip_of_still, clock_offset
 from blinkgl.recordings.simulation import emulator_config
 from blinkgl.recordings.statistics import sums
+from blinkgl.report.calibration import mosaic
 from blinkgl.types.events import Events
 from tests.shared_data import shared
 
@@ -323,3 +324,12 @@ def test_slider_depth_is_fitted_on_its_first_half_and_judged_on_its_second():
     assert before.rate_ratio > 5 and 0.9 <= after.rate_ratio <= 1.1
     assert before.interval_distance > 0.5 and after.interval_distance <= 0.1
     assert after.polarity_correlation > before.polarity_correlation
+
+
+def test_tiles_of_a_clip_are_shown_in_rows():
+    strip = np.repeat(np.arange(5.0), TILE_PX)[:, None] * np.ones(TILE_PX)
+    shown = mosaic(strip)
+    assert shown.shape == (2 * TILE_PX, 3 * TILE_PX)
+    assert shown[::TILE_PX, ::TILE_PX].tolist() == [[0, 1, 2], [3, 4, 0]]
+    whole = np.ones((3 * TILE_PX, 2 * TILE_PX))
+    assert mosaic(whole) is whole

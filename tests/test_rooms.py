@@ -162,7 +162,7 @@ DOORS = {
     "verify": "blinkgl.cli.verify blinkgl.verify blinkgl.dataset.verify.verify_dataset",
     "generate": "blinkgl.cli.generate blinkgl.generate blinkgl.dataset.run.run_dataset",
     "explain": "blinkgl.cli.explain blinkgl.dataset.explain.explain",
-    "sequence": "blinkgl.simulate_sequence blinkgl.sequence.simulate.simulate_sequence",
+    "sequence": "blinkgl.simulate_sequence blinkgl.sequence.SequenceRequest",
     "report": "blinkgl.cli.report blinkgl.report.page.write_report",
 }
 OTHERWISE = {

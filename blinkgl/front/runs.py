@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from blinkgl.dataset.run import Outcome
     from blinkgl.dataset.verify import Verification
     from blinkgl.scene.types import Scene as SceneData
+    from blinkgl.sequence.request import SequenceRequest
 
 MAX_INDEX = 10_000_000
 Source = Scene | RunTemplate
@@ -158,6 +159,15 @@ def configured(source: Source, rig: Rig | str | None = None, **settings: Unpack[
     if "sensor" in own:
         validate_field(SequenceConfig, "sensor", middle(own["sensor"]))
     return RunTemplate(merge(template.tree, own), template.base) if own else template
+
+
+def requested(source: Source, config: SequenceConfig, index: int, **wanted: Any) -> SequenceRequest:
+    """Sequence ``index`` of ``source``.   wanted : as of :class:`SequenceRequest`."""
+    from blinkgl.sequence.request import SequenceRequest
+
+    if isinstance(source, Scene):
+        return SequenceRequest(config, index, scene=source.build(config), **wanted)
+    return SequenceRequest(config, index, source.base, **wanted)
 
 
 def scene_of(source: Source, config: SequenceConfig, index: int) -> SceneData:

@@ -22,6 +22,7 @@ from blinkgl.scene.geometry import primitives
 from blinkgl.scene.geometry.meshes import faces_in_float32
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Light, Material, Part, SceneObject, Texture
+from blinkgl.sequence.request import SequenceRequest
 from blinkgl.sequence_files.sequence_dir import verify_sequence
 from tests.extremes.measures import FACING
 from tests.render.render_scenes import LEVEL, cube, drift, mesh, quad, rig, scene, smooth_texture, still, thing
@@ -307,9 +308,11 @@ def test_the_message_names_what_is_seen_where_and_when(gl, color, background, se
         ) as caught:
             list(
                 simulate_sequence(
-                    SequenceConfig(timeline=UniformTimeline(fps=100), events=EsimConfig()),
-                    labels=False,
-                    renderer=renderer,
+                    SequenceRequest(
+                        SequenceConfig(timeline=UniformTimeline(fps=100), events=EsimConfig()),
+                        labels=False,
+                        renderer=renderer,
+                    )
                 )
             )
     assert "\n" not in str(caught.value)

@@ -22,6 +22,7 @@ from blinkgl.scene.rig import Rig, Sensor
 from blinkgl.scene.surfaces.textures import procedural_texture
 from blinkgl.scene.types import Material, Part, Scene, SceneObject
 from blinkgl.sequence import EventChunk, simulate_sequence
+from blinkgl.sequence.request import SequenceRequest
 
 SECOND = 1_000_000_000
 BASELINE = 0.12
@@ -82,7 +83,7 @@ def test_a_scene_that_was_made_already_is_recorded_as_the_configuration_says(gl)
     assert isinstance(scene.sensors[0].emulator, EsimConfig) and isinstance(scene.sensors[0].labels, LabelsConfig)
 
     def events(scene):
-        with simulate_sequence(CONFIG, 0, gl, scene=scene, labels=False) as sequence:
+        with simulate_sequence(SequenceRequest(CONFIG, 0, scene=scene, labels=False), gl) as sequence:
             assert sequence.sensor.folder == scene.sensors[0].folder
             return [item.events for item in sequence if isinstance(item, EventChunk)]
 

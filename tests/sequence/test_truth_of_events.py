@@ -24,6 +24,7 @@ from blinkgl import (
 from blinkgl.config.run import RunTemplate
 from blinkgl.front.runs import configured
 from blinkgl.sequence import simulate_sequence
+from blinkgl.sequence.request import SequenceRequest
 from blinkgl.types.events import Cause
 
 SQUARES = np.where(((np.indices((64, 64)) // 8).sum(0) % 2)[..., None], (230, 200, 60), (40, 60, 110)).astype(np.uint8)
@@ -53,7 +54,7 @@ def made(scene: Scene, **more):
     """The events of a scene with sections of a configuration laid over it."""
     template = configured(scene, labels=["events"])
     config = RunTemplate({**template.tree, **more}, template.base).sequence(0)
-    with simulate_sequence(config, scene=scene.build(config)) as sequence:
+    with simulate_sequence(SequenceRequest(config, scene=scene.build(config))) as sequence:
         return sequence.gather()
 
 
@@ -125,7 +126,7 @@ def test_moved_back_by_its_velocity_an_edge_is_sharp():
             },
             "labels": {"events": True, "images": False, "flow": [], "occlusion": False},
         }
-        with simulate_sequence(RunTemplate(tree, Path(".")).sequence(0)) as sequence:
+        with simulate_sequence(SequenceRequest(RunTemplate(tree, Path(".")).sequence(0))) as sequence:
             events = sequence.gather()
         window = events.window(10_000, 70_000)
         back = 1e-6 * (window.t - 40_000)[:, None] * window.truth["velocity"]

@@ -289,14 +289,6 @@ def test_what_would_come_wrong_is_refused(scenes, tmp_path, name, words):
     assert "\n" not in str(caught.value) and os.listdir(tmp_path) == []
 
 
-@pytest.mark.parametrize("option", ["--texture-size", "--bake-seconds"])
-def test_options_that_are_gone_are_refused(scenes, tmp_path, capsys, option):
-    assert cli.run(["import", str(scenes / "evil.blend"), "--out", str(tmp_path / "o.glb"), option, "64"]) == 2
-    assert (
-        capsys.readouterr().err == f"error: {option}: colours are no longer baked; expected colours baked in Blender\n"
-    )
-
-
 def test_scripts_are_never_run(imported, scenes, capsys, tmp_path):
     """Neither by the import nor by what it reads back; both would run where they were allowed to (the control)."""
     assert (scenes / "control.txt").read_text() == "PWNED.text PWNED.driver"

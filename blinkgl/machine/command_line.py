@@ -98,7 +98,7 @@ def user_line(error: Exception) -> str | None:
     if _is_usage_error(error):
         context = getattr(error, "ctx", None)
         command = context.command_path if context is not None else "blinkgl"
-        message = " ".join(error.format_message().split()).rstrip(".")
+        message = " ".join(error.format_message().split()).rstrip(".")  # type: ignore[missing-attribute]
         return f"{message}; see '{command} --help'"
     if isinstance(error, ModuleNotFoundError) and error.name in EXTRAS["learn"][0]:
         return f"{error.name} is not installed; run {install(*EXTRAS['learn'][0])}"

@@ -1,48 +1,32 @@
-"""What a glTF file's animations do to its shapes: clips chosen, mixed, taken from other files, and the deformers of the
-pieces that follow them."""
+"""What a glTF file's animations do to its shapes: clips chosen, taken from other files, and the deformers of the pieces
+that follow them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from blinkgl.config.deform import AnimationConfig, ClipConfig
+from blinkgl.config.deform import AnimationConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.importing import gltf
-from blinkgl.scene.shapes.clips import PATHS, Blend, Clip, Playing, Track
+from blinkgl.scene.shapes.clips import PATHS, Clip, Playing, Track
 from blinkgl.scene.shapes.deformer import Deformer
-from blinkgl.scene.shapes.skeleton import Motion, Skeleton, Still
+from blinkgl.scene.shapes.skeleton import Skeleton, Still
 from blinkgl.scene.shapes.skin import Morphs, Skin
 from blinkgl.scene.types import Mesh
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """One of the clips that are played at once. share : of it in the whole."""
-
-    tracks: list[Track]
-    playing: Playing
-    share: float
-
-
 class Animation:
-    """A file's clips as they are played. document : whose nodes move.   skeleton : all of its nodes, in the file's
+    """A file's clip as it is played. document : whose nodes move.   skeleton : all of its nodes, in the file's
     world."""
 
-    def __init__(self, document: gltf.Document, parts: Sequence[_Part]):
-        self.document, self._parts, self._places = document, parts, document.places
-        rest = document.rest()
-        motions: list[Motion] = [Clip(rest, part.tracks, part.playing) for part in parts]
-        self.motion = motions[0] if len(motions) == 1 else Blend(motions[0], motions[1], parts[1].share)
-        self.skeleton: Skeleton = document.skeleton(self.motion)
-        self._moved = {track.joint for part in parts for track in part.tracks if track.path in PATHS}
-
-    @property
-    def tracks(self) -> list[Track]:
-        return [track for part in self._parts for track in part.tracks]
+    def __init__(self, document: gltf.Document, tracks: list[Track], playing: Playing):
+        self.document, self.tracks, self._playing, self._places = document, tracks, playing, document.places
+        self.skeleton: Skeleton = document.skeleton(Clip(document.rest(), tracks, playing))
+        self._moved = {track.joint for track in tracks if track.path in PATHS}
 
     def moves(self, node: int) -> bool:
         """Whether a node or one that it hangs on is moved."""
@@ -64,9 +48,9 @@ class Animation:
     def sample_times(self, keys: list[np.ndarray], t0_ns: int, t1_ns: int, step: float, most: int) -> np.ndarray:
         """(N,) int64 ns in [t0, t1] to lay a path through: regular ones and, of a clip at the sequence's own times,
         the key frames (keys : s), as far as it lasts."""
-        playing = self._parts[0].playing
+        playing = self._playing
         start, end = t0_ns * 1e-9, t1_ns * 1e-9
-        plain = len(self._parts) == 1 and not playing.loop and playing.speed == 1 and playing.phase == -playing.first
+        plain = not playing.loop and playing.speed == 1 and playing.phase == -playing.first
         if plain:
             first, last = min(k[0] for k in keys), max(k[-1] for k in keys)
             start, end = max(first, min(start, last)), min(last, max(end, first))
@@ -121,34 +105,27 @@ class Animation:
         if piece.targets is None:
             return None
         positions, normals = piece.targets
-        count, place = len(positions), self._places[node]
-        mine = [
-            (part.share, part.playing, [t for t in part.tracks if t.joint == place and t.path == "weights"])
-            for part in self._parts
-        ]
-        whole = self.document.morph_weights(node, max(count, 1))
-        values = [t.values[:, 1] if t.values.ndim == 3 else t.values for _, _, tracks in mine for t in tracks]
+        place, playing = self._places[node], self._playing
+        mine = [t for t in self.tracks if t.joint == place and t.path == "weights"]
+        whole = self.document.morph_weights(node, max(len(positions), 1))
+        values = [t.values[:, 1] if t.values.ndim == 3 else t.values for t in mine]
         used = np.flatnonzero(np.any([whole != 0, *(np.abs(v).max(axis=0) > 0 for v in values)], axis=0))
         if not len(used):
             return None
 
         def weights(t_ns: int) -> tuple[np.ndarray, np.ndarray]:
-            value, rate = np.zeros(count), np.zeros(count)
-            for share, playing, tracks in mine:
-                time, speed = playing.at(t_ns)
-                now, change = tracks[-1].at(time) if tracks else (whole, np.zeros(count))
-                value, rate = value + share * now, rate + share * speed * change
-            return value[used], rate[used]
+            time, speed = playing.at(t_ns)
+            now, change = mine[-1].at(time) if mine else (whole, np.zeros(len(whole)))
+            return now[used], speed * change[used]
 
-        moving = [playing for _, playing, tracks in mine if tracks and not playing.is_static]
-        periods = {playing.period_ns for playing in moving}
+        moving = bool(mine) and not playing.is_static
         morphs = Morphs(
             positions[used],
             None if normals is None else normals[used],
             weights,
             not moving,
-            periods.pop() if len(periods) == 1 else None,
-            max((playing.span_ns for playing in moving), default=0),
+            playing.period_ns if moving else None,
+            playing.span_ns if moving else 0,
         )
         return morphs.taken(source).transformed(at_rest[:3, :3])
 
@@ -156,12 +133,33 @@ class Animation:
 def play(document: gltf.Document, config: AnimationConfig, base: Path, where: str) -> Animation:
     """A file's animation as the configuration asks for it. where : key of the configuration.
     Raises ConfigError (a clip or file that is not there) and AssetError (what is wrong with the clip)."""
-    shares = (1.0,) if config.blend is None else (1 - config.share, config.share)
-    clips = (config,) if config.blend is None else (config, config.blend)
-    keys = (where, f"{where}.blend")
-    return Animation(
-        document, [_part(document, clip, share, base, key) for clip, share, key in zip(clips, shares, keys)]
-    )
+    theirs = _source(document, config.file, base, f"{where}.file")
+    names = clip_names(theirs)
+    index = names.index(config.clip) if config.clip in names else config.clip
+    if not isinstance(index, int) or not 0 <= index < len(names):
+        accepted = (
+            f"one of: {', '.join(names)}, or an index below {len(names)}" if names else "null (the file has none)"
+        )
+        raise ConfigError("no such animation in the file", where=where, value=config.clip, accepted=accepted)
+    tracks = theirs.tracks(index)
+    if theirs is not document:
+        tracks = _by_name(theirs, tracks, document, f"{where}.file", config.file or "")
+    times = [track.times for track in tracks]
+    first, last = (min(t[0] for t in times), max(t[-1] for t in times)) if times else (0.0, 0.0)
+    # A clip that is held is at its own time 0 at the sequence's: as its file says.
+    phase = config.phase if config.loop else config.phase - first
+    return Animation(document, tracks, Playing(float(first), float(last), config.speed, float(phase), config.loop))
+
+
+def _source(document: gltf.Document, file: str | None, base: Path, where: str) -> gltf.Document:
+    """The document whose clips are meant: ``document``, or another file."""
+    if file is None:
+        return document
+    path = Path(file).expanduser()
+    path = path if path.is_absolute() else base / path
+    if not path.is_file():
+        raise ConfigError("no such file", where=where, value=file, accepted="a gltf or glb file")
+    return gltf.read(path, materials=False)
 
 
 def rest_pieces(document: gltf.Document, node: int) -> tuple[list[gltf.Piece], np.ndarray]:
@@ -205,31 +203,6 @@ def _at_rest(
 def clip_names(document: gltf.Document) -> list[str]:
     """Of a file's animations; the number of one that has none."""
     return [str(a.get("name", i)) for i, a in enumerate(document.tree.get("animations", []))]
-
-
-def _part(document: gltf.Document, config: ClipConfig, share: float, base: Path, where: str) -> _Part:
-    theirs = document
-    if config.file is not None:
-        path = Path(config.file).expanduser()
-        path = path if path.is_absolute() else base / path
-        if not path.is_file():
-            raise ConfigError("no such file", where=f"{where}.file", value=config.file, accepted="a gltf or glb file")
-        theirs = gltf.read(path, materials=False)
-    names = clip_names(theirs)
-    index = names.index(config.clip) if config.clip in names else config.clip
-    if not isinstance(index, int) or not 0 <= index < len(names):
-        accepted = (
-            f"one of: {', '.join(names)}, or an index below {len(names)}" if names else "null (the file has none)"
-        )
-        raise ConfigError("no such animation in the file", where=where, value=config.clip, accepted=accepted)
-    tracks = theirs.tracks(index)
-    if theirs is not document:
-        tracks = _by_name(theirs, tracks, document, f"{where}.file", config.file or "")
-    times = [track.times for track in tracks]
-    first, last = (min(t[0] for t in times), max(t[-1] for t in times)) if times else (0.0, 0.0)
-    # A clip that is held is at its own time 0 at the sequence's: as its file says.
-    phase = config.phase if config.loop else config.phase - first
-    return _Part(tracks, Playing(float(first), float(last), config.speed, float(phase), config.loop), share)
 
 
 def _by_name(theirs: gltf.Document, tracks: list[Track], mine: gltf.Document, where: str, file: str) -> list[Track]:

@@ -173,7 +173,7 @@ def test_record_of_a_yaml_is_what_generate_writes(tmp_path):
                 "scene": {
                     "kind": "random",
                     "objects": {"count": 2},
-                    "pool": {"urdfs": False},
+                    "pool": {},
                     "textures": {"photographs": False},
                 },
                 "preview": {"enabled": False},

@@ -76,7 +76,7 @@ class Body(Piece):
     """What falls, or is fallen on: ``Primitive("cuboid", body=Body(velocity=(1, 0, 2)))`` (docs/scenes.md, "Dynamics").
 
     kind : "dynamic" falls; "fixed" stays, or goes its way, whatever hits it; "none" is not there.
-    shape : what touches, "auto", "hull", "box" or "sphere".   mass : kg, or by density : kg/m³ (default 700).
+    mass : kg, or by density : kg/m³ (default 700).
     friction : Coulomb's coefficient.   rolling : the same of rolling, of the radius.
     restitution : share of the speed that an impact leaves.
     velocity : (3,) m/s, of the centre of mass at the start.   spin : (3,) degrees/s about the world's axes.

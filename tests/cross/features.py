@@ -25,7 +25,7 @@ WIDTH, HEIGHT, FPS = 32, 24, 100
 OF_PAIRS = ("disparity",)
 """Labels of stereo pairs: tests/dataset/test_rig_runs.py."""
 _POOLS = {
-    "pool": {"primitives": ["cuboid", "sphere"], "variants": 8, "urdfs": False, "test_fraction": 0.3},
+    "pool": {"primitives": ["cuboid", "sphere"], "variants": 8, "test_fraction": 0.3},
     "textures": {
         "procedural": ["checks", "fbm"],
         "variants": 8,

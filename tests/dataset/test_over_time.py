@@ -22,7 +22,7 @@ imu: {preset: adis16448, rate: 1000, position: [0.05, 0, 0]}
 tracks: {points: 60, choose: surface, rate: 200}
 labels: {flow: [], occlusion: false}
 preview: {enabled: false}
-scene: {kind: random, pool: {primitives: [cuboid], urdfs: false}, textures: {photographs: false, max_size: 32}}
+scene: {kind: random, pool: {primitives: [cuboid]}, textures: {photographs: false, max_size: 32}}
 """
 
 

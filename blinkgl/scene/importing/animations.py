@@ -1,4 +1,4 @@
-"""What a glTF file's animations do to its shapes: clips chosen, taken from other files, and the deformers of the pieces
+"""What a glTF file's animations do to its shapes: clips chosen, taken from other files, and the deformers of the meshes
 that follow them."""
 
 from __future__ import annotations
@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.config.deform import AnimationConfig
-from blinkgl.errors import AssetError, ConfigError
+from blinkgl.errors import ConfigError
 from blinkgl.scene.importing import gltf
+from blinkgl.scene.importing.raw_mesh import RawMesh, transformed
 from blinkgl.scene.shapes.clips import PATHS, Clip, Playing, Track
 from blinkgl.scene.shapes.deformer import Deformer
 from blinkgl.scene.shapes.skeleton import Skeleton, Still
@@ -64,20 +65,20 @@ class Animation:
     def deformer(
         self,
         node: int,
-        piece: gltf.Piece,
+        raw: RawMesh,
         source: np.ndarray,
         at_rest: np.ndarray,
         turn: np.ndarray,
         on_path: bool = False,
     ) -> Deformer | None:
-        """Of a mesh that was made of a piece of a node's mesh; None where it is rigid, or follows the object's path.
+        """Of a mesh that was made of one of a node's raw ones; None where it is rigid, or follows the object's path.
 
-        source : (W,) which of the piece's vertices each of the mesh's is.   at_rest : (4, 4) what took the piece to
-        the object's axes.
+        source : (W,) which of the raw mesh's vertices each of the mesh's is.
+        at_rest : (4, 4) what took the raw mesh to the object's axes.
         turn : (4, 4) from the file's world to the object's axes.   on_path : the object's own path moves the node."""
         skin = self.document.nodes[node].skin
-        bound = piece.binding if skin is not None else None
-        morphs = self._morphs(node, piece, source, at_rest)
+        bound = raw.binding if skin is not None else None
+        morphs = self._morphs(node, raw, source, at_rest)
         where = f"{self.document.path.name}, mesh of node '{self.document.nodes[node].name}'"
         if bound is not None and skin is not None:
             joints, bind = self.document.skin(skin)
@@ -100,11 +101,11 @@ class Animation:
             )
         return None if morphs is None else Skin.morphing(morphs, where)
 
-    def _morphs(self, node: int, piece: gltf.Piece, source: np.ndarray, at_rest: np.ndarray) -> Morphs | None:
+    def _morphs(self, node: int, raw: RawMesh, source: np.ndarray, at_rest: np.ndarray) -> Morphs | None:
         """Those targets that have a weight at any time."""
-        if piece.targets is None:
+        if raw.targets is None:
             return None
-        positions, normals = piece.targets
+        positions, normals = raw.targets
         place, playing = self._places[node], self._playing
         mine = [t for t in self.tracks if t.joint == place and t.path == "weights"]
         whole = self.document.morph_weights(node, max(len(positions), 1))
@@ -162,42 +163,34 @@ def _source(document: gltf.Document, file: str | None, base: Path, where: str) -
     return gltf.read(path, materials=False)
 
 
-def rest_pieces(document: gltf.Document, node: int) -> tuple[list[gltf.Piece], np.ndarray]:
-    """(pieces of a node's mesh as the file shows them at rest, (4, 4) what takes them to the file's world): a skin has
-    its joints where its nodes are, morph targets have the weights that the file gives. What is wrong with a skin that
-    nobody plays is no reason to refuse the file: its shape as it was modelled is drawn, and that is said."""
+def meshes_at_rest(document: gltf.Document, node: int) -> tuple[list[RawMesh], np.ndarray]:
+    """(meshes of a node as the file shows them at rest, (4, 4) what takes them to the file's world): a skin has its
+    joints where its nodes are, morph targets have the weights that the file gives."""
     mesh, skin = document.nodes[node].mesh, document.nodes[node].skin
     assert mesh is not None
-    try:
-        pieces = document.mesh_pieces(mesh, changing=True)
-        bound = skin is not None and any(piece.binding is not None for piece in pieces)
-        joints, bind = document.skin(skin) if bound and skin is not None else ([], np.zeros((0, 4, 4)))
-        posed = [_at_rest(document, node, piece, joints, bind) for piece in pieces]
-        return posed, np.eye(4) if bound else document.world(node)
-    except AssetError as error:
-        pieces = document.mesh_pieces(mesh)  # which raises what is wrong with the rest
-        document.omissions.add(f"a pose at rest ({error.problem})")
-        return pieces, document.world(node)
+    raws = document.raw_meshes(mesh)
+    bound = skin is not None and any(raw.binding is not None for raw in raws)
+    joints, bind = document.skin(skin) if bound and skin is not None else ([], np.zeros((0, 4, 4)))
+    posed = [_at_rest(document, node, raw, joints, bind) for raw in raws]
+    return posed, np.eye(4) if bound else document.world(node)
 
 
-def _at_rest(
-    document: gltf.Document, node: int, piece: gltf.Piece, joints: Sequence[int], bind: np.ndarray
-) -> gltf.Piece:
-    """A piece of a node's mesh; in the file's world where there are joints."""
-    if piece.targets is not None:
-        positions, normals = piece.targets
+def _at_rest(document: gltf.Document, node: int, raw: RawMesh, joints: Sequence[int], bind: np.ndarray) -> RawMesh:
+    """One of a node's meshes; in the file's world where there are joints."""
+    if raw.targets is not None:
+        positions, normals = raw.targets
         weights = document.morph_weights(node, len(positions))
-        piece = replace(piece, vertices=piece.vertices + np.tensordot(weights, positions, 1), targets=None)
-        if piece.normals is not None and normals is not None:
-            piece = replace(piece, normals=piece.normals + np.tensordot(weights, normals, 1))
+        raw = replace(raw, vertices=raw.vertices + np.tensordot(weights, positions, 1), targets=None)
+        if raw.normals is not None and normals is not None:
+            raw = replace(raw, normals=raw.normals + np.tensordot(weights, normals, 1))
     if len(joints):
-        shape = Mesh(piece.vertices, piece.faces, piece.normals, piece.uvs)  # type: ignore[arg-type]
-        if piece.binding is None:  # follows the node, and not its joints
-            return gltf.transformed(piece, document.world(node))
-        skin = Skin(document.skeleton(Still(document.rest())), joints, bind, *piece.binding, where=document.path.name)
-        turned = None if piece.normals is None else skin.normals(shape, 0)
-        piece = replace(piece, vertices=skin.positions(shape, 0), normals=turned, binding=None)
-    return piece
+        shape = Mesh(raw.vertices, raw.faces, raw.normals, raw.uvs)  # type: ignore[arg-type]
+        if raw.binding is None:  # follows the node, and not its joints
+            return transformed(raw, document.world(node))
+        skin = Skin(document.skeleton(Still(document.rest())), joints, bind, *raw.binding, where=document.path.name)
+        turned = None if raw.normals is None else skin.normals(shape, 0)
+        raw = replace(raw, vertices=skin.positions(shape, 0), normals=turned, binding=None)
+    return raw
 
 
 def clip_names(document: gltf.Document) -> list[str]:

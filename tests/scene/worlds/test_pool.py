@@ -16,7 +16,7 @@ from blinkgl.scene.worlds.pool import Cache, object_pool, split_of, texture_pool
 from tests.scene.gltf_files import GltfBuilder, triangle
 from tests.shared_data import shared
 
-NOTHING = dict(primitives=(), urdfs=False)
+NOTHING = dict(primitives=())
 
 
 def box(path, seed=0):
@@ -130,14 +130,6 @@ def test_all_real_models_load_both_ways():
                 for p in asset.parts
             )
             assert len(asset.parts) == 1 or keep
-
-
-def test_random_urdfs():
-    pytest.importorskip("pybullet_data", reason="pybullet is not installed")
-    pool = object_pool(PoolConfig(primitives=(), urdfs=True), ".")
-    assert len(pool.entries) == 1000
-    mesh = pool.load(pool.entries[0]).parts[0].mesh
-    assert mesh.closed and mesh.uvs.min() >= 0 and mesh.uvs.max() <= 1
 
 
 def config_error(make):

@@ -245,7 +245,7 @@ def message(make):
                 "capsule, prism, pyramid, figure, flag, fish (got ['cube'])"
             ),
         ),
-        ({"pool": {"urdfs": "maybe"}}, "scene.pool.urdfs: must be auto, true, false (got 'maybe')"),
+        ({"pool": {"urdfs": "maybe"}}, "scene.pool.urdfs: this key was removed (got 'maybe'); expected folders: [...]"),
         (
             {"pool": {"test_fraction": 1.5}},
             "scene.pool.test_fraction: too large (got 1.5); expected a number from 0 to 1",
@@ -304,7 +304,7 @@ def test_a_camera_that_runs_into_something_gets_another_path(monkeypatch, tmp_pa
         drawn.append(path)
         result = resolve(objects, path, *rest)
         if len(drawn) == 1:
-            return replace(result, events=(Collision(1, "camera", objects[0].name, "contact", 0.0, ("camera",)),))
+            return replace(result, events=(Collision(1, "camera", objects[0].name, 0.0, ("camera",)),))
         return result
 
     monkeypatch.setattr(module, "resolve_collisions", once_unlucky)

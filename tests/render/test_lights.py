@@ -87,15 +87,6 @@ def test_a_spot_light_shines_in_its_cone(gl):
     assert (share == 1).any() and (share == 0).any() and ((share > 0) & (share < 1)).sum() > 100
 
 
-def test_behind_the_surface_and_far_away_nothing_is_lit(gl):
-    world, _ = wall_at()
-    behind = Lamp("point", (3.0, 3.0, 3.0), StaticPath(lamp_pose((0, 3, 0))))
-    touching = replace(behind, path=StaticPath(lamp_pose((0, 2, 0))))
-    for lamp in (behind, touching):
-        seen = luminance(gl, replace(world, light=Light(sun=0, sky=0, lamps=(lamp,))))
-        assert np.isfinite(seen).all() and seen.max() < 0.1
-
-
 @pytest.mark.parametrize("offset", [0.0, 1e5])
 def test_every_light_is_the_references(gl, offset):
     """Of moving things, textured and not, and far from the origin."""
@@ -200,26 +191,6 @@ def test_one_channel_does_where_a_surface_has_one_colour(gl):
         assert hued == ({"1"} if name == "of several colours" else {None}), name
         np.testing.assert_allclose(seen, colour @ LUMA, rtol=1e-5, atol=1e-6)
         np.testing.assert_array_equal(rates, seen)
-
-
-def test_white_light_is_the_same_through_either_program(gl):
-    """The plain formula, and lamps that say the same."""
-    world = mixed_scene()
-    white = Lamp("sun", (Light().sun,) * 3, StaticPath(lamp_pose(shines=-np.array(Light().sun_direction))))
-    as_lamp = replace(world, light=Light(sun=0.0, lamps=(white,)))
-    faint = replace(world, light=Light(lamps=(replace(SUN, strength=(1e-12, 0.0, 0.0)),)))  # takes three channels
-    for t in (0, SECOND // 2):
-        plain = luminance(gl, world, t)
-        np.testing.assert_allclose(luminance(gl, as_lamp, t), plain, atol=1e-6)
-        np.testing.assert_allclose(luminance(gl, faint, t), plain, atol=1e-5)
-
-
-def test_who_asks_for_no_lights_gets_the_programs_without(gl):
-    gl.shaders.clear()
-    with Renderer(gl, mixed_scene(), PLAIN) as renderer:
-        renderer.luminance(0), renderer.brightness(0), renderer.colour(0), renderer.brightness(0, 4)
-    for _, defines in gl.shaders.compiled:
-        assert not {"LIGHTS", "HUED", "SUNS", "LAMPS", "AMBIENT"} & {name for name, _ in defines}
 
 
 MOVING = replace(POINT, path=drift((0.3, 3, 1), (0.8, 2.5, 0.4)))

@@ -130,6 +130,8 @@ def test_clips_that_nobody_plays_and_lines(tmp_path):
     path = glb(tmp_path, change=change)
     assert sorted(said(path)) == ["animations (the rest pose is drawn)", "points and lines"]
     assert said(path, keep_materials=False) == said(path)  # shape is asked for whatever the material
+    with pytest.raises(AssetError, match="no valid glTF .JOINTS_0 without WEIGHTS_0"):
+        load_asset(glb(tmp_path, JOINTS_0=(np.zeros((3, 4), "u1"), "VEC4")))
 
 
 def test_extensions_that_are_used(tmp_path):

@@ -132,14 +132,6 @@ def test_skins_of_one_skeleton_can_be_one():
     assert joined([one.deformer, arm().deformer]) is None  # another skeleton
 
 
-def test_no_more_joints_than_are_used_are_looked_at():
-    skin = Skin(
-        Skeleton([-1, 0], Swinging()), [0, 1], np.tile(np.eye(4), (2, 1, 1)), [[1, 0, 0, 0]] * 3, [[5, 0, 0, 0]] * 3
-    )
-    assert skin.sizes["SKIN_WEIGHTS"] == 1
-    np.testing.assert_array_equal(skin.weights, 1.0)
-
-
 BIND = np.tile(np.eye(4), (2, 1, 1))
 NAN = np.where(np.arange(2)[:, None, None] == 1, np.nan, BIND)
 

@@ -41,7 +41,7 @@ from blinkgl.labels import (
 )
 from blinkgl.labels.files import npy
 from blinkgl.recordings.simulation import frames_to_events
-from blinkgl.render.reference import scene_parts
+from blinkgl.render.casting import scene_parts
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.tools.config_docs import page

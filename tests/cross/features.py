@@ -266,7 +266,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "nothing": NOTHING,
         "grid, noisy": {"tracks": {"points": 30, "choose": "grid"}, "imu": {"preset": "adis16448", "rate": 1000}},
         "surfaces, ideal": {"tracks": {"points": 20, "choose": "surface", "rate": 300}, "imu": {"rate": 90}},
-        "drawn": {"tracks": {"points": {"integer": [5, 9]}, "choose": "random"}},
+        "drawn": {"tracks": {"points": {"integer": [5, 9]}}},
     },
     "preview": {"off": NOTHING, "on": {"preview": {"enabled": True, "rate": 100}}},
     "time": {

@@ -80,7 +80,7 @@ def test_explain_counts_them(tmp_path):
         (["imu.noise=1"], "imu.noise: unknown key"),
         (
             ["tracks.choose=edges"],
-            "tracks.choose: unknown choice (got 'edges'); expected 'grid', 'random' or 'surface'",
+            "tracks.choose: unknown choice (got 'edges'); expected 'grid' or 'surface'",
         ),
         (["tracks.points=1000000", "tracks.rate=10000"], "tracks.points: 1e+09 positions (got 1000000)"),
         (["frames={folders: [x], fps: 30}"], "imu: recorded frames do not tell where their camera was"),

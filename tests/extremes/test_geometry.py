@@ -12,7 +12,7 @@ from blinkgl.camera import PinHole
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import AssetError, GLError
 from blinkgl.labels import LabelRequest
-from blinkgl.render import reference
+from blinkgl.render import casting, reference
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Material
 from tests.extremes.measures import FACING, MOTION, compare, length, moving_camera
@@ -81,7 +81,7 @@ def test_order_of_surfaces_close_behind_one_another(gl, promise):
         world = scene(pair, rig(96, 72, 90.0, near=1e-3))
         with Renderer(gl, world, RenderConfig()) as renderer:
             ids = renderer.labels(0, LabelRequest("ids")).ids
-        wrong += (ids != reference.cast(world, 0).instance.reshape(ids.shape)).sum()
+        wrong += (ids != casting.cast(world, 0).instance.reshape(ids.shape)).sum()
     promise("surfaces a relative 1e-6 apart, 0.01 to 1e6 units: wrong pixels", wrong, 0)
 
 

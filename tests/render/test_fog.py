@@ -9,7 +9,7 @@ import blinkgl
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import ConfigError
 from blinkgl.labels import LabelRequest
-from blinkgl.render import reference
+from blinkgl.render import appearance, casting
 from blinkgl.render.colour import LUMA
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Fog, Material
@@ -58,8 +58,8 @@ def test_the_reference_sees_the_same_fog(gl):
     t, where = SECOND // 2, world()
     with Renderer(gl, where, PLAIN) as renderer:
         drawn, parts = renderer.colour(t).read(), renderer.scene
-    hits = reference.cast(parts, t)
-    true = reference.surface(parts, hits).colour.reshape(drawn.shape)
+    hits = casting.cast(parts, t)
+    true = appearance.surface(parts, hits).colour.reshape(drawn.shape)
     assert np.median(np.abs(drawn - true)) < 1e-3 and (np.abs(drawn - true).max(axis=2) < 0.02).mean() > 0.95
 
 

@@ -20,7 +20,7 @@ from blinkgl.config.run import load_run
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.gl.shader import ShaderLoader, shader_folder
 from blinkgl.labels import LabelRequest
-from blinkgl.render import reference
+from blinkgl.render import appearance, casting, reference
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Light, Material
@@ -122,7 +122,7 @@ def test_every_buffer_of_the_label_pass(gl, name):
     in_camera_axes = ref.normal @ world.camera_path.pose(T0)[:3, :3]
     np.testing.assert_allclose(labels.normals[off], in_camera_axes[off], atol=5e-5)
     np.testing.assert_allclose(labels.colour[off], ref.colour[off], atol=2e-3 if name == "everything" else 2e-5)
-    np.testing.assert_allclose(luminance, labels.colour @ reference.LUMA, atol=1e-6)  # silhouettes as well
+    np.testing.assert_allclose(luminance, labels.colour @ appearance.LUMA, atol=1e-6)  # silhouettes as well
     empty = (ref.instance == 0) & (labels.ids == 0)
     assert (luminance[empty] == world.background).all()
 
@@ -196,10 +196,10 @@ def test_supersampling_is_the_mean_of_finer_rays(gl, factor):
     world = shapes()["sphere"]
     cam = world.camera
     sub = (np.arange(factor) + 0.5) / factor - 0.5
-    grid = reference.pixel_grid(cam)
+    grid = casting.pixel_grid(cam)
     rays = (grid[:, None, None] + np.stack(np.meshgrid(sub, sub), -1)).reshape(-1, 2)
     fine = (
-        reference.surface(world, reference.cast(world, T0, rays)).luminance.reshape(cam.height, cam.width, -1).mean(-1)
+        appearance.surface(world, casting.cast(world, T0, rays)).luminance.reshape(cam.height, cam.width, -1).mean(-1)
     )
     with Renderer(gl, world, RenderConfig(antialiasing=f"ssaa{factor}")) as renderer:
         luminance = renderer.luminance(T0).read()

@@ -13,7 +13,7 @@ from blinkgl.camera.rectified import rectified
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.gl import create_context
 from blinkgl.labels import LABELS, LabelRequest
-from blinkgl.render import reference
+from blinkgl.render import casting, reference
 from blinkgl.render.lens import places_of
 from blinkgl.render.renderer import Renderer
 from tests.render.test_materials import drift, hidden_ball
@@ -57,7 +57,7 @@ def next_facets(true, scene, t_ns=T):
     """Pixels whose ray meets another facet, or body, than the flat picture's nearest pixel shows."""
     flat = seen_through(scene.camera)
     nearest = np.floor(places_of(scene.camera, flat, scene.camera.width, scene.camera.height).places)
-    drawn = reference.cast(scene.with_camera(flat), t_ns, nearest.reshape(-1, 2))
+    drawn = casting.cast(scene.with_camera(flat), t_ns, nearest.reshape(-1, 2))
     same = (drawn.part == true.part.ravel()) & (drawn.triangle == true.triangle.ravel())
     return true.hit & ~same.reshape(true.hit.shape)
 
@@ -175,12 +175,12 @@ def test_edges_are_where_the_rays_have_them(gl, lens):
     scene = board(LENSES[lens])
     with Renderer(gl, scene, RenderConfig(antialiasing="ssaa4")) as renderer:
         picture = renderer.luminance(T).read().astype(float)
-        grid = reference.pixel_grid(scene.camera)
+        grid = casting.pixel_grid(scene.camera)
         true = np.zeros(len(grid))
         offsets = (np.arange(10) + 0.5) / 10 - 0.5
         for dy in offsets:
             for dx in offsets:
-                true += reference.cast(scene, T, grid + [dx, dy]).hit / 100.0
+                true += casting.cast(scene, T, grid + [dx, dy]).hit / 100.0
     true = true.reshape(picture.shape)
     assert picture.max() == pytest.approx(1.0) and 0.1 < true.mean() < 0.6
     middle_y, middle_x = 40, 52

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.config.deform import TwistConfig
 from blinkgl.config.sequence import RenderConfig
-from blinkgl.render import reference, resources
+from blinkgl.render import casting, draw_items, reference
 from blinkgl.render.colour import LUMA
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.lights import lamp_pose
@@ -50,7 +50,7 @@ def wall_at(distance=2.0):
     """A white wall across the camera's axis, and where each pixel's point of it is, (H, W, 3)."""
     wall = thing("wall", 1, quad(9, 9), still((0, distance, 0), Rotation.from_euler("x", 90, degrees=True)))
     world = scene([wall])
-    xy = reference.pixel_grid(world.camera)
+    xy = casting.pixel_grid(world.camera)
     points = world.camera.rays(xy) * distance @ np.asarray(LEVEL.as_matrix()).T
     return world, points.reshape(world.camera.height, world.camera.width, 3)
 
@@ -165,7 +165,7 @@ def test_flat_facets_are_lit_at_their_corners(gl, monkeypatch, finer):
         beside_rates = renderer.brightness(0).read()[..., 0]
     programs = [dict(defines) for _, defines in gl.shaders.compiled]
     assert any("FACETED" in one and one.get("AMBIENT") == ("3" if finer else "2") for one in programs)
-    monkeypatch.setattr(resources, "_Facets", lambda _: SimpleNamespace(flat=lambda _: False))
+    monkeypatch.setattr(draw_items, "_Facets", lambda _: SimpleNamespace(flat=lambda _: False))
     with Renderer(gl, world, unfiltered) as renderer:
         smooth = renderer.luminance(0).read(), renderer.colour(0).read()
     ids = reference.render(world, 0).instance

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.labels import LabelRequest
-from blinkgl.render import reference
+from blinkgl.render import appearance, reference
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.geometry.tangents import split_mirrored, tangents
 from blinkgl.scene.lights import beam, lamp_pose, lamps_of
@@ -183,8 +183,8 @@ def test_lamps_and_surroundings_are_one(metallic, roughness):
         total[c] = (lobe * nl * ((1 - metallic) * plain + metallic * metal)).sum() * solid
     even = tuple(tuple(tuple(float(i == j == 3) for j in range(4)) for i in range(4)) for _ in range(3))
     made = scene([], light=Light(sun=0.0, sky=0.0, around=even))
-    light = reference.received(made, 0, np.zeros((1, 3)), normal)
-    _, mirrored = reference.shone(
+    light = appearance.received(made, 0, np.zeros((1, 3)), normal)
+    _, mirrored = appearance.shone(
         made, 0, light, np.zeros((1, 3)), normal, eye, albedo, np.array([metallic]), np.array([roughness])
     )
     assert mirrored[0] == pytest.approx(total, rel=0.02)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.labels import LabelRequest
-from blinkgl.render import reference
+from blinkgl.render import casting, reference
 from blinkgl.render.occlusion import HIDDEN, NARROW, REACH, SEEN, UNDECIDED, judged_by_samples, near_thin
 from blinkgl.render.renderer import Renderer
 from render_scenes import LEVEL, cube, drift, mixed_scene, quad, rig, scene, sphere, still, thing
@@ -184,12 +184,12 @@ def test_thin_is_what_has_others_on_both_sides_and_farther():
 def test_rays_are_asked_where_samples_do_not_agree_and_matter_there(gl, monkeypatch):
     """The two halves of the work, each seen to be needed: few rays, and many wrong pixels without them."""
     asked = []
-    true = reference.is_hidden
-    monkeypatch.setattr(reference, "is_hidden", lambda s, t, xy, z, e: asked.append(len(xy)) or true(s, t, xy, z, e))
+    true = casting.is_hidden
+    monkeypatch.setattr(casting, "is_hidden", lambda s, t, xy, z, e: asked.append(len(xy)) or true(s, t, xy, z, e))
     world = crowd()
     mask, flow, same = masks(gl, world, 300 * MS, 420 * MS)
     assert 0 < asked[0] < 0.12 * mask.size
-    monkeypatch.setattr(reference, "is_hidden", lambda s, t, xy, z, e: np.zeros(len(xy), bool))
+    monkeypatch.setattr(casting, "is_hidden", lambda s, t, xy, z, e: np.zeros(len(xy), bool))
     without, _, _ = masks(gl, world, 300 * MS, 420 * MS)
     hidden = flow.occluded & ~flow.outside & same
     assert ((without != flow.occluded) & same).sum() > 0.05 * hidden.sum()

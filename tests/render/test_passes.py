@@ -16,7 +16,7 @@ from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import GLError
 from blinkgl.gl.shader import ShaderError
 from blinkgl.labels import LabelRequest
-from blinkgl.render import reference
+from blinkgl.render import casting
 from blinkgl.render.canvas import DEPTH_BUFFER
 from blinkgl.render.matrices import mat4_bytes
 from blinkgl.render.moment import View
@@ -113,7 +113,7 @@ def test_a_shadow_map_is_a_pass_before_a_pass(gl):
     with Renderer(gl, world, PLAIN) as renderer:
         for t in (0, 3 * SECOND // 4):
             light = renderer.draw(Lamplight(ShadowMap(tuple(lamp))), t).read()
-            hits = reference.cast(world, t)
+            hits = casting.cast(world, t)
             floor = (hits.instance == 1).reshape(light.shape)
             box = world.objects[1].path.pose(t)[:3, 3]
             points = np.where(hits.instance[:, None] == 1, hits.local + world.objects[0].path.pose(t)[:3, 3], facing_up)

@@ -9,7 +9,7 @@ from blinkgl.config.problems import validate
 from blinkgl.config.sequence import RenderConfig, SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.labels import LabelRequest
-from blinkgl.render import reference
+from blinkgl.render import casting, reference
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.geometry.primitives import cuboid, grid
@@ -78,7 +78,7 @@ def test_disparity_is_focal_length_times_baseline_over_depth(gl):
         with Renderer(gl, scene.seen_by(number), RenderConfig()) as renderer:
             frames.append(renderer.labels(0, LabelRequest("depth", "ids")))
     left, right = frames
-    xy = reference.pixel_grid(CAMERA)
+    xy = casting.pixel_grid(CAMERA)
     rays = CAMERA.rays(xy)
     points = rays * left.depth.reshape(-1, 1)
     there = CAMERA.project(points - [BASELINE, 0, 0])  # in the right eye's axes

@@ -8,7 +8,7 @@ read (:mod:`blinkgl.config.corners`).
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
@@ -187,6 +187,16 @@ class OutputConfig(Config):
     )
 
 
+class CameraOnRig(NamedTuple):
+    """One camera of a sequence's rig: its number among the sensors, the name of its folder ("" of a single camera),
+    what a single camera would have to say to be it, and whether it gives events."""
+
+    number: int
+    name: str
+    config: SequenceConfig
+    gives_events: bool
+
+
 class SequenceConfig(Config):
     """One sequence, every value plain and final."""
 
@@ -236,6 +246,16 @@ class SequenceConfig(Config):
     )
     preview: PreviewConfig = Field(PreviewConfig(), description="preview.mp4")
     gl: GLConfig = Field(GLConfig(), description="which OpenGL to use")
+
+    def cameras(self) -> list[CameraOnRig]:
+        """All that see, in their order; a single camera is the only one of its rig, and has no name."""
+        if self.sensors is None:
+            return [CameraOnRig(0, "", self, True)]
+        return [
+            CameraOnRig(k, one.name, self.of_sensor(k), one.events is not None)
+            for k, one in enumerate(self.sensors)
+            if one.sees
+        ]
 
     def of_sensor(self, number: int) -> SequenceConfig:
         """What a single camera would have to say to be the rig's sensor of this number at the rig's origin, without a

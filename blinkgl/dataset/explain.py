@@ -10,7 +10,6 @@ import math
 import platform
 import time
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -31,7 +30,7 @@ from blinkgl.render.tracks import track_points
 from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.lights import is_coloured, lamps_of
 from blinkgl.scene.types import Light, Scene
-from blinkgl.sequence import Simulation, simulate_sequence
+from blinkgl.sequence import SequenceRequest, Simulation, simulate_sequence
 from blinkgl.sequence.inertial import measured
 from blinkgl.sequence.recorded import RECORDED
 from blinkgl.sequence.rendered import surfaces_at
@@ -75,7 +74,8 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
     with create_context(config.gl.backend, config.gl.device) as gl:
         scene = sequence_scene(config, index, template.base)
         result = Explanation(machine=gl.renderer)
-        for name, own, seen, events in _cameras(config, scene):
+        for number, name, own, events in config.cameras():
+            own, seen = own.model_copy(update={"preview": config.preview}), scene.seen_by(number)
             with Renderer(gl, seen, config.render) as renderer:
                 one = Explanation(scene=_describe(renderer.scene, renderer, config))
                 if events:
@@ -88,16 +88,6 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
     result.seconds = sum(p.seconds for p in result.passes)
     result.seconds_per_simulated_second = result.seconds / simulated
     return result
-
-
-def _cameras(config: SequenceConfig, scene: Scene) -> Iterator[tuple[str, SequenceConfig, Scene, bool]]:
-    """(name, its own configuration, the scene as it sees it, whether it gives events) of every camera."""
-    if config.sensors is None:
-        yield "", config, scene, True
-    for k, one in enumerate(config.sensors or ()):
-        if one.sees:
-            own = config.of_sensor(k).model_copy(update={"preview": config.preview})
-            yield one.name, own, scene.seen_by(k), one.events is not None
 
 
 def _join(result: Explanation, name: str, one: Explanation) -> None:
@@ -114,7 +104,7 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
     """A sequence that is converted from recorded frames: nothing is rendered; the first few
     frames are converted and timed."""
     frames = config.frames
-    probe = simulate_sequence(config, index, base=base, labels=False)
+    probe = simulate_sequence(SequenceRequest(config, index, base, labels=False))
     files, flows, masks = probe.files, probe.flows, probe.masks
     duration = (len(files) - 1) / frames.fps
     result = Explanation(machine=platform.processor() or platform.machine(), seconds=0.0)
@@ -235,7 +225,7 @@ def _timed(run, times) -> float:
 def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer, result: Explanation) -> None:
     """Adds every kind of drawing, a few of each timed."""
     times = [int(t) for t in np.linspace(scene.t0_ns, scene.t1_ns, PROBES)]
-    probe = simulate_sequence(config, index, labels=False, scene=scene, renderer=renderer)
+    probe = simulate_sequence(SequenceRequest(config, index, labels=False, scene=scene, renderer=renderer))
     seen = [chunk.t_ns for chunk in islice(probe.chunks(), 2 * PROBES)]  # a short stretch of it, as it will be
     event_s = _timed(lambda t: renderer.luminance(t).view(), times)
     result.frames = _event_frames(config, probe, times, (scene.t1_ns - scene.t0_ns) * 1e-9)

@@ -1,5 +1,4 @@
-"""Generates sequences: one consumer of :func:`~blinkgl.sequence.simulate.simulate_sequence`,
-and the plainest loop around it."""
+"""Generates sequences: one consumer of :func:`~blinkgl.sequence.rig.simulate_rig`, and the plainest loop around it."""
 
 from __future__ import annotations
 
@@ -22,9 +21,11 @@ from blinkgl.imaging.metering import decibels
 from blinkgl.io.frame_camera import ExposureLine
 from blinkgl.io.tracks import TRACKS
 from blinkgl.labels import LABELS
-from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Item, Picture, Simulation, simulate_sequence
+from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Item, Picture, SequenceRequest, Simulation
 from blinkgl.sequence.clock import StageClock
+from blinkgl.sequence.rig import RigSequence, simulate_rig
 from blinkgl.sequence_files.lens_files import write_lens
+from blinkgl.sequence_files.rig_dir import RigWriter
 from blinkgl.sequence_files.sequence_dir import SequenceWriter, refuse_existing
 
 
@@ -65,29 +66,52 @@ def generate_sequence(
     gl : context to draw with; not looked at (None) for a sequence that is converted from frames.
     base : folder that relative paths in the configuration start from.
     Raises BlinkGLError for anything the user or the machine caused."""
-    if config.sensors is not None:
-        from blinkgl.dataset.rig import generate_rig  # which writes each of its sensors as is done here
-
-        return generate_rig(config, index, out, gl, base=base, progress=progress)
     report = SequenceReport(index, Path(out) / sequence_name(config.output, index))
     pictures_hz = config.preview.rate if config.preview.enabled else None
-    with (
-        simulate_sequence(config, index, gl, base=base, pictures_hz=pictures_hz) as sequence,
-        writer_of(sequence, report.path, config_yaml(sequence.config, index)) as writer,
-    ):
-        span_ns = sequence.t1_ns - sequence.t0_ns
-        with PreviewRecorder(config.preview, [sequence], writer) as preview:
-            for item in sequence:
-                write_item(writer, sequence, item)
-                preview.take(sequence, item)
+    request = SequenceRequest(config, index, base, pictures_hz=pictures_hz)
+    with simulate_rig(request, gl) as rig, folder_of(rig, report.path) as folder:
+        units = list(rig.inertial_units())  # a velocity that jumps is refused before anything is drawn
+        with PreviewRecorder(config.preview, rig.members, folder) as preview, ExitStack() as stack:
+            writers = _writers(rig, folder, stack)
+            for member, item in rig:
+                write_item(writers[member.name], member, item)
+                preview.take(member, item)
                 if isinstance(item, EventChunk) and progress is not None:
-                    report.count(sequence)
-                    progress(report, (item.t_ns - sequence.t0_ns) / span_ns)
-        report.count(sequence)
-        write_end(writer, sequence)
+                    report.count(rig)
+                    progress(report, (item.t_ns - rig.t0_ns) / (rig.t1_ns - rig.t0_ns))
+            for member in rig.members:
+                write_end(writers[member.name], member)
+        if isinstance(folder, RigWriter):
+            with rig.clock("write"):
+                for member in rig.members:
+                    folder.adopt(member.name)
+                for name, unit_config, inertial in units:
+                    folder.imu(unit_config, vars(inertial), f"{name}/")
+                folder.info.update(_shared_info(rig))
+        report.count(rig)
         flushing = StageClock()  # leaving the block waits for the writers' threads and syncs the files
-    report.finish(sequence, flushing.total)
+    report.finish(rig, flushing.total)
     return report
+
+
+def folder_of(rig: RigSequence, path: Path) -> SequenceWriter:
+    """What writes the sequence's own folder."""
+    text = config_yaml(rig.config, rig.index)
+    if rig.config.sensors is None:
+        return writer_of(rig.members[0], path, text)
+    return RigWriter(path, rig.config.sensors, config_yaml=text, t_offset_us=rig.t0_ns // 1000)
+
+
+def _writers(rig: RigSequence, folder: SequenceWriter, stack: ExitStack) -> dict[str, SequenceWriter]:
+    """What writes each camera, by name: a folder below ``folder``; a single camera has that one for itself."""
+    if not isinstance(folder, RigWriter):
+        return {rig.members[0].name: folder}
+    writers = {}
+    for member in rig.members:
+        writer = writer_of(member, folder.folder(member.name), folder.config_yaml)
+        writer.info["sensor"] = member.name
+        writers[member.name] = stack.enter_context(writer)
+    return writers
 
 
 def writer_of(sequence: Simulation, path: Path, config_text: str) -> SequenceWriter:
@@ -171,6 +195,19 @@ def manifest_info(sequence: Simulation) -> dict:
         **losses(*sequence.losses),
         **({"events_by_cause": sequence.causes} if sequence.causes else {}),
         **sequence.facts(),
+    }
+
+
+def _shared_info(rig: RigSequence) -> dict:
+    """As :func:`manifest_info`, of what the sensors of a rig have in common."""
+    facts = rig.members[0].facts() if rig.members else {}
+    common = ("opengl", "timeline", "triangles", "objects", "scene_log", "not_drawn", "dynamics")
+    return {
+        **made_by(rig.config, rig.index, rig.libraries),
+        "frames": rig.frames,
+        "labels": rig.labels,
+        "duration_us": rig.t1_ns // 1000 - rig.t0_ns // 1000,
+        **{key: facts[key] for key in common if key in facts},
     }
 
 

@@ -13,7 +13,6 @@ from blinkgl.config.reader import to_yaml
 from blinkgl.config.sequence import SequenceConfig
 
 if TYPE_CHECKING:
-    from blinkgl.sequence import Simulation
     from blinkgl.sequence.rig import RigSequence
 
 STAGES = ("scene", "render", "read-back", "events", "images", "write", "preview")
@@ -45,7 +44,7 @@ class SequenceReport:
     omissions: tuple[str, ...] = ()
     """what files of the scene ask for and is not drawn, a line per file"""
 
-    def count(self, sequence: Simulation | RigSequence) -> None:
+    def count(self, sequence: RigSequence) -> None:
         """What there is of it so far."""
         self.frames, self.events, self.labels, self.seconds = (
             sequence.frames,
@@ -55,7 +54,7 @@ class SequenceReport:
         )
         self.causes = sequence.causes
 
-    def finish(self, sequence: Simulation | RigSequence, flushed_s: float) -> None:
+    def finish(self, sequence: RigSequence, flushed_s: float) -> None:
         """All there is, now that its files are. flushed_s : what closing them took."""
         self.count(sequence)
         self.seconds["write"] += flushed_s

@@ -12,7 +12,7 @@ from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.front.rigs import Rig
-from blinkgl.front.runs import MAX_INDEX, Settings, Source, configured, scene_of
+from blinkgl.front.runs import MAX_INDEX, Settings, Source, configured, requested
 from blinkgl.front.sequences import Gathered, Recording
 from blinkgl.sequence import rig as core
 from blinkgl.sequence.inertial import Inertial
@@ -43,7 +43,7 @@ def simulate_rig(
         raise ConfigError(
             "the source is of a single camera", where="rig", value=rig, accepted="a Rig, or a preset's name; or record"
         )
-    return core.simulate_rig(config, index, base=template.base, scene=scene_of(source, config, index))
+    return core.simulate_rig(requested(source, config, index))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,13 +83,14 @@ def record_rig(
         cameras = {member.name: gathered[member.name].recording(member) for member in sequence.members}
         units = {name: one.imu for name, one in cameras.items() if one.imu is not None}
         units |= {name: measured for name, _, measured in sequence.inertial_units()}
-    config, path = sequence.config, sequence.scene.rig.path
+    config, scene = sequence.config, sequence.scene
+    assert scene is not None  # of a rig
     times = np.array([config.time.t0_ns, *config.time.label_times_ns], np.int64)
     return RigRecording(
         cameras,
         units,
         {one.name: one.place.T for one in config.sensors or ()},
         times // 1000,
-        path.poses(times),
+        scene.rig.path.poses(times),
         config,
     )

@@ -15,8 +15,8 @@ from blinkgl.front.runs import (
     Settings,
     Source,
     configured,
+    requested,
 )
-from blinkgl.front.scenes import Scene
 from blinkgl.labels import Flow, LabelFrame
 from blinkgl.render.tracks import Tracks
 from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Item, Simulation, simulate as core
@@ -60,17 +60,11 @@ def simulate_sequence(
     check.one_of(events, "events", bool, "True or False")
     if pictures_hz is not None:
         pictures_hz = check.number(pictures_hz, "pictures_hz", above=0, most=1e4)
-    return _simulation(source, config, index, events=events, pictures_hz=pictures_hz)
+    return core.simulate_sequence(requested(source, config, index, events=events, pictures_hz=pictures_hz))
 
 
 def _configured(source: Source, index: int, settings: Settings) -> SequenceConfig:
     return configured(source, **settings).sequence(check.whole(index, "index", 0, MAX_INDEX))
-
-
-def _simulation(source: Source, config: SequenceConfig, index: int, **wanted) -> Simulation:
-    if isinstance(source, Scene):
-        return core.simulate_sequence(config, index, scene=source.build(config), **wanted)
-    return core.simulate_sequence(config, index, base=source.base, **wanted)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +132,7 @@ def record(source: Source, *, index: int = 0, **settings: Unpack[Settings]) -> R
     Raises ConfigError, AssetError, GLError, EventDataError."""
     config = _configured(source, index, settings)
     gathered = Gathered()
-    with _simulation(source, config, index) as sequence:
+    with core.simulate_sequence(requested(source, config, index)) as sequence:
         for item in sequence:
             gathered.take(item)
         return gathered.recording(sequence)

@@ -17,7 +17,7 @@ from blinkgl.dataset.work import Maker, Message, failed
 from blinkgl.errors import may_pass
 from blinkgl.online.cuts import CUTS
 from blinkgl.online.job import StreamJob
-from blinkgl.sequence import simulate_sequence
+from blinkgl.sequence import SequenceRequest, simulate_sequence
 
 TRIES = 8
 """Sequences of a slot that may give nothing, before it is given up."""
@@ -56,7 +56,8 @@ class SlotMaker(Maker):
                 self.renew()
                 config = group.template.sequence(index)
                 name = sequence_name(config.output, index).split("/")[1]
-                with simulate_sequence(config, index, self.gl, base=Path(job.base), labels=False) as sequence:
+                asked = SequenceRequest(config, index, Path(job.base), labels=False)
+                with simulate_sequence(asked, self.gl) as sequence:
                     for sample in CUTS[job.kind](sequence, job, name, job.samples - made, self._dice(slot, tried, 1)):
                         sample.write(sample_file(Path(job.out), number, made))
                         made += 1

@@ -6,6 +6,16 @@ Start: simulate.py; rendered.py and recorded.py are its two sources, rig.py merg
 """
 
 from blinkgl.sequence.items import CameraImage, EventChunk, GroundTruth, Item, Picture
+from blinkgl.sequence.request import SequenceRequest
 from blinkgl.sequence.simulate import Simulation, simulate_sequence
 
-__all__ = ["CameraImage", "EventChunk", "GroundTruth", "Item", "Picture", "Simulation", "simulate_sequence"]
+__all__ = [
+    "CameraImage",
+    "EventChunk",
+    "GroundTruth",
+    "Item",
+    "Picture",
+    "SequenceRequest",
+    "Simulation",
+    "simulate_sequence",
+]

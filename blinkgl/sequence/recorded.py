@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.events.camera import EventCamera
 from blinkgl.labels import Flow, LabelFrame, asked_for
@@ -19,6 +19,7 @@ from blinkgl.rng import Role, kernel_seed
 from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.folders import flow_files, folder_of, read_flow_of, read_frame, read_mask_of, used_images
 from blinkgl.sequence.items import GroundTruth, Picture
+from blinkgl.sequence.request import SequenceRequest
 from blinkgl.sequence.simulate import Simulation
 from blinkgl.tensors.choice import make_on_device
 from blinkgl.types.events import Events
@@ -35,13 +36,11 @@ class RecordedSequence(Simulation):
     images.   flows, masks : files of labels, or none.
     Raises BlinkGLError: unreadable or unequal frames, flow that does not fit them, frames too far apart."""
 
-    def __init__(
-        self, config: SequenceConfig, index: int, *, base: Path, events: bool, labels: bool, pictures_hz: float | None
-    ):
-        clock, frames = StageClock(), config.frames
+    def __init__(self, request: SequenceRequest):
+        config, clock, frames = request.config, StageClock(), request.config.frames
         assert frames is not None
         self._recorded = frames
-        self.folder = folder_of(frames, index, base)
+        self.folder = folder_of(frames, request.index, request.base)
         self.files = used_images(frames, self.folder)
         self.flows, self.masks = flow_files(self.folder, frames, self.files)
         self._kept: dict[int, np.ndarray] = {
@@ -53,29 +52,27 @@ class RecordedSequence(Simulation):
                 for first, flow in zip(self.files, self.flows):
                     _refuse_far_apart(first, *read_flow_of(flow, size), frames.max_displacement)
         resolved = config.model_copy(
-            update={"frames": frames.model_copy(update={"folders": (os.path.relpath(self.folder, base),)})}
+            update={"frames": frames.model_copy(update={"folders": (os.path.relpath(self.folder, request.base),)})}
         )
         camera = (
             EventCamera(
                 config.events,
                 config.readout,
                 *size,
-                kernel_seed(config.seed, index, Role.EVENTS),
+                kernel_seed(config.seed, request.index, Role.EVENTS),
                 make=make_on_device,
             )
-            if events
+            if request.events
             else None
         )
         self._luminance: np.ndarray | None = None
+        pictures_hz = None if request.pictures_hz is None else min(request.pictures_hz, frames.fps * 8)
         super().__init__(
-            resolved,
-            index,
+            replace(request, config=resolved, pictures_hz=pictures_hz),
             clock,
             size=size,
             span_ns=(0, self._time_of(len(self.files) - 1, frames.fps)),
             camera=camera,
-            pictures_hz=None if pictures_hz is None else min(pictures_hz, frames.fps * 8),
-            labels=labels,
         )
 
     def _resume(self) -> None:

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,6 +33,7 @@ from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.first_look import first_look
 from blinkgl.sequence.inertial import Inertial, measured
 from blinkgl.sequence.items import GroundTruth, Item, Picture
+from blinkgl.sequence.request import SequenceRequest
 from blinkgl.sequence.simulate import Simulation
 from blinkgl.tensors.choice import make_on_device
 from blinkgl.timeline import Timeline, make_timeline
@@ -97,45 +97,31 @@ class RenderedSequence(Simulation):
     sensor : what is recorded, and through which camera. A scene that was made already is
     recorded as the configuration says.   number : of the sensor on its rig, by which noise differs."""
 
-    def __init__(
-        self,
-        config: SequenceConfig,
-        index: int,
-        gl: GLContext | None,
-        *,
-        base: Path,
-        events: bool,
-        labels: bool,
-        pictures_hz: float | None,
-        scene: Scene | None,
-        renderer: Renderer | None,
-        window_ns: tuple[int, int] | None,
-        number: int = 0,
-    ):
-        self.number = number
-        clock = StageClock()
-        scene = scene or (renderer.scene if renderer is not None else None)
+    def __init__(self, request: SequenceRequest, gl: GLContext | None):
+        self.number = request.number
+        config, index, renderer, clock = request.config, request.index, request.renderer, StageClock()
+        scene = request.scene or (renderer.scene if renderer is not None else None)
         if scene is None:
             with clock("scene"):
-                scene = sequence_scene(config, index, base)
+                scene = sequence_scene(config, index, request.base)
         with ExitStack() as stack:
             if renderer is None:
                 gl = gl or stack.enter_context(create_context(config.gl.backend, config.gl.device))
                 renderer = stack.enter_context(Renderer(gl, scene, config.render))
-            size, span_ns = (renderer.height, renderer.width), window_ns or (scene.t0_ns, scene.t1_ns)
+            size, span_ns = (renderer.height, renderer.width), request.window_ns or (scene.t0_ns, scene.t1_ns)
             self.scene, self.renderer, self.omissions = scene, renderer, scene.omissions
             if scene.dynamics is not None:
                 self.libraries = {scene.dynamics.engine: scene.dynamics.version}
             self.sensor = recording(scene, config).sensors[0]
             self.name = self.sensor.folder
-            if labels and self.sensor.labels is not None:
+            if request.labels and self.sensor.labels is not None:
                 for name in asked_for(self.sensor.labels):
                     LABELS[name].check(scene, self.sensor.labels)
             self.triangles, self._before = renderer.triangles, (renderer.stats.render_s, renderer.stats.readback_s)
             camera = None
-            if events:
+            if request.events:
                 emulator, readout = self.sensor.emulator, self.sensor.readout
-                seed = kernel_seed(config.seed, index, Role.EVENTS, number)
+                seed = kernel_seed(config.seed, index, Role.EVENTS, request.number)
                 camera = EventCamera(
                     emulator,
                     readout,
@@ -145,20 +131,10 @@ class RenderedSequence(Simulation):
                     partial(make_on_device, gl=renderer.gl),
                 )
                 self.timeline = timeline_of(config, scene, renderer, span_ns)
-            if labels and config.images is not None:
-                seed = kernel_seed(config.seed, index, Role.IMAGES, number)
+            if request.labels and config.images is not None:
+                seed = kernel_seed(config.seed, index, Role.IMAGES, request.number)
                 self.frame_camera = FrameCamera(renderer, config.images, seed, span_ns)
-            super().__init__(
-                config,
-                index,
-                clock,
-                size=size,
-                span_ns=span_ns,
-                pictures_hz=pictures_hz,
-                camera=camera,
-                labels=labels,
-                stack=stack.pop_all(),
-            )
+            super().__init__(request, clock, size=size, span_ns=span_ns, camera=camera, stack=stack.pop_all())
 
     def _resume(self) -> None:
         self.renderer.gl.resume()

@@ -1,10 +1,10 @@
-"""Several sensors on one rig: their sequences, merged by time.
+"""The sensors on one rig: their sequences, merged by time. A single camera is a rig of one.
 
-    with simulate_rig(config, index, gl) as rig:
+    with simulate_rig(SequenceRequest(config, index), gl) as rig:
         for member, item in rig:
-            member.sensor.folder, item
+            member.name, item
 
-Each camera is a :class:`~blinkgl.sequence.rendered.RenderedSequence` of its own, which sees the scene from its place;
+Each camera is a :class:`~blinkgl.sequence.simulate.Simulation` of its own, which sees the scene from its place;
 they share the scene, OpenGL, meshes, textures, shadow maps and the times of frames.
 """
 
@@ -12,8 +12,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from operator import itemgetter
-from pathlib import Path
 from typing import Any
 
 from blinkgl.config.sequence import SequenceConfig
@@ -25,75 +25,72 @@ from blinkgl.scene.types import Scene
 from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.inertial import Inertial, measured
 from blinkgl.sequence.items import Item
-from blinkgl.sequence.rendered import RenderedSequence
+from blinkgl.sequence.request import SequenceRequest
+from blinkgl.sequence.simulate import Simulation, simulate_sequence
 from blinkgl.timeline import together
 
 
-def simulate_rig(
-    config: SequenceConfig,
-    index: int = 0,
-    gl: GLContext | None = None,
-    *,
-    base: Path = Path("."),
-    pictures_hz: float | None = None,
-    scene: Scene | None = None,
-) -> RigSequence:
-    """Sequence ``index`` of a run whose configuration has ``sensors``; arguments as of
-    :func:`~blinkgl.sequence.simulate.simulate_sequence`. Raises BlinkGLError."""
-    return RigSequence(config, index, gl, base=base, pictures_hz=pictures_hz, scene=scene)
+def simulate_rig(request: SequenceRequest, gl: GLContext | None = None) -> RigSequence:
+    """A sequence with all cameras of its configuration, be it one or several.
+
+    gl : context to draw with; None: one of its own, where something is drawn at all. Raises BlinkGLError."""
+    clock, config, index = StageClock(), request.config, request.index
+    with ExitStack() as stack:
+        if config.sensors is None:
+            alone = stack.enter_context(simulate_sequence(request, gl))
+            return RigSequence(alone.config, index, clock, [alone], alone, stack.pop_all())
+        with clock("scene"):
+            scene = request.scene or sequence_scene(config, index, request.base)
+        members = list(_rendered(request, scene, gl, stack))
+        timed = [member for member in members if member.timeline is not None]
+        shared = together([member.timeline for member in timed if member.timeline is not None])
+        for member, timeline in zip(timed, shared, strict=True):
+            member.timeline = timeline
+        return RigSequence(config, index, clock, members, scene, stack.pop_all())
+
+
+def _rendered(request: SequenceRequest, scene: Scene, gl: GLContext | None, stack: ExitStack) -> Iterator[Simulation]:
+    """The cameras of a rig, which share what the first one's renderer holds; ``stack`` lets go of it."""
+    settings, first = request.config.gl, None
+    for number, _, config, gives_events in request.config.cameras():
+        gl = gl or stack.enter_context(create_context(settings.backend, settings.device))
+        renderer = stack.enter_context(Renderer(gl, scene.seen_by(number), config.render, beside=first))
+        first = first or renderer
+        own = replace(
+            request,
+            config=config,
+            events=gives_events,
+            # of a camera without events at the frames of nobody: it has none
+            pictures_hz=request.pictures_hz if gives_events else None,
+            scene=scene.seen_by(number),
+            renderer=renderer,
+            number=number,
+        )
+        yield simulate_sequence(own, gl)
 
 
 class RigSequence:
     """Iterate over it once: (member, what happens there), in time order; of what happens at one time that of the first
     sensor comes first. It holds OpenGL until its end, or that of its ``with`` block.
 
-    config : of the rig.   members : of its cameras, in their order; ``member.sensor.folder`` is the sensor's name.
-    scene : with all sensors.   clock : wall seconds per stage, but those of the members."""
+    config : of the rig, every value as drawn.   members : of its cameras, in their order; ``member.name`` is the
+    sensor's, "" of a single camera.   scene : with all sensors; None of a single camera.
+    t0_ns, t1_ns : first and last time, ns.   clock : wall seconds per stage, but those of the members.
+    omissions : what files of the scene ask for and is not drawn, a line per file."""
 
     def __init__(
         self,
         config: SequenceConfig,
         index: int,
-        gl: GLContext | None,
-        *,
-        base: Path,
-        pictures_hz: float | None,
-        scene: Scene | None = None,
+        clock: StageClock,
+        members: list[Simulation],
+        whole: Scene | Simulation,
+        stack: ExitStack,
     ):
-        self.config, self.index, self.clock, self.pictures_hz = config, index, StageClock(), pictures_hz
-        with self.clock("scene"):
-            self.scene = scene or sequence_scene(config, index, base)
-        self.t0_ns, self.t1_ns = self.scene.t0_ns, self.scene.t1_ns
-        self.members: list[RenderedSequence] = []
-        with ExitStack() as stack:
-            renderers: list[Renderer] = []
-            for k, one in enumerate(config.sensors or ()):
-                if not one.sees:
-                    continue
-                gl = gl or stack.enter_context(create_context(config.gl.backend, config.gl.device))
-                beside = renderers[0] if renderers else None
-                renderers.append(stack.enter_context(Renderer(gl, self.scene.seen_by(k), config.render, beside=beside)))
-                self.members.append(
-                    RenderedSequence(
-                        config.of_sensor(k),
-                        index,
-                        gl,
-                        base=base,
-                        events=one.events is not None,
-                        labels=True,
-                        # of a camera without events at the frames of nobody: it has none
-                        pictures_hz=pictures_hz if one.events is not None else None,
-                        scene=self.scene.seen_by(k),
-                        renderer=renderers[-1],
-                        window_ns=None,
-                        number=k,
-                    )
-                )
-            timed = [member for member in self.members if member.timeline is not None]
-            shared = together([member.timeline for member in timed if member.timeline is not None])
-            for member, timeline in zip(timed, shared, strict=True):
-                member.timeline = timeline
-            self._stack = stack.pop_all()
+        self.config, self.index, self.clock, self.members = config, index, clock, members
+        self.scene = whole if isinstance(whole, Scene) else None
+        self.t0_ns, self.t1_ns, self.omissions = whole.t0_ns, whole.t1_ns, whole.omissions
+        self._stack = stack
 
     def __enter__(self) -> RigSequence:
         return self
@@ -105,7 +102,7 @@ class RigSequence:
         """Lets go of OpenGL. Harmless when repeated."""
         self._stack.close()
 
-    def __iter__(self) -> Iterator[tuple[RenderedSequence, Item]]:
+    def __iter__(self) -> Iterator[tuple[Simulation, Item]]:
         with self:
             waiting = [(iter(member), member) for member in self.members]
             heads = [next(items, None) for items, _ in waiting]
@@ -118,7 +115,7 @@ class RigSequence:
         """(name, configuration, what it measured) of the sensors that are inertial units and nothing else; those of
         cameras are ``member.imu()``. Raises ConfigError where the rig's velocity jumps."""
         for k, one in enumerate(self.config.sensors or ()):
-            if one.imu is not None and not one.sees:
+            if one.imu is not None and not one.sees and self.scene is not None:
                 path = self.scene.rig.path_of(self.scene.sensors[k])
                 rng = generator(self.config.seed, self.index, Role.IMU, k)
                 yield one.name, one.imu, measured(path, one.imu, self.t0_ns, self.t1_ns, rng)
@@ -153,10 +150,6 @@ class RigSequence:
     def achieved(self) -> dict[str, Any]:
         """Of the first camera's timeline: all have the same times."""
         return self.members[0].achieved if self.members else {}
-
-    @property
-    def omissions(self) -> tuple[str, ...]:
-        return self.scene.omissions
 
     @property
     def libraries(self) -> Mapping[str, str]:

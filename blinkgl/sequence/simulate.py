@@ -1,6 +1,6 @@
 """``simulate_sequence``: what happens in a sequence, in the order of time. Writing it down is one consumer of many.
 
-    with simulate_sequence(config, index, gl) as sequence:
+    with simulate_sequence(SequenceRequest(config, index), gl) as sequence:
         for item in sequence:
             match item:
                 case EventChunk(t_ns, events): ...
@@ -18,91 +18,43 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from blinkgl.camera import CameraModel
-from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.events.camera import EventCamera
 from blinkgl.gl import GLContext
 from blinkgl.imaging import FrameCamera
-from blinkgl.render.renderer import Renderer
 from blinkgl.render.tracks import Tracks
-from blinkgl.scene.types import Scene
 from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.inertial import Inertial
 from blinkgl.sequence.items import CameraImage, EventChunk, GroundTruth, Item, Picture
+from blinkgl.sequence.request import SequenceRequest
 from blinkgl.timeline import Ticks, Timeline
 from blinkgl.types.events import Events, count_causes, named_causes
 
 
-def simulate_sequence(
-    config: SequenceConfig,
-    index: int = 0,
-    gl: GLContext | None = None,
-    *,
-    base: Path = Path("."),
-    events: bool = True,
-    labels: bool = True,
-    pictures_hz: float | None = None,
-    scene: Scene | None = None,
-    renderer: Renderer | None = None,
-    window_ns: tuple[int, int] | None = None,
-) -> Simulation:
-    """Sequence ``index`` of a run, ready to be iterated over: :class:`EventChunk`, :class:`GroundTruth`,
+def simulate_sequence(request: SequenceRequest, gl: GLContext | None = None) -> Simulation:
+    """The sequence of a single camera, ready to be iterated over: :class:`EventChunk`, :class:`GroundTruth`,
     :class:`CameraImage` and :class:`Picture` in time order.
 
     gl : context to draw with; None: one of its own, where something is drawn at all.
-    base : folder that relative paths in the configuration start from.
-    events, labels : False leaves them out, ``labels`` ground truth and the frame camera's images; what ``labels:`` and
-    ``images:`` do not ask for is left out anyway. Nothing is drawn that nobody asked for.
-    pictures_hz : pictures per second of simulated time, at the frames of the event pass; None: none.
-    scene : made already, instead of the configuration's.   renderer : made already, and not
-    released at the end; its scene is drawn.
-    window_ns : first and last time, ns, instead of all of the sequence. (These three: of
-    what is drawn, not of recorded frames.)
     Raises BlinkGLError for anything the user or the machine caused, here or while iterating."""
-    if pictures_hz is not None and not events:
-        raise ConfigError(
-            "pictures are of event frames, and there are none",
-            where="pictures_hz",
-            value=pictures_hz,
-            accepted="None, or events=True",
-        )
-    if config.sensors is not None:
+    if request.config.sensors is not None:
         raise ConfigError(
             "several sensors are simulated together, not as one camera",
             where="sensors",
-            value=[one.name for one in config.sensors],
+            value=[one.name for one in request.config.sensors],
             accepted="record_rig or simulate_rig, or a configuration of a single camera",
         )
     # They import this module, for what they share.
     from blinkgl.sequence.recorded import RecordedSequence
     from blinkgl.sequence.rendered import RenderedSequence
 
-    wanted = dict(events=events, labels=labels, pictures_hz=pictures_hz)
-    if config.frames is None:
-        return RenderedSequence(
-            config,
-            index,
-            gl,
-            base=base,
-            scene=scene,
-            renderer=renderer,
-            window_ns=window_ns,
-            **wanted,
-        )
-    if scene is not None or renderer is not None or window_ns is not None:
-        raise ConfigError(
-            "nothing is drawn of recorded frames",
-            where="frames",
-            accepted="no scene, renderer or window_ns",
-        )
-    return RecordedSequence(config, index, base=base, **wanted)
+    return RenderedSequence(request, gl) if request.config.frames is None else RecordedSequence(request)
 
 
 class _Due:
@@ -153,22 +105,19 @@ class Simulation(ABC):
 
     def __init__(
         self,
-        config: SequenceConfig,
-        index: int,
+        request: SequenceRequest,
         clock: StageClock,
         *,
         size: tuple[int, int],
         span_ns: tuple[int, int],
-        pictures_hz: float | None,
         camera: EventCamera | None,
-        labels: bool,
         stack: ExitStack | None = None,
     ):
-        self.config, self.index, self.clock, self.camera = config, index, clock, camera
+        self.config, self.index, self.clock, self.camera = request.config, request.index, clock, camera
         (self.height, self.width), (self.t0_ns, self.t1_ns) = size, span_ns
-        self.pictures_hz, self.events, self.labels = pictures_hz, 0, 0
+        self.pictures_hz, self.events, self.labels = request.pictures_hz, 0, 0
         self._by_cause = count_causes(Events.empty())
-        self._labels, self._stack, self._begun = labels, stack or ExitStack(), False
+        self._labels, self._stack, self._begun = request.labels, stack or ExitStack(), False
 
     def __enter__(self) -> Simulation:
         return self

@@ -15,8 +15,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from blinkgl.config.run import RunTemplate, apply_overrides
+from blinkgl.config.run import RunTemplate
 from blinkgl.config.sequence import SequenceConfig
+from blinkgl.config.trees import apply_overrides
 from blinkgl.errors import ConfigError
 from blinkgl.events import Events, emulator_of
 from blinkgl.events.grids import masked
@@ -26,7 +27,7 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.types import Scene
-from blinkgl.sequence import Simulation, simulate_sequence
+from blinkgl.sequence import SequenceRequest, Simulation, simulate_sequence
 from blinkgl.trade.labels import flow_errors
 from blinkgl.trade.metrics import EventErrors, SpeedMaps, event_errors
 from blinkgl.trade.reference import FineTiles, reference_events
@@ -274,8 +275,9 @@ class Bench:
         config = config.model_copy(update={"events": self.emulator, "readout": None})
 
         def clip(end_ns: int) -> Simulation:
+            window_ns = self.t0_ns, end_ns
             return simulate_sequence(
-                config, self.options.sequence, labels=False, renderer=renderer, window_ns=(self.t0_ns, end_ns)
+                SequenceRequest(config, self.options.sequence, labels=False, renderer=renderer, window_ns=window_ns)
             )
 
         for _ in clip(self.t0_ns + (self.t1_ns - self.t0_ns) // 20):  # programs, targets, kernels: made the first time

@@ -21,6 +21,7 @@ from blinkgl.imaging import CameraImage
 from blinkgl.io.frame_camera import read_codes, read_exposures
 from blinkgl.report.collect import collect
 from blinkgl.sequence import EventChunk, GroundTruth, simulate_sequence
+from blinkgl.sequence.request import SequenceRequest
 
 RUN = {
     "seed": 5,
@@ -89,7 +90,7 @@ def test_the_same_seed_gives_the_same_bytes_with_workers(made, tmp_path, monkeyp
 def test_images_come_in_time_between_events_and_labels(made):
     config = template().sequence(0)
     seen, times = [], []
-    for item in simulate_sequence(config, 0):
+    for item in simulate_sequence(SequenceRequest(config, 0)):
         if isinstance(item, EventChunk):
             assert not len(item.events) or item.events.t[0] >= (times[-1] // 1000 if times else 0)
             done_us = item.t_ns // 1000
@@ -104,11 +105,15 @@ def test_images_come_in_time_between_events_and_labels(made):
     for k in (0, 9):
         for name, codes in images[k].pictures.items():
             np.testing.assert_array_equal(codes, read_codes(made[0].path / f"frame_camera/{name}/{k:06d}.png"))
-    alone = [item for item in simulate_sequence(config, 0, events=False) if isinstance(item, CameraImage)]
+    alone = [
+        item for item in simulate_sequence(SequenceRequest(config, 0, events=False)) if isinstance(item, CameraImage)
+    ]
     assert all(np.array_equal(a.image, b.image) for a, b in zip(images, alone, strict=True)), (
         "whoever else is drawn for"
     )
-    assert not any(isinstance(item, CameraImage) for item in simulate_sequence(config, 0, labels=False))
+    assert not any(
+        isinstance(item, CameraImage) for item in simulate_sequence(SequenceRequest(config, 0, labels=False))
+    )
 
 
 def test_events_and_labels_are_what_they_are_without_it(made, tmp_path):

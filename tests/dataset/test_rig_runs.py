@@ -22,6 +22,7 @@ from blinkgl.io.imu import read_imu
 from blinkgl.render.reference import render as by_reference
 from blinkgl.scene.build import sequence_scene
 from blinkgl.sequence import simulate_sequence
+from blinkgl.sequence.request import SequenceRequest
 from blinkgl.sequence.rig import simulate_rig
 from blinkgl.sequence_files.index import made_folders, read_index, sequence_folders
 from blinkgl.sequence_files.rig_dir import read_rig
@@ -223,7 +224,7 @@ def test_a_damaged_eye_is_made_again_with_its_rig(pair, tmp_path):
 
 def test_items_come_in_the_order_of_time(pair):
     config = config_of(pair)
-    with create_context() as gl, simulate_rig(config, 0, gl, base=pair) as rig:
+    with create_context() as gl, simulate_rig(SequenceRequest(config, 0, base=pair), gl) as rig:
         seen = [(item.t_ns, member.name) for member, item in rig]
         frames = {member.name: member.frames for member in rig.members}
     assert [t for t, _ in seen] == sorted(t for t, _ in seen) and {n for _, n in seen} == {"left", "right", "rgb"}
@@ -232,7 +233,7 @@ def test_items_come_in_the_order_of_time(pair):
 
 def test_one_door_for_several_sensors(pair):
     with pytest.raises(ConfigError, match="several sensors are simulated together"):
-        simulate_sequence(config_of(pair))
+        simulate_sequence(SequenceRequest(config_of(pair)))
 
 
 def test_a_sensor_moves_no_other(pair, tmp_path):
@@ -252,7 +253,7 @@ def _events(config, base):
     from blinkgl.sequence import EventChunk
     from blinkgl.types.events import Events
 
-    with create_context() as gl, simulate_rig(config, 0, gl, base=base) as rig:
+    with create_context() as gl, simulate_rig(SequenceRequest(config, 0, base=base), gl) as rig:
         return Events.concatenate([i.events for m, i in rig if m.name == "left" and isinstance(i, EventChunk)])
 
 

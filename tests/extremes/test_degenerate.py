@@ -290,9 +290,11 @@ def test_the_message_names_what_is_seen_where_and_when(gl, color, background, se
         ) as caught:
             list(
                 simulate_sequence(
-                    SequenceConfig(timeline=UniformTimeline(fps=100), events=EsimConfig()),
-                    labels=False,
-                    renderer=renderer,
+                    SequenceRequest(
+                        SequenceConfig(timeline=UniformTimeline(fps=100), events=EsimConfig()),
+                        labels=False,
+                        renderer=renderer,
+                    )
                 )
             )
     assert "\n" not in str(caught.value)

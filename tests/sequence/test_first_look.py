@@ -22,6 +22,7 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import sequence_scene
 from blinkgl.sequence import EventChunk, simulate_sequence
 from blinkgl.sequence.first_look import BINS, FINER, LEAST_EVENTS, TILES, TRUE, WORTH, Look, first_look
+from blinkgl.sequence.request import SequenceRequest
 from test_simulate_sequence import SMALL, assert_same
 
 CLIPS = Path(__file__).parents[2] / "configs" / "trade"
@@ -34,7 +35,7 @@ def clip(name: str, *overrides: str):
 
 def look_at(gl, name: str, *overrides: str) -> dict:
     config, base = clip(name, *overrides)
-    with simulate_sequence(config, 0, gl, base=base, labels=False) as sequence:
+    with simulate_sequence(SequenceRequest(config, 0, base=base, labels=False), gl) as sequence:
         return {**sequence.timeline.info(), "used": sequence.timeline.config.max_px}
 
 
@@ -94,7 +95,7 @@ def test_events_are_those_of_the_step_that_it_chose(gl, name):
     config, base = clip(name, *small)
 
     def events_of(config):
-        with simulate_sequence(config, 0, gl, base=base, labels=False) as sequence:
+        with simulate_sequence(SequenceRequest(config, 0, base=base, labels=False), gl) as sequence:
             chunks = [item.events for item in sequence if isinstance(item, EventChunk)]
             return Events.concatenate(chunks), sequence.timeline.config.max_px
 

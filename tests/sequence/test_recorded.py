@@ -12,6 +12,7 @@ import yaml
 from blinkgl.config.run import load_run
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.sequence import EventChunk, GroundTruth, Picture, simulate_sequence
+from blinkgl.sequence.request import SequenceRequest
 
 H, W, N, FPS = 6, 8, 5, 20
 
@@ -55,7 +56,7 @@ def opened(clip: Path, index: int = 0, folders=("clip",), tree=None, **wanted):
             }
         )
     )
-    return simulate_sequence(load_run(path).sequence(0), index, base=clip.parent, **wanted)
+    return simulate_sequence(SequenceRequest(load_run(path).sequence(0), index, base=clip.parent, **wanted))
 
 
 def truths(sequence) -> list[GroundTruth]:

@@ -16,6 +16,7 @@ from blinkgl.gl import create_context
 from blinkgl.io.formats import open_events
 from blinkgl.render.renderer import Renderer
 from blinkgl.sequence import EventChunk, GroundTruth, Picture, simulate_sequence
+from blinkgl.sequence.request import SequenceRequest
 
 SMALL = {
     "seed": 4,
@@ -66,7 +67,7 @@ def assert_same(a: Events, b: Events) -> None:
 def test_ground_truth_comes_between_the_events_before_and_after_its_time(tmp_path, gl, changes):
     """The label rate and the frames' have no common divisor, so most labels lie inside a chunk."""
     config = config_of(tmp_path, **changes)
-    with simulate_sequence(config, 0, gl, pictures_hz=50) as sequence:
+    with simulate_sequence(SequenceRequest(config, 0, pictures_hz=50), gl) as sequence:
         items = list(sequence)
     last_us, done_us, inside = None, config.time.t0_ns // 1000, 0
     for item in items:
@@ -112,7 +113,7 @@ def test_what_is_asked_for_is_what_is_drawn(tmp_path, gl, monkeypatch):
         ("labels", {"events": False}),
     ):
         drawn.clear()
-        made[name] = list(simulate_sequence(config, 0, gl, **wanted))
+        made[name] = list(simulate_sequence(SequenceRequest(config, 0, **wanted), gl))
         expected = {
             "everything": {"luminance", "velocity_of_movers", "colour", "labels", "velocity"},
             "events": {"luminance", "velocity_of_movers"},
@@ -152,7 +153,7 @@ def test_what_is_asked_for_is_what_is_drawn(tmp_path, gl, monkeypatch):
 def test_files_hold_what_happens(tmp_path, gl, changes):
     config = config_of(tmp_path, **changes)
     (report,) = generate_run(load_run(tmp_path / "run.yaml"), tmp_path / "out")
-    with simulate_sequence(config, 0, gl) as sequence:
+    with simulate_sequence(SequenceRequest(config, 0), gl) as sequence:
         items = list(sequence)
     assert_same(events_of(items), open_events(report.path / "events.h5").read())
     assert sequence.camera.dropped > 0 and (report.events, report.frames, report.labels) == (
@@ -180,9 +181,9 @@ def test_opengl_is_let_go_however_it_ends(tmp_path, how, monkeypatch):
 
     def consume():
         if how == "never begun":
-            with simulate_sequence(config, 0) as sequence:
+            with simulate_sequence(SequenceRequest(config, 0)) as sequence:
                 return sequence
-        sequence = simulate_sequence(config, 0)
+        sequence = simulate_sequence(SequenceRequest(config, 0))
         for k, _ in enumerate(sequence):
             if how == "break" and k == 5:
                 break
@@ -201,15 +202,17 @@ def test_opengl_is_let_go_however_it_ends(tmp_path, how, monkeypatch):
 
 def test_a_renderer_that_is_lent_is_not_released(tmp_path, gl):
     config = config_of(tmp_path)
-    with simulate_sequence(config, 0, gl) as sequence:
+    with simulate_sequence(SequenceRequest(config, 0), gl) as sequence:
         scene = sequence.scene
     with Renderer(gl, scene, config.render) as renderer:
-        first, second = (list(simulate_sequence(config, 0, labels=False, renderer=renderer)) for _ in range(2))
+        first, second = (
+            list(simulate_sequence(SequenceRequest(config, 0, labels=False, renderer=renderer))) for _ in range(2)
+        )
         assert_same(events_of(first), events_of(second))
 
 
 def test_it_is_iterated_over_once(tmp_path, gl):
-    sequence = simulate_sequence(config_of(tmp_path), 0, gl, events=False)
+    sequence = simulate_sequence(SequenceRequest(config_of(tmp_path), 0, events=False), gl)
     assert len(list(sequence)) == 4
     with pytest.raises(ConfigError, match="^simulate_sequence: a simulation is iterated over once"):
         iter(sequence)
@@ -218,9 +221,9 @@ def test_it_is_iterated_over_once(tmp_path, gl):
 def test_two_at_once_are_as_one_after_the_other(tmp_path):
     """Each has a context of its own, and draws in it, whoever drew last."""
     config = config_of(tmp_path, labels={"flow": ["forward"]})
-    alone = list(simulate_sequence(config, 0))
+    alone = list(simulate_sequence(SequenceRequest(config, 0)))
     other = create_context()
-    with other, simulate_sequence(config, 0) as a, simulate_sequence(config, 0) as b:
+    with other, simulate_sequence(SequenceRequest(config, 0)) as a, simulate_sequence(SequenceRequest(config, 0)) as b:
         together = []
         for x, _ in zip(a, b, strict=True):
             together += [x]

@@ -11,6 +11,7 @@ from blinkgl.config.sequence import SequenceConfig
 from blinkgl.events import Events
 from blinkgl.scene.build import sequence_scene
 from blinkgl.sequence import simulate_sequence
+from blinkgl.sequence.request import SequenceRequest
 from blinkgl.timeline import bounded_times
 from blinkgl.trade.matching import match_events
 
@@ -58,7 +59,10 @@ def falling():
 
 def events_at_the_impact(gl, scene, at, **timeline):
     with simulate_sequence(
-        configuration(**timeline), 0, gl, scene=scene, labels=False, window_ns=(at - 12 * MS, at + 12 * MS)
+        SequenceRequest(
+            configuration(**timeline), 0, scene=scene, labels=False, window_ns=(at - 12 * MS, at + 12 * MS)
+        ),
+        gl,
     ) as sequence:
         return Events.concatenate([chunk.events for chunk in sequence])
 
@@ -97,5 +101,5 @@ def test_frames_are_drawn_at_impacts(gl, falling):
     scene, _ = falling
     (at,) = scene.dynamics.impacts_ns
     config = configuration(kind="displacement", max_px=2.0)
-    with simulate_sequence(config, 0, gl, scene=scene, labels=False) as sequence:
+    with simulate_sequence(SequenceRequest(config, 0, scene=scene, labels=False), gl) as sequence:
         assert at in [chunk.t_ns for chunk in sequence]

@@ -75,11 +75,11 @@ def not_asked_for(wanted: set[str], manifest: dict[str, Any]) -> list[str]:
 def files_of_rig(config: SequenceConfig) -> Iterator[str]:
     """Names of the files of a rig's sequence, its manifest left out."""
     yield from ("config.yaml", RIG)
-    for k, one in enumerate(config.sensors or ()):
-        if one.sees:
-            yield f"{one.name}/{MANIFEST}"
-            yield from (f"{one.name}/{file}" for file in _files_of(config.of_sensor(k), one.events is not None))
-        elif one.imu is not None:
+    for _, name, own, gives_events in config.cameras():
+        yield f"{name}/{MANIFEST}"
+        yield from (f"{name}/{file}" for file in _files_of(own, gives_events))
+    for one in config.sensors or ():
+        if one.imu is not None and not one.sees:
             yield from (f"{one.name}/{file}" for file in IMU_FILES)
     if config.preview.enabled and any(one.events is not None for one in config.sensors or ()):
         yield "preview.mp4"

@@ -56,18 +56,17 @@ def look_at_rig(folder: Path, name: str, manifest: dict[str, Any], config: Seque
         return problems
     if problems := not_asked_for(set(files_of_rig(config)), manifest):
         return problems
-    for one in config.sensors:
-        if one.sees:
-            inside = guarded(lambda one=one: look_at_sensor(read_manifest(folder / one.name), config))
-            problems += [f"{one.name}/{line}" for line in inside]
-    total = sum(read_manifest(folder / one.name)["events"] for one in config.sensors if one.sees)
+    names = [name for _, name, _, _ in config.cameras()]
+    for name in names:
+        inside = guarded(lambda name=name: look_at_sensor(read_manifest(folder / name), config))
+        problems += [f"{name}/{line}" for line in inside]
+    total = sum(read_manifest(folder / name)["events"] for name in names)
     return problems or unlike(manifest, [("events", total)])
 
 
 def look_at_sensor(manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
     """Problems of the folder of one camera of a rig, whose configuration is the rig's."""
-    number = {one.name: k for k, one in enumerate(config.sensors or ()) if one.sees}.get(str(manifest.get("sensor")))
-    if number is None or config.sensors is None:
-        return [f"{MANIFEST}: sensor is {shown(manifest.get('sensor'))}, of which config.yaml says nothing"]
-    own, events = config.of_sensor(number), config.sensors[number].events is not None
-    return bound(".", manifest, own, events)
+    for _, name, own, gives_events in config.cameras():
+        if name == manifest.get("sensor"):
+            return bound(".", manifest, own, gives_events)
+    return [f"{MANIFEST}: sensor is {shown(manifest.get('sensor'))}, of which config.yaml says nothing"]

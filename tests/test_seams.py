@@ -41,7 +41,7 @@ from blinkgl.labels import (
 )
 from blinkgl.labels.files import npy
 from blinkgl.recordings.simulation import frames_to_events
-from blinkgl.render.reference import scene_parts
+from blinkgl.render.casting import scene_parts
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.tools.config_docs import page
@@ -114,7 +114,7 @@ SMALL = {
     "scene": {
         "kind": "random",
         "objects": {"count": 3, "distance": [2, 4]},
-        "pool": {"primitives": ["cuboid", "sphere"], "variants": 2, "urdfs": False},
+        "pool": {"primitives": ["cuboid", "sphere"], "variants": 2},
         "textures": {"procedural": ["checks", "fbm"], "variants": 2, "photographs": False, "max_size": 64},
     },
     "events": {"emulator": "toy", "dead_us": {"uniform": [100, 2000]}},

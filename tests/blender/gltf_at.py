@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from blinkgl.scene.importing import gltf
+from blinkgl.scene.importing.raw_mesh import Z_UP
 
 
 class Played:
@@ -79,7 +80,7 @@ class Played:
 
     def camera(self, name: str, t: float) -> np.ndarray:
         """(4, 4) of a camera in Blender's world: it looks along its -z."""
-        return gltf.Z_UP @ self.world(self.node(name), t)
+        return Z_UP @ self.world(self.node(name), t)
 
     def positions(self, name: str, t: float) -> np.ndarray:
         """(V, 3) of all primitives of a node, one after the other, in Blender's world."""
@@ -101,7 +102,7 @@ class Played:
                 found.append(p @ T[:3, :3].T + T[:3, 3])
                 continue
             found.append(self._skinned(p, primitive["attributes"], self.tree["skins"][raw["skin"]], t))
-        turn = gltf.Z_UP[:3, :3]
+        turn = Z_UP[:3, :3]
         return np.concatenate(found) @ turn.T
 
     def _skinned(self, p, attributes, skin, t):

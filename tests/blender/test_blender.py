@@ -19,7 +19,7 @@ from blinkgl.blender.importing import Imported, import_scene
 from blinkgl.camera import PinHole
 from blinkgl.config.deform import AnimationConfig
 from blinkgl.errors import BlinkGLError
-from blinkgl.scene.importing.mesh_files import load_asset
+from blinkgl.scene.importing.mesh_files import clip_of, load_asset
 from blinkgl.scene.worlds.from_file import from_gltf
 from gltf_at import Played
 
@@ -193,7 +193,7 @@ def test_a_clip_without_skin(imported):
     figure, clip = imported("mixamo.fbx"), imported("mixamo_clip.fbx")
     assert clip.report.counts["meshes"] == 0 and clip.report.counts["animations"] == 1
     animation = AnimationConfig(file=str(clip.path), loop=False)
-    parts = load_asset(figure.path, animation=animation, base=clip.path.parent).parts
+    parts = load_asset(figure.path, play=clip_of(animation, clip.path.parent)).parts
 
     def at(t: float) -> np.ndarray:
         return np.concatenate([p.mesh.deformer.positions(p.mesh, round(t * NS)) for p in parts])

@@ -31,7 +31,7 @@ SMALL = {
     "scene": {
         "kind": "random",
         "objects": {"count": 3},
-        "pool": {"primitives": ["cuboid", "sphere"], "variants": 2, "urdfs": False},
+        "pool": {"primitives": ["cuboid", "sphere"], "variants": 2},
         "textures": {"procedural": ["checks", "fbm"], "variants": 2, "photographs": False, "max_size": 64},
     },
     "labels": {
@@ -288,7 +288,7 @@ def test_existing_output_is_refused_before_any_work(tmp_path, capsys, monkeypatc
     [
         ("camera.widht=3", "camera.widht: unknown key; expected 'width' (nearest)"),
         ("scene.pool.folders=[nowhere]", "scene.pool.folders.0: "),
-        ("scene.pool={primitives: [], urdfs: false}", "scene.pool: "),
+        ("scene.pool={primitives: []}", "scene.pool: "),
         ("gl={backend: egl, device: 99}", "gl"),
         ("events.emulator=blender", "events.emulator: unknown choice"),
     ],

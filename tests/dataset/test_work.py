@@ -126,7 +126,7 @@ EXPLAINED = {
         "kind": "random",
         "objects": {"count": 3},
         "textures": {"photographs": False, "max_size": 64, "variants": 2},
-        "pool": {"primitives": ["cuboid"], "variants": 2, "urdfs": False},
+        "pool": {"primitives": ["cuboid"], "variants": 2},
     },
     "labels": {"flow": ["forward", "backward"], "depth": True, "ids": True},
     "preview": {"enabled": True, "rate": 30},

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from blinkgl import Camera, ConfigError, Keyframes, Primitive, Scene, look_at, record
 from blinkgl.config.imu import ImuConfig, imu_times
 from blinkgl.io.imu import imu_csv
-from blinkgl.scene.motion.paths import KeyframePath, SplinePath, StaticPath
+from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.sequence.inertial import measured, place_of
 
 S = 1_000_000_000
@@ -58,7 +58,7 @@ def test_integrated_over_ten_seconds_it_gives_the_flight_back():
     rng = RNG(0)
     knots = np.arange(0, 11 * S + 1, S)
     turns = Rotation.from_rotvec(np.cumsum(rng.normal(size=(len(knots), 3)) * 0.4, axis=0))
-    path = SplinePath(knots, rng.normal(size=(len(knots), 3)), turns)
+    path = KeyframePath(knots, rng.normal(size=(len(knots), 3)), turns)
     config = ImuConfig(rate=1000, position=(0.1, -0.2, 0.05), rotation=(10, 20, 30))
     got = measured(path, config, 0, 10 * S, rng)
     T = place_of(config)

@@ -120,7 +120,7 @@ def test_moved_back_by_its_velocity_an_edge_is_sharp():
             "scene": {
                 "kind": "random",
                 "objects": {"count": 4, "distance": [2, 5]},
-                "pool": {"urdfs": False, "primitives": ["cuboid", "sphere"]},
+                "pool": {"primitives": ["cuboid", "sphere"]},
                 "textures": {"photographs": False, "variants": 6, "max_size": 64},
                 "camera_motion": {"speed": [2, 3], "rotation_rate": [20, 40]},
             },

@@ -16,7 +16,7 @@ from blinkgl.config.run import load_run
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.gl import ShaderLoader, create_context
 from blinkgl.labels import LabelRequest
-from blinkgl.render import reference
+from blinkgl.render import appearance, casting
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.geometry.primitives import grid
@@ -133,7 +133,7 @@ def test_every_buffer_agrees(both):
 
 def test_debug_pass_draws_the_same_fragments(both):
     gpu, ref, _, _ = both
-    parts = reference.scene_parts(ref.scene)
+    parts = casting.scene_parts(ref.scene)
     ids = np.array([thing.instance_id for thing, _ in parts] + [0])
     np.testing.assert_array_equal(ids[gpu["part"]], gpu["id"])
     hit = gpu["id"] != 0
@@ -231,10 +231,10 @@ def test_mip_chain_keeps_the_mean_and_level_0_is_the_reference():
     np.testing.assert_allclose(chain[-1].image[0, 0], image.mean((0, 1)), atol=1e-6)
     uv = rng.uniform(-2, 2, (50, 2))
     np.testing.assert_array_equal(
-        mipmaps.sample_trilinear(texture, uv, np.zeros(50)), reference.sample_bilinear(texture, uv)
+        mipmaps.sample_trilinear(texture, uv, np.zeros(50)), appearance.sample_bilinear(texture, uv)
     )
     np.testing.assert_array_equal(
-        mipmaps.sample_trilinear(texture, uv, np.full(50, -3.0)), reference.sample_bilinear(texture, uv)
+        mipmaps.sample_trilinear(texture, uv, np.full(50, -3.0)), appearance.sample_bilinear(texture, uv)
     )
     half = mipmaps.sample_trilinear(texture, uv, np.full(50, 1.5))
     np.testing.assert_allclose(

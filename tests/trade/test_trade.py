@@ -33,7 +33,7 @@ CONFIG = {
     "scene": {
         "kind": "random",
         "objects": {"count": 3, "distance": [2, 4]},
-        "pool": {"primitives": ["cuboid", "sphere"], "variants": 4, "urdfs": False},
+        "pool": {"primitives": ["cuboid", "sphere"], "variants": 4},
         "textures": {"procedural": ["checks", "fbm"], "variants": 4, "photographs": False, "max_size": 64},
     },
 }

@@ -107,7 +107,8 @@ DOORS = {
         blinkgl.recordings.simulation.frames_to_events blinkgl.recordings.simulation.simulated_steps
         blinkgl.recordings.simulation.file_to_events""",
     "compare": "blinkgl.cli.compare blinkgl.compare blinkgl.recordings.comparison.compare",
-    "calibrate": "blinkgl.cli.calibrate blinkgl.recordings.calibration.calibrate",
+    "calibrate": """blinkgl.cli.calibrate blinkgl.calibrate blinkgl.recordings.calibration.calibrate
+        blinkgl.recordings.clip.FrameReading""",
     "convert": "blinkgl.cli.convert blinkgl.convert blinkgl.io.formats.convert",
     "write": "blinkgl.write_events blinkgl.io.formats.event_writer",
     "verify": "blinkgl.cli.verify blinkgl.verify blinkgl.dataset.verify.verify_dataset",

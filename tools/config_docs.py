@@ -101,6 +101,8 @@ class _Page:
         rows: dict[str, str] = {}
         below: list[tuple[type[BaseModel], str, str]] = []
         for name, info in model.model_fields.items():
+            if (tag := tag_of(model)) and name == tag[0] and note:
+                continue  # the heading says it
             inner = f"{path}.{name}" if path else name
             # a sensor's sections are those of a single camera, and have been described
             children = [] if model is RigSensorConfig and name in SECTIONS else _models(info.annotation)

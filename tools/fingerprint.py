@@ -29,8 +29,8 @@ import cv2
 import numpy as np
 
 from blinkgl.config.reader import read_table, to_yaml
-from blinkgl.config.recipe import merge
 from blinkgl.config.run import load_run
+from blinkgl.config.trees import merge
 from blinkgl.dataset.generate import generate_run
 from blinkgl.events.table import EMULATORS
 from blinkgl.gl import create_context

@@ -20,7 +20,8 @@ from pathlib import Path
 
 from blinkgl.config.quality import QUALITIES
 from blinkgl.config.reader import to_yaml
-from blinkgl.config.run import RunTemplate, apply_overrides
+from blinkgl.config.run import RunTemplate
+from blinkgl.config.trees import apply_overrides
 from blinkgl.trade.pareto import excess
 from blinkgl.trade.settings import suite_design
 

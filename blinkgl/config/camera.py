@@ -141,24 +141,11 @@ def camera_radius(camera: CameraModel, clearance: float) -> float:
     return max(clearance, 1.01 * camera.near_corner)
 
 
-def with_calibrations(tree: dict[str, Any], base: Path) -> dict[str, Any]:
-    """A run's ``tree`` with every ``camera: {calibration: FILE}``, at the top and in groups, read from ``base`` and
-    replaced by what it says. Raises ConfigError."""
-    from blinkgl.config.rig import with_sections  # whose sensors have cameras
-
-    tree, groups = dict(tree), tree.get("groups")
-    if isinstance(groups, dict):
-        tree["groups"] = {
-            name: with_calibrations(group, base) if isinstance(group, dict) and "groups" not in group else group
-            for name, group in groups.items()
-        }
-    if isinstance(tree.get("camera"), dict) and tree["camera"].get("calibration") is not None:
-        tree["camera"] = calibrated(tree["camera"], base)
-    return with_sections(tree, lambda one: with_calibrations(one, base))
-
-
-def calibrated(camera: dict[str, Any], base: Path) -> dict[str, Any]:
-    """A ``camera:`` table with the keys of its calibration in that one's place. Raises ConfigError."""
+def calibrated(camera: Any, base: Path) -> Any:
+    """A ``camera:`` table with the keys of its calibration in that one's place, read from ``base``; without one as it
+    stands. Raises ConfigError."""
+    if not isinstance(camera, dict) or camera.get("calibration") is None:
+        return camera
     from blinkgl.config.camchain import read_camchain
 
     own = {key: value for key, value in camera.items() if key not in ("calibration", "calibration_name")}

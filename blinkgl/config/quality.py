@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import copy
-from functools import lru_cache
-from importlib import resources
 from typing import Any, Literal
 
-from blinkgl.config.reader import parse_yaml
+from blinkgl.config.shipped import shipped
 
 Quality = Literal["fast", "balanced", "accurate", "reference", "auto"]
 QUALITIES = ("fast", "balanced", "accurate", "reference")
@@ -23,18 +20,10 @@ def with_default(tree: Any) -> Any:
 
 def load_quality(name: str) -> dict[str, Any]:
     """``timeline:`` and ``render:`` of a preset, plain data; the figures it was chosen by are comments in its file."""
-    preset = copy.deepcopy(_shipped(DEFAULT if name == "auto" else name))
+    preset = shipped("quality", DEFAULT if name == "auto" else name)
     if name == "auto":
         preset["timeline"]["first_look"] = True
     return preset
-
-
-@lru_cache
-def _shipped(name: str) -> dict[str, Any]:
-    return parse_yaml(
-        (resources.files("blinkgl.configs") / "quality" / f"{name}.yaml").read_text(encoding="utf-8"),
-        f"quality/{name}.yaml",
-    )
 
 
 def fill_quality(quality: Any, kind: Any) -> dict[str, Any]:

@@ -1,5 +1,5 @@
-"""What stands between the pixels of a sensor and the outside: pixels that are broken or noisy by themselves, latency,
-the bus and its clock. In this order; what is not said is not there."""
+"""What stands between the pixels of a sensor and the outside: pixels that are broken or noisy by themselves, the bus
+and its clock. In this order; what is not said is not there."""
 
 from __future__ import annotations
 
@@ -52,27 +52,14 @@ class PixelsConfig(Config):
     )
 
 
-class LatencyConfig(Config):
-    """How late a pixel's events are, longer in the dark: `fixed_us + dark_us / (I + 1)`, I the luminance on the 8-bit
-    scale, as the time constant of IEBCS depends on it (Joubert et al., Frontiers in Neuroscience 2021). No event
-    overtakes another of its pixel, none comes before it happened."""
-
-    fixed_us: float = Field(0.0, ge=0, le=1e6, description="In any light, microseconds.")
-    dark_us: float = Field(0.0, ge=0, le=1e7, description="More in the dark: so much at I = 0, half of it at I = 1.")
-    jitter_us: float = Field(0.0, ge=0, le=1e6, description="Standard deviation from event to event, microseconds.")
-    full_scale: float = Field(255.0, gt=0, le=1e9, description="I of luminance 1.0.")
-
-    @property
-    def longest_us(self) -> float:
-        """Beyond which jitter is cut."""
-        return self.fixed_us + self.dark_us + 6.0 * self.jitter_us
-
-
 class ReadoutConfig(Config):
-    """The bus between pixels and time stamps; see :mod:`blinkgl.events.readout`. Before it pixels and latency:
+    """The bus between pixels and time stamps; see :mod:`blinkgl.events.readout`. Before it the pixels' own noise:
     :mod:`blinkgl.events.pixels`."""
 
-    removed: ClassVar = {"filters": Removed("events filtered after they were written", lambda value: not value)}
+    removed: ClassVar = {
+        "filters": Removed("events filtered after they were written", lambda value: not value),
+        "latency": Removed("the key left out: v2e's cutoff_hz makes events late", lambda value: value is None),
+    }
 
     events_per_second: float | None = Field(
         None,
@@ -96,7 +83,6 @@ class ReadoutConfig(Config):
         description="Time stamps are multiples of this, microseconds: the last one that has passed.",
     )
     pixels: PixelsConfig | None = Field(None, description="Dead, hot and noisy pixels; null: none.")
-    latency: LatencyConfig | None = Field(None, description="How late a pixel's events are; null: not at all.")
 
     @rule("events_per_second", "row_ns", "queue_events")
     def _queue_empties(rate: float | None, row_ns: float, queue: int):

@@ -13,9 +13,6 @@
         enabled: false                        # described, but not made until somebody turns it on
         ...
 
-``scene: {from: FILE, …}`` is the scene of another YAML file (:func:`~blinkgl.config.run.load_run` puts it in its
-place when the recipe is read).
-
 A group is the common part with the group's own keys laid over it. Each group has a seed of its own, derived from the
 recipe's seed and the group's name, so that growing, adding or leaving out one group changes no sequence of another.
 """
@@ -32,11 +29,8 @@ from blinkgl.config.draw import is_distribution
 from blinkgl.config.problems import validate_field
 from blinkgl.config.run import RunTemplate
 from blinkgl.config.sequence import SequenceConfig
+from blinkgl.config.trees import merge
 from blinkgl.errors import ConfigError
-
-_TAGS = ("kind", "emulator")
-_WHOLE = ("sensor",)
-"""Keys whose tables are not mixed: another camera is another camera."""
 
 
 @dataclass(frozen=True)
@@ -125,18 +119,6 @@ def _group(name: str, tree: dict[str, Any], template: RunTemplate, enabled: bool
 def derived_seed(seed: int, name: str) -> int:
     """63-bit seed of the group ``name``."""
     return int.from_bytes(hashlib.sha256(f"{seed}/{name}".encode()).digest()[:8], "little") >> 1
-
-
-def merge(common: Any, own: Any) -> Any:
-    """``own`` laid over ``common``: tables key by key; anything else, a distribution, or a table of another kind
-    (``kind: explicit`` over ``kind: random``) replaces what was there."""
-    both = (
-        isinstance(common, dict) and isinstance(own, dict) and not is_distribution(common) and not is_distribution(own)
-    )
-    if not both or any(tag in own and own[tag] != common.get(tag) for tag in _TAGS):
-        return copy.deepcopy(own)
-    laid = {key: copy.deepcopy(value) if key in _WHOLE else merge(common.get(key), value) for key, value in own.items()}
-    return {**copy.deepcopy(common), **laid}
 
 
 def _plain(node: Any) -> Any:

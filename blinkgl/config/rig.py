@@ -16,7 +16,6 @@ import copy
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from importlib import resources
 from typing import Annotated, Any
 
 import numpy as np
@@ -30,10 +29,11 @@ from blinkgl.config.images import ImagesConfig
 from blinkgl.config.imu import ImuConfig
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.places import Matrix, check_rigid, rigid_matrix
-from blinkgl.config.reader import parse_yaml
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.config.sensor import Sensor
+from blinkgl.config.shipped import shipped, shipped_names
 from blinkgl.config.tracks import TracksConfig
+from blinkgl.config.trees import merge
 from blinkgl.config.values import Position, Vector3
 from blinkgl.errors import ConfigError
 
@@ -133,36 +133,17 @@ class RigSensorConfig(Config):
         return self.events is not None or self.images is not None
 
 
-def rig_names() -> tuple[str, ...]:
-    """Names of the shipped rigs, ``rig:``."""
-    found = resources.files("blinkgl.configs").joinpath("rigs").iterdir()
-    return tuple(sorted(file.name.removesuffix(".yaml") for file in found if file.name.endswith(".yaml")))
-
-
 def load_rig(name: Any) -> list[dict[str, Any]]:
     """Sensors of a shipped rig, as plain trees. Raises ConfigError for an unknown one."""
-    if name not in rig_names():
-        raise ConfigError("unknown rig", where="rig", value=name, accepted=f"one of {', '.join(rig_names())}")
-    text = resources.files("blinkgl.configs").joinpath(f"rigs/{name}.yaml").read_text(encoding="utf-8")
-    return parse_yaml(text, f"rigs/{name}.yaml")["sensors"]
+    known = shipped_names("rigs")
+    if name not in known:
+        raise ConfigError("unknown rig", where="rig", value=name, accepted=f"one of {', '.join(known)}")
+    return shipped("rigs", name)["sensors"]
 
 
 def is_rig(tree: Any) -> bool:
     """Whether a configuration is of several sensors."""
     return isinstance(tree, dict) and (tree.get("rig") is not None or tree.get("sensors") is not None)
-
-
-def tables_of(tree: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
-    """The tables that ``sensors:`` lists, with their numbers; what is no table is left to validation."""
-    given = tree.get("sensors")
-    return [(k, one) for k, one in enumerate(given) if isinstance(one, dict)] if isinstance(given, list) else []
-
-
-def with_sections(tree: dict[str, Any], change: Callable[[dict[str, Any]], dict[str, Any]]) -> dict[str, Any]:
-    """``tree`` with every sensor's table changed."""
-    if not tables_of(tree):
-        return tree
-    return {**tree, "sensors": [change(one) if isinstance(one, dict) else one for one in tree["sensors"]]}
 
 
 def spelled_out(tree: dict[str, Any], fills: Iterable[Callable[[dict[str, Any]], dict[str, Any]]]) -> dict[str, Any]:
@@ -184,7 +165,7 @@ def spelled_out(tree: dict[str, Any], fills: Iterable[Callable[[dict[str, Any]],
                 where=key,
                 accepted=f"{key} in one of `sensors`",
             )
-    base = [] if tree.get("rig") is None else copy.deepcopy(load_rig(tree["rig"]))
+    base = [] if tree.get("rig") is None else load_rig(tree["rig"])
     tables = _laid(own, base)
     if not tables:
         raise ConfigError("a rig without a sensor", where="sensors", value=own, accepted="one or more")
@@ -193,8 +174,6 @@ def spelled_out(tree: dict[str, Any], fills: Iterable[Callable[[dict[str, Any]],
 
 def _laid(own: list[dict[str, Any]], base: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """A preset's sensors under those of the same names, in its order; then the others."""
-    from blinkgl.config.recipe import merge
-
     said: dict[Any, dict[str, Any]] = {}
     for k, one in enumerate(own):
         name = one.get("name")
@@ -214,8 +193,6 @@ def _laid(own: list[dict[str, Any]], base: list[dict[str, Any]]) -> list[dict[st
 def _complete(
     own: dict[str, Any], number: int, tree: dict[str, Any], fills: Iterable[Callable[[dict[str, Any]], dict[str, Any]]]
 ) -> dict[str, Any]:
-    from blinkgl.config.recipe import merge
-
     for key in _SHARED:
         if key in own:
             raise ConfigError(

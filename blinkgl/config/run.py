@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,23 +9,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from blinkgl.config.base import remembering
-from blinkgl.config.camera import with_calibrations
 from blinkgl.config.corners import Fill, corners, sites
 from blinkgl.config.draw import draw, is_distribution
+from blinkgl.config.expansion import expanded, with_scenes
 from blinkgl.config.labels import fill_causes
 from blinkgl.config.problems import validate, validate_field
 from blinkgl.config.quality import fill_quality, with_default
-from blinkgl.config.reader import parse_yaml, read_table
-from blinkgl.config.recipes import with_recipes
+from blinkgl.config.reader import read_table
 from blinkgl.config.rig import (
     SECTIONS,
     check_pairs,
     is_rig,
     spelled_out as with_whole_sensors,
-    with_sections,
 )
-from blinkgl.config.sensor import fill_sensor, spelled_out
+from blinkgl.config.sensor import fill_sensor
 from blinkgl.config.sequence import SequenceConfig
+from blinkgl.config.trees import apply_overrides
 from blinkgl.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -150,8 +148,8 @@ def load_run(path: str | Path, overrides: Sequence[str] = (), *, seed: int | Non
 
     Raises ConfigError: missing or unreadable file, bad YAML (with line and column), unknown key, bad value."""
     base = Path(path).parent
-    tree = with_calibrations(apply_overrides(_with_scenes(read_table(path), base), overrides), base)
-    tree = with_recipes(with_sensors(tree, base))
+    tree = apply_overrides(with_scenes(read_table(path), base), overrides)
+    tree = expanded(tree, base)
     if seed is not None:
         tree["seed"] = seed
     if "seed" in tree and not is_distribution(tree["seed"]):  # which check() refuses
@@ -159,79 +157,3 @@ def load_run(path: str | Path, overrides: Sequence[str] = (), *, seed: int | Non
     template = RunTemplate(tree, base)
     template.check()
     return template
-
-
-def _with_scenes(tree: dict[str, Any], base: Path) -> dict[str, Any]:
-    """``scene: {from: FILE, …}``, at the top and in groups, becomes the scene of that file with the other keys laid
-    over it; the tree then says all by itself, wherever it is read next. Raises ConfigError."""
-    from blinkgl.config.recipe import merge
-
-    groups = tree.get("groups")
-    named = [("groups." + str(name), group) for name, group in groups.items()] if isinstance(groups, dict) else []
-    for where, table in (("", tree), *named):
-        own = table.get("scene") if isinstance(table, dict) else None
-        if not isinstance(own, dict) or "from" not in own:
-            continue
-        where, own = f"{where}.scene.from".lstrip("."), dict(own)
-        given = own.pop("from")
-        if not isinstance(given, str):
-            raise ConfigError("not a file", where=where, value=given, accepted="a YAML file with a scene")
-        scene = read_table(base / given).get("scene")
-        if not isinstance(scene, dict) or "from" in scene:
-            raise ConfigError(
-                "the file has no scene of its own", where=where, value=given, accepted="a file with a table scene"
-            )
-        table["scene"] = merge(scene, own)
-    return tree
-
-
-def with_sensors(tree: dict[str, Any], base: Path) -> dict[str, Any]:
-    """``tree`` with sensors' files, at the top and in groups, read from ``base`` and spelled out.
-    Raises ConfigError."""
-    tree, groups = dict(tree), tree.get("groups")
-    if isinstance(groups, dict):
-        tree["groups"] = {
-            name: with_sensors(group, base) if isinstance(group, dict) and "groups" not in group else group
-            for name, group in groups.items()
-        }
-    if "sensor" in tree:
-        tree["sensor"] = spelled_out(tree["sensor"], base)
-    return with_sections(
-        tree, lambda one: {**one, "sensor": spelled_out(one["sensor"], base)} if "sensor" in one else one
-    )
-
-
-def apply_overrides(tree: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
-    """Copy of ``tree`` with ``--set`` options applied; tables on the way are made when absent."""
-    tree = copy.deepcopy(tree)
-    for option in overrides:
-        dotted, equals, text = option.partition("=")
-        keys = dotted.strip().split(".")
-        if not equals or not all(keys):
-            raise ConfigError("not an override", where="--set", value=option, accepted="path.to.key=value")
-        value = parse_yaml(text, f"--set {dotted}")
-        node: Any = tree
-        for depth, key in enumerate(keys):
-            last = depth == len(keys) - 1
-            if isinstance(node, list):
-                if not key.isdigit() or int(key) >= len(node):
-                    raise ConfigError(
-                        "no such list entry",
-                        where="--set " + ".".join(keys[: depth + 1]),
-                        value=key,
-                        accepted=f"0 … {len(node) - 1}",
-                    )
-                key = int(key)
-            elif not isinstance(node, dict):
-                raise ConfigError(
-                    "is a plain value and has no keys", where="--set " + ".".join(keys[:depth]), value=node
-                )
-            if last:
-                node[key] = value
-            elif isinstance(node, dict):
-                if node.get(key) is None:
-                    node[key] = {}
-                node = node[key]
-            else:
-                node = node[key]
-    return tree

@@ -22,8 +22,6 @@ A sequence draws one unit; whoever wants a single camera takes the middle, or a 
 from __future__ import annotations
 
 import copy
-from functools import lru_cache
-from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -34,8 +32,9 @@ from blinkgl.config.corners import corners
 from blinkgl.config.draw import draw, is_distribution, middle
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.problems import validate
-from blinkgl.config.reader import parse_yaml, read_table
+from blinkgl.config.reader import read_table
 from blinkgl.config.readout import ReadoutConfig
+from blinkgl.config.shipped import shipped, shipped_names
 from blinkgl.errors import ConfigError
 
 
@@ -123,16 +122,9 @@ class SensorConfig(Config):
         return validate(models[emulator], {**self.values(emulator), **overrides}, where="events")
 
 
-@lru_cache
 def sensor_names() -> tuple[str, ...]:
     """Names of the shipped sensors, as ``load_sensor`` takes them."""
-    return tuple(
-        sorted(
-            f.name.removesuffix(".yaml")
-            for f in (resources.files("blinkgl.configs") / "sensors").iterdir()
-            if f.name.endswith(".yaml")
-        )
-    )
+    return shipped_names("sensors")
 
 
 def load_sensor(name: str, unit: int | None = None) -> SensorConfig:
@@ -164,7 +156,7 @@ def sensor_table(name: Any) -> dict[str, Any]:
             value=name,
             accepted=f"one of {', '.join(sensor_names())}, or a sensor file ending in .yaml",
         )
-    return copy.deepcopy(_shipped(known))
+    return shipped("sensors", known)
 
 
 def is_sensor_file(name: Any) -> bool:
@@ -182,29 +174,17 @@ def known_sensor(name: Any) -> str | None:
     )
 
 
-@lru_cache
-def _shipped(known: str) -> dict[str, Any]:
-    text = (resources.files("blinkgl.configs") / "sensors" / f"{known}.yaml").read_text(encoding="utf-8")
-    return parse_yaml(text, f"sensors/{known}.yaml")
-
-
-def spelled_out(sensor: Any, base: Path) -> Any:
-    """What a run's key ``sensor`` says, with the table of a file in the place of its path (from ``base``): a run then
-    says all by itself. A shipped sensor whose values are distributions is spelled out, too, because a
-    sequence has to say which unit it drew; the others stay a name. Raises ConfigError."""
-    if is_distribution(sensor):
-        kind, spec = next(iter(sensor.items()))
-        if kind == "choice" and isinstance(spec, list):
-            return {kind: [spelled_out(one, base) for one in spec]}
-        if kind == "shares" and isinstance(spec, list) and all(isinstance(part, dict) for part in spec):
-            return {kind: [{**part, "value": spelled_out(part.get("value"), base)} for part in spec]}
-        return sensor
+def sensor_file_or_name(sensor: Any, base: Path) -> Any:
+    """What a run's key ``sensor`` says, with the table of a file in the place of its path (from ``base``). A shipped
+    sensor whose values are distributions is spelled out, too, because a sequence has to say which unit it drew; the
+    others stay a name. Raises ConfigError."""
     if is_sensor_file(sensor):
         table = sensor_table(str(base / sensor))
         _check(table, str(base / sensor))
         return table
     known = known_sensor(sensor)
-    return sensor if known is None or not _has_distributions(_shipped(known)) else sensor_table(sensor)
+    table = None if known is None else shipped("sensors", known)
+    return table if _has_distributions(table) else sensor
 
 
 def _has_distributions(node: Any) -> bool:

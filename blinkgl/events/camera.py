@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import EventDataError
-from blinkgl.events.pixels import Latency, PixelNoise
+from blinkgl.events.pixels import PixelNoise
 from blinkgl.events.readout import Readout
 from blinkgl.events.table import make_emulator
 from blinkgl.events.truth import Surfaces, SurfaceTruth
@@ -44,8 +44,8 @@ class EventFrame(NamedTuple):
 class EventCamera:
     """``events:`` and ``readout:`` of a configuration: frames in, the events that leave the sensor out.
 
-    Events go from the emulator through the pixels' defects, their latency, the bus with its clock, as
-    far as the configuration has them. readout : None: none of it.   seed : of the draws.
+    Events go from the emulator through the pixels' defects, the bus with its clock, as far as the
+    configuration has them. readout : None: none of it.   seed : of the draws.
     emulator : the :class:`Emulator` itself.
     truth : says what made each event, of frames that come with their ``surfaces``; None: nobody asks.
     make : of the emulator: that on the processor, or on the device that is asked for (``tensors/choice.py``).
@@ -63,12 +63,10 @@ class EventCamera:
     ):
         self._truth = truth
         self.emulator = make(config, height, width, seed)
-        self._pixels, self._latency, self._readout = None, None, None
+        self._pixels, self._readout = None, None
         if readout is not None:
             if readout.pixels is not None:
                 self._pixels = PixelNoise(readout.pixels, height, width, seed, self.emulator.causes)
-            if readout.latency is not None:
-                self._latency = Latency(readout.latency, height, width, seed)
             self._readout = Readout(readout)
 
     @property
@@ -80,7 +78,7 @@ class EventCamera:
     def tensor_device(self) -> Any:
         """The torch device of which it takes frames as tensors; None: arrays alone, because the emulator does or
         because something else of the camera looks at them."""
-        return self.emulator.tensor_device if self._latency is None and self._truth is None else None
+        return self.emulator.tensor_device if self._truth is None else None
 
     @property
     def frames(self) -> int:
@@ -99,8 +97,8 @@ class EventCamera:
 
     @property
     def late(self) -> int:
-        """Events under way to the outside: on the bus, or not known yet for their latency."""
-        return sum(stage.late for stage in (self._latency, self._readout) if stage is not None)
+        """Events under way to the outside, on the bus."""
+        return 0 if self._readout is None else self._readout.late
 
     def step(self, frame: EventFrame) -> Events:
         """The events that are out by the frame's time and were not before. Raises EventDataError as ``Emulator.step``;
@@ -118,11 +116,7 @@ class EventCamera:
             events = self._pixels.step(events, until_us)
         if self._truth is not None:  # what is behind the pixels carries it along, whenever it lets an event go
             events = replace(events, truth=self._truth.of(events, frame.t_ns))
-        if self._readout is None:
-            return events
-        if self._latency is not None:
-            events = self._latency.step(events, self.emulator.decoded(frame.luminance), until_us)
-        return self._readout.step(events, until_us)
+        return events if self._readout is None else self._readout.step(events, until_us)
 
 
 def emulate(

@@ -42,7 +42,6 @@ class Stream(IntEnum):
     START = 8  # initial state
     DEFECT = 9  # dead and hot pixels and their rates, frozen per pixel
     OWN_NOISE = 10  # noise events of pixels, "pixel" is the event's number
-    LATENCY = 11  # jitter of latency, "pixel" is the event's number
 
 
 # "always": loops over draws become vector instructions only if nothing is called in them.

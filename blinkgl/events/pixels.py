@@ -1,6 +1,6 @@
-"""What single pixels do by themselves, whatever the emulator: dead ones, noise of their own, and how late they are.
+"""What single pixels do by themselves, whatever the emulator: dead ones, and noise of their own.
 
-Stages between the emulator and the bus, as :mod:`blinkgl.config.readout` describes them. Noise is a process in
+A stage between the emulator and the bus, as :mod:`blinkgl.config.readout` describes it. Noise is a process in
 continuous time that the steps only look at: its events are numbered, and number n is drawn from the seed and n alone.
 """
 
@@ -11,7 +11,7 @@ from dataclasses import replace
 import numba
 import numpy as np
 
-from blinkgl.config.readout import LatencyConfig, PixelsConfig
+from blinkgl.config.readout import PixelsConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events.arith import exp_f64, log_f64
 from blinkgl.events.packing import JIT
@@ -21,7 +21,7 @@ from blinkgl.types.events import OPTIONAL, Cause, Events
 # Events drawn at once; the highest rate, one event per microsecond; the longest time before the
 # recording.
 _BATCH, _MOST_HZ, _LONGEST_BEFORE_S = 1024, 1e6, 5.0
-_DEFECT, _OWN, _LATE = np.uint64(Stream.DEFECT), np.uint64(Stream.OWN_NOISE), np.uint64(Stream.LATENCY)
+_DEFECT, _OWN = np.uint64(Stream.DEFECT), np.uint64(Stream.OWN_NOISE)
 
 
 @numba.njit(**JIT)
@@ -146,61 +146,6 @@ class PixelNoise:
             self._last[...] = state["last"]
         started, t_ns, self._batch, self._from_us = (int(v) for v in state["clock"])
         self._t_ns = t_ns if started else None
-
-
-@numba.njit(**JIT)
-def _delay(pixel, t_us, delay, last, out):
-    for i in range(t_us.size):
-        # Events of one pixel keep their order.
-        out[i] = max(t_us[i] + np.int64(delay[i]), last[pixel[i]])
-        last[pixel[i]] = out[i]
-
-
-class Latency:
-    """Events as they happen -> events when they are known outside, in order from step to step."""
-
-    def __init__(self, config: LatencyConfig, height: int, width: int, seed: int):
-        self.config, self._width = config, width
-        self._seed = np.uint64(int(seed) & (2**64 - 1))
-        self._last = np.full(height * width, -(2**62), np.int64)
-        self._count = 0
-        self._held = Events.empty()
-
-    @property
-    def late(self) -> int:
-        """Events that no step has given out yet."""
-        return len(self._held)
-
-    def step(self, events: Events, luminance: np.ndarray, until_us: int) -> Events:
-        """The events that are known until ``until_us`` (that microsecond included).
-
-        luminance : (H, W) float32, linear."""
-        if len(events):
-            c = self.config
-            pixel = events.y.astype(np.int64) * self._width + events.x
-            intensity = luminance.reshape(-1)[pixel].astype(np.float64) * c.full_scale
-            # A constant part, and one that falls with the photocurrent; +1 keeps it finite in the dark.
-            delay = c.fixed_us + c.dark_us / (intensity + 1.0)
-            if c.jitter_us:
-                index = np.uint64(self._count) + np.arange(len(events), dtype=np.uint64)
-                normal, _ = normal2(self._seed, index, _LATE, np.uint64(0))
-                delay += c.jitter_us * np.clip(normal, -6.0, 6.0)
-            self._count += len(events)
-            t = np.empty(len(events), np.int64)
-            _delay(pixel, events.t, np.maximum(delay, 0.0), self._last, t)
-            self._held = Events.concatenate([self._held, replace(events, t=t)])
-            # Delays differ between pixels: events that are held back may be overtaken.
-            self._held = self._held.part(np.argsort(self._held.t, kind="stable"))
-        count = int(np.searchsorted(self._held.t, until_us, side="right"))
-        known, self._held = self._held.part(slice(count)), self._held.part(slice(count, None)).copy()
-        return known
-
-    def state_dict(self) -> dict[str, np.ndarray]:
-        return {"last": self._last.copy(), "count": np.array([self._count], np.int64), **_columns("held", self._held)}
-
-    def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
-        self._held = _events("held", state, {"last", "count"})
-        self._last[...], self._count = state["last"], int(state["count"][0])
 
 
 def _columns(name: str, events: Events) -> dict[str, np.ndarray]:

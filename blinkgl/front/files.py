@@ -199,6 +199,15 @@ def compare(
     )
 
 
+class ReadingOptions(TypedDict, total=False):
+    """How the frames beside a recording are to be understood, as :func:`blinkgl.calibrate` says it."""
+
+    gamma: str | float
+    interpolate: str
+    max_px: float
+    frame_delay_ms: float | None
+
+
 def calibrate(
     recording: str | os.PathLike,
     frames: str | os.PathLike | None = None,
@@ -208,12 +217,9 @@ def calibrate(
     still: bool = False,
     fps: float | None = None,
     timestamps: str | os.PathLike | None = None,
-    gamma: str | float = "linear",
-    interpolate: str = "motion",
-    max_px: float = 1.0,
-    frame_delay_ms: float | None = None,
     starts: int = 3,
     seed: int = 0,
+    **reading: Unpack[ReadingOptions],
 ) -> Calibration:
     """Fits an emulator to a camera's own recording. ``config`` of the result is the emulator as fitted, ``values`` and
     ``uncertainty`` are of its fitted keys, ``untold`` says why others were left alone, ``judged`` how near it comes in
@@ -226,25 +232,29 @@ def calibrate(
     "motion" or "linear".   max_px : of "motion", px.   frame_delay_ms : added to their times, ms; None: found.
     starts : of the search.   Raises AssetError, EventDataError, ConfigError."""
     from blinkgl.recordings import calibration
+    from blinkgl.recordings.clip import FrameReading
 
     listed = isinstance(fixed, Iterable) and not isinstance(fixed, str)
     given = tuple(fixed) if listed else (None,)
     keys = tuple(key for key in given if isinstance(key, str))
     if len(keys) != len(given):
         raise ConfigError("not names of keys", where="fixed", value=fixed, accepted="a list of texts")
-    delay = None if frame_delay_ms is None else check.number(frame_delay_ms, "frame_delay_ms", least=-1e6, most=1e6)
+    delay = reading.get("frame_delay_ms")
+    understood = FrameReading(
+        reading.get("gamma", FrameReading.gamma),
+        reading.get("interpolate", FrameReading.interpolate),
+        check.number(reading.get("max_px", FrameReading.max_px), "max_px", above=0, most=1000),
+        None if delay is None else check.number(delay, "frame_delay_ms", least=-1e6, most=1e6),
+    )
     return calibration.calibrate(
         check.path(recording, "recording"),
         None if frames is None else check.path(frames, "frames"),
+        understood,
         emulator=events_tree(emulator),
         fixed=keys,
         still=bool(still),
         fps=_fps(fps),
         timestamps=None if timestamps is None else check.path(timestamps, "timestamps"),
-        gamma=gamma,
-        interpolate=interpolate,
-        max_px=check.number(max_px, "max_px", above=0, most=1000),
-        frame_delay_ms=delay,
         starts=check.whole(starts, "starts", 1, 20),
         seed=check.seed(seed),
     )

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
 from blinkgl.config.draw import middle
+from blinkgl.config.expansion import expanded
 from blinkgl.config.problems import validate_field
-from blinkgl.config.recipe import merge
-from blinkgl.config.recipes import with_recipes
-from blinkgl.config.run import RunTemplate, load_run, with_sensors
+from blinkgl.config.run import RunTemplate, load_run
 from blinkgl.config.sequence import SequenceConfig
+from blinkgl.config.trees import merge
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.front.rigs import Rig, rig_of
@@ -153,7 +153,7 @@ def configured(source: Source, rig: Rig | str | None = None, **settings: Unpack[
             own[key] = read(value)
     if rig is not None:
         own |= rig_of(rig).tree
-    own = with_recipes(with_sensors(own, Path.cwd()))
+    own = expanded(own, Path.cwd())
     if "quality" in own:
         validate_field(SequenceConfig, "quality", own["quality"])
     if "sensor" in own:

@@ -101,7 +101,7 @@ def _damage(path: Path) -> Iterator[None]:
     """Turn what the decoder raises on damaged bytes, a panic of its Rust code included, into AssetError."""
     try:
         yield
-    except AssetError:
+    except (AssetError, ImportError):
         raise
     except OSError as error:
         raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error

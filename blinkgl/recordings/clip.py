@@ -90,32 +90,94 @@ class Clip:
         return replace(self, events=events)
 
 
+@dataclass(frozen=True)
+class FrameReading:
+    """How the frames beside a recording are to be understood.
+
+    gamma : of their codes, "linear", "srgb" or an exponent.   interpolate : what is shown between two frames, "motion"
+    or "linear"; max_px : of motion, px per step.   delay_ms : of the frames' clock against the events'; None: found
+    from both.   exposures : whether their times are known to be the middles of exposures.   name : for messages."""
+
+    gamma: str | float = "linear"
+    interpolate: str = "motion"
+    max_px: float = 1.0
+    delay_ms: float | None = None
+    exposures: bool = False
+    name: str = "frames"
+
+
+PLAIN = FrameReading()
+"""Linear codes at times that are found."""
+
+
 def clip_of_frames(
     events: Events,
     frames: Iterable[tuple[np.ndarray, int, str]],
     size: tuple[int, int],
+    reading: FrameReading = PLAIN,
     *,
-    gamma: str | float = "linear",
-    interpolate: str = "motion",
-    max_px: float = 1.0,
-    delay_us: int | None = None,
-    where: str = "frames",
     most: int = MOST_PIXEL_STEPS,
     seed: int = 0,
 ) -> Clip:
     """Of a recording that saw something.
 
     frames : (array, t_ns, name), at the middle of their exposures.   size : (height, width) of the events' sensor.
-    gamma : of the frames' codes.   interpolate : "motion" or "linear", what is shown between two frames.
-    delay_us : of the frames' clock against the events'; None: found from both.
     Raises EventDataError: frames of another size, no common time, saturated frames, clocks that do not match."""
-    decode = Decoder(gamma)
+    grey, clock, full = _greys(frames, size, reading)
+    facts: dict[str, float] = {"saturated": float(full.mean())}
+    bursts = frame_bursts(events, float(np.median(np.diff(clock)))) if len(clock) > 1 else np.empty((0, 2), np.int64)
+    if len(bursts):
+        facts |= {"bursts": len(bursts), "in_bursts": float(inside_any(events.t, bursts).mean())}
+    logs = [cv2.GaussianBlur(np.log(g.astype(np.float64) * 255 + LOG_OFFSET), (0, 0), BLUR_PX) for g in grey]
+    change = np.diff(np.stack(logs), axis=0).astype(np.float32)
+    found, correlation = clock_offset(events, change, clock, size)
+    delay_us = _delay(found, correlation, reading)
+    facts |= {"delay_us": delay_us, "found_delay_us": found, "delay_correlation": correlation}
+    clock = clock + delay_us
+    inside = _spanned(events, clock, reading.name)
+    first, last = _one_exposure(inside, change, clock, ~full, events, reading.name)
+    if last - first < len(inside):
+        facts["other_exposure"] = len(inside) - (last - first)
+    grey, logs, clock, change = (
+        grey[first : last + 1],
+        logs[first : last + 1],
+        clock[first : last + 1],
+        change[first:last],
+    )
+    edges = clock.copy()
+    edges[0], edges[-1] = max(clock[0], events.t[0]), min(clock[-1], events.t[-1] + 1)
+    path = _path(grey, clock, reading, facts)
+    still = np.abs(change).max(axis=0) < STILL
+    mean = np.mean(logs, axis=0)
+    light = np.searchsorted(np.quantile(mean, np.arange(1, 8) / 8), mean).astype(np.uint8)
+    tiles = Tiles(size, len(path), most, seed)
+    return Clip(
+        [(t, tiles.cut(g)) for g, t in path],
+        clock,
+        edges,
+        tiles.events(events.window(int(edges[0]), int(edges[-1])), ~full),
+        tiles.cut(~full),
+        tiles.cut(still & ~full),
+        tiles.cut(light),
+        tiles.cut(change),
+        size,
+        tiles.share,
+        bursts,
+        facts,
+    )
+
+
+def _greys(
+    frames: Iterable[tuple[np.ndarray, int, str]], size: tuple[int, int], reading: FrameReading
+) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+    """The frames' luminance, their times in µs, and (H, W) bool, which pixels were saturated in any of them."""
+    decode = Decoder(reading.gamma)
     grey, times, full = [], [], np.zeros(size, bool)
     for frame, t_ns, name in frames:
         if frame.shape[:2] != size:
             raise EventDataError(
                 "frames are of another size than the recording",
-                where=where,
+                where=reading.name,
                 value=f"{frame.shape[1]}x{frame.shape[0]}",
                 accepted=f"{size[1]}x{size[0]}, as its events",
             )
@@ -124,34 +186,33 @@ def clip_of_frames(
             full |= top.any(axis=2) if top.ndim == 3 else top
         grey.append(decode(frame, name))
         times.append(t_ns)
-    saturated = float(full.mean())
-    if saturated > MOST_SATURATED:
+    if full.mean() > MOST_SATURATED:
         raise EventDataError(
             "too many pixels of the frames are saturated to say what the light did there",
-            where=where,
-            value=f"{100 * saturated:.0f} %",
+            where=reading.name,
+            value=f"{100 * full.mean():.0f} %",
             accepted=f"at most {100 * MOST_SATURATED:.0f} % (a shorter exposure)",
         )
-    logs = [cv2.GaussianBlur(np.log(g.astype(np.float64) * 255 + LOG_OFFSET), (0, 0), BLUR_PX) for g in grey]
-    clock = np.array(times, np.int64) // 1000
-    facts: dict[str, float] = {"saturated": saturated}
-    bursts = frame_bursts(events, float(np.median(np.diff(clock)))) if len(clock) > 1 else np.empty((0, 2), np.int64)
-    if len(bursts):
-        facts |= {"bursts": len(bursts), "in_bursts": float(inside_any(events.t, bursts).mean())}
-    change = np.diff(np.stack(logs), axis=0).astype(np.float32)
-    found, correlation = clock_offset(events, change, clock, size)
-    if delay_us is None:
-        if not correlation >= LEAST_CORRELATION:
-            raise EventDataError(
-                "events and frames do not match: no clock offset within "
-                f"{MOST_SHIFT_US // 1000} ms makes polarity sums follow the frames' change",
-                where=where,
-                value=f"best correlation {correlation:.2f}",
-                accepted=f"at least {LEAST_CORRELATION}, frames of the same scene, clock and orientation",
-            )
-        delay_us = found
-    facts |= {"delay_us": delay_us, "found_delay_us": found, "delay_correlation": correlation}
-    clock = clock + delay_us
+    return grey, np.array(times, np.int64) // 1000, full
+
+
+def _delay(found_us: int, correlation: float, reading: FrameReading) -> int:
+    """What is added to the frames' times, µs: what was asked for, or what was found, where it is to be trusted."""
+    if reading.delay_ms is not None:
+        return round(reading.delay_ms * 1000)
+    if not correlation >= LEAST_CORRELATION:
+        raise EventDataError(
+            "events and frames do not match: no clock offset within "
+            f"{MOST_SHIFT_US // 1000} ms makes polarity sums follow the frames' change",
+            where=reading.name,
+            value=f"best correlation {correlation:.2f}",
+            accepted=f"at least {LEAST_CORRELATION}, frames of the same scene, clock and orientation",
+        )
+    return found_us
+
+
+def _spanned(events: Events, clock: np.ndarray, where: str) -> np.ndarray:
+    """Numbers of the intervals between frames that the events span."""
     # The first interval may begin a little before the first event, the last end a little after the last.
     slack = (clock[1:] - clock[:-1]) // 4
     inside = np.flatnonzero((clock[:-1] >= events.t[0] - slack) & (clock[1:] <= events.t[-1] + 1 + slack))
@@ -162,53 +223,25 @@ def clip_of_frames(
             value=[tuple(round(t / 1e6, 6) for t in (a[0], a[-1])) for a in (events.t, clock)],
             accepted="two or more, on one clock (seconds of events and of frames shown)",
         )
-    same = _one_exposure(inside, change, clock, ~full, events)
-    if len(same) < len(inside):
-        facts["other_exposure"] = len(inside) - len(same)
-        if len(same) < 2:
-            raise EventDataError(
-                "the frames' exposure changes from one to the next, and the events do not: what the light did is not "
-                "in them",
-                where=where,
-                value=f"{len(inside) - len(same)} of {len(inside)} intervals",
-                accepted="three or more frames in a row of one exposure and gain",
-            )
-    first, last = int(same[0]), int(same[-1]) + 1
-    grey, logs, clock = grey[first : last + 1], logs[first : last + 1], clock[first : last + 1]
-    edges = clock.copy()
-    edges[0], edges[-1] = max(clock[0], events.t[0]), min(clock[-1], events.t[-1] + 1)
-    given = zip(grey, (clock * 1000).tolist())
+    return inside
+
+
+def _path(
+    grey: list[np.ndarray], clock: np.ndarray, reading: FrameReading, facts: dict[str, float]
+) -> list[tuple[np.ndarray, int]]:
+    """What the emulator is shown, (luminance, t_ns), the warm-up first; what was found on the way goes to ``facts``."""
+    path: list[tuple[np.ndarray, int]] = list(zip(grey, (clock * 1000).tolist()))
+    if reading.interpolate == "motion":
+        displacement = Displacement()
+        path = [
+            (g.astype(np.float32, copy=False), t) for g, t in motion(path, reading.max_px, displacement=displacement)
+        ]
+        facts |= {"displacement_px": displacement.p99, "inserted": displacement.inserted}
     # Before the first frame the pixels have seen something else, and stand anywhere between their levels: another
     # part of the same picture, from which the light goes over to the first frame.
-    other = np.roll(grey[0], (size[0] // 3, size[1] // 3), (0, 1))
-    displacement = Displacement()
-    if interpolate == "motion":
-        given = motion(given, max_px, displacement=displacement)
-        path = [(g.astype(np.float32, copy=False), t) for g, t in given]
-        facts |= {"displacement_px": displacement.p99, "inserted": displacement.inserted}
-    else:
-        path = list(given)
-    path.insert(0, (other, int(2 * clock[0] - clock[1]) * 1000))
-    change = change[first:last]
-    still = np.abs(change).max(axis=0) < STILL
-    mean = np.mean(logs, axis=0)
-    light = np.searchsorted(np.quantile(mean, np.arange(1, 8) / 8), mean).astype(np.uint8)
-    events = events.window(int(edges[0]), int(edges[-1]))
-    tiles = Tiles(size, len(path), most, seed)
-    return Clip(
-        [(t, tiles.cut(g)) for g, t in path],
-        clock,
-        edges,
-        tiles.events(events, ~full),
-        tiles.cut(~full),
-        tiles.cut(still & ~full),
-        tiles.cut(light),
-        tiles.cut(change),
-        size,
-        tiles.share,
-        bursts,
-        facts,
-    )
+    height, width = grey[0].shape[:2]
+    other = np.roll(grey[0], (height // 3, width // 3), (0, 1))
+    return [(other, int(2 * clock[0] - clock[1]) * 1000), *path]
 
 
 def clip_of_still(events: Events, size: tuple[int, int], *, luminance: float = DARK_BACKGROUND, parts: int = 8) -> Clip:
@@ -232,10 +265,11 @@ def clip_of_still(events: Events, size: tuple[int, int], *, luminance: float = D
 
 
 def _one_exposure(
-    inside: np.ndarray, change: np.ndarray, clock_us: np.ndarray, used: np.ndarray, events: Events
-) -> np.ndarray:
-    """The longest stretch of the intervals ``inside`` in which the picture as a whole does not become brighter or
-    darker without events: there the frames' exposure or gain was changed, which an emulator would take for light."""
+    inside: np.ndarray, change: np.ndarray, clock_us: np.ndarray, used: np.ndarray, events: Events, where: str
+) -> tuple[int, int]:
+    """The longest stretch of the intervals ``inside``, first and behind the last, in which the picture as a whole does
+    not become brighter or darker without events: there the frames' exposure or gain was changed, which an emulator
+    would take for light."""
     pixels = max(int(used.sum()), 1)
     stretch, best = [], []
     for k in inside.tolist():
@@ -245,7 +279,15 @@ def _one_exposure(
         leaps = abs(middle) > LEAP and np.sign(middle) * polarity * LARGEST_THRESHOLD < abs(middle) / 2
         stretch = [] if leaps else [*stretch, k]
         best = stretch if len(stretch) > len(best) else best
-    return np.array(best, np.int64)
+    if len(best) < 2:
+        raise EventDataError(
+            "the frames' exposure changes from one to the next, and the events do not: what the light did is not "
+            "in them",
+            where=where,
+            value=f"{len(inside) - len(best)} of {len(inside)} intervals",
+            accepted="three or more frames in a row of one exposure and gain",
+        )
+    return best[0], best[-1] + 1
 
 
 class Tiles:

@@ -15,6 +15,7 @@ from blinkgl.errors import ConfigError, OutputError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.machine.terminal import plain_column, plain_console, say
 from blinkgl.recordings.calibration import calibrate
+from blinkgl.recordings.clip import FrameReading
 from blinkgl.recordings.pixel_noise import fit_pixels
 from blinkgl.report import pixel_noise
 from blinkgl.report.calibration import page, parameters, rows
@@ -36,8 +37,8 @@ def run(
     quiet: bool = False,
     **options: Any,
 ) -> int:
-    """``options``: of :func:`~blinkgl.recordings.calibration.calibrate`. Writes the sensor file ``out`` and, beside it,
-    a page of the same name that ends in .html; both or neither."""
+    """``options``: of :func:`~blinkgl.recordings.calibration.calibrate` and of its FrameReading. Writes the sensor file
+    ``out`` and, beside it, a page of the same name that ends in .html; both or neither."""
     target = Path(out)
     if target.suffix.lower() not in (".yaml", ".yml"):
         raise OutputError("not the name of a sensor file", where=out, accepted="a name that ends in .yaml")
@@ -47,6 +48,8 @@ def run(
             raise OutputError("output file exists", where=str(path), accepted="a new name, or --overwrite")
     if emulator == PIXELS:
         return _pixels(recording, frames, target, sensor, overrides, overwrite, quiet, options)
+    said = (options.pop(key) for key in ("gamma", "interpolate", "max_px", "frame_delay_ms"))
+    reading = FrameReading(*said)
     base = emulator_options(emulator, None, overrides, sensor)["emulator"]
     fixed = [item.partition("=")[0].strip() for item in overrides]
     console = plain_console(quiet=quiet)
@@ -57,6 +60,7 @@ def run(
         result = calibrate(
             recording,
             frames,
+            reading,
             emulator=base,
             fixed=fixed,
             progress=progress,

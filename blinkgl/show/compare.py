@@ -11,7 +11,8 @@ from rich.table import Table
 
 from blinkgl.io.atomic import atomic_file
 from blinkgl.machine.terminal import plain_console, say
-from blinkgl.recordings.comparison import BLUR_PX, compare, plot
+from blinkgl.recordings.comparison import BLUR_PX, compare
+from blinkgl.recordings.comparison_plot import plot
 
 
 def run(a: str, b: str | None, out: str | None = None, **options: Any) -> int:

@@ -10,8 +10,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
 from blinkgl.config.draw import middle
+from blinkgl.config.expansion import expanded
 from blinkgl.config.reader import parse_yaml, read_table
-from blinkgl.config.recipes import with_recipes
 from blinkgl.errors import ConfigError
 from blinkgl.machine.terminal import causes_line, plain_column, plain_console, say
 
@@ -35,7 +35,7 @@ def emulator_options(
             raise ConfigError("not key=value", where="--set", value=item)
         data[key.strip()] = parse_yaml(value, f"--set {key.strip()}")
     if "recipe" in data:  # a video is one camera: the middle of what the recipe draws
-        data = middle(with_recipes({"events": data})["events"])
+        data = middle(expanded({"events": data}, Path.cwd())["events"])
     if sensor is None:
         return {"emulator": data, "readout": None}
     from blinkgl.config.sensor import load_sensor

@@ -15,8 +15,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from blinkgl.config.run import RunTemplate, apply_overrides
+from blinkgl.config.run import RunTemplate
 from blinkgl.config.sequence import SequenceConfig
+from blinkgl.config.trees import apply_overrides
 from blinkgl.errors import ConfigError
 from blinkgl.events import Events, emulator_of
 from blinkgl.events.grids import masked

@@ -20,8 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from blinkgl.config.quality import QUALITIES, load_quality
-from blinkgl.config.run import RunTemplate, apply_overrides, load_run
+from blinkgl.config.run import RunTemplate, load_run
 from blinkgl.config.sequence import SequenceConfig
+from blinkgl.config.trees import apply_overrides
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.trade.measure import Density, Options

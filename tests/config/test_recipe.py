@@ -8,8 +8,9 @@ import pytest
 import yaml
 
 from blinkgl.config.draw import draw
-from blinkgl.config.recipe import all_groups, merge
+from blinkgl.config.recipe import all_groups
 from blinkgl.config.run import RunTemplate, load_run
+from blinkgl.config.trees import merge
 from blinkgl.dataset.plan import Plan
 from blinkgl.errors import ConfigError
 

@@ -9,9 +9,10 @@ import pytest
 
 from blinkgl.config.draw import draw, middle, options
 from blinkgl.config.events import EsimConfig, V2eConfig
+from blinkgl.config.expansion import load_recipe
 from blinkgl.config.problems import validate
-from blinkgl.config.recipes import load_recipe, recipe_names
 from blinkgl.config.run import load_run
+from blinkgl.config.shipped import shipped_names
 from blinkgl.errors import ConfigError
 from blinkgl.show.simulate import emulator_options
 
@@ -30,7 +31,7 @@ def thresholds(events):
 
 def test_every_value_of_every_recipe_has_a_source_and_the_page_names_it():
     page = PAGE.read_text()
-    for name in recipe_names():
+    for name in shipped_names("emulators"):
         recipe = load_recipe(name)
         shares = recipe.events.get("shares")
         tables = [part["value"] for part in shares] if shares else [recipe.events]

@@ -7,11 +7,12 @@ from importlib import resources
 import numpy as np
 import pytest
 
+from blinkgl.config.expansion import load_recipe
 from blinkgl.config.reader import parse_yaml
-from blinkgl.config.recipes import load_recipe, recipe_names
 from blinkgl.config.rig import PlaceConfig
 from blinkgl.config.run import RunTemplate, load_run
 from blinkgl.config.sequence import SequenceConfig
+from blinkgl.config.shipped import shipped_names
 from blinkgl.errors import ConfigError
 
 
@@ -54,7 +55,7 @@ def test_files_of_sensors_are_found_beside_the_run(tmp_path):
     (tmp_path / "mine.yaml").write_text(
         resources.files("blinkgl.configs").joinpath("sensors/davis240c.yaml").read_text()
     )
-    run, recipe = tmp_path / "run.yaml", recipe_names()[0]
+    run, recipe = tmp_path / "run.yaml", shipped_names("emulators")[0]
     run.write_text(f"sensors: [{{name: a, sensor: mine.yaml}}, {{name: b, events: {{recipe: {recipe}}}}}]")
     a, b = load_run(run).sequence(0).sensors
     assert a.camera.width == 240 and b.events.emulator == load_recipe(recipe).events["emulator"]

@@ -173,7 +173,6 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "pixels": {
             "readout": {
                 "pixels": {"dead_fraction": 0.1, "hot_fraction": 0.02, "hot_rate_hz": 500, "rate_hz": 5},
-                "latency": {"fixed_us": 100, "dark_us": 2000, "jitter_us": 20},
             }
         },
     },

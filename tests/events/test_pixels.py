@@ -1,18 +1,16 @@
-"""What is before the bus: dead, hot and noisy pixels, latency; the bus against queue theory; the camera as a whole."""
+"""What is before the bus: dead, hot and noisy pixels; the bus against queue theory; the camera as a whole."""
 
 from __future__ import annotations
-
-import itertools
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from blinkgl.config.events import EsimConfig
-from blinkgl.config.readout import LatencyConfig, PixelsConfig, ReadoutConfig
+from blinkgl.config.readout import PixelsConfig, ReadoutConfig
 from blinkgl.events import Events
 from blinkgl.events.camera import EventCamera, EventFrame
-from blinkgl.events.pixels import Latency, PixelNoise
+from blinkgl.events.pixels import PixelNoise
 from blinkgl.events.readout import Readout
 from blinkgl.types.events import Cause
 from tests.events.clips import assert_same
@@ -123,42 +121,6 @@ def test_dead_pixels_are_silent_and_others_untouched():
     assert 0.25 < 1 - alive.mean() < 0.35
 
 
-def test_latency_depends_on_light_as_stated():
-    config = LatencyConfig(fixed_us=40.0, dark_us=4000.0, jitter_us=30.0)
-    frame = np.tile(np.linspace(0, 1, W, dtype=np.float32), (H, 1))
-    y, x = (c.ravel().astype(np.uint16) for c in np.mgrid[:H, :W])
-    events = Events(x, y, np.full(H * W, 1000, np.int64), np.ones(H * W, np.uint8))
-    late = Latency(config, H, W, 3).step(events, frame, 10_000)
-    assert (np.diff(late.t) >= 0).all() and len(late) == H * W
-    for column in (0, 1, 20, 79):
-        mean = 40 + 4000 / (frame[0, column] * 255 + 1)
-        delays = late.t[late.x == column] - 1000
-        assert abs(delays.mean() + 0.5 - mean) < 4 * 30 / np.sqrt(H) + 0.5, column
-        assert column == 79 or abs(delays.std() / 30 - 1) < 0.4
-
-
-def test_latency_keeps_a_pixels_order_and_any_chunking():
-    config, rng, n = LatencyConfig(fixed_us=50, dark_us=300, jitter_us=200), np.random.default_rng(4), 4000
-    frame = np.full((H, W), 0.01, np.float32)
-    events = Events(rng.integers(0, 3, n).astype(np.uint16), rng.integers(0, 2, n).astype(np.uint16),
-                    np.sort(rng.integers(0, 30_000, n)), (np.arange(n) % 2).astype(np.uint8))  # fmt: skip
-    whole = Latency(config, H, W, 1).step(events, frame, 10**9)
-    stage, parts = Latency(config, H, W, 1), []
-    for a, b in itertools.pairwise([0, 100, 7000, 7001, 30_000]):
-        parts.append(stage.step(events.window(a, b), frame, b - 1))
-        assert not len(parts[-1]) or parts[-1].t[-1] < b
-        again = Latency(config, H, W, 1)
-        again.load_state_dict(stage.state_dict())
-        stage = again
-    held = stage.late
-    parts.append(stage.step(Events.empty(), frame, 10**9))
-    assert held == len(parts[-1]) > 0 and stage.late == 0
-    assert_same(Events.concatenate(parts), whole)
-    for pixel in range(3):  # events of one pixel come out in the order in which they went in
-        mine, before = whole.part(whole.x == pixel), events.part(events.x == pixel)
-        assert (mine.part(mine.y == 0).p == before.part(before.y == 0).p).all()
-
-
 @pytest.mark.parametrize("load", [0.3, 0.6, 0.9])
 def test_the_bus_waits_as_an_m_d_1_queue(load):
     """Poisson arrivals, one server of fixed time s: the wait W before service has the mean s load / (2 (1 - load))
@@ -189,10 +151,7 @@ def test_clock_is_the_last_tick_that_has_passed():
 
 def test_a_camera_with_all_of_it():
     """Stages in order, whatever the steps: nothing late or dropped is lost to the counts."""
-    readout = ReadoutConfig(
-        events_per_second=2e6, queue_events=4096, clock_us=5, pixels=NOISY,
-        latency=LatencyConfig(fixed_us=100, dark_us=1000, jitter_us=20),
-    )  # fmt: skip
+    readout = ReadoutConfig(events_per_second=2e6, queue_events=4096, clock_us=5, pixels=NOISY)
     rng = np.random.default_rng(0)
     frames = [rng.random((H, W)).astype(np.float32) for _ in range(8)]
     cameras = [EventCamera(EsimConfig(causes=True), r, H, W, seed=3) for r in (None, readout)]

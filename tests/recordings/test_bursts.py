@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from blinkgl.recordings.bursts import frame_bursts, inside_any
-from blinkgl.recordings.clip import clip_of_frames, read_recording
+from blinkgl.recordings.clip import FrameReading, clip_of_frames, read_recording
 from blinkgl.recordings.simulation import emulator_config
 from blinkgl.recordings.statistics import sums
 from blinkgl.types.events import Events
@@ -51,7 +51,7 @@ def test_no_interval_begins_or_ends_in_a_burst():
     take = lambda own, burst: np.concatenate([own, burst.astype(own.dtype)])[order]
     x, y = rng.integers(0, W, more), rng.integers(0, H, more)
     struck = Events(take(events.x, x), take(events.y, y), t[order], take(events.p, np.ones(more)))
-    clip = clip_of_frames(struck, frames, (H, W), delay_us=0)
+    clip = clip_of_frames(struck, frames, (H, W), FrameReading(delay_ms=0))
     assert clip.facts["bursts"] == 6 and 0.1 < clip.facts["in_bursts"] < 0.95
     found, undisturbed = (sums(e, clip, 0, clip.intervals) for e in (struck, events))
     assert found.rates.sum() + found.still.sum() > undisturbed.rates.sum() + undisturbed.still.sum() + 20_000

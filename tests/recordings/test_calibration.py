@@ -13,8 +13,9 @@ import yaml
 from blinkgl.cli import run
 from blinkgl.errors import BlinkGLError, ConfigError, EventDataError
 from blinkgl.io.formats import write_events
-from blinkgl.recordings.calibration import _Search, calibrate, calibrate_events
-from blinkgl.recordings.clip import TILE_PX, Clip, clip_of_frames, clip_of_still, clock_offset
+from blinkgl.recordings.calibration import calibrate, calibrate_events
+from blinkgl.recordings.clip import TILE_PX, Clip, FrameReading, clip_of_frames, clip_of_still, clock_offset
+from blinkgl.recordings.search import Search
 from blinkgl.recordings.simulation import emulator_config
 from blinkgl.recordings.statistics import sums
 from blinkgl.report.calibration import mosaic
@@ -42,7 +43,7 @@ def scene(frames=None) -> Clip:
     frames = frames or moving()
     first, last = frames[0][1] // 1000, frames[-1][1] // 1000
     ends = Events(*(np.zeros(2, t) for t in (np.uint16, np.uint16)), np.array([first, last - 1]), np.zeros(2, np.uint8))
-    return clip_of_frames(ends, frames, (H, W), delay_us=0)
+    return clip_of_frames(ends, frames, (H, W), FrameReading(delay_ms=0))
 
 
 def files(folder, frames=None, emulator=None, shift_us: int = 0, seed: int = 9):
@@ -101,15 +102,15 @@ def test_a_frame_of_another_exposure_is_no_light():
     frames = moving(most=0.6)
     events = scene(frames).simulate(emulator_config({"emulator": "esim", **TRUE}), 1)
     longer = [(np.round(frames[0][0] * 1.4).astype(np.uint8), *frames[0][1:]), *frames[1:]]
-    cut = clip_of_frames(events, longer, (H, W), delay_us=0)
-    whole = clip_of_frames(events, frames, (H, W), delay_us=0)
+    cut = clip_of_frames(events, longer, (H, W), FrameReading(delay_ms=0))
+    whole = clip_of_frames(events, frames, (H, W), FrameReading(delay_ms=0))
     assert cut.facts["other_exposure"] == 1 and np.array_equal(cut.clock_us, whole.clock_us[1:])
     assert "other_exposure" not in whole.facts
     dimmed = scene(longer).simulate(emulator_config({"emulator": "esim", **TRUE}), 1)
-    assert "other_exposure" not in clip_of_frames(dimmed, longer, (H, W), delay_us=0).facts
+    assert "other_exposure" not in clip_of_frames(dimmed, longer, (H, W), FrameReading(delay_ms=0)).facts
     by_turns = [(np.round(f * (1.4 if k % 2 else 1)).astype(np.uint8), *rest) for k, (f, *rest) in enumerate(frames)]
     with pytest.raises(EventDataError, match="exposure changes from one to the next"):
-        clip_of_frames(events, by_turns, (H, W), delay_us=0)
+        clip_of_frames(events, by_turns, (H, W), FrameReading(delay_ms=0))
 
 
 def test_a_model_of_one_threshold_is_asked_for_on_and_off_together():
@@ -120,7 +121,7 @@ def test_a_model_of_one_threshold_is_asked_for_on_and_off_together():
     fewer = np.ones(len(events), bool)
     fewer[off[::2]] = False
     recorded = sums(events.part(fewer), clip, 0, 3)
-    apart, together = (_Search(clip.with_events(events.part(fewer)), emulator_config(kind), 3, 0, None).target
+    apart, together = (Search(clip.with_events(events.part(fewer)), emulator_config(kind), 3, 0, None).target
                        for kind in ("esim", "voltmeter"))  # fmt: skip
     assert together.together and not apart.together
     assert np.count_nonzero(together.block == "rate") == np.count_nonzero(apart.block == "rate") / 2
@@ -132,8 +133,8 @@ def test_tiles_of_a_large_sensor_have_the_same_events(monkeypatch):
     """Half of the pixels: what they see, and their recorded events, stay together."""
     frames = moving()
     events = scene(frames).simulate(emulator_config({"emulator": "esim", **TRUE, "threshold_sigma": 0.0}), 1)
-    whole = clip_of_frames(events, frames, (H, W), delay_us=0)
-    part = clip_of_frames(events, frames, (H, W), delay_us=0, most=2 * 32 * 32 * len(whole.frames))
+    whole = clip_of_frames(events, frames, (H, W), FrameReading(delay_ms=0))
+    part = clip_of_frames(events, frames, (H, W), FrameReading(delay_ms=0), most=2 * 32 * 32 * len(whole.frames))
     assert part.size == (64, 32) and part.share == pytest.approx(2 * 32 * 32 / (H * W))
     again = part.simulate(emulator_config({"emulator": "esim", **TRUE, "threshold_sigma": 0.0}), 5)
     assert len(again) == len(part.events) > 1000
@@ -167,11 +168,11 @@ def test_from_files_to_a_sensor_file_and_a_page(tmp_path, capsys):
     assert "output file exists" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("given", [dict(exposures=True), dict(frame_delay_ms=3.0)])
+@pytest.mark.parametrize("given", [FrameReading(exposures=True), FrameReading(delay_ms=3.0)])
 def test_no_note_where_exposures_or_the_offset_are_known(given):
     events = scene().simulate(emulator_config("esim"), 1)
     fixed = [key for key in emulator_config("esim").fitted if key != "contrast_threshold"]
-    result = calibrate_events(events, (H, W), moving(), fixed=fixed, starts=1, **given)
+    result = calibrate_events(events, (H, W), moving(), given, fixed=fixed, starts=1)
     assert result.warnings == []
 
 

@@ -13,7 +13,8 @@ from blinkgl.cli import run
 from blinkgl.errors import EventDataError
 from blinkgl.io.formats import write_events
 from blinkgl.recordings import comparison
-from blinkgl.recordings.comparison import compare, plot
+from blinkgl.recordings.comparison import compare
+from blinkgl.recordings.comparison_plot import plot
 from blinkgl.types.events import Events
 from tests.shared_data import shared
 

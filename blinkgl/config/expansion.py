@@ -1,0 +1,103 @@
+"""What a run names becomes what it stands for, once, when it is read: a run and its sequences then say all by
+themselves, wherever they are read next.
+
+    scene: {from: FILE, …}        the scene of another YAML file, the other keys laid over it
+    camera: {calibration: FILE}   the intrinsics of a calibration (blinkgl.config.camera)
+    sensor: FILE                  the table of a sensor's file, or of a shipped one whose values are distributions
+    events: {recipe: NAME, …}     an emulator as a published training set had it, the other keys laid over it
+
+These stand at the top, in groups and, but for scenes, at the sensors of a rig; also as options of a distribution.
+(``quality:`` and ``rig:`` are filled in later, when a sequence has been drawn: blinkgl.config.run.)
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from blinkgl.config.base import Config
+from blinkgl.config.camera import calibrated
+from blinkgl.config.problems import validate
+from blinkgl.config.reader import read_table
+from blinkgl.config.sensor import sensor_file_or_name
+from blinkgl.config.shipped import shipped, shipped_names
+from blinkgl.config.trees import Table, each_option, merge, with_groups, with_sections
+from blinkgl.errors import ConfigError
+
+
+class Recipe(Config):
+    """A shipped recipe as its file says it."""
+
+    about: str = Field(description="Which data set or program, and its paper.")
+    events: dict[str, Any] = Field(description="Keys of `events:`; distributions are drawn once a sequence.")
+    sources: dict[str, str] = Field(description="Where each value comes from, by key.")
+    differs: str = Field("", description="In what this is not what they did.")
+
+
+def load_recipe(name: str) -> Recipe:
+    """A shipped recipe. Raises ConfigError naming the known ones."""
+    known = shipped_names("emulators")
+    if not isinstance(name, str) or name not in known:
+        raise ConfigError("unknown recipe", where="events.recipe", value=name, accepted=f"one of {', '.join(known)}")
+    return validate(Recipe, shipped("emulators", name), where=f"emulators/{name}.yaml")
+
+
+def expanded(tree: Table, base: Path) -> Table:
+    """``tree`` with its calibrations and sensors' files, read from ``base``, and recipes spelled out. Raises
+    ConfigError."""
+    meanings = {
+        "camera": partial(calibrated, base=base),
+        "sensor": partial(sensor_file_or_name, base=base),
+        "events": _recipe,
+    }
+
+    def spelled_out(table: Table) -> Table:
+        said = {key: each_option(table[key], meaning) for key, meaning in meanings.items() if key in table}
+        return {**table, **said}
+
+    return with_groups(tree, lambda table: with_sections(spelled_out(table), spelled_out))
+
+
+def _recipe(events: Any) -> Any:
+    if not isinstance(events, dict) or "recipe" not in events:
+        return events
+    own = {key: value for key, value in events.items() if key != "recipe"}
+    return each_option(load_recipe(events["recipe"]).events, partial(_over, own=own))
+
+
+def _over(events: Table, own: Table) -> Table:
+    """``own`` keys over those of a recipe."""
+    if own.get("emulator", events.get("emulator")) != events.get("emulator"):
+        raise ConfigError(
+            "the recipe is of another emulator",
+            where="events.emulator",
+            value=own["emulator"],
+            accepted=f"{events.get('emulator')}, or no recipe",
+        )
+    return {**events, **own}
+
+
+def with_scenes(tree: Table, base: Path) -> Table:
+    """``tree`` with every ``scene: {from: FILE, …}`` replaced by that file's scene. Raises ConfigError."""
+    groups = tree.get("groups")
+    named = [(f"groups.{name}.", group) for name, group in groups.items()] if isinstance(groups, dict) else []
+    for prefix, table in (("", tree), *named):
+        own = table.get("scene") if isinstance(table, dict) else None
+        if isinstance(own, dict) and "from" in own:
+            table["scene"] = _scene_from(dict(own), f"{prefix}scene.from", base)
+    return tree
+
+
+def _scene_from(own: Table, where: str, base: Path) -> Table:
+    given = own.pop("from")
+    if not isinstance(given, str):
+        raise ConfigError("not a file", where=where, value=given, accepted="a YAML file with a scene")
+    scene = read_table(base / given).get("scene")
+    if not isinstance(scene, dict) or "from" in scene:
+        raise ConfigError(
+            "the file has no scene of its own", where=where, value=given, accepted="a file with a table scene"
+        )
+    return merge(scene, own)

@@ -1,0 +1,283 @@
+"""The search for an emulator's parameters: least squares on the logarithms of the parameters, from several starts.
+
+Numbers of the recording (:mod:`~blinkgl.recordings.statistics`) are compared with the same of a simulation, each
+difference divided by what it may be by chance, with a robust loss (the method of simulated moments, McFadden,
+Econometrica 57, 1989). What the data say nothing about is left at its default, and named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.stats import qmc
+
+from blinkgl.config.events import EmulatorConfig
+from blinkgl.errors import EventDataError
+from blinkgl.recordings.clip import Clip
+from blinkgl.recordings.simulation import emulator_config
+from blinkgl.recordings.statistics import Sums, Target, sums, target
+
+TRIED = 64
+"""Settings drawn over the whole room of the parameters, of which the best are started from."""
+STEP = 0.05
+"""Of a parameter's logarithm, for derivatives: far above the jumps of single events."""
+UNTOLD = 0.5
+"""Standard deviation of a parameter's logarithm from which on the data are taken not to tell it."""
+VAGUE = 0.25
+"""From which on other places are tried, too."""
+LEAST_CHANCE = 0.05
+"""Of a number's error, where chance is known at all."""
+TOLERANCE = 0.5
+"""How much worse the fit may become by putting a parameter that is not told back to its default."""
+_MOST_STEPS = 20
+_FEW_STEPS, _PLACES = 3, 6
+_WORTH = 0.2
+"""How much worse than the best a place may be, with derivatives from elsewhere, to be worth a descent."""
+_EACH = 3
+"""Places for a start, from which a few steps are tried."""
+_LITTLE = 0.01
+"""Part of the cost that a step has to gain, or the descent ends."""
+
+
+class Search:
+    """Looks for the parameters; their logarithms are what it works with."""
+
+    def __init__(self, clip: Clip, base: EmulatorConfig, stop: int, seed: int, progress: Callable[[float], None]):
+        self._clip, self._base, self._stop, self._seed, self._progress = clip, base, stop, seed, progress
+        recorded = sums(clip.events, clip, 0, stop)
+        # What a model has no parameter for it would buy with those that are for something else.
+        self.target: Target = target(recorded, together=base.one_threshold)
+        if not len(self.target.values):
+            raise EventDataError("too few pixels to tell an emulator's parameters", value=int(clip.used.sum()))
+        self.evaluations = 0
+        self.untold: dict[str, str] = {}
+        self.cost = float("nan")
+        self._set: dict[str, Any] = {}
+        self._keys: list[str] = []
+        self._at: np.ndarray = np.empty(0)
+        self._jacobian: np.ndarray = np.empty((0, 0))
+        self._residual: np.ndarray = np.empty(0)
+        self._planned = 1
+
+    def responding(self, keys: list[str]) -> list[str]:
+        """Those that make any difference to the scene; the others are named and left alone. What is tried is the middle
+        of all rooms with one key at either end."""
+        middle = self._ends(keys).mean(axis=1)
+        here, found = self._difference(keys, middle), []
+        for i, ends in enumerate(self._ends(keys)):
+            places = np.repeat(middle[None], 2, axis=0)
+            places[:, i] = ends
+            if any(np.abs(self._difference(keys, at) - here).max() > 0 for at in places):
+                found.append(keys[i])
+            else:
+                self.untold[keys[i]] = "makes no difference to this scene, left as it was"
+                self._set[keys[i]] = self._default(keys[i])
+        return found
+
+    def roughly(self, keys: list[str], starts: int) -> np.ndarray:
+        """The logarithms of the parameters where the best of several descents ends: a few steps from more places, then
+        all from those that led lowest."""
+        ends = self._ends(keys)
+        tried = qmc.scale(qmc.Sobol(len(keys), seed=self._seed).random(TRIED), *ends.T)
+        tried = np.vstack([np.clip(self._defaults(keys), ends[:, 0], ends[:, 1]), tried])
+        self._planned = len(tried) + starts * 20 * (len(keys) + 2)
+        ordered = tried[np.argsort(self._costs(keys, tried))]
+        self.target = self.target.beside(self._sums(keys, ordered[0]), floor="expected")
+        first = [self._descend(keys, one, steps=_FEW_STEPS) for one in _apart(ordered, _EACH * starts)]
+        first.sort(key=lambda found: found[0])
+        self._keys = keys
+        self._at = min((self._descend(keys, at) for _, at in first[:starts]), key=lambda found: found[0])[1]
+        return self._at
+
+    @property
+    def place(self) -> np.ndarray:
+        """The logarithms of the parameters where it stands."""
+        return self._at
+
+    def run(self, keys: list[str], start: np.ndarray) -> None:
+        """start : logarithms of the parameters, where :meth:`roughly` ended."""
+        if not keys:
+            self.cost = _loss(self._difference([], np.empty(0)))
+            return
+        self.target = self.target.beside(self._sums(keys, start), floor="expected")
+        best = self._descend(keys, start)
+        # As if the model were the camera, with nothing but chance between them; then with what it turns out to be off
+        # by.
+        for floor in ("lowest", "seen"):
+            self.target = self.target.beside(self._sums(keys, best[1]), floor=floor)
+            best = self._descend(keys, best[1])
+            if floor == "lowest":
+                best = self._scanned(keys, best)
+        while True:
+            self.cost, self._at, self._keys = best[0], best[1], keys
+            self._residual = self._difference(keys, best[1])
+            self._jacobian = self._derivatives(keys, best[1], self._residual)
+            spread = self._spread()
+            worst = int(np.argmax(spread))
+            if spread[worst] <= UNTOLD:
+                return
+            key = keys[worst]
+            keys = [k for k in keys if k != key]
+            default = float(np.clip(np.exp(self._defaults([key])[0]), *self._base.fitted[key]))
+            there = float(np.exp(best[1][worst]))
+            others = np.delete(best[1], worst)
+            within = f"the data tell it within a factor of {min(np.exp(spread[worst]), 1e6):.2g} at best"
+            self._set[key] = self._default(key)
+            again = (_loss(self._difference(keys, others)), others)  # often the others need not follow
+            if again[0] > best[0] + TOLERANCE:
+                again = self._descend(keys, others)
+            if again[0] <= best[0] + TOLERANCE:
+                self.untold[key] = f"not told by the recording, left at its default ({within})"
+                best = again
+            else:
+                self._set[key] = there
+                side = "less" if there < default else "more"
+                self.untold[key] = f"told only to be {side} than its default ({within})"
+                best = self._descend(keys, others)
+            if not keys:
+                self.cost, self._at = best
+                self._keys = []
+                return
+
+    def config(self, keys: list[str] | None = None, at: np.ndarray | None = None) -> EmulatorConfig:
+        keys, at = (self._keys, self._at) if keys is None or at is None else (keys, at)
+        values = {key: float(np.exp(v)) for key, v in zip(keys, at)}
+        base = self._base.model_dump()
+        if base.get("threshold_ratio") is not None:  # of two thresholds that now go their own ways
+            base["threshold_ratio"] = None
+        return emulator_config({**base, **self._set, **values})
+
+    def values(self) -> dict[str, float]:
+        return {key: float(np.exp(v)) for key, v in zip(self._keys, self._at)}
+
+    def uncertainty(self) -> dict[str, float]:
+        """Of the recording's and the simulation's chance alone, more where the model does not fit: from what the fit
+        would move by if a group of pixels were missing."""
+        if not self._keys:
+            return {}
+        t = self.target
+        weights = self._robust()
+        j = self._jacobian * weights[:, None]
+        pull = np.linalg.solve(j.T @ j + self._prior(), j.T * weights)
+        moved = (t.jackknife - t.jackknife.mean(axis=0)) * (t.weight / t.error) @ pull.T
+        count = len(t.jackknife)
+        spread = np.sqrt((count - 1) / count * (moved**2).sum(axis=0))
+        # Where the model is off by more than chance, by that much; a number that hardly any group of pixels moves says
+        # nothing of chance.
+        known = t.chance > LEAST_CHANCE * t.error
+        off = self._residual[known] / t.weight[known] * t.error[known] / t.chance[known]
+        misfit = max(1.0, float(np.sqrt(np.mean(off**2)))) if known.any() else 1.0
+        return {key: float(np.exp(v) * s * misfit) for key, v, s in zip(self._keys, self._at, spread)}
+
+    def _spread(self) -> np.ndarray:
+        weights = self._robust()
+        j = self._jacobian * weights[:, None]
+        return np.sqrt(np.diag(np.linalg.inv(j.T @ j + self._prior())))
+
+    def _robust(self) -> np.ndarray:
+        """Square roots of the weights that the loss gives to the residuals."""
+        return (1 + self._residual**2) ** -0.25
+
+    def _prior(self) -> np.ndarray:
+        """Nothing is known but the ends: a normal law as wide."""
+        ends = self._ends(self._keys)
+        return np.diag(12 / np.diff(ends, axis=1)[:, 0] ** 2)
+
+    def _default(self, key: str) -> float | None:
+        return getattr(self._base, key)
+
+    def _defaults(self, keys: list[str]) -> np.ndarray:
+        other = {"contrast_threshold_off": "contrast_threshold"}
+        values = [self._default(key) or (self._default(other[key]) if key in other else 0) or 0 for key in keys]
+        return np.log([max(v, self._base.fitted[key].low) for key, v in zip(keys, values)])
+
+    def _ends(self, keys: list[str]) -> np.ndarray:
+        return np.log([self._base.fitted[key] for key in keys]).reshape(-1, 2)
+
+    def _sums(self, keys: list[str], at: np.ndarray) -> Sums:
+        self.evaluations += 1
+        self._progress(min(self.evaluations / self._planned, 0.99))
+        events = self._clip.simulate(self.config(keys, at), self._seed, stop=self._stop)
+        return sums(events, self._clip, 0, self._stop, self.target.sums.polarity)
+
+    def _difference(self, keys: list[str], at: np.ndarray) -> np.ndarray:
+        return self.target.residual(self._sums(keys, at))
+
+    def _costs(self, keys: list[str], places: np.ndarray) -> np.ndarray:
+        return np.array([_loss(self._difference(keys, at)) for at in places])
+
+    def _derivatives(self, keys: list[str], at: np.ndarray, here: np.ndarray) -> np.ndarray:
+        """By steps of ``STEP``; by wider ones where that does hardly anything."""
+        columns = []
+        for i, (low, high) in enumerate(self._ends(keys)):
+            for width in (STEP, 8 * STEP):
+                step = width if at[i] + width <= high else -width
+                there = at.copy()
+                there[i] = min(max(at[i] + step, low), high)
+                moved = self._difference(keys, there) - here
+                if moved @ moved > 1:
+                    break
+            columns.append(moved / step)
+        return np.array(columns).T.reshape(len(here), len(keys))
+
+    def _scanned(self, keys: list[str], best: tuple[float, np.ndarray]) -> tuple[float, np.ndarray]:
+        """What a descent cannot see: far from where a parameter matters (a dead time shorter than any interval, an
+        offset darker than any pixel) nothing says which way to go. So those that the data hardly tell here are each
+        held at places over their whole room while the others follow, and the descent begins
+        again where that is better."""
+        self._keys, self._at, self._residual = keys, best[1], self._difference(keys, best[1])
+        self._jacobian = self._derivatives(keys, best[1], self._residual)
+        vague = [i for i, spread in enumerate(self._spread()) if spread > VAGUE]
+        start, slopes = best, self._jacobian
+        for i in vague:
+            others, held = [key for key in keys if key != keys[i]], self._set
+            (low, high), tried = self._ends([keys[i]])[0], []
+            for place in np.linspace(low, high, _PLACES + 2)[1:-1]:
+                self._set = {**held, keys[i]: float(np.exp(place))}
+                # By the derivatives of where the scan began: near enough to see which places are worth a descent.
+                cost, at = self._descend(others, np.delete(start[1], i), np.delete(slopes, i, axis=1), _FEW_STEPS)
+                tried.append((cost, np.insert(at, i, place)))
+            self._set = held
+            tried.sort(key=lambda one: one[0])
+            # A place may be better although the nearest that was tried is not: let go of it.
+            worth = [at for cost, at in tried[:2] if cost < best[0] + max(_WORTH * best[0], 2.0)]
+            best = min([best, *(self._descend(keys, at) for at in worth)], key=lambda one: one[0])
+        return best
+
+    def _descend(
+        self, keys: list[str], start: np.ndarray, slopes: np.ndarray | None = None, steps: int = _MOST_STEPS
+    ) -> tuple[float, np.ndarray]:
+        """(loss, logarithms of the parameters) where least squares lead from ``start``.
+
+        slopes : derivatives to stay with; None: those of each place."""
+        if not keys:
+            return _loss(self._difference(keys, start)), start
+        low, high = self._ends(keys).T
+        found = least_squares(
+            lambda at: self._difference(keys, at),
+            np.clip(start, low, high),
+            jac=lambda at: self._derivatives(keys, at, self._difference(keys, at)) if slopes is None else slopes,
+            bounds=(low, high),
+            loss="soft_l1",
+            ftol=_LITTLE,
+            max_nfev=steps,
+        )
+        return 2 * float(found.cost), found.x
+
+
+def _loss(residual: np.ndarray) -> float:
+    return float(np.sum(2 * (np.sqrt(1 + residual**2) - 1)))
+
+
+def _apart(ordered: np.ndarray, count: int) -> list[np.ndarray]:
+    """The best ones, no two of them within a factor of two in all parameters."""
+    chosen: list[np.ndarray] = []
+    for place in ordered:
+        if all(np.abs(place - other).max() > np.log(2) for other in chosen):
+            chosen.append(place)
+        if len(chosen) == count:
+            break
+    return chosen

@@ -210,7 +210,7 @@ def shapes() -> dict[str, Any]:
     said = {kind: told_mesh(BUILDERS[kind](**keys)) for kind, keys in other.items()}
     for kind in ("cuboid", "sphere", "prism", "torus"):
         mesh = BUILDERS[kind](**other[kind])
-        for name, keys in {"creased": {}, "sharp": {"crease_degrees": 10.0}, "tiled": {"uv_size": 0.37}}.items():
+        for name, keys in {"creased": {}, "tiled": {"uv_size": 0.37}}.items():
             said[f"{kind} {name}"] = told_mesh(make_mesh(mesh.vertices, mesh.faces, **keys))
     return said
 

@@ -19,8 +19,9 @@ from blinkgl.blender.importing import Imported, import_scene
 from blinkgl.camera import PinHole
 from blinkgl.config.deform import AnimationConfig
 from blinkgl.errors import BlinkGLError
+from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.mesh_files import clip_of, load_asset
-from blinkgl.scene.worlds.from_file import from_gltf
+from blinkgl.scene.worlds.from_file import from_document
 from gltf_at import Played
 
 pytestmark = pytest.mark.skipif(bool(process.available()), reason=process.available() or "there")
@@ -78,7 +79,7 @@ def imported(scenes, tmp_path_factory):
 def drawn(came: Came, camera=None):
     """What BlinkGL's own importer makes of it."""
     size = PinHole.centred(64, 48, 60.0)
-    return from_gltf(came.path, size, 0, round(came.report.duration_s * NS), camera_name=camera)
+    return from_document(gltf.read(came.path), size, 0, round(came.report.duration_s * NS), camera_name=camera)
 
 
 def places(scene, name: str, t: float) -> np.ndarray:
@@ -207,7 +208,8 @@ def drawn_with_a_pose(came: Came):
     from blinkgl.scene.motion.paths import StaticPath
 
     end = round(came.report.duration_s * NS)
-    return from_gltf(came.path, PinHole.centred(64, 48, 60.0), 0, end, camera_path=StaticPath(np.eye(4), 0, end))
+    still = StaticPath(np.eye(4), 0, end)
+    return from_document(gltf.read(came.path), PinHole.centred(64, 48, 60.0), 0, end, camera_path=still)
 
 
 @pytest.mark.parametrize("name", ["formats.usdc", "collada.dae", "formats.abc"])

@@ -37,7 +37,6 @@ def make_mesh(
     name: str = "",
     source_hash: str = "",
     where: str | None = None,
-    crease_degrees: float = CREASE_DEGREES,
     uv_size: float | None = None,
     project_degenerate: bool = False,
     log: list[str] | None = None,
@@ -49,7 +48,7 @@ def make_mesh(
     ----------
     vertices : (V, 3) any float, object-local.   faces : (F, 3) any int, counter-clockwise seen from outside.
     normals : (V, 3) or None: made from the faces, angle-weighted, split where faces meet at more than
-        ``crease_degrees`` (so a cuboid stays flat and a sphere smooth).
+        ``CREASE_DEGREES`` (so a cuboid stays flat and a sphere smooth).
     uvs : (V, 2), v down, or None: box projection (:func:`box_project`).
     uv_size : edge of one repeat of projected texture coordinates, in the mesh's units; None: the largest side of the
         bounding box, so that the texture covers the mesh once.
@@ -65,29 +64,8 @@ def make_mesh(
     """
     where, label = where or name or "mesh", name or where or "mesh"
     log = [] if log is None else log
-    vertices = np.array(vertices, dtype=np.float64)
-    faces = np.asarray(faces)
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or (faces.size and (faces.ndim != 2 or faces.shape[1] != 3)):
-        raise AssetError(f"vertices {vertices.shape} and faces {faces.shape} are no triangle mesh", where=where)
-    if faces.size == 0:
-        raise AssetError("the mesh has no faces", where=where, accepted="a mesh with triangles")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise AssetError(f"a face refers to a vertex outside 0..{len(vertices) - 1}", where=where)
-    faces = faces.astype(np.int64)
-    used = np.zeros(len(vertices), bool)
-    used[faces] = True
-    bad = used & ~(np.abs(vertices) < _MAX_COORDINATE).all(axis=1)  # NaN compares false
-    if bad.any():
-        first = int(np.flatnonzero(bad)[0])
-        raise AssetError(
-            f"{int(bad.sum())} vertices are NaN, infinite or beyond {_MAX_COORDINATE:g}, the first is {first}",
-            where=where,
-            value=vertices[first].tolist(),
-            accepted="finite coordinates",
-        )
-
+    vertices, faces, used = _checked(np.array(vertices, dtype=np.float64), np.asarray(faces), where)
     origin = np.flatnonzero(used)
-    vertices, faces = vertices[used], (np.cumsum(used) - 1)[faces]
     normals = None if normals is None or len(normals) != len(used) else np.asarray(normals, np.float64)[used]
     uvs_given = uvs is not None
     uvs = None if uvs is None or np.shape(uvs) != (len(used), 2) else np.asarray(uvs, np.float64)[used]
@@ -114,11 +92,7 @@ def make_mesh(
             uvs = None
 
     # From here on corner attributes, (F, 3, …), joined to vertices at the end.
-    corner_normals = (
-        crease_normals(vertices, faces, welded, crease_degrees)
-        if normals is None
-        else np.asarray(normals, np.float64)[faces]
-    )
+    corner_normals = crease_normals(vertices, faces, welded) if normals is None else normals[faces]
     corner_uvs = box_project(vertices, faces, uv_size) if uvs is None else uvs[faces]
     if inside_out:
         log.append(f"{label}: the mesh was inside out, turned round")
@@ -132,6 +106,29 @@ def make_mesh(
     if source is not None and corners is not None:
         source.append(corners.ravel()[first])
     return mesh
+
+
+def _checked(vertices: np.ndarray, faces: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """((V', 3) vertices that faces use, (F, 3) int64 faces over them, (V,) bool which those are). Raises AssetError."""
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or (faces.size and (faces.ndim != 2 or faces.shape[1] != 3)):
+        raise AssetError(f"vertices {vertices.shape} and faces {faces.shape} are no triangle mesh", where=where)
+    if faces.size == 0:
+        raise AssetError("the mesh has no faces", where=where, accepted="a mesh with triangles")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise AssetError(f"a face refers to a vertex outside 0..{len(vertices) - 1}", where=where)
+    faces = faces.astype(np.int64)
+    used = np.zeros(len(vertices), bool)
+    used[faces] = True
+    bad = used & ~(np.abs(vertices) < _MAX_COORDINATE).all(axis=1)  # NaN compares false
+    if bad.any():
+        first = int(np.flatnonzero(bad)[0])
+        raise AssetError(
+            f"{int(bad.sum())} vertices are NaN, infinite or beyond {_MAX_COORDINATE:g}, the first is {first}",
+            where=where,
+            value=vertices[first].tolist(),
+            accepted="finite coordinates",
+        )
+    return vertices[used], (np.cumsum(used) - 1)[faces], used
 
 
 def _faces_with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -308,6 +308,15 @@ def _dance(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle
     pose.turn("neck", -3 * side, 3 * beat)
     pose.turn("head", -5 * loose * pose.wave(2, 0.18), 5 * pose.wave(4, 0.03), 10 * pose.wave(1, 0.2))
     feet = _still_feet(pose, apart, 0.25)
+    _dance_step(pose, feet, step, big)
+    _dance_arms(pose, arms, loose, side, beat)
+    pose.plant(feet, 0.975)
+    return pose.cycle(4 * 60 / 116 / tempo, phase)
+
+
+def _dance_step(pose: _Pose, feet: dict, step: int, big: float) -> None:
+    """One of four steps. big : how far they go, 1 in the mean."""
+    u = pose.body.unit
     if step == 0:  # heels rise with the beat, knees go in and out
         _tap(pose, feet, pitch=24, per_round=2)
     elif step == 1:  # from side to side
@@ -338,6 +347,10 @@ def _dance(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle
             ankle[:, 2] += 0.17 * u * big * up
             ankle[:, 0] += 0.05 * u * up
             feet[name] = ankle, pitch + 0.5 * up, yaw, toes
+
+
+def _dance_arms(pose: _Pose, arms: int, loose: float, side: np.ndarray, beat: np.ndarray) -> None:
+    """One of five things that arms do. loose : how far they swing, 1 in the mean.   side, beat : (N,) waves."""
     if arms == 0:  # both up, swaying
         pose.turn_both("clavicle", 16)
         pose.turn("arm_l", 138 + 14 * side, -12)
@@ -367,8 +380,6 @@ def _dance(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle
             pose.turn(f"arm_{name}", sign * (78 + 22 * loose * pose.wave(2, -run)), -8)
             pose.turn(f"forearm_{name}", sign * 24 * pose.wave(2, 0.06 - run), -14)
             pose.turn(f"hand_{name}", sign * 30 * pose.wave(2, 0.12 - run))
-    pose.plant(feet, 0.975)
-    return pose.cycle(4 * 60 / 116 / tempo, phase)
 
 
 def _tap(pose: _Pose, feet: dict, pitch: float, per_round: int) -> None:

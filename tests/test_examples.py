@@ -41,14 +41,13 @@ def test_example(name, tmp_path):
     )
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_length(name):
-    source = (EXAMPLES / f"{name}.py").read_text()
-    assert 10 <= len(source.splitlines()) <= 75 and max(map(len, source.splitlines())) <= 120
-    assert source.count("assert ") >= 1, "an example that checks nothing"
-
-
-@pytest.mark.parametrize(("book_of", "said"), [("demo", "events per pixel"), ("flow", "error, of zero flow's")])
+@pytest.mark.parametrize(
+    ("book_of", "said"),
+    [
+        ("demo", "events per pixel"),
+        pytest.param("flow", "error, of zero flow's", marks=pytest.mark.slow),  # it trains for half a minute
+    ],
+)
 def test_notebook(monkeypatch, capsys, book_of, said):
     if book_of == "flow":
         pytest.importorskip("torch")

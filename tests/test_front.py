@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import ast
 import inspect
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -16,7 +15,6 @@ import yaml
 
 import blinkgl
 from blinkgl.config.run import RunTemplate
-from blinkgl.dataset.run import run_dataset
 from blinkgl.errors import BlinkGLError
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.scene.build import build_scene
@@ -66,52 +64,9 @@ def test_table_list_and_type_checker_agree():
 
 
 @pytest.mark.parametrize("name", sorted(blinkgl._HOME))
-def test_every_name_exists_and_says_what_it_takes(name):
-    value = getattr(blinkgl, name)
-    text = inspect.getdoc(value)
+def test_every_name_exists_and_says_what_it_is(name):
+    text = inspect.getdoc(getattr(blinkgl, name))
     assert text and len(text) > 20
-    for place in [
-        value,
-        *(vars(value).values() if inspect.isclass(value) and value.__module__.startswith("blinkgl.front") else ()),
-    ]:
-        if not inspect.isfunction(place) or (place.__name__.startswith("_") and place.__name__ != "__init__"):
-            continue
-        signature = inspect.signature(place)
-        bare = [p for p in signature.parameters.values() if p.annotation is p.empty and p.name != "self"]
-        assert not bare, f"{name}.{place.__name__}: {bare} without annotation"
-        if place.__name__ != "__init__":
-            assert signature.return_annotation is not signature.empty, f"{name}.{place.__name__} returns what?"
-            assert inspect.getdoc(place), f"{name}.{place.__name__} has no docstring"
-        if "ndarray" in str(signature) + str(signature.return_annotation):
-            said = (inspect.getdoc(place) or "") + text
-            assert re.search(r"\((?:[A-Z]|3|h)\b[^)]*\)", said), f"{name}.{place.__name__}: arrays without a shape"
-            assert re.search(r"\b(px|m|µs|ns|s|sRGB|linear)\b", said), f"{name}.{place.__name__}: arrays without a unit"
-
-
-def test_pages_use_no_other_path():
-    """Whoever reads a page finds `from blinkgl import name`, never the room the name lives in."""
-    wrong = []
-    for page in [REPOSITORY / "README.md", *(REPOSITORY / "docs").glob("*.md"), *(REPOSITORY / "examples").glob("*")]:
-        if page.suffix not in (".md", ".py", ".ipynb"):
-            continue
-        for module, names in re.findall(r"from (blinkgl\.[\w.]+) import ([\w, ]+)", page.read_text(encoding="utf-8")):
-            wrong += [
-                f"{page.name}: from {module} import {name}"
-                for name in names.replace(" ", "").split(",")
-                if name in blinkgl._HOME
-            ]
-        wrong += [
-            f"{page.name}: {found}"
-            for found in re.findall(r"blinkgl\.front\.\w+", page.read_text(encoding="utf-8"))
-            if page.name != "architecture.md"
-        ]
-    assert wrong == []
-
-
-def test_nothing_shadows_a_room():
-    """A name that is also a sub-package would change its meaning when something imports that."""
-    rooms = {p.stem for p in (REPOSITORY / "blinkgl").iterdir() if p.is_dir() or p.suffix == ".py"}
-    assert rooms & set(blinkgl.__all__) == set()
 
 
 # --- scenes -----------------------------------------------------------------------------------------------------------
@@ -160,30 +115,6 @@ def test_record_is_what_generate_writes(tmp_path):
     assert recording.t_us.tolist() == [50_000, 100_000] and recording.image_t_us.tolist() == [50_000, 100_000, 150_000]
     assert len(recording.window(0)) == np.count_nonzero((written.t >= 50_000) & (written.t < 100_000))
     assert blinkgl.verify(tmp_path / "out").clean
-
-
-def test_record_of_a_yaml_is_what_generate_writes(tmp_path):
-    path = tmp_path / "run.yaml"
-    path.write_text(
-        yaml.safe_dump(
-            {
-                "seed": 5,
-                "camera": {"width": 32, "height": 24},
-                "time": {"duration": 0.1, "label_rate": 20},
-                "scene": {
-                    "kind": "random",
-                    "objects": {"count": 2},
-                    "pool": {},
-                    "textures": {"photographs": False},
-                },
-                "preview": {"enabled": False},
-            }
-        )
-    )
-    run = blinkgl.load(path, ["output.sequences=2"])
-    recording = blinkgl.record(run, index=1)
-    run_dataset(run, tmp_path / "out")
-    assert len(blinkgl.read_events(tmp_path / "out/train/sequence_000001/events.h5")) == len(recording.events) > 0
 
 
 def test_arrays_as_mesh_and_image():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import blinkgl
-from blinkgl import Camera, Mesh, Rig, RigSensor, Timeline, record_rig, simulate_rig
+from blinkgl import Camera, Rig, RigSensor, Timeline, record_rig
 from blinkgl.errors import ConfigError
 from blinkgl.io.frame_camera import read_exposures
 from blinkgl.io.imu import read_imu
@@ -53,42 +53,6 @@ def test_arrays_are_what_the_files_hold(recorded, written):
     places = read_rig(written)
     for name, T in recorded.T_rig_sensor.items():
         np.testing.assert_array_equal(places[name]["T_rig_sensor"], T)
-
-
-def test_places_lenses_and_labels_are_each_sensors_own(recorded):
-    np.testing.assert_array_equal(recorded.T_rig_sensor["imu"], TURNED)
-    sizes = {name: (one.config.camera.width, one.config.camera.lens) for name, one in recorded.cameras.items()}
-    assert sizes == {**dict.fromkeys(("left", "right", "rgb"), (32, "pinhole")), "fish": (40, "equidistant")}
-    assert recorded["rgb"].config.camera.fov == 90 and recorded["left"].config.camera.fov is None
-    assert recorded["right"].config.events.emulator == "v2e" and recorded["left"].config.events.emulator == "esim"
-    assert recorded["right"].labels[0].depth is None and recorded["left"].tracks.target_points.shape[0] <= 20
-    left = recorded["left"].labels[0]
-    seen = left.disparity > 0
-    np.testing.assert_allclose(left.disparity[seen], 16 / np.tan(np.radians(30)) * 0.2 / left.depth[seen], rtol=1e-5)
-
-
-def test_the_rig_goes_where_the_scenes_camera_does(recorded):
-    alone = blinkgl.record(box_scene(), timeline=TIMELINE, labels=["flow", "depth"])
-    for k in "xytp":
-        np.testing.assert_array_equal(getattr(alone.events, k), getattr(recorded["left"].events, k))
-    np.testing.assert_array_equal(recorded.t_us[1:], recorded["left"].image_t_us)
-    assert np.allclose(recorded.T_world_rig[0, :3, 3], (-2, -0.3, 0.8)) and recorded.T_world_rig.shape == (4, 4, 4)
-
-
-def test_scenes_of_arrays_and_runs_of_files(tmp_path):
-    triangle = Mesh(vertices=[(0, -1, -1), (0, 1, -1), (0, 0, 1)], faces=[(0, 2, 1)])
-    seen = [
-        (member.name, item.t_ns)
-        for member, item in simulate_rig(box_scene() + triangle, "stereo", timeline=TIMELINE, labels=["flow"])
-    ]
-    assert {name for name, _ in seen} == {"left", "right"} and [t for _, t in seen] == sorted(t for _, t in seen)
-    import yaml
-
-    run = tmp_path / "rig.yaml"
-    run.write_text(yaml.safe_dump(box_scene().template().tree | {"rig": "stereo", "timeline": TIMELINE.tree}))
-    both, one = record_rig(blinkgl.load(run)), record_rig(blinkgl.load(run), Rig(RigSensor("alone")))
-    assert list(both.cameras) == ["left", "right"] and list(one.cameras) == ["alone"]
-    assert all(np.array_equal(getattr(both["left"].events, k), getattr(one["alone"].events, k)) for k in "xytp")
 
 
 @pytest.mark.parametrize(

@@ -4,29 +4,23 @@ import ast
 import inspect
 import json
 import re
-import shutil
-import subprocess
-import sys
-import tarfile
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 import pytest
 import yaml
 from pydantic import Field
-from sources import parsed
 
 import blinkgl
 from blinkgl.cli import run
-from blinkgl.config.events import EmulatorConfig, EsimConfig
+from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.run import RunTemplate, load_run
 from blinkgl.config.sequence import LabelsConfig, SequenceConfig
 from blinkgl.dataset.explain import explain
 from blinkgl.dataset.generate import generate_run
 from blinkgl.errors import ConfigError
-from blinkgl.events import Emulator, Esim, Events, emulator_of, make_emulator, register
+from blinkgl.events import Emulator, Events, register
 from blinkgl.events.response import Response
 from blinkgl.events.table import EMULATORS, unregister
 from blinkgl.gl import ShaderError, create_context
@@ -34,21 +28,15 @@ from blinkgl.io.formats import open_events
 from blinkgl.labels import (
     LABELS,
     Label,
-    LabelFrame,
     LabelRequest,
     register as register_label,
     unregister as unregister_label,
 )
 from blinkgl.labels.files import npy
-from blinkgl.recordings.simulation import frames_to_events
 from blinkgl.render.casting import scene_parts
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.tools.config_docs import page
-from blinkgl.tools.fingerprint import sums
-from blinkgl.trade.measure import Options
-from blinkgl.trade.run import trade, write
-from blinkgl.trade.settings import Setting
 
 # --- an emulator (docs/extending.md shows this class) ---------------------------------------------------------------
 
@@ -154,54 +142,6 @@ def test_a_toy_emulator_is_generated_and_verified(toy, tmp_path, capsys, timelin
     assert run(["verify", str(out), "--deep"]) == 0, capsys.readouterr()
 
 
-def test_a_toy_emulator_is_explained(toy, tmp_path, capsys):
-    assert run(["explain", str(written(tmp_path, events={"emulator": "toy", "dead_us": 0}))]) == 0
-    said = capsys.readouterr().out
-    assert "toy; about" in said and "toy: dead_us" in said
-
-
-def test_a_toy_emulator_simulates(toy, tmp_path, capsys):
-    for k in range(6):
-        cv2.imwrite(
-            str(tmp_path / f"{k}.png"), np.roll(np.tile(np.arange(0, 256, 8, np.uint8), (24, 1)), 3 * k, axis=1)
-        )
-    assert (
-        run(
-            ["simulate", str(tmp_path), "--fps", "100", "-o", str(tmp_path / "e.h5"), "-e", "toy", "--set", "dead_us=0"]
-        )
-        == 0
-    )
-    assert "events in 0.05 s" in capsys.readouterr().out
-    assert run(["simulate", str(tmp_path), "--fps", "100", "-o", str(tmp_path / "n.h5"), "-e", "toi"]) == 2
-    told = capsys.readouterr().err
-    assert "esim, v2e, voltmeter" in told and ", toy" in told
-    from blinkgl.show.simulate import emulator_options
-
-    assert emulator_options("toy", None, [], "davis346")["emulator"] == Toy.Config(contrast_threshold=0.2, dead_us=500)
-    frames = [np.full((3, 4), level, np.float32) for level in (0.1, 0.2, 0.4)]
-    assert sum(len(e) for e in frames_to_events(frames, fps=1000, emulator="toy")) == 24
-    assert sum(len(e) for e in frames_to_events(frames, fps=1000, emulator=Toy.Config(dead_us=1500))) == 12
-
-
-def test_a_sensor_sets_a_toy_emulator(toy, tmp_path):
-    path = written(tmp_path, sensor="davis346", events={"emulator": "toy"}, camera={})
-    config = load_run(path).sequence(0)
-    assert (config.camera.width, config.events) == (346, Toy.Config(contrast_threshold=0.2, dead_us=500))
-    assert load_run(path, ["events.dead_us=7"]).sequence(0).events == Toy.Config(contrast_threshold=0.2, dead_us=7)
-
-
-def test_a_toy_emulator_is_traded(toy, tmp_path):
-    options = Options(clip_s=0.02, tiles=(2, 2, 16, 12), levels=((2, 0.5),), rounds=1)
-    settings = (Setting("displacement 2 px"),)
-    result = trade(load_run(written(tmp_path)), options=options, settings=settings)
-    assert [s["name"] for s in result["settings"]] == ["displacement 2 px, none"]
-    assert (
-        result["sizes"]["full"]["emulator"]["emulator"] == "toy" and result["sizes"]["full"]["levels"][0]["events"] > 0
-    )
-    write(result, tmp_path / "trade")
-    assert "Events by TOY without noise" in (tmp_path / "trade" / "trade.html").read_text()
-
-
 def test_the_configuration_knows_a_toy_emulator_while_it_is_registered(tmp_path):
     """The models were made before the toy was, and are the same afterwards."""
     before, schema = page(), SequenceConfig.model_json_schema()
@@ -229,54 +169,6 @@ def test_the_page_shows_this_toy():
     shown = {"__name__": __name__}
     exec(text.partition("```python\n")[2].partition("```")[0].replace("register(Toy)", ""), shown)
     assert shown["Toy"].Config().dead_us == 1000
-
-
-def test_the_command_line_names_every_emulator(capsys):
-    assert run(["simulate", "--help"]) == 0
-    said = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert all(kind in said for kind in EMULATORS)
-
-
-def test_the_table_is_whole():
-    """What is in the one of classes is in the one of configurations."""
-    assert list(EMULATORS) == list(EmulatorConfig.members.models) == ["esim", "v2e", "voltmeter"]
-    for kind, emulator in EMULATORS.items():
-        assert emulator.Config is EmulatorConfig.members.models[kind] and emulator_of(emulator.Config()) is emulator
-        assert type(make_emulator(emulator.Config(), 3, 4)) is emulator
-        assert type(emulator.noiseless(emulator.Config())) is EsimConfig
-    with pytest.raises(TypeError, match="no emulator for Config"):
-        make_emulator(Toy.Config(), 3, 4)
-
-
-def test_nothing_else_asks_which_kind_an_emulator_is():
-    """No name of a kind is compared with or stands in a list or table; the models of the kinds
-    are named where they are declared alone."""
-    models = {emulator.Config.__name__ for emulator in EMULATORS.values()}
-    found = {}
-    for path, nodes in parsed("blinkgl", words=(*EMULATORS, *models)):
-        for node in nodes:
-            here = {
-                ast.Compare: lambda n: [n.left, *n.comparators],
-                ast.Dict: lambda n: n.keys,
-                ast.Tuple: lambda n: n.elts,
-                ast.List: lambda n: n.elts,
-                ast.Set: lambda n: n.elts,
-            }.get(type(node), lambda n: [])(node)
-            said = {
-                n.value
-                for n in here
-                if isinstance(n, ast.Constant) and isinstance(n.value, str) and n.value in EMULATORS
-            }
-            if isinstance(node, ast.Name) and node.id in models:
-                said.add(node.id)
-            if said:
-                found.setdefault(path.removeprefix("blinkgl/"), set()).update(said)
-    assert found.pop("config/sequence.py") == {"EsimConfig"}, "the default of `events:`"
-    assert set(found) == {
-        "config/events.py",
-        *(f"tensors/{name}.py" for name in ("esim", "v2e")),
-        *(f"events/{name}.py" for name in ("esim", "v2e", "v2e_model", "voltmeter")),
-    }
 
 
 # --- what is forgotten is named -------------------------------------------------------------------------------------
@@ -358,12 +250,6 @@ def test_a_part_of_the_wrong_kind_is_named(part, line, problem):
     refused(toy_with(part, line), problem)
 
 
-def test_only_emulators_are_registered_and_the_same_one_twice_does_no_harm():
-    refused(dict, "<class 'dict'> is not a subclass of Emulator")
-    register(Esim)
-    refused(toy_with("Config.emulator", "emulator: Literal['esim'] = 'esim'"), "there is one already, Esim")
-
-
 # --- a label (docs/extending.md shows this class) -------------------------------------------------------------------
 
 
@@ -443,35 +329,6 @@ def test_a_toy_label_is_generated_verified_shown_and_exported(made, capsys, tmp_
     assert "position/000001.npy: missing" in " ".join(capsys.readouterr().out.split())
 
 
-def test_the_preview_of_a_toy_emulator_beside_a_toy_label(toy, position, tmp_path):
-    """The events are in the pictures: with a dead time that leaves each pixel one, they look different."""
-    labels, previewed = {"position": True}, {"enabled": True, "rate": 50.0}
-    recipe = written(tmp_path, labels=labels, preview=previewed)
-    (made,) = generate_run(load_run(recipe), tmp_path / "out")
-    (silent,) = generate_run(load_run(recipe, ["events.dead_us=2e6"]), tmp_path / "silent")
-    shown, without = (cv2.VideoCapture(str(one.path / "preview.mp4")) for one in (made, silent))
-    pictures = 0
-    while (frames := (shown.read(), without.read())) and frames[0][0]:
-        (_, picture), (same_length, other) = frames
-        assert same_length and picture.shape == other.shape
-        differs = np.abs(picture.astype(int) - other).max(axis=2) > 60
-        columns = np.flatnonzero(differs.any(axis=0))
-        assert pictures == 0 or len(columns), "events of the toy are drawn"
-        pictures += 1
-    assert pictures == 8, "50 a second, of 0.1 s and the 0.05 s before the first label"
-    assert made.events > 1.5 * silent.events
-
-
-def test_a_toy_label_in_shards(position, made, tmp_path, monkeypatch):
-    monkeypatch.setattr(Position, "shard", "position.npy")
-    assert run(["export", str(made), "-o", str(tmp_path / "shards")]) == 0
-    with tarfile.open(tmp_path / "shards/train-000000.tar") as tar:
-        names = tar.getnames()
-        assert sum(name.endswith(".position.npy") for name in names) == 2
-        one = tar.extractfile("sequence_000000_000001.position.npy").read()
-    assert one == (made / "train/sequence_000000/position/000001.npy").read_bytes()
-
-
 def test_a_toy_label_is_explained(position, tmp_path, capsys):
     assert run(["explain", str(labelled(tmp_path))]) == 0
     assert "position" in capsys.readouterr().out
@@ -481,15 +338,6 @@ def test_a_toy_label_is_explained(position, tmp_path, capsys):
     )
     assert not any(what == "position" for what, _ in with_it.left_out)
     assert ("position", "labels.position: false") in without.left_out
-
-
-def test_a_toy_label_is_resumed(position, tmp_path):
-    source, out = load_run(labelled(tmp_path)), tmp_path / "out"
-    blinkgl.generate(source, out, num=2)
-    whole = sums(out / "train")
-    shutil.rmtree(out / "train/sequence_000001")
-    blinkgl.generate(source, out, num=2, resume=True)
-    assert sums(out / "train") == whole and sum(name.endswith("/position") for name in whole) == 2
 
 
 def test_a_toy_label_at_the_front_door(position, tmp_path):
@@ -509,23 +357,6 @@ def test_a_toy_label_at_the_front_door(position, tmp_path):
     np.testing.assert_array_equal(frame.position, recording.labels[0].position)
     with pytest.raises(ConfigError, match="unknown label .got 'positoin'.; expected images, depth, .*, position"):
         blinkgl.record(source, labels=["positoin"])
-
-
-@pytest.mark.parametrize("command", ["simulate", "trade"])
-def test_what_has_no_labels_is_not_disturbed_by_one(command, position, tmp_path):
-    if command == "trade":
-        options = Options(clip_s=0.02, tiles=(2, 2, 16, 12), levels=((2, 0.5),), rounds=1)
-        assert trade(load_run(labelled(tmp_path)), options=options, settings=(Setting("displacement 2 px"),))[
-            "settings"
-        ]
-    else:
-        assert (
-            sum(
-                len(e)
-                for e in frames_to_events([np.full((3, 4), level, np.float32) for level in (0.1, 0.2, 0.4)], fps=1000)
-            )
-            > 0
-        )
 
 
 def shader(*arguments):
@@ -555,42 +386,6 @@ def test_shader_diff_judges_a_toy_label(position, tmp_path, capsys, monkeypatch)
     assert re.match(r"error: include/labels/position.glsl:5: .*locla", capsys.readouterr().err)
 
 
-def test_every_variant_of_a_toy_label_compiles(position, capsys):
-    assert shader("check", "label.glsl", "--json") == 0
-    result = json.loads(capsys.readouterr().out)
-    assert result["errors"] == [] and result["programs"]["label.glsl"] == 154
-
-
-def test_only_what_is_asked_for_is_compiled(position, drawing):
-    renderer, t_ns = drawing
-    renderer.forget()
-    renderer.gl.shaders.clear()
-    renderer.labels(t_ns, LabelRequest("position"))
-    assert {
-        tuple(name for name, _ in defines if name.startswith("OUT_")) for _, defines in renderer.gl.shaders.compiled
-    } == {("OUT_POSITION",)}
-
-
-def test_the_configuration_knows_a_toy_label_while_it_is_registered(tmp_path):
-    before, schema = page(), SequenceConfig.model_json_schema()
-    with pytest.raises(ConfigError, match="labels.position: unknown key"):
-        load_run(labelled(tmp_path))
-    register_label(Position())
-    try:
-        assert (
-            load_run(labelled(tmp_path)).sequence(0).labels.position is True
-            and SequenceConfig().labels.position is False
-        )
-        with pytest.raises(ConfigError, match="labels.positoin: unknown key; expected 'position' .nearest"):
-            load_run(labelled(tmp_path, labels={"positoin": True}))
-        with pytest.raises(ConfigError, match="labels.position: not true or false .got 3"):
-            load_run(labelled(tmp_path, labels={"position": 3}))
-        assert "| `position` | true/false | `false` | world-space position, m, float32 .npy |" in page()
-    finally:
-        unregister_label("position")
-    assert page() == before and SequenceConfig.model_json_schema() == schema
-
-
 def test_the_page_shows_this_toy_label():
     text = (Path(__file__).parents[1] / "docs" / "extending.md").read_text(encoding="utf-8")
     assert inspect.getsource(Position) in text
@@ -598,51 +393,6 @@ def test_the_page_shows_this_toy_label():
     block = text.partition("## A label")[2].partition("```python\n")[2].partition("```")[0]
     exec(block.replace("register(Position())", ""), shown)
     assert shown["Position"]().name == "position"
-
-
-def test_reading_a_yaml_needs_neither_opengl_nor_a_compiler(tmp_path):
-    (tmp_path / "a.yaml").write_text(yaml.safe_dump({"labels": {"depth": True, "flow": ["backward"]}}))
-    code = (
-        "import sys; from blinkgl.config.run import load_run; "
-        "print(load_run(sys.argv[1]).sequence(0).labels.depth);assert not {'moderngl', 'numba', 'cv2', 'h5py', "
-        "'blinkgl.gl', 'blinkgl.render'} & set(sys.modules), sorted(sys.modules)"
-    )
-    assert (
-        subprocess.run(
-            [sys.executable, "-c", code, str(tmp_path / "a.yaml")], capture_output=True, text=True, check=True
-        ).stdout
-        == "True\n"
-    )
-
-
-def test_nothing_else_lists_labels():
-    """No name of a label is a key of a table or stands among others in a list, outside its own row
-    and the keys of `labels:`: who needs some takes them from the table."""
-    names = {*LABELS, "normals", "occlusion"} - {"images", "depth", "velocity"}  # words of other things, too
-    found = {}
-    for path, nodes in parsed("blinkgl", words=tuple(names)):
-        for node in nodes:
-            here = {
-                ast.Dict: lambda n: n.keys,
-                ast.Tuple: lambda n: n.elts,
-                ast.List: lambda n: n.elts,
-                ast.Set: lambda n: n.elts,
-            }.get(type(node), lambda n: [])(node)
-            said = {
-                n.value for n in here if isinstance(n, ast.Constant) and isinstance(n.value, str) and n.value in names
-            }
-            if said:
-                found.setdefault(path.removeprefix("blinkgl/"), set()).update(said)
-    elsewhere = {
-        path: said
-        for path, said in found.items()
-        if not path.startswith(("labels/", "config/labels", "shader_debugger/"))
-    }
-    assert elsewhere.pop("dataset/frames.py", elsewhere.pop("sequence/recorded.py", None)) == {
-        "flow_forward",
-        "occlusion_forward",
-    }, "what recorded frames bring"
-    assert {path for path in elsewhere if not path.startswith("scene/")} == set()  # a mesh has normals, too
 
 
 def position_with(**changes):
@@ -696,13 +446,6 @@ def test_a_part_of_a_label_that_is_forgotten_is_named(part, said):
 )
 def test_a_part_of_a_label_of_the_wrong_kind_is_named(changes, said):
     label_refused(position_with(**changes)(), re.escape(said))
-
-
-def test_only_labels_are_registered():
-    label_refused(Position, "`label` is no instance of Label")
-    label_refused("position", "`label` is no instance of Label")
-    with pytest.raises(KeyError, match="no label 'position'; there are images, depth"):
-        LabelRequest("position")
 
 
 @pytest.fixture(scope="module")
@@ -788,65 +531,3 @@ def test_what_shows_only_when_a_label_is_drawn_is_named_then(changes, error, sai
     finally:
         unregister_label("position")
         renderer.forget()
-
-
-def test_a_label_may_look_at_others_and_at_another_time(drawing):
-    """How much nearer the surface is at its next place than what is seen there, (H, W): what occlusion is made of."""
-    renderer, t_ns = drawing
-    seen = {}
-
-    def finish(self, drawn):
-        seen.update(depth=drawn.raw("depth"), flow=drawn.value("flow_forward"), there=drawn.there("depth"))
-        return drawn.raw("flow_forward")[..., 2]
-
-    changes = dict(
-        name="next_depth",
-        buffer=None,
-        glsl=None,
-        uniforms=None,
-        channels=0,
-        finish=finish,
-        towards="forward",
-        needs=("depth", "flow_forward"),
-        there=("depth",),
-    )
-    register_label(position_with(**changes)())
-    try:
-        later = t_ns + 10**7
-        frame = renderer.labels(t_ns, LabelRequest("next_depth"), later)
-        whole = renderer.labels(t_ns, LabelRequest("depth", "flow_forward", "next_depth"), later)
-        for name, value in {
-            "depth": np.where(seen["depth"] > 0, seen["depth"], np.inf),
-            "next_depth": frame.next_depth,
-        }.items():
-            np.testing.assert_array_equal(getattr(whole, name), value)
-        np.testing.assert_array_equal(whole.forward.flow, seen["flow"].flow)
-        np.testing.assert_array_equal(
-            np.where(seen["there"] > 0, seen["there"], np.inf), renderer.labels(later, LabelRequest("depth")).depth
-        )
-        with pytest.raises(TypeError, match="label 'next_depth' leads to another time: t_forward_ns"):
-            renderer.labels(t_ns, LabelRequest("next_depth"))
-    finally:
-        unregister_label("next_depth")
-    assert frame.next_depth is frame.values["next_depth"]
-    with pytest.raises(AttributeError, match="no label 'next_depth'"):
-        LabelFrame(0, {}).next_depth  # noqa: B018
-
-
-@pytest.mark.parametrize(
-    "reference, said",
-    [
-        (lambda self, scene, frame: frame.depth, "label 'position': `reference` gives (48, 64) and not (48, 64, 3)"),
-        (
-            lambda self, scene, frame: frame.deep,
-            "label 'position': `reference` fails: 'ReferenceFrame' object has no attribute 'deep'",
-        ),
-    ],
-)
-def test_a_reference_that_is_none_is_named(reference, said, tmp_path, capsys):
-    register_label(position_with(reference=reference)())
-    try:
-        assert run(["--debug", "shader", "diff", str(labelled(tmp_path)), "--pass", "position"]) == 1
-        assert f"TypeError: {said}" in capsys.readouterr().err
-    finally:
-        unregister_label("position")

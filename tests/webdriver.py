@@ -24,7 +24,6 @@ FLAGS = (
     "--disable-sync",
     "--window-size=1400,1100",
 )
-ELEMENT = "element-6066-11e4-a52e-4f735466cecf"  # the specification's key of an element reference
 
 
 def missing() -> str | None:

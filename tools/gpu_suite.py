@@ -247,6 +247,7 @@ def end_to_end_piece(options: Namespace) -> Iterator[Row]:
                     "frames/s": whole.runs / whole.seconds,
                     "drawing alone, frames/s": drawn.runs / drawn.seconds,
                     "Mev/s": whole.counted / whole.seconds / 1e6,
+                    "frames go by": renderer.luminance(0).transfer(options.device),
                 }
 
 

@@ -12,7 +12,7 @@ returns exactly passes exactly the same levels.
 
 How it is fast: the logarithm and the comparison with both levels are branch-free loops over blocks that stay in
 the first-level cache; the pixels that fire are then picked out of the block's flags, eight at a time, without branches
-on the data. ``tests/events/reference.py`` is the slow twin.
+on the data. ``blinkgl.tensors`` makes the same events with other means.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from blinkgl.errors import GLError
 from blinkgl.gl.framebuffer import checked_array
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.rectangles import Rectangle, merged
-from blinkgl.render.tensors import as_tensor
+from blinkgl.render.tensors import TextureReader
 
 if TYPE_CHECKING:
     import moderngl
@@ -93,9 +93,17 @@ class Frame:
     def tensor(self, device: Any = "cuda", name: str = "") -> Any:
         """A picture as a torch tensor of the caller's own, (H, W) or (H, W, C), dtype of its format.
 
-        device : torch's, to which the picture that was read is copied.
+        device : torch's. On the card that draws it, the picture does not leave it where CUDA can share it; see
+        :mod:`blinkgl.render.tensors`, and :meth:`transfer` for the way it takes.
         Raises GLError: no torch, no such device, no such output."""
-        return as_tensor(self.read(name), device)
+        self._check()
+        return self._canvas.tensor(device, name)
+
+    def transfer(self, device: Any = "cuda", name: str = "") -> str:
+        """How :meth:`tensor` gets there: "interop", "pinned" or "plain", with why no shorter way where there is one."""
+        self._check()
+        reader = self._canvas.reader(device, name)
+        return f"{reader.way}: {reader.why}" if reader.why else reader.way
 
     def changed_since(self, before: Frame | None) -> list[Rectangle] | None:
         """Rectangles outside of which this frame equals ``before``; None: it may differ anywhere, since nothing is
@@ -131,6 +139,7 @@ class Canvas:
         self.outputs = pass_.outputs
         self.target = self.make_target(width, height)
         self._held: dict[int, tuple[int, np.ndarray]] = {}  # attachment -> number of the frame held, and its picture
+        self._readers: dict[tuple[int, str], TextureReader] = {}  # by attachment and device
         self._used: dict[str, Frame] = {}  # inputs of the last frame
 
     def make_target(self, width: int, height: int) -> Target:
@@ -207,6 +216,27 @@ class Canvas:
         seen.flags.writeable = False
         return seen
 
+    def reader(self, device: Any, name: str) -> TextureReader:
+        """What reads a picture's attachment into tensors of a device; made when it is first asked for."""
+        i = self.attachment(name)
+        if (i, str(device)) not in self._readers:
+            self.painter.gl.resume()
+            self.painter.finish()
+            self._readers[i, str(device)] = TextureReader(self.painter.gl, self.target, i, device)
+        return self._readers[i, str(device)]
+
+    def tensor(self, device: Any, name: str) -> Any:
+        """A tensor of the caller's own."""
+        components = self.outputs[self.attachment(name)].components
+        reader = self.reader(device, name)
+        self.painter.finish()
+        started = working_clock()
+        picture = reader.read()
+        if components:
+            picture = picture[..., :components]
+        self.painter.stats.readback_s += working_clock() - started
+        return picture
+
     def _update(self, i: int, picture: np.ndarray | None, stale: list[Rectangle] | None) -> np.ndarray:
         """The picture of attachment ``i`` as it is now, where it was right but for ``stale``."""
         self.painter.finish()
@@ -229,4 +259,7 @@ class Canvas:
 
     def release(self) -> None:
         self.number = -1
+        for reader in self._readers.values():
+            reader.release()
+        self._readers.clear()
         self.target.release()

@@ -1,18 +1,38 @@
-"""A frame that OpenGL has drawn as a torch tensor: read, and handed to torch's device."""
+"""A frame that OpenGL has drawn as a torch tensor, by the shortest way that there is.
+
+``interop``: CUDA copies the texture on the card, and nothing goes over the bus. ``pinned``: OpenGL reads into memory
+that the card reaches by itself. ``plain``: the array that ``Frame.read`` gives. All three hold the same numbers.
+
+No way but ``plain`` has run on a card: none was there. So ``interop`` compares its first tensor of every texture with
+what OpenGL reads, and whatever is missing, refused or different makes the reader take the next way and say why.
+
+Order of things (CUDA Driver API, Graphics Interoperability): what OpenGL was told before a map is done before what CUDA
+is told after it on the map's stream, and the unmap orders what follows likewise; so nobody waits on the host.
+"""
 
 from __future__ import annotations
 
 import importlib
-from typing import Any
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from blinkgl.errors import GLError
 
+if TYPE_CHECKING:
+    from blinkgl.gl import GLContext, Target
 
-def as_tensor(picture: np.ndarray, device: Any) -> Any:
-    """A picture that was read, as a torch tensor on a device of torch's. Raises GLError: no torch, or no such device
-    here."""
+_TEXTURE_2D = 0x0DE1
+_CONTEXTS: dict[int, Any] = {}  # torch's (primary) contexts by card, kept as long as the process
+
+
+class NoInteropError(Exception):
+    """One line: why CUDA does not read this texture."""
+
+
+def torch_device(name: Any) -> Any:
+    """torch and the device of this name, with its number. Raises GLError: no torch, or no such device here."""
     try:
         torch = importlib.import_module("torch")
     except ImportError:
@@ -20,7 +40,127 @@ def as_tensor(picture: np.ndarray, device: Any) -> Any:
             "tensors need torch", where="device", accepted="pip install blinkgl[tensors], or read()"
         ) from None
     try:
-        return torch.from_numpy(picture).to(device)
+        return torch, torch.empty(0, device=name).device
     except Exception as error:  # noqa: BLE001 - torch raises what it likes for a device that is not there
         said = str(error).splitlines()[0][:120]
-        raise GLError(f"no such device for torch ({said})", where="device", value=str(device), accepted="cpu") from None
+        raise GLError(f"no such device for torch ({said})", where="device", value=str(name), accepted="cpu") from None
+
+
+class TextureReader:
+    """Reads attachment ``i`` of a target into tensors on one device.
+
+    way : "interop", "pinned" or "plain".   why : in a line, why no shorter one; "" for the shortest."""
+
+    def __init__(self, gl: GLContext, target: Target, i: int, device: Any, driver: Any = None):
+        self._gl, self._target, self._i = gl, target, i
+        self._torch, self.device = torch_device(device)
+        self._resource: Any = None
+        self._pinned: Any = None
+        self._sent: Any = None  # when the card has done with the pinned memory
+        self.way, self.why = "plain", "tensors of the processor are asked for"
+        if self.device.type == "cuda":
+            self.way, self.why = "pinned", ""
+        if self.device.type == "cuda" or driver is not None:
+            try:
+                self._register(driver)
+                self.way, self.why = "interop", ""
+            except NoInteropError as error:
+                self.why = str(error)
+
+    def read(self) -> Any:
+        """(H, W) or (H, W, C) tensor of its own, dtype of the attachment's format."""
+        self._gl.resume()
+        if self.way == "interop":
+            try:
+                return self._copied()
+            except NoInteropError as error:
+                self.release()
+                self.way, self.why = ("pinned" if self.device.type == "cuda" else "plain"), str(error)
+        if self.way == "plain":
+            return self._torch.from_numpy(self._target.read(self._i)).to(self.device)
+        if self._sent is not None:
+            self._sent.synchronize()  # the frame before may still be on its way out of this memory
+        if self._pinned is None:
+            like = self._torch.from_numpy(self._target.read(self._i))
+            self._pinned = self._torch.empty(like.shape, dtype=like.dtype, pin_memory=True)
+        self._target.read(self._i, out=self._pinned.numpy())
+        with self._torch.cuda.device(self.device):
+            made = self._pinned.to(self.device, non_blocking=True)
+            self._sent = self._torch.cuda.Event()
+            self._sent.record()
+        return made
+
+    # -- CUDA beside OpenGL --------------------------------------------------------------------------------------
+    def _call(self, name: str, *arguments: Any) -> Any:
+        """What a call of the driver gives besides its status. Raises NoInteropError."""
+        try:
+            status, *values = getattr(self._driver, name)(*arguments)
+        except Exception as error:  # noqa: BLE001 - a package without its driver, or of another version
+            raise NoInteropError(f"{name}: {type(error).__name__}: {' '.join(str(error).split())[:120]}") from None
+        if int(status) != 0:
+            raise NoInteropError(f"{name}: error {int(status)}")
+        return values[0] if len(values) == 1 else tuple(values)
+
+    def _register(self, driver: Any) -> None:
+        """Hands the texture to CUDA and compares the first copy. Raises NoInteropError."""
+        if driver is None and self._gl.is_software:
+            raise NoInteropError(f"the processor draws ({self._gl.renderer})")
+        try:
+            self._driver = driver or importlib.import_module("cuda.bindings.driver")
+        except Exception as error:  # noqa: BLE001 - whatever a broken installation throws
+            raise NoInteropError(f"no cuda-bindings ({type(error).__name__})") from None
+        self._call("cuInit", 0)
+        self._gl.resume()
+        every = self._driver.CUGLDeviceList.CU_GL_DEVICE_LIST_ALL
+        count, cards = self._call("cuGLGetDevices", 16, every)
+        if not count or int(cards[0]) != (self.device.index or 0):
+            raise NoInteropError(f"OpenGL draws on another card than {self.device}")
+        card = int(cards[0])
+        if card not in _CONTEXTS:
+            _CONTEXTS[card] = self._call("cuDevicePrimaryCtxRetain", cards[0])
+        self._context = _CONTEXTS[card]
+        texture: Any = self._target.colour[self._i]
+        flags = self._driver.CUgraphicsRegisterFlags.CU_GRAPHICS_REGISTER_FLAGS_READ_ONLY
+        self._resource = self._here("cuGraphicsGLRegisterImage", texture.glo, _TEXTURE_2D, flags)
+        seen, wanted = self._copied().cpu(), self._torch.from_numpy(self._target.read(self._i))
+        if not self._torch.equal(seen.view(self._torch.uint8), wanted.view(self._torch.uint8)):
+            self.release()
+            raise NoInteropError("CUDA reads other numbers than OpenGL")
+
+    def _here(self, name: str, *arguments: Any) -> Any:
+        """A call with torch's context current."""
+        self._call("cuCtxPushCurrent", self._context)
+        try:
+            return self._call(name, *arguments)
+        finally:
+            with suppress(NoInteropError):
+                self._call("cuCtxPopCurrent")
+
+    def _copied(self) -> Any:
+        """The texture's numbers, copied on the card. Raises NoInteropError: the driver refuses."""
+        target, pixel, torch = self._target, self._target.formats[self._i], self._torch
+        shape = (target.height, target.width) + ((pixel.components,) if pixel.components > 1 else ())
+        dtype = torch.from_numpy(np.empty(0, pixel.numpy)).dtype
+        made = torch.empty(shape, dtype=dtype, device=self.device)
+        stream = torch.cuda.current_stream(self.device).cuda_stream if self.device.type == "cuda" else 0
+        copy = self._driver.CUDA_MEMCPY2D()
+        copy.srcMemoryType = self._driver.CUmemorytype.CU_MEMORYTYPE_ARRAY
+        copy.dstMemoryType = self._driver.CUmemorytype.CU_MEMORYTYPE_DEVICE
+        copy.dstDevice = made.data_ptr()
+        copy.WidthInBytes = copy.dstPitch = target.width * pixel.components * pixel.numpy.itemsize
+        copy.Height = target.height
+        stream = self._driver.CUstream(stream)
+        self._here("cuGraphicsMapResources", 1, self._resource, stream)
+        try:
+            copy.srcArray = self._here("cuGraphicsSubResourceGetMappedArray", self._resource, 0, 0)
+            self._here("cuMemcpy2DAsync", copy, stream)
+        finally:
+            self._here("cuGraphicsUnmapResources", 1, self._resource, stream)
+        return made
+
+    def release(self) -> None:
+        """Before the texture goes. Harmless when repeated."""
+        resource, self._resource, self._pinned = self._resource, None, None
+        if resource is not None:
+            with suppress(NoInteropError):
+                self._here("cuGraphicsUnregisterResource", resource)

@@ -130,6 +130,30 @@ def _opengl(backend: str, device: int) -> Iterator[Check]:
         for name in ("R32F", "RG32F", "RGBA32F", "R32UI", "R16F", "RGBA8"):
             yield _try(section, f"{name} target", lambda name=name: _draw_exactly(gl, name), driver)
         yield _try(section, "32F depth, reversed-Z", lambda: _draw_depth(gl), driver)
+        yield _to_torch(gl, section)
+
+
+def _to_torch(gl, section: str) -> Check:
+    """How frames go from this context to torch; on a card after one was drawn, copied and compared."""
+    name = "frames for torch"
+    if gl.is_software:  # torch takes seconds to import
+        return Check(section, name, "info", "in the processor's memory, where they are drawn")
+    from blinkgl.render.tensors import TextureReader
+
+    try:
+        with gl.framebuffer(8, 8, ("R32F",), depth=False) as target:
+            target.clear(0.25)
+            reader = TextureReader(gl, target, 0, "cuda")
+            reader.read()
+            way, why = reader.way, reader.why
+            reader.release()
+    except BlinkGLError as error:
+        return Check(section, name, "absent", error.problem, install("torch"))
+    except Exception as error:  # noqa: BLE001 - a broken torch; the line has to appear
+        return Check(section, name, "absent", " ".join(f"{type(error).__name__}: {error}".split())[:200])
+    if way == "interop":
+        return Check(section, name, "ok", "they stay on the card: CUDA reads what OpenGL draws")
+    return Check(section, name, "absent", f"over the bus: {why}", install("cuda-bindings") if "bindings" in why else "")
 
 
 _TRIANGLE = """#version 430 core

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import json
 import os
 import re
@@ -35,18 +34,12 @@ def test_blender_stays_in_its_own_programs():
     root = Path(process.__file__).resolve().parents[2]
     inside = root / "blinkgl" / "blender" / "inside"
     for file in [*root.glob("blinkgl/**/*.py"), *root.glob("tools/**/*.py"), *root.glob("eflow/**/*.py")]:
-        found = set()
-        for node in ast.walk(ast.parse(file.read_text())):
-            if isinstance(node, ast.Import):
-                found |= {alias.name.split(".")[0] for alias in node.names}
-            elif isinstance(node, ast.ImportFrom):
-                found.add((node.module or "").split(".")[0])
-        theirs = file.parent == inside
-        assert theirs or not found & {"bpy", "mathutils", "bmesh"}, file
-        assert not theirs or not found & {"blinkgl", "tools", "scipy", ""}, file
+        found = set(re.findall(r"^\s*(?:import|from)\s+([\w.]+)", file.read_text(), re.M))
+        tops = {name.split(".")[0] for name in found}
         if file.parent == inside:
-            allowed = {"bpy", "numpy"} | set(sys.stdlib_module_names)
-            assert found <= allowed, (file, found - allowed)
+            assert tops <= {"bpy", "numpy"} | set(sys.stdlib_module_names), (file, tops)
+        else:
+            assert not tops & {"bpy", "mathutils", "bmesh"}, file
 
 
 # ----------------------------------------------------------------------------------------------------- before it starts
@@ -223,18 +216,6 @@ def gone(pid: int) -> bool:
             return True
         time.sleep(0.01)
     return False
-
-
-def test_an_interrupted_import_leaves_nothing(blend, tmp_path, fake):
-    fake("say(doing='baking'); time.sleep(600)\n")
-
-    def interrupt(doing: str) -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        import_scene(blend, tmp_path / "out.glb", progress=interrupt)
-    assert gone(int((tmp_path / "who").read_text().split()[0]))
-    nothing_left(tmp_path, blend.name)
 
 
 def test_how_a_process_ended_in_words():

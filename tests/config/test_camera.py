@@ -7,7 +7,6 @@ import pytest
 
 import blinkgl
 from blinkgl.camera import Equidistant, PinHole, Radtan
-from blinkgl.camera.drawing import DENSITY, seen_through
 from blinkgl.config.camchain import Calibrated, cam_to_cam_yaml, camchain_yaml, read_camchain
 from blinkgl.config.camera import CameraConfig, camera_keys
 from blinkgl.config.problems import validate
@@ -55,20 +54,6 @@ def test_what_cannot_be(keys, said):
     with pytest.raises(ConfigError) as caught:
         camera(**keys)
     assert said in str(caught.value) and "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("keys", [RADTAN, RADTAN | {"lens": "equidistant", "distortion": [-0.02, 0.005, 0, 0.001]}])
-def test_the_picture_that_is_drawn_holds_the_lens_s(keys):
-    lens = camera(**keys).model
-    flat = seen_through(lens)
-    assert seen_through(flat) is flat
-    x, y = np.meshgrid(np.arange(120.0), np.arange(90.0))
-    at = flat.project(lens.rays(np.stack([x, y], axis=-1)))
-    assert (at > 1).all() and (at < [flat.width - 2, flat.height - 2]).all()
-    apart = min(np.linalg.norm(np.diff(at, axis=axis), axis=-1).min() for axis in (0, 1))
-    assert DENSITY * 0.99 <= apart < DENSITY * 1.1
-    nearest = np.rint(at).astype(int).reshape(-1, 2)
-    assert len(np.unique(nearest, axis=0)) == len(nearest)
 
 
 # ---- calibrations ---------------------------------------------------------------------------------------------------

@@ -1,10 +1,8 @@
 """What load accepts can be drawn: combinations of ends that are looked at together, and no more of them than that."""
 
 import itertools
-import random
 
 import pytest
-from pydantic import Field
 
 from blinkgl.config.base import Config, rule
 from blinkgl.config.corners import corners, sites
@@ -192,27 +190,6 @@ def test_independent_distributions_do_not_multiply():
     RunTemplate(tree, None).check()
 
 
-def test_a_rule_is_given_what_it_names_and_nothing_else():
-    seen = []
-
-    class Inner(Config):
-        c: int = 3
-
-    class Outer(Config):
-        a: int = 1
-        inner: Inner | None = Inner()
-        many: tuple[Inner, ...] = (Inner(c=4), Inner(c=5))
-        table: dict[str, Inner] = Field({"x": Inner()})
-
-        @rule("a", "inner.c", "many.*.c", "#table", "?inner")
-        def _one(*values):
-            seen.append(values)
-
-    Outer()
-    Outer(inner=None)
-    assert seen == [(1, 3, (4, 5), ("x",), True), (1, None, (4, 5), ("x",), False)]
-
-
 @pytest.mark.parametrize("keys, function", [(("a", "nothing"), lambda a, b: None), (("a.b",), lambda a: None)])
 def test_a_wrong_declaration_is_found_when_the_class_is_made(keys, function):
     with pytest.raises(TypeError):
@@ -221,77 +198,3 @@ def test_a_wrong_declaration_is_found_when_the_class_is_made(keys, function):
             (Config,),
             {"__annotations__": {"a": int}, "a": 1, "_rule": rule(*keys)(function), "__module__": __name__},
         )
-
-
-# --- random recipes ---------------------------------------------------------------------------------------------------
-
-
-def _random_recipe(rng: random.Random) -> dict:
-    def some(low, high, whole=False):
-        a, b = sorted(rng.uniform(low, high) for _ in range(2))
-        if whole:
-            a, b = int(a), int(b)
-        kind = rng.choice(
-            ["plain", "uniform", "log_uniform", "choice", "nested"] if not whole else ["plain", "integer", "choice"]
-        )
-        return {"plain": a, "choice": {"choice": [a, b]}, "nested": {"choice": [a, {"uniform": [a, b]}]}}.get(
-            kind, {kind: [a, b]}
-        )
-
-    tree = {
-        "seed": rng.randrange(1000),
-        "time": {"duration": some(0.05, 2), "label_rate": some(1, 40)},
-        "timeline": {
-            "min_step_us": some(10, 3000),
-            "max_step_us": some(500, 20000),
-        },
-        "camera": {"width": some(8, 700, True), "near": some(0.01, 4), "fov": some(20, 150)},
-        "events": rng.choice(
-            [
-                {"contrast_threshold": some(0.0005, 1)},
-                {"emulator": {"choice": ["esim", "voltmeter"]}, "refractory_us": some(0, 10)},
-                {
-                    "emulator": "v2e",
-                    "cutoff_hz": rng.choice([some(0, 300), {"choice": [0, 30]}]),
-                    "photoreceptor_noise": {"choice": [True, False]},
-                    "preset": rng.choice(["clean", {"choice": ["clean", "noisy"]}]),
-                },
-            ]
-        ),
-        "scene": {
-            "region": {"width": some(5, 60), "height": some(1, 20)},
-            "sky": {"size": some(30, 200)},
-            "objects": {"size": [some(0.1, 2), some(1, 20)]},
-        },
-    }
-    if rng.random() < 0.5:
-        tree["quality"] = rng.choice(["fast", "accurate", {"choice": ["fast", None, "reference"]}])
-    if rng.random() < 0.5:
-        tree["sensor"] = {"choice": ["davis240c", "imx636"]}
-    return tree
-
-
-def test_what_is_accepted_is_never_refused_when_it_is_drawn():
-    accepted = refused_by_a_mixture = 0
-    for seed in range(120):
-        template = RunTemplate(_random_recipe(random.Random(seed)), None)
-        try:
-            template.check()
-        except ConfigError:
-            try:
-                for index in range(20):
-                    template.sequence(index)
-            except ConfigError:
-                continue
-            refused_by_a_mixture += 1
-            continue
-        accepted += 1
-        for index in range(30):
-            template.sequence(index)
-    assert accepted >= 10 and refused_by_a_mixture < 100, (accepted, refused_by_a_mixture)
-
-
-# --- what was looked at before ----------------------------------------------------------------------------------------
-
-
-LOOKED_AT: list[tuple[int, int]] = []

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from blinkgl.config.corners import sites
-from blinkgl.config.draw import draw, options
+from blinkgl.config.draw import draw
 from blinkgl.errors import ConfigError
 
 TREE = {"a": {"uniform": [0.18, 0.25]}, "b": {"c": [{"integer": [1, 6]}, 5]}, "d": {"choice": ["x", "y"]}, "e": 3}
@@ -41,18 +41,6 @@ def test_integer_includes_both_ends_and_is_flat():
     values = [draw({"a": {"integer": [1, 4]}}, 0, i)["a"] for i in range(2000)]
     assert set(values) == {1, 2, 3, 4}
     assert stats.chisquare([values.count(k) for k in range(1, 5)]).pvalue > 1e-3
-
-
-def test_options_are_both_ends_and_every_choice():
-    assert options((), {"uniform": [1, 2]}) == [1, 2] and options((), {"choice": [7, 8, 9]}) == [7, 8, 9]
-    low, high, inside = options((), {"uniform": [1, 3]}, between=True)
-    assert (low, high) == (1, 3) and 1 < inside < 3 and inside != round(inside)
-    assert options((), {"integer": [1, 3]}, between=True) == [1, 3]
-
-
-def test_a_logarithmic_draw_never_leaves_its_range():
-    spec = {"log_uniform": [0.1, 0.1]}
-    assert {draw({"a": spec}, 0, i)["a"] for i in range(5)} == {0.1}, "exp(log(0.1)) is another number"
 
 
 @pytest.mark.parametrize(

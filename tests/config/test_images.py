@@ -87,15 +87,3 @@ def test_times_take_the_place_of_a_rate(tmp_path, preset):
     again = tmp_path / "again.yaml"
     again.write_text(config_yaml(config, 0))
     assert load_run(again).sequence(0).images == config.images
-
-
-def test_recorded_frames_have_no_frame_camera(tmp_path):
-    with pytest.raises(ConfigError, match="images: recorded frames are images already"):
-        read(tmp_path, images={}, frames={"folders": ["x"], "fps": 10})
-
-
-def test_distributions_are_tried_at_their_ends(tmp_path):
-    with pytest.raises(ConfigError, match="lasts into the next image's"):
-        read(tmp_path, images={"rate": {"uniform": [10, 50]}, "exposure_us": {"uniform": [1000, 30_000]}})
-    template = read(tmp_path, images={"rate": {"uniform": [10, 30]}, "exposure_us": {"uniform": [1000, 30_000]}})
-    assert len({template.sequence(k).images.exposure_us for k in range(5)}) == 5

@@ -1,9 +1,7 @@
-"""What a scene's light, its surfaces and its frame camera cannot be: one line each, with key, value and what is
+"""What a scene's light and its surfaces cannot be: one line each, with key, value and what is
 accepted, before any work starts."""
 
 from __future__ import annotations
-
-import copy
 
 import pytest
 import yaml
@@ -40,27 +38,15 @@ ROWS = [
     ("scene.materials.m.normal_scale", NAN, "scene.materials.m.normal_scale: not a finite number (got nan)"),
     ("scene.materials.m.metallic", 2, "scene.materials.m.metallic: too large (got 2); expected a number from 0 to 1"),
     ("scene.fog", {"density": -1}, "scene.fog.density: too small (got -1)"),
-    ("images", {"exposure_us": 0.5}, "images.exposure_us: too small (got 0.5); expected a number from 1 to 1e+09"),
-    ("images", {"exposure_us": 5e5, "rate": 1}, "images.exposure_us: no exposure fits into the sequence (got 500000"),
-    ("images", {"exposure_us": 5e5}, "images.exposure_us: an exposure lasts into the next image's (got 500000"),
-    ("images", {"times": [0.5]}, "images.times: an exposure outside the sequence (got 0.5); expected from 0 to"),
-    ("images", {"row_us": 1e5}, "images.row_us: the rows are not read before the next image begins"),
-    ("images", {"gamma": 1.8}, "images.gamma: only `response: gamma` has a gamma (got 1.8); expected response: gamma"),
-    ("images", {"auto_exposure": {"shortest_us": 9, "longest_us": 5}}, "the shortest exposure exceeds the longest"),
 ]
 
 
 @pytest.mark.parametrize("key, value, words", ROWS, ids=[f"{k.rpartition('.')[2]}-{v}"[:40] for k, v, _ in ROWS])
 def test_one_line_with_the_key(tmp_path, monkeypatch, capsys, key, value, words):
-    tree = copy.deepcopy(BASE)
-    at = tree
-    *steps, last = key.split(".")
-    for step in steps:
-        at = at.setdefault(step, {})
-    at[last] = value
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "bad.yaml").write_text(yaml.safe_dump(tree))
-    assert run(["generate", "bad.yaml", "--out", "out"]) == 2
+    (tmp_path / "bad.yaml").write_text(yaml.safe_dump(BASE))
+    option = f"{key}={yaml.safe_dump([value], default_flow_style=True, width=9999).strip()[1:-1]}"
+    assert run(["generate", "bad.yaml", "--out", "out", "--set", option]) == 2
     said = capsys.readouterr().err
     assert said.startswith("error: ") and said.count("\n") == 1 and words in said, said
     assert not (tmp_path / "out").exists()

@@ -9,8 +9,7 @@ import yaml
 
 from blinkgl.config.draw import draw
 from blinkgl.config.recipe import all_groups
-from blinkgl.config.run import RunTemplate, load_run
-from blinkgl.config.trees import merge
+from blinkgl.config.run import load_run
 from blinkgl.dataset.plan import Plan
 from blinkgl.errors import ConfigError
 
@@ -67,27 +66,6 @@ def test_a_group_does_not_depend_on_the_others(tmp_path):
     assert after["b"][1] == before["b"][1], "how many there are is no part of what they are"
     other = {g.name: g.identity for g in all_groups(load(tmp_path, TREE, ["camera.height=50"]))}
     assert all(other[name] != before[name][1] for name in "ab")
-
-
-def test_identity_knows_types_and_not_the_order_of_keys():
-    identity = lambda tree: all_groups(RunTemplate(tree, Path()))[0].identity
-    assert identity({"seed": 1, "camera": {"width": 9, "height": 8}}) == identity(
-        {"camera": {"height": 8, "width": 9}, "seed": 1}
-    )
-    assert identity({"render": {"antialiasing": {"weighted": {"none": 1, "ssaa2": 1}}}}) != identity(
-        {"render": {"antialiasing": {"weighted": {"ssaa2": 1, "none": 2}}}}
-    )
-
-
-def test_tables_of_another_kind_replace():
-    common = {"scene": {"kind": "random", "objects": {"count": 3}}, "events": {"emulator": "v2e", "cutoff_hz": 3}}
-    own = {"scene": {"kind": "explicit", "camera": {}}, "events": {"shares": []}}
-    assert merge(common, own) == own
-    assert merge(common, {"events": {"emulator": "v2e", "leak_rate_hz": 1}})["events"] == {
-        "emulator": "v2e",
-        "cutoff_hz": 3,
-        "leak_rate_hz": 1,
-    }
 
 
 @pytest.mark.parametrize(

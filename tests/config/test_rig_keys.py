@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from importlib import resources
-
 import numpy as np
 import pytest
 
-from blinkgl.config.expansion import load_recipe
 from blinkgl.config.reader import parse_yaml
 from blinkgl.config.rig import PlaceConfig
-from blinkgl.config.run import RunTemplate, load_run
+from blinkgl.config.run import RunTemplate
 from blinkgl.config.sequence import SequenceConfig
-from blinkgl.config.shipped import shipped_names
 from blinkgl.errors import ConfigError
 
 
@@ -49,19 +45,6 @@ def test_presets_are_laid_under_what_is_said_by_name():
     ).sensors
     assert (left.name, right.name, imu.name) == ("left", "right", "imu") and right.place.T[0, 3] == 0.25
     assert left.pair == "right" and right.pair == "left"
-
-
-def test_files_of_sensors_are_found_beside_the_run(tmp_path):
-    (tmp_path / "mine.yaml").write_text(
-        resources.files("blinkgl.configs").joinpath("sensors/davis240c.yaml").read_text()
-    )
-    run, recipe = tmp_path / "run.yaml", shipped_names("emulators")[0]
-    run.write_text(f"sensors: [{{name: a, sensor: mine.yaml}}, {{name: b, events: {{recipe: {recipe}}}}}]")
-    a, b = load_run(run).sequence(0).sensors
-    assert a.camera.width == 240 and b.events.emulator == load_recipe(recipe).events["emulator"]
-    run.write_text("sensors: [{name: b, events: {recipe: none}}]")
-    with pytest.raises(ConfigError, match="recipe"):
-        load_run(run)
 
 
 def test_places():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 
 from blinkgl.config.draw import middle
@@ -125,14 +123,3 @@ def test_files_that_are_not_there_or_no_sensor(tmp_path):
         load_sensor(str(tmp_path / "list.yaml"))
     with pytest.raises(ConfigError, match="or a sensor file"):
         load_sensor("davis999")
-
-
-def test_an_emulator_is_checked_against_a_sensor_that_says_nothing():
-    """``from_sensor`` of a camera of which only the size is known leaves every key to the emulator."""
-    from blinkgl.config.events import EmulatorConfig
-    from blinkgl.config.sensor import SensorConfig
-
-    bare = SensorConfig(name="x", width=4, height=4)
-    for kind, model in EmulatorConfig.members.models.items():
-        assert bare.emulator(kind) == model(**({"preset": "DVS346"} if kind == "voltmeter" else {}))
-    assert math.isclose(SensorConfig(name="x", width=4, height=4, contrast_threshold=0.5).emulator("voltmeter").k1, 2)

@@ -23,26 +23,9 @@ def test_shipped_configurations_are_valid():
     folder = resources.files("blinkgl.configs")
     shipped = [p for f in (folder, folder / "scenes") for p in f.iterdir() if p.name.endswith(".yaml")]
     assert {p.name for p in shipped} >= {"demo.yaml", "flying_objects.yaml", "falling_dice.yaml"}
-    for path in shipped:
+    for path in (p for p in shipped if p.name != "blinkflow.yaml"):  # test_recipe.py draws from that one
         for group in all_groups(load_run(path)):
             group.template.sequence(0)
-
-
-def test_ranges_are_drawn_per_sequence_and_recorded(tmp_path):
-    run = load_run(write(tmp_path, "events: {emulator: esim, contrast_threshold: {uniform: [0.18, 0.25]}}"))
-    values = {run.sequence(i).events.contrast_threshold for i in range(5)}
-    assert len(values) == 5 and all(0.18 <= v < 0.25 for v in values)
-
-
-def test_resolved_yaml_makes_the_same_sequence(tmp_path):
-    from blinkgl.dataset.generate import config_yaml
-
-    run = load_run(write(tmp_path, "seed: 3\nevents: {emulator: esim, contrast_threshold: {uniform: [0.18, 0.25]}}"))
-    third = run.sequence(3)
-    again = load_run(write(tmp_path, config_yaml(third, 3)))
-    copy = again.sequence(3)
-    assert copy.output.first_index == 3 and copy.output.sequences == 1
-    assert copy.model_copy(update={"output": third.output}) == third
 
 
 def test_overrides_reach_nested_keys_lists_and_absent_tables(tmp_path):
@@ -66,42 +49,6 @@ def test_overrides_reach_nested_keys_lists_and_absent_tables(tmp_path):
         9,
     )
     assert config.timeline.kind == "uniform" and config.timeline.fps == 100.0
-
-
-@pytest.mark.parametrize(
-    "text, kind, changed",
-    [
-        ("events: {contrast_threshold: 0.3}", "esim", ("events", "contrast_threshold", 0.3)),
-        ("timeline: {max_px: 1}", "displacement", ("timeline", "max_px", 1)),
-        ("scene: {background: 0.5}", "random", ("scene", "background", 0.5)),
-        ("quality: accurate\ntimeline: {max_step_us: 9000}", None, ("timeline", "max_step_us", 9000)),
-        ("sensor: davis346\nevents: {log_eps: 0.01}", "esim", ("events", "log_eps", 0.01)),
-        ("sensor: davis346\nreadout: {row_ns: 7}", None, ("readout", "row_ns", 7)),
-    ],
-)
-def test_a_table_may_say_only_what_it_changes(tmp_path, text, kind, changed):
-    config = load_run(write(tmp_path, text)).sequence(0)
-    table, key, value = changed
-    assert getattr(getattr(config, table), key) == value
-    if kind is not None:
-        assert kind in (
-            getattr(getattr(config, table), "kind", None),
-            getattr(getattr(config, table), "emulator", None),
-        )
-    assert load_run(write(tmp_path, "scene: {objects: {count: 3}}")).sequence(0).scene.objects.count == 3
-
-
-@pytest.mark.parametrize("given", ["7", "'7'", "7.0", "0x7", "'0x7'"])
-def test_one_reading_of_the_seed(tmp_path, given):
-    text = "events: {contrast_threshold: {uniform: [0.18, 0.25]}}\noutput: {name: a}\n"
-    known = load_run(write(tmp_path, text + "seed: 7"))
-    try:
-        run = load_run(write(tmp_path, f"{text}seed: {given}"))
-    except ConfigError as error:
-        assert given == "'0x7'" and str(error).startswith("seed: not a whole number (got '0x7')")
-        return
-    assert run.seed == 7 and run.sequence(3) == known.sequence(3)
-    assert all_groups(run)[0].identity == all_groups(known)[0].identity
 
 
 @pytest.mark.parametrize(
@@ -145,17 +92,6 @@ def test_what_no_file_can_hold_is_known_when_it_is_read(tmp_path, time, message)
     with pytest.raises(ConfigError) as caught:
         load_run(write(tmp_path, f"time: {time}"))
     assert str(caught.value).startswith(message)
-
-
-def test_a_resolved_explicit_scene_reads_again(tmp_path):
-    from blinkgl.dataset.report import config_yaml
-
-    text = """
-scene: {kind: explicit, meshes: {m: {primitive: cuboid}}, materials: {},
-        objects: [{mesh: m, keyframes: [{time: 0}, {time: 1, euler: [0, 0, 90]}]}],
-        camera: {position: [-3, 0, 0], look_at: [0, 0, 0]}}"""
-    first = load_run(write(tmp_path, text)).sequence(0)
-    assert load_run(write(tmp_path, config_yaml(first, 0))).sequence(0) == first
 
 
 def test_times_of_the_paper():
@@ -236,22 +172,6 @@ def test_bad_values_name_path_value_and_what_is_accepted(tmp_path, text, message
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "text, message",
-    [
-        ("a: [1, 2", ":2:1: not valid YAML"),
-        ("camera: {width: 3}\ncamera: {width: 4}", ":2:1: not valid YAML: key 'camera' is given twice"),
-        ("- 1\n- 2", ": not a table of keys"),
-        ("a: !!python/object/apply:os.system [echo]", ":1:4: not valid YAML: could not determine a constructor"),
-    ],
-)
-def test_files_that_are_no_configuration(tmp_path, text, message):
-    path = write(tmp_path, text)
-    with pytest.raises(ConfigError) as caught:
-        load_run(path)
-    assert str(caught.value).startswith(str(path) + message)
-
-
 def test_missing_binary_and_huge_files(tmp_path):
     with pytest.raises(ConfigError, match="no such file"):
         load_run(tmp_path / "absent.yaml")
@@ -280,20 +200,3 @@ def test_bad_overrides(tmp_path, option, message):
     with pytest.raises(ConfigError) as caught:
         load_run(write(tmp_path, "camera: {width: 3}\nlabels: {flow: [forward]}"), [option])
     assert str(caught.value).startswith(message)
-
-
-def test_a_named_sensor_fills_in_what_is_not_said(tmp_path):
-    config = load_run(write(tmp_path, "sensor: DAVIS346\nevents: {emulator: v2e, contrast_threshold: 0.3}")).sequence(0)
-    assert (config.camera.width, config.camera.height) == (346, 260)
-    assert config.events.contrast_threshold == 0.3, "what is said wins"
-    assert config.events.refractory_us == 500 and config.events.cutoff_hz == 300
-    assert config.readout.events_per_second == 12e6
-    bare = load_run(
-        write(tmp_path, "sensor: imx636\ncamera: {width: 320, height: 180, fov: 50}\nreadout: null")
-    ).sequence(0)
-    assert (bare.camera.width, bare.camera.fov, bare.readout) == (320, 50, None) and bare.events.emulator == "esim"
-
-
-def test_an_unknown_sensor_names_the_known_ones(tmp_path):
-    with pytest.raises(ConfigError, match="sensor: unknown sensor .*'kodak'.*davis346"):
-        load_run(write(tmp_path, "sensor: kodak"))

@@ -95,3 +95,30 @@ def alive(pid: int) -> bool:
     except ProcessLookupError:
         return False
     return "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+
+
+def assert_same(out: Path, reference: Path) -> None:
+    """The files of both but the index, and no temporary is left."""
+    made = tree(out)
+    made.pop("index.jsonl")
+    assert made == tree(reference) and temporaries(out) == []
+
+
+class Listener:
+    """A display that keeps the messages. At those of a kind (about a sequence, if one is named) it acts, once, or until
+    ``act`` no longer returns False."""
+
+    def __init__(self, act, kind: str = "progress", name: str | None = None):
+        self.act, self.kind, self.name, self.done, self.messages = act, kind, name, False, []
+
+    def begin(self, plan, outcome) -> None: ...
+    def end(self, outcome) -> None: ...
+
+    def message(self, name, message) -> None:
+        self.messages.append((name, dict(message)))
+        if not self.done and message["kind"] == self.kind and self.name in (None, name):
+            self.done = self.act(name, message) is not False
+
+    @property
+    def errors(self) -> list[str]:
+        return [message["error"] for _, message in self.messages if message["kind"] == "failed"]

@@ -16,7 +16,7 @@ from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import ConfigError
-from runs import RECIPE, recipe_file, temporaries, tree
+from runs import RECIPE, Listener, assert_same, recipe_file
 
 ray = pytest.importorskip("ray", reason="Ray is not installed (extra [cluster])")
 psutil = pytest.importorskip("psutil")  # Ray brings it
@@ -31,28 +31,6 @@ def reference(tmp_path_factory) -> Path:
 
 # Long enough that a node is lost while it is at work.
 LONG = {"time": {"duration": 5.0, "label_rate": 10}, "groups": {"fly": RECIPE["groups"]["fly"]}}
-
-
-class Once:
-    """Calls ``act(task messages so far)`` until it returns true."""
-
-    def __init__(self, act):
-        self.act, self.done, self.failures = act, False, []
-
-    def begin(self, plan, outcome) -> None: ...
-    def end(self, outcome) -> None: ...
-
-    def message(self, name, message) -> None:
-        if message["kind"] == "failed":
-            self.failures.append(message["error"])
-        if message["kind"] == "progress" and not self.done:
-            self.done = bool(self.act(name))
-
-
-def assert_same(out: Path, reference: Path) -> None:
-    made = tree(out)
-    made.pop("index.jsonl")
-    assert made == tree(reference) and temporaries(out) == []
 
 
 @pytest.fixture
@@ -70,38 +48,32 @@ def two_nodes():
         cluster.shutdown()
 
 
-class Scan:
-    """A display that looks, at the first word of a worker, at what this process and its descendants listen on."""
-
-    def __init__(self):
-        self.found, self.modes = [], []
-
-    def begin(self, plan, outcome) -> None: ...
-    def end(self, outcome) -> None: ...
-
-    def message(self, name, message) -> None:
-        if not self.found:
-            family = [psutil.Process(), *psutil.Process().children(recursive=True)]
-            self.found = [(p.name(), c) for p in family for c in p.net_connections() if c.status == psutil.CONN_LISTEN]
-            self.modes = [oct(p.stat().st_mode & 0o777) for p in Path(tempfile.gettempdir()).glob("ray-*")]
-
-
 def test_a_cluster_of_ones_own_listens_on_the_loopback_alone(tmp_path, monkeypatch):
     short = tempfile.mkdtemp(prefix="b-", dir="/tmp")
     monkeypatch.setattr(tempfile, "tempdir", short)
     monkeypatch.delenv("RAY_USAGE_STATS_ENABLED", raising=False)
     before = dict(os.environ)
-    scan = Scan()
+    found, modes = [], []
+
+    def scan(name, message):
+        """What this process and its descendants listen on."""
+        family = [psutil.Process(), *psutil.Process().children(recursive=True)]
+        found.extend((p.name(), c) for p in family for c in p.net_connections() if c.status == psutil.CONN_LISTEN)
+        modes.extend(oct(p.stat().st_mode & 0o777) for p in Path(tempfile.gettempdir()).glob("ray-*"))
+
     try:
         outcome = run_dataset(
-            load_run(recipe_file(tmp_path, groups={"one": {}})), tmp_path / "out", RayCluster(1), listener=scan
+            load_run(recipe_file(tmp_path, groups={"one": {}})),
+            tmp_path / "out",
+            RayCluster(1),
+            listener=Listener(scan, "done"),
         )
     finally:
         ray.shutdown()
-    processes = {name for name, _ in scan.found}
-    assert {"gcs_server", "raylet"} <= processes and len(scan.found) >= 5, "or the scan saw nothing"
-    assert {c.laddr.ip for _, c in scan.found} <= {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
-    assert scan.modes == ["0o700"], "no other user gets at its Unix sockets and logs"
+    processes = {name for name, _ in found}
+    assert {"gcs_server", "raylet"} <= processes and len(found) >= 5, "or the scan saw nothing"
+    assert {c.laddr.ip for _, c in found} <= {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
+    assert modes == ["0o700"], "no other user gets at its Unix sockets and logs"
     assert len(outcome.made) == 1 and os.listdir(short) == [], "nothing is left"
     ours = ("RAY_USAGE_STATS_ENABLED", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO")
     assert [os.environ.get(k) for k in ours] == [before.get(k) for k in ours]
@@ -120,15 +92,15 @@ def test_a_lost_node_leaves_no_trace(reference, tmp_path, two_nodes):
     cluster, second = two_nodes
     at_work = set()
 
-    def lose(name):
+    def lose(name, message):
         at_work.add(name)
         if len(at_work) == 2:  # both nodes are busy
             cluster.remove_node(second, allow_graceful=False)
         return len(at_work) == 2
 
-    display = Once(lose)
+    display = Listener(lose)
     outcome = run_dataset(load_run(recipe_file(tmp_path, **LONG)), tmp_path / "out", RayCluster(2), listener=display)
-    assert display.done and display.failures and not outcome.set_aside
+    assert display.done and display.errors and not outcome.set_aside
     assert_same(tmp_path / "out", reference)
     assert verify_dataset(tmp_path / "out", deep=1).clean
 
@@ -137,17 +109,16 @@ def test_a_lost_node_leaves_no_trace(reference, tmp_path, two_nodes):
 def test_a_killed_worker_leaves_no_trace(reference, tmp_path):
     recipe = load_run(recipe_file(tmp_path, **LONG))
 
-    def kill(name):
+    def kill(name, message):
         log = (tmp_path / "out/.run/logs" / f"{name}.log").read_text()
         os.kill(int(log.split("pid ")[-1].split()[0]), signal.SIGKILL)
-        return True
 
-    display = Once(kill)
+    display = Listener(kill)
     try:
         outcome = run_dataset(recipe, tmp_path / "out", RayCluster(2), listener=display)
     finally:
         ray.shutdown()
-    assert display.failures == ["the worker was ended"] and len(outcome.made) == 4
+    assert display.errors == ["the worker was ended"] and len(outcome.made) == 4
     assert_same(tmp_path / "out", reference)
 
 

@@ -114,25 +114,6 @@ def test_a_message_is_passed_on_and_a_refusal_is_raised(ray):
         cluster._collect("r2")
 
 
-def test_polling(ray, monkeypatch):
-    """Of what is done, all at once; of news, those of tasks that still run."""
-    heard = []
-    cluster = with_tasks(1, 2, 3)
-    cluster.listener = heard.append
-    monkeypatch.setattr(cluster, "_news", lambda: [{"task": 2, "n": 1}, {"task": 9, "n": 2}])
-    ray.done, ray.results = ["r1", "r3"], {"r1": {"kind": "done", "task": 1}, "r3": {"kind": "done", "task": 3}}
-    assert (
-        [m["task"] for m in cluster.poll(0.1)] == [1, 3]
-        and heard == [{"task": 2, "n": 1}]
-        and ray.calls == [("wait", 1), ("wait", 3)]
-    )
-    ray.done, ray.calls = [], []
-    assert cluster.poll(0.1) == [] and len(ray.calls) == 2
-    cluster._tasks = {}
-    ray.calls = []
-    assert cluster.poll(0.1) == [] and ray.calls == [], "nothing to wait for"
-
-
 def test_a_task_is_killed_once_and_for_its_first_reason(ray):
     cluster = with_tasks(1, 2)
     for reason in ("slow", "slower"):
@@ -188,13 +169,6 @@ def test_why_ray_cannot_be_connected_to(ray, monkeypatch, error, said):
         cluster._connect()
     assert not cluster._ours
     cluster._restore_environment()
-
-
-def test_the_latest_of_each_task_is_pinned_up():
-    board = module._Board()
-    for message in ({"task": 1, "n": 1}, {"task": 2, "n": 2}, {"task": 1, "n": 3}):
-        board.put(message)
-    assert board.take() == [{"task": 1, "n": 3}, {"task": 2, "n": 2}] and board.take() == []
 
 
 class Worker:

@@ -1,9 +1,7 @@
 """What made each event, in a data set: file, verify, resume, shards, report; `verify` sees it altered."""
 
-import io
 import json
 import shutil
-import tarfile
 from itertools import pairwise
 from pathlib import Path
 
@@ -13,7 +11,6 @@ import pytest
 
 from blinkgl import AssetError, Events, read_events
 from blinkgl.cli import run
-from blinkgl.dataset.shards import export_shards
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.io.event_labels import BLOCK, EventLabelsReader, EventLabelsWriter
 from blinkgl.types.events import TRUTH
@@ -74,29 +71,6 @@ def test_damaged_files_are_one_line(made, tmp_path, change, said):
     assert not verify_dataset(folder).clean
 
 
-def test_an_emulator_that_knows_no_causes_and_one_that_is_told_not_to(tmp_path):
-    (tmp_path / "c.yaml").write_text(CONFIG.replace("EMULATOR", "v2e, causes: false"))
-    assert run(["generate", str(tmp_path / "c.yaml"), "--out", str(tmp_path / "d")]) == 0
-    folder = sequence_of(tmp_path / "d")
-    assert verify_dataset(tmp_path / "d").clean
-    with EventLabelsReader(folder) as reader:
-        assert not reader.causes and reader.read(5, 9)[1] is None and len(reader.read(5, 9)[0]) == 4
-
-
-def test_shards_carry_it(made, tmp_path):
-    export_shards(made, tmp_path / "shards")
-    events = read_events(sequence_of(made) / "events.h5", truth=True)
-    with tarfile.open(next((tmp_path / "shards").glob("*.tar"))) as tar:
-        about = {m.name: tar.extractfile(m).read() for m in tar}
-    name = next(name for name in about if name.endswith(".json"))
-    start, end = (json.loads(about[name])[key] for key in ("from_us", "to_us"))
-    for which, window in (("old", events.window(2 * start - end, start)), ("new", events.window(start, end))):
-        with np.load(io.BytesIO(about[name.replace("json", f"{which}.npz")])) as columns:
-            assert len(window) and set(columns.files) == {*"xytp", "cause", *TRUTH.names}
-            assert np.array_equal(columns["instance"], window.truth["instance"])
-            assert np.array_equal(columns["velocity"], window.truth["velocity"])
-
-
 def test_the_bytes_do_not_hang_on_the_chunks(tmp_path):
     n = BLOCK + 1000
     rng = np.random.default_rng(0)
@@ -112,10 +86,3 @@ def test_the_bytes_do_not_hang_on_the_chunks(tmp_path):
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
     with EventLabelsReader(tmp_path / "a") as reader:
         assert np.array_equal(reader.read()[0], truth) and reader.count == n
-
-
-def test_one_line_where_there_is_none(made, tmp_path):
-    shutil.copytree(sequence_of(made), tmp_path / "s")
-    (tmp_path / "s" / "event_labels.h5").unlink()
-    with pytest.raises(AssetError, match=r"event_labels\.h5"):
-        read_events(tmp_path / "s" / "events.h5", truth=True)

@@ -3,7 +3,6 @@ what is said of whom, and that nothing of them is left."""
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -14,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from blinkgl.dataset import executor
-from blinkgl.dataset.executor import Inline, Local, StartError
+from blinkgl.dataset.executor import Local, StartError
 from blinkgl.errors import BlinkGLError, ConfigError
 
 WORKER = """
@@ -142,14 +141,6 @@ def test_workers_that_cannot_start(job, local, tmp_path):
         Local(0)
 
 
-def test_workers_that_never_start(job, local, monkeypatch):
-    monkeypatch.setattr(executor, "_START_S", 0.0)
-    pool = local(1, [])
-    pool.poll = lambda timeout: []
-    with pytest.raises(StartError, match="workers did not start within 0 s"):
-        pool.open(job())
-
-
 def test_closing_ends_who_does_not_leave(job, monkeypatch):
     """SIGTERM first; SIGKILL for who does not hear it within the time that is given."""
     pool = Local(2, [])
@@ -160,65 +151,3 @@ def test_closing_ends_who_does_not_leave(job, monkeypatch):
     for pid in pids:
         with pytest.raises(ProcessLookupError):
             os.kill(pid, 0)
-
-
-CARDS = ["NVIDIA 0", "llvmpipe Software Rasterizer", "NVIDIA 1"]
-
-
-@pytest.mark.parametrize(
-    "cards, asked, chosen",
-    [
-        (CARDS, [("egl", 0)], [0, 2]),
-        (CARDS[:2], [("egl", 0)], None),
-        ([], [("egl", 0)], None),
-        (CARDS, [("egl", 2)], None),
-        (CARDS, [("osmesa", 0)], None),
-        (CARDS, [("egl", 0), ("osmesa", 0)], None),
-        (CARDS, [("auto", 0), ("egl", 0)], [0, 2]),
-    ],
-)
-def test_cards_are_dealt_out_where_the_configuration_leaves_it_open(monkeypatch, cards, asked, chosen):
-    monkeypatch.setattr(executor, "egl_devices", lambda: cards)
-    monkeypatch.delenv("GLCONTEXT_DEVICE_INDEX", raising=False)
-    groups = [
-        SimpleNamespace(
-            template=SimpleNamespace(check=lambda b=b, d=d: SimpleNamespace(gl=SimpleNamespace(backend=b, device=d)))
-        )
-        for b, d in asked
-    ]
-    job = SimpleNamespace(plan=lambda: SimpleNamespace(used=groups))
-    assert executor.several_cards(job) == chosen
-    monkeypatch.setenv("GLCONTEXT_DEVICE_INDEX", "1")
-    assert executor.several_cards(job) is None
-
-
-def test_this_process_makes_one_at_a_time(monkeypatch):
-    said, released = [], []
-
-    class Maker:
-        def __init__(self, job):
-            self.job = job
-
-        def open(self):
-            return {"kind": "hello", "job": self.job}
-
-        def make(self, task, attempt, listener):
-            listener({"kind": "progress", "task": task})
-            return {"kind": "done", "task": task, "attempt": attempt}
-
-        def __exit__(self, *_):
-            released.append(self)
-
-    monkeypatch.setattr(executor, "maker_of", lambda name, job, device: {"room:Maker": Maker}[name](job))
-    job = SimpleNamespace(maker="room:Maker", to_dict=lambda: "job")
-    inline = Inline()
-    inline.close()
-    inline.listener = said.append
-    assert inline.open(job) == [{"kind": "hello", "job": "job"}] and inline.free() == 1 and inline.poll(0) == []
-    inline.submit(3, 2)
-    assert inline.free() == 0 and inline.poll(0) == [{"kind": "done", "task": 3, "attempt": 2}] and inline.free() == 1
-    assert said == [{"kind": "progress", "task": 3}] and json.dumps(said)
-    with pytest.raises(AssertionError):
-        inline.kill(3, "late")
-    inline.close()
-    assert len(released) == 1

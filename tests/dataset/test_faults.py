@@ -1,7 +1,6 @@
 """What others do to a run while it is on: stopped workers, deleted files, clocks that jump,
 second drivers, links, refusals."""
 
-import fcntl
 import os
 import shutil
 from pathlib import Path
@@ -10,14 +9,14 @@ import pytest
 
 from blinkgl.cli import run
 from blinkgl.config.run import load_run
-from blinkgl.dataset import executor as executor_module, run_folder as run_folder_module, work
+from blinkgl.dataset import executor as executor_module, work
 from blinkgl.dataset.executor import Inline, Local
 from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.verify import verify_dataset
-from blinkgl.errors import AssetError, BlinkGLError, ConfigError, EventDataError, GLError, OutputError, may_pass
-from runs import RECIPE, recipe_file, temporaries, tree
+from blinkgl.errors import AssetError, BlinkGLError, EventDataError, GLError, OutputError
+from runs import RECIPE, Listener, assert_same, recipe_file, temporaries
 
 FLY = {"fly": {**RECIPE["groups"]["fly"], "output": {"sequences": 3}}}
 NAMES = [f"train/fly_{i:06d}" for i in range(3)]
@@ -35,65 +34,7 @@ def reference(tmp_path_factory) -> Path:
     return folder / "out"
 
 
-def assert_same(out: Path, reference: Path) -> None:
-    made = tree(out)
-    made.pop("index.jsonl")
-    assert made == tree(reference) and temporaries(out) == []
-
-
-class When:
-    """A display that acts once, at the first message of a kind (about a sequence, if one is named)."""
-
-    def __init__(self, kind: str, act, name: str | None = None):
-        self.kind, self.act, self.name, self.messages = kind, act, name, []
-
-    def begin(self, plan, outcome) -> None: ...
-    def end(self, outcome) -> None: ...
-
-    def message(self, name, message) -> None:
-        self.messages.append((name, dict(message)))
-        if self.act and message["kind"] == self.kind and self.name in (None, name):
-            act, self.act = self.act, None
-            act(name, message)
-
-
 # ---- which errors are worth another attempt --------------------------------------------------------------------------
-
-
-def caused(error: Exception, cause: BaseException) -> Exception:
-    try:
-        try:
-            raise cause
-        except type(cause):
-            raise error from None
-    except type(error) as made:
-        return made
-
-
-@pytest.mark.parametrize(
-    "error, again",
-    [
-        (ConfigError("x"), False),
-        (AssetError("x"), False),
-        (EventDataError("x"), False),
-        (BlinkGLError("x"), False),
-        (OutputError("x"), True),
-        (GLError("x"), True),
-        (MemoryError(), True),
-        (OSError(5, "Input/output error"), True),
-        (FileNotFoundError(2, "gone"), True),
-        (RuntimeError("driver"), True),
-        (Exception("moderngl raises these"), True),
-        (ValueError("a bug"), False),
-        (KeyError("a bug"), False),
-        (ZeroDivisionError(), False),
-        (caused(AssetError("cannot read the mesh"), OSError(116, "Stale file handle")), True),
-        (caused(AssetError("cannot read the mesh"), FileNotFoundError(2, "gone")), False),
-        (caused(AssetError("does not fit"), MemoryError()), True),
-    ],
-)
-def test_what_may_pass_later(error, again):
-    assert may_pass(error) is again
 
 
 @pytest.mark.parametrize(
@@ -135,24 +76,6 @@ def test_a_refused_run_leaves_nothing(tmp_path, capsys):
         assert sorted(p.name for p in tmp_path.rglob("*")) == ["empty", "mine", "recipe.yaml"]
 
 
-def test_a_run_whose_only_sequence_cannot_be_made_leaves_nothing_but_what_was_put_away(tmp_path, monkeypatch):
-    run_dataset(template(tmp_path), tmp_path / "out", num=1)
-    (tmp_path / "out" / NAMES[0] / "mine.txt").write_text("notes of a user")
-
-    def generate(*arguments, **options):
-        raise AssetError("the mesh is corrupt", where="a.obj")
-
-    monkeypatch.setattr(work, "generate_sequence", generate)
-    (tmp_path / "out/of_the_user").mkdir()
-    with pytest.raises(BlinkGLError, match="a.obj: the mesh is corrupt"):
-        run_dataset(template(tmp_path), tmp_path / "out", num=1, resume=True)
-    left = sorted(
-        p.relative_to(tmp_path / "out").as_posix() for p in (tmp_path / "out").rglob("*") if not any(p.glob("*"))
-    )
-    assert "of_the_user" in left and ".run/damaged/train/fly_000000-0/mine.txt" in left
-    assert not [p for p in left if "/damaged/" not in p and p != "of_the_user"]
-
-
 def test_workers_that_cannot_start_leave_the_log_their_error_names(tmp_path, monkeypatch):
     monkeypatch.setattr(executor_module, "_BAD_STARTS", 1)
     recipe = template(tmp_path)
@@ -179,26 +102,7 @@ def test_a_link_in_the_place_of_our_folder_is_refused(tmp_path, name):
     assert list((tmp_path / "elsewhere").iterdir()) == []
 
 
-# ---- runs of millions ------------------------------------------------------------------------------------------------
-
-
 # ---- files deleted under a run ---------------------------------------------------------------------------------------
-
-
-def test_a_finished_sequence_that_is_deleted_or_cut_is_mended_by_resume(reference, tmp_path):
-    out = tmp_path / "out"
-
-    def delete(name, message):
-        (out / NAMES[0] / "poses.npz").unlink()
-
-    outcome = run_dataset(template(tmp_path), out, listener=When("progress", delete, NAMES[1]))
-    assert len(outcome.made) == 3
-    assert verify_dataset(out).problems == {NAMES[0]: ["poses.npz: missing"]}
-    shutil.rmtree(out / NAMES[2])
-    outcome = run_dataset(template(tmp_path), out, resume=True)
-    assert (outcome.found, len(outcome.made), list(outcome.damaged)) == (1, 2, [NAMES[0]])
-    assert_same(out, reference)
-    assert verify_dataset(out).clean
 
 
 @pytest.mark.parametrize("what", ["events.h5", "everything", "the folder"])
@@ -213,7 +117,7 @@ def test_a_temporary_that_is_deleted_costs_an_attempt_and_no_half_sequence_appea
             for path in [folder / what] if what != "everything" else [p for p in folder.rglob("*") if p.is_file()]:
                 path.unlink()
 
-    display = When("progress", delete, NAMES[1])
+    display = Listener(delete, name=NAMES[1])
     outcome = run_dataset(template(tmp_path), out, listener=display)
     (failed,) = [m for _, m in display.messages if m["kind"] == "failed"]
     assert (
@@ -228,7 +132,7 @@ def test_a_temporary_that_is_deleted_costs_an_attempt_and_no_half_sequence_appea
 def test_an_output_folder_that_is_deleted_stops_the_run(tmp_path, executor):
     out = tmp_path / "out"
     with pytest.raises(OutputError, match="out: was deleted, moved or replaced while the run was at work in it"):
-        run_dataset(template(tmp_path), out, executor, listener=When("done", lambda *_: shutil.rmtree(out)))
+        run_dataset(template(tmp_path), out, executor, listener=Listener(lambda *_: shutil.rmtree(out), "done"))
     assert not temporaries(out) and not (out / "index.jsonl").exists() and not (out / ".run/run.json").exists()
     assert all(verify_dataset(manifest.parent).clean for manifest in out.rglob("manifest.json")), (
         "what was made since is whole"
@@ -239,13 +143,10 @@ def test_an_output_folder_that_is_deleted_stops_the_run(tmp_path, executor):
 
 def test_a_record_that_is_deleted_is_written_again(reference, tmp_path):
     out = tmp_path / "out"
-    run_dataset(template(tmp_path), out, listener=When("done", lambda *_: shutil.rmtree(out / ".run")))
+    run_dataset(template(tmp_path), out, listener=Listener(lambda *_: shutil.rmtree(out / ".run"), "done"))
     assert_same(out, reference)
     with pytest.raises(OutputError, match="another recipe"):
         run_dataset(template(tmp_path, seed=12), out, resume=True)
-
-
-# ---- clocks ----------------------------------------------------------------------------------------------------------
 
 
 # ---- others at work --------------------------------------------------------------------------------------------------
@@ -266,20 +167,3 @@ def test_a_driver_that_meets_another_takes_nothing_of_it_away(tmp_path):
             with pytest.raises(OutputError, match="deleted"):
                 first.check_in_place()
     assert not out.exists()
-
-
-def test_a_folder_that_goes_before_it_is_locked_is_made_again(tmp_path, monkeypatch):
-    """Another run was refused just then, and took away the empty folder that we had opened."""
-    out, flock, calls = tmp_path / "out", fcntl.flock, []
-
-    def late(handle, how):
-        if not calls:
-            out.rmdir()
-        calls.append(handle)
-        flock(handle, how)
-
-    monkeypatch.setattr(run_folder_module.fcntl, "flock", late)
-    with RunFolder(out).locked():
-        with pytest.raises(OutputError, match="another run is at work"), RunFolder(out).locked():
-            raise AssertionError
-    assert len(calls) == 3

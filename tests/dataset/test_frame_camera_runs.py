@@ -7,15 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import blinkgl
 from blinkgl.config.run import RunTemplate
-from blinkgl.dataset.executor import Local
-from blinkgl.dataset.explain import explain
 from blinkgl.dataset.generate import generate_run
-from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.shards import export_shards
 from blinkgl.dataset.verify import verify_dataset
-from blinkgl.dataset.verify.reproduce import differences
 from blinkgl.errors import AssetError
 from blinkgl.imaging import CameraImage
 from blinkgl.io.frame_camera import read_codes, read_exposures
@@ -75,18 +70,6 @@ def test_images_are_written_beside_everything_else_and_verified(made):
     assert verify_dataset(out, deep=1).clean
 
 
-def test_the_same_seed_gives_the_same_bytes_with_workers(made, tmp_path, monkeypatch):
-    report, _ = made
-    monkeypatch.setenv("NUMBA_NUM_THREADS", "1")
-    outcome = run_dataset(template(), tmp_path / "out", Local(2), num=2)
-    assert not outcome.set_aside
-    assert differences(report.path, tmp_path / "out/train/sequence_000000") == []
-    other = tmp_path / "out/train/sequence_000001"
-    assert not np.array_equal(
-        read_codes(other / "frame_camera/images/000000.png"), read_codes(report.path / "frame_camera/images/000000.png")
-    )
-
-
 def test_images_come_in_time_between_events_and_labels(made):
     config = template().sequence(0)
     seen, times = [], []
@@ -105,23 +88,6 @@ def test_images_come_in_time_between_events_and_labels(made):
     for k in (0, 9):
         for name, codes in images[k].pictures.items():
             np.testing.assert_array_equal(codes, read_codes(made[0].path / f"frame_camera/{name}/{k:06d}.png"))
-    alone = [
-        item for item in simulate_sequence(SequenceRequest(config, 0, events=False)) if isinstance(item, CameraImage)
-    ]
-    assert all(np.array_equal(a.image, b.image) for a, b in zip(images, alone, strict=True)), (
-        "whoever else is drawn for"
-    )
-    assert not any(
-        isinstance(item, CameraImage) for item in simulate_sequence(SequenceRequest(config, 0, labels=False))
-    )
-
-
-def test_events_and_labels_are_what_they_are_without_it(made, tmp_path):
-    report, _ = made
-    (plain,) = generate_run(RunTemplate({**RUN, "images": None, "labels": {"images": False}}, Path(".")), tmp_path)
-    for name in ("events.h5", "flow/forward/000001.png", "poses.npz"):
-        assert (plain.path / name).read_bytes() == (report.path / name).read_bytes(), name
-    assert not (plain.path / "frame_camera").exists()
 
 
 @pytest.mark.parametrize("old, new", [("start_us", "begin_us"), ("500000.000", "nan")])
@@ -131,17 +97,6 @@ def test_a_damaged_list_of_exposures_is_one_line(made, tmp_path, old, new):
     path.write_text((made[0].path / "frame_camera/exposures.csv").read_text().replace(old, new))
     with pytest.raises(AssetError, match="damaged list of exposures"):
         read_exposures(tmp_path)
-
-
-def test_explain_says_what_is_taken_and_what_is_left_out():
-    told = explain(template())
-    (camera,) = [p for p in told.passes if p.name == "frame camera"]
-    assert camera.count == 10 and "10 images, exposed 6000 µs, rows 50 µs apart" in camera.why
-    assert "photon noise" in camera.why and "beside them sharp and clean" in camera.why
-    out = dict(told.left_out)
-    assert "frame camera: defocus" in out and "frame camera: noise" not in out
-    none = dict(explain(RunTemplate({**RUN, "images": None}, Path("."))).left_out)
-    assert none["frame camera: motion blur, noise, lens"] == "images: null"
 
 
 def test_the_report_and_the_shards_have_them(made, tmp_path):
@@ -161,15 +116,6 @@ def test_the_report_and_the_shards_have_them(made, tmp_path):
     for ending, name in (("camera", "images"), ("camera_sharp", "sharp"), ("camera_clean", "clean")):
         path = report.path / f"frame_camera/{name}/{about['camera']['image']:06d}.png"
         assert files[f"sequence_000000_000001.{ending}.png"] == path.read_bytes()
-
-
-def test_from_python(made):
-    recording = blinkgl.record(template(), images={"preset": "raw", "rate": 20, "exposure_us": 4000})
-    assert len(recording.camera) == 3 and recording.camera[0].image.shape == (30, 40) and recording.images is None
-    with pytest.raises(blinkgl.ConfigError, match=r"images.preset: unknown choice \(got 'night'\)"):
-        blinkgl.record(template(), images="night")
-    with pytest.raises(blinkgl.ConfigError, match="images: not a frame camera"):
-        blinkgl.record(template(), images=3)
 
 
 def test_no_list_of_exposures_is_said(tmp_path):

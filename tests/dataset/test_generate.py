@@ -11,16 +11,12 @@ import numba
 import numpy as np
 import pytest
 import yaml
-from shared_data import shared
 
 from blinkgl.cli import run
 from blinkgl.config.run import load_run
 from blinkgl.dataset import generate as generate_module
 from blinkgl.dataset.generate import generate_run
-from blinkgl.dataset.verify import verify_dataset
-from blinkgl.io.dsec import DsecEventReader
 from blinkgl.render.passes import Luminance
-from blinkgl.sequence_files.sequence_dir import verify_sequence
 
 SMALL = {
     "seed": 4,
@@ -113,97 +109,6 @@ def test_flow_png_equals_the_float_flow_to_half_a_quantum(sequence):
             assert start == 3_050_000 + 50_000 * k and end == start + (50_000 if direction == "forward" else -50_000)
 
 
-def test_images_labels_and_poses_fit_together(sequence):
-    stamps = [int(x) for x in (sequence / "images/timestamps.txt").read_text().split()]
-    assert stamps == [3_050_000 + 50_000 * k for k in range(5)]
-    poses = np.load(sequence / "poses.npz", allow_pickle=False)
-    assert list(poses["t_ns"] // 1000) == [3_000_000, *stamps]
-    for k in range(4):
-        image = cv2.imread(str(sequence / f"images/{k:06d}.png"))
-        assert image.shape == (48, 64, 3) and 5 < image.mean() < 250
-        depth, ids = (
-            np.load(sequence / f"depth/{k:06d}.npy"),
-            cv2.imread(str(sequence / f"ids/{k:06d}.png"), cv2.IMREAD_UNCHANGED),
-        )
-        assert np.isfinite(depth[ids > 0]).all() and set(np.unique(ids)) <= {0, *poses["object_ids"]}
-
-
-def test_flow_follows_from_depth_ids_and_poses(sequence):
-    """The flow is recomputed in float64 from the other files: lift each pixel by its depth, move it with its object,
-    project it into the next camera."""
-    poses = np.load(sequence / "poses.npz", allow_pickle=False)
-    K = poses["K"]
-    index = {int(i): n for n, i in enumerate(poses["object_ids"])}
-    y, x = np.mgrid[0:48, 0:64].astype(np.float64)
-    for k in range(4):
-        depth, ids = (
-            np.load(sequence / f"depth/{k:06d}.npy"),
-            cv2.imread(str(sequence / f"ids/{k:06d}.png"), cv2.IMREAD_UNCHANGED),
-        )
-        flow = np.load(sequence / f"flow/forward_npy/{k:06d}.npy")
-        now, then = k + 1, k + 2
-        errors = []
-        for i in np.unique(ids[ids > 0]):
-            at = (ids == i) & (flow[..., 2] > 0)
-            rays = np.stack([(x[at] - K[0, 2]) / K[0, 0], (y[at] - K[1, 2]) / K[1, 1], np.ones(at.sum())])
-            local = (
-                np.linalg.inv(poses["T_world_obj"][index[i], now])
-                @ poses["T_world_cam"][now]
-                @ np.vstack([rays * depth[at], np.ones(at.sum())])
-            )
-            moved = np.linalg.inv(poses["T_world_cam"][then]) @ poses["T_world_obj"][index[i], then] @ local
-            pixel = K @ (moved[:3] / moved[2])
-            errors.append(np.hypot(pixel[0] - x[at] - flow[at, 0], pixel[1] - y[at] - flow[at, 1]))
-        errors = np.concatenate(errors)
-        assert np.median(errors) < 1e-4 and errors.max() < 1e-2
-
-
-def test_the_poses_begin_with_the_first_frame(tmp_path):
-    """A camera that moves 1 m/s along x on straight lines: its position is the clock, to the nanosecond."""
-    scene = {
-        "kind": "explicit",
-        "meshes": {"box": {"primitive": "cuboid"}},
-        "objects": [{"mesh": "box", "position": [3, 0, 0]}],
-        "camera": {"interpolation": "linear", "keyframes": [{"time": t, "position": [t, 0, 0]} for t in (0, 10)]},
-    }
-    folder = generate(tmp_path, scene=scene, time={"duration": 0.2, "label_rate": 30, "start": 3.0000005})[0]
-    poses = np.load(folder / "poses.npz", allow_pickle=False)
-    start, interval = 3_000_000_500, 33_333_333
-    assert poses["t_ns"].tolist() == [start + k * interval for k in range(8)]
-    np.testing.assert_allclose(poses["T_world_cam"][:, 0, 3], poses["t_ns"] * 1e-9, rtol=0, atol=1e-12)
-
-
-def test_a_clock_between_microseconds(tmp_path):
-    """Start and labels that no µs count holds: labels, duration and events still agree."""
-    for start in (7e-7, 3.0000009):
-        folder = generate(tmp_path, out=f"{start}", time={"duration": 0.1, "label_rate": 30, "start": start})[0]
-        manifest = json.loads((folder / "manifest.json").read_text())
-        last = int((folder / "images/timestamps.txt").read_text().split()[-1])
-        assert manifest["t_offset_us"] + manifest["duration_us"] == last
-        assert verify_dataset(folder).clean
-
-
-def test_events_that_leave_the_bus_late_are_no_part_of_the_recording(tmp_path):
-    """With a sensor's read-out, too, windows are a partition of the recording, and nothing made is unaccounted for."""
-    free = json.loads((generate(tmp_path, out="free")[0] / "manifest.json").read_text())
-    folder = generate(tmp_path, out="slow", readout={"events_per_second": 4000, "queue_events": 40})[0]
-    slow = json.loads((folder / "manifest.json").read_text())
-    assert verify_dataset(folder).clean
-    assert slow["events_late_in_readout"] > 0 and slow["events_lost_in_readout"] > 0
-    assert slow["events"] + slow["events_late_in_readout"] + slow["events_lost_in_readout"] == free["events"]
-    with DsecEventReader(folder / "events.h5") as reader:
-        windows = [reader.slice(a, a + 50_000) for a in range(3_000_000, 3_250_000, 50_000)]
-        assert sum(map(len, windows)) + int((next(reader.chunks()).t == 3_250_000).sum()) == slow["events"]
-
-
-def test_manifest_is_complete(sequence):
-    assert verify_sequence(sequence) == []
-    manifest = json.loads((sequence / "manifest.json").read_text())
-    assert manifest["seed"] == 4 and manifest["opengl"]["renderer"] and manifest["versions"]["numba"]
-    with h5py.File(sequence / "events.h5") as file:
-        assert manifest["events"] == len(file["events/t"])
-
-
 # ---- reproducible ------------------------------------------------------------------------------------------------
 
 
@@ -225,13 +130,6 @@ def test_another_seed_or_index_is_another_sequence_and_order_does_not_matter(seq
     assert digests(alone)["events.h5"] == digests(second)["events.h5"]
     other = generate(tmp_path, out="other", seed=5)[0]
     assert digests(other)["events.h5"] != digests(first)["events.h5"]
-
-
-def test_resolved_configuration_reproduces_the_sequence(tmp_path):
-    second = generate(tmp_path, num=2, events={"emulator": "esim", "contrast_threshold": {"uniform": [0.1, 0.5]}})[1]
-    again = list(generate_run(load_run(second / "config.yaml"), tmp_path / "again"))[0].path
-    assert again.name == second.name
-    assert digests(again)["events.h5"] == digests(second)["events.h5"]
 
 
 def test_a_still_camera_saves_work_and_changes_nothing(tmp_path, monkeypatch):
@@ -284,24 +182,6 @@ def test_existing_output_is_refused_before_any_work(tmp_path, capsys, monkeypatc
 
 
 @pytest.mark.parametrize(
-    "option, message",
-    [
-        ("camera.widht=3", "camera.widht: unknown key; expected 'width' (nearest)"),
-        ("scene.pool.folders=[nowhere]", "scene.pool.folders.0: "),
-        ("scene.pool={primitives: []}", "scene.pool: "),
-        ("gl={backend: egl, device: 99}", "gl"),
-        ("events.emulator=blender", "events.emulator: unknown choice"),
-    ],
-)
-def test_bad_input_is_one_line_and_status_2(tmp_path, capsys, option, message):
-    out = tmp_path / "out"
-    assert run(["generate", str(config_file(tmp_path)), "--out", str(out), "--set", option]) == 2
-    error = capsys.readouterr().err
-    assert message in error and error.count("\n") == 1 and "Traceback" not in error
-    assert not out.exists() or not any(p.is_file() for p in out.rglob("*"))
-
-
-@pytest.mark.parametrize(
     "name, content, message",
     [
         ("meshes/a.obj", b"v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "NaN"),
@@ -330,39 +210,3 @@ def test_bad_assets_are_one_line_and_status_2_and_leave_nothing(tmp_path, capsys
         assert error.startswith(f"error: {path}") and message in error and error.count("\n") == 1
         assert not out.exists()
     assert run(["generate", config, "--out", str(out), "--quiet"]) == 0
-
-
-def test_output_that_is_a_file(tmp_path, capsys):
-    (tmp_path / "out").write_text("")
-    assert run(["generate", str(config_file(tmp_path)), "--out", str(tmp_path / "out")]) == 2
-    assert "is a file" in capsys.readouterr().err
-
-
-# ---- real input, long input --------------------------------------------------------------------------------------
-
-
-def test_flying_objects_from_real_meshes_and_photographs(tmp_path):
-    meshes, textures = shared("data/assets/models_cc0"), shared("data/assets/textures_cc0")
-    shipped = Path(__file__).parents[2] / "configs/flying_objects.yaml"
-    template = load_run(
-        shipped,
-        [
-            f"scene.pool.folders=[{json.dumps(str(meshes))}]",
-            f"scene.textures.folders=[{json.dumps(str(textures))}]",
-            "scene.pool.primitives=[]",
-            "scene.textures.procedural=false",
-            "camera.width=160",
-            "camera.height=120",
-            "time.duration=0.2",
-            "preview.enabled=false",
-            "timeline={kind: uniform, fps: 100}",
-        ],
-    )
-    folder = list(generate_run(template, tmp_path / "out"))[0].path
-    assert verify_sequence(folder) == []
-    names = [
-        o["name"] for o in json.loads((folder / "manifest.json").read_text())["objects"] if o["category"] == "object"
-    ]
-    assert len(names) >= 8
-    with h5py.File(folder / "events.h5") as file:
-        assert len(dsec_slice(file, 100_000, 300_000)["t"]) > 1000

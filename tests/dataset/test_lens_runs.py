@@ -3,20 +3,17 @@
 import shutil
 from pathlib import Path
 
-import cv2
 import h5py
 import numpy as np
 import pytest
 
 from blinkgl.camera.rectified import rectified
 from blinkgl.cli import run
-from blinkgl.config.camchain import read_camchain
 from blinkgl.config.reader import to_yaml
 from blinkgl.config.run import load_run
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import ConfigError
 from blinkgl.io.flow import read_flow
-from blinkgl.sequence_files.lens_files import FILES
 
 LENS = {"width": 64, "height": 48, "fov": 75, "lens": "radtan", "distortion": [-0.3, 0.1, 1e-3, -2e-3]}
 RUN = {
@@ -71,24 +68,6 @@ def test_verify_knows_the_lens(made, tmp_path):
         assert name in found
 
 
-def test_what_a_sequence_says_of_its_lens(made):
-    for name in ("bent", "flat"):
-        folder = made / f"train/{name}_000000"
-        assert all((folder / file).is_file() for file in FILES)
-        camera = load_run(folder / "config.yaml").sequence(0).camera.model
-        for file in FILES[1:]:
-            (seen,) = (one.camera for one in read_camchain(folder / file).values())
-            assert seen == camera
-        poses = np.load(folder / "poses.npz")
-        assert str(poses["lens"]) == "radtan" and poses["distortion"].tolist() == [-0.3, 0.1, 1e-3, -2e-3, 0.0]
-        # as a stranger rectifies an event
-        with h5py.File(folder / "rectify_map.h5") as file:
-            given = file["rectify_map"][()]
-        centre = np.array([[[40.0, 30.0]]])
-        theirs = cv2.undistortPoints(centre, camera.K, poses["distortion"], P=poses["K"])[0, 0]
-        np.testing.assert_allclose(given[30, 40], theirs, atol=1e-3)
-
-
 def test_rectified_labels_are_where_the_map_leads(made):
     bent, flat = (made / f"train/{name}_000000" for name in ("bent", "flat"))
     for name in ("events.h5", "frame_camera/images/000000.png", "rectify_map.h5"):
@@ -115,15 +94,6 @@ def test_tracks_are_in_the_labels_pixels(made, name):
     assert seen.sum() > 20
     off = np.abs(flow[y, x] - moved)[seen].max(axis=-1)
     assert np.quantile(off, 0.9) < 1 / 128 and np.abs(moved[seen]).max() > 1  # the PNG's quantum
-
-
-def test_the_truth_of_events_is_in_the_sensor_s_pixels(made):
-    for name in ("bent", "flat"):
-        with h5py.File(made / f"train/{name}_000000/event_labels.h5") as file:
-            assert len(file["instance"]) > 100
-    one, other = (made / f"train/{name}_000000/event_labels.h5" for name in ("bent", "flat"))
-    with h5py.File(one) as a, h5py.File(other) as b:
-        np.testing.assert_array_equal(a["depth"][()], b["depth"][()])
 
 
 def test_a_file_s_own_camera_has_no_lens(tmp_path):

@@ -65,14 +65,6 @@ def test_a_run_says_it_once(tmp_path, capsys, scene, workers):
     assert explain(load_run(path)).scene["not drawn"] == LINE
 
 
-def test_a_pool_of_textures_of_its_own_asks_for_nothing(tmp_path, capsys):
-    """Materials that the pool's textures replace are nobody's wish."""
-    path = recipe(tmp_path, {**RANDOM, "pool": {**RANDOM["pool"], "keep_materials": False}})
-    assert run(str(path), str(tmp_path / "out"), num=1) == 0
-    (manifest,) = (tmp_path / "out").glob("*/*/manifest.json")
-    assert "note: " not in capsys.readouterr().out and json.loads(manifest.read_text())["not_drawn"] == []
-
-
 def test_many_files_are_not_a_screenful(tmp_path, capsys):
     """Messages of any number of workers arrive in any order; a line is printed once, and not more than so many."""
     display = Display(Console(width=200), tmp_path)

@@ -18,14 +18,11 @@ from blinkgl.dataset.verify import verify_dataset
 from blinkgl.dataset.verify.reproduce import differences
 from blinkgl.errors import ConfigError, OutputError
 from blinkgl.gl import create_context
-from blinkgl.io.imu import read_imu
 from blinkgl.render.reference import render as by_reference
 from blinkgl.scene.build import sequence_scene
 from blinkgl.sequence import simulate_sequence
 from blinkgl.sequence.request import SequenceRequest
 from blinkgl.sequence.rig import simulate_rig
-from blinkgl.sequence_files.index import made_folders, read_index, sequence_folders
-from blinkgl.sequence_files.rig_dir import read_rig
 from blinkgl.sequence_files.sequence_dir import read_manifest
 
 WAY = [
@@ -109,32 +106,6 @@ def test_a_rig_of_one_is_the_single_camera(tmp_path):
     assert verify_dataset(rig / "out").clean
 
 
-def test_what_lies_on_disk(pair):
-    out = pair / "out"
-    assert [f.name for f in made_folders(out)] == ["sequence_000000", "sequence_000001"]
-    names = [f.relative_to(out).as_posix() for f in sequence_folders(out)]
-    assert names == [f"train/sequence_00000{k}/{eye}" for k in (0, 1) for eye in ("left", "rgb", "right")]
-    assert [(line["path"], line["sensor"]) for line in read_index(out)] == [(n, n.split("/")[-1]) for n in names]
-    folder = out / "train/sequence_000000"
-    rig, manifest = read_rig(folder), read_manifest(folder)
-    assert list(rig) == manifest["sensors"] == ["left", "right", "rgb", "unit"]
-    assert manifest["cameras"] == ["left", "right", "rgb"] and manifest["format"] == "blinkgl-rig"
-    assert manifest["events"] == sum(read_manifest(folder / eye)["events"] for eye in ("left", "right")) > 1000
-    assert rig["right"]["baseline"] == -0.1 and rig["right"]["T_rig_sensor"][0, 3] == 0.1
-    assert rig["rgb"]["records"] == ["images"] and not (folder / "rgb/events.h5").exists()
-    assert not (folder / "rgb/flow").exists() and (folder / "rgb/frame_camera/images/000000.png").is_file()
-    assert len(read_imu(folder / "unit")["t_ns"]) == 16 and (folder / "preview.mp4").stat().st_size > 1000
-    assert read_manifest(folder / "left")["frames"] == read_manifest(folder / "right")["frames"] > 5
-
-
-def test_places_and_poses_agree(pair):
-    folder = pair / "out/train/sequence_000001"
-    poses = {eye: np.load(folder / eye / "poses.npz")["T_world_cam"] for eye in ("left", "right", "rgb")}
-    for eye, one in read_rig(folder).items():
-        if eye in poses:
-            assert np.abs(poses["left"] @ one["T_rig_sensor"] - poses[eye]).max() < 1e-12
-
-
 def test_disparity_is_f_b_over_z(pair):
     config, folder = config_of(pair), pair / "out/train/sequence_000000"
     scene, worst = sequence_scene(config, 0, pair), []
@@ -147,23 +118,6 @@ def test_disparity_is_f_b_over_z(pair):
         worst.append(np.abs(drawn - f * b / np.where(same, true.depth, np.inf))[same].max())
         assert same.mean() > 0.5 and drawn[same].min() > 0.3
     assert max(worst) < 1e-4, "px"
-
-
-def test_what_one_eye_sees_the_other_sees_a_disparity_away(pair):
-    """Points of the left eye that the right one sees, too: there both say one disparity."""
-    config = config_of(pair)
-    scene, t_ns = sequence_scene(config, 0, pair), config.time.label_times_ns[0]
-    left, right = (by_reference(scene.seen_by(k), t_ns) for k in (0, 1))
-    folder = pair / "out/train/sequence_000000"
-    mine, theirs = (np.load(folder / eye / "disparity/000000.npy") for eye in ("left", "right"))
-    y, x = np.nonzero(_inside(left.instance))
-    there = x - mine[y, x]
-    whole = np.rint(there).astype(int)
-    ok = (whole >= 0) & (whole < 64)
-    y, x, there, whole = y[ok], x[ok], there[ok], whole[ok]
-    same = (right.instance[y, whole] == left.instance[y, x]) & _inside(right.instance)[y, whole]
-    assert same.sum() > 500
-    assert np.abs(theirs[y, whole] - mine[y, x])[same].max() < 0.3, "px, between neighbours' centres"
 
 
 def test_flow_of_both_eyes_is_that_of_depth_and_poses(pair):
@@ -220,15 +174,6 @@ def test_a_damaged_eye_is_made_again_with_its_rig(pair, tmp_path):
     for k in (0, 1):
         name = f"train/sequence_00000{k}"
         assert differences(pair / "out" / name, out / name) == [], "another process makes the same bytes"
-
-
-def test_items_come_in_the_order_of_time(pair):
-    config = config_of(pair)
-    with create_context() as gl, simulate_rig(SequenceRequest(config, 0, base=pair), gl) as rig:
-        seen = [(item.t_ns, member.name) for member, item in rig]
-        frames = {member.name: member.frames for member in rig.members}
-    assert [t for t, _ in seen] == sorted(t for t, _ in seen) and {n for _, n in seen} == {"left", "right", "rgb"}
-    assert frames["left"] == frames["right"] > 5 and frames["rgb"] == 0
 
 
 def test_one_door_for_several_sensors(pair):

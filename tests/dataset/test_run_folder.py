@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -57,22 +56,6 @@ def test_files_that_are_not_those_the_run_began_with(tmp_path, before, now, said
     ).split("began with: ")[1].startswith(said + ";")
 
 
-@pytest.mark.parametrize(
-    "ours, theirs, names",
-    [
-        ({"": "b"}, {"": "a"}, "the configuration"),
-        ({"x": "1", "y": "2"}, {"x": "1", "y": "1"}, "y"),
-        ({"x": "1"}, {"x": "1", "z": "1"}, "z"),
-        ({"x": "2", "y": "2"}, {"x": "1", "z": "1"}, "x, y, z"),
-    ],
-)
-def test_the_run_of_another_recipe(tmp_path, ours, theirs, names):
-    folder = begun(tmp_path / "out", identity=theirs)
-    folder.check(plan(ours), {}, True)
-    with pytest.raises(OutputError, match=rf"holds the run of another recipe \(different: {names}\)"):
-        folder.check(plan(ours), {}, False)
-
-
 def test_another_installation(tmp_path):
     folder = begun(tmp_path / "out")
     folder.check_environment(ENVIRONMENT, False)
@@ -83,45 +66,6 @@ def test_another_installation(tmp_path):
         match=r"the run began with another installation: numpy 2.0, now 1.0; opengl llvmpipe, 4.5, now Voodoo",
     ):
         folder.check_environment({"numpy": "1.0", "opengl": "Voodoo"}, False)
-
-
-def test_what_identifies_a_run_is_written_and_stays(tmp_path):
-    folder = begun(tmp_path / "out", identity={"g": "1"}, assets={"m": "h"})
-    record = json.loads((tmp_path / "out/.run/run.json").read_text())
-    assert (
-        record["groups"] == {"g": "1"}
-        and record["environment"] == ENVIRONMENT
-        and record["mixed"] == []
-        and record["num"] == 3
-    )
-    assert record["base"] == str(Path.cwd()) and folder.begun
-    assert (tmp_path / "out/.run/recipe.yaml").read_text() == "seed: 1\n" and json.loads(
-        (tmp_path / "out/.run/assets.json").read_text()
-    ) == {"m": "h"}
-    begun(tmp_path / "out", identity={"g": "1"}, assets={"m": "h"})
-    assert json.loads((tmp_path / "out/.run/run.json").read_text())["mixed"] == []
-    begun(tmp_path / "out", identity={"g": "2"}, assets={"m": "i"})
-    begun(tmp_path / "out", identity={"g": "1"}, environment={"numpy": "3"})
-    record = json.loads((tmp_path / "out/.run/run.json").read_text())
-    assert record["groups"] == {"g": "1"} and record["environment"] == ENVIRONMENT, "the beginning stays"
-    assert record["mixed"] == [
-        {"environment": ENVIRONMENT, "groups": {"g": "2"}},
-        {"environment": {"numpy": "3"}, "groups": {"g": "1"}},
-    ]
-
-
-def test_a_run_of_which_nothing_came_leaves_nothing(tmp_path):
-    for keep in (False, True):
-        out = tmp_path / f"out{keep}"
-        folder = begun(out)
-        for name in ("train", ".run/logs"):
-            (out / name).mkdir()
-        for name in ("index.jsonl", ".run/failed.json", ".run/costs.jsonl", ".run/logs/worker-1.log"):
-            (out / name).write_text("")
-        folder.forget(plan({}), keep)
-        assert sorted(p.relative_to(out).as_posix() for p in out.rglob("*")) == (
-            [".run", ".run/logs", ".run/logs/worker-1.log"] if keep else []
-        )
 
 
 def test_what_lies_at_a_sequences_name(tmp_path):
@@ -150,36 +94,3 @@ def test_what_lies_at_a_sequences_name(tmp_path):
         assert (tmp_path / f".run/damaged/train/odd-{k}/x").exists() and not (tmp_path / "train/odd").exists()
         (tmp_path / "train/odd").mkdir()
         (tmp_path / "train/odd/x").write_text("")
-
-
-def test_one_run_at_a_time_and_no_trace_of_one_that_was_refused(tmp_path):
-    out = tmp_path / "a/b"
-    with RunFolder(out).locked():
-        with pytest.raises(OutputError, match="another run is at work in this folder"), RunFolder(out).locked():
-            pass
-        assert out.is_dir()
-    assert not (tmp_path / "a").exists()
-    out.mkdir(parents=True)
-    with RunFolder(out).locked() as _:
-        (out / "kept").write_text("")
-    assert (out / "kept").exists()
-    (out / ".run").symlink_to(tmp_path)
-    with pytest.raises(OutputError, match="is a symbolic link"), RunFolder(out).locked():
-        pass
-
-
-def test_logs_of_workers_that_began_nothing(tmp_path):
-    out = tmp_path / "out"
-    folder = RunFolder(out)
-    with folder.locked():
-        (out / ".run/logs").mkdir(parents=True)
-        (out / ".run/logs/worker-1.log").write_text("")
-        folder.take_back_logs()
-        assert not (out / ".run").exists(), "the run made it"
-        (out / ".run/logs").mkdir(parents=True)
-        (out / ".run/logs/worker-1.log").write_text("")
-    folder = RunFolder(out)
-    with folder.locked():
-        (out / ".run/logs/worker-2.log").write_text("")
-        folder.take_back_logs()
-    assert [p.name for p in (out / ".run/logs").iterdir()] == ["worker-1.log"], "an earlier run's stay"

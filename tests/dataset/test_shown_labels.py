@@ -8,15 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from blinkgl import ConfigError, Renderer, load
+from blinkgl import Renderer, load
 from blinkgl.cli import run
 from blinkgl.config.reader import to_yaml
-from blinkgl.config.run import load_run
 from blinkgl.dataset.shards import sample
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.io.boxes import read_boxes
 from blinkgl.io.images import read_ids
-from blinkgl.io.overlays import TrackLines, with_tracks
 from blinkgl.report.collect import collect
 
 RUN = {
@@ -74,21 +72,6 @@ def test_report_shows_them(made):
     assert (others["boxes"] != frame).any() and (others["point tracks, 20"] != frame).any()
 
 
-def test_tracks_have_tails():
-    """A dot where the point is now, its tail behind it, nothing of what is hidden, at any scale."""
-    t_us = np.arange(5) * 10_000
-    px = np.zeros((2, 5, 2))
-    px[0] = np.stack([np.arange(5) * 8.0 + 4, np.full(5, 10.0)], 1)
-    px[1] = px[0] + [0, 20]
-    lines = TrackLines(t_us, px, np.array([[False] * 5, [True] * 5]), np.array([3, 4]), np.array([48, 40]))
-    for scale in (1, 2):
-        out = with_tracks(np.zeros((40 * scale, 48 * scale, 3), np.uint8), lines, 25_000)
-        y, x = np.nonzero(out.max(axis=2) > 60)
-        assert abs(x.max() / scale - 25) < 2 and x.min() / scale < 6 and np.abs((y + 0.5) / scale - 10.5).max() < 2
-        assert out[10 * scale + scale // 2, 24 * scale + scale // 2].max() > 150
-    assert not with_tracks(np.zeros((40, 48, 3), np.uint8), lines, 50_000).any()
-
-
 def test_a_table_that_fits_nothing_is_refused(made, tmp_path, capsys):
     tree = {**RUN, "labels": {"semantics": {"car*": 1, "bus": 2}}}
     (tmp_path / "a.yaml").write_text(to_yaml(tree), encoding="utf-8")
@@ -100,8 +83,3 @@ def test_a_table_that_fits_nothing_is_refused(made, tmp_path, capsys):
     assert "cuboid" in said and "Traceback" not in said and not list((tmp_path / "out").rglob("manifest.json"))
     with Renderer(load(tmp_path / "a.yaml")) as renderer:
         assert renderer.frame(0.05, labels=["semantics"]).semantics.max() > 1  # by kinds of shape
-    for table in ({"": 1}, {"a": 70_000}, {"a": "b"}, [1]):
-        tree["labels"] = {"semantics": table}
-        (tmp_path / "a.yaml").write_text(to_yaml(tree), encoding="utf-8")
-        with pytest.raises(ConfigError, match="labels.semantics"):
-            load_run(tmp_path / "a.yaml")

@@ -9,62 +9,10 @@ from types import SimpleNamespace
 import hdf5plugin  # noqa: F401
 import pytest
 
-from blinkgl.dataset.verify import cross_checks as between, reproduce as again
+from blinkgl.dataset.verify import cross_checks as between
 from blinkgl.dataset.verify.problems import Known, Verification, guarded
 
-# --- two machines -----------------------------------------------------------------------------------------------------
-
-
-def test_what_sets_two_machines_apart():
-    here = {"blinkgl": "1.0", "versions": {"numpy": "2"}, "opengl": {"renderer": "llvmpipe", "version": "4.5"}}
-    assert again._apart(here, dict(here)) == ""
-    assert again._apart({**here, "blinkgl": "0.9"}, here) == "made with BlinkGL 0.9, this machine has 1.0"
-    assert (
-        again._apart({**here, "opengl": {"renderer": "Voodoo", "version": "1"}}, here)
-        == "made with opengl Voodoo, 1, this machine has llvmpipe, 4.5"
-    )
-    assert again._apart({**here, "versions": {"numpy": "1", "numba": "3"}}, here) == (
-        "made with numba 3, this machine has None; made with numpy 1, this machine has 2"
-    )
-    assert between.made_with({"versions": None, "opengl": None}) == {}
-
-
-@pytest.mark.parametrize(
-    "a, b, where",
-    [
-        ({"a": 1}, {"a": 1}, ""),
-        ({"a": 1}, {"a": 2}, "a"),
-        ({"a": {"b": [1, 2]}}, {"a": {"b": [1, 3]}}, "a.b"),
-        ({"a": {"b": 1}, "c": 1}, {"a": {"b": 1}, "c": 2}, "c"),
-        ({"a": 1}, {"a": 1, "b": 0}, "b"),
-        ({"b": 1, "a": 1}, {"b": 2, "a": 2}, "a"),
-        ({"a": {}}, {"a": 3}, "a"),
-    ],
-)
-def test_where_two_configurations_differ(a, b, where):
-    assert between.first_difference(a, b) == where
-
-
 # --- what lies between sequences --------------------------------------------------------------------------------------
-
-
-def test_what_belongs_to_no_sequence(tmp_path):
-    for name in ("train/a_000000", "train/b_000000", ".run", "train/nothing", "deep/er/empty"):
-        (tmp_path / name).mkdir(parents=True)
-    for name in ("train/a_000000/events.h5", "index.jsonl", "report.html", ".run/run.json"):
-        (tmp_path / name).write_text("")
-    folders = [tmp_path / "train/a_000000", tmp_path / "train/b_000000"]
-    assert between.strangers(tmp_path, folders) == ["deep: belongs to no sequence"]
-    (tmp_path / "deep").rename(tmp_path / "train/.c_000001.blinkgl-tmp-0123456789ab-1-0")
-    (tmp_path / "train/index.jsonl").write_text("")
-    (tmp_path / "train/nothing/x").write_text("")
-    (tmp_path / "link").symlink_to(tmp_path / "train")
-    assert between.strangers(tmp_path, folders) == [
-        "link: belongs to no sequence",
-        "train/.c_000001.blinkgl-tmp-0123456789ab-1-0: left by a run that was cut off",
-        "train/index.jsonl: belongs to no sequence",
-        "train/nothing: belongs to no sequence",
-    ]
 
 
 def known(

@@ -9,13 +9,13 @@ torch = pytest.importorskip("torch")
 
 from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 
-from eflow.checkpoint import load_optimizer, optimizer_tensors, write_tensors  # noqa: E402
 from eflow.config import TrainConfig  # noqa: E402
-from eflow.data.window import Window  # noqa: E402
 from eflow.models import build_model, model_config  # noqa: E402
 from eflow.ops.precision import fp32  # noqa: E402
 from eflow.precision import use_tf32  # noqa: E402
-from eflow.train import Readings, _alike, _forward, validate  # noqa: E402
+from eflow.train import _forward  # noqa: E402
+from eflow.training_data import _alike, validate  # noqa: E402
+from eflow.training_log import Readings  # noqa: E402
 
 WAITS = {
     "aten::_local_scalar_dense": "a number that Python reads: float(t), int(t), if t",
@@ -84,18 +84,6 @@ def test_a_training_step_waits_for_nothing(model, size, tmp_path):
     assert read.values() == []
 
 
-def test_the_error_that_is_told_is_the_mean_over_valid_pixels():
-    whole = config(name="ev_flownet", width=4)
-    net = build_model(whole.model).train()
-    batch = {"new": torch.randn(1, 4, 32, 32), "flow": torch.full((1, 2, 32, 32), 3.0)}
-    batch["valid"] = torch.zeros(1, 32, 32, dtype=torch.bool)
-    batch["flow"][0, :, 0] = float("nan")
-    assert float(_forward(net, batch, whole, 1)[1]) == 0, "nothing is valid"
-    batch["valid"][0, 5:9] = True
-    _, epe, flow = _forward(net, batch, whole, 1)
-    assert float(epe) == pytest.approx(float((flow - batch["flow"]).norm(dim=1)[0, 5:9].mean()), rel=1e-5)
-
-
 def test_validation_in_batches_is_validation_one_by_one():
     torch.manual_seed(0)
     net = build_model(model_config({"name": "ev_flownet", "width": 4}))
@@ -119,18 +107,6 @@ def test_validation_in_batches_is_validation_one_by_one():
     assert one["set/AEE"] == pytest.approx(many["set/AEE"], abs=1e-5) and one["set/zero"] == many["set/zero"]
 
 
-def test_merging_new_events_is_sorting_all_of_them():
-    rng = np.random.default_rng(1)
-    for n, m in ((1000, 50), (0, 20), (30, 0), (5, 500)):
-        t = np.sort(rng.integers(0, 60, n))  # many equal times
-        window = Window(np.arange(n, dtype=np.uint16), np.zeros(n, np.uint16), t, np.ones(n, np.uint8), 0, 100)
-        x, new = 2000 + np.arange(m), rng.integers(0, 60, m)
-        merged = window.with_events(x, np.ones(m, int), new, np.zeros(m, np.uint8))
-        order = np.argsort(np.concatenate([t, new]), kind="stable")
-        assert np.array_equal(merged.x, np.concatenate([window.x, x])[order]) and merged.x.dtype == np.uint16
-        assert np.array_equal(merged.t, np.concatenate([t, new])[order]) and merged.p.sum() == n
-
-
 def test_tf32_by_capability_and_never_in_islands(monkeypatch):
     cuda = torch.device("cuda", 0)
     for capability, wanted, able in (((8, 0), True, True), ((7, 5), True, False), ((9, 0), False, False)):
@@ -148,20 +124,3 @@ def test_tf32_by_capability_and_never_in_islands(monkeypatch):
         assert torch.backends.cuda.matmul.allow_tf32
     finally:
         torch.backends.cuda.matmul.allow_tf32 = False
-
-
-@pytest.mark.parametrize("fused", [False, True])
-def test_the_state_of_a_fused_optimiser_comes_back(fused, tmp_path):
-    torch.manual_seed(0)
-    net = build_model(model_config({"name": "ev_flownet", "width": 4}))
-    make = lambda: torch.optim.AdamW(net.parameters(), 1e-3, fused=fused)
-    first = make()
-    for p in net.parameters():
-        p.grad = torch.randn_like(p)
-    first.step()
-    write_tensors(tmp_path / "o.safetensors", optimizer_tensors(net, first), {})
-    second = make()
-    load_optimizer(tmp_path / "o.safetensors", net, second)
-    for p in net.parameters():
-        assert all(torch.equal(first.state[p][k], second.state[p][k]) for k in ("step", "exp_avg", "exp_avg_sq"))
-    second.step()

@@ -92,24 +92,6 @@ def test_predict_any_event_file(network, tmp_path, ending, capsys):
     assert run(["predict", network, str(file), "--out", str(out)]) == 2
 
 
-def test_predict_streams_the_same_windows_as_a_slice(tmp_path):
-    from eflow.infer import open_sized, windows
-
-    events = moving_events(180, 240, 5000, 1_000_000, n=30000)
-    write_events(tmp_path / "e.h5", events, 180, 240)
-    file = open_sized(tmp_path / "e.h5")
-    got = list(windows(file, 90_000, start_us=20_000, end_us=700_000))
-    assert [w.t_us for w in got] == [110_000 + 90_000 * i for i in range(6)]
-    for w in got:
-        for part, a, b in ((w.old, w.t_us - 90_000, w.t_us), (w.new, w.t_us, w.t_us + 90_000)):
-            expected = events.window(a, b)
-            assert (
-                (part.t0, part.t1) == (a, b)
-                and np.array_equal(part.t, expected.t)
-                and np.array_equal(part.x, expected.x)
-            )
-
-
 def test_a_video_of_the_flow(network, tmp_path, capsys):
     write_events(tmp_path / "e.h5", moving_events(130, 145, 0, 4 * SPAN, n=8000), 130, 145)
     video = tmp_path / "flow.mp4"
@@ -126,9 +108,9 @@ def test_a_video_of_the_flow(network, tmp_path, capsys):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["e.h5", "flow.mp4"]
 
 
-@pytest.mark.parametrize("speed", [20.0, 800.0])
-def test_a_window_as_long_as_things_need_to_move_by_five_pixels(speed, tmp_path, capsys):
+def test_a_window_as_long_as_things_need_to_move_by_five_pixels(tmp_path, capsys):
     """Points at a known velocity, found again by contrast."""
+    speed = 800.0
     span = round(1e6 * 5 / speed)
     events = moving_events(64, 72, 0, 4 * span, (speed * 0.8, -speed * 0.6), n=2000)
     write_events(tmp_path / "e.h5", events, 64, 72)
@@ -138,40 +120,6 @@ def test_a_window_as_long_as_things_need_to_move_by_five_pixels(speed, tmp_path,
     assert 0.7 * span < 1000 * found < 1.4 * span
     assert run([*command[:-1], "soon"]) == 2
     assert "--window-ms: not a length (got 'soon'); expected milliseconds, or auto" in capsys.readouterr().err
-
-
-def test_from_eflow_import_load_model(network):
-    import eflow
-
-    assert eflow.load_model(network).config.name == "ev_flownet" and eflow.Predictor.__name__ == "Predictor"
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        eflow.nothing  # noqa: B018
-
-
-def test_predict_whole_file_with_truth(refined, tmp_path, capsys):
-    truth = np.broadcast_to(np.float32([[[8.0]], [[-4.0]]]), (1, 2, 128, 144)).copy()  # 2 intervals at (40, -20) px/s
-    np.save(tmp_path / "truth.npy", truth)
-    write_events(tmp_path / "e.txt", moving_events(128, 144, 0, 2 * SPAN), 128, 144)
-    assert (
-        run(
-            [
-                "predict",
-                refined,
-                str(tmp_path / "e.txt"),
-                "--whole",
-                "--truth",
-                str(tmp_path / "truth.npy"),
-                "--size",
-                "144x128",
-            ]
-        )
-        == 0
-    )
-    out = capsys.readouterr().out
-    assert (
-        re.search(r"all pixels: AEE [\d.]+ px, cosine -?[\d.]+; zero flow AEE 8\.944 px", out)
-        and "pixels with events" in out
-    )
 
 
 def test_warm_start_runs(refined, tmp_path, capsys):
@@ -304,46 +252,6 @@ def test_submit_blinkflow(network, tmp_path, full, capsys):
     assert tag == (2502001 if full else 2502002)
     assert len(data) == 12 + 8 * (480 * 640 if full else 120 * 160)
     assert submit.decode(data).shape == ((480, 640, 2) if full else (19200, 2))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "arguments, message",
-    [
-        (["evaluate", "{tmp}/none", "{data}"], "none: no such checkpoint"),
-        (["evaluate", "{net}", "{tmp}/none"], "none: no such data set"),
-        (["evaluate", "{net}", "{bare}"], "thun_00_a/000002: no ground truth"),
-        (["evaluate", "{net}", "{data}", "--format", "kitti"], "--format: unknown choice"),
-        (["predict", "{net}", "{tmp}/none.h5"], "none.h5: no such file"),
-        (["predict", "{net}", "{tmp}/x.docx"], "unknown event file ending"),
-        (["predict", "{net}", "{data}/train/seq_000000/events.h5", "--window-ms", "900"], "shorter than two windows"),
-        (
-            ["predict", "{net}", "{data}/train/seq_000000/events.h5", "--iterations", "3"],
-            "--iterations: this network has no iterations",
-        ),
-        (["predict", "{net}", "{data}/train/seq_000000/events.h5", "--size", "big"], "--size: not a size"),
-        (
-            ["predict", "{net}", "{data}/train/seq_000000/events.h5", "--precision", "fp8"],
-            "--precision: unknown choice",
-        ),
-        (["submit", "{net}", "{data}", "--benchmark", "kitti", "--out", "{tmp}/a.zip"], "--benchmark: unknown choice"),
-        (["train", "-m", "raft", "--data", "{data}"], "--model: unknown model"),
-        (["train", "{tmp}/none.yaml", "--out", "{tmp}/o"], "none.yaml: no such file"),
-    ],
-)
-def test_one_clear_line(network, data, tmp_path, arguments, message, capsys):
-    bare = dsec_set(tmp_path / "bare", labels=1, test=True) if "{bare}" in arguments else ""
-    filled = [a.format(tmp=tmp_path, data=data, net=network, bare=bare) for a in arguments]
-    assert run(filled) == 2
-    err = capsys.readouterr().err
-    assert err.startswith("error: ") and err.count("\n") == 1 and message in err, err
-
-
-def test_a_small_sensor_is_refused_by_name(refined, tmp_path, capsys):
-    write_events(tmp_path / "e.npz", moving_events(64, 64, 0, 3 * SPAN), 64, 64)
-    assert run(["predict", refined, str(tmp_path / "e.npz"), "--out", str(tmp_path / "flow")]) == 2
-    assert "input is too small" in capsys.readouterr().err and not (tmp_path / "flow").exists()
-    assert [p.name for p in tmp_path.iterdir()] == ["e.npz"]  # no temporary left
 
 
 def test_a_silent_window(network, tmp_path, capsys):

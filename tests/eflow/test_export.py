@@ -60,17 +60,6 @@ def test_ev_flownet_of_any_size_and_batch(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_one_size_alone(tmp_path):
-    model = network(name="spike_flownet", width=8, steps=2)
-    told = export_onnx(model, tmp_path / "n.onnx", size=(32, 48))
-    assert told["sizes"] == "48x32"
-    shape = (
-        onnxruntime.InferenceSession(str(tmp_path / "n.onnx"), providers=["CPUExecutionProvider"]).get_inputs()[0].shape
-    )
-    assert shape[2:] == [32, 48]
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "tree",
     [
@@ -83,13 +72,6 @@ def test_other_networks_of_any_size(tmp_path, tree):
     model = network(**tree)
     export_onnx(model, tmp_path / "n.onnx")
     agrees(model, tmp_path / "n.onnx", [(128, 144), (160, 128)])
-
-
-@pytest.mark.slow
-def test_eflowformer_of_one_size(tmp_path):
-    model = network(name="eflowformer", size="tiny", iterations=2, train_iterations=2)
-    export_onnx(model, tmp_path / "n.onnx", size=(128, 144))
-    agrees(model, tmp_path / "n.onnx", [(128, 144)])
 
 
 def test_what_is_not_exported(tmp_path, capsys):

@@ -29,11 +29,6 @@ def test_by_hand():
     assert m["AE3D"] == pytest.approx((third + fourth + last) / 4)
 
 
-def test_thresholds_are_strict():
-    m = frame_metrics(frame((3, 0), (103.0, 0)), frame((0, 0), (100, 0)), np.ones((1, 2), bool))
-    assert m["3PE"] == 0 and m["2PE"] == 100 and m["outlier"] == 0  # exactly 3 px is no outlier
-
-
 def test_valid_mask_and_400_px_rule():
     truth, predicted = frame((1, 0), (400, 0), (0, 399.9), (5, 5)), np.zeros((1, 4, 2))
     m = frame_metrics(predicted, truth, np.array([[True, True, True, False]]))
@@ -41,11 +36,6 @@ def test_valid_mask_and_400_px_rule():
     truth[0, 3] = np.nan  # invalid pixels may hold anything
     assert frame_metrics(predicted, truth, np.array([[True, False, False, False]]))["AEE"] == 1
     assert frame_metrics(predicted, truth, np.zeros((1, 4), bool)) is None
-
-
-def test_a_nan_prediction_is_no_improvement():
-    m = frame_metrics(frame((np.nan, 0), (0, 0), (0, 0), (0, 0)), frame((1, 0), (1, 0), (1, 0), (1, 0)), EVERY)
-    assert all(np.isnan(m[k]) for k in ("AEE", "outlier", "3PE"))
 
 
 def test_angles_at_the_ends():

@@ -119,22 +119,6 @@ def test_training_gradients_of_fast_and_plain_agree():
         assert (a - b).abs().max() <= 2e-3 * b.abs().max() + 1e-5, name
 
 
-def test_match_is_supervised_detached_and_first():
-    model = build(name="eflowformer", size="tiny", train_iterations=2, context_norm="instance").train()
-    prediction = model(batch_for(model))
-    assert (
-        prediction.has_match
-        and len(prediction.flows) == 3
-        and all(f.shape == (1, 2, 128, 128) for f in prediction.flows)
-    )
-    # nothing of the refinement reaches the enhancement layers through V0 itself: only through the volume's lookups
-    first = torch.autograd.grad(prediction.flows[0].sum(), model.layers[0].local.qkv.weight, retain_graph=True)[0]
-    assert first.abs().max() > 0
-    model.want_backward = True
-    out = predict(model, batch_for(model))
-    assert out.backward_match.shape == (1, 2, 16, 16) and len(out.flows) == 1
-
-
 def test_iteration_checkpointing_changes_no_gradient():
     gradients = []
     for checkpointing in (False, True):
@@ -146,15 +130,6 @@ def test_iteration_checkpointing_changes_no_gradient():
         ).backward()
         gradients.append([p.grad for p in model.parameters()])
     assert all(torch.allclose(a, b, rtol=1e-4, atol=1e-6) for a, b in zip(*gradients))
-
-
-def test_warm_start_starts_there():
-    model = build(name="eraft", iterations=1).eval()
-    torch.nn.init.zeros_(model.update.flow_head[-1].weight)
-    batch = batch_for(model)
-    warm = torch.randn(1, 2, 16, 16)
-    assert torch.equal(predict(model, {**batch, "flow_init": warm}).low, warm)
-    assert torch.equal(predict(model, batch).low, torch.zeros(1, 2, 16, 16))
 
 
 @pytest.mark.parametrize("name", ["ev_flownet", "spike_flownet", "ste_flownet"])
@@ -187,25 +162,6 @@ def test_spikes_reset_to_zero_and_pass_gradients_where_they_fired():
     assert x.grad.tolist() == [10.0, 2.0]
 
 
-def test_a_slice_of_ste_flownet_has_a_flow_of_its_own_that_sweeps_add_to():
-    """Answers change with sweeps and with every slice, the last most of all; nothing is carried from call to call."""
-    model = build(name="ste_flownet", size="tiny", sweeps=2).train()
-    for decoder in model.decoders:
-        torch.nn.init.normal_(decoder.flow.weight, std=0.1)
-    batch = {k: v.abs().round() for k, v in batch_for(model, 1, 64, 64).items()}
-    seen = []
-    decode = model._decode
-    model._decode = lambda hidden, before: seen.append(before) or decode(hidden, before)
-    answer = model(batch).flow
-    assert len(seen) == 2 * 5 and all(not f.any() for before in seen[:5] for f in before)
-    assert all(f.any() for before in seen[5:] for f in before), "the second sweep begins with what the first found"
-    assert torch.equal(model(batch).flow, answer)
-    for i in range(5):
-        changed = batch["new"].clone()
-        changed[:, 2 * i] += 1
-        assert not torch.equal(model({**batch, "new": changed}).flow, answer), f"slice {i}"
-
-
 @pytest.mark.parametrize("name", NETWORKS)
 def test_sizes_of_every_network(name):
     """tiny about a million parameters, and each size takes its smallest input and answers at its size."""
@@ -219,20 +175,6 @@ def test_sizes_of_every_network(name):
     )
 
 
-def test_widths_can_be_given_one_by_one():
-    model = build(name="eraft", size="tiny", trunk=[16, 24, 40], features=48, hidden=32, levels=2, radius=2)
-    assert model.least == 32 and model.features[-1].out_channels == 48 and model.context[-1].out_channels == 64
-    assert model.update.motion.corr1.in_channels == 2 * 25
-    batch = batch_for(model, 1, 40, 48)
-    loud(model)
-    fast = predict(model, batch).flow
-    model.plain = True
-    assert (fast - predict(model, batch).flow).abs().max() < 1e-3
-    assert build(name="ev_flownet", size="tiny", width=8).encoders[0].out_channels == 8
-    with pytest.raises(BlinkGLError, match="trunk: not widths"):
-        model_config({"name": "eraft", "trunk": [4, 8, 8]})
-
-
 @pytest.mark.parametrize("size", SIZES)
 def test_eflowformer_starts_near_zero_flow(size):
     """The matching layer's first answer: on average within a pixel of none, where a flat softmax says "the middle of
@@ -242,74 +184,6 @@ def test_eflowformer_starts_near_zero_flow(size):
         model = build(name="eflowformer", size=size, match_prior=prior, train_iterations=1).train()
         means.append(float(model(batch_for(model)).flows[0].norm(dim=1).mean().detach()))
     assert means[0] < 1 and means[1] > 20, means
-
-
-def test_the_prior_is_learnt_and_the_same_without_a_volume():
-    model = build(name="eflowformer", size="tiny", train_iterations=1).train()
-    sequence_loss(
-        model(batch_for(model)), torch.full((1, 2, 128, 128), 9.0), torch.ones(1, 128, 128, dtype=torch.bool)
-    ).backward()
-    assert model.log_prior.grad > 0, "longer flow wants a lower price"
-    with torch.no_grad():
-        model.log_gain.add_(0.15)
-    model.want_backward = True
-    batch = batch_for(model, 1, 136, 160)
-    dense = predict(model, batch)
-    model.config = model.config.model_copy(update={"correlation": "on_demand"})
-    on_demand = predict(model, batch)
-    assert (dense.backward_match - on_demand.backward_match).abs().max() < 1e-4
-    assert (dense.flow - on_demand.flow).abs().max() < 1e-3
-
-
-def test_correlations_are_fp32_under_autocast():
-    """A match that bf16 would miss by a quarter of a pixel."""
-    model = build(name="eflowformer", size="tiny").eval()
-    f1, f2 = 4 * torch.randn(1, 128, 16, 16), 4 * torch.randn(1, 128, 16, 16)
-    exact = model._correlation(f1, f2)
-    with torch.autocast("cpu", torch.bfloat16):
-        inside = model._correlation(f1, f2)
-    assert torch.equal(inside.volume, exact.volume)
-
-
-def test_iterations_that_nothing_was_trained_for_come_to_rest():
-    """Without damping each adds as much as the last; with it all together no more than the last trained one, however
-    many there are."""
-    flows = {}
-    for damping in (0.5, 1.0):
-        for iterations in (3, 12, 60):
-            model = build(name="eraft", size="tiny", levels=1, train_iterations=3, iterations=3, damping=damping).eval()
-            model.update.forward = lambda h, c, taps, flow, mask: (
-                h,
-                torch.ones_like(flow),
-                torch.zeros(1, 576, *flow.shape[2:]) if mask else None,
-            )
-            model.config = model.config.model_copy(update={"iterations": iterations})
-            flows[damping, iterations] = float(predict(model, batch_for(model, 1, 32, 32)).low.mean())
-    assert [flows[1.0, n] for n in (3, 12, 60)] == pytest.approx([3, 12, 60])
-    assert [flows[0.5, n] for n in (3, 12, 60)] == pytest.approx([3, 4, 4], abs=0.01)
-
-
-def test_burn_in_draws_from_the_saved_generator_and_half_of_the_steps_have_none():
-    model = build(name="eraft", size="tiny", trunk=[8, 8, 8], features=16, hidden=16, iterations=5, train_iterations=1)
-    model.train()
-    seen = []
-    update = model.update.forward
-    model.update.forward = lambda *a: seen.append(1) or update(*a)
-    batch, counts = batch_for(model, 1, 64, 64), []
-    for _ in range(40):
-        seen.clear()
-        assert len(model(batch).flows) == 1
-        counts.append(len(seen) - 1)
-    assert set(counts) == {0, 1, 2, 3, 4} and 12 < counts.count(0) < 28
-    state = torch.get_rng_state()
-    seen.clear(), model(batch), torch.set_rng_state(state)
-    before = len(seen)
-    seen.clear(), model(batch)
-    assert len(seen) == before
-    model = build(name="eraft", size="tiny", iterations=5, train_iterations=1, burn_in=0).train()
-    state = torch.get_rng_state()
-    model(batch)
-    assert torch.equal(torch.get_rng_state(), state), "nothing is drawn where nothing is asked for"
 
 
 @pytest.mark.parametrize(
@@ -345,26 +219,6 @@ def test_loss_by_hand():
     doubled = sequence_loss(FlowPrediction(flows), target.repeat(2, 1, 1, 1), torch.cat([valid, valid & False]))
     assert doubled.item() == pytest.approx(0.64 * errors[0] + 0.8 * errors[1])  # more invalid pixels do not dilute it
     assert sequence_loss(FlowPrediction(flows), target, valid & False).item() == 0
-
-
-@pytest.mark.parametrize(
-    "terms, expected",
-    [
-        ({"l1": 0, "epe": 2}, 2 * (5 + 0) / 2),
-        ({"l1": 1, "epe": 4}, (7 + 4 * 5) / 2),
-    ],
-)
-def test_terms_of_the_loss_by_hand(terms, expected):
-    """No flow where the truth is (3, 4), and the truth where it is (6, 8)."""
-    target = torch.tensor([3.0, 4.0, 6.0, 8.0]).view(1, 2, 2).permute(2, 0, 1).reshape(1, 2, 1, 2)
-    predicted = target.clone()
-    predicted[..., 0] = 0
-    assert target[0, :, 0, 0].tolist() == [3, 4]
-    valid = torch.ones(1, 1, 2, dtype=torch.bool)
-    found = sequence_loss(FlowPrediction([predicted.requires_grad_()]), target, valid, loss=LossConfig(**terms))
-    assert found.item() == pytest.approx(expected, abs=0.01)
-    found.backward()
-    assert predicted.grad.isfinite().all(), "also where nothing is wrong"
 
 
 def test_a_loss_of_nothing_is_refused():

@@ -53,19 +53,6 @@ def test_the_same_samples_whoever_renders_them_though_a_worker_is_killed(recipe)
     assert not spool.exists()
 
 
-def test_another_seed_another_split_other_sequences(recipe):
-    names = lambda seed, split: {s[0] for s in samples(seed, split)}
-    flows = lambda seed, split: {s[1] for s in samples(seed, split)}
-
-    def samples(seed, split):
-        with open_online(asked(recipe), seed, split=split) as source:
-            return [said(source[n]) for n in range(4)]
-
-    assert flows(0, "train") == flows(0, "train") and not flows(0, "train") & flows(1, "train")
-    assert {name.split("_")[0] for name in names(0, "train")} <= {"one", "two"}
-    assert {name.split("_")[0] for name in names(0, "test")} == {"judge"}
-
-
 def test_ranks_take_their_own_streams_one_sample_after_the_other():
     """Of a stream of its own each rank takes the samples 0, 1, 2 …; of a folder they share the order of one process."""
     mixture = Mixture([None, 10, None], [1.0, 0.3, 0.5], seed=3)
@@ -153,29 +140,6 @@ def test_flow_is_over_the_windows_own_length(tmp_path):
         for flow, sign in ((sample.flow, -1), (sample.backward, 1)):
             truth = [sign * 32e-6 * span, 0]
             np.testing.assert_allclose(flow[sample.valid], np.broadcast_to(truth, (sample.valid.sum(), 2)), atol=1e-4)
-
-
-def test_a_recipe_that_makes_no_sample_is_one_line(tmp_path, capsys):
-    tree = {**RECIPE, "scene": {**RECIPE["scene"], "camera_motion": {"kind": "static"}}}
-    (tmp_path / "still.yaml").write_text(yaml.safe_dump(tree))
-    path = run_file(tmp_path, {"recipe": "still.yaml", "online": True, "workers": 0})
-    assert run(["train", str(path), "-o", str(tmp_path / "out"), "-q"]) == 2
-    line = capsys.readouterr().err.strip()
-    assert line.count("\n") == 0 and "gave 0 of 8 samples" in line and "no window as asked for, with 1 events" in line
-    assert not (tmp_path / "out").exists()
-
-
-def test_failing_sequences_are_replaced_and_counted(tmp_path):
-    """Two of three draws hold no two windows: others of the same slot stand in; it ends when that is the rule."""
-    tree = {**RECIPE, "time": {"duration": {"choice": [0.05, 0.001, 0.001]}, "label_rate": 1000}}
-    (tmp_path / "some.yaml").write_text(yaml.safe_dump(tree))
-    with open_online(asked(tmp_path / "some.yaml", window_ms=(10, 20)), 0) as source:
-        assert source[0].flow.shape == (32, 32, 2)
-        assert source.stats.failures >= 0
-        with pytest.raises(ConfigError, match=r"sequences failed, the last: .*holds no two windows|sequences gave"):
-            for n in range(1, 200):
-                source[n]
-        assert source.stats.failures > 10
 
 
 def run_file(folder: Path, *sets: dict, **keys) -> Path:

@@ -39,14 +39,6 @@ def test_every_sample_once_per_epoch_in_a_new_order():
     assert [again.key(n) for n in (30, 2, 13)] == [epochs[2][6], epochs[0][2], epochs[1][1]]  # any order of asking
 
 
-def test_weights_are_shares_and_small_sets_are_gone_through_evenly():
-    mixture = Mixture([4, 16], [1, 1], seed=0)
-    drawn = [k for e in range(4) for k in mixture.epoch(e)]
-    assert sum(k.source == 0 for k in drawn) == 40 and len(drawn) == 80
-    counts = np.bincount([k.index for k in drawn if k.source == 0])
-    assert counts.tolist() == [10] * 4
-
-
 def equal(a: dict, b: dict) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) if torch.is_tensor(a[k]) else a[k] == b[k] for k in a)
 
@@ -134,29 +126,6 @@ def test_unlabelled_data_cannot_be_trained_on(tmp_path):
         dataset[Key(0, 0, 0, 0)]
 
 
-def test_windows_without_events(tmp_path):
-    from blinkgl.labels import Flow
-    from blinkgl.sequence_files.sequence_dir import SequenceWriter
-    from flow_data import SPAN, constant_flow, moving_events
-
-    with SequenceWriter(tmp_path / "still", 128, 128, config_yaml="") as writer:
-        writer.append_events(moving_events(128, 128, 0, 2 * SPAN))
-        for k in range(3):
-            writer.label(
-                "flow_forward",
-                k,
-                Flow(constant_flow(128, 128), np.ones((128, 128), bool)),
-                SPAN * (k + 1),
-                SPAN * (k + 2),
-            )
-        writer.t_end_us = 4 * SPAN
-    source = open_source(tmp_path)
-    with pytest.raises(BlinkGLError, match=r"still/000001: no events in the new window \[200000, 300000\) µs"):
-        FlowDataset([source], VoxelGrid())[1]
-    skipping = FlowDataset([source], VoxelGrid(), empty="skip")
-    assert skipping[1]["name"] == "still/000000"
-
-
 def test_a_window_that_nobody_reads_may_be_empty(source):
     from dataclasses import replace
 
@@ -173,19 +142,3 @@ def test_a_window_that_nobody_reads_may_be_empty(source):
         FlowDataset([Beginning()], VoxelGrid())[0]
     sample = FlowDataset([Beginning()], VoxelGrid(), reads=("new",))[0]
     assert "old" not in sample and sample["new"].any()
-
-
-def test_flow_from_400_px_on_is_not_supervised(source):
-    from dataclasses import replace
-
-    class Fast:
-        has_backward = True
-        __len__ = lambda self: 1
-
-        def __getitem__(self, i):
-            flow = source[0].flow.copy()
-            flow[50, 50], flow[51, 51] = (400, 0), (399, 0)
-            return replace(source[0], flow=flow)
-
-    sample = FlowDataset([Fast()], VoxelGrid())[0]
-    assert not sample["valid"][50, 50] and sample["valid"][51, 51]

@@ -42,14 +42,6 @@ def test_what_was_rendered_comes_back(recipe, folder):
     assert about["samples"] == 6 and about["window_ms"] == [5, 20] and about["recipe"] == "recipe.yaml"
 
 
-def test_nearly_empty_windows_are_passed_over(recipe):
-    density = lambda s: len(s.new) / s.valid.size / max(np.hypot(*s.flow[s.valid].T).mean(), 0.3)
-    with open_online(asked(recipe, window_ms=(5, 20)), 4) as source:
-        some = sorted(density(source[n]) for n in range(12))
-    with open_online(asked(recipe, window_ms=(5, 20), min_density=some[6]), 4) as source:
-        assert min(density(source[n]) for n in range(12)) >= 0.999 * some[6] > some[0]
-
-
 def test_a_training_and_an_evaluation_read_it(folder, tmp_path, capsys):
     config = {
         "model": {"name": "ev_flownet", "size": "tiny", "input": "voxel", "consensus": True},

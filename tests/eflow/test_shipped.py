@@ -16,7 +16,6 @@ from blinkgl.io.formats import write_events  # noqa: E402
 from blinkgl.tools import real_recordings as rr  # noqa: E402
 from eflow import checkpoint as ckpt, shipped  # noqa: E402
 from eflow.cli import run  # noqa: E402
-from eflow.config import load_train_config  # noqa: E402
 from eflow.methods.iwe import flow_warp_loss  # noqa: E402
 from eflow.models import build_model, model_config  # noqa: E402
 from flow_data import SPAN, blinkgl_set, moving_events  # noqa: E402
@@ -90,28 +89,6 @@ def test_pack_then_call_by_name(source, list_of, tmp_path, capsys, monkeypatch):
         assert said in text, text
     assert text.count("nor will it be") == 1, "limits are in the card, not in the list"
     assert run(["models", "--json"]) == 0 and json.loads(capsys.readouterr().out)[0]["sha256"] == card.sha256
-
-
-def test_a_file_of_that_name_goes_first(source, list_of, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    packed(source, list_of)
-    weights(tmp_path / "toy_net", 0.5)
-    own, package = ckpt.load_model("toy_net"), ckpt.load_model(list_of / "toy_net")
-    assert not any(torch.equal(a, b) for a, b in zip(own.parameters(), package.parameters(), strict=True) if a.ndim > 1)
-
-
-def test_training_may_start_from_one(source, list_of, tmp_path):
-    packed(source, list_of)
-    tree = {
-        "model": {"name": "ev_flownet"},
-        "data": {"train": [{"path": "x"}], "crop": [64, 64]},
-        "init_from": "toy_net",
-    }
-    (tmp_path / "c.yaml").write_text(yaml.safe_dump(tree))
-    assert load_train_config(tmp_path / "c.yaml").init_from == "toy_net"
-    (tmp_path / "toy_net").mkdir()
-    assert load_train_config(tmp_path / "c.yaml").init_from == str(tmp_path / "toy_net"), "a folder beside the YAML"
-    assert load_train_config(tmp_path / "c.yaml", ["init_from=w"]).init_from == str(tmp_path / "w")
 
 
 def test_an_empty_list_works(list_of, capsys):

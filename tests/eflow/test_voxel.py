@@ -49,11 +49,6 @@ def test_voxel_equals_its_slow_twin(rectified, normalise):
     np.testing.assert_allclose(fast, slow, atol=2e-5)
 
 
-def test_times_far_beyond_float32_are_subtracted_as_integers():
-    here, far = window(t0=0), window(t0=2**52)
-    np.testing.assert_array_equal(VoxelGrid()(here, H, W), VoxelGrid()(far, H, W))
-
-
 def test_bounds_of_the_window_or_of_the_events():
     t = np.array([30_000, 50_000, 70_000])
     w = Window(np.zeros(3, np.uint16), np.zeros(3, np.uint16), t, np.ones(3, np.uint8), 0, 100_000)
@@ -85,14 +80,3 @@ def test_counts_against_a_histogram():
     slice_ = (w.t - w.t0) * 5 // (w.t1 - w.t0)
     expected, _ = np.histogramdd(np.stack([slice_, w.p, w.y, w.x], 1), bins=[np.arange(n + 1) for n in (5, 2, H, W)])
     np.testing.assert_array_equal(counts, expected)
-
-
-def test_counts_and_latest_times():
-    w = window(3000)
-    image = CountsAndTimes()(w, H, W)
-    for polarity in (0, 1):
-        for y, x in ((0, 0), (5, 7), (12, 16)):
-            hits = w.t[(w.x == x) & (w.y == y) & (w.p == polarity)]
-            assert image[polarity, y, x] == len(hits)
-            latest = (hits[-1] - w.t0) / (w.t1 - w.t0) if len(hits) else 0
-            assert image[2 + polarity, y, x] == pytest.approx(latest, abs=1e-6)

@@ -10,13 +10,11 @@ import pytest
 
 from blinkgl.cli import run as command
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
-from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import EventDataError, OutputError
 from blinkgl.events import Events, make_emulator
-from blinkgl.events.camera import EventCamera, EventFrame
 from blinkgl.io.formats import convert, event_writer, open_events, write_events
 from blinkgl.recordings.simulation import SimulationReport, frames_to_events
-from blinkgl.types.events import Cause, count_causes, named_causes
+from blinkgl.types.events import count_causes, named_causes
 from tests.events.clips import assert_same, random_clip, run
 
 MS = 10**6
@@ -77,55 +75,25 @@ def test_the_larger_part_of_the_way_is_the_cause(leak_share, cause, dead_us):
     assert shares(volt, 0.4, slope / volt.k1)[cause] > 0.99
 
 
-def test_diffusion_is_the_cause_where_drift_is_the_lesser_half():
-    """Between two events drift moves V by mu t in time t: under a half of the way where t < 1/(2 mu)."""
-    config = VoltmeterConfig(**{**STILL, "k4": 2e-5, "k6": 6e-3}, start="zero")
-    emulator = make_emulator(config, 60, 60, 3)
-    events = run(emulator, [np.full((60, 60), 0.4, np.float32)] * 301, np.arange(301) * MS)
-    pixel = events.y.astype(int) * 60 + events.x
-    order = np.lexsort((events.t, pixel))
-    pixel, t, cause, p = pixel[order], events.t[order], events.cause[order], events.p[order]
-    gap = np.where(np.diff(pixel, prepend=-1) == 0, np.diff(t, prepend=0), t)
-    by_drift = (p == 1) & (2e-5 * gap > 0.5)
-    wrong = (cause == Cause.LEAK) != by_drift
-    assert not wrong[np.abs(2e-5 * gap - 0.5) > 1e-4].any()
-    assert 0.1 < by_drift.mean() < 0.9
-
-
 @pytest.mark.parametrize(
     "config",
     [
         V2eConfig(shot_noise_rate_hz=50.0, leak_rate_hz=30.0, refractory_us=9_000.0, causes=True),
         V2eConfig(preset="noisy", photoreceptor_noise=True, hot_pixel_fraction=0.1, causes=True),
         VoltmeterConfig(k6=2e-3, k4=3e-5, refractory_us=2_000.0, causes=True),
+        VoltmeterConfig(k3=0.01, refractory_us=9000.0),
         EsimConfig(causes=True),
+        EsimConfig(threshold_jitter=0.05, refractory_us=400.0),
     ],
 )
-def test_causes_survive_saving_and_restoring(config):
+def test_a_run_that_is_saved_and_restored_is_the_same(config):
     clip, times = random_clip(2, frames=8)
     whole = run(make_emulator(config, 37, 45, 3), clip, times)
     first, second = (make_emulator(config, 37, 45, 3) for _ in range(2))
     head = run(first, clip[:3], times[:3])
     second.load_state_dict(first.state_dict())
     assert_same(whole, Events.concatenate([head, run(second, clip[3:], times[3:])]))
-    assert whole.cause is not None
-
-
-def test_causes_follow_their_events_through_the_read_out():
-    config = V2eConfig(shot_noise_rate_hz=200.0, leak_rate_hz=100.0, causes=True)
-    clip, times = random_clip(1, frames=6)
-    free = EventCamera(config, None, 37, 45, 1)
-    slow = EventCamera(config, ReadoutConfig(events_per_second=1e5, queue_events=64), 37, 45, 1)
-    frames = [EventFrame(int(t), f) for f, t in zip(clip, times)]
-    made = Events.concatenate([free.step(f) for f in frames])
-    sent = Events.concatenate([slow.step(f) for f in frames])
-    assert 0 < len(sent) < len(made) and set(np.unique(sent.cause)) == {0, 1, 2}
-    k = 0  # what is sent is what was made, some left out, each a little later: the first that fits is it
-    for x, y, p, cause in zip(sent.x, sent.y, sent.p, sent.cause):
-        while (made.x[k], made.y[k], made.p[k], made.cause[k]) != (x, y, p, cause):
-            k += 1
-        k += 1
-    assert k <= len(made)
+    assert (whole.cause is not None) == config.causes and second.frames == 8
 
 
 def events_with_causes() -> Events:
@@ -195,14 +163,6 @@ def test_too_many_rows(tmp_path):
     assert len(make_emulator(EsimConfig(causes=True), 2**14, 2).step(np.ones((2**14, 2), np.float32), 0)) == 0
 
 
-def test_the_last_row_keeps_its_number():
-    emulator = make_emulator(EsimConfig(threshold_sigma=0.0, causes=True), 2**14, 1)
-    frame = np.ones((2**14, 1), np.float32)
-    emulator.step(frame, 0)
-    events = emulator.step(frame * 1.3, MS)
-    assert events.y.tolist() == list(range(2**14)) and not events.cause.any()
-
-
 def test_simulate_counts_by_cause(tmp_path, capsys):
     frames = [np.full((20, 20), 0.4, np.float32)] * 30
     report, config = SimulationReport(), V2eConfig(shot_noise_rate_hz=100.0, leak_rate_hz=90.0, causes=True)
@@ -217,6 +177,3 @@ def test_simulate_counts_by_cause(tmp_path, capsys):
     assert "by cause: signal " in capsys.readouterr().out
     with open_events(tmp_path / "a.h5") as file:
         assert file.causes
-    assert command(["simulate", str(tmp_path / "clip.npy"), "--out", str(tmp_path / "a.csv"), *options]) == 2
-    assert "csv cannot hold the causes of events" in capsys.readouterr().err
-    assert not (tmp_path / "a.csv").exists()

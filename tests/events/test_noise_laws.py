@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from blinkgl.config.events import V2eConfig, VoltmeterConfig
-from blinkgl.events import DvsVoltmeter, V2e
+from blinkgl.events import V2e
 from tests.events.clips import run
-from tests.events.noise_laws import FRAMES, Case, cases, judge, shot_rate, v2e_law, voltmeter_law, watch
+from tests.events.noise_laws import FRAMES, Case, cases, judge, voltmeter_law, watch
 
 SIDE, LEAST_P = 40, 1e-4
 CASES = cases()
@@ -24,9 +24,9 @@ def test_rate_intervals_and_first_event_are_of_the_stated_law(name, frames):
     case = CASES[name]
     seen = judge(watch(case, FRAMES[frames], SIDE, seed=3), case, SIDE)
     assert seen.events > 10_000
-    assert seen.rate_p > LEAST_P, (seen.rate, seen.rate_law)
-    assert seen.interval_p > LEAST_P, seen.interval_ks
-    assert seen.first_p > LEAST_P, seen.first_ks
+    assert seen.rate_p > LEAST_P
+    assert seen.interval_p > LEAST_P
+    assert seen.first_p > LEAST_P
     assert abs(seen.on - case.law.on) < 6 * np.sqrt(0.25 / seen.events) + 1e-3
 
 
@@ -37,17 +37,6 @@ def test_a_cameras_own_constants_hold_their_jitter():
     for fps in (50.0, 500.0):
         seen = judge(watch(case, fps, SIDE, seed=1), case, SIDE)
         assert abs(seen.interval_cv / seen.cv_law - 1) < 0.08 and abs(seen.cv_law - 0.0162) < 2e-4
-
-
-def test_a_flat_image_does_not_fire_all_at_once():
-    """From V = 0 most pixels have their leak event in the same few milliseconds; from the stationary law, one in
-    ten each tenth of the interval."""
-    frame, shares = np.full((50, 50), 0.4, np.float32), {}
-    for start in ("stationary", "zero"):
-        emulator = DvsVoltmeter(50, 50, VoltmeterConfig(preset="DVS240", start=start), seed=1)
-        events = run(emulator, [frame] * 41, np.arange(41) * 10_000_000)
-        shares[start] = np.histogram(events.t, np.arange(0, 400_001, 10_000))[0].max() / 2500
-    assert shares["zero"] > 0.5 and shares["stationary"] < 0.08
 
 
 @pytest.mark.parametrize("start, tilt", [("stationary", (1.1, 9.0)), ("balanced", (0.9, 1.1)), ("zero", (0.99, 1.01))])
@@ -62,24 +51,3 @@ def test_start_of_v2e_tilts_on_and_off(start, tilt):
     events = run(emulator, [frame, after], [0, 1_000_000])
     ratio = (events.p == 1).sum() / (events.p == 0).sum()
     assert tilt[0] < ratio < tilt[1], ratio
-
-
-def test_v2e_starts_as_a_scene_that_was_watched():
-    """Shot noise that comes more often than leak holds leak back, from the first frame on."""
-    law = v2e_law(4.0, 0.1, shot_rate(60.0, 0.4))
-    config = V2eConfig(
-        preset="clean",
-        threshold_sigma=0.0,
-        leak_rate_hz=4.0,
-        leak_cov_decades=0.0,
-        leak_jitter=0.1,
-        shot_noise_rate_hz=60.0,
-    )
-    case = Case(config, 0.4, law, 0.5)
-    seen = judge(watch(case, 200.0, 60, seed=1), case, 60)
-    assert min(seen.rate_p, seen.first_p, seen.interval_p) > LEAST_P
-
-
-def test_noisy_is_v2es():
-    """v2e's `noisy` has no dead time."""
-    assert V2eConfig(preset="noisy").refractory_us == 0.0 and V2eConfig().refractory_us == 500.0

@@ -88,13 +88,3 @@ def test_rate_intervals_and_spread_are_the_equations(frames):
     mine, exacts = (one_interval(pixels, 0.3) for pixels in (ours, theirs))
     assert min(len(mine), len(exacts)) > 500 and min(mine.min(), exacts.min()) >= DEAD_S - 2e-6
     assert stats.ks_2samp(mine, exacts).pvalue > 1e-4
-
-
-@pytest.mark.parametrize("frames", FRAMES)
-@pytest.mark.parametrize("cutoff_hz", [30.0, 300.0])
-def test_the_rate_is_the_one_asked_for(frames, cutoff_hz):
-    """5 Hz, dead time from a twentieth of a frame to five frames, 0.08 and 0.8 of the noise's time constant. On the low
-    side, because pixels begin where they would be without a dead time, and take seconds to leave there."""
-    times = frame_times(FRAMES[frames], 2.0)
-    counts = [(t > 0.5).sum() for t in emulated(times, 5.0, cutoff_hz, 24, 1)]
-    assert 0.65 < np.mean(counts) / 1.5 / 5.0 < 1.25

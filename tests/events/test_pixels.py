@@ -7,9 +7,7 @@ import pytest
 from scipy import stats
 
 from blinkgl.config.events import EsimConfig
-from blinkgl.config.problems import validate
 from blinkgl.config.readout import PixelsConfig, ReadoutConfig
-from blinkgl.errors import ConfigError
 from blinkgl.events import Events
 from blinkgl.events.camera import EventCamera, EventFrame
 from blinkgl.events.pixels import PixelNoise
@@ -58,27 +56,6 @@ def test_noise_is_poisson_at_each_pixels_rate_at_any_frame_rate(step_us):
     assert abs(events.p.mean() - 0.7) < 4 * 0.5 / np.sqrt(len(events)) and (np.diff(events.t) >= 0).all()
 
 
-def test_a_rate_of_next_to_nothing_makes_no_events_and_ends():
-    """Waiting times beyond any recording are cut to what a clock of 64 bits can add up."""
-    stage = PixelNoise(PixelsConfig(rate_hz=1e-12), H, W, 5, False)
-    stage.step(Events.empty(), 0)
-    assert len(stage.step(Events.empty(), 172_800 * 10**6)) == 0
-
-
-def test_noise_does_not_depend_on_the_steps_and_resumes():
-    _, whole = noise_of(NOISY, [0, 1_000_000], causes=True)
-    stage, parts = PixelNoise(NOISY, H, W, 5, True), []
-    for t in (0, 1, 77, 20_000, 20_001, 600_000, 1_000_000):
-        parts.append(stage.step(Events.empty(), t))
-        again = PixelNoise(NOISY, H, W, 5, True)
-        again.load_state_dict(stage.state_dict())
-        stage = again
-    assert_same(Events.concatenate(parts), whole)
-    assert set(np.unique(whole.cause)) == {Cause.SHOT, Cause.HOT}
-    hot = stage.hot[whole.y.astype(int) * W + whole.x]
-    assert ((whole.cause == Cause.HOT) == hot).all()
-
-
 ANSWERED = PixelsConfig(
     rate_hz=3.0, spread_decades=0.4, on_share=0.7, answered=0.6, answer_ms=20, answer_spread_decades=0.4
 )
@@ -120,24 +97,6 @@ def test_a_hot_pixel_answers_nothing_and_prefers_a_polarity_of_its_own():
     assert usual.sum() > 500 and stats.kstest(z[usual], "norm").pvalue > 1e-3
     z = (n[hot] - 4 * stage.rates[hot]) / np.sqrt(4 * stage.rates[hot])
     assert stats.kstest(z, "norm").pvalue > 1e-3, "Poisson: answers would make counts scatter more"
-
-
-@pytest.mark.parametrize(("share", "spread"), [(0.0, 2.0), (1.0, 2.0), (0.5, 0.0)])
-def test_hot_pixels_at_the_ends_of_their_share(share, spread):
-    config = PixelsConfig(hot_fraction=1.0, hot_rate_hz=5.0, hot_on_share=share, hot_on_spread=spread)
-    stage, events = noise_of(config, [0, 1_000_000])
-    assert (stage.on_shares == share).all() and len(events) > 1000
-    assert share == 0.5 or (events.p == share).all()
-
-
-@pytest.mark.parametrize("step_us", [500, 200_000])
-def test_answers_are_in_the_rates_from_the_first_moment(step_us):
-    stage, events = noise_of(ANSWERED, np.arange(0, 2_000_001, step_us))
-    expected = stage.rates.sum() * 0.1
-    early, late = (((a < events.t) & (events.t <= a + 100_000)).sum() for a in (0, 1_900_000))
-    for count in (early, late):
-        assert abs(count - expected) < 5 * np.sqrt(2 * expected)
-    assert events.t[0] > 0 and (np.diff(events.t) >= 0).all()
 
 
 def test_answers_do_not_depend_on_the_steps_and_resume():
@@ -182,15 +141,6 @@ def test_the_bus_waits_as_an_m_d_1_queue(load):
     assert abs((wait == 0).mean() - (1 - load)) < 0.02, "the bus is idle for a share 1 - load of the time"
 
 
-def test_rows_share_their_arbitration():
-    """A row arbiter is paid once for all events of a row that wait together: k events cost k + r, not k (1 + r)."""
-    events = Events(
-        np.arange(40, dtype=np.uint16), np.full(40, 3, np.uint16), np.zeros(40, np.int64), np.zeros(40, np.uint8)
-    )
-    bus = Readout(ReadoutConfig(events_per_second=1e6, row_ns=5000))
-    assert bus.step(events).t.tolist() == [6 + k for k in range(40)]
-
-
 def test_clock_is_the_last_tick_that_has_passed():
     events = Events(*(np.zeros(6, np.uint16),) * 2, np.array([0, 9, 10, 11, 29, 30]), np.zeros(6, np.uint8))
     assert Readout(ReadoutConfig(clock_us=10)).step(events).t.tolist() == [0, 0, 10, 10, 20, 30]
@@ -218,10 +168,3 @@ def test_a_camera_with_all_of_it():
     alive = (~noise.dead[free.y.astype(int) * W + free.x]).sum()
     own = len(full) + camera.late + camera.dropped - alive
     assert abs(own - noise.rates.sum() * 0.07) < 6 * np.sqrt(noise.rates.sum() * 0.07)
-
-
-def test_filters_on_the_camera_are_refused_and_none_are_read():
-    """As configurations of earlier versions have them."""
-    assert validate(ReadoutConfig, {"filters": []}) == ReadoutConfig()
-    with pytest.raises(ConfigError, match=r"filters: this key was removed .*; expected events filtered after"):
-        validate(ReadoutConfig, {"filters": [{"kind": "trail"}]})

@@ -113,10 +113,3 @@ def test_arithmetic_is_accurate_and_the_same_compiled():
         np.abs(cos - np.cos(2 * np.pi * (d % 1))).max() < 2e-15
         and np.abs(sin - np.sin(2 * np.pi * (d % 1))).max() < 2e-15
     )
-
-
-def test_log_is_monotone_to_a_unit_and_bounded_at_the_ends():
-    v = np.linspace(0.5, 2.5, 500_001).astype(np.float32)
-    assert np.diff(arith.log_q25(v)).min() >= -4  # 2^-25 units; the levels are 3e5 of them apart
-    ends = arith.log_q25(np.array([2.0**-30, 1.0, 2.0**30], np.float32))
-    assert ends[1] == 0 and abs(int(ends[0])) < 2**30 and abs(int(ends[2])) < 2**30

@@ -29,30 +29,6 @@ def test_every_part_is_done_once(count):
         assert (counts == 20).all()
 
 
-def test_the_helpers_are_there_and_take_part():
-    """Parts that wait for each other: only as many threads as there are parts get through."""
-    together, taken = threading.Barrier(3), []
-
-    def kernel(_, start):
-        together.wait(20)
-        taken.append(threading.current_thread())
-
-    threads.run(kernel, 3, (), 3)
-    assert len(set(taken)) == 3 and all(helper.is_alive() for helper in threads._helpers)
-
-
-def test_helpers_begin_at_places_of_their_own():
-    seen = []
-
-    def kernel(taken, start):
-        seen.append(start)
-        everybody.wait(10)
-
-    everybody = threading.Barrier(4)
-    threads.run(kernel, 8, (), 4)
-    assert sorted(seen) == [0, 2, 4, 6]
-
-
 def test_the_caller_does_not_wait_for_who_has_not_begun(monkeypatch):
     """No helper ever gets a core here: the work is done all the same."""
     monkeypatch.setattr(threads, "_helpers", [None])
@@ -78,18 +54,6 @@ def test_an_error_in_a_helper_is_raised_in_the_caller():
     counts = np.zeros(10, np.int64)
     threads.run(_count, 10, (counts,), 2)
     assert (counts == 1).all(), "the helper is alive"
-
-
-def test_helpers_sleep():
-    """What is idle holds no core: no processor time goes by while helpers wait for work."""
-    import resource
-
-    counts = np.zeros(1000, np.int64)
-    threads.run(_count, 1000, (counts,), 3)
-    asleep = threading.Event()
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_utime
-    asleep.wait(0.3)
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_utime - before < 0.1
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")

@@ -1,11 +1,9 @@
 """Which surface made an event, by hand: two frames of three pixels, and what an event between them is given."""
 
 import numpy as np
-import pytest
 
 from blinkgl.events import Events
 from blinkgl.events.truth import Surfaces, SurfaceTruth
-from blinkgl.types.events import TRUTH
 
 MS = 1_000_000
 
@@ -37,13 +35,6 @@ def test_the_nearer_in_time_where_nothing_passes_else_the_nearer_surface():
     assert np.allclose(given["depth"], [5, 5.1, 3, 3, 3, 3, 3])
 
 
-def test_an_arm_before_its_own_body_passes_too():
-    truth = SurfaceTruth()
-    truth.see(0, shown((1, 3, 9)))
-    truth.see(10 * MS, shown((1, 4, 0)))
-    assert truth.of(events((0, 9000)), 10 * MS)["velocity"][0, 0] == 9
-
-
 def test_a_pixel_that_sees_its_neighbours_asks_them():
     frames = shown(WALL, BOX), shown(WALL, BOX)
     for reach, whose in ((0, 1), (1, 2)):
@@ -60,16 +51,3 @@ def test_what_a_pixel_remembers_is_still_that_of_what_left():
         if ms == 20:
             assert truth.of(events((0, 15_000)), 20 * MS)["instance"][0] == 2
     assert truth.of(events((0, 24_000), (0, 26_000)), 30 * MS)["instance"].tolist() == [2, 1]
-
-
-def test_events_carry_it_along():
-    one = events((0, 1), (0, 2))
-    told = Events(one.x, one.y, one.t, one.p, truth=np.zeros(2, TRUTH))
-    told.truth["instance"] = (3, 4)
-    assert told.columns == ("x", "y", "t", "p", "truth") and one.columns == ("x", "y", "t", "p")
-    assert told.part(slice(1, 2)).truth["instance"].tolist() == [4]
-    both = Events.concatenate([told, told.copy()])
-    assert both.truth["instance"].tolist() == [3, 4, 3, 4]
-    assert Events.concatenate([told, one]).truth is None, "half of them know nothing"
-    with pytest.raises(Exception, match=r"Events\.truth"):
-        Events(one.x, one.y, one.t, one.p, truth=np.zeros(2))

@@ -15,29 +15,19 @@ from aedat2_files import (
     records,
 )
 from blinkgl.cli import run
-from blinkgl.errors import AssetError, EventDataError, OutputError
+from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.aedat2 import Aedat2Reader
 from blinkgl.io.formats import convert, open_events
 from blinkgl.io.frames import open_frames
 from blinkgl.types.events import Events
+from tests.io.some_events import same, some_events
 from tests.shared_data import shared
 
 H, W = 180, 240
 
 
-def events(n=5000, seed=0, height=H, width=W, t0=10_000) -> Events:
-    rng = np.random.default_rng(seed)
-    t = t0 + np.sort(rng.integers(0, 300_000, n))
-    return Events(
-        rng.integers(0, width, n).astype(np.uint16),
-        rng.integers(0, height, n).astype(np.uint16),
-        t,
-        rng.integers(0, 2, n).astype(np.uint8),
-    )
-
-
-def same(a: Events, b: Events) -> bool:
-    return all(np.array_equal(getattr(a, k), getattr(b, k)) for k in "xytp")
+def events(n=5000, t0=10_000) -> Events:
+    return some_events(n, t0, t0 + 300_000, H, W)
 
 
 def put(path, data: bytes):
@@ -55,29 +45,12 @@ def test_events_as_they_were(tmp_path):
     assert len(parts) == 7 and same(Events.concatenate(parts), given)
 
 
-def test_the_axes_are_turned_as_jaer_turns_them(tmp_path):
-    """Raw x 0 is the right column, raw y 0 the bottom row; bit 11 is ON."""
-    path = put(tmp_path / "e.aedat", header() + records([0, (H - 1) << 22 | (W - 1) << 12 | 1 << 11], [1, 2]))
-    found = open_events(path).read()
-    assert (found.x.tolist(), found.y.tolist(), found.p.tolist()) == ([W - 1, 0], [H - 1, 0], [0, 1])
-
-
 def test_times_go_on_where_32_bits_end(tmp_path):
     t = np.array([2**31 - 5, 2**31 + 5, 2**32 - 3, 2**32 + 4, 2**32 + 2**31 + 1, 2**33 - 1, 2**33 + 7])
     given = Events(*(np.arange(len(t)).astype(np.uint16) for _ in "xy"), t, np.zeros(len(t), np.uint8))
     path = put(tmp_path / "e.aedat", header() + records(event_addresses(given), given.t))
     assert open_events(path).read().t.tolist() == t.tolist()
     assert np.concatenate([e.t for e in Aedat2Reader(path).chunks(records=2)]).tolist() == t.tolist()
-
-
-def test_a_record_that_begins_like_a_line_of_the_header(tmp_path):
-    """y = 140 from the bottom is the byte '#': the header ends where its lines end, or where it says so."""
-    for end in (True, False):
-        given = events(50, t0=0)
-        given.y[:] = H - 1 - 140
-        data = records(event_addresses(given), given.t)
-        assert data[:1] == b"#"
-        assert same(open_events(put(tmp_path / "e.aedat", header(end=end) + data)).read(), given), end
 
 
 # ---- frames and IMU --------------------------------------------------------------------------------------------------
@@ -123,27 +96,6 @@ def test_frames_are_reset_minus_signal(tmp_path):
     assert all(np.array_equal(a.image, b.image) for a, b in zip(small, found))
 
 
-def test_a_rolling_shutter(tmp_path):
-    """Columns are reset one after the other and read 3 ms later, when others are still being reset."""
-    reset, signal = pictures(1)[0]
-    parts = [
-        (frame_addresses(read, is_signal), begin + np.arange(H * W) // H * 25)
-        for read, is_signal, begin in ((reset, False, 100), (signal, True, 3100))
-    ]
-    (frame,) = open_events(put(tmp_path / "f.aedat", header() + file_of(*parts))).frames()
-    np.testing.assert_array_equal(frame.image, np.maximum(reset - signal, 0))
-    assert (frame.begin_us, frame.end_us) == (100, 3100)
-
-
-def test_frames_that_are_cut_are_left_out_and_counted(tmp_path):
-    shown = pictures(3)
-    address, t = (np.concatenate([p[i] for p in global_frames(shown)]) for i in (0, 1))
-    reader = Aedat2Reader(put(tmp_path / "f.aedat", header() + records(address[100:-50], t[100:-50])))
-    (frame,) = reader.frames()
-    np.testing.assert_array_equal(frame.image, np.maximum(shown[1][0] - shown[1][1], 0))
-    assert reader.frames_cut == 2
-
-
 def test_frames_go_through_the_door_of_frames(tmp_path):
     path = put(tmp_path / "f.aedat", header() + file_of(*global_frames(pictures(3))))
     source = open_frames(path)
@@ -175,16 +127,6 @@ def test_the_inertial_unit(tmp_path):
     other = open_events(put(tmp_path / "j.aedat", said + file_of(imu))).imu()
     np.testing.assert_allclose(other.acceleration, found.acceleration / 4)
     np.testing.assert_allclose(other.rate, found.rate / 4)
-
-
-def test_samples_of_the_inertial_unit_that_are_not_whole(tmp_path):
-    """A file begins within a sample, loses a value, and ends within another."""
-    address, t = imu_addresses(np.arange(35).reshape(5, 7)), np.repeat([10, 20, 30, 40, 50], 7)
-    keep = np.ones(35, bool)
-    keep[[0, 1, 17, 33, 34]] = False
-    found = open_events(put(tmp_path / "i.aedat", header() + records(address[keep], t[keep]))).imu()
-    assert found.t.tolist() == [20, 40]
-    assert len(open_events(put(tmp_path / "e.aedat", header() + records([0], [1]))).imu()) == 0
 
 
 # ---- a real recording ------------------------------------------------------------------------------------------------
@@ -263,12 +205,6 @@ def test_damage_is_refused_by_its_place(tmp_path, data, message):
             read(open_events(path))
     with pytest.raises(AssetError, match=message.split(":")[0]):
         list(Aedat2Reader(path).chunks(records=2))
-
-
-def test_it_is_not_written(tmp_path):
-    given = put(tmp_path / "e.aedat", header() + records([0], [1]))
-    with pytest.raises(OutputError, match=r"aedat2 files are read only \(got '.aedat'\); expected .h5, .hdf5, .raw"):
-        convert(given, tmp_path / "out.aedat")
 
 
 def test_a_header_without_an_end(tmp_path):

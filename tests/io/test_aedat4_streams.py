@@ -82,16 +82,6 @@ def test_what_a_recording_does_not_hold():
         open_frames(file.path)
 
 
-def test_a_recording_that_is_cut(tmp_path):
-    path = tmp_path / "e.aedat4"
-    path.write_bytes(opened(STILL).path.read_bytes()[:200_000])
-    for read in (lambda f: list(f.frames()), lambda f: f.imu()):
-        try:
-            read(open_events(path))
-        except AssetError as error:
-            assert "AEDAT4" in str(error) or "in the recording" in str(error)
-
-
 def recorded(monkeypatch, kind, packets):
     """A recording of such packets, by a library of our own."""
 
@@ -123,19 +113,3 @@ def test_samples_whose_times_run_backwards(monkeypatch):
     rows["t"] = (5, 9, 8)
     with pytest.raises(EventDataError, match=r"times run backwards at sample 2 of the inertial unit \(got \(9, 8\)\)"):
         recorded(monkeypatch, "imus", [rows]).imu()
-
-
-class PanicException(BaseException):
-    """As the package raises for damage that it did not expect."""
-
-    __module__ = "pyo3_runtime"
-
-
-@pytest.mark.parametrize("error", [RuntimeError("no  such\n stream"), PanicException("no such stream")])
-def test_damage_is_one_line(monkeypatch, error):
-    def decoder(path):
-        raise error
-
-    monkeypatch.setitem(sys.modules, "aedat", SimpleNamespace(Decoder=decoder))
-    with pytest.raises(AssetError, match="^e.aedat4: damaged AEDAT4 file: no such stream$"):
-        Aedat4Reader("e.aedat4")

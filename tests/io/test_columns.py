@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import BlinkGLError, EventDataError
-from blinkgl.io.columns import check_events, events_of, microseconds
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.formats import convert, open_events, write_events
 from blinkgl.types.events import Events
+from tests.io.some_events import some_events
 
 GOOD = {"x": [1, 2, 3], "y": [4, 5, 6], "t": [10, 20, 30], "p": [0, 1, 1]}
 
@@ -112,29 +112,8 @@ def test_events_outside_the_declared_sensor(tmp_path, kind, name):
         open_events(path).read()
 
 
-@pytest.mark.parametrize("name", ["e.h5", "e.raw", "e.txt", "e.csv", "e.npz", "e.npy"])
-@pytest.mark.parametrize(
-    "x, t, p, message",
-    [(9, 2, 1, "event 1 is outside the sensor"), (3, 0, 1, "backwards at event 1"), (3, 2, 7, "polarity of event 1")],
-)
-def test_no_writer_takes_them_either(tmp_path, name, x, t, p, message):
-    events = Events(
-        np.array([3, x], np.uint16), np.array([4, 4], np.uint16), np.array([1, t]), np.array([0, p], np.uint8)
-    )
-    with pytest.raises(EventDataError, match=message):
-        write_events(tmp_path / name, events, 8, 8)
-    assert not list(tmp_path.iterdir())
-
-
 def test_slices_are_checked_too(tmp_path):
-    rng = np.random.default_rng(0)
-    n = 5000
-    events = Events(
-        rng.integers(0, 64, n).astype(np.uint16),
-        rng.integers(0, 48, n).astype(np.uint16),
-        np.sort(rng.integers(0, 90_000, n)),
-        rng.integers(0, 2, n).astype(np.uint8),
-    )
+    events = some_events(5000, 0, 90_000, 48, 64)
     path = tmp_path / "e.h5"
     write_events(path, events, 48, 64)
     for change, message in (
@@ -201,41 +180,9 @@ def test_csv_in_microseconds_is_faerys(tmp_path):
     assert open_events(tmp_path / "f.csv").read().t.tolist() == [5, 1_500_000]
 
 
-def test_the_command_writes_microseconds(tmp_path, capsys):
-    from blinkgl.cli import run
-
-    (tmp_path / "a.txt").write_text("0.000005 1 2 0\n")
-    assert run(["convert", str(tmp_path / "a.txt"), str(tmp_path / "b.csv"), "--time-unit", "us"]) == 0
-    assert (tmp_path / "b.csv").read_text() == "t,x@240,y@180,on\n5,1,2,0\n"
-    assert run(["convert", str(tmp_path / "a.txt"), str(tmp_path / "c.csv"), "--time-unit", "ms"]) == 2
-    assert "unit of time (got 'ms'); expected s or us" in capsys.readouterr().err and not (tmp_path / "c.csv").exists()
-
-
 def test_times_with_and_without_names(tmp_path):
     from blinkgl.io.frames import read_timestamps
 
     (tmp_path / "t.txt").write_text("0 a.png\n10000\n")
     with pytest.raises(EventDataError, match="t.txt: times with a name and times without one"):
         read_timestamps(tmp_path / "t.txt")
-
-
-def test_every_value_that_fits_comes_through():
-    edge = events_of(
-        np.array([0, 65535.0]),
-        np.array([True, False]),
-        np.array([-(1 << 62), 1 << 62]),
-        np.array([-1, 1]),
-        "f",
-        signed=True,
-    )
-    assert (
-        edge.x.tolist() == [0, 65535]
-        and edge.y.tolist() == [1, 0]
-        and edge.p.tolist() == [0, 1]
-        and edge.t.tolist() == [-(1 << 62), 1 << 62]
-    )
-    assert events_of(*(np.empty(0, d) for d in ("u2", "f4", "f8", "?")), "f").t.dtype == np.int64
-    assert microseconds(np.array([1.0000004, -2.5]), "f").tolist() == [1000000, -2500000]
-    with pytest.raises(EventDataError, match="t of event 7"):
-        events_of([1], [1], [1 << 61], [1], "f", 7, offset=1 << 62)
-    assert check_events(Events.empty(), "f", after=5) == 5

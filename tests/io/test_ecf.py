@@ -110,13 +110,6 @@ def test_a_chunk_that_was_not_packed(tmp_path):
     np.testing.assert_array_equal(events.x, [*range(16), *x])
 
 
-def test_a_chunk_may_hold_more_than_the_table(tmp_path):
-    """HDF5's own way through the filter packs the last chunk whole, with rows of zeros behind the last event."""
-    (_, _, t, _), packed = WRITTEN["all in one"]
-    table_of(tmp_path / "e.h5", [(bytes.fromhex(packed), 0)], 4, step=16)
-    np.testing.assert_array_equal(open_events(tmp_path / "e.h5").read().t, t[:4])
-
-
 @pytest.mark.parametrize(
     "change, says",
     [

@@ -91,21 +91,6 @@ def test_random_words_of_evt3(tmp_path, block):
 
 
 @pytest.mark.parametrize(
-    "before, after, turns",
-    [(2047, 0, 0), (2048, 0, 0), (2049, 0, 1), (4095, 0, 1), (4095, 2047, 0), (4095, 2046, 1), (0, 4095, 0)],
-)
-def test_evt3s_counter_has_turned_when_it_falls_by_more_than_half(tmp_path, before, after, turns):
-    rows = decoded(tmp_path / "e.raw", "evt3", [0x8000 | before, 0x8000 | after, 0x2001])
-    assert rows == [(1, 0, (turns << 24) + (after << 12), 0)]
-
-
-@pytest.mark.parametrize("fall, turns", [(1 << 27, 0), ((1 << 27) + 1, 1)])
-def test_evt2s_counter_has_turned_when_it_falls_by_more_than_half(tmp_path, fall, turns):
-    rows = decoded(tmp_path / "e.raw", "evt2", [8 << 28 | fall, 8 << 28, 1 << 28 | 5 << 22 | 3 << 11 | 4])
-    assert rows == [(3, 4, (turns << 34) + 5, 1)]
-
-
-@pytest.mark.parametrize(
     "words, bad",
     [
         ([0x8000, 0x3000 | 2047, 0x4001, 0x4001], 3),
@@ -201,34 +186,3 @@ def test_the_writers_limits(tmp_path):
     for size in ((2049, 10), (10, 2049)):
         with pytest.raises(EventDataError, match="EVT3 has 11-bit coordinates"):
             EvtWriter(tmp_path / "f.raw", *size)
-
-
-@pytest.mark.parametrize(
-    "header, size",
-    [
-        (b"% geometry 640x480\n", (480, 640)),
-        (b"% format EVT3;height=480;width=640\n", (480, 640)),
-        (b"% geometry 640x480\n% format EVT3;height=1;width=2\n", (480, 640)),
-        (b"% height=480\n", (480, None)),
-        (b"% width=640\n", (None, 640)),
-        (b"% anything else\n", (None, None)),
-    ],
-)
-def test_the_size_in_the_header(tmp_path, header, size):
-    decoded(tmp_path / "e.raw", "evt3", [0x8000], header=header)
-    reader = EvtReader(tmp_path / "e.raw")
-    assert (reader.height, reader.width) == size
-
-
-def test_headers_without_an_end_and_with_lines_too_long(tmp_path):
-    path, word = tmp_path / "e.raw", np.array([0x8000, 0x2001], "<u2").tobytes()
-    path.write_bytes(b"% evt 3.0\n% camera x\n" + word)
-    assert [len(e) for e in EvtReader(path).chunks()] == [1]
-    # A word that begins with the byte of '%'.
-    path.write_bytes(b"% evt 3.0\n" + np.array([0x8000 | 0x25, 0x2001], "<u2").tobytes())
-    assert [e.t.tolist() for e in EvtReader(path).chunks()] == [[0x25 << 12]]
-    path.write_bytes(b"% evt 3.0\n% " + b"x" * 4000 + b"\n% end\n" + word)
-    assert [len(e) for e in EvtReader(path).chunks()] == [1]
-    path.write_bytes(b"% evt 3.0\n% " + b"x" * 5000 + b"\n% end\n" + word)
-    with pytest.raises(AssetError, match="header line 2 is longer than 4096 bytes"):
-        EvtReader(path)

@@ -12,7 +12,7 @@ import pytest
 
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io import flow_png, pfm
-from blinkgl.io.flow import read_flow, read_flow_npy, write_flow
+from blinkgl.io.flow import read_flow, write_flow
 
 
 @pytest.mark.parametrize("ending, lost", [(".png", 1), (".flo", 0), (".npy", 0)])
@@ -30,37 +30,6 @@ def test_every_ending_gives_back_what_it_holds(tmp_path, ending, lost):
             (AssetError, OutputError), match=r"unknown flow file ending .got '.exr'.; expected .png, .flo, .npy"
         ):
             act(tmp_path / "a.exr")
-
-
-@pytest.mark.parametrize(
-    "array, fine",
-    [
-        (np.ones((2, 3, 2), np.float64), True),
-        (np.ones((2, 3, 3), np.float16), True),
-        (np.ones((2, 3, 4), np.float32), False),
-        (np.ones((2, 3, 1), np.float32), False),
-        (np.ones((2, 3), np.float32), False),
-        (np.ones((2, 3, 2), np.int32), False),
-    ],
-)
-def test_arrays_of_flow(tmp_path, array, fine):
-    np.save(tmp_path / "a.npy", array)
-    if not fine:
-        with pytest.raises(AssetError, match=r"not a flow field .*; expected float \(H, W, 2\) or \(H, W, 3\)"):
-            read_flow(tmp_path / "a.npy")
-        return
-    array[0, 0, 0] = np.nan
-    array[1, 1, 1] = np.inf
-    if array.shape[2] == 3:
-        array[0, 2, 2], array[1, 2, 2] = 0, -1
-    np.save(tmp_path / "a.npy", array)
-    flow, valid = read_flow(tmp_path / "a.npy")
-    wrong = [[0, 0], [1, 1]] + ([[0, 2], [1, 2]] if array.shape[2] == 3 else [])
-    assert (
-        sorted(np.argwhere(~valid).tolist()) == sorted(wrong) and (flow[~valid] == 0).all() and (flow[valid] == 1).all()
-    )
-    as_it_stands, stated = read_flow_npy(tmp_path / "a.npy")
-    assert np.isnan(as_it_stands[0, 0, 0]) and stated[0, 0] and as_it_stands.dtype == np.float32
 
 
 @pytest.mark.parametrize("scale, low, high", [(128.0, -256.0, 255.9921875), (64.0, -512.0, 511.984375)])

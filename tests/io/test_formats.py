@@ -6,10 +6,10 @@ import h5py
 import numpy as np
 import pytest
 
-from blinkgl.errors import AssetError, BlinkGLError, EventDataError, OutputError
-from blinkgl.io.evt import EvtReader
-from blinkgl.io.formats import convert, event_writer, open_events, write_events
+from blinkgl.errors import AssetError, BlinkGLError
+from blinkgl.io.formats import convert, open_events, write_events
 from blinkgl.types.events import Events
+from tests.io.some_events import same
 from tests.shared_data import shared
 
 H, W = 480, 640
@@ -47,10 +47,6 @@ def pieces(events: Events, seed=0):
         i += n
 
 
-def same(a: Events, b: Events) -> bool:
-    return all(np.array_equal(getattr(a, k), getattr(b, k)) for k in "xytp")
-
-
 @pytest.mark.parametrize("kind", FILES)
 def test_write_then_read_is_exact(tmp_path, kind):
     events = random_events()
@@ -61,20 +57,6 @@ def test_write_then_read_is_exact(tmp_path, kind):
     assert (file.height, file.width) == ((None, None) if kind in ("text", "csv", "npy") else (H, W))
     assert same(file.read(), events)
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
-
-
-@pytest.mark.parametrize("kind", FILES)
-def test_no_events_at_all(tmp_path, kind):
-    write_events(tmp_path / FILES[kind], Events.empty(), H, W)
-    assert len(open_events(tmp_path / FILES[kind]).read()) == 0
-
-
-@pytest.mark.parametrize("ending", ["raw", "txt", "csv"])
-def test_bytes_do_not_depend_on_chunking(tmp_path, ending):
-    events = random_events(3000)
-    for i in range(2):
-        write_events(tmp_path / f"{i}.{ending}", pieces(events, i), H, W)
-    assert (tmp_path / f"0.{ending}").read_bytes() == (tmp_path / f"1.{ending}").read_bytes()
 
 
 def test_faery_reads_what_we_write(tmp_path):
@@ -129,41 +111,6 @@ def test_real_recordings(tmp_path, name, kind, size, count):
     assert same(open_events(tmp_path / "e.h5").read(), events)
 
 
-def test_evt3_vectors_and_counter_wrap(tmp_path):
-    words = [
-        0x2005,
-        0x8000 | 0xFFE,
-        0x6123,
-        0x0007,
-        0x3803 + 0,
-        0x4000 | 0b100000000001,
-        0x5000 | 0b10000001,
-        0x2805,
-        0x8FFF,
-        0x6001,
-        0x2001,
-        0x8000,
-        0x6002,
-        0x0800 | 3,
-        0x2002,
-        0xA000,
-        0x7123,
-        0xE000,
-        0xF001,
-    ]
-    (tmp_path / "e.raw").write_bytes(b"% evt 3.0\n% end\n" + np.array(words, "<u2").tobytes())
-    for block in (1, 3, 1 << 17):
-        e = Events.concatenate(list(EvtReader(tmp_path / "e.raw").chunks(block)))
-        # the first word precedes any TIME_HIGH and is dropped; vectors advance the base by 12, then 8
-        assert (
-            e.x.tolist() == [3, 14, 15, 22, 5, 1, 2]
-            and e.y.tolist() == [7] * 6 + [3]
-            and e.p.tolist() == [1, 1, 1, 1, 1, 0, 0]
-        )
-        high = 0xFFE << 12
-        assert e.t.tolist() == [high + 0x123] * 5 + [(0xFFF << 12) + 1, (1 << 24) + 2]
-
-
 def test_blinkflow_and_mvsec(tmp_path):
     events = random_events(5000, duration_us=3_000_000)
     with h5py.File(tmp_path / "blinkflow.h5", "w") as file:  # u8 times, no t_offset, table without the final ms
@@ -185,44 +132,6 @@ def test_blinkflow_and_mvsec(tmp_path):
     with h5py.File(tmp_path / "dsec.h5") as dsec:
         assert dsec["t_offset"][()] == events.t[0] // 10**6 * 10**6
     assert same(open_events(tmp_path / "dsec.h5").read(), events)
-
-
-def test_zero_time(tmp_path):
-    events = random_events(1000, t0=1_506_117_887_000_000)
-    write_events(tmp_path / "a.npz", events, H, W)
-    with pytest.raises(EventDataError, match=r"EVT3 times count from the recording's start.*use --zero-time"):
-        convert(tmp_path / "a.npz", tmp_path / "b.raw")
-    assert not (tmp_path / "b.raw").exists()
-    convert(tmp_path / "a.npz", tmp_path / "b.raw", zero_time=True)
-    assert np.array_equal(open_events(tmp_path / "b.raw").read().t, events.t - events.t[0])
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "0.1 1 2",
-        "0.1 1 2 3 4",
-        "0.1 1 2 7",
-        "0.1 a 2 1",
-        "0.1 -1 2 1",
-        "0.1 1.5 2 1",
-        "nan 1 2 1",
-        "0.1 70000 2 1",
-        "99999999999999999999 1 2 1",
-        "1e30 1 2 1",
-        "0.1 1 2 1x",
-    ],
-)
-def test_bad_text_lines_are_named(tmp_path, line):
-    (tmp_path / "e.txt").write_text(f"0.1 1 2 1\n0.1 1 2 1\n{line}\n0.2 1 2 1\n")
-    with pytest.raises(AssetError, match=r"e.txt: line 3 is not an event .*expected t x y p"):
-        open_events(tmp_path / "e.txt").read()
-
-
-def test_backwards_time_is_named(tmp_path):
-    (tmp_path / "e.txt").write_text("3 1 1 1\n4 1 1 1\n2 1 1 1\n")
-    with pytest.raises(EventDataError, match=r"run backwards at event 2 \(got \(4, 2\)\)"):
-        open_events(tmp_path / "e.txt").read()
 
 
 def _bad(tmp_path, name, data):
@@ -280,13 +189,6 @@ def test_random_damage_never_ends_in_a_traceback(tmp_path, name):
     assert errors >= (5 if name == "e.raw" else 15)
 
 
-def test_truncated_recordings(tmp_path):
-    source = shared("data/events/aedat4/davis346_events_frames_imu.aedat4")
-    for keep in (200, 100_000):
-        with pytest.raises(AssetError, match="AEDAT4"):
-            open_events(_bad(tmp_path, "e.aedat4", source.read_bytes()[:keep])).read()
-
-
 @pytest.mark.parametrize(
     "array, message",
     [
@@ -303,34 +205,6 @@ def test_arrays_that_are_not_events(tmp_path, array, message):
     np.save(tmp_path / "e.npy", array)
     with pytest.raises(BlinkGLError, match=message):
         open_events(tmp_path / "e.npy")
-
-
-def test_foreign_array_names(tmp_path):
-    np.savez(tmp_path / "e.npz", timestamps=[0.5, 1.0], x=[1, 2], y=[3, 4], polarity=[-1, 1])
-    e = open_events(tmp_path / "e.npz").read()
-    assert e.t.tolist() == [500_000, 1_000_000] and e.p.tolist() == [0, 1]
-
-
-@pytest.mark.parametrize("kind", FILES)
-def test_failure_leaves_the_old_file(tmp_path, kind):
-    path = tmp_path / FILES[kind]
-    path.write_text("old")
-    with pytest.raises(ZeroDivisionError), event_writer(path, H, W) as writer:
-        writer.append(random_events(100))
-        raise ZeroDivisionError
-    assert path.read_text() == "old" and [p.name for p in tmp_path.iterdir()] == [path.name]
-
-
-def test_output_names(tmp_path):
-    with pytest.raises(OutputError, match="unknown event file ending"):
-        write_events(tmp_path / "e.xyz", Events.empty(), H, W)
-    with pytest.raises(OutputError, match=r"aedat4 files are read only .*expected .h5, .hdf5, .raw, .txt"):
-        write_events(tmp_path / "e.aedat4", Events.empty(), H, W)
-    with pytest.raises(EventDataError, match="11-bit"):
-        write_events(tmp_path / "e.raw", Events.empty(), 4000, 3000)
-    with pytest.raises(EventDataError, match="outside the sensor"):
-        write_events(tmp_path / "e.raw", random_events(100), 10, 10)
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
@@ -359,26 +233,3 @@ def test_a_size_that_is_not_said_is_that_of_the_smallest_sensor_that_holds_all(t
     file = open_events(tmp_path / "e.txt")
     assert (file.height, file.width) == (None, None)
     assert (file.sized().height, file.sized().width) == size
-
-
-@pytest.mark.parametrize(
-    "first, zero, offset",
-    [
-        (5, False, 0),
-        (999_999, False, 0),
-        (1_000_000, False, 10**6),
-        (2_500_000, False, 2 * 10**6),
-        (2_500_000, True, 0),
-    ],
-)
-def test_dsec_counts_from_the_first_event_s_second(tmp_path, first, zero, offset):
-    """Or from the source's own beginning, or from the first event."""
-    (tmp_path / "e.txt").write_text(f"{first} 1 2 1\n{first + 7} 3 4 0\n")
-    source, count = convert(tmp_path / "e.txt", tmp_path / "e.h5", zero_time=zero)
-    assert count == 2 and source.format == "text"
-    with open_events(tmp_path / "e.h5") as file:
-        assert file.t_offset_us == offset and file.read().t.tolist() == [0 if zero else first, 7 if zero else first + 7]
-    write_events(tmp_path / "own.h5", random_events(9, t0=3_300_000), H, W, t_offset_us=3_250_000)
-    convert(tmp_path / "own.h5", tmp_path / "again.h5")
-    with open_events(tmp_path / "again.h5") as file:
-        assert file.t_offset_us == 3_250_000

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 import subprocess
-from pathlib import Path
 
 import cv2
 import imageio_ffmpeg
@@ -15,7 +13,6 @@ from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.frames import open_frames, read_any_image, read_timestamps
 from blinkgl.io.pfm import write_pfm
 from blinkgl.io.video import VideoWriter
-from tests.shared_data import shared
 
 
 def images(folder, count=3, size=(12, 16), ending="png"):
@@ -27,14 +24,6 @@ def images(folder, count=3, size=(12, 16), ending="png"):
 
 def listed(source):
     return [(int(frame.flat[0]), t, name) for frame, t, name in source]
-
-
-def test_folder_in_natural_order(tmp_path):
-    images(tmp_path, 11)
-    source = open_frames(tmp_path, fps=100)
-    assert (source.height, source.width, source.count) == (12, 16, 11)
-    assert listed(source) == [(10 * i, i * 10_000_000, f"f{i}.png") for i in range(11)]
-    assert listed(source) == listed(source), "can be read again"
 
 
 @pytest.mark.parametrize(
@@ -50,19 +39,6 @@ def test_time_stamp_files_are_found(tmp_path, name, text, expected):
     (tmp_path / name).write_text(text)
     assert [t for _, t, _ in open_frames(tmp_path)] == expected
     assert [t for _, t, _ in open_frames(tmp_path, fps=1)] == [0, 10**9, 2 * 10**9], "--fps wins"
-
-
-def test_event_camera_dataset_folder():
-    root = shared("data/events/slider_depth")
-    for path in (root, root / "images"):
-        source = open_frames(path)
-        frames = list(source)
-        assert (
-            len(frames) == 12
-            and frames[1][1] == 38_766_001
-            and frames[0][0].shape == (180, 240)
-            and frames[0][0].dtype == np.uint8
-        )
 
 
 def test_video(tmp_path):
@@ -188,13 +164,6 @@ def test_bad_arrays_and_files(tmp_path):
         read_timestamps(tmp_path / "t.txt")
 
 
-def test_one_file_may_hold_half_of_the_memory():
-    from blinkgl.io.images import memory_limit
-
-    total = int(re.search(r"MemTotal:\s+(\d+) kB", Path("/proc/meminfo").read_text())[1]) * 1024
-    assert memory_limit() == pytest.approx(total / 2, rel=0.05)
-
-
 # --- which times are taken --------------------------------------------------------------------------------------------
 
 
@@ -219,23 +188,6 @@ def test_times_that_are_named_come_before_those_that_lie_there(tmp_path):
     assert times(folder, timestamps=tmp_path / "mine.txt", fps=10) == [0, 10**8, 2 * 10**8]
     with pytest.raises(AssetError, match="none.txt: cannot read: No such file"):
         open_frames(folder, timestamps=tmp_path / "none.txt")
-
-
-def test_times_of_arrays_and_videos_that_are_named(tmp_path):
-    frames = np.ones((3, 4, 5), np.float32)
-    np.save(tmp_path / "a.npy", frames)
-    np.savez(tmp_path / "a.npz", frames=frames, t=[0, 1, 2])
-    (tmp_path / "mine.txt").write_text("5\n6\n8\n")
-    with VideoWriter(tmp_path / "v.mp4", 32, 48, 50) as video:
-        for i in range(3):
-            video.write(np.full((32, 48, 3), 40 * i, np.uint8))
-    for name in ("a.npy", "a.npz", "v.mp4"):
-        assert times(tmp_path / name, timestamps=tmp_path / "mine.txt") == [5000, 6000, 8000]
-        assert times(tmp_path / name, timestamps=tmp_path / "mine.txt", fps=1e3) == [0, 10**6, 2 * 10**6]
-    (tmp_path / "mine.txt").write_text("5\n6\n")
-    for name in ("a.npy", "a.npz"):
-        with pytest.raises(EventDataError, match=r"one time stamp per frame .got '2 stamps, 3 frames'"):
-            open_frames(tmp_path / name, timestamps=tmp_path / "mine.txt")
 
 
 def test_lines_of_times(tmp_path):

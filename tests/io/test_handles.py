@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import BlinkGLError
-from blinkgl.io.dsec import DsecEventReader, DsecEventWriter
 from blinkgl.io.formats import event_writer, open_events
-from blinkgl.sequence_files.sequence_dir import SequenceWriter
 from blinkgl.types.events import Events
 
 FILES = {
@@ -63,29 +61,3 @@ def test_writers(tmp_path, kind, how):
         assert open_events(path).read().t.tolist() == some().t.tolist()
     for again in (writer.abort, writer.abort):
         again()
-
-
-def test_the_writer_of_dsec_ends_its_thread(tmp_path):
-    for end in ("close", "abort"):
-        writer = DsecEventWriter(tmp_path / end, 8, 8)
-        writer.append(some())
-        assert "dsec-writer" in held()[1]
-        getattr(writer, end)()
-        getattr(writer, end)()
-    with DsecEventReader(tmp_path / "close") as reader:
-        assert len(reader.slice(0, 1000)) == 5
-    reader.close()
-
-
-@pytest.mark.parametrize("fails", [False, True])
-def test_a_sequence_ends_its_threads(tmp_path, fails):
-    try:
-        with SequenceWriter(tmp_path / "s", 8, 8, config_yaml="") as writer:
-            writer.append_events(some())
-            for k in range(20):  # more than wait for the encoder at once
-                writer.label("depth", k, np.ones((8, 8), np.float32), k)
-            if fails:
-                raise KeyError
-    except KeyError:
-        assert fails
-    assert (tmp_path / "s").exists() is not fails and len(list(tmp_path.iterdir())) == (not fails)

@@ -4,10 +4,7 @@ believed, and nothing of the process changes."""
 from __future__ import annotations
 
 import itertools
-import os
 import struct
-import subprocess
-import sys
 
 import h5py
 import hdf5plugin
@@ -19,7 +16,7 @@ from blinkgl.io.dsec import identity_rectify_map, write_rectify_map
 from blinkgl.io.formats import open_events
 from blinkgl.io.hdf5 import blosc_dataset, dataset, open_hdf5, write_rows
 from eflow.data.sources import FolderSource
-from tests.io.test_columns import GOOD, dsec, mvsec
+from tests.io.test_columns import dsec, mvsec
 
 
 def external_storage(file, name, secret):
@@ -71,13 +68,6 @@ def test_files_that_lead_elsewhere_are_refused(tmp_path, how, message, kind):
         read()
 
 
-def test_soft_links_inside_the_file_are_fine(tmp_path):
-    with h5py.File(dsec(tmp_path / "e.h5"), "r+") as file:
-        file.move("events/x", "columns")
-        file["events/x"] = h5py.SoftLink("/columns")
-    assert open_events(tmp_path / "e.h5").read().x.tolist() == GOOD["x"]
-
-
 @pytest.mark.parametrize(
     "change, message",
     [
@@ -104,16 +94,6 @@ def test_dsec_data_sets_of_wrong_shape_or_type(tmp_path, change, message):
             file.create_group(name) if value is None else file.create_dataset(name, data=value)
     with pytest.raises(BlinkGLError, match=message):
         open_events(tmp_path / "e.h5").read()
-
-
-@pytest.mark.parametrize("value", [None, np.zeros(4), np.zeros((4, 3)), np.zeros((4, 4), int), np.array(["a"])])
-def test_mvsec_table_of_wrong_shape_or_type(tmp_path, value):
-    with h5py.File(tmp_path / "e.hdf5", "w") as file:
-        file.create_group("davis/left/events") if value is None else file.create_dataset(
-            "davis/left/events", data=np.asarray(value).astype("S") if value.dtype.kind == "U" else value
-        )
-    with pytest.raises(AssetError, match="'davis/left/events'"):
-        open_events(tmp_path / "e.hdf5").read()
 
 
 def test_claims_without_data(tmp_path):
@@ -186,33 +166,3 @@ def test_rows_written_here_are_those_of_the_filter(tmp_path):
                     data[i:j] = rows[i:j]
             np.testing.assert_array_equal(data[()], rows)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
-
-
-_PROGRAM = """
-import hashlib, os, sys
-import numpy as np
-from blinkgl.types.events import Events
-from blinkgl.io.formats import open_events, write_events
-before = dict(os.environ)
-rng, n = np.random.default_rng(0), 150_000
-x, y, p = rng.integers(0, 64, n).astype("u2"), rng.integers(0, 48, n).astype("u2"), rng.integers(0, 2, n).astype("u1")
-events = Events(x, y, np.sort(rng.integers(0, 10**6, n)), p)
-write_events(sys.argv[1], events, 48, 64)
-assert len(open_events(sys.argv[1]).read()) == n and dict(os.environ) == before, "the environment was changed"
-print(hashlib.sha256(open(sys.argv[1], "rb").read()).hexdigest())
-"""
-
-
-def test_the_environment_is_left_alone_and_does_not_change_the_bytes(tmp_path):
-    environment = {k: v for k, v in os.environ.items() if k != "BLOSC_NTHREADS"}
-    digests = {
-        subprocess.run(
-            [sys.executable, "-c", _PROGRAM, str(tmp_path / "e.h5")],
-            env={**environment, **extra},
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
-        for extra in ({}, {"BLOSC_NTHREADS": "3"})
-    }
-    assert len(digests) == 1

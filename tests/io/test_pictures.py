@@ -1,4 +1,4 @@
-"""Pictures of arrays: which colour means which number."""
+"""Pictures of arrays: which colour means which number; colours of flow against the published wheel."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import ConfigError
-from blinkgl.io import pictures
 from blinkgl.io.colour import flow_colour
-from blinkgl.io.pictures import EMPTY, component, finite_range, id_colours, map_scalar, picture
+from blinkgl.io.pictures import EMPTY, finite_range, id_colours, map_scalar, picture
 
 RAMP = np.arange(1001, dtype=np.float64)
 
@@ -43,18 +42,6 @@ def test_numbers_by_a_colour_map():
         map_scalar(values, "jet", 0, 1)
 
 
-def test_components_of_vectors():
-    vectors = np.array([[[3.0, 4.0, 12.0]]])
-    assert component(vectors, "length") == component(vectors, "auto") == 13
-    assert [float(component(vectors, axis)[0, 0]) for axis in "xyz"] == [3, 4, 12]
-    assert component(vectors[..., 0], "z") == 3, "a number has no components"
-    for bad in ("w", "xy", "", "q"):
-        with pytest.raises(
-            ConfigError, match="component: no such component .*expected one of auto, length, x, y, z|xyz"
-        ):
-            component(vectors, bad)
-
-
 KINDS = {
     "mask": (np.array([[True, False]]), [[245] * 3, [25] * 3], {"kind": "mask"}),
     "ids": (np.array([[0, 1]]), [EMPTY.tolist(), id_colours(np.array([[1]]))[0, 0].tolist()], {"kind": "ids"}),
@@ -71,47 +58,27 @@ def test_each_kind_has_its_way(kind):
     assert rgb.dtype == np.uint8 and rgb[0].tolist() == colours and said == legend
 
 
-@pytest.mark.parametrize("hit", [None, "some", "none"])
-def test_motion_by_the_wheel(hit):
-    flow = np.zeros((1, 1000, 2), np.float32)
-    flow[0, :, 0] = np.arange(1000)
-    where = None if hit is None else np.arange(1000)[None] < (500 if hit == "some" else 0)
-    rgb, said = picture("motion", flow, hit=where)
-    top = 0.995 * (499 if hit == "some" else 999)
-    assert said == {"kind": "wheel", "high": pytest.approx(top)}
-    assert np.array_equal(rgb, flow_colour(flow, said["high"], where))
-    assert picture("motion", flow, high=7.0)[1]["high"] == 7
+def middlebury(u: float, v: float) -> np.ndarray:
+    """Colour of a flow of at most unit length, by the published bands of hue (Baker et al. 2011)."""
+    bands = [
+        (15, (255, 0, 0), (0, 1, 0)),
+        (6, (255, 255, 0), (-1, 0, 0)),
+        (4, (0, 255, 0), (0, 0, 1)),
+        (11, (0, 255, 255), (0, -1, 0)),
+        (13, (0, 0, 255), (1, 0, 0)),
+        (6, (255, 0, 255), (0, 0, -1)),
+    ]
+    ring = [np.array(start) + 255 * k / steps * np.array(way) for steps, start, way in bands for k in range(steps)]
+    turn = (np.arctan2(-v, -u) / np.pi + 1) / 2 * 55
+    low = int(turn) % 55
+    hue = ring[low] * (1 - turn % 1) + ring[(low + 1) % 55] * (turn % 1)
+    return 255 - np.hypot(u, v) * (255 - hue)
 
 
-@pytest.mark.parametrize(
-    "kind, which, low, expected",
-    [
-        ("scalar", "auto", 1, ("viridis", 1 + 0.005 * 999, 1000 - 0.005 * 999, False)),
-        ("depth", "auto", 1, ("viridis", 1 + 0.005 * 999, 1000 - 0.005 * 999, True)),
-        ("depth", "auto", -10, ("viridis", -10 + 0.005 * 1010, 1000 - 0.005 * 1010, False)),
-        ("signed", "auto", 1, ("RdBu_r", -(1000 - 0.005 * 999), 1000 - 0.005 * 999, False)),
-        ("motion", "x", 1, ("RdBu_r", -(1000 - 0.005 * 999), 1000 - 0.005 * 999, False)),
-        ("unit", "y", 1, ("RdBu_r", -(1000 - 0.005 * 999), 1000 - 0.005 * 999, False)),
-        ("motion", "length", 1, ("viridis", None, None, False)),
-        ("light", "x", 1, ("viridis", 1 + 0.005 * 999, 1000 - 0.005 * 999, False)),
-    ],
-)
-def test_numbers_get_a_bar(kind, which, low, expected):
-    values = np.linspace(low, 1000, 1000)[None]
-    array = values if which == "auto" else np.stack([values, values, np.zeros_like(values)], axis=-1)
-    rgb, said = picture(kind, array, which=which)
-    name, least, most, log = expected
-    assert said["kind"] == "bar" and said["map"] == name and said["log"] is log
-    if least is not None:
-        assert (said["low"], said["high"]) == pytest.approx((least, most))
-    shown = pictures.component(array, which)
-    assert np.array_equal(rgb, map_scalar(shown, name, said["low"], said["high"], log))
-    given, said = picture(kind, array, which=which, colours="turbo", low=2.0, high=5.0)
-    assert (said["map"], said["low"], said["high"]) == ("turbo", 2, 5) and given[0, -1].tolist() == code("turbo", 1.0)
-
-
-def test_where_nothing_is_hit_nothing_is_shown():
-    values = np.r_[RAMP, np.full(99, 1e9)][None]
-    hit = values < 1e6
-    rgb, said = picture("scalar", values, hit=hit)
-    assert said["high"] == pytest.approx(995) and (rgb[~hit] == EMPTY).all() and (rgb[hit] != EMPTY).any(axis=-1).all()
+def test_flow_by_the_published_wheel():
+    dice = np.random.default_rng(0)
+    flow = dice.uniform(-5, 5, (30, 40, 2)).astype(np.float32)
+    rgb = flow_colour(flow, 10.0)
+    for y, x in dice.integers(0, 30, (200, 2)):
+        u, v = np.round(flow[y, x] / 10.0 * 255) / 255
+        np.testing.assert_allclose(rgb[y, x], middlebury(u, v), atol=0.51)

@@ -101,17 +101,6 @@ def test_video_without_pictures(tmp_path):
         VideoWriter(tmp_path / "v.mp4", 47, 64, 25)
 
 
-def test_frames_that_do_not_fit_are_refused_and_closing_twice_is_fine(tmp_path):
-    video = VideoWriter(tmp_path / "v.mp4", 48, 64, 25)
-    for frame in (np.zeros((48, 64), np.uint8), np.zeros((64, 48, 3), np.uint8), np.zeros((48, 64, 3), np.float32)):
-        with pytest.raises(ValueError, match=r"expected uint8 \(48, 64, 3\)"):
-            video.write(frame)
-    video.write(np.zeros((48, 64, 3), np.uint8))
-    for end in (video.close, video.close, video.abort):
-        end()
-    assert len(list(VideoReader(tmp_path / "v.mp4"))) == 1
-
-
 def test_no_ffmpeg(tmp_path, monkeypatch):
     monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: (_ for _ in ()).throw(RuntimeError("No ffmpeg exe")))
     with pytest.raises(OutputError, match="no ffmpeg binary.*use pip install imageio-ffmpeg"):

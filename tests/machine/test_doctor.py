@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import sys
+from types import SimpleNamespace
 
 import pytest
 
 from blinkgl import cli
+from blinkgl.errors import GLError
 from blinkgl.gl import context as context_module, osmesa
 from blinkgl.show import checks as doctor
 from blinkgl.show.doctor import show
@@ -109,3 +111,29 @@ def test_shown_text_is_plain_when_piped(report, capsys):
     for check in report.checks:  # one check, one line
         assert any(check.name in line and check.value[:60] in line for line in shown.splitlines()), check
     assert "All required parts are there." in shown
+
+
+@pytest.mark.parametrize(
+    ("answer", "status", "value", "remedy"),
+    [
+        (("interop", ""), "ok", "they stay on the card: CUDA reads what OpenGL draws", ""),
+        (("pinned", "no cuda-bindings"), "absent", "over the bus: no cuda-bindings", "cuda-bindings"),
+        (("pinned", "cuInit: error 999"), "absent", "over the bus: cuInit: error 999", ""),
+        (GLError("tensors need torch"), "absent", "tensors need torch", "torch"),
+        (OSError("libcudart"), "absent", "OSError: libcudart", ""),
+    ],
+)
+def test_how_frames_go_to_torch(gl, monkeypatch, answer, status, value, remedy):
+    """Of a card's context; there is none here."""
+
+    def reader(*_):
+        if isinstance(answer, Exception):
+            raise answer
+        return SimpleNamespace(way=answer[0], why=answer[1], read=lambda: None, release=lambda: None)
+
+    monkeypatch.setattr("blinkgl.render.tensors.TextureReader", reader)
+    card = SimpleNamespace(is_software=False, framebuffer=gl.framebuffer)
+    check = doctor._to_torch(card, "OpenGL")
+    assert (check.status, check.value) == (status, value)
+    assert remedy in check.remedy and bool(check.remedy) == bool(remedy)
+    assert doctor._to_torch(SimpleNamespace(is_software=True), "OpenGL").status == "info"

@@ -201,14 +201,6 @@ def test_noise_of_a_still_scene_comes_back(tmp_path):
     }
 
 
-@pytest.mark.parametrize("option", ["--flicker", "--edge"])
-def test_scenes_without_frames_are_refused(tmp_path, capsys, option):
-    path = still_recording(tmp_path)
-    assert run(["calibrate", str(path), "--out", str(tmp_path / "out.yaml"), option, "20,0.6"]) == 2
-    line = f"error: {option}: no scene is guessed without frames; expected --frames or --still\n"
-    assert capsys.readouterr().err == line
-
-
 FIVE = range(5)
 
 

@@ -13,12 +13,7 @@ import yaml
 import blinkgl
 from blinkgl import EventChunk, Events, GroundTruth, Picture
 from blinkgl.config.run import load_run
-from blinkgl.dataset import explain as explain_module
-from blinkgl.dataset.explain import explain
 from blinkgl.dataset.generate import generate_run
-from blinkgl.rng import Role, kernel_seed
-from blinkgl.trade.measure import Bench, Options
-from blinkgl.trade.settings import Setting
 
 BUS = {"events_per_second": 20_000, "row_ns": 300, "queue_events": 40}
 DRAWN = {
@@ -111,30 +106,6 @@ def test_every_door_gives_the_same(run, tmp_path):
     )
 
 
-@pytest.mark.parametrize("run", ["linear", "motion"], indirect=True)
-def test_frames_of_a_folder_are_frames_of_any_source(run, tmp_path):
-    """The same pictures given to the simulator of videos, with the sequence's own seed."""
-    from blinkgl.recordings.simulation import frames_to_events
-
-    config = run.sequence(0)
-    frames = [cv2.imread(str(path)) for path in sorted((tmp_path / "clip/image_left").iterdir())]
-    given = ((frame[..., 0], round(k * 1e9 / FPS)) for k, frame in enumerate(frames))
-    events = Events.concatenate(
-        list(
-            frames_to_events(
-                given,
-                emulator=config.events,
-                gamma="srgb",
-                interpolate=config.frames.interpolate,
-                max_px=0.5,
-                readout=config.readout,
-                seed=kernel_seed(config.seed, 0, Role.EVENTS),
-            )
-        )
-    )
-    assert same(blinkgl.record(run).events, events)
-
-
 @pytest.mark.parametrize("run", ["drawn", "linear"], indirect=True)
 def test_pictures_come_after_the_events_until_then(run):
     items = list(blinkgl.simulate_sequence(run, pictures_hz=20, labels=[]))
@@ -146,26 +117,3 @@ def test_pictures_come_after_the_events_until_then(run):
     assert times[0] == 0 and np.diff(times).max() < 0.05 + 1 / 50 + 1e-9
     drawn = items[pictures[0]].velocity is not None
     assert all(items[k].image.dtype == np.float32 and (items[k].velocity is not None) == drawn for k in pictures)
-
-
-@pytest.mark.parametrize("run", ["drawn", "motion"], indirect=True)
-def test_explain_sees_the_events_that_leave_the_sensor(run, monkeypatch):
-    seen = []
-    monkeypatch.setattr(
-        explain_module,
-        "simulate_sequence",
-        lambda *args, _door=explain_module.simulate_sequence, **kwargs: seen.append(_door(*args, **kwargs)) or seen[0],
-    )
-    explain(run)
-    assert seen[0].camera.dropped > 0 and 0 < seen[0].events < seen[0].frames * BUS["queue_events"] * 10
-
-
-@pytest.mark.parametrize("run", ["drawn"], indirect=True)
-def test_trade_judges_what_the_pixels_see(run, gl):
-    """A bus makes events late, which is no error of a setting: it is left out, as noise is."""
-    options = Options(clip_s=0.02, tiles=(2, 2, 16, 12), rounds=1)
-    events = []
-    for tree in (run.tree, {**run.tree, "readout": None}):
-        (measured,) = Bench(gl, type(run)(tree, run.base), options).measure([Setting("displacement 1 px")])
-        events.append(measured.events)
-    assert len(events[0]) == len(events[1]) > 10 and np.array_equal(events[0].t, events[1].t)

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from blinkgl import Camera, ConfigError, Keyframes, Primitive, Scene, look_at, record
-from blinkgl.config.imu import ImuConfig, imu_times
-from blinkgl.io.imu import imu_csv
+from blinkgl import ConfigError
+from blinkgl.config.imu import ImuConfig
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.sequence.inertial import measured, place_of
 
@@ -45,13 +44,6 @@ def test_on_a_circle_it_feels_the_centre_and_the_weight(arm):
     place = np.array([2 + arm[0], arm[1], 0])
     assert np.allclose(got.acceleration, (*(-9 * place[:2]), 9.81), atol=1e-6)
     assert np.array_equal(got.rate, got.ideal_rate) and not got.rate_bias.any()
-
-
-def test_it_measures_in_its_own_axes():
-    config = ImuConfig(rate=10, rotation=(90, 0, 0), gravity=(0, 0, -9.81))
-    got = measured(StaticPath(None, 0, S), config, 0, S, RNG(0))
-    assert np.allclose(got.acceleration, (0, 9.81, 0)), "its y looks along the camera's z"
-    assert len(got.t_ns) == 11 and not got.rate.any()
 
 
 def test_integrated_over_ten_seconds_it_gives_the_flight_back():
@@ -114,23 +106,3 @@ def test_a_camera_whose_velocity_jumps_is_refused_and_one_that_stops_softly_is_n
     turns = Rotation.from_rotvec([(0, 0, 0), (0, 0, 1), (0, 0, 0)])
     with pytest.raises(ConfigError, match="velocity jumps"):
         measured(KeyframePath(knots, 0 * positions, turns, "linear"), ImuConfig(), 0, 2 * S, RNG(0))
-
-
-def test_times_do_not_drift():
-    times = imu_times(300, 5, 5 + 3 * S)
-    assert len(times) == 901 and times[-1] == 5 + 3 * S and times[1] == 5 + 3_333_333
-
-
-def test_in_python_and_as_text(tmp_path):
-    way = Keyframes({0.0: look_at((-3, -0.3, 0), (0, 0, 0)), 0.2: look_at((-3, 0.3, 0.1), (0, 0, 0))})
-    scene = Scene(Camera(16, 12, pose=way), duration=0.05, label_rate=20)
-    scene += Primitive("sphere")
-    got = record(scene, labels=[], imu={"preset": "adis16448", "rate": 400}).imu
-    again = record(scene, labels=[], imu={"preset": "adis16448", "rate": 400}).imu
-    assert got.rate.shape == (41, 3) and np.array_equal(got.rate, again.rate) and got.rate_bias.any()
-    (tmp_path / "imu.csv").write_text(imu_csv(got.t_ns, got.rate, got.acceleration))
-    told = np.loadtxt(tmp_path / "imu.csv", delimiter=",")
-    assert np.array_equal(told, np.column_stack([got.t_ns, got.rate, got.acceleration]))
-    assert record(scene, labels=[]).imu is None
-    with pytest.raises(ConfigError, match="not an inertial unit"):
-        record(scene, imu=3)

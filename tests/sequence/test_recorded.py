@@ -11,7 +11,7 @@ import yaml
 
 from blinkgl.config.run import load_run
 from blinkgl.errors import AssetError, ConfigError
-from blinkgl.sequence import EventChunk, GroundTruth, Picture, simulate_sequence
+from blinkgl.sequence import GroundTruth, simulate_sequence
 from blinkgl.sequence.request import SequenceRequest
 
 H, W, N, FPS = 6, 8, 5, 20
@@ -96,56 +96,10 @@ def test_times_of_frames_do_not_drift(clip, fps):
     assert sequence.frames == 0 and sequence.losses == (0, 0, 0) and sequence.events == 0 and sequence.camera is None
 
 
-def test_what_is_not_asked_for_is_not_there(clip):
-    no_flow = truths(opened(clip, tree={"labels": {"flow": [], "images": True}}, events=False))
-    assert [t.forward_ns for t in no_flow] == [None] * 4 and all(t.frame.images is not None for t in no_flow)
-    bare = truths(opened(clip, tree={"labels": {"flow": ["forward"], "images": False, "occlusion": False}}))
-    assert all(t.frame.images is None for t in bare) and [t.forward_ns is None for t in bare] == [False] * 3 + [True]
-    assert all(t.frame.forward.occluded is None for t in bare[:-1])
-    items = list(opened(clip, labels=False))
-    assert all(isinstance(item, EventChunk) for item in items) and [i.t_ns for i in items] == [
-        k * 50_000_000 for k in range(N)
-    ]
-    for mask in (clip / "flow").glob("*_mask.npy"):
-        mask.unlink()
-    assert all(t.frame.forward.occluded is None for t in truths(opened(clip))[:-1])
-    assert all(t.frame.forward is None for t in truths(opened(clip, frames={"flow": None})))
-
-
-def test_pictures_come_when_they_are_due(clip):
-    """At a frame, the first at or after each multiple; linear light of the frame itself."""
-    for rate, expected in ((20, [0, 1, 2, 3, 4]), (10, [0, 2, 4]), (7, [0, 3]), (1e6, [0, 1, 2, 3, 4])):
-        pictures = [item for item in opened(clip, pictures_hz=rate) if isinstance(item, Picture)]
-        assert [p.t_ns for p in pictures] == [k * 50_000_000 for k in expected]
-    for picture in pictures:
-        code = 40 * (picture.t_ns // 50_000_000 + 1) / 255
-        light = ((code + 0.055) / 1.055) ** 2.4
-        assert picture.image.dtype == np.float32 and picture.image.shape == (H, W) and picture.velocity is None
-        assert picture.image == pytest.approx(light * (0.2126 + 0.7152) + 0.0722 * 9 / 255 / 12.92, rel=1e-4)
-    with pytest.raises(ConfigError, match="pictures_hz: pictures are of event frames, and there are none"):
-        opened(clip, pictures_hz=5, events=False)
-    opened(clip, pictures_hz=None, events=False).close()
-
-
 @pytest.mark.parametrize("given", [{"window_ns": (0, 1)}, {"scene": object()}, {"renderer": object()}])
 def test_nothing_is_drawn_of_them(clip, given):
     with pytest.raises(ConfigError, match="frames: nothing is drawn of recorded frames"):
         opened(clip, **given)
-
-
-@pytest.mark.parametrize(
-    "frames, error, said",
-    [
-        ({"count": 6}, AssetError, r"image_left: too few frames \(got 5\); expected at least 6"),
-        ({"count": 4, "first": 2}, AssetError, r"too few frames \(got 3\); expected at least 4"),
-        ({"first": 3}, AssetError, r"too few frames \(got 2\); expected at least 3"),
-        ({"flow": "flaw"}, AssetError, "flaw: no such folder"),
-        ({"images": "right"}, ConfigError, "frames.images: no such folder"),
-    ],
-)
-def test_what_is_too_little(clip, frames, error, said):
-    with pytest.raises(error, match=said):
-        opened(clip, frames=frames)
 
 
 @pytest.mark.parametrize(
@@ -180,13 +134,6 @@ def test_frames_too_far_apart_are_refused(clip):
         AssetError, match=r"3.png: too far from the next frame .*got '4.24 px'.; expected at most 4.2 px"
     ):
         opened(clip, frames={"max_displacement": 4.2})
-
-
-def test_numbers_of_flow_may_be_shifted_where_none_is_missing(clip):
-    for k in reversed(range(N - 1)):
-        for what in ("flow", "mask"):
-            (clip / f"flow/{k}_{what}.npy").rename(clip / f"flow/{k + 1}_{what}.npy")
-    assert truths(opened(clip))[0].frame.forward.flow[0, 0, 0] == 1
 
 
 @pytest.mark.parametrize("what, shape", [("flow", (H, W + 1, 2)), ("flow", (W, H, 2)), ("mask", (H + 1, W))])

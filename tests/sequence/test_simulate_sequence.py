@@ -9,11 +9,8 @@ import pytest
 import yaml
 
 from blinkgl.config.run import load_run
-from blinkgl.dataset.generate import generate_run
-from blinkgl.errors import ConfigError
 from blinkgl.events import Events
 from blinkgl.gl import create_context
-from blinkgl.io.formats import open_events
 from blinkgl.render.renderer import Renderer
 from blinkgl.sequence import EventChunk, GroundTruth, Picture, simulate_sequence
 from blinkgl.sequence.request import SequenceRequest
@@ -131,42 +128,6 @@ def test_what_is_asked_for_is_what_is_drawn(tmp_path, gl, monkeypatch):
         )
 
 
-# --- its consumers see one and the same -------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {
-            "timeline": {"kind": "uniform", "fps": 110},
-            "events": {"emulator": "esim", "refractory_us": 2000},
-            "readout": {"events_per_second": 3000, "queue_events": 16},
-        },
-        {
-            "sensor": "davis346",
-            "events": {"emulator": "v2e"},
-            "readout": {"events_per_second": 3000, "queue_events": 16},
-        },
-    ],
-    ids=["refractory, read-out", "sensor, v2e, read-out"],
-)
-def test_files_hold_what_happens(tmp_path, gl, changes):
-    config = config_of(tmp_path, **changes)
-    (report,) = generate_run(load_run(tmp_path / "run.yaml"), tmp_path / "out")
-    with simulate_sequence(SequenceRequest(config, 0), gl) as sequence:
-        items = list(sequence)
-    assert_same(events_of(items), open_events(report.path / "events.h5").read())
-    assert sequence.camera.dropped > 0 and (report.events, report.frames, report.labels) == (
-        sequence.events,
-        sequence.frames,
-        sequence.labels,
-    )
-    with np.load(report.path / "poses.npz") as poses:
-        truths = [item for item in items if isinstance(item, GroundTruth)]
-        np.testing.assert_array_equal(poses["T_world_cam"][1:], [t.T_world_cam for t in truths])
-        np.testing.assert_array_equal(poses["T_world_obj"][:, 1:], np.stack([t.T_world_obj for t in truths], axis=1))
-
-
 # --- its end ----------------------------------------------------------------------------------------------------------
 
 
@@ -198,24 +159,6 @@ def test_opengl_is_let_go_however_it_ends(tmp_path, how, monkeypatch):
     else:
         sequence = consume()
         assert released == [sequence.renderer] and sequence.renderer.gl.released
-
-
-def test_a_renderer_that_is_lent_is_not_released(tmp_path, gl):
-    config = config_of(tmp_path)
-    with simulate_sequence(SequenceRequest(config, 0), gl) as sequence:
-        scene = sequence.scene
-    with Renderer(gl, scene, config.render) as renderer:
-        first, second = (
-            list(simulate_sequence(SequenceRequest(config, 0, labels=False, renderer=renderer))) for _ in range(2)
-        )
-        assert_same(events_of(first), events_of(second))
-
-
-def test_it_is_iterated_over_once(tmp_path, gl):
-    sequence = simulate_sequence(SequenceRequest(config_of(tmp_path), 0, events=False), gl)
-    assert len(list(sequence)) == 4
-    with pytest.raises(ConfigError, match="^simulate_sequence: a simulation is iterated over once"):
-        iter(sequence)
 
 
 def test_two_at_once_are_as_one_after_the_other(tmp_path):

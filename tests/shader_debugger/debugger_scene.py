@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 from blinkgl.gl.shader import shader_folder
@@ -144,22 +143,3 @@ LOOKUP_MISTAKES = {
         {"floor"},
     ),
 }
-
-
-class LatePath:
-    """A pose path that is behind by ``late_ns``: a stale pose."""
-
-    def __init__(self, path, late_ns: int):
-        self.path, self.late_ns, self.is_static = path, late_ns, path.is_static
-
-    def pose(self, t_ns: int):
-        return self.path.pose(t_ns - self.late_ns)
-
-    def derivative(self, t_ns: int):
-        return self.path.derivative(t_ns - self.late_ns)
-
-
-def with_stale_pose(scene, name: str, late_ns: int):
-    """The scene with one object where it was ``late_ns`` ago."""
-    late = [replace(o, path=LatePath(o.path, late_ns)) if o.name == name else o for o in scene.objects]
-    return replace(scene, objects=tuple(late))

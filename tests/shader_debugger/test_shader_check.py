@@ -8,23 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from blinkgl.config.run import load_run
-from blinkgl.config.sequence import RenderConfig
-from blinkgl.gl.shader import ShaderError, ShaderLoader, expand, normalised
-from blinkgl.labels import LABELS, LabelRequest
-from blinkgl.render.painter import Painter
-from blinkgl.render.renderer import Renderer
-from blinkgl.scene.build import build_scene
-from blinkgl.shader_debugger import diagnostics, variants
+from blinkgl.gl.shader import expand
 from debugger_scene import edit
-
-PRODUCTION = ("luminance.glsl", "velocity.glsl", "colour.glsl", "label.glsl", "downsample.glsl", "edges.glsl")
-
-
-def scene_of(config, **camera):
-    one = load_run(config, [f"camera.{k}={v}" for k, v in camera.items()]).sequence(0)
-    return build_scene(one.scene, one.camera, one.time.t0_ns, one.time.t1_ns, seed=one.seed)
-
 
 # ------------------------------------------------------------------------------------------------- what compiles
 
@@ -44,44 +29,6 @@ def test_everything_compiles(shader):
         "shadow.glsl": 28,
         "velocity.glsl": 84,
     }
-
-
-def test_the_table_of_variants_is_what_the_renderer_asks_for(gl, config, monkeypatch):
-    """Each label alone and all at once, and every super-sampling, on a scene with several materials."""
-    asked = set()
-    compile_one = ShaderLoader._compile
-
-    def record(self, name, defines):
-        asked.add((name, normalised(defines)))
-        return compile_one(self, name, defines)
-
-    monkeypatch.setattr(ShaderLoader, "_compile", record)
-    monkeypatch.setattr(gl, "shaders", ShaderLoader(gl.ctx))
-    # Linking is enough: llvmpipe compiles at the first draw.
-    monkeypatch.setattr(Painter, "draw", lambda self, uniforms, item: None)
-    world = scene_of(config, width=8, height=6)
-    fields = [name for name, label in LABELS.items() if label.buffer]
-    t = 100_000_000
-    with Renderer(gl, world, RenderConfig(antialiasing="ssaa2", image_antialiasing="ssaa4")) as renderer:
-        renderer.luminance(t), renderer.colour(t), renderer.velocity(t), renderer.velocity(t, 4)
-        with Renderer(gl, world, RenderConfig(antialiasing="taps4")) as tapped:
-            tapped.luminance(t)
-        with Renderer(gl, world, RenderConfig(antialiasing="edges")) as edged:
-            edged.luminance(t)
-        renderer.brightness(t)
-        renderer.brightness(t, 4)
-        for names in (*([name] for name in fields), fields):
-            renderer.labels(t, LabelRequest(*names), t + 10**8, t - 10**8)
-    gl.shaders.clear()
-    table = {(name, normalised(defines)) for name in PRODUCTION for defines in variants.variants(name)}
-    assert asked <= table
-    outputs = {
-        tuple(pair for pair in defines if pair[0].startswith("OUT_")) for name, defines in asked if name == "label.glsl"
-    }
-    assert outputs == {
-        normalised({k: v for k, v in defines.items() if k.startswith("OUT_")})
-        for defines in variants.variants("label.glsl")
-    }  # and none that nobody asks for
 
 
 # ------------------------------------------------------------------------------------------------- what does not
@@ -139,24 +86,6 @@ def test_files_select_programs_and_a_file_elsewhere_brings_its_folder(shader, sh
     assert status == 0 and set(json.loads(out)["programs"]) == {"downsample.glsl", "gather.glsl"}
 
 
-@pytest.mark.parametrize(
-    "log, expected",
-    [
-        ("0:12(5): error: `foo' undeclared", (12, "error")),
-        ('0(12) : error C1503: undefined variable "foo"', (12, "error")),
-        ("ERROR: 0:12: 'foo' : undeclared identifier", (12, "error")),
-    ],
-)
-def test_messages_of_other_drivers(log, expected, tmp_path):
-    (tmp_path / "p.glsl").write_text("\n" * 7 + "float a; // nothing\nvoid main() { float x = foo; }\n\n\n\n")
-    source = expand("p.glsl", "fragment", {}, tmp_path)
-    line = source.text.splitlines().index("void main() { float x = foo; }") + 1
-    said = log.replace("12", str(line), 1)
-    error = ShaderError("x", log=f"GLSL Compiler failed\n\nfragment_shader\n===============\n{said}")
-    found = diagnostics.diagnose(error, {"fragment": source}, tmp_path)[0]
-    assert (found.file, found.line, found.column, found.kind, found.stage) == ("p.glsl", 9, 25, "error", "fragment")
-
-
 # ------------------------------------------------------------------------------------------------- show, preprocessor
 
 
@@ -187,7 +116,6 @@ def test_show_is_what_the_compiler_gets(shader):
         (("check", "--shaders", "TMP"), ["--shaders", "no shaders in this folder"]),
         (("check", "--shaders", "CONFIG"), ["--shaders", "not a folder"]),
         (("check", "--shaders", "OLDER"), ["--shaders", "has no debug.glsl"]),
-        (("time", "CONFIG", "--repeat", "3"), ["shader time: passes are no longer timed"]),
         (("check", "nothing.glsl"), ["nothing.glsl", "label.glsl"]),
         (("check", "--backend", "vulkan"), ["gl.backend", "vulkan"]),
         (("check", "--device", "97", "--backend", "egl"), ["gl"]),

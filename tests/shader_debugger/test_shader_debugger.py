@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,20 +12,18 @@ from scipy.spatial.transform import Rotation
 from blinkgl.camera import PinHole
 from blinkgl.config.run import load_run
 from blinkgl.config.sequence import RenderConfig
-from blinkgl.gl import ShaderLoader, create_context
+from blinkgl.gl import create_context
 from blinkgl.labels import LabelRequest
-from blinkgl.render import appearance, casting
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.geometry.primitives import grid
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Material, Part, Scene, SceneObject, Texture
-from blinkgl.shader_debugger import compare, mipmaps, moments, probe, session, silhouettes
+from blinkgl.shader_debugger import compare, moments, probe, silhouettes
 from blinkgl.shader_debugger.session import DebugRenderer, When, moment, open_renderer, open_subject
-from debugger_scene import HEIGHT, LOOKUP_MISTAKES, MISTAKES, WIDTH, edit, with_stale_pose
+from debugger_scene import HEIGHT, LOOKUP_MISTAKES, MISTAKES, WIDTH, edit
 
-DEMO = str(Path(__file__).parents[2] / "configs/demo.yaml")
 T, T_NEXT, T_LAST = 100_000_000, 200_000_000, 0
 
 
@@ -88,19 +84,6 @@ def test_passes_writes_every_buffer_that_generation_renders(written, world):
     assert not arrays["valid_forward"][labels.ids == 4].any() and (labels.ids == 4).any()  # the pane passes the camera
 
 
-def test_only_the_passes_asked_for(shader, config, tmp_path):
-    status, _out, _ = shader(
-        "passes", config, "--out", tmp_path / "o", "--pass", "depth", "--pass", "colour_uv", "--time", 0.25
-    )
-    assert status == 0 and sorted(p.name for p in (tmp_path / "o").iterdir()) == [
-        "colour_uv.npy",
-        "colour_uv.png",
-        "contact_sheet.png",
-        "depth.npy",
-        "depth.png",
-    ]
-
-
 # ------------------------------------------------------------------------------------------------- against the
 # reference
 
@@ -131,15 +114,6 @@ def test_every_buffer_agrees(both):
     assert np.ptp(gpu["luminance_level"]) > 3 and np.abs(gpu["dL_dt"]).max() > 1
 
 
-def test_debug_pass_draws_the_same_fragments(both):
-    gpu, ref, _, _ = both
-    parts = casting.scene_parts(ref.scene)
-    ids = np.array([thing.instance_id for thing, _ in parts] + [0])
-    np.testing.assert_array_equal(ids[gpu["part"]], gpu["id"])
-    hit = gpu["id"] != 0
-    np.testing.assert_allclose(1 / gpu["window"][..., 3][hit], gpu["depth"][hit], rtol=1e-6)
-
-
 def test_look_ups_are_those_of_the_pass_itself(both):
     """The variant that shows them writes the very picture of the pass, and what it shows makes that picture."""
     gpu, ref, _, _ = both
@@ -152,13 +126,6 @@ def test_look_ups_are_those_of_the_pass_itself(both):
         np.testing.assert_allclose((product if name == "colour" else product[..., 0])[hit], gpu[name][hit], rtol=1e-6)
         np.testing.assert_array_equal(gpu[f"{name}_count"][hit], textured[hit].astype(np.float32))
     np.testing.assert_array_equal(gpu["luminance_uv"], gpu["colour_uv"])
-
-
-def test_the_mip_bias_of_a_configuration_is_no_error(shader, config):
-    status, out, _ = shader(
-        "diff", config, "--set", "render.mip_bias=-1", "--pass", "luminance_level", "--pass", "luminance_albedo"
-    )
-    assert status == 0, out
 
 
 def test_derivative_of_luminance_of_a_sliding_cosine(gl):
@@ -221,32 +188,6 @@ def test_reference_mip_level_of_a_facing_plane():
     assert moments.footprint(points, texels, ray, slopes)[0] == pytest.approx(brute, abs=1e-6)
 
 
-def test_mip_chain_keeps_the_mean_and_level_0_is_the_reference():
-    rng = np.random.default_rng(1)
-    image = rng.uniform(0, 1, (32, 64, 3)).astype(np.float32)
-    texture = Texture(image)
-    chain = mipmaps.mip_chain(texture)
-    assert [level.image.shape[:2] for level in chain] == [(32, 64), (16, 32), (8, 16), (4, 8), (2, 4), (1, 2), (1, 1)]
-    np.testing.assert_allclose(chain[2].image[3, 5], image[12:16, 20:24].mean((0, 1)), atol=1e-6)
-    np.testing.assert_allclose(chain[-1].image[0, 0], image.mean((0, 1)), atol=1e-6)
-    uv = rng.uniform(-2, 2, (50, 2))
-    np.testing.assert_array_equal(
-        mipmaps.sample_trilinear(texture, uv, np.zeros(50)), appearance.sample_bilinear(texture, uv)
-    )
-    np.testing.assert_array_equal(
-        mipmaps.sample_trilinear(texture, uv, np.full(50, -3.0)), appearance.sample_bilinear(texture, uv)
-    )
-    half = mipmaps.sample_trilinear(texture, uv, np.full(50, 1.5))
-    np.testing.assert_allclose(
-        half,
-        (
-            mipmaps.sample_trilinear(texture, uv, np.full(50, 1.0))
-            + mipmaps.sample_trilinear(texture, uv, np.full(50, 2.0))
-        )
-        / 2,
-    )
-
-
 # ------------------------------------------------------------------------------------------------- edges
 
 
@@ -268,59 +209,13 @@ def test_what_edges_puts_together_is_what_its_twin_does(shader, config, tmp_path
     assert status == 1 and "FAIL luminance_edges" in text  # float32
 
 
-def test_pictures_of_edges_are_there_where_the_configuration_filters_so(shader, config):
-    there = lambda *more: silhouettes.edged_of(load_run(config, more).sequence(0))
-    assert there() == ("luminance_edges",)
-    assert there("render.antialiasing=taps4") == there("quality=null") == ()
-    assert there("render.antialiasing=taps4", "render.image_antialiasing=edges") == ("colour_edges",)
-    status, _, error = shader("diff", config, "--set", "render.antialiasing=taps4", "--pass", "luminance_edges")
-    assert status == 2 and "unknown pass (got 'luminance_edges')" in error
-
-
-EDGES_MISTAKES = {
-    # name: (right, wrong, words of the suspicion)
-    "nothing changes": ("change += share * (front - back);", "", "nothing is filtered"),
-    "sign": ("change += share * (front", "change -= share * (front", "what the lines change has the wrong sign"),
-    "the picture is left out": ("LIGHT result = plain + change * whole;", "LIGHT result = change * whole;", ""),
-    "depths from below": ("clamp(place, ivec2(0)", "clamp(ivec2(place.x, image_size.y - 1.0 - place.y), ivec2(0)", ""),
-    "another row of crossings": ("const int ROW = 512;", "const int ROW = 511;", ""),
-    "no focal length": ("uniform float pixel; // 1 / focal length, px", "const float pixel = 1.0;", ""),
-}
-
-
-@pytest.fixture
-def with_shaders(both):
-    """``with_shaders(folder, "luminance_edges")``: reports of the moment drawn with a folder's shaders."""
-    right, _, comparison, _ = both
-    ours = right.renderer.gl.shaders
-
-    def drawn(folder, *names):
-        right.renderer.gl.make_current()
-        right.renderer.use_shaders(ShaderLoader(right.renderer.gl.ctx, session.open_folder(str(folder))))
-        gpu = moments.GpuMoment(right.renderer, right.when, right.log_eps)
-        return [comparison.of(gpu).report(name) for name in names]
-
-    yield drawn
-    right.renderer.use_shaders(ours)
-
-
-@pytest.mark.parametrize("mistake", EDGES_MISTAKES)
-def test_a_mistake_in_edges_is_found(with_shaders, shaders, mistake):
-    right, wrong, suspicion = EDGES_MISTAKES[mistake]
-    edit(shaders / "edges.glsl", right, wrong)
-    (report,) = with_shaders(shaders, "luminance_edges")
-    assert not report.passed and report.objects[0]["over_tolerance"] > 0
-    assert not suspicion or report.suspicions[0].startswith(suspicion)
-
-
 def test_a_mistake_in_edges_is_named_and_can_be_probed(shader, config, shaders):
-    right, wrong, suspicion = EDGES_MISTAKES["sign"]
-    edit(shaders / "edges.glsl", right, wrong)
+    edit(shaders / "edges.glsl", "change += share * (front", "change -= share * (front")
     names = ("--pass", "depth", "--pass", "luminance_edges")
     status, out, _ = shader("diff", config, "--shaders", shaders, *names)
     lines = out.splitlines()
     assert status == 1 and lines[0].startswith("The first that is wrong: luminance, edges (edges.glsl), on ")
-    assert f"it looks as if: {suspicion}" in lines[1]
+    assert "it looks as if: what the lines change has the wrong sign" in lines[1]
     pixel = re.search(r"1 of 2 buffers are over their tolerance; look closer with: probe --pixel (\d+,\d+)", out)[1]
     status, out, _ = shader("probe", config, "--shaders", shaders, "--pixel", pixel)
     assert status == 0 and any(line.startswith("!! luminance, edges") for line in out.splitlines())
@@ -332,7 +227,7 @@ def test_a_mistake_in_edges_is_named_and_can_be_probed(shader, config, shaders):
 FILTERED = ("colour", "luminance", "luminance_edges", "log_luminance", "dL_dt")
 
 
-def test_probe_shows_the_values_of_passes(shader, config, written, world):
+def test_probe_shows_the_values_of_passes(shader, config, written):
     x, y = 35, 40
     status, out, _ = shader("probe", config, "--time", 0.1, "--pixel", f"{x},{y}", "--json")
     found = json.loads(out)
@@ -352,21 +247,6 @@ def test_probe_shows_the_values_of_passes(shader, config, written, world):
     bary = found["surface"]["reference"]["bary"]
     np.testing.assert_allclose(found["surface"]["gpu"]["bary"], bary, atol=1e-3)
     assert sum(bary) == pytest.approx(1) and min(bary) >= 0
-    # the positions hang together: barycentrics -> local -> world -> clip -> pixel
-    scene = world[1]
-    thing = next(o for o in scene.objects if o.name == "ball")
-    mesh = thing.parts[0].mesh
-    local = np.asarray(bary) @ mesh.vertices[mesh.faces[found["surface"]["reference"]["triangle"]]]
-    positions = {row["name"]: row["reference"] for row in found["positions"]}
-    np.testing.assert_allclose(positions["local"], local, atol=1e-12)
-    for label, t in (("t", T), ("t' forward", T_NEXT)):
-        at = thing.path.pose(t)[:3, :3] @ local + thing.path.pose(t)[:3, 3]
-        np.testing.assert_allclose(positions[f"world, {label}"], at, atol=1e-12)
-        X = scene.camera_path.pose(t)[:3, :3].T @ (at - scene.camera_path.pose(t)[:3, 3])
-        np.testing.assert_allclose(positions[f"camera, {label}"], X, atol=1e-12)
-        clip = np.asarray(positions[f"clip, {label}"])
-        pixel = (clip[:2] / clip[3] + 1) / 2 * [WIDTH, HEIGHT] - 0.5
-        np.testing.assert_allclose(pixel, [x, y] if label == "t" else positions["pixel, t' forward"], atol=1e-9)
     for row in found["positions"]:
         if row["gpu"] is not None:
             np.testing.assert_allclose(row["gpu"], row["reference"], atol=1e-4)
@@ -398,13 +278,6 @@ def test_probe_says_why(both, config, shader):
             assert status == 0 and "forward   reference  hidden at t' by box" in out
 
 
-def test_ulps():
-    one = np.float32(1.0)
-    assert probe.ulps(one + np.spacing(one), 1.0) == 1.0 and probe.ulps(one, 1.0) == 0.0
-    assert probe.ulps(np.float32(np.inf), np.inf) == 0.0 and probe.ulps(np.float32(np.nan), 1.0) == np.inf
-    assert probe.ulps(np.array([1, 2], np.float32), np.array([1.0, 2.0 + 4 * np.spacing(np.float32(2))])) == 4.0
-
-
 # ------------------------------------------------------------------------------------------------- diff, and the
 # mistakes
 
@@ -420,40 +293,6 @@ def test_diff_of_the_shipped_shaders_is_clean(shader, config, tmp_path):
     )
     assert (tmp_path / "d" / "diff.png").stat().st_size > 10_000
     assert np.load(tmp_path / "d" / "depth_error.npy").shape == (HEIGHT, WIDTH)
-
-
-def test_a_full_disk_names_the_user_s_file(shader, config, tmp_path, monkeypatch):
-    def full(file, array, **more):
-        raise OSError(errno.ENOSPC, "No space left on device", file.name)
-
-    monkeypatch.setattr(np, "save", full)
-    for command, more in (("passes", ()), ("diff", ("--tolerance", "1"))):
-        status, _, err = shader(command, config, "--pass", "depth", *more, "--out", tmp_path / command)
-        assert (
-            status == 2
-            and err.startswith(f"error: {tmp_path / command}/depth")
-            and "no space left" in err
-            and "blinkgl-tmp" not in err
-        )
-        assert [p.name for p in (tmp_path / command).iterdir()] == []
-
-
-def test_tolerances(shader, config):
-    status, out, _ = shader("diff", config, "--pass", "depth", "--pass", "id", "--tolerance", "depth=0", "--json")
-    report = json.loads(out)
-    assert status == 1 and not report["passed"]
-    assert [(b["buffer"], b["passed"]) for b in report["buffers"]] == [("depth", False), ("id", True)]
-    objects = report["buffers"][0]["objects"]
-    assert {o["object"] for o in objects} == {"floor", "ball", "box", "passing", "nothing hit"}
-    assert [o["max"] for o in objects] == sorted((o["max"] for o in objects), reverse=True)
-    assert sum(o["pixels"] for o in objects) == report["buffers"][0]["off_silhouettes"]["pixels"]
-    assert report["first"]["buffer"] == "depth" and {o["object"] for o in report["objects"]} == {
-        "floor",
-        "ball",
-        "box",
-        "passing",
-    }
-    assert sum(report["buffers"][0]["histogram"].values()) == report["buffers"][0]["off_silhouettes"]["pixels"]
 
 
 EXPECTED = {
@@ -483,17 +322,6 @@ def test_a_broken_shader_is_found(shader, config, shaders, mistake):
     assert status == 0 and any(line[3:].startswith(title) for line in marked)
 
 
-def test_a_stale_pose_is_found_before_all_else(shader, config, monkeypatch):
-    class Stale(DebugRenderer):
-        def __init__(self, gl, scene, render):
-            super().__init__(gl, with_stale_pose(scene, "ball", 20_000_000), render)
-
-    monkeypatch.setattr(session, "DebugRenderer", Stale)
-    status, out, _ = shader("diff", config, "--json")
-    first = json.loads(out)["first"]
-    assert status == 1 and (first["buffer"], first["objects"]) == ("local", ["ball"])
-
-
 @pytest.mark.parametrize("mistake", LOOKUP_MISTAKES)
 def test_a_mistaken_look_up_is_named_as_such(shader, config, shaders, mistake):
     edits, buffer, suspicion, objects = LOOKUP_MISTAKES[mistake]
@@ -509,59 +337,3 @@ def test_a_mistaken_look_up_is_named_as_such(shader, config, shaders, mistake):
     for name in objects:  # one line each, with a pixel to look at
         row = [line for line in lines if line.startswith(f"  {name} ") and moments.PASSES[buffer].title in line]
         assert len(row) == 1 and re.search(r"\(\d+, \d+\)", row[0])
-
-
-@pytest.mark.parametrize(
-    "more",
-    [
-        ("--time", "0.25"),
-        ("--set", "camera.width=61", "--set", "camera.height=47"),
-        ("--set", "render.mip_bias=-1", "--time", "0"),
-        ("--set", "render.antialiasing=taps4", "--time", "0.1"),
-    ],
-)
-def test_right_shaders_raise_no_suspicion(shader, config, more):
-    status, out, _ = shader("diff", config, *more)
-    assert status == 0 and "looks as if" not in out and "FAIL" not in out
-
-
-def pretend(comparison, name: str, wrong: np.ndarray) -> list[str]:
-    """Suspicions if the GPU had written ``wrong``."""
-    gpu = comparison.gpu
-    original = gpu[name]
-    try:
-        gpu._made[name] = wrong
-        return comparison.report(name).suspicions
-    finally:
-        gpu._made[name] = original
-
-
-def test_suspicions_want_evidence(both):
-    _, ref, comparison, _ = both
-    right = ref["flow_forward"]
-    noise = np.random.default_rng(0).normal(0, 1, right.shape)
-    assert pretend(comparison, "flow_forward", right + noise) == []
-    assert pretend(comparison, "flow_forward", right[..., ::-1])[0].startswith("x and y are exchanged")
-    y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
-    camera = ref.scene.camera
-    along = ref["depth"] * np.sqrt(1 + ((x - camera.cx) / camera.fx) ** 2 + ((y - camera.cy) / camera.fy) ** 2)
-    assert pretend(comparison, "depth", along)[0].startswith("distance along the ray")
-
-
-def test_nothing_written_where_the_gpu_says_nan(both):
-    _, ref, comparison, _ = both
-    quantity = compare.QUANTITIES["depth"]
-    broken = comparison.gpu["depth"].copy()
-    y, x = np.argwhere(ref.frame.hit & ~comparison.band)[500]
-    broken[y, x] = np.nan
-    original = comparison.gpu._made["depth"]
-    try:
-        comparison.gpu._made["depth"] = broken
-        report = comparison.report("depth")
-    finally:
-        comparison.gpu._made["depth"] = original
-    assert (
-        report.value == np.inf
-        and report.tolerance == quantity.tolerance
-        and (report.objects[0]["x"], report.objects[0]["y"]) == (x, y)
-    )

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from blinkgl.gl import ShaderLoader
-from blinkgl.render.passes import ScenePass
 from blinkgl.shader_debugger import compare, moments, session
 from blinkgl.shader_debugger.session import moment, open_renderer, open_subject
 from debugger_scene import edit
@@ -81,25 +80,6 @@ def test_every_term_agrees_with_the_reference(looked_at):
         assert 0.05 < there.mean() < 0.9 and reports[name].graded[there].mean() > 0.7
 
 
-def test_terms_make_the_light_and_the_picture(looked_at):
-    gpu, comparison, *_ = looked_at
-    red = comparison.owner("luminance") == comparison.objects.index("box")
-    for of in ("luminance", "colour"):
-        whole = gpu[f"{of}_direct"] * gpu[f"{of}_shadow"] + gpu[f"{of}_around"]
-        np.testing.assert_allclose(whole[red], gpu[f"{of}_light"][red], rtol=1e-5)
-
-
-def test_what_a_scene_has_not_is_not_shown(shader, config, looked_at):
-    """Of the plain scene neither shadows nor disparity, which belongs to two eyes; asked for, both are refused."""
-    subject = open_subject(config)
-    there = moments.buffers_of(subject.scene)
-    lacking = {"disparity", "shadow_map_0", "luminance_shadow", "colour_mirrored", "luminance_emission"}
-    assert not lacking & set(there) and lacking < set(moments.PASSES) and "luminance_direct" in there
-    for name in ("shadow_map_0", "disparity"):
-        status, _, error = shader("diff", config, "--pass", name)
-        assert status == 2 and f"unknown pass (got '{name}')" in error
-
-
 def test_maps_and_terms_as_pictures_and_of_a_pixel(shader, lit, tmp_path):
     names = ("shadow_map_0", "luminance_shadow", "colour_emission")
     asked = [word for name in names for word in ("--pass", name)]
@@ -117,7 +97,6 @@ def test_maps_and_terms_as_pictures_and_of_a_pixel(shader, lit, tmp_path):
 
 LIGHTS, SURFACE, SHADOWS = (f"include/{name}.glsl" for name in ("lights", "surface", "shadows"))
 SUN = "float facing = {}(0.0, dot(n, beam.towards));\n        SHOW(direct, facing * beam.strength)\n#ifdef SHADOW_SUNS"
-OF_MAP = "facing *= shadow_share[map];"
 SKY = "dot(even.xyz, n) + even.w"
 MISTAKES = {
     # name: (file, right, wrong, the first term that is wrong)
@@ -153,10 +132,3 @@ def test_a_mistake_is_named_by_its_term(judge, shaders, mistake):
     gpu.renderer.gl.make_current()
     wrong = judge.wrong(ShaderLoader(gpu.renderer.gl.ctx, session.open_folder(str(shaders))))
     assert wrong and wrong[0] == term, wrong
-
-
-def test_a_map_that_is_drawn_from_the_front_is_found_in_itself(shader, lit, monkeypatch):
-    """Without what turns the culling round: the sides that face the light."""
-    monkeypatch.setattr(session.WholeShadowMap, "paint", ScenePass.paint)
-    status, out, _ = shader("diff", lit, "--json", "--pass", "shadow_map_0")
-    assert status == 1 and json.loads(out)["first"]["buffer"] == "shadow_map_0"

@@ -97,7 +97,7 @@ def test_a_state_goes_on_with_the_other_device(card, kind, config):
         given = torch.from_numpy(frame) if k % 2 else frame
         assert_same(ours.step(given, 1_000_000 * k), theirs.step(frame, 1_000_000 * k), k)
     codes = (clip[0] * 200).clip(0, 255).astype(np.uint8)
-    assert_same(ours.step(codes, 10**10), theirs.step(codes, 10**10), "codes")
+    assert_same(ours.step(codes, 10**7), theirs.step(codes, 10**7), "codes")
 
 
 def test_a_bad_frame_is_said_in_the_same_words(card):

@@ -81,12 +81,6 @@ def test_a_bad_intensity_is_named_and_nothing_changes(value):
         assert_same(ours, theirs, value)
 
 
-def test_minus_zero_is_a_zero():
-    emulator = TensorEsim(4, 6, envs=3)
-    emulator.step(good(value=0.0), 0)
-    assert len(emulator.step(good(value=-0.0), 1000)) == 0
-
-
 @pytest.mark.parametrize(
     ("frames", "t_ns", "says"),
     [
@@ -126,10 +120,3 @@ def test_what_does_not_fit_is_refused():
         emulator.reset(torch.ones(2, dtype=torch.bool))
     with pytest.raises(EventDataError, match="other emulators"):
         emulator.load_state_dict(TensorEsim(4, 6, envs=2).state_dict())
-
-
-def test_frames_that_carry_gradients_are_detached():
-    emulator = TensorEsim(4, 6, envs=3)
-    emulator.step(good().requires_grad_(), 0)
-    events = emulator.step(good(value=0.9).requires_grad_() * 1.0, 1000)
-    assert len(events) and not events.t.requires_grad

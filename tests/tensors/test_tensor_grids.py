@@ -27,14 +27,6 @@ def test_voxel_grids_have_the_bits_of_the_numba_loop(events, bins):
         assert len(chunk) > 100 and np.array_equal(made[k].numpy(), wanted)
 
 
-def test_events_outside_the_window_count_as_nothing(events):
-    made = voxel_grid(events, 2_000, 6_000, 3)
-    for k, chunk in enumerate(events.numpy()):
-        inside = chunk.part((chunk.t >= 2_000) & (chunk.t <= 6_000))
-        assert np.array_equal(made[k].numpy(), grids.voxel_grid(inside, 2_000, 6_000, 11, 17, 3))
-        assert np.array_equal(made[k].numpy(), grids.voxel_grid(chunk, 2_000, 6_000, 11, 17, 3))
-
-
 def test_counts_and_time_surfaces(events):
     counts, latest = event_counts(events), latest_times(events)
     surface = time_surface(latest, torch.tensor([10_000, 8_000, 20_000]), 3_000.0)

@@ -22,6 +22,8 @@ OPTIONS = {
     "defaults": {},
     "noise, causes": _NOISY,
     "all of photoreceptor noise": {**_NOISY, "photoreceptor_noise": True, "start": "balanced"},
+    "long dead time, noise, hot pixels": {**_NOISY, "refractory_us": 20_000},
+    "thresholds apart": {"contrast_threshold_off": 0.3, "threshold_sigma": 0},
     "v2e's noisy": {"preset": "noisy", "causes": True, "start": "zero"},
 }
 

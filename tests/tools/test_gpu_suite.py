@@ -48,6 +48,7 @@ def test_every_piece_runs_here(tmp_path, capsys, monkeypatch):
         # The thresholds differ by pixel, and pixels walk out of the clip's range (in numba
         # alike): the first steps have more events, so how many fit decides the mean.
         assert 0.5 < 1e6 * row["Mev/s"] / row["frames/s"] / (0.1 * 48 * 64) < 1.6
+    assert all(row["frames go by"].startswith("plain") for row in rows["end_to_end"].values())
     page = (tmp_path / "gpu_suite.md").read_text()
     assert "| OpenGL: renderer | info |" in page and page in capsys.readouterr().out
 

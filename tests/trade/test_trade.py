@@ -249,7 +249,6 @@ def test_errors(config, tmp_path, capsys):
     for arguments, message in (
         (["--only", "raytracing"], "--only, --skip: no setting is called that"),
         (["--cost", "euros"], "--cost: unknown cost"),
-        (["--reference", "cycles"], "--reference: scenes are no longer path-traced; expected --reference-set"),
         (["--set", "render.antialiasing=fxaa"], "render.antialiasing"),
     ):
         assert run(["trade", str(config), "-o", str(tmp_path / "x"), *arguments]) == 2

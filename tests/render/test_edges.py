@@ -449,17 +449,3 @@ def test_seams_of_textures(gl):
     inside = np.s_[16:32, 20:28]
     error = {name: rmse(luminance(gl, world, name)[inside], true[inside]) for name in ("taps4", "edges")}
     assert error["edges"] < 0.5 * error["taps4"]
-
-
-def test_a_finer_grid_is_the_mean_of_a_larger_picture(gl):
-    """edges2: lines, taps and shares of a picture of twice the size, then the mean of four."""
-    world, factor = mixed_scene(81, 61), 2
-    camera = world.camera
-    larger = world.with_camera(camera.resized(factor * camera.width, factor * camera.height))
-    t_ns = 100_000_000
-    with Renderer(gl, larger, RenderConfig(antialiasing="edges")) as renderer:
-        fine = renderer.luminance(t_ns).read().astype(np.float64)
-    with Renderer(gl, world, RenderConfig(antialiasing=f"edges{factor}")) as renderer:
-        found = renderer.luminance(t_ns).read()
-    expected = fine.reshape(camera.height, factor, camera.width, factor).mean(axis=(1, 3))
-    np.testing.assert_allclose(found, expected, atol=2e-5 * np.abs(expected).max())

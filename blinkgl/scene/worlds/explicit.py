@@ -163,9 +163,7 @@ def motion_path(
         return StaticPath(pose_matrix(config, camera), t0_ns, t1_ns)
     poses = np.stack([pose_matrix(k, camera) for k in config.keyframes])
     times = [round(k.time * 1e9) for k in config.keyframes]
-    return KeyframePath(
-        times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]), config.interpolation, f"{where}.keyframes"
-    )
+    return KeyframePath(times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]), config.interpolation)
 
 
 def trajectory_path(config: TrajectoryConfig, t0_ns: int, t1_ns: int, where: str, base: Path) -> PosePath:
@@ -191,7 +189,7 @@ def trajectory_path(config: TrajectoryConfig, t0_ns: int, t1_ns: int, where: str
     t_ns, poses = t_ns[first:last], poses[first:last]
     positions, rotations = smoothed(t_ns, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]), aside)
     _check_speeds(config, t_ns, positions, rotations, where)
-    path = KeyframePath(t_ns, positions, rotations, "spline", where)
+    path = KeyframePath(t_ns, positions, rotations)
     return path if config.T_body_sensor is None else OffsetPath(path, _on_body(config.T_body_sensor, where, base))
 
 

@@ -239,7 +239,7 @@ def _motion(
             f"{document.path.name}: jumps in the animation of node '{document.nodes[node].name}' are smoothed"
         )
     poses = np.stack(poses)
-    return KeyframePath(times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]), "spline", document.where), first
+    return KeyframePath(times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3])), first
 
 
 def _with_lights(

@@ -45,7 +45,7 @@ CLOSE, CLOSE_PIXELS = 2e-6, 1e-3
 
 WORLDS: dict[str, dict[str, Any]] = {
     "default": {},
-    "walls, no sky": {"walls": {"count": 3}, "sky": None},
+    "no sky": {"sky": None},
     "no ground, all flying": {"ground": None, "objects": {"count": 5, "flying": 1.0, "tint": 0.0}},
     "crowd": {
         "objects": {"count": 14, "size": [0.4, 1.0], "distance": [1.5, 6], "in_view": 0.5, "flying": 0.3},

@@ -1,4 +1,4 @@
-"""Random worlds: a textured sky box, ground, walls, and objects from a pool, resting or flying, mostly in view.
+"""Random worlds: a textured sky box, ground, and objects from a pool, resting or flying, mostly in view.
 
 After "BlinkFlow" (IROS 2023), section III: random scale, rotation, texture and placement; way-points in free space
 joined by splines; whoever collides stops. The world is z up, in metres, ground at ``ground.height``.
@@ -21,12 +21,12 @@ from blinkgl.config.base import tag_of
 from blinkgl.config.camera import camera_radius
 from blinkgl.config.deform import AnimationConfig, DeformConfig, RandomDeformConfig
 from blinkgl.config.physics import BodyConfig, RandomPhysicsConfig
-from blinkgl.config.scene import RandomSceneConfig, SkyConfig, WallsConfig
+from blinkgl.config.scene import RandomSceneConfig, SkyConfig
 from blinkgl.errors import ConfigError
 from blinkgl.rng import Role, generator
 from blinkgl.scene.geometry.deforming import deforming
 from blinkgl.scene.geometry.meshes import scale_mesh
-from blinkgl.scene.geometry.primitives import cuboid, grid
+from blinkgl.scene.geometry.primitives import grid
 from blinkgl.scene.importing.mesh_files import Asset
 from blinkgl.scene.lights import MAX_LAMPS, make_light, random_lamps
 from blinkgl.scene.motion.body_shapes import Barrier
@@ -156,7 +156,7 @@ class _Room:
 
 
 def _backdrop(config, textures, rng, rng_texture, split, floor, base, log):
-    """([(name, category, parts, pose)] of sky, ground and walls, the panorama on the sky or None)."""
+    """([(name, category, parts, pose)] of sky and ground, the panorama on the sky or None)."""
     backdrop, panorama = [], None
     if config.sky:
         parts, panorama = _sky(config.sky, textures, rng_texture, split, base, log)
@@ -168,8 +168,7 @@ def _backdrop(config, textures, rng, rng_texture, split, floor, base, log):
         texture = textures.draw(rng_texture, split, log)
         material = Material(texture, uv_scale=(repeats, repeats), unlit=config.light.unlit)
         backdrop.append(("ground", "ground", (Part(mesh, material),), _shift(floor)))
-    walls = _walls(config.walls, config, textures, rng, rng_texture, split, floor, log)
-    backdrop += [(f"wall-{k}", "wall", parts, T) for k, (parts, T) in enumerate(walls)]
+    rng.permutation(4)  # chose the sides of walls, which are gone: all that is drawn next stays what it was
     return backdrop, panorama
 
 
@@ -421,7 +420,7 @@ def _bodies(config: RandomPhysicsConfig | None, names: list[str], rng) -> dict[s
 
 
 def _sides(config: RandomSceneConfig, floor: float) -> list[Barrier]:
-    """Of the region, as far out as walls stand, so that no object is in one; its floor where there is no ground."""
+    """Of the region, far enough out that no object is in one; its floor where there is no ground."""
     reach = 0.5 * config.objects.size[1] + _GAP
     out = config.region.width / 2 + reach
     sides = [Barrier((sx, sy, 0.0), -out) for sx, sy in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))]
@@ -444,22 +443,6 @@ def _sky(config: SkyConfig, textures: Pool, rng, split, base, log) -> tuple[tupl
     else:
         images = [textures.draw(rng, split, log)] * len(SKY_SIDES)
     return sky_box(config.size, config.subdivisions, images, brightness, repeats, inset), panorama
-
-
-def _walls(walls: WallsConfig, config: RandomSceneConfig, textures, rng, rng_texture, split, floor, log):
-    """(parts, T_world_wall) of slabs outside the region, far enough for any object whose origin stays inside."""
-    out = config.region.width / 2 + config.objects.size[1] / 2 + walls.thickness / 2 + _GAP
-    for side in rng.permutation(4)[: walls.count]:
-        height, length = float(rng.uniform(*walls.height)), 2 * out
-        mesh = cuboid(extents=(walls.thickness, length, height), subdivisions=8)
-        tile = _log_uniform(rng_texture, walls.tile)
-        material = Material(
-            textures.draw(rng_texture, split, log), uv_scale=(length / tile, height / tile), unlit=config.light.unlit
-        )
-        turn = Rotation.from_rotvec([0, 0, math.pi / 2 * side])
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = np.round(turn.as_matrix()), turn.apply([out, 0, 0]) + [0, 0, floor + height / 2]
-        yield (Part(mesh, material),), T
 
 
 def _shift(z: float) -> np.ndarray:

@@ -279,7 +279,7 @@ def test_the_message_names_what_is_seen_where_and_when(gl, color, background, se
     from blinkgl.config.events import EsimConfig
     from blinkgl.config.sequence import SequenceConfig
     from blinkgl.config.timeline import UniformTimeline
-    from blinkgl.sequence import simulate_sequence
+    from blinkgl.sequence import SequenceRequest, simulate_sequence
 
     wall = thing("wall", 7, quad(0.5, 0.5), still((0, 3, 0), FACING), Material(base_color=color, unlit=True))
     world = replace(scene([wall], background=background), t0_ns=250 * MS, t1_ns=500 * MS)

@@ -19,7 +19,6 @@ from blinkgl.scene.geometry import primitives
 from blinkgl.scene.geometry.meshes import faces_in_float32
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Light, Material, Part, SceneObject, Texture
-from blinkgl.sequence.request import SequenceRequest
 from tests.extremes.measures import FACING
 from tests.render.render_scenes import LEVEL, drift, mesh, quad, rig, scene, smooth_texture, still, thing
 

@@ -152,7 +152,7 @@ def test_mixed_corners_are_refused_when_the_file_is_read(tree, message):
         {
             "scene": {
                 "kind": {"choice": ["random"]},
-                "lights": {"choice": [None, {"saturation": {"uniform": [0, 0.4]}}]},
+                "lights": {"choice": [None, {"kinds": {"choice": [["sun"], ["point"]]}}]},
             }
         },
         {

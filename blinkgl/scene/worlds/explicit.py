@@ -27,10 +27,10 @@ from blinkgl.scene.geometry.tangents import split_mirrored
 from blinkgl.scene.importing.mesh_files import Asset, clip_of, load_asset
 from blinkgl.scene.lights import make_light
 from blinkgl.scene.motion.collision import resolve_collisions
+from blinkgl.scene.motion.curves import path_along_curve
 from blinkgl.scene.motion.dynamics import simulate
 from blinkgl.scene.motion.paths import KeyframePath, OffsetPath, StaticPath, smoothed
 from blinkgl.scene.motion.trajectories import look_rotation
-from blinkgl.scene.motion.ways import way_path
 from blinkgl.scene.reading import contents
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.shapes.deformer import gait
@@ -149,7 +149,7 @@ def _object_path(item: ObjectConfig, parts: Sequence[Part], t0_ns: int, t1_ns: i
         return motion_path(item, t0_ns, t1_ns, where, base)
     speed = way.speed or gait(part.mesh for part in parts)[1] or 1.0
     form = {"closed": way.closed, "level": way.level, "start": way.start}
-    return way_path(way.points, speed, t0_ns, t1_ns, **form, where=f"{where}.way")
+    return path_along_curve(way.points, speed, t0_ns, t1_ns, **form, where=f"{where}.way")
 
 
 def motion_path(

@@ -31,10 +31,10 @@ from blinkgl.scene.importing.mesh_files import Asset
 from blinkgl.scene.lights import MAX_LAMPS, make_light, random_lamps
 from blinkgl.scene.motion.body_shapes import Barrier
 from blinkgl.scene.motion.collision import resolve_collisions
+from blinkgl.scene.motion.curves import random_path_along_curve
 from blinkgl.scene.motion.dynamics import Exploded, simulate
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.motion.trajectories import FreeSpace, look_rotation, random_camera_path, random_path
-from blinkgl.scene.motion.ways import random_way
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.shapes.deformer import filled, gait
 from blinkgl.scene.surfaces.images import SKY_SIDES
@@ -180,7 +180,7 @@ def _object_path(config: RandomSceneConfig, one: _Placed, space: FreeSpace, rng,
         return random_path(rng, t0_ns, t1_ns, config.object_motion, space, one.radius, one.pose, on_ground=turns)
     if speed == 0 or config.object_motion.kind == "static":
         return StaticPath(one.pose, t0_ns, t1_ns)
-    return random_way(rng, t0_ns, t1_ns, space, one.radius, one.pose, speed, flat=goes == "upright")
+    return random_path_along_curve(rng, t0_ns, t1_ns, space, one.radius, one.pose, speed, flat=goes == "upright")
 
 
 def _resolved(objects, falling: set[str], camera_paths: Iterable[PosePath], clearance, t0_ns, t1_ns, log):

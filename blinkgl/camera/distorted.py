@@ -127,11 +127,13 @@ class DistortedModel(CameraModel):
         """Largest angle between the optical axis and what is in the picture, rad, or a little more."""
         rays = self.rays(self._border)
         angles = np.arctan2(np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2])
+        # The border is looked at in steps: what lies between two may be as much larger as they differ.
         return float(angles.max() + np.abs(np.diff(angles, axis=-1)).max())
 
     @cached_property
     def magnification(self) -> float:
         """A displacement d at depth Z > 0 moves the image by at most ``magnification * d / Z`` px."""
+        # Looked at on a grid; between its places it changes by no more than from one to the next.
         x, y = np.linspace(-0.5, self.width - 0.5, _GRID), np.linspace(-0.5, self.height - 0.5, _GRID)
         rays = self.rays(np.stack(np.meshgrid(x, y), axis=-1))
         with np.errstate(divide="ignore", invalid="ignore"):

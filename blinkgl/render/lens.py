@@ -57,6 +57,7 @@ def claims_of(camera: CameraModel, flat: PinHole) -> np.ndarray:
     where none does."""
     places = places_of(camera, flat, camera.width, camera.height).places
     claims = np.full((flat.height, flat.width, 2), 9, np.float32)
+    # The one pixel of the lens that looks through this one of the flat picture claims it; 9 is nobody's.
     nearest = np.floor(places).astype(np.intp)
     claims[nearest[..., 1], nearest[..., 0]] = places - (nearest + np.float32(0.5))
     return claims

@@ -55,6 +55,7 @@ class ArcLengthCurve:
         """((N, 3) places, (N, 3) unit directions) after (N,) units along the curve."""
         s = np.asarray(s, np.float64)
         within = s % self.length if self.closed else np.clip(s, 0, self.length)
+        # The table gives a start; two Newton steps on the length's spline make it exact to rounding.
         u = np.interp(within, self._lengths, self._at)
         for _ in range(2):
             u = np.clip(u - (self._length(u) - within) / np.maximum(self._length(u, 1), 1e-12), 0, self._at[-1])
@@ -77,7 +78,8 @@ def path_along_curve(
     """The motion along a way over [t0, t1]. Raises ConfigError for points that coincide with the next.
 
     points : as of :class:`ArcLengthCurve`.   speed : units/s, > 0.   level : the body's z axis stays up; otherwise its
-    x axis goes up and down with the way, its y axis staying level.   start : share of the way that lies behind at time 0."""
+    x axis goes up and down with the way, its y axis staying level.   start : share of the way that lies behind at
+    time 0."""
     given = np.asarray(points, np.float64)
     after = np.roll(given, -1, axis=0) if closed else given[1:]
     for k in np.flatnonzero(np.abs(after - given[: len(after)]).max(axis=1) < 1e-6):
@@ -90,6 +92,7 @@ def path_along_curve(
     # A step more at both ends: labels look a little beyond.
     times = np.linspace(t0_ns - span / count * 1e9, t1_ns + span / count * 1e9, count + 3).round().astype(np.int64)
     places, ahead = curve.at(start * curve.length + speed * times * 1e-9)
+    # Unwrapped, or a body would turn right round where atan2 jumps from pi to -pi.
     if level:
         heading = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
         turns = Rotation.from_rotvec(heading[:, None] * [0.0, 0.0, 1.0])

@@ -94,6 +94,7 @@ class Skeleton:
     def at(self, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
         """((n, 4, 4), (n, 4, 4)) float64: each joint's transform to the object's frame, and its rate, 1/s. Those of the
         last few times are kept; not to be written to."""
+        # Positions, rates and the vertex stage ask for the same few times, one after the other.
         if t_ns not in self._kept:
             world, rate = np.empty((2, len(self.parents), 4, 4))
             _world(self.parents, self.fixed, *self.motion.locals(t_ns), world, rate)
@@ -127,6 +128,7 @@ def _world(parents, fixed, T, R, S, dT, dR, dS, world, rate):
                 D[r, c] = D[r, c] * S[i, c] + L[r, c] * dS[i, c]
                 L[r, c] *= S[i, c]
             L[r, 3], D[r, 3] = T[i, r], dT[i, r]
+        # fixed stands before the joint's own transform and does not move: it takes transform and rate alike.
         _times(fixed[i], L, F)
         _times(fixed[i], D, G)
         parent = parents[i]
@@ -134,6 +136,7 @@ def _world(parents, fixed, T, R, S, dT, dR, dS, world, rate):
             world[i], rate[i] = F, G
         else:
             _times(world[parent], F, world[i])
+            # (W F)' = W' F + W F': the second term is added below.
             _times(rate[parent], F, rate[i])
             for r in range(4):
                 for c in range(4):

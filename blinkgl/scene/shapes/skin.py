@@ -94,8 +94,10 @@ class Skin(Deformer):
             np.asarray(joints), np.asarray(weights, np.float64), len(self.bones), where
         )
         _check_bones(self.inverse_bind, where)
+        # What does not change with time is multiplied once.
         self._bind = self.inverse_bind @ self.before
         targets = 0 if morphs is None else len(morphs.positions)
+        # A joint's matrix is three rows of four; morph weights are packed four to a row behind them.
         self._rows = 3 * len(self.bones) + -(-targets // 4)
         if self._rows > MAX_ROWS:
             raise AssetError(
@@ -105,6 +107,7 @@ class Skin(Deformer):
                 accepted=f"three per joint and a quarter per target, at most {MAX_ROWS} together",
             )
         moving = [part for part in (skeleton.motion, morphs) if part is not None and not part.is_static]
+        # Joints and targets that repeat at different times have no common period that anybody waits for.
         periods = {part.period_ns for part in moving}
         self.period_ns = periods.pop() if len(periods) == 1 else None
         self.span_ns = max((part.span_ns for part in moving), default=0)
@@ -198,6 +201,7 @@ class Skin(Deformer):
         n = np.asarray(mesh.normals, np.float64)
         if self.morphs is not None:
             n = self._morphed(n, self.morphs.normals, self.morphs.weights(t_ns)[0])
+        # The rows of the cofactor matrix are cross products of the blended matrix's rows: right for any linear map.
         return np.stack([(np.cross(p, q) * n).sum(axis=1) for p, q in ((b, c), (c, a), (a, b))], axis=1)
 
     # ---- the shape, for the vertex stage -------------------------------------------------------------------------
@@ -302,10 +306,12 @@ def _checked_weights(joints: np.ndarray, weights: np.ndarray, bones: int, where:
             value=int(joints[vertex][outside[vertex]][0]),
             accepted=f"0 to {bones - 1}",
         )
+    # Heaviest first, so that what is cut off at the end weighs least.
     order = np.argsort(-weights, axis=1, kind="stable")
     weights, joints = np.take_along_axis(weights, order, 1), np.take_along_axis(np.where(used, joints, 0), order, 1)
     width = min(max(int(used.sum(axis=1).max()), 1), MAX_WEIGHTS)
     weights, joints = weights[:, :width], joints[:, :width].astype(np.int64)
+    # Rounded to what the vertex stage gets: CPU and GPU then follow the same joints by the same parts.
     weights = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32).astype(np.float64)
     return joints, weights
 

@@ -47,8 +47,7 @@ def make_mesh(
     Parameters
     ----------
     vertices : (V, 3) any float, object-local.   faces : (F, 3) any int, counter-clockwise seen from outside.
-    normals : (V, 3) or None: made from the faces, angle-weighted, split where faces meet at more than
-        ``CREASE_DEGREES`` (so a cuboid stays flat and a sphere smooth).
+    normals : (V, 3) or None: made from the faces, angle-weighted, split where faces meet at ``CREASE_DEGREES`` or more.
     uvs : (V, 2), v down, or None: box projection (:func:`box_project`).
     uv_size : edge of one repeat of projected texture coordinates, in the mesh's units; None: the largest side of the
         bounding box, so that the texture covers the mesh once.
@@ -72,24 +71,14 @@ def make_mesh(
 
     points, welded = weld(vertices, faces)
     closed, inside_out = closed_or_nearly(points, welded)  # before slivers go: they close gaps of no width
-    kept = _faces_with_area(vertices, faces)
-    if not kept.any():
-        raise AssetError("the mesh has no faces with an area", where=where, accepted="a mesh with triangles")
-    if not kept.all():
-        if (~kept).mean() > 0.1:  # a few slivers are in almost every file
-            log.append(f"{label}: {int((~kept).sum())} of {len(faces)} faces without area dropped")
-        faces, welded = faces[kept], welded[kept]
-
+    kept = _worth_drawing(vertices, faces, where, label, log)
+    faces, welded = faces[kept], welded[kept]
     if normals is not None and not _usable_normals(normals, vertices, faces):
         log.append(f"{label}: the normals are unusable, made new ones")
         normals = None
-    if uvs_given:
-        broken = uvs is None or not (np.abs(uvs[faces]) < _MAX_REPEATS).all()  # NaN compares false
-        if broken or (project_degenerate and uvs_degenerate(vertices, faces, uvs)):
-            log.append(
-                f"{label}: the texture coordinates are {'broken' if broken else 'degenerate'}, projected new ones"
-            )
-            uvs = None
+    if uvs_given and (wrong := _wrong_coordinates(vertices, faces, uvs, project_degenerate)):
+        log.append(f"{label}: the texture coordinates are {wrong}, projected new ones")
+        uvs = None
 
     # From here on corner attributes, (F, 3, …), joined to vertices at the end.
     corner_normals = crease_normals(vertices, faces, welded) if normals is None else normals[faces]
@@ -129,6 +118,23 @@ def _checked(vertices: np.ndarray, faces: np.ndarray, where: str) -> tuple[np.nd
             accepted="finite coordinates",
         )
     return vertices[used], (np.cumsum(used) - 1)[faces], used
+
+
+def _wrong_coordinates(vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray | None, degenerate: bool) -> str:
+    """What is wrong with texture coordinates, in a word; "" where they can be used. degenerate : is a fault, too."""
+    if uvs is None or not (np.abs(uvs[faces]) < _MAX_REPEATS).all():  # NaN compares false
+        return "broken"
+    return "degenerate" if degenerate and uvs_degenerate(vertices, faces, uvs) else ""
+
+
+def _worth_drawing(vertices: np.ndarray, faces: np.ndarray, where: str, label: str, log: list[str]) -> np.ndarray:
+    """(F,) bool: faces with an area. Raises AssetError where there are none."""
+    kept = _faces_with_area(vertices, faces)
+    if not kept.any():
+        raise AssetError("the mesh has no faces with an area", where=where, accepted="a mesh with triangles")
+    if (~kept).mean() > 0.1:  # a few slivers are in almost every file
+        log.append(f"{label}: {int((~kept).sum())} of {len(faces)} faces without area dropped")
+    return kept
 
 
 def _faces_with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

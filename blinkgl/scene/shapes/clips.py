@@ -129,13 +129,15 @@ class Clip:
     def locals(self, t_ns: int) -> Locals:
         time, speed = self.playing.at(t_ns)
         out = self.rest.copy()
-        _evaluate(time, speed, self._joint, self._path, self._kind, self._first, self._times, self._values, *out)
+        _evaluate(time, speed, self._joint, self._path, self._kind, self._first, self._times, self._values, out)
         return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _evaluate(time, speed, joint, path, kind, first, times, values, T, R, S, dT, dR, dS):
-    """Writes what the tracks give at a time of the clip, and rates per second of the sequence's clock."""
+def _evaluate(time, speed, joint, path, kind, first, times, values, out):
+    """Writes what the tracks give at a time of the clip into ``out``, :class:`Locals`, and rates per second of the
+    sequence's clock."""
+    T, R, S, dT, dR, dS = out
     value, rate = np.zeros(4), np.zeros(4)
     for track in range(len(joint)):
         begin, end = first[track], first[track + 1]

@@ -449,3 +449,17 @@ def test_seams_of_textures(gl):
     inside = np.s_[16:32, 20:28]
     error = {name: rmse(luminance(gl, world, name)[inside], true[inside]) for name in ("taps4", "edges")}
     assert error["edges"] < 0.5 * error["taps4"]
+
+
+@pytest.mark.parametrize("subdivisions, dents", [(4, 0.01), (5, 0.005)])
+def test_small_triangles_do_not_flicker(gl, subdivisions, dents):
+    """All lines of a pixel mean the same two surfaces, whichever way they run: an outline of steps of 0.7 and 0.35 px
+    has about the error of a smooth one, and no more of it changes from frame to frame when frames come closer."""
+    world = rough_ball(subdivisions, dents)
+    times = [int(k * (SECOND // 40)) for k in range(5)]  # a seventh of a pixel each
+    true = np.stack([finest(gl, world, 8, t) for t in times])
+    off = {name: np.stack([luminance(gl, world, name, t) for t in times]) - true for name in ("none", "edges")}
+    assert rmse(off["edges"], 0) < 0.45 * rmse(off["none"], 0)
+    for step in (1, 2):
+        change = {name: rmse(np.diff(error[::step], axis=0), 0) for name, error in off.items()}
+        assert change["edges"] < 0.45 * change["none"]

@@ -106,7 +106,9 @@ class Panorama(NamedTuple):
     brightness: float
 
 
-def drawn_panorama(config: SkyConfig, rng, split, test_fraction, base, brightness: float) -> Panorama:
+def drawn_panorama(
+    config: SkyConfig, rng: np.random.Generator, split: str, test_fraction: float, base: Path, brightness: float
+) -> Panorama:
     """A panorama of this split, turned to a random heading."""
     files = []
     for i, given in enumerate(config.panoramas):

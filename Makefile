@@ -73,8 +73,6 @@ setup: .venv/.installed-dev opengl
 	@$(INSTALL) -e .
 	@touch $@
 
-# pyrender, the independent renderer some tests compare with, asks for PyOpenGL 3.1.0, which does not run on Python 3.13: hence
-# --no-deps and what it needs by name. Where that fails those tests are skipped and say so.
 .venv/.installed-dev: .venv/.installed-core
 	@echo "installing the test tools into .venv"
 	@$(INSTALL) -e '.[dev]'
@@ -82,8 +80,6 @@ setup: .venv/.installed-dev opengl
 	@$(INSTALL) -e '.[onnx]' || echo "ONNX could not be installed: the tests of eflow export will be skipped"
 	@$(INSTALL) -e '.[cluster]' || echo "Ray could not be installed: the tests of the Ray executor will be skipped"
 	@$(INSTALL) -e '.[physics]' || echo "MuJoCo could not be installed: the tests of falling bodies will be skipped"
-	@$(INSTALL) --no-deps pyrender PyOpenGL==3.1.10 freetype-py pyglet six \
-		|| echo "pyrender could not be installed: the comparisons with it will be skipped"
 	@touch $@
 
 # The tests build the site, too: a dead link is an error.

@@ -13,8 +13,6 @@ def pytest_configure(config: pytest.Config) -> None:
     # Under xdist there is one process per core already: more llvmpipe and numba threads would only fight over them.
     if os.environ.get("PYTEST_XDIST_WORKER"):
         os.environ.setdefault("LP_NUM_THREADS", "0")
-    # pyrender imports its viewer's pyglet, which fails where there is only half of X11.
-    os.environ.setdefault("PYGLET_HEADLESS", "1")
     # Runs of the tests count as one build, although somebody may be editing the code while they are on. (From the
     # start: a process looks once.)
     os.environ["BLINKGL_BUILD"] = "tests"

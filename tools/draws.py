@@ -45,7 +45,7 @@ CLOSE, CLOSE_PIXELS = 2e-6, 1e-3
 
 WORLDS: dict[str, dict[str, Any]] = {
     "default": {},
-    "walls, no sky": {"walls": {"count": 3}, "sky": None},
+    "no sky": {"sky": None},
     "no ground, all flying": {"ground": None, "objects": {"count": 5, "flying": 1.0, "tint": 0.0}},
     "crowd": {
         "objects": {"count": 14, "size": [0.4, 1.0], "distance": [1.5, 6], "in_view": 0.5, "flying": 0.3},
@@ -210,7 +210,7 @@ def shapes() -> dict[str, Any]:
     said = {kind: told_mesh(BUILDERS[kind](**keys)) for kind, keys in other.items()}
     for kind in ("cuboid", "sphere", "prism", "torus"):
         mesh = BUILDERS[kind](**other[kind])
-        for name, keys in {"creased": {}, "sharp": {"crease_degrees": 10.0}, "tiled": {"uv_size": 0.37}}.items():
+        for name, keys in {"creased": {}, "tiled": {"uv_size": 0.37}}.items():
             said[f"{kind} {name}"] = told_mesh(make_mesh(mesh.vertices, mesh.faces, **keys))
     return said
 

@@ -26,7 +26,7 @@ from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.motion.paths import StaticPath
-from blinkgl.scene.worlds.from_file import from_gltf
+from blinkgl.scene.worlds.from_file import from_document
 
 PROGRAM = Path(__file__).with_name("inside") / "convert.py"
 ENDINGS = (".blend", ".fbx", ".usd", ".usda", ".usdc", ".usdz", ".dae", ".abc", ".obj")
@@ -165,13 +165,11 @@ def _read_back(path: Path, out: Path) -> tuple[str, ...]:
     """Loads the GLB as a scene; what is not drawn of it, under its final name. AssetError when it cannot be loaded."""
     still = StaticPath(np.eye(4), 0, 1)
     try:
-        document = gltf.read(path)
+        document = gltf.read(path, max_faces=_MOST_FACES, max_texture=16384)
         if all(node.mesh is None for node in document.nodes.values()):  # a clip for a figure of another file
             document.tracks(0)
             return ()
-        scene = from_gltf(
-            path, PinHole.centred(32, 32, 32.0), 0, 1, camera_path=still, max_faces=_MOST_FACES, max_texture=16384
-        )
+        scene = from_document(document, PinHole.centred(32, 32, 32.0), 0, 1, camera_path=still)
     except BlinkGLError as error:
         raise AssetError(f"what Blender wrote cannot be read ({error.problem})", where=str(out)) from error
     return tuple(line.replace(path.name, out.name) for line in scene.omissions)

@@ -17,7 +17,6 @@ STEPS = 100
 """Steps of a solver at most; five or six are usual, halving brackets takes about sixty where the derivative
 vanishes."""
 _GRID = 33  # places along either side of the picture where the magnification is looked at
-_SIDE = 65  # points along either side of the rectangle whose image bounds a body
 
 
 def radius_limit(coefficients: tuple[float, ...]) -> float:
@@ -128,11 +127,13 @@ class DistortedModel(CameraModel):
         """Largest angle between the optical axis and what is in the picture, rad, or a little more."""
         rays = self.rays(self._border)
         angles = np.arctan2(np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2])
+        # The border is looked at in steps: what lies between two may be as much larger as they differ.
         return float(angles.max() + np.abs(np.diff(angles, axis=-1)).max())
 
     @cached_property
     def magnification(self) -> float:
         """A displacement d at depth Z > 0 moves the image by at most ``magnification * d / Z`` px."""
+        # Looked at on a grid; between its places it changes by no more than from one to the next.
         x, y = np.linspace(-0.5, self.width - 0.5, _GRID), np.linspace(-0.5, self.height - 0.5, _GRID)
         rays = self.rays(np.stack(np.meshgrid(x, y), axis=-1))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -155,34 +156,6 @@ class DistortedModel(CameraModel):
         left, right, top, bottom = self.plane_edges
         planes = np.array([[1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom], [0, 0, 1]], float)
         return planes / np.linalg.norm(planes, axis=1, keepdims=True)
-
-    def bounds(self, points: np.ndarray) -> tuple[int, int, int, int] | None:
-        """Pixels that the hull can touch: those of the rectangle that holds its picture by a pin-hole camera."""
-        whole = (0, 0, self.width, self.height)
-        if self.plane_edges is None:
-            return whole
-        if points[:, 2].min() <= self.near:
-            return whole if points[:, 2].max() > self.near else None
-        left, right, top, bottom = self.plane_edges
-        flat = points[:, :2] / points[:, 2:]
-        low, high = np.maximum(flat.min(axis=0), [left, top]), np.minimum(flat.max(axis=0), [right, bottom])
-        if (low > high).any():
-            return None
-        u, v = np.linspace(low[0], high[0], _SIDE), np.linspace(low[1], high[1], _SIDE)
-        one = np.ones(_SIDE)
-        sides = np.stack(
-            [
-                np.stack([*s, one], axis=-1)
-                for s in ((u, low[1] * one), (u, high[1] * one), (low[0] * one, v), (high[0] * one, v))
-            ]
-        )
-        seen = self.project(sides)
-        if not np.isfinite(seen).all():  # a corner of the rectangle lies beyond what the model sees
-            return whole
-        (x_low, y_low), (x_high, y_high) = _extremes(seen)
-        x0, x1 = max(0, math.floor(x_low) - 1), min(self.width, math.ceil(x_high) + 2)
-        y0, y1 = max(0, math.floor(y_low) - 1), min(self.height, math.ceil(y_high) + 2)
-        return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
 
 
 def largest_stretch(J: np.ndarray) -> np.ndarray:

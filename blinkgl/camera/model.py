@@ -102,12 +102,6 @@ class CameraModel(ABC):
         """(n, 3) inward unit normals, camera axes, of planes through the centre: what is in the picture is on the
         inner side of each."""
 
-    @abstractmethod
-    def bounds(self, points: np.ndarray) -> tuple[int, int, int, int] | None:
-        """(x0, y0, x1, y1): pixels x0 <= x < x1, y0 <= y < y1 are all that the convex hull of (n, 3) points can
-        touch, with a pixel to spare on
-        every side. The whole image where the hull meets the near plane; None when it is out of the picture."""
-
     @property
     def px_per_slope(self) -> float:
         """How far, px, the image of a point moves at most when (X / Z, Y / Z) changes by a step of length 1."""

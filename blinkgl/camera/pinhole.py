@@ -93,7 +93,10 @@ class PinHole(CameraModel):
         return planes / np.linalg.norm(planes, axis=1, keepdims=True)
 
     def bounds(self, points: np.ndarray) -> tuple[int, int, int, int] | None:
-        """Of a convex body in front of the camera the corners are seen farthest out."""
+        """(x0, y0, x1, y1): pixels x0 <= x < x1, y0 <= y < y1 are all that the convex hull of (n, 3) points can touch,
+        with a pixel to spare on every side. The whole image where the hull meets the near plane; None when it is out of
+        the picture."""
+        # Of a convex body in front of the camera the corners are seen farthest out.
         z = points[:, 2]
         if z.min() <= self.near:
             return (0, 0, self.width, self.height) if z.max() > self.near else None

@@ -51,8 +51,8 @@ class PhysicsConfig(Config):
 
 
 class RandomPhysicsConfig(PhysicsConfig):
-    """Of a random world: a share of the objects is dropped where it was placed, or thrown. They meet the ground, the
-    walls, each other, objects on their trajectories and the camera's clearance, and stay in the region: its sides hold
+    """Of a random world: a share of the objects is dropped where it was placed, or thrown. They meet the ground,
+    each other, objects on their trajectories and the camera's clearance, and stay in the region: its sides hold
     them back, seen or not."""
 
     max_speed: float = Field(50.0, gt=0, le=1e4, description="m/s; an object that comes to be faster is left out")

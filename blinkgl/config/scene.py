@@ -136,16 +136,6 @@ class GroundConfig(Config):
     tile: PositiveRange = Field((2.0, 8.0), description="edge of one texture repeat, m; log-uniform")
 
 
-class WallsConfig(Config):
-    """Textured vertical slabs on the sides of the region."""
-
-    count: int = Field(0, ge=0, le=4, description="how many of the region's four sides have a wall")
-    height: PositiveRange = Field((1.5, 5.0), description="m; uniform")
-    thickness: ClassVar = 0.3
-    fixed: ClassVar = ("thickness",)
-    tile: PositiveRange = Field((2.0, 6.0), description="edge of one texture repeat, m; log-uniform")
-
-
 class RegionConfig(Config):
     """Box in which the camera and the objects live, centred on the z axis, standing on the ground."""
 
@@ -166,9 +156,6 @@ class RandomSceneConfig(Config):
     region: RegionConfig = RegionConfig()
     sky: SkyConfig | None = Field(SkyConfig(), description="null: none, the background is seen")
     ground: GroundConfig | None = Field(GroundConfig(), description="null: none; then every object flies")
-    walls: Annotated[WallsConfig, BeforeValidator(lambda v: WallsConfig(count=4 * v) if isinstance(v, bool) else v)] = (
-        Field(WallsConfig(), description="true: four walls")
-    )
     light: LightConfig = LightConfig()
     fog: FogConfig | None = FOG
     lights: RandomLightsConfig | None = Field(
@@ -181,6 +168,12 @@ class RandomSceneConfig(Config):
         0.3, gt=0, le=1e4, description="radius of the sphere round the camera centre that touches nothing, m"
     )
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
+    removed: ClassVar = {
+        "walls": Removed(
+            "a scene: {kind: explicit} with objects of category: wall",
+            lambda value: value is False or (isinstance(value, dict) and not value.get("count")),
+        )
+    }
 
     @rule("?lights", "sky.lights", "light.unlit", "?light.environment")
     def _lit(lights, sky_lights, unlit, environment):

@@ -106,8 +106,11 @@ class Drawn(Protocol):
 
 
 class Label:
-    """One kind of ground truth. ``name``, ``reference`` and ``tolerance`` have to be said; a label of the
-    shader says ``buffer``, and ``glsl``.
+    """One kind of ground truth.
+
+    A label that the shader draws says ten things and nothing else: ``name``, ``about``, ``unit``; ``buffer``, ``glsl``,
+    ``varyings``, ``channels`` and ``uniforms``; ``reference`` and ``tolerance``. All the rest has a default, and is for
+    labels that are made of others, lead to another time, lie on disk in several forms, or are no picture.
 
     What it is called
         name : key of ``labels:`` (unless ``asked`` looks at another), folder, attribute of a

@@ -8,7 +8,6 @@ import shlex
 import sys
 
 EXTRAS = {  # extra of setup.cfg -> (distributions, what they are for)
-    "check": (("pyrender",), "an independent renderer to compare with"),
     "cycles": (
         ("bpy",),
         "Blender: blinkgl import; better in an environment of its own, see docs/install.md",
@@ -20,7 +19,6 @@ EXTRAS = {  # extra of setup.cfg -> (distributions, what they are for)
     "physics": (("mujoco",), "scenes in which things fall"),
     "formats": (("faery",), "checks of EVT2 and EVT3, which need nothing"),
     "viz": (("rerun-sdk",), "3D viewer"),
-    "urdf": (("pybullet",), "its random meshes as an object pool"),
     "docs": (("zensical", "mkdocstrings", "towncrier"), "the documentation as a site"),
     "dev": (("pytest", "pytest-xdist", "hypothesis", "build"), "tests and packaging"),
 }

@@ -166,7 +166,16 @@ def _holes_of(part: Part) -> Holes | None:
     return Holes(uvs, mask.alpha.astype(np.float32) / np.float32(255), mask.threshold, part.material.wrap)
 
 
-def nearest(scene, t_ns, rays, far=None, skip=None, eye=None, near=None, any_will_do=False):
+def nearest(
+    scene: Scene,
+    t_ns: int,
+    rays: np.ndarray,
+    far: np.ndarray | None = None,
+    skip: np.ndarray | None = None,
+    eye: np.ndarray | None = None,
+    near: float | None = None,
+    any_will_do: bool = False,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (hit (N, 3) int32, bary (N, 3), depth (N,)) as described at :func:`raycast.nearest_tree`. eye, near :
     of other rays than the camera's: (4, 4) pose where they come from, Z at which they begin.   any_will_do : as
     there."""
@@ -196,7 +205,7 @@ def nearest(scene, t_ns, rays, far=None, skip=None, eye=None, near=None, any_wil
     return hit, bary, depth
 
 
-def by_part(part: np.ndarray):
+def by_part(part: np.ndarray) -> list[tuple[int, np.ndarray]]:
     """Return (p, indices of the points on part p) for every part that was hit."""
     return [(int(p), np.flatnonzero(part == p)) for p in np.unique(part) if p >= 0]
 

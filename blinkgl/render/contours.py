@@ -15,7 +15,7 @@ surface itself, and its line runs back along others that are seen: it is one of 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numba as nb
 import numpy as np
@@ -106,6 +106,17 @@ def _edges(faces: np.ndarray, places: int) -> np.ndarray:
     return np.ascontiguousarray(np.column_stack([ends[lead], face[lead], second]), np.int32)
 
 
+class _Arrays(NamedTuple):
+    """Of a pool, for kernels."""
+
+    starts: np.ndarray
+    places: np.ndarray
+    faces: np.ndarray
+    planes: np.ndarray
+    edges: np.ndarray
+    sharp: np.ndarray
+
+
 class _Pool:
     """Contours one behind the other: places, faces, planes, edges, sharp as theirs, with numbers that count on.
 
@@ -173,10 +184,9 @@ class Lines:
         room = int((pool.starts[numbers + 1, 2] - pool.starts[numbers, 2]).sum())
         if room > len(self._lines):
             self._lines = np.empty((2 * room, LINE))
-        count = _emit(
-            numbers, bodies, culled, moment.T_cam_obj, moment.mvp, pool.starts, pool.places, pool.faces, pool.planes,
-            pool.edges, pool.sharp, float(width), float(height), self._lines,
-        )  # fmt: skip
+        arrays = _Arrays(pool.starts, pool.places, pool.faces, pool.planes, pool.edges, pool.sharp)
+        poses = moment.T_cam_obj, moment.mvp
+        count = _emit(numbers, bodies, culled, *poses, arrays, float(width), float(height), self._lines)
         return self._lines[:count]
 
     def in_pixels(
@@ -212,9 +222,10 @@ def _planes(places, faces, out):
 
 
 @nb.njit(cache=True, nogil=True)
-def _emit(numbers, bodies, culled, T_cam_obj, mvps, starts, places, faces, planes, edges, sharp, width, height, out):
+def _emit(numbers, bodies, culled, T_cam_obj, mvps, pool, width, height, out):
     """Write the lines of all items and return their number. numbers, bodies, culled : of each item, its contour's
     place in the pool, its object's, and whether the backs of its faces are not drawn."""
+    starts, planes = pool.starts, pool.planes
     front = np.empty(len(planes), np.bool_)
     # np.int64(0), because a literal 0 would compile _emit_one for a second type.
     count = np.int64(0)
@@ -227,17 +238,17 @@ def _emit(numbers, bodies, culled, T_cam_obj, mvps, starts, places, faces, plane
         for f in range(starts[number, 1], starts[number + 1, 1]):
             # The camera lies on the outer side of the face's plane.
             front[f] = planes[f, 0] * x + planes[f, 1] * y + planes[f, 2] * z > planes[f, 3]
-        mine = edges[starts[number, 2] : starts[number + 1, 2]]
-        torn = sharp[starts[number, 2] : starts[number + 1, 2]]
-        count = _emit_one(
-            mvps[bodies[n]], places, faces, planes, mine, torn, front, culled[n], width, height, out, count
-        )
+        mine = starts[number, 2], starts[number + 1, 2]
+        count = _emit_one(mvps[bodies[n]], pool, mine, front, culled[n], width, height, out, count)
     return count
 
 
 @nb.njit(cache=True, nogil=True)
-def _emit_one(mvp, places, faces, planes, edges, sharp, front, culled, width, height, out, count):
-    """Append the lines of one item to the first ``count``, and return the new number."""
+def _emit_one(mvp, pool, mine, front, culled, width, height, out, count):
+    """Append the lines of one item, whose edges are ``mine`` of the pool's, to the first ``count``, and return the new
+    number."""
+    places, faces, planes = pool.places, pool.faces, pool.planes
+    edges, sharp = pool.edges[mine[0] : mine[1]], pool.sharp[mine[0] : mine[1]]
     ends = np.empty((2, 4))
     for e in range(len(edges)):
         # Kinds and directions from which faces are seen.

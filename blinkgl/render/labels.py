@@ -101,6 +101,7 @@ class Labels:
         if key not in self._kept:
             frame = self._drawn(names, t_ns, {})
             self._kept[key] = {name: frame.read(name) for name in names}
+            # Neighbouring labels look at the same moments; the oldest goes first.
             while len(self._kept) > KEPT:
                 self._kept.pop(next(iter(self._kept)))
         return self._kept[key]

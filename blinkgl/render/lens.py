@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from blinkgl.camera.drawing import seen_through
-from blinkgl.render.rectangles import Rectangle
 
 if TYPE_CHECKING:
     import moderngl
@@ -58,6 +57,7 @@ def claims_of(camera: CameraModel, flat: PinHole) -> np.ndarray:
     where none does."""
     places = places_of(camera, flat, camera.width, camera.height).places
     claims = np.full((flat.height, flat.width, 2), 9, np.float32)
+    # The one pixel of the lens that looks through this one of the flat picture claims it; 9 is nobody's.
     nearest = np.floor(places).astype(np.intp)
     claims[nearest[..., 1], nearest[..., 0]] = places - (nearest + np.float32(0.5))
     return claims
@@ -131,14 +131,6 @@ class Lens:
             uniforms["lens_limit"].value = self.camera.plane_limit  # type: ignore[missing-attribute]
         if "lens_k" in uniforms:
             uniforms["lens_k"].value = self._numbers[: uniforms["lens_k"].array_length]
-
-    def rectangle(self, flat: Rectangle) -> Rectangle | None:
-        """Pixels of the lens's picture that can look at these of the flat one."""
-        x, y = np.array([flat.x0, flat.x1, flat.x0, flat.x1]), np.array([flat.y0, flat.y0, flat.y1, flat.y1])
-        step = np.array([[-1.5, -1.5], [0.5, -1.5], [-1.5, 0.5], [0.5, 0.5]])  # neighbours are looked at
-        rays = self.flat.rays(np.stack([x, y], axis=1) + step)
-        bounds = self.camera.bounds(rays * (2 * self.camera.near))
-        return None if bounds is None else Rectangle(*bounds)
 
     def release(self) -> None:
         for texture in self._textures.values():

@@ -13,10 +13,6 @@ class Rectangle(NamedTuple):
     x1: int
     y1: int
 
-    @property
-    def area(self) -> int:
-        return (self.x1 - self.x0) * (self.y1 - self.y0)
-
     def meets(self, other: Rectangle) -> bool:
         return self.x0 < other.x1 and other.x0 < self.x1 and self.y0 < other.y1 and other.y0 < self.y1
 

@@ -131,9 +131,11 @@ def _of_surfaces(scene: Scene, points: int, times: list[int], rng: np.random.Gen
     for _ in range(_DRAWS):
         if not len(ends) or ends[-1] <= 0:
             break
+        # Half of what is drawn evenly on closed bodies faces away.
         draws = 2 * left
         chosen = places_[np.minimum(np.searchsorted(ends, rng.random(draws) * ends[-1], side="right"), len(ends) - 1)]
         u, v = rng.random((2, draws))
+        # The far half of the parallelogram is folded back: even over the triangle.
         u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
         ids = np.array([thing.instance_id for thing, _ in parts], np.int32)[chosen[:, 0]]
         nothing = np.zeros(draws)

@@ -154,6 +154,7 @@ def beam(lamp: Lamp, pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, 
     towards = way / distance[:, None]
     fall = distance**-2.0
     if math.isfinite(lamp.reach):
+        # KHR_lights_punctual's window: 0 at the reach, and unchanged nearby.
         fall = fall * np.maximum(0.0, 1.0 - (distance / lamp.reach) ** 4)
     if lamp.kind == "spot":
         scale, offset = lamp.cone

@@ -20,7 +20,7 @@ from blinkgl.camera import PinHole
 from blinkgl.errors import BlinkGLError
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.motion.paths import StaticPath
-from blinkgl.scene.worlds.from_file import from_gltf
+from blinkgl.scene.worlds.from_file import from_document
 
 pytestmark = pytest.mark.skipif(bool(process.available()), reason=process.available() or "there")
 BUILDER = Path(__file__).with_name("build_scenes.py")
@@ -81,7 +81,7 @@ def drawn(came: Came, camera: str | None = None):
     """What BlinkGL's own importer makes of it."""
     size, end = PinHole.centred(64, 48, 60.0), round(came.report.duration_s * NS)
     still = None if camera else StaticPath(np.eye(4), 0, end)
-    return from_gltf(came.path, size, 0, end, camera_name=camera, camera_path=still)
+    return from_document(gltf.read(came.path), size, 0, end, camera_name=camera, camera_path=still)
 
 
 def places(scene, name: str | None, t: float) -> np.ndarray:

@@ -15,8 +15,9 @@ from scipy.spatial import cKDTree
 from shared_data import shared
 
 from blinkgl.camera import PinHole
+from blinkgl.scene.importing import gltf
 from blinkgl.scene.motion.paths import StaticPath
-from blinkgl.scene.worlds.from_file import from_gltf
+from blinkgl.scene.worlds.from_file import from_document
 
 GOLDEN = np.load(Path(__file__).parents[1] / "golden" / "mannequins.npz")
 NS = 1_000_000_000
@@ -25,7 +26,9 @@ NS = 1_000_000_000
 def drawn(path: Path, times: np.ndarray) -> np.ndarray:
     """(T, V, 3) by BlinkGL's importer."""
     end, found = round(times[-1] * NS), []
-    scene = from_gltf(path, PinHole.centred(160, 120, 150.0), 0, end, camera_path=StaticPath(np.eye(4), 0, end))
+    scene = from_document(
+        gltf.read(path), PinHole.centred(160, 120, 150.0), 0, end, camera_path=StaticPath(np.eye(4), 0, end)
+    )
     for t in times:
         t_ns, points = round(t * NS), []
         for thing in scene.objects:

@@ -57,9 +57,7 @@ def stereographic():
 def test_a_model_from_outside_is_in_the_table(stereographic):
     assert CAMERA_MODELS["stereographic"] is Stereographic and register(Stereographic) is Stereographic
     camera = Stereographic(64, 48, 40.0, 40.0, 31.5, 23.5)
-    assert (
-        camera.part(0, 0, 32, 24, 2).pull == 1.0 and camera.bounds(np.array([[0.0, 0, 3], [0.1, 0.1, 3]])) is not None
-    )
+    assert camera.part(0, 0, 32, 24, 2).pull == 1.0
 
 
 def without(part, value=None):

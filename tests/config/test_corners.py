@@ -149,7 +149,12 @@ def test_mixed_corners_are_refused_when_the_file_is_read(tree, message):
             "timeline": {"max_step_us": {"uniform": [5000, 9000]}},
             "events": {"emulator": {"choice": ["esim", "v2e"]}},
         },
-        {"scene": {"kind": {"choice": ["random"]}, "walls": {"choice": [True, False, {"count": {"integer": [0, 4]}}]}}},
+        {
+            "scene": {
+                "kind": {"choice": ["random"]},
+                "lights": {"choice": [None, {"kinds": {"choice": [["sun"], ["point"]]}}]},
+            }
+        },
         {
             "events": {
                 "choice": [

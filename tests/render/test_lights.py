@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from blinkgl.config.deform import TwistConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.render import casting, draw_items, reference
-from blinkgl.render.colour import LUMA
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.lights import lamp_pose
 from blinkgl.scene.motion.paths import StaticPath
@@ -173,24 +172,6 @@ def test_flat_facets_are_lit_at_their_corners(gl, monkeypatch, finer):
     for one, other in zip(flat, smooth):
         np.testing.assert_allclose(one, other, rtol=2e-6, atol=1e-7)
     np.testing.assert_allclose(beside_rates, flat[0], rtol=2e-6, atol=1e-7)
-
-
-def test_one_channel_does_where_a_surface_has_one_colour(gl):
-    """And three are taken where it has several; both give the luminance of the picture."""
-    light = Light(lamps=LAMPS, sky_color=(0.5, 0.8, 1.0))
-    grey_image = replace(smooth_texture(), image=np.repeat(smooth_texture().image[..., :1], 3, axis=2))
-    quick = {"untextured": None, "grey": grey_image, "of several colours": smooth_texture()}
-    for name, texture in quick.items():
-        paint = Material(texture, base_color=(0.9, 0.3, 0.1))
-        world = scene([thing("ball", 1, sphere(1.0), still((0, 4, 0)), paint)], light=light)
-        gl.shaders.clear()
-        with Renderer(gl, world, RenderConfig(image_antialiasing="none")) as renderer:
-            seen, colour = renderer.luminance(0).read(), renderer.colour(0).read()
-            rates = renderer.brightness(0).read()[..., 0]
-        hued = {dict(defines).get("HUED") for program, defines in gl.shaders.compiled if program == "luminance.glsl"}
-        assert hued == ({"1"} if name == "of several colours" else {None}), name
-        np.testing.assert_allclose(seen, colour @ LUMA, rtol=1e-5, atol=1e-6)
-        np.testing.assert_array_equal(rates, seen)
 
 
 MOVING = replace(POINT, path=drift((0.3, 3, 1), (0.8, 2.5, 0.4)))

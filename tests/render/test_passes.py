@@ -2,7 +2,6 @@
 docs/extending.md shows them."""
 
 import inspect
-from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -22,7 +21,7 @@ from blinkgl.render.matrices import mat4_bytes
 from blinkgl.render.moment import View
 from blinkgl.render.passes import Geometry, Input, Output, ScenePass, ScreenPass
 from blinkgl.render.renderer import Renderer
-from render_scenes import LEVEL, SECOND, cube, drift, mixed_scene, quad, scene, still, thing
+from render_scenes import SECOND, cube, drift, mixed_scene, quad, scene, still, thing
 
 PLAIN = RenderConfig(image_antialiasing="none")
 TOYS = Path(__file__).parent / "toys"
@@ -251,46 +250,3 @@ def test_what_is_read_what_is_viewed_and_what_is_written_into_are_one(gl, antial
                             with pytest.raises(ValueError, match="out must be a C-contiguous"):
                                 frame.read(name, wrong)
             assert frames[3].read().shape == (36, 48, 3) and frames[0].names == ("luminance",)
-
-
-def test_a_moment_is_computed_once_and_shared(gl):
-    """Poses and their derivatives of one time, however many passes look at it, and labels at
-    those of their neighbours."""
-    asked = Counter()
-
-    class Watched:
-        def __init__(self, path):
-            self._path = path
-
-        def __getattr__(self, name):
-            return getattr(self._path, name)
-
-        def pose(self, t_ns):
-            asked["pose", t_ns] += 1
-            return self._path.pose(t_ns)
-
-        def derivative(self, t_ns):
-            asked["derivative", t_ns] += 1
-            return self._path.derivative(t_ns)
-
-    world = scene([thing("box", 1, cube(0.5), Watched(drift((-1, 4, 0), (1, 4, 0), LEVEL)))])
-    interval = SECOND // 10
-    with Renderer(gl, world, PLAIN) as renderer:
-        asked.clear()
-        for t in range(interval, 6 * interval, interval):
-            (
-                renderer.velocity_of_movers(t, 4),
-                renderer.luminance(t),
-                renderer.brightness(t, 2),
-                renderer.colour(t),
-            )
-            renderer.labels(
-                t,
-                LabelRequest("flow_forward", "flow_backward", "occlusion_forward", "velocity"),
-                t + interval,
-                t - interval,
-            )
-    # The caster that decides about undecided pixels is the reference's, and asks for itself.
-    assert all(times == 1 or (what == "pose" and times == 2) for (what, _), times in asked.items()), asked
-    assert {t for what, t in asked if what == "pose"} == {k * interval for k in range(7)}
-    assert {t for what, t in asked if what == "derivative"} == {k * interval for k in range(1, 6)}

@@ -182,28 +182,6 @@ def test_edges_and_corners_belong_to_the_triangle_seen_from_either_side(kernel, 
     assert (ask(kernel, forest_of([sheet], [False]), np.zeros((1, 3)), np.eye(3)[None], outside)[0][:, 0] == -1).all()
 
 
-def test_a_tree_holds_every_triangle_once_inside_its_boxes():
-    corners = triangles(5, 101)
-    tree = build_tree(corners.reshape(-1, 3), np.arange(303).reshape(-1, 3))
-    assert sorted(tree.face) == list(range(101))
-    np.testing.assert_array_equal(tree.triangles, corners[tree.face])
-    seen, stack = [], [(0, 0)]
-    while stack:
-        node, depth = stack.pop()
-        assert depth <= 7, "balanced"
-        if tree.count[node]:
-            assert 1 <= tree.count[node] <= LEAF_TRIANGLES
-            inside = tree.triangles[tree.child[node] : tree.child[node] + tree.count[node]].reshape(-1, 3)
-            seen += range(tree.child[node], tree.child[node] + tree.count[node])
-            np.testing.assert_array_equal((tree.lower[node], tree.upper[node]), (inside.min(0), inside.max(0)))
-        else:
-            pair = [tree.child[node], tree.child[node] + 1]
-            np.testing.assert_array_equal(tree.lower[node], tree.lower[pair].min(0))
-            np.testing.assert_array_equal(tree.upper[node], tree.upper[pair].max(0))
-            stack += [(k, depth + 1) for k in pair]
-    assert sorted(seen) == list(range(101)) and len(tree.child) == len(tree.count) == len(tree.lower)
-
-
 def test_no_parts_at_all():
     forest = join_trees([], [])
     hit, _, depth = ask(nearest_tree, forest, np.empty((0, 3)), np.empty((0, 3, 3)), np.zeros((2, 2)))

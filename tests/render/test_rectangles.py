@@ -99,8 +99,8 @@ def test_rectangles_meet_where_they_share_a_pixel(a, b, meet):
     assert merged([a, b]) == ([union] if meet else sorted([a, b], key=lambda r: (r.y0, r.x0)))
 
 
-def test_area_and_scale():
-    assert Rectangle(1, 2, 4, 9).area == 21 and Rectangle(1, 2, 4, 9).scaled(3) == Rectangle(3, 6, 12, 27)
+def test_scale():
+    assert Rectangle(1, 2, 4, 9).scaled(3) == Rectangle(3, 6, 12, 27)
 
 
 def test_merging_goes_on_until_none_meet():

@@ -5,7 +5,6 @@ import pytest
 
 from blinkgl.camera import PinHole
 from blinkgl.config.sequence import RenderConfig
-from blinkgl.gl import create_context
 from blinkgl.labels import LABELS, LabelRequest
 from blinkgl.render.moment import Moment
 from blinkgl.render.renderer import Renderer
@@ -86,23 +85,6 @@ def test_two_renderers_in_one_context_do_not_disturb_each_other(gl):
         b.luminance(0).read()
         np.testing.assert_array_equal(alone, a.luminance(0).read())
         assert b.luminance(0).read().mean() > alone.mean()
-
-
-@pytest.mark.parametrize("antialiasing", ["none", "edges"])
-def test_a_context_goes_on_after_another_one_has_ended(antialiasing):
-    """Whoever draws, reads or begins finds its own context current, whatever was made in the thread since."""
-    config, scene = RenderConfig(antialiasing=antialiasing, image_antialiasing="none"), world()
-    with create_context() as first, Renderer(first, scene, config) as renderer:
-        good, later = renderer.luminance(0).read(), renderer.luminance(SECOND // 2)
-        with create_context() as second, Renderer(second, world(40, 30, 3), config) as other:
-            other.luminance(0).read()
-        later = later.read()
-        np.testing.assert_array_equal(renderer.luminance(0).read(), good)
-        np.testing.assert_array_equal(renderer.luminance(SECOND // 2).view(), later)
-        with create_context() as second, Renderer(second, world(40, 30, 3), config) as other:
-            other.luminance(0).read()
-        with Renderer(first, scene, config) as again:
-            np.testing.assert_array_equal(again.luminance(0).read(), good)
 
 
 def test_only_what_is_asked_for_is_made(gl):

@@ -145,28 +145,6 @@ def test_each_camera_of_a_rig_has_the_shadows_that_it_sees(gl, crowd):
             np.testing.assert_array_equal(renderers[k].luminance(SECOND // 2).read(), alone[k], err_msg=str(k))
 
 
-def test_a_map_is_drawn_again_only_where_something_moved(gl):
-    """Whatever the camera does; and it stays where it is: what does not move has the same shadow on the same place."""
-    still_world = sunlit(thing("box", 2, cube(0.5), still((0.2, 4.0, 0.6))))
-    flown = still_world.with_path(drift((0, 0, 1), (0.3, 0.2, 1.2), DOWN))
-    with Renderer(gl, flown, PLAIN) as renderer:
-        (map_,) = shadow_maps(flown, renderer.items)
-        first = renderer.draw(map_, 0)
-        before = first.target.read_depth()
-        second = renderer.draw(map_, SECOND // 2)
-        assert second.changed == [] and (before > 0).sum() > 1e5
-        np.testing.assert_array_equal(second.target.read_depth(), before)
-    mover = thing("ball", 3, sphere(0.3), drift((-1, 4, 0.5), (0.5, 4, 0.5)))
-    moved = replace(flown, objects=(*flown.objects, mover))
-    with Renderer(gl, moved, PLAIN) as renderer, Renderer(gl, moved, PLAIN) as other:
-        (map_,) = shadow_maps(moved, renderer.items)
-        for t in (0, SECOND // 8, SECOND // 4):
-            frame = renderer.draw(map_, t)
-            seen = frame.target.read_depth()
-        assert frame.changed and sum(r.area for r in frame.changed) < 0.5 * map_.texels**2
-        np.testing.assert_array_equal(seen, other.draw(map_, SECOND // 4).target.read_depth())
-
-
 def test_a_still_camera_sees_shadows_move(gl):
     """What is lit by a lamp behind something that moves is drawn again, too."""
     world = moving_world(3, camera=False)

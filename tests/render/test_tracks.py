@@ -87,21 +87,6 @@ def test_queries_are_where_their_points_are_seen(made):
     assert np.array_equal(again.target_points, tracks.target_points)
 
 
-def test_a_point_goes_where_its_corner_goes(made):
-    """Of the figure's skin: the corner's position by the deformer, in the world."""
-    scene, times, _ = made
-    tracks = track_points(scene, TracksConfig(points=500, choose="surface"), times, RNG(2))
-    parts = casting.scene_parts(scene)
-    lively = [i for i, (p, _) in enumerate(tracks.surface) if parts[p][1].mesh.deformer is not None]
-    assert len(lively) > 50
-    for i in lively[:20]:
-        (_, triangle), (thing, piece) = tracks.surface[i], parts[tracks.surface[i, 0]]
-        for k, t_ns in enumerate(times):
-            corners = piece.mesh.deformer.positions(piece.mesh, t_ns)[piece.mesh.faces[triangle]]
-            world = thing.path.pose(t_ns) @ (*(tracks.weights[i] @ corners), 1)
-            assert np.allclose(tracks.points_world[i, k], world[:3], atol=1e-9)
-
-
 def test_nothing_to_follow_and_too_much_of_it():
     empty = Scene(Camera(16, 12), duration=0.05, label_rate=20)
     empty += Primitive("sphere", radius=0.1, pose=(-50, 0, 0))

@@ -17,7 +17,7 @@ from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.mesh_files import load_asset
 from blinkgl.scene.reading import contents, reading
-from blinkgl.scene.worlds.from_file import from_gltf
+from blinkgl.scene.worlds.from_file import from_document
 from tests.scene.gltf_files import GltfBuilder, triangle
 
 CAMERA = CameraConfig(width=64, height=48).model
@@ -63,7 +63,7 @@ def everything() -> GltfBuilder:
 
 def read_all(path):
     load_asset(path, max_faces=1000)
-    return from_gltf(path, CAMERA, 0, 10**9, intrinsics="file", max_faces=1000)
+    return from_document(gltf.read(path, max_faces=1000), CAMERA, 0, 10**9, intrinsics="file")
 
 
 def places(tree, path=()):

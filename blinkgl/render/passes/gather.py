@@ -17,7 +17,7 @@ from blinkgl.render.passes.colour import Colour
 from blinkgl.render.passes.edged import Edged
 from blinkgl.render.passes.geometry import Geometry
 from blinkgl.render.passes.velocity import Velocity
-from blinkgl.render.rectangles import Rectangle, merged
+from blinkgl.render.rectangles import Rectangle
 
 if TYPE_CHECKING:
     from blinkgl.render.draw_items import DrawItem, Kind
@@ -50,10 +50,9 @@ class Gather(ScreenPass):
         return max(1, self.camera.width // every), max(1, self.camera.height // every)
 
     def changed(self, painter: Painter, rectangles: list[Rectangle]) -> list[Rectangle]:
-        assert painter.lens is not None
-        seen = [painter.lens.rectangle(r) for r in rectangles]
-        # Rectangles of the flat picture that no pixel of the lens sees change nothing.
-        return merged([r for r in seen if r is not None])
+        """All of it, where anything of the flat picture has changed."""
+        width, height = self.size(self.camera.width, self.camera.height)
+        return [Rectangle(0, 0, width, height)] if rectangles else []
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
         defines: dict[str, Any] = {}

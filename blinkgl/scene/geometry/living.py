@@ -37,7 +37,7 @@ def figure(
         raise AssetError("bad parameter", where="figure.height", value=height, accepted="a number up to 1000")
     proportions = Proportions(height, build, legs, arms, head)
     body = body_of(proportions)
-    skeleton = Skeleton(PARENTS, clip_of(clip, proportions, tempo, phase, variant), where="figure")
+    skeleton = Skeleton(PARENTS, clip_of(clip, proportions, tempo, phase, variant))
     skin = Skin(skeleton, range(len(PARENTS)), body.inverse_bind, body.joints, body.weights, where="figure")
     return (body.vertices, body.normals, body.uvs, body.faces), skin
 

@@ -37,7 +37,6 @@ def make_mesh(
     name: str = "",
     source_hash: str = "",
     where: str | None = None,
-    crease_degrees: float = CREASE_DEGREES,
     uv_size: float | None = None,
     project_degenerate: bool = False,
     log: list[str] | None = None,
@@ -48,8 +47,7 @@ def make_mesh(
     Parameters
     ----------
     vertices : (V, 3) any float, object-local.   faces : (F, 3) any int, counter-clockwise seen from outside.
-    normals : (V, 3) or None: made from the faces, angle-weighted, split where faces meet at more than
-        ``crease_degrees`` (so a cuboid stays flat and a sphere smooth).
+    normals : (V, 3) or None: made from the faces, angle-weighted, split where faces meet at ``CREASE_DEGREES`` or more.
     uvs : (V, 2), v down, or None: box projection (:func:`box_project`).
     uv_size : edge of one repeat of projected texture coordinates, in the mesh's units; None: the largest side of the
         bounding box, so that the texture covers the mesh once.
@@ -65,8 +63,42 @@ def make_mesh(
     """
     where, label = where or name or "mesh", name or where or "mesh"
     log = [] if log is None else log
-    vertices = np.array(vertices, dtype=np.float64)
-    faces = np.asarray(faces)
+    vertices, faces, used = _checked(np.array(vertices, dtype=np.float64), np.asarray(faces), where)
+    origin = np.flatnonzero(used)
+    normals = None if normals is None or len(normals) != len(used) else np.asarray(normals, np.float64)[used]
+    uvs_given = uvs is not None
+    uvs = None if uvs is None or np.shape(uvs) != (len(used), 2) else np.asarray(uvs, np.float64)[used]
+
+    points, welded = weld(vertices, faces)
+    closed, inside_out = closed_or_nearly(points, welded)  # before slivers go: they close gaps of no width
+    kept = _worth_drawing(vertices, faces, where, label, log)
+    faces, welded = faces[kept], welded[kept]
+    if normals is not None and not _usable_normals(normals, vertices, faces):
+        log.append(f"{label}: the normals are unusable, made new ones")
+        normals = None
+    if uvs_given and (wrong := _wrong_coordinates(vertices, faces, uvs, project_degenerate)):
+        log.append(f"{label}: the texture coordinates are {wrong}, projected new ones")
+        uvs = None
+
+    # From here on corner attributes, (F, 3, …), joined to vertices at the end.
+    corner_normals = crease_normals(vertices, faces, welded) if normals is None else normals[faces]
+    corner_uvs = box_project(vertices, faces, uv_size) if uvs is None else uvs[faces]
+    if inside_out:
+        log.append(f"{label}: the mesh was inside out, turned round")
+        faces, corner_uvs, corner_normals = faces[:, ::-1], corner_uvs[:, ::-1], corner_normals[:, ::-1]
+        if (corner_normals.sum(axis=1) * _face_cross(vertices, faces)).sum() < 0:
+            corner_normals = -corner_normals
+    corners = None if source is None else origin[faces]
+    mesh, first = _from_corners(
+        vertices[faces], corner_normals, corner_uvs, corners, closed=closed, name=name, source_hash=source_hash
+    )
+    if source is not None and corners is not None:
+        source.append(corners.ravel()[first])
+    return mesh
+
+
+def _checked(vertices: np.ndarray, faces: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """((V', 3) vertices that faces use, (F, 3) int64 faces over them, (V,) bool which those are). Raises AssetError."""
     if vertices.ndim != 2 or vertices.shape[1] != 3 or (faces.size and (faces.ndim != 2 or faces.shape[1] != 3)):
         raise AssetError(f"vertices {vertices.shape} and faces {faces.shape} are no triangle mesh", where=where)
     if faces.size == 0:
@@ -85,53 +117,24 @@ def make_mesh(
             value=vertices[first].tolist(),
             accepted="finite coordinates",
         )
+    return vertices[used], (np.cumsum(used) - 1)[faces], used
 
-    origin = np.flatnonzero(used)
-    vertices, faces = vertices[used], (np.cumsum(used) - 1)[faces]
-    normals = None if normals is None or len(normals) != len(used) else np.asarray(normals, np.float64)[used]
-    uvs_given = uvs is not None
-    uvs = None if uvs is None or np.shape(uvs) != (len(used), 2) else np.asarray(uvs, np.float64)[used]
 
-    points, welded = weld(vertices, faces)
-    closed, inside_out = closed_or_nearly(points, welded)  # before slivers go: they close gaps of no width
+def _wrong_coordinates(vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray | None, degenerate: bool) -> str:
+    """What is wrong with texture coordinates, in a word; "" where they can be used. degenerate : is a fault, too."""
+    if uvs is None or not (np.abs(uvs[faces]) < _MAX_REPEATS).all():  # NaN compares false
+        return "broken"
+    return "degenerate" if degenerate and uvs_degenerate(vertices, faces, uvs) else ""
+
+
+def _worth_drawing(vertices: np.ndarray, faces: np.ndarray, where: str, label: str, log: list[str]) -> np.ndarray:
+    """(F,) bool: faces with an area. Raises AssetError where there are none."""
     kept = _faces_with_area(vertices, faces)
     if not kept.any():
         raise AssetError("the mesh has no faces with an area", where=where, accepted="a mesh with triangles")
-    if not kept.all():
-        if (~kept).mean() > 0.1:  # a few slivers are in almost every file
-            log.append(f"{label}: {int((~kept).sum())} of {len(faces)} faces without area dropped")
-        faces, welded = faces[kept], welded[kept]
-
-    if normals is not None and not _usable_normals(normals, vertices, faces):
-        log.append(f"{label}: the normals are unusable, made new ones")
-        normals = None
-    if uvs_given:
-        broken = uvs is None or not (np.abs(uvs[faces]) < _MAX_REPEATS).all()  # NaN compares false
-        if broken or (project_degenerate and uvs_degenerate(vertices, faces, uvs)):
-            log.append(
-                f"{label}: the texture coordinates are {'broken' if broken else 'degenerate'}, projected new ones"
-            )
-            uvs = None
-
-    # From here on corner attributes, (F, 3, …), joined to vertices at the end.
-    corner_normals = (
-        crease_normals(vertices, faces, welded, crease_degrees)
-        if normals is None
-        else np.asarray(normals, np.float64)[faces]
-    )
-    corner_uvs = box_project(vertices, faces, uv_size) if uvs is None else uvs[faces]
-    if inside_out:
-        log.append(f"{label}: the mesh was inside out, turned round")
-        faces, corner_uvs, corner_normals = faces[:, ::-1], corner_uvs[:, ::-1], corner_normals[:, ::-1]
-        if (corner_normals.sum(axis=1) * _face_cross(vertices, faces)).sum() < 0:
-            corner_normals = -corner_normals
-    corners = None if source is None else origin[faces]
-    mesh, first = _from_corners(
-        vertices[faces], corner_normals, corner_uvs, corners, closed=closed, name=name, source_hash=source_hash
-    )
-    if source is not None and corners is not None:
-        source.append(corners.ravel()[first])
-    return mesh
+    if (~kept).mean() > 0.1:  # a few slivers are in almost every file
+        log.append(f"{label}: {int((~kept).sum())} of {len(faces)} faces without area dropped")
+    return kept
 
 
 def _faces_with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

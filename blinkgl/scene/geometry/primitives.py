@@ -78,6 +78,33 @@ def parameter_hash(*parts: object) -> str:
     return hashlib.blake2b(repr(parts).encode(), digest_size=16).hexdigest()
 
 
+def _checked(where: str, key: str, value: Any, default: Any) -> Any:
+    """A parameter's value, of its default's type. Raises AssetError naming ``where`` and ``key``."""
+    # A range for this primitive alone comes before that of all.
+    within = _RANGES.get(f"{where}.{key}", _RANGES.get(key))
+    if isinstance(default, str):
+        right, accepted = value in _WORDS[key], "one of " + ", ".join(_WORDS[key])
+    elif isinstance(value, str):
+        right, accepted = False, "a number"
+    elif within is not None:
+        right = not np.shape(value) and within[0] <= value <= within[1]
+        accepted = f"a number from {within[0]:g} to {within[1]:g}"
+    elif isinstance(default, int):
+        # Each subdivision has four times the triangles: 7 are 327,680.
+        low, high = (0, 7) if where == "icosphere" else (_LEAST[key], _MOST.get(key, _MAX_SEGMENTS))
+        right = not np.shape(value) and low <= value <= high and float(value) == int(value)
+        accepted = f"a whole number in {low}..{high}"
+    else:
+        right = np.shape(value) == np.shape(default) and np.isfinite(value).all() and np.min(value) > 0
+        accepted = f"{len(default)} numbers greater than 0" if np.shape(default) else "a number greater than 0"
+    if not right:
+        problem = f"no such {key}" if isinstance(default, str) else "bad parameter"
+        raise AssetError(problem, where=f"{where}.{key}", value=value, accepted=accepted)
+    if np.shape(default):
+        return tuple(map(float, value))
+    return type(default)(value)
+
+
 def primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Callable[..., Mesh]:
     """Makes a builder of a kind in ``config/primitives.py``, which checks the parameters and stamps name, hash and
     closedness; puts it into :data:`BUILDERS`. Raises TypeError for a name that is not there."""
@@ -98,40 +125,7 @@ def primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Calla
         bound = signature.bind(**parameters)
         bound.apply_defaults()
         for key, value in bound.arguments.items():
-            default = signature.parameters[key].default
-            # A range for this primitive alone comes before that of all.
-            within = _RANGES.get(f"{where}.{key}", _RANGES.get(key))
-            if isinstance(default, str):
-                if value not in _WORDS[key]:
-                    raise AssetError(
-                        f"no such {key}",
-                        where=f"{where}.{key}",
-                        value=value,
-                        accepted="one of " + ", ".join(_WORDS[key]),
-                    )
-            elif isinstance(value, str):
-                raise AssetError("bad parameter", where=f"{where}.{key}", value=value, accepted="a number")
-            elif within is not None:
-                if np.shape(value) or not within[0] <= value <= within[1]:
-                    accepted = f"a number from {within[0]:g} to {within[1]:g}"
-                    raise AssetError("bad parameter", where=f"{where}.{key}", value=value, accepted=accepted)
-                bound.arguments[key] = float(value)
-            elif isinstance(default, int):
-                # Each subdivision has four times the triangles: 7 are 327,680.
-                low, high = (0, 7) if where == "icosphere" else (_LEAST[key], _MOST.get(key, _MAX_SEGMENTS))
-                if np.shape(value) or not low <= value <= high or float(value) != int(value):
-                    raise AssetError(
-                        "bad parameter",
-                        where=f"{where}.{key}",
-                        value=value,
-                        accepted=f"a whole number in {low}..{high}",
-                    )
-                bound.arguments[key] = int(value)
-            elif np.shape(value) != np.shape(default) or not np.isfinite(value).all() or np.min(value) <= 0:
-                accepted = f"{len(default)} numbers greater than 0" if np.shape(default) else "a number greater than 0"
-                raise AssetError("bad parameter", where=f"{where}.{key}", value=value, accepted=accepted)
-            else:
-                bound.arguments[key] = tuple(map(float, value)) if np.shape(default) else float(value)
+            bound.arguments[key] = _checked(where, key, value, signature.parameters[key].default)
         return bound
 
     @wraps(build)

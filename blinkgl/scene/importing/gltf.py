@@ -252,7 +252,7 @@ class Document:
         places, nodes = self.places, list(self.nodes.values())
         parents = [-1 if node.parent is None else places[node.parent] for node in nodes]
         fixed = [np.eye(4) if node.matrix is None else node.matrix for node in nodes]
-        return Skeleton(parents, motion, np.array(fixed).reshape(-1, 4, 4), [node.name for node in nodes], self.where)
+        return Skeleton(parents, motion, np.array(fixed).reshape(-1, 4, 4))
 
     def morph_weights(self, node: int, count: int) -> np.ndarray:
         """(count,) of a node's mesh at rest. AssetError where there are others than targets."""

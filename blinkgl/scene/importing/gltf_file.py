@@ -31,6 +31,7 @@ def parse(data: bytes, where: str) -> tuple[dict, bytes]:
                 where=where,
                 value=f"version {version}, {len(data)} of {length} bytes",
             )
+        # A GLB: 12 bytes of header, then chunks of (length, kind, content); the first of each kind counts.
         position, chunks = 12, {}
         while position + 8 <= length:
             size, kind = struct.unpack_from("<II", data, position)
@@ -55,6 +56,7 @@ def buffers_of(tree: dict, binary: bytes, path: Path) -> list[bytes]:
     """Contents of all buffers, as long as the file says. Raises AssetError."""
     buffers = []
     for number, buffer in enumerate(tree.get("buffers", [])):
+        # EXT_meshopt_compression leaves a buffer without content as its fallback.
         compressed = next((e for e in buffer.get("extensions", {}) if e.endswith("_meshopt_compression")), None)
         if compressed and "uri" not in buffer:
             raise needs(compressed, str(path))

@@ -91,12 +91,14 @@ class Materials:
             self.omissions.add("occlusion maps")
         emissive, bumps = m.get("emissiveTexture"), m.get("normalTexture")
         rough = pbr.get("metallicRoughnessTexture")
+        # Without a texture of the base colour the coordinates of the next map are the mesh's.
         if not info:
             base = _Place.of(next((one for one in (rough, bumps, emissive) if one), {}))
         strength = m.get("extensions", {}).get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
         emission = tuple(float(c * strength) for c in m.get("emissiveFactor", (0, 0, 0)))
         if any(emission):
             material = replace(material, emission=emission, emission_map=self._map(emissive, base, "colour"))
+        # The standard's defaults are a rough metal: a material that says nothing is metallic 1.
         metallic, roughness = (min(float(pbr.get(f"{key}Factor", 1)), 1.0) for key in ("metallic", "roughness"))
         if metallic > 0 or roughness < 1 or rough:
             material = replace(material, gloss=Gloss(metallic, roughness, self._map(rough, base, "numbers")))
@@ -114,6 +116,8 @@ class Materials:
         image = np.full((1, 1), 255, np.uint8) if alpha is None else alpha.image
         cutoff = float(m.get("alphaCutoff", 0.5)) if mode == "MASK" else 0.5
         least, most = (factor * float(v) / 255 for v in (image.min(), image.max()))
+        # Nothing here is drawn half transparent: what is mostly there is cut out, what is nowhere half there is
+        # opaque.
         if mode == "BLEND":
             if most < cutoff:
                 self.omissions.add("alpha BLEND (drawn opaque)")
@@ -138,6 +142,7 @@ class Materials:
         if abs(np.linalg.det(first)) < 1e-12:
             at = own
         else:
+            # The mesh's coordinates are already those of the first texture: its own transform is undone.
             at = own @ np.linalg.inv(first)
         a, b, c, d, e, f = (float(v) for v in np.round(at[:2], 12).ravel())
         return Map(texture, (a, b, c, d, e, f), self._wraps(info["index"]))

@@ -89,17 +89,9 @@ def load_asset(
         if total > max_faces:
             raise AssetError("the mesh has too many faces", where=where, value=total, accepted=f"at most {max_faces}")
         has_materials = keep_materials and any(raw.material is not None for raw in found.raws)
+        common = {"name": path.stem, "where": where, "source_hash": digest, "log": found.log}
         parts = tuple(
-            part_of(
-                raw,
-                name=path.stem,
-                where=where,
-                source_hash=digest,
-                log=found.log,
-                materials=has_materials,
-                uv_size=uv_size,
-                deformer=deformer,
-            )
+            part_of(raw, **common, materials=has_materials, uv_size=uv_size, deformer=deformer)
             for raw, deformer in zip(found.raws, found.deformers, strict=True)
             if len(raw.faces) or len(found.raws) == 1
         )
@@ -108,19 +100,9 @@ def load_asset(
     parts = closed_parts(parts) if has_materials else _one_part(parts, path.stem, digest)
     said = tuple(dict.fromkeys(found.log)), found.omissions.lines()
     asset = Asset(path.stem, digest, parts, has_materials, *said, tuple(found.clips))
-    again = partial(
-        load_asset,
-        path,
-        max_faces=max_faces,
-        max_bytes=max_bytes,
-        keep_materials=keep_materials,
-        max_texture=max_texture,
-        source_hash=source_hash,
-        uv_size=uv_size,
-        up=up,
-    )
-    replay = lambda config: again(play=clip_of(config))
-    return replace(asset, replay=replay) if asset.clips else asset
+    given = {"max_faces": max_faces, "max_bytes": max_bytes, "keep_materials": keep_materials, "uv_size": uv_size}
+    again = partial(load_asset, path, **given, max_texture=max_texture, source_hash=source_hash, up=up)
+    return replace(asset, replay=lambda config: again(play=clip_of(config))) if asset.clips else asset
 
 
 def clip_of(config: AnimationConfig, base: Path | str = ".", where: str = "animation") -> ClipOf:

@@ -153,7 +153,7 @@ class FolderResolver(trimesh.resolvers.Resolver):
         return self._textures[number]
 
     def _read_mtl(self, data: bytes) -> None:
-        """Notes the images that a material file names, and what it asks for beside a matt colour."""
+        """Notes the images that a material file names, and what its maps ask for beside a matt colour."""
         for line in data.decode("utf-8", errors="replace").splitlines():
             key, _, rest = line.strip().partition(" ")
             key, rest = key.lower(), rest.strip()
@@ -161,14 +161,6 @@ class FolderResolver(trimesh.resolvers.Resolver):
                 self._named.add(rest)
             elif key in _MTL_MAPS:
                 self.omissions.add(_MTL_MAPS[key])
-            elif key in _MTL_VALUES:
-                what, plain = _MTL_VALUES[key]
-                try:
-                    asked = any(float(value) != plain for value in rest.split()[:3])
-                except ValueError:
-                    asked = False
-                if asked:
-                    self.omissions.add(what)
 
     def write(self, name: str, data: bytes) -> NoReturn:
         raise AssetError("a mesh loader wanted to write", where=self.where, value=name)
@@ -189,14 +181,6 @@ _MTL_MAPS = {
     "map_ks": "shine (drawn matt)",
     "map_pr": "shine (drawn matt)",
     "map_pm": "shine (drawn matt)",
-}
-# Statement -> what it asks for, unless all its values are this.
-_MTL_VALUES = {
-    "ke": ("emissive light", 0.0),
-    "ks": ("shine (drawn matt)", 0.0),
-    "pm": ("shine (drawn matt)", 0.0),
-    "d": ("transparency (drawn opaque)", 1.0),
-    "tr": ("transparency (drawn opaque)", 0.0),
 }
 
 

@@ -67,7 +67,8 @@ class KeyframePath:
     interpolation : "spline": C2 (cubic, not-a-knot ends; two key frames give the straight line);
                     "linear": straight lines and slerp, velocity jumps at the key frames (the derivative there is that
                     of the following piece).
-    Raises ConfigError (prefixed by ``where``) on wrong shapes, non-finite values, zero quaternions or unordered times.
+    Raises ValueError on wrong shapes, non-finite values, zero quaternions or unordered times: whoever reads them from a
+    person has said what is wrong with them before.
     """
 
     def __init__(
@@ -76,9 +77,8 @@ class KeyframePath:
         positions: ArrayLike,
         rotations: Rotation | ArrayLike,
         interpolation: Literal["spline", "linear"] = "spline",
-        where: str | None = None,
     ):
-        knots, positions, rotations = _checked_keys(times_ns, positions, rotations, where)
+        knots, positions, rotations = _checked_keys(times_ns, positions, rotations)
         self.t0_ns, self.t1_ns = int(knots[0]), int(knots[-1])
         if len(knots) == 1:
             # One nanosecond of standing still, so that the evaluation below needs no special case.
@@ -89,14 +89,12 @@ class KeyframePath:
         if interpolation == "spline":
             cp = CubicSpline(seconds, positions).c
             cr = RotationSpline(seconds, rotations).interpolator.c
-        elif interpolation == "linear":
+        else:
             # Straight lines and slerp: two coefficients each, highest power first as scipy has them.
             h = np.diff(seconds)[:, None]
             cp = np.stack([np.diff(positions, axis=0) / h, positions[:-1]])
             turn = (rotations[:-1].inv() * rotations[1:]).as_rotvec()
             cr = np.stack([turn / h, np.zeros_like(turn)])
-        else:
-            raise ConfigError("unknown interpolation", where=where, value=interpolation, accepted="spline or linear")
         self._knots = knots
         self._cp, self._cr = _ascending(cp), _ascending(cr)
         # Rotation at the start of each piece; the polynomial phi turns on from there.
@@ -340,54 +338,14 @@ def rigid(T: ArrayLike, where: str | None = None) -> np.ndarray:
     return T
 
 
-def _checked_keys(times_ns, positions, rotations, where):
-    try:
-        times = np.asarray(times_ns)
-        knots = times.astype(np.int64)
-        positions = np.array(positions, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise ConfigError("key frames are not numbers", where=where) from None
-    if knots.ndim != 1 or len(knots) == 0 or not np.array_equal(knots, times):
-        raise ConfigError("key-frame times have to be a list of whole nanoseconds, at least one", where=where)
-    if (np.diff(knots) <= 0).any():
-        at = int(np.argmax(np.diff(knots) <= 0)) + 1
-        raise ConfigError(
-            f"key-frame times have to increase (key frame {at})",
-            where=where,
-            value=int(knots[at]),
-            accepted=f"more than {int(knots[at - 1])} ns",
-        )
-    if positions.shape != (len(knots), 3) or not np.isfinite(positions).all():
-        raise ConfigError(
-            "key-frame positions have to be finite and three per time",
-            where=where,
-            value=f"shape {positions.shape}",
-            accepted=f"shape ({len(knots)}, 3)",
-        )
-    if not isinstance(rotations, Rotation):
-        try:
-            quaternions = np.array(rotations, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise ConfigError("key-frame rotations are not numbers", where=where) from None
-        if (
-            quaternions.shape != (len(knots), 4)
-            or not np.isfinite(quaternions).all()
-            or not (np.linalg.norm(quaternions, axis=1) > 1e-12).all()
-        ):
-            raise ConfigError(
-                "key-frame rotations have to be non-zero quaternions (x, y, z, w), one per time",
-                where=where,
-                value=f"shape {quaternions.shape}",
-                accepted=f"shape ({len(knots)}, 4)",
-            )
-        rotations = Rotation.from_quat(quaternions)
-    elif rotations.single or len(rotations) != len(knots):
-        raise ConfigError(
-            "key-frame rotations have to be one per time",
-            where=where,
-            value=1 if rotations.single else len(rotations),
-            accepted=str(len(knots)),
-        )
+def _checked_keys(
+    times_ns: ArrayLike, positions: ArrayLike, rotations: Rotation | ArrayLike
+) -> tuple[np.ndarray, np.ndarray, Rotation]:
+    knots, positions = np.asarray(times_ns, np.int64), np.array(positions, np.float64)
+    rotations = rotations if isinstance(rotations, Rotation) else Rotation.from_quat(rotations)
+    fits = positions.shape == (len(knots), 3) and len(rotations) == len(knots) > 0
+    if not fits or (np.diff(knots) <= 0).any() or not np.isfinite(positions).all():
+        raise ValueError("key frames have increasing times, and a finite position and a rotation each")
     return knots, positions, rotations
 
 

@@ -13,7 +13,19 @@ from numba import njit
 
 
 @njit(cache=True)
-def hermite_piece(h, p0, p1, v0, v1, q0, q1, w0, w1, cp, cr):
+def hermite_piece(
+    h: float,
+    p0: np.ndarray,
+    p1: np.ndarray,
+    v0: np.ndarray,
+    v1: np.ndarray,
+    q0: np.ndarray,
+    q1: np.ndarray,
+    w0: np.ndarray,
+    w1: np.ndarray,
+    cp: np.ndarray,
+    cr: np.ndarray,
+) -> float:
     """Fill ``cp`` and ``cr`` (4, 3), the cubics of one piece of ``h`` seconds (see the module's docstring), from
     positions p, velocities v, quaternions q (w x y z) and body rates w at its ends. Returns the angle from the
     first rotation to the last, rad.
@@ -138,7 +150,7 @@ def _piece(t, knots):
 
 
 @njit(cache=True)
-def pose(t, knots, cp, cr, rot, T):
+def pose(t: int, knots: np.ndarray, cp: np.ndarray, cr: np.ndarray, rot: np.ndarray, T: np.ndarray) -> None:
     """Write the pose at a time, held beyond both ends."""
     t = min(max(t, knots[0]), knots[-1])
     i = _piece(t, knots)
@@ -171,14 +183,14 @@ def pose(t, knots, cp, cr, rot, T):
 
 
 @njit(cache=True)
-def poses(times, knots, cp, cr, rot, T):
+def poses(times: np.ndarray, knots: np.ndarray, cp: np.ndarray, cr: np.ndarray, rot: np.ndarray, T: np.ndarray) -> None:
     """Write the poses at (n,) times."""
     for k in range(len(times)):
         pose(times[k], knots, cp, cr, rot, T[k])
 
 
 @njit(cache=True)
-def derivative(t, knots, cp, cr, rot, D):
+def derivative(t: int, knots: np.ndarray, cp: np.ndarray, cr: np.ndarray, rot: np.ndarray, D: np.ndarray) -> None:
     """Write D = dT/dt. Body rate w = J_r(phi) phi' with the right Jacobian of SO(3), J_r = I - (1 - cos a)/a^2
     [phi]x + (a - sin a)/a^3 [phi]x^2, a = |phi|."""
     T = np.empty((4, 4))
@@ -246,7 +258,16 @@ def _cubic_bound(c, ua, ub):
 
 
 @njit(cache=True)
-def approach_bound(ta, tb, knots, cp, cr, rot, normal, reach):
+def approach_bound(
+    ta: int,
+    tb: int,
+    knots: np.ndarray,
+    cp: np.ndarray,
+    cr: np.ndarray,
+    rot: np.ndarray,
+    normal: np.ndarray,
+    reach: float,
+) -> float:
     """n . (velocity of the point x) = n . p' + x . (n x w), all in key frame i's axes, where w = J_l(phi) phi' with
     J_l = I + a [phi]x + b [phi]x^2, 0 <= a <= 1/2, 0 <= b <= 1/6. With the parts across n, phi_n and phi'_n:
     |n x w| <= |phi'_n| + X / 2 + |phi| X / 6,  X = |phi x phi'| <= |phi| |phi'_n| + |phi_n| |phi'|;  also <= |phi'|."""
@@ -276,7 +297,7 @@ def approach_bound(ta, tb, knots, cp, cr, rot, normal, reach):
 
 
 @njit(cache=True)
-def speed_bound(ta, tb, knots, cp, cr):
+def speed_bound(ta: int, tb: int, knots: np.ndarray, cp: np.ndarray, cr: np.ndarray) -> tuple[float, float]:
     """Return upper bounds over [ta, tb] of the speed of the origin and of the angular rate."""
     if tb < knots[0] or ta > knots[-1] or tb < ta:
         return 0.0, 0.0

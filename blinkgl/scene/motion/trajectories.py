@@ -224,12 +224,14 @@ def waypoints(
         space = FreeSpace(
             np.r_[space.low[:2], -np.inf], np.r_[space.high[:2], np.inf], None, space.centres, space.radii
         )
+    # Spheres that overlap at the start cannot be left without being inside them for a while.
     entangled = np.linalg.norm(space.centres - start, axis=1) < space.radii + radius
     best, least = None, math.inf
     for _ in range(_REDRAWS):
         points = _walk(rng, config, space, radius, start, speed * duration, flat, count, ahead)
         times = _timed(points, t0_ns, t1_ns, speed)
         used = int(np.searchsorted(times, t1_ns)) + 1
+        # The spline bulges out of its straight legs: it is looked at, too.
         curve = CubicSpline((times - t0_ns) * 1e-9, points)(np.linspace(0, duration, _SAMPLES * used))
         outside = space.depth(curve, radius, skip=entangled).max()
         if outside < least:
@@ -266,6 +268,7 @@ def _timed(points, t0_ns, t1_ns, speed) -> np.ndarray:
     go as the square root of the leg (centripetal parametrisation): no loops and cusps where legs differ.
     """
     legs = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    # A floor on the steps, or two way-points in one place would give the spline a parameter step of 0.
     steps = np.sqrt(np.maximum(legs, 0.05 * max(legs.max(), 1e-12)))
     parameter = np.r_[0.0, np.cumsum(steps)]
     middle = (parameter[:-1, None] + steps[:, None] * (np.arange(_SAMPLES) + 0.5) / _SAMPLES).ravel()
@@ -275,6 +278,7 @@ def _timed(points, t0_ns, t1_ns, speed) -> np.ndarray:
     duration = (t1_ns - t0_ns) * 1e-9
     end = np.interp(speed * duration, arc, at)  # a body that found no way out is slower than configured
     times = np.rint(parameter * ((t1_ns - t0_ns) / end)).astype(np.int64)
+    # Rounded times of very short legs may coincide: each is at least a nanosecond after the one before.
     order = np.arange(len(times))
     return np.maximum.accumulate(times - order) + order + t0_ns
 
@@ -320,6 +324,7 @@ def _camera_turns(rng, config, rate, times, R, aims) -> np.ndarray:
     turns, axis = [], None
     for k, dt in enumerate(np.diff(times) * 1e-9):
         angle = rate * dt * rng.uniform(0.6, 1.4)
+        # All are drawn whether or not an early one fits: the number of draws must not hang on the geometry.
         tries = [angle * _turned(rng, config, axis, False) for _ in range(16)]
         home = Rotation.from_matrix(R.T @ look_rotation(aims[k + 1])).as_rotvec()
         tries.append(home * min(1.0, angle / max(float(np.linalg.norm(home)), 1e-12)))

@@ -46,6 +46,7 @@ class Track:
         if not cubic:
             return (1 - s) * values[i] + s * values[i + 1], (values[i + 1] - values[i]) / h
         a, b, u, v = values[i], values[i + 1], h * self.values[i, 2], h * self.values[i + 1, 0]
+        # Cubic Hermite: the tangents are per second, the curve is over h seconds.
         value = (
             (2 * s**3 - 3 * s**2 + 1) * a + (s**3 - 2 * s**2 + s) * u + (3 * s**2 - 2 * s**3) * b + (s**3 - s**2) * v
         )
@@ -88,7 +89,9 @@ class Playing:
         if length <= 0:
             return self.first, 0.0
         if self.loop:
+            # Whole periods are taken off in ns, so that a loop is the same to the last bit in every round.
             passed = self.speed * (int(t_ns) if period is None else int(t_ns) % period) * 1e-9 + self.phase
+            # fmod has the sign of its first argument: a clip that runs backwards comes from below 0.
             within = math.fmod(passed, length)
             return self.first + (within if within >= 0 else within + length), self.speed
         time = self.first + self.phase + self.speed * int(t_ns) * 1e-9
@@ -114,6 +117,8 @@ class Clip:
         self._values = np.zeros((len(self._times), 3, 4))
         for track, first in zip(moving, self._first):
             values = np.asarray(track.values, np.float64)
+            # One layout for all kinds: in-tangent, value, out-tangent; the tangents of straight lines are unused
+            # zeros.
             values = values if values.ndim == 3 else np.stack([0 * values, values, 0 * values], axis=1)
             if track.path == "rotation":
                 values = values / np.where(
@@ -124,13 +129,15 @@ class Clip:
     def locals(self, t_ns: int) -> Locals:
         time, speed = self.playing.at(t_ns)
         out = self.rest.copy()
-        _evaluate(time, speed, self._joint, self._path, self._kind, self._first, self._times, self._values, *out)
+        _evaluate(time, speed, self._joint, self._path, self._kind, self._first, self._times, self._values, out)
         return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _evaluate(time, speed, joint, path, kind, first, times, values, T, R, S, dT, dR, dS):
-    """Writes what the tracks give at a time of the clip, and rates per second of the sequence's clock."""
+def _evaluate(time, speed, joint, path, kind, first, times, values, out):
+    """Writes what the tracks give at a time of the clip into ``out``, :class:`Locals`, and rates per second of the
+    sequence's clock."""
+    T, R, S, dT, dR, dS = out
     value, rate = np.zeros(4), np.zeros(4)
     for track in range(len(joint)):
         begin, end = first[track], first[track + 1]
@@ -165,6 +172,7 @@ def _evaluate(time, speed, joint, path, kind, first, times, values, T, R, S, dT,
                     rate[k] = (values[i + 1, 1, k] - values[i, 1, k]) / h
             else:
                 _slerp(values[i, 1], values[i + 1, 1], s, 1.0 / h, value, rate)
+        # A unit quaternion's rate has no part along the quaternion: that part is taken out.
         if n == 4:
             length, along = 0.0, 0.0
             for k in range(4):
@@ -191,11 +199,13 @@ def _slerp(a, b, s, ds, value, rate):
     cosine = 0.0
     for k in range(4):
         cosine += a[k] * b[k]
+    # q and -q are one rotation; the nearer of the two is gone to.
     side = 1.0 if cosine >= 0 else -1.0
     distance = 0.0
     for k in range(4):
         distance += (side * b[k] - a[k]) ** 2
     angle = 2 * np.arcsin(min(0.5 * np.sqrt(distance), 1.0))  # exact for small ones, as acos is not
+    # Both sines vanish: a straight line is exact to rounding.
     if angle < 1e-9:
         for k in range(4):
             value[k] = a[k] + s * (side * b[k] - a[k])

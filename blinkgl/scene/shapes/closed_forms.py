@@ -88,6 +88,7 @@ class Waves(Deformer):
 
     def transformed(self, matrix: np.ndarray) -> Waves:
         linear, shift = matrix[:3, :3], matrix[:3, 3]
+        # Phases and envelope are linear forms of the points: they take the inverse map of the points' coordinates.
         inverse = np.linalg.inv(linear)
 
         def form(vector: np.ndarray, constant: float) -> tuple[np.ndarray, float]:
@@ -118,6 +119,8 @@ class Waves(Deformer):
     def normals(self, mesh: Mesh, t_ns: int) -> np.ndarray:
         e, terms, n = self._envelope(mesh), list(self._terms(mesh, t_ns)), np.asarray(mesh.normals, np.float64)
         height = sum(A * np.sin(x) for A, _, x, _ in terms)
+        # The map is p + h(p) d: its Jacobian is I + d grad h^T, whose cofactor matrix takes the normals (Sherman-
+        # Morrison).
         slope = np.outer(height, self.envelope[0]) + sum(np.outer(e * A * np.cos(x), k) for A, k, x, _ in terms)
         return n * (1 + slope @ self.direction)[:, None] - slope * (n @ self.direction)[:, None]
 
@@ -176,6 +179,7 @@ class Flag(Waves):
         pole = low
         if config.held == "high":
             along, pole = -along, np.where(along > 0, high, low)
+        # The second wave runs aslant and twice as fast, or the cloth would look like corrugated iron.
         k = 2 * math.pi / (config.wavelength * length)
         first, second = k * along, k * (1.6 * along + 0.9 * across)
         beat = Beat(config.period, -math.radians(config.phase))
@@ -234,6 +238,8 @@ class Turn(Deformer):
         angles = self._angle(t_ns) * self._share(mesh)
         arm = self._turned(mesh.vertices - self.pivot, angles)
         n = self._turned(np.asarray(mesh.normals, np.float64), angles)
+        # d q / dp is the turn and, where the share grows, a shear along axis x arm; cofactors of a rank-one update
+        # again.
         shear = np.cross(self.axis, arm)
         along = self._angle(t_ns) * self._turned(np.broadcast_to(self.share[0], arm.shape), angles)
         return n * (1 + (shear * along).sum(axis=1))[:, None] - along * (shear * n).sum(axis=1)[:, None]
@@ -329,6 +335,7 @@ class Breathe(Deformer):
         return self._rate(t_ns) * (mesh.vertices - self.centre)
 
     def normals(self, mesh: Mesh, t_ns: int) -> np.ndarray:
+        # Of a scale the cofactors are, but for a common factor, the inverse.
         return np.asarray(mesh.normals, np.float64) / self._factor(t_ns)
 
     def _rows(self, centre: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -349,6 +356,7 @@ class Breathe(Deformer):
 def _similarity(deformer: Deformer, matrix: np.ndarray) -> tuple[float, np.ndarray]:
     """(scale, (3, 3) rotation) of an affine map that is nothing else, but for a shift. Raises TypeError."""
     linear = matrix[:3, :3]
+    # The cube root keeps the sign: a mirroring map has a negative scale and is refused.
     scale = float(np.cbrt(np.linalg.det(linear)))
     if scale <= 0 or not np.allclose(linear @ linear.T, scale**2 * np.eye(3), rtol=0, atol=1e-9 * scale**2):
         raise TypeError(f"{type(deformer).__name__} can be turned and scaled evenly, and nothing else")
@@ -358,5 +366,6 @@ def _similarity(deformer: Deformer, matrix: np.ndarray) -> tuple[float, np.ndarr
 def _length(low: np.ndarray, high: np.ndarray, along: np.ndarray) -> float:
     """Of a box along an axis; of one that is flat there its largest side."""
     sides = high - low
+    # A sheet has no length across: wavelengths and amplitudes need some length all the same.
     length = float(along @ sides)
     return length if length > 1e-6 * sides.max() else float(sides.max())

@@ -41,7 +41,9 @@ class Cycle:
         self.phase, self.speed = phase, speed
         count = len(angles)
         values = np.concatenate([root[:, None], angles], axis=1)  # the root's place is row 0
+        # Higher harmonics are dropped: what they hold is the corners of the keyed angles, which no body turns.
         spectrum = np.fft.rfft(values, axis=0)[: HARMONICS + 1] / count
+        # A real signal has each wave twice in its spectrum, but for the constant.
         spectrum[1:] *= 2
         self._cosines = np.ascontiguousarray(spectrum.real)
         self._sines = np.ascontiguousarray(-spectrum.imag)
@@ -74,6 +76,7 @@ def _evaluate(phi, rate, cosines, sines, offsets, T, R, dT, dR):
         T[0, j] += value[0, j]
         dT[0, j] = change[0, j]
     q, d, turn, turning, p, e = np.zeros(4), np.zeros(4), np.zeros(4), np.zeros(4), np.zeros(4), np.zeros(4)
+    # Row 0 is the root's place; rows 1 on are the joints' angles.
     for i in range(1, rows):
         q[:], d[:] = 0.0, 0.0
         q[3] = 1.0
@@ -82,6 +85,7 @@ def _evaluate(phi, rate, cosines, sines, offsets, T, R, dT, dR):
             turn[:], turning[:] = 0.0, 0.0
             turn[axis], turn[3] = np.sin(half), np.cos(half)
             turning[axis], turning[3] = half_rate * turn[3], -half_rate * turn[axis]
+            # The product rule on q turn: dq turn + q dturn, before q itself moves on.
             _product(q, turning, e)
             _product(d, turn, p)
             for k in range(4):

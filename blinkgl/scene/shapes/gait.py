@@ -120,10 +120,12 @@ class _Pose:
             for side, foot in feet.items()
         ]
         least = min(float((r - (self.pelvis + hips[side])[:, 2]).min()) for r, side in zip(room, feet))
+        # Lowered by the same amount at all phases: a pelvis that dipped for one foot would bob.
         self.pelvis[:, 2] += min(least, 0.0)
         for side, (ankle, pitch, yaw, toes) in feet.items():
             d = turned.inv().apply(ankle - self.pelvis - hips[side])
             length = np.minimum(np.linalg.norm(d, axis=1), 0.9995 * (body.thigh + body.shank))
+            # The law of cosines, for the outer angle of the knee: 0 is a straight leg.
             bent = (length**2 - body.thigh**2 - body.shank**2) / (2 * body.thigh * body.shank)
             knee = np.arccos(np.clip(bent, -0.9, 1))
             lag = np.arctan2(body.shank * np.sin(knee), body.thigh + body.shank * np.cos(knee))
@@ -132,6 +134,7 @@ class _Pose:
             angles[:, 1] = np.arcsin(np.clip(-d[:, 0] / np.linalg.norm(d, axis=1), -1, 1)) - lag
             self.angles[:, J[f"shank_{side}"], 1] = knee
             leg = turned * Rotation.from_euler("XYZ", angles) * Rotation.from_euler("Y", knee[:, None])
+            # The foot's pitch and yaw are said in the world, and its joint hangs on the leg.
             flat = Rotation.from_euler("ZY", np.stack([yaw, pitch], axis=1))
             self.angles[:, J[f"foot_{side}"]] = (leg.inv() * flat).as_euler("XYZ")
             self.angles[:, J[f"toes_{side}"], 1] = toes
@@ -166,6 +169,7 @@ def _feet(pose: _Pose, stride: float, duty: float, strike: float, push: float, l
             np.stack([np.cos(pitch) * o[0] + np.sin(pitch) * o[1], np.cos(pitch) * o[1] - np.sin(pitch) * o[0]], -1)
             for o in foot
         )
+        # It rolls over the heel while its toes are up, and over the ball afterwards.
         fixed = np.where((pitch < 0)[:, None], foot[1] - heel, foot[0] - ball)
         x = stride * duty * (0.43 - s) + fixed[:, 0]
         return np.stack([x, body.ankle + fixed[:, 1]], -1), pitch
@@ -175,6 +179,7 @@ def _feet(pose: _Pose, stride: float, duty: float, strike: float, push: float, l
         phi = (pose.phi - late) % 1.0
         ground, s = phi < duty, (phi - duty) / (1 - duty)
         ankle, pitch = at(np.minimum(phi / duty, 1.0))
+        # Both ends of the swing have the ground's speed, so that the foot lands and leaves without a jerk.
         back = -stride * (1 - duty)
         swing = np.stack([_between(s, last[0], first[0], back), _between(s, last[1], first[1])], -1)
         early = np.clip(s, 0, 1) ** 0.75  # before the toes, which hang, come forward
@@ -199,6 +204,7 @@ def _still_feet(pose: _Pose, apart: float, yaw: float = 0.2) -> dict:
 def _round(body: Proportions, tempo: float, longest: float, stride: float, froude: float) -> tuple[float, float]:
     """(m of two steps, s for them) of a gait that takes ``stride`` legs at tempo 1 and then goes at ``froude``
     sqrt(g leg). Whoever is quicker takes longer steps, too, up to ``longest`` times as long ones."""
+    # Equal Froude numbers: legs of any length walk alike (Alexander 1976).
     speed = froude * math.sqrt(_GRAVITY * body.hip)
     length = stride * body.hip
     return length * min(math.sqrt(tempo), longest), length / speed / tempo
@@ -308,6 +314,15 @@ def _dance(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle
     pose.turn("neck", -3 * side, 3 * beat)
     pose.turn("head", -5 * loose * pose.wave(2, 0.18), 5 * pose.wave(4, 0.03), 10 * pose.wave(1, 0.2))
     feet = _still_feet(pose, apart, 0.25)
+    _dance_step(pose, feet, step, big)
+    _dance_arms(pose, arms, loose, side, beat)
+    pose.plant(feet, 0.975)
+    return pose.cycle(4 * 60 / 116 / tempo, phase)
+
+
+def _dance_step(pose: _Pose, feet: dict, step: int, big: float) -> None:
+    """One of four steps. big : how far they go, 1 in the mean."""
+    u = pose.body.unit
     if step == 0:  # heels rise with the beat, knees go in and out
         _tap(pose, feet, pitch=24, per_round=2)
     elif step == 1:  # from side to side
@@ -338,6 +353,10 @@ def _dance(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle
             ankle[:, 2] += 0.17 * u * big * up
             ankle[:, 0] += 0.05 * u * up
             feet[name] = ankle, pitch + 0.5 * up, yaw, toes
+
+
+def _dance_arms(pose: _Pose, arms: int, loose: float, side: np.ndarray, beat: np.ndarray) -> None:
+    """One of five things that arms do. loose : how far they swing, 1 in the mean.   side, beat : (N,) waves."""
     if arms == 0:  # both up, swaying
         pose.turn_both("clavicle", 16)
         pose.turn("arm_l", 138 + 14 * side, -12)
@@ -367,8 +386,6 @@ def _dance(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle
             pose.turn(f"arm_{name}", sign * (78 + 22 * loose * pose.wave(2, -run)), -8)
             pose.turn(f"forearm_{name}", sign * 24 * pose.wave(2, 0.06 - run), -14)
             pose.turn(f"hand_{name}", sign * 30 * pose.wave(2, 0.12 - run))
-    pose.plant(feet, 0.975)
-    return pose.cycle(4 * 60 / 116 / tempo, phase)
 
 
 def _tap(pose: _Pose, feet: dict, pitch: float, per_round: int) -> None:

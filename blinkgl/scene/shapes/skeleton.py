@@ -10,16 +10,12 @@ A :class:`Motion` gives translation, rotation and scale of every joint to its pa
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
-from blinkgl.errors import AssetError
-
-MAX_JOINTS = 200_000
 _KEPT = 4
 
 
@@ -78,76 +74,30 @@ class Still:
 
 
 class Skeleton:
-    """parents : (n,) number of each joint's parent, -1: none; in any order.   motion : of the n joints.
-    fixed : (n, 4, 4) what stands before each joint's own transform, such as the place of a root; None: nothing.
-    names : of the joints, for messages.   where : of whom errors speak.
+    """parents : (n,) number of each joint's parent, -1: none; parents before their children.
+    motion : of the n joints.   fixed : (n, 4, 4) what stands before each joint's own transform, such as the place of a
+    root; None: nothing. Raises ValueError for a parent that does not come before."""
 
-    Raises AssetError for parents that are none of the joints or go in a circle, and for a ``fixed`` that is not
-    finite."""
-
-    def __init__(
-        self,
-        parents: ArrayLike,
-        motion: Motion,
-        fixed: ArrayLike | None = None,
-        names: Sequence[str] = (),
-        where: str = "skeleton",
-    ):
+    def __init__(self, parents: ArrayLike, motion: Motion, fixed: ArrayLike | None = None):
         self.parents = np.asarray(parents, np.int64).reshape(-1)
-        self.motion, self.names, self.where = motion, tuple(names), where
         count = len(self.parents)
-        if count > MAX_JOINTS:
-            raise AssetError(
-                "the skeleton has too many joints", where=where, value=count, accepted=f"at most {MAX_JOINTS}"
-            )
+        if not ((self.parents >= -1) & (self.parents < np.arange(count))).all():
+            raise ValueError("a skeleton's parents come before their children")
+        self.motion = motion
         self.fixed = np.tile(np.eye(4), (count, 1, 1)) if fixed is None else np.array(fixed, np.float64)
-        if self.fixed.shape != (count, 4, 4) or not np.isfinite(self.fixed).all():
-            raise AssetError(
-                "the skeleton's fixed transforms are not finite, or not one per joint",
-                where=where,
-                value=self.fixed.shape,
-                accepted=f"shape ({count}, 4, 4)",
-            )
-        self.order = self._parents_first()
         self._kept: OrderedDict[int, tuple[np.ndarray, np.ndarray]] = OrderedDict()
 
     @property
     def is_static(self) -> bool:
         return self.motion.is_static
 
-    def _parents_first(self) -> np.ndarray:
-        count, parents = len(self.parents), self.parents
-        if count and (parents.min() < -1 or parents.max() >= count):
-            first = int(np.flatnonzero((parents < -1) | (parents >= count))[0])
-            raise AssetError(
-                f"joint {self._name(first)} has a parent that does not exist",
-                where=self.where,
-                value=int(parents[first]),
-                accepted=f"-1 to {count - 1}",
-            )
-        children: list[list[int]] = [[] for _ in range(count)]
-        order = []
-        for i, parent in enumerate(parents.tolist()):
-            if parent < 0:
-                order.append(i)
-            else:
-                children[parent].append(i)
-        for i in order:  # grows while it is gone through
-            order += children[i]
-        if len(order) < count:
-            circle = min(set(range(count)) - set(order))
-            raise AssetError(f"the parents of joint {self._name(circle)} go in a circle", where=self.where)
-        return np.array(order, np.int64)
-
-    def _name(self, joint: int) -> str:
-        return f"'{self.names[joint]}'" if joint < len(self.names) else str(joint)
-
     def at(self, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
         """((n, 4, 4), (n, 4, 4)) float64: each joint's transform to the object's frame, and its rate, 1/s. Those of the
         last few times are kept; not to be written to."""
+        # Positions, rates and the vertex stage ask for the same few times, one after the other.
         if t_ns not in self._kept:
             world, rate = np.empty((2, len(self.parents), 4, 4))
-            _world(self.order, self.parents, self.fixed, *self.motion.locals(t_ns), world, rate)
+            _world(self.parents, self.fixed, *self.motion.locals(t_ns), world, rate)
             self._kept[t_ns] = world, rate
             if len(self._kept) > _KEPT:
                 self._kept.popitem(last=False)
@@ -155,11 +105,11 @@ class Skeleton:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _world(order, parents, fixed, T, R, S, dT, dR, dS, world, rate):
+def _world(parents, fixed, T, R, S, dT, dR, dS, world, rate):
     """Transforms of all joints, parents first, and their rates by the product rule."""
     L, D, F, G = np.zeros((4, 4)), np.zeros((4, 4)), np.empty((4, 4)), np.empty((4, 4))
     L[3, 3] = 1.0
-    for i in order:
+    for i in range(len(parents)):
         x, y, z, w = R[i]
         dx, dy, dz, dw = dR[i]
         _turn(x, y, z, w, L)
@@ -178,6 +128,7 @@ def _world(order, parents, fixed, T, R, S, dT, dR, dS, world, rate):
                 D[r, c] = D[r, c] * S[i, c] + L[r, c] * dS[i, c]
                 L[r, c] *= S[i, c]
             L[r, 3], D[r, 3] = T[i, r], dT[i, r]
+        # fixed stands before the joint's own transform and does not move: it takes transform and rate alike.
         _times(fixed[i], L, F)
         _times(fixed[i], D, G)
         parent = parents[i]
@@ -185,6 +136,7 @@ def _world(order, parents, fixed, T, R, S, dT, dR, dS, world, rate):
             world[i], rate[i] = F, G
         else:
             _times(world[parent], F, world[i])
+            # (W F)' = W' F + W F': the second term is added below.
             _times(rate[parent], F, rate[i])
             for r in range(4):
                 for c in range(4):

@@ -93,9 +93,11 @@ class Skin(Deformer):
         self.joints, self.weights = _checked_weights(
             np.asarray(joints), np.asarray(weights, np.float64), len(self.bones), where
         )
-        _check_bones(self.bones, self.inverse_bind, len(skeleton.parents), where)
+        _check_bones(self.inverse_bind, where)
+        # What does not change with time is multiplied once.
         self._bind = self.inverse_bind @ self.before
         targets = 0 if morphs is None else len(morphs.positions)
+        # A joint's matrix is three rows of four; morph weights are packed four to a row behind them.
         self._rows = 3 * len(self.bones) + -(-targets // 4)
         if self._rows > MAX_ROWS:
             raise AssetError(
@@ -105,6 +107,7 @@ class Skin(Deformer):
                 accepted=f"three per joint and a quarter per target, at most {MAX_ROWS} together",
             )
         moving = [part for part in (skeleton.motion, morphs) if part is not None and not part.is_static]
+        # Joints and targets that repeat at different times have no common period that anybody waits for.
         periods = {part.period_ns for part in moving}
         self.period_ns = periods.pop() if len(periods) == 1 else None
         self.span_ns = max((part.span_ns for part in moving), default=0)
@@ -140,7 +143,7 @@ class Skin(Deformer):
     @classmethod
     def morphing(cls, morphs: Morphs, where: str = "morph targets") -> Skin:
         """No joint at all, but for one that lies still."""
-        still = Skeleton([-1], Still(Locals.rest(1)), where=where)
+        still = Skeleton([-1], Still(Locals.rest(1)))
         return cls.rigid(still, 0, morphs.positions.shape[1], morphs, where=where)
 
     @property
@@ -198,6 +201,7 @@ class Skin(Deformer):
         n = np.asarray(mesh.normals, np.float64)
         if self.morphs is not None:
             n = self._morphed(n, self.morphs.normals, self.morphs.weights(t_ns)[0])
+        # The rows of the cofactor matrix are cross products of the blended matrix's rows: right for any linear map.
         return np.stack([(np.cross(p, q) * n).sum(axis=1) for p, q in ((b, c), (c, a), (a, b))], axis=1)
 
     # ---- the shape, for the vertex stage -------------------------------------------------------------------------
@@ -275,13 +279,6 @@ def joined(skins: Sequence[Skin]) -> Skin | None:
 def _checked_weights(joints: np.ndarray, weights: np.ndarray, bones: int, where: str) -> tuple[np.ndarray, np.ndarray]:
     """((V, k) int64, (V, k) float64), the weights of each vertex in falling order and summing to 1, as exact in
     float32."""
-    if joints.ndim != 2 or joints.shape != weights.shape or not joints.shape[1] >= 1:
-        raise AssetError(
-            "joints and weights of a skin differ in shape",
-            where=where,
-            value=f"{joints.shape} and {weights.shape}",
-            accepted="(V, k) both",
-        )
     bad = ~(np.isfinite(weights) & (weights >= 0)).all(axis=1)
     if bad.any():
         vertex = int(np.flatnonzero(bad)[0])
@@ -309,28 +306,17 @@ def _checked_weights(joints: np.ndarray, weights: np.ndarray, bones: int, where:
             value=int(joints[vertex][outside[vertex]][0]),
             accepted=f"0 to {bones - 1}",
         )
+    # Heaviest first, so that what is cut off at the end weighs least.
     order = np.argsort(-weights, axis=1, kind="stable")
     weights, joints = np.take_along_axis(weights, order, 1), np.take_along_axis(np.where(used, joints, 0), order, 1)
     width = min(max(int(used.sum(axis=1).max()), 1), MAX_WEIGHTS)
     weights, joints = weights[:, :width], joints[:, :width].astype(np.int64)
+    # Rounded to what the vertex stage gets: CPU and GPU then follow the same joints by the same parts.
     weights = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32).astype(np.float64)
     return joints, weights
 
 
-def _check_bones(bones: np.ndarray, inverse_bind: np.ndarray, joints: int, where: str) -> None:
-    if not len(bones) or bones.min() < 0 or bones.max() >= joints:
-        raise AssetError(
-            "a skin names a joint that is not in its skeleton",
-            where=where,
-            value=bones[(bones < 0) | (bones >= joints)][:1].tolist(),
-        )
-    if inverse_bind.shape != (len(bones), 4, 4):
-        raise AssetError(
-            "a skin has not one inverse bind matrix per joint",
-            where=where,
-            value=str(inverse_bind.shape),
-            accepted=f"shape ({len(bones)}, 4, 4)",
-        )
+def _check_bones(inverse_bind: np.ndarray, where: str) -> None:
     if not np.isfinite(inverse_bind).all():
         first = int(np.flatnonzero(~np.isfinite(inverse_bind).all(axis=(1, 2)))[0])
         raise AssetError(

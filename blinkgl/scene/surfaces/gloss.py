@@ -133,7 +133,7 @@ def several(F0: np.ndarray, roughness: np.ndarray) -> np.ndarray:
 def looks() -> np.ndarray:
     """(roughness 32, cosine 64, 5) float64, at the places of :func:`energy`: where a surface looks at its surroundings,
     for :func:`both`. A lobe that is seen from aside is longer than the one along the normal, by which they are blurred,
-    and cut off at the horizon: two looks stand for it (``tests/scene/surfaces/fit_gloss.py``)."""
+    and cut off at the horizon: two looks stand for it (``tests/scene/surfaces/lobes.py``)."""
     table = np.array(_LOOKS.split(), np.float64).reshape(LEVELS, COSINES, 5) * 1e-3
     x = np.linspace(0, COSINES - 1, _ANGLES)
     rows = [_bilinear(table, x, np.full(_ANGLES, y)) for y in np.linspace(0, LEVELS - 1, _ROUGHNESSES)]

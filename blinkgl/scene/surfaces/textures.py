@@ -23,6 +23,7 @@ def procedural_hash(kind: str, index: int) -> str:
 
 def procedural_texture(kind: str, index: int, size: int = 512) -> Texture:
     """The ``index``-th texture of a kind, (size, size, 3) uint8 sRGB; the same on every run."""
+    # By the kind's place in the list: data sets are told apart by it, so kinds are only ever added at the end.
     rng = np.random.default_rng([_ALL_KINDS.index(kind), index])
     if kind == "pips":
         image = _pips(rng, size)
@@ -70,6 +71,7 @@ def _lattice(size: int, cells: int):
     """Per pixel along one axis: cell before, cell after (wrapped), fraction."""
     x = (np.arange(size) + 0.5) / size * cells
     low = np.floor(x).astype(int)
+    # Wrapped round, so that the texture repeats without a seam.
     return low % cells, (low + 1) % cells, x - low
 
 
@@ -119,6 +121,7 @@ def _stripes(rng, size):
     phase = (a * x + b * y) + rng.uniform(0, 0.3) * _perlin_noise(rng, size, 4)
     if rng.random() < 0.5:
         return (0.5 + 0.5 * np.sin(2 * np.pi * phase)).astype(np.float32)
+    # Labels, not values: a sum keeps them positive for the palette's remainder.
     return np.floor(2 * phase).astype(np.int64) + 1000
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,7 +18,7 @@ from blinkgl.config.materials import MaterialConfig
 from blinkgl.config.places import rigid_matrix
 from blinkgl.config.poses import KeyedMotionConfig, PoseConfig, TrajectoryConfig
 from blinkgl.config.primitives import PRIMITIVES
-from blinkgl.config.scene import ExplicitSceneConfig, MeshConfig, object_names
+from blinkgl.config.scene import ExplicitSceneConfig, MeshConfig, ObjectConfig, object_names
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.geometry import BUILDERS
 from blinkgl.scene.geometry.deforming import deforming
@@ -27,10 +27,10 @@ from blinkgl.scene.geometry.tangents import split_mirrored
 from blinkgl.scene.importing.mesh_files import Asset, clip_of, load_asset
 from blinkgl.scene.lights import make_light
 from blinkgl.scene.motion.collision import resolve_collisions
+from blinkgl.scene.motion.curves import path_along_curve
 from blinkgl.scene.motion.dynamics import simulate
 from blinkgl.scene.motion.paths import KeyframePath, OffsetPath, StaticPath, smoothed
 from blinkgl.scene.motion.trajectories import look_rotation
-from blinkgl.scene.motion.ways import way_path
 from blinkgl.scene.reading import contents
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.shapes.deformer import gait
@@ -66,54 +66,9 @@ def explicit_scene(
     bodies that touch at the start; with ``physics``, what :func:`simulate` raises) and AssetError."""
     log: list[str] = []
     omissions: dict[str, None] = {}
-    materials = {
-        name: _material(m, base, f"scene.materials.{name}", memory.textures.get(name), memory.maps.get(name, {}))
-        for name, m in config.materials.items()
-    }
-    assets: dict[tuple[str, bool, AnimationConfig | None], Asset] = {}
-    objects, names = [], object_names([item.name for item in config.objects], [item.mesh for item in config.objects])
-    for k, item in enumerate(config.objects):
-        where = f"scene.objects.{k}"
-        own, animation = item.material is None, animation_of(item.animation)
-        key = item.mesh, own, animation
-        if key not in assets:
-            assets[key] = _asset(
-                config.meshes[item.mesh],
-                item.mesh,
-                own,
-                base,
-                config.max_faces,
-                memory.meshes,
-                animation,
-                f"{where}.animation",
-            )
-            log += [line for line in assets[key].log if line not in log]
-            omissions.update(dict.fromkeys(assets[key].omissions))
-        matrix = np.diag(np.broadcast_to(np.asarray(item.scale, float), 3))
-        parts = []
-        for part in assets[key].parts:
-            material = part.material if own else materials[item.material]
-            material = replace(material, unlit=material.unlit or config.light.unlit)
-            mesh = transform_mesh(part.mesh, matrix)
-            if not own and material.bumps is not None and mesh.deformer is None:
-                mesh, _ = split_mirrored(mesh)  # of what deforms already the seams stay: its joints count its vertices
-            parts.append(Part(mesh, material))
-        if item.deform is not None:
-            if animation is not None:
-                raise ConfigError(
-                    "an object deforms by one thing", where=f"{where}.deform", accepted="deform or animation"
-                )
-            parts = list(deforming(parts, item.deform))
-        way = item.way
-        if way is None:
-            path = motion_path(item, t0_ns, t1_ns, where, base)
-        else:
-            speed = way.speed or gait(part.mesh for part in parts)[1] or 1.0
-            form = {"closed": way.closed, "level": way.level, "start": way.start}
-            path = way_path(way.points, speed, t0_ns, t1_ns, **form, where=f"{where}.way")
-        objects.append(SceneObject(names[k], k + 1, tuple(parts), path, item.category))
+    objects = _objects(config, t0_ns, t1_ns, base, memory, log, omissions)
     path = motion_path(config.camera, t0_ns, t1_ns, "scene.camera", base, camera=True)
-    bodies = {name: item.physics for name, item in zip(names, config.objects) if item.physics is not None}
+    bodies = {thing.name: item.physics for thing, item in zip(objects, config.objects) if item.physics is not None}
     if config.collisions:
         # What falls is stopped by nothing: the engine knows the others' paths, as they are after this.
         falling = {name for name, body in bodies.items() if body.kind == "dynamic"}
@@ -132,17 +87,69 @@ def explicit_scene(
     if config.physics is not None:
         objects, dynamics = simulate(objects, bodies, config.physics, t0_ns, t1_ns)
     light, objects = with_environment(config.light.environment, make_light(config.light), base, objects)
-    return Scene(
-        objects,
-        Rig.alone(camera, path),
-        t0_ns,
-        t1_ns,
-        light,
-        config.background,
-        tuple(log),
-        tuple(omissions),
-        dynamics,
-    )
+    said = tuple(log), tuple(omissions)
+    return Scene(objects, Rig.alone(camera, path), t0_ns, t1_ns, light, config.background, *said, dynamics)
+
+
+def _objects(
+    config: ExplicitSceneConfig,
+    t0_ns: int,
+    t1_ns: int,
+    base: Path,
+    memory: InMemory,
+    log: list[str],
+    omissions: dict[str, None],
+) -> list[SceneObject]:
+    """The objects in their order, numbered from 1 on. log, omissions : get what there is to say of their files."""
+    materials = {
+        name: _material(m, base, f"scene.materials.{name}", memory.textures.get(name), memory.maps.get(name, {}))
+        for name, m in config.materials.items()
+    }
+    assets: dict[tuple[str, bool, AnimationConfig | None], Asset] = {}
+    objects, names = [], object_names([item.name for item in config.objects], [item.mesh for item in config.objects])
+    for k, item in enumerate(config.objects):
+        where = f"scene.objects.{k}"
+        own, animation = item.material is None, animation_of(item.animation)
+        key = item.mesh, own, animation
+        if key not in assets:
+            given = config.meshes[item.mesh], item.mesh, own, base, config.max_faces, memory.meshes
+            assets[key] = _asset(*given, animation, f"{where}.animation")
+            log += [line for line in assets[key].log if line not in log]
+            omissions.update(dict.fromkeys(assets[key].omissions))
+        parts = _parts(assets[key], item, None if own else materials[item.material], config.light.unlit)
+        if item.deform is not None:
+            if animation is not None:
+                raise ConfigError(
+                    "an object deforms by one thing", where=f"{where}.deform", accepted="deform or animation"
+                )
+            parts = deforming(parts, item.deform)
+        path = _object_path(item, parts, t0_ns, t1_ns, where, base)
+        objects.append(SceneObject(names[k], k + 1, tuple(parts), path, item.category))
+    return objects
+
+
+def _parts(asset: Asset, item: ObjectConfig, material: Material | None, unlit: bool) -> list[Part]:
+    """An asset at an object's size. material : instead of its own ones."""
+    matrix = np.diag(np.broadcast_to(np.asarray(item.scale, float), 3))
+    parts = []
+    for part in asset.parts:
+        worn = part.material if material is None else material
+        worn = replace(worn, unlit=worn.unlit or unlit)
+        mesh = transform_mesh(part.mesh, matrix)
+        if material is not None and worn.bumps is not None and mesh.deformer is None:
+            mesh, _ = split_mirrored(mesh)  # of what deforms already the seams stay: its joints count its vertices
+        parts.append(Part(mesh, worn))
+    return parts
+
+
+def _object_path(item: ObjectConfig, parts: Sequence[Part], t0_ns: int, t1_ns: int, where: str, base: Path) -> PosePath:
+    """An object's pose, key frames, trajectory, or way, at the speed that its steps ask for."""
+    way = item.way
+    if way is None:
+        return motion_path(item, t0_ns, t1_ns, where, base)
+    speed = way.speed or gait(part.mesh for part in parts)[1] or 1.0
+    form = {"closed": way.closed, "level": way.level, "start": way.start}
+    return path_along_curve(way.points, speed, t0_ns, t1_ns, **form, where=f"{where}.way")
 
 
 def motion_path(
@@ -156,9 +163,7 @@ def motion_path(
         return StaticPath(pose_matrix(config, camera), t0_ns, t1_ns)
     poses = np.stack([pose_matrix(k, camera) for k in config.keyframes])
     times = [round(k.time * 1e9) for k in config.keyframes]
-    return KeyframePath(
-        times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]), config.interpolation, f"{where}.keyframes"
-    )
+    return KeyframePath(times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]), config.interpolation)
 
 
 def trajectory_path(config: TrajectoryConfig, t0_ns: int, t1_ns: int, where: str, base: Path) -> PosePath:
@@ -184,7 +189,7 @@ def trajectory_path(config: TrajectoryConfig, t0_ns: int, t1_ns: int, where: str
     t_ns, poses = t_ns[first:last], poses[first:last]
     positions, rotations = smoothed(t_ns, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]), aside)
     _check_speeds(config, t_ns, positions, rotations, where)
-    path = KeyframePath(t_ns, positions, rotations, "spline", where)
+    path = KeyframePath(t_ns, positions, rotations)
     return path if config.T_body_sensor is None else OffsetPath(path, _on_body(config.T_body_sensor, where, base))
 
 

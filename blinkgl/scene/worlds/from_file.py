@@ -1,6 +1,6 @@
 """Finished scenes of glTF files.
 
-    scene = from_gltf("room.glb", camera, t0_ns, t1_ns)
+    scene = from_document(gltf.read("room.glb"), camera, t0_ns, t1_ns)
 
 ``camera`` is a :class:`~blinkgl.camera.CameraModel`. Each node that shows a mesh becomes one object; a
 node's scale is baked into its vertices, what remains is its rigid pose. Cameras, which look along -z with y up, get
@@ -49,29 +49,29 @@ def scene_from_file(config: FileSceneConfig, camera: CameraModel, t0_ns: int, t1
     camera_path = (
         None if config.pose is None else motion_path(config.pose, t0_ns, t1_ns, "scene.pose", base, camera=True)
     )
-    scene = from_gltf(
-        path,
-        camera,
-        t0_ns,
-        t1_ns,
-        camera_name=config.camera,
-        camera_path=camera_path,
-        intrinsics=config.intrinsics,
-        animation=config.animation,
-        base=base,
-        light=make_light(config.light),
-        lights_gain=config.lights_gain if config.lights == "file" else None,
-        background=config.background,
-        max_faces=config.max_faces,
-        max_texture=config.max_texture_size,
-    )
+    own = config.lights == "file"
+    with reading("scene", str(path)):
+        limits = {"max_faces": config.max_faces, "max_texture": config.max_texture_size}
+        scene = from_document(
+            gltf.read(path, **limits, lights=own),
+            camera,
+            t0_ns,
+            t1_ns,
+            camera_name=config.camera,
+            camera_path=camera_path,
+            intrinsics=config.intrinsics,
+            animation=config.animation,
+            base=base,
+            light=make_light(config.light),
+            lights_gain=config.lights_gain if own else None,
+        )
     light, objects = with_environment(config.light.environment, scene.light, base, scene.objects)
-    scene = replace(scene, light=light, objects=objects)
+    scene = replace(scene, light=light, objects=objects, background=config.background)
     return unlit(scene) if config.light.unlit else scene
 
 
-def from_gltf(
-    path: Path | str,
+def from_document(
+    document: gltf.Document,
     camera: CameraModel,
     t0_ns: int,
     t1_ns: int,
@@ -83,11 +83,8 @@ def from_gltf(
     base: Path | str = ".",
     light: Light = Light(),
     lights_gain: float | None = None,
-    background: float = 0.2,
-    max_faces: int = 5_000_000,
-    max_texture: int = 2048,
 ) -> Scene:
-    """A glTF 2.0 file with its materials, cameras and node animations.
+    """A glTF 2.0 file, as it was read, with its materials, cameras and node animations.
 
     camera_name : name or index of the file's camera (None: the first), unless ``camera_path`` is given.
     intrinsics : "config": those of ``camera``; "file": fx = fy = height / 2 / tan(yfov / 2), centred, near = znear.
@@ -99,22 +96,20 @@ def from_gltf(
     What the file asks for and is not drawn is in the scene's ``omissions``.
     Raises AssetError (file), ConfigError (camera, animation or lights that are not there).
     """
-    with reading("scene", str(path)):
-        document = gltf.read(Path(path), max_faces=max_faces, max_texture=max_texture, lights=lights_gain is not None)
-        playing = _animation(document, animation, Path(base))
-        if lights_gain is not None:
-            light = _with_lights(document, playing, t0_ns, t1_ns, light, lights_gain)
-        objects = _objects(document, playing, t0_ns, t1_ns)
-        if camera_path is None or intrinsics == "file":
-            index = _camera_node(document, camera_name)
-            if document.tree["cameras"][document.nodes[index].camera]["type"] == "orthographic":
-                document.omissions.add("an orthographic camera (drawn in perspective)")
-            if camera_path is None:
-                camera_path, _ = _motion(document, index, playing, t0_ns, t1_ns, CV_FROM_GL)
-            if intrinsics == "file":
-                camera = _gltf_intrinsics(document, index, camera)
+    playing = _animation(document, animation, Path(base))
+    if lights_gain is not None:
+        light = _with_lights(document, playing, t0_ns, t1_ns, light, lights_gain)
+    objects = _objects(document, playing, t0_ns, t1_ns)
+    if camera_path is None or intrinsics == "file":
+        index = _camera_node(document, camera_name)
+        if document.tree["cameras"][document.nodes[index].camera]["type"] == "orthographic":
+            document.omissions.add("an orthographic camera (drawn in perspective)")
+        if camera_path is None:
+            camera_path, _ = _motion(document, index, playing, t0_ns, t1_ns, CV_FROM_GL)
+        if intrinsics == "file":
+            camera = _gltf_intrinsics(document, index, camera)
     rig, log = Rig.alone(camera, camera_path), tuple(dict.fromkeys(document.log))
-    return Scene(objects, rig, t0_ns, t1_ns, light, background, log, document.omissions.lines())
+    return Scene(objects, rig, t0_ns, t1_ns, light, log=log, omissions=document.omissions.lines())
 
 
 def _objects(document: gltf.Document, animation: Animation | None, t0_ns: int, t1_ns: int) -> tuple[SceneObject, ...]:
@@ -244,7 +239,7 @@ def _motion(
             f"{document.path.name}: jumps in the animation of node '{document.nodes[node].name}' are smoothed"
         )
     poses = np.stack(poses)
-    return KeyframePath(times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]), "spline", document.where), first
+    return KeyframePath(times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3])), first
 
 
 def _with_lights(

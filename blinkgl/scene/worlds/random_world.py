@@ -1,4 +1,4 @@
-"""Random worlds: a textured sky box, ground, walls, and objects from a pool, resting or flying, mostly in view.
+"""Random worlds: a textured sky box, ground, and objects from a pool, resting or flying, mostly in view.
 
 After "BlinkFlow" (IROS 2023), section III: random scale, rotation, texture and placement; way-points in free space
 joined by splines; whoever collides stops. The world is z up, in metres, ground at ``ground.height``.
@@ -21,27 +21,26 @@ from blinkgl.config.base import tag_of
 from blinkgl.config.camera import camera_radius
 from blinkgl.config.deform import AnimationConfig, DeformConfig, RandomDeformConfig
 from blinkgl.config.physics import BodyConfig, RandomPhysicsConfig
-from blinkgl.config.scene import RandomSceneConfig, SkyConfig, WallsConfig
+from blinkgl.config.scene import RandomSceneConfig, SkyConfig
 from blinkgl.errors import ConfigError
 from blinkgl.rng import Role, generator
 from blinkgl.scene.geometry.deforming import deforming
 from blinkgl.scene.geometry.meshes import scale_mesh
-from blinkgl.scene.geometry.primitives import cuboid, grid
+from blinkgl.scene.geometry.primitives import grid
 from blinkgl.scene.importing.mesh_files import Asset
 from blinkgl.scene.lights import MAX_LAMPS, make_light, random_lamps
 from blinkgl.scene.motion.body_shapes import Barrier
 from blinkgl.scene.motion.collision import resolve_collisions
+from blinkgl.scene.motion.curves import random_path_along_curve
 from blinkgl.scene.motion.dynamics import Exploded, simulate
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.motion.trajectories import FreeSpace, look_rotation, random_camera_path, random_path
-from blinkgl.scene.motion.ways import random_way
-from blinkgl.scene.reading import contents
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.shapes.deformer import filled, gait
-from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, SKY_SIDES, content_hash, load_image, shrink
-from blinkgl.scene.types import Lamp, Material, Mesh, Part, Scene, SceneObject, Texture
-from blinkgl.scene.worlds.pool import Pool, files_below, object_pool, resolve, split_of, texture_pool
-from blinkgl.scene.worlds.sky import PANORAMA_INSET, panorama_light, panorama_textures, sky_box
+from blinkgl.scene.surfaces.images import SKY_SIDES
+from blinkgl.scene.types import Lamp, Light, Material, Mesh, Part, PosePath, Scene, SceneObject
+from blinkgl.scene.worlds.pool import Pool, object_pool, texture_pool
+from blinkgl.scene.worlds.sky import PANORAMA_INSET, Panorama, drawn_panorama, panorama_light, sky_box
 
 _PLACEMENTS = 300  # positions tried for an object before it is left out
 _CAMERA_PATHS = 6  # camera paths tried for one that runs into nothing; the last is cut where it does
@@ -67,9 +66,49 @@ def random_world(
     log: list[str] = []
     omissions: dict[str, None] = {}
     floor = config.ground.height if config.ground else 0.0
-    unlit = config.light.unlit
 
     T_cam, target = _viewpoint(config, rng, floor)
+    clearance = _clearance(config, camera)
+    backdrop, panorama = _backdrop(config, textures, rng, rng_texture, split, floor, base, log)
+    items = [(name, category, parts, StaticPath(T, t0_ns, t1_ns)) for name, category, parts, T in backdrop]
+
+    dice = rng, rng_texture, rng_shape
+    placed = _place(config, camera, objects, textures, dice, split, T_cam, clearance, floor, log, omissions)
+    # What goes by itself is not thrown.
+    lifeless = [one.name for one in placed if _gait(one.parts)[0] == "anyhow"]
+    bodies = _bodies(config.physics, lifeless, generator(seed, sequence, Role.PHYSICS))
+    room = _Room(config, floor, placed, T_cam, clearance)
+    for k, one in enumerate(placed):
+        path = (
+            StaticPath(one.pose, t0_ns, t1_ns)
+            if one.name in bodies
+            else _object_path(config, one, room.beside(k), rng_motion, t0_ns, t1_ns)
+        )
+        items.append((one.name, "object", one.parts, path))
+    scene_objects = tuple(
+        SceneObject(name, k + 1, parts, motion, category) for k, (name, category, parts, motion) in enumerate(items)
+    )
+    camera_paths = (
+        random_camera_path(rng_motion, t0_ns, t1_ns, config.camera_motion, room.for_camera(), clearance, target, T_cam)
+        for _ in range(_CAMERA_PATHS)
+    )
+    kept, camera_path = _resolved(scene_objects, set(bodies), camera_paths, clearance, t0_ns, t1_ns, log)
+    kept, dynamics = _fallen(config, kept, bodies, (camera_path, clearance), floor, t0_ns, t1_ns, log)
+    return Scene(
+        objects=kept,
+        rig=Rig.alone(camera, camera_path),
+        t0_ns=t0_ns,
+        t1_ns=t1_ns,
+        light=_light(config, panorama, rng, generator(seed, sequence, Role.LIGHT), floor),
+        background=config.background,
+        log=tuple(log),
+        omissions=tuple(omissions),
+        dynamics=dynamics,
+    )
+
+
+def _clearance(config: RandomSceneConfig, camera: CameraModel) -> float:
+    """How far everything keeps from the camera. Raises ConfigError: the region has no room for that."""
     clearance = camera_radius(camera, config.camera_clearance)
     if clearance > config.region.height:
         raise ConfigError(
@@ -79,63 +118,77 @@ def random_world(
             accepted=f"at least {clearance:.4g} m (scene.camera_clearance, or the "
             "distance of the near plane's corners: camera.near and camera.fov)",
         )
+    return clearance
+
+
+class _Placed(NamedTuple):
+    """An object at t0. pose : (4, 4).   radius : of its bounding sphere.   resting : on the ground."""
+
+    name: str
+    parts: tuple[Part, ...]
+    pose: np.ndarray
+    radius: float
+    resting: bool
+
+
+class _Room:
+    """Where bodies of a random world may go: the region without the others' bounding spheres at t0."""
+
+    def __init__(
+        self, config: RandomSceneConfig, floor: float, placed: list[_Placed], T_cam: np.ndarray, clearance: float
+    ):
+        half = config.region.width / 2
+        self.low, self.high = np.array([-half, -half, floor]), np.array([half, half, floor + config.region.height])
+        self.ground_z = floor if config.ground else None
+        self.centres = np.array([one.pose[:3, 3] for one in placed]).reshape(-1, 3)
+        self.radii = np.array([one.radius for one in placed])
+        self.camera, self.clearance = T_cam[:3, 3], clearance
+
+    def beside(self, number: int) -> FreeSpace:
+        """For one of those that were placed."""
+        others = np.arange(len(self.radii)) != number
+        centres, radii = np.vstack([self.centres[others], self.camera]), self.radii[others]
+        return FreeSpace(self.low, self.high, self.ground_z, centres, np.append(radii, self.clearance + _STAND_OFF))
+
+    def for_camera(self) -> FreeSpace:
+        low = self.low + [0, 0, self.clearance]
+        return FreeSpace(low, self.high, self.ground_z, self.centres, self.radii + _STAND_OFF)
+
+
+def _backdrop(config, textures, rng, rng_texture, split, floor, base, log):
+    """([(name, category, parts, pose)] of sky and ground, the panorama on the sky or None)."""
     backdrop, panorama = [], None
     if config.sky:
         parts, panorama = _sky(config.sky, textures, rng_texture, split, base, log)
-        backdrop.append(("sky", "sky", parts, StaticPath(_shift(floor), t0_ns, t1_ns)))
+        backdrop.append(("sky", "sky", parts, _shift(floor)))
     if config.ground:
         size = config.ground.size or (config.sky.size if config.sky else 4 * config.region.width)
         mesh = grid(width=size, depth=size, subdivisions=config.ground.subdivisions)
         repeats = size / _log_uniform(rng_texture, config.ground.tile)
-        material = Material(textures.draw(rng_texture, split, log), uv_scale=(repeats, repeats), unlit=unlit)
-        backdrop.append(("ground", "ground", (Part(mesh, material),), StaticPath(_shift(floor), t0_ns, t1_ns)))
-    backdrop += [
-        (f"wall-{k}", "wall", parts, StaticPath(T, t0_ns, t1_ns))
-        for k, (parts, T) in enumerate(_walls(config.walls, config, textures, rng, rng_texture, split, floor, log))
-    ]
+        texture = textures.draw(rng_texture, split, log)
+        material = Material(texture, uv_scale=(repeats, repeats), unlit=config.light.unlit)
+        backdrop.append(("ground", "ground", (Part(mesh, material),), _shift(floor)))
+    rng.permutation(4)  # chose the sides of walls, which are gone: all that is drawn next stays what it was
+    return backdrop, panorama
 
-    dice = rng, rng_texture, rng_shape
-    placed = _place(config, camera, objects, textures, dice, split, T_cam, clearance, floor, log, omissions)
-    centres = np.array([T[:3, 3] for *_, T, _, _ in placed]).reshape(-1, 3)
-    radii = np.array([radius for *_, radius, _ in placed])
-    half = config.region.width / 2
-    low, high = np.array([-half, -half, floor]), np.array([half, half, floor + config.region.height])
-    ground_z = floor if config.ground else None
 
-    # What goes by itself is not thrown.
-    lifeless = [name for name, parts, *_ in placed if _gait(parts)[0] == "anyhow"]
-    bodies = _bodies(config.physics, lifeless, generator(seed, sequence, Role.PHYSICS))
-    items = list(backdrop)
-    for k, (name, parts, T, radius, resting) in enumerate(placed):
-        if name in bodies:
-            items.append((name, "object", parts, StaticPath(T, t0_ns, t1_ns)))
-            continue
-        others = np.arange(len(placed)) != k
-        space = FreeSpace(
-            low,
-            high,
-            ground_z,
-            np.vstack([centres[others], T_cam[:3, 3]]),
-            np.append(radii[others], clearance + _STAND_OFF),
-        )
-        goes, speed = _gait(parts)
-        if goes == "anyhow" or (goes == "level" and speed == 0):
-            turns = resting or goes == "level"
-            path = random_path(rng_motion, t0_ns, t1_ns, config.object_motion, space, radius, T, on_ground=turns)
-        elif speed == 0 or config.object_motion.kind == "static":
-            path = StaticPath(T, t0_ns, t1_ns)
-        else:
-            path = random_way(rng_motion, t0_ns, t1_ns, space, radius, T, speed, flat=goes == "upright")
-        items.append((name, "object", parts, path))
-    scene_objects = tuple(
-        SceneObject(name, k + 1, parts, motion, category) for k, (name, category, parts, motion) in enumerate(items)
-    )
-    space = FreeSpace(low + [0, 0, clearance], high, ground_z, centres, radii + _STAND_OFF)
-    # A camera that was stopped would see a still world from then on: another path is better.
-    for _ in range(_CAMERA_PATHS):
-        path = random_camera_path(rng_motion, t0_ns, t1_ns, config.camera_motion, space, clearance, target, T_cam)
-        # What falls is stopped by nothing: the engine knows the others' paths, as they are after this.
-        others = tuple(o for o in scene_objects if o.name not in bodies)
+def _object_path(config: RandomSceneConfig, one: _Placed, space: FreeSpace, rng, t0_ns: int, t1_ns: int) -> PosePath:
+    """At random, or, of what goes by itself, along a way as fast as its steps take it."""
+    goes, speed = _gait(one.parts)
+    if goes == "anyhow" or (goes == "level" and speed == 0):
+        turns = one.resting or goes == "level"
+        return random_path(rng, t0_ns, t1_ns, config.object_motion, space, one.radius, one.pose, on_ground=turns)
+    if speed == 0 or config.object_motion.kind == "static":
+        return StaticPath(one.pose, t0_ns, t1_ns)
+    return random_path_along_curve(rng, t0_ns, t1_ns, space, one.radius, one.pose, speed, flat=goes == "upright")
+
+
+def _resolved(objects, falling: set[str], camera_paths: Iterable[PosePath], clearance, t0_ns, t1_ns, log):
+    """(the objects, those that ran into something stopped, without those that did so at the start; the camera's path).
+    camera_paths : drawn one by one until one is not stopped: a camera that was would see a still world from then on."""
+    # What falls is stopped by nothing: the engine knows the others' paths, as they are after this.
+    others = tuple(o for o in objects if o.name not in falling)
+    for path in camera_paths:
         result = resolve_collisions(others, path, clearance, t0_ns, t1_ns)
         if not any("camera" in event.cut for event in result.events):
             break
@@ -147,17 +200,27 @@ def random_world(
         log.append("left out, touching something at the start: " + ", ".join(sorted(bad)))
     log += result.log
     resolved = {o.name: o for o in result.objects}
-    kept, dynamics = tuple(resolved.get(o.name, o) for o in scene_objects if o.name not in bad), None
-    while config.physics is not None and dynamics is None and any(o.name in bodies for o in kept):
-        sides, eye = _sides(config, floor), (result.camera_path, clearance)
+    return tuple(resolved.get(o.name, o) for o in objects if o.name not in bad), result.camera_path
+
+
+def _fallen(config, objects, bodies, eye, floor, t0_ns, t1_ns, log):
+    """(the objects without those that explode, Dynamics or None). eye : the camera's path and clearance."""
+    if config.physics is None:
+        return objects, None
+    while any(o.name in bodies for o in objects):
+        sides = _sides(config, floor)
         try:
-            kept, dynamics = simulate(kept, bodies, config.physics, t0_ns, t1_ns, camera=eye, sides=sides)
+            return simulate(objects, bodies, config.physics, t0_ns, t1_ns, camera=eye, sides=sides)
         except Exploded as error:  # squeezed between two that nothing stops
-            kept = tuple(o for o in kept if o.name != error.body)
+            objects = tuple(o for o in objects if o.name != error.body)
             log.append(f"left out, it came to be faster than scene.physics.max_speed: {error.body}")
+    return objects, None
+
+
+def _light(config: RandomSceneConfig, panorama: Panorama | None, rng, rng_lamps, floor: float) -> Light:
     lamps: tuple[Lamp, ...] = ()
     if config.lights is not None:
-        lamps = random_lamps(config.lights, generator(seed, sequence, Role.LIGHT), half, floor)
+        lamps = random_lamps(config.lights, rng_lamps, config.region.width / 2, floor)
         if len(lamps) + len(config.light.lights) + 1 > MAX_LAMPS:
             raise ConfigError(
                 "too many lights",
@@ -168,17 +231,7 @@ def random_world(
     light = make_light(config.light, rng, lamps)
     if config.sky is not None and config.sky.lights and panorama is not None:
         light = panorama_light(panorama.file, panorama.angle, panorama.brightness, light, panorama.where)
-    return Scene(
-        objects=kept,
-        rig=Rig.alone(camera, result.camera_path),
-        t0_ns=t0_ns,
-        t1_ns=t1_ns,
-        light=light,
-        background=config.background,
-        log=tuple(log),
-        omissions=tuple(omissions),
-        dynamics=dynamics,
-    )
+    return light
 
 
 def pools(config: RandomSceneConfig, base: Path) -> tuple[Pool, Pool]:
@@ -207,11 +260,13 @@ def _viewpoint(config: RandomSceneConfig, rng, floor: float) -> tuple[np.ndarray
     return T, target
 
 
-def _place(config, camera, objects: Pool, textures: Pool, dice, split, T_cam, clearance, floor, log, omissions):
-    """[(name, parts, T_world_obj, bounding radius, resting)]: no two bounding spheres, nor the camera's, overlap."""
+def _place(
+    config, camera, objects: Pool, textures: Pool, dice, split, T_cam, clearance, floor, log, omissions
+) -> list[_Placed]:
+    """What was found a place: no two bounding spheres, nor the camera's, overlap."""
     settings, region = config.objects, config.region
     rng, rng_texture, rng_shape = dice
-    placed: list[tuple] = []
+    placed: list[_Placed] = []
     if settings.count == 0:
         return placed
     centres, radii = [T_cam[:3, 3]], [clearance]
@@ -251,7 +306,7 @@ def _place(config, camera, objects: Pool, textures: Pool, dice, split, T_cam, cl
         T[:3, :3], T[:3, 3] = rotation, position
         centres.append(position)
         radii.append(radius)
-        placed.append((f"{asset.name}#{k}", parts, T, radius, resting))
+        placed.append(_Placed(f"{asset.name}#{k}", parts, T, radius, resting))
         log.extend(f"{asset.name}#{k} {text}" for text in (said, word) if text)
         log.extend(line for line in asset.log if line not in log)
         omissions.update(dict.fromkeys(asset.omissions))
@@ -365,7 +420,7 @@ def _bodies(config: RandomPhysicsConfig | None, names: list[str], rng) -> dict[s
 
 
 def _sides(config: RandomSceneConfig, floor: float) -> list[Barrier]:
-    """Of the region, as far out as walls stand, so that no object is in one; its floor where there is no ground."""
+    """Of the region, far enough out that no object is in one; its floor where there is no ground."""
     reach = 0.5 * config.objects.size[1] + _GAP
     out = config.region.width / 2 + reach
     sides = [Barrier((sx, sy, 0.0), -out) for sx, sy in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))]
@@ -375,73 +430,19 @@ def _sides(config: RandomSceneConfig, floor: float) -> list[Barrier]:
     return sides
 
 
-def _sky(config: SkyConfig, textures: Pool, rng, split, base, log) -> tuple[tuple[Part, ...], _Panorama | None]:
+def _sky(config: SkyConfig, textures: Pool, rng, split, base, log) -> tuple[tuple[Part, ...], Panorama | None]:
     """The box around everything, and the panorama that is on it."""
     brightness = float(rng.uniform(*config.brightness))
     repeats, inset = _log_uniform(rng, config.repeat), 1.0
     panorama = None
     if config.panoramas:
-        panorama = _panorama(config, rng, split, textures.test_fraction, base, brightness)
+        panorama = drawn_panorama(config, rng, split, textures.test_fraction, base, brightness)
         images, repeats, inset = panorama.sides, 1.0, PANORAMA_INSET
     elif config.per_face:
         images = [textures.draw(rng, split, log) for _ in SKY_SIDES]
     else:
         images = [textures.draw(rng, split, log)] * len(SKY_SIDES)
     return sky_box(config.size, config.subdivisions, images, brightness, repeats, inset), panorama
-
-
-class _Panorama(NamedTuple):
-    """Of a sky. sides : of its box.   angle : rad by which it is turned, from +x towards +y."""
-
-    file: Path
-    where: str
-    sides: list[Texture]
-    angle: float
-    brightness: float
-
-
-def _panorama(config: SkyConfig, rng, split, test_fraction, base, brightness: float) -> _Panorama:
-    """A panorama of this split, turned to a random heading."""
-    files = []
-    for i, given in enumerate(config.panoramas):
-        path, where = resolve(given, base), f"scene.sky.panoramas.{i}"
-        if not path.exists():
-            raise ConfigError(
-                "no such file or folder",
-                where=where,
-                value=given,
-                accepted="an equirectangular image or a folder of them",
-            )
-        files += [path] if path.is_file() else files_below(path, where, given, IMAGE_SUFFIXES, "images")
-    hashed = sorted({content_hash(contents(f, "image")): f for f in files}.items())
-    mine = [(h, f) for h, f in hashed if split_of(h, test_fraction) == split]
-    if not mine:
-        raise ConfigError(
-            f"none of the {len(hashed)} panoramas falls to split '{split}'",
-            where="scene.sky.panoramas",
-            accepted="more panoramas, or another scene.textures.test_fraction",
-        )
-    digest, file = mine[int(rng.integers(len(mine)))]
-    image = shrink(load_image(file), 4096)
-    columns = int(rng.integers(image.shape[1]))
-    sides = panorama_textures(np.roll(image, columns, axis=1), file.stem, digest)
-    return _Panorama(file, str(file), sides, -2 * math.pi * columns / image.shape[1], brightness)
-
-
-def _walls(walls: WallsConfig, config: RandomSceneConfig, textures, rng, rng_texture, split, floor, log):
-    """(parts, T_world_wall) of slabs outside the region, far enough for any object whose origin stays inside."""
-    out = config.region.width / 2 + config.objects.size[1] / 2 + walls.thickness / 2 + _GAP
-    for side in rng.permutation(4)[: walls.count]:
-        height, length = float(rng.uniform(*walls.height)), 2 * out
-        mesh = cuboid(extents=(walls.thickness, length, height), subdivisions=8)
-        tile = _log_uniform(rng_texture, walls.tile)
-        material = Material(
-            textures.draw(rng_texture, split, log), uv_scale=(length / tile, height / tile), unlit=config.light.unlit
-        )
-        turn = Rotation.from_rotvec([0, 0, math.pi / 2 * side])
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = np.round(turn.as_matrix()), turn.apply([out, 0, 0]) + [0, 0, floor + height / 2]
-        yield (Part(mesh, material),), T
 
 
 def _shift(z: float) -> np.ndarray:

@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from blinkgl.config.lights import EnvironmentConfig
+from blinkgl.config.scene import SkyConfig
 from blinkgl.errors import ConfigError
 from blinkgl.scene.geometry.primitives import parameter_hash, square
 from blinkgl.scene.lights import lit_by
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.reading import contents
 from blinkgl.scene.surfaces.environment import environment, turned
-from blinkgl.scene.surfaces.images import SKY_SIDES, content_hash, cube_faces, load_image, load_panorama, shrink
+from blinkgl.scene.surfaces.images import (
+    IMAGE_SUFFIXES,
+    SKY_SIDES,
+    content_hash,
+    cube_faces,
+    load_image,
+    load_panorama,
+    shrink,
+)
 from blinkgl.scene.types import Light, Material, Mesh, Part, SceneObject, Texture
-from blinkgl.scene.worlds.pool import resolve
+from blinkgl.scene.worlds.pool import files_below, resolve, split_of
 
 _MARGIN = 1 / 16
 PANORAMA_INSET = 1 / (1 + _MARGIN)
@@ -83,3 +94,43 @@ def with_environment(
         number = 1 + max((thing.instance_id for thing in objects), default=0)
         objects = (*objects, SceneObject("sky", number, parts, StaticPath(), "sky"))
     return light, objects
+
+
+class Panorama(NamedTuple):
+    """Of a sky. sides : of its box.   angle : rad by which it is turned, from +x towards +y."""
+
+    file: Path
+    where: str
+    sides: list[Texture]
+    angle: float
+    brightness: float
+
+
+def drawn_panorama(
+    config: SkyConfig, rng: np.random.Generator, split: str, test_fraction: float, base: Path, brightness: float
+) -> Panorama:
+    """A panorama of this split, turned to a random heading."""
+    files = []
+    for i, given in enumerate(config.panoramas):
+        path, where = resolve(given, base), f"scene.sky.panoramas.{i}"
+        if not path.exists():
+            raise ConfigError(
+                "no such file or folder",
+                where=where,
+                value=given,
+                accepted="an equirectangular image or a folder of them",
+            )
+        files += [path] if path.is_file() else files_below(path, where, given, IMAGE_SUFFIXES, "images")
+    hashed = sorted({content_hash(contents(f, "image")): f for f in files}.items())
+    mine = [(h, f) for h, f in hashed if split_of(h, test_fraction) == split]
+    if not mine:
+        raise ConfigError(
+            f"none of the {len(hashed)} panoramas falls to split '{split}'",
+            where="scene.sky.panoramas",
+            accepted="more panoramas, or another scene.textures.test_fraction",
+        )
+    digest, file = mine[int(rng.integers(len(mine)))]
+    image = shrink(load_image(file), 4096)
+    columns = int(rng.integers(image.shape[1]))
+    sides = panorama_textures(np.roll(image, columns, axis=1), file.stem, digest)
+    return Panorama(file, str(file), sides, -2 * math.pi * columns / image.shape[1], brightness)

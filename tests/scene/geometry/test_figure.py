@@ -10,7 +10,7 @@ from blinkgl.scene.geometry.figure import ATLAS, CHARTS
 from blinkgl.scene.geometry.isosurface import isosurface
 from blinkgl.scene.geometry.living import figure, fish, flag
 from blinkgl.scene.geometry.meshes import closedness, uvs_degenerate, weld
-from blinkgl.scene.shapes.gait import CLIPS, J
+from blinkgl.scene.shapes.gait import CLIPS
 
 MS = 1_000_000
 PEOPLE = [
@@ -74,38 +74,6 @@ def test_texture_coordinates_are_an_atlas_in_one_scale():
         assert min(one) >= 0 and max(one) <= ATLAS
         for other in boxes[k + 1 :]:
             assert one[2] <= other[0] or other[2] <= one[0] or one[3] <= other[1] or other[3] <= one[1]
-
-
-@pytest.mark.parametrize(
-    ("chart", "joint", "down", "middle"),
-    [
-        ("torso", "chest", (0, 0, -1), (1, 0, 0)),
-        ("head", "head", (0, 0, -1), (1, 0, 0)),
-        ("upper_arm", "arm_l", ("arm_l", "forearm_l"), (0, 1, 0)),
-        ("forearm", "forearm_l", ("forearm_l", "hand_l"), (0, 1, 0)),
-        ("hand", "hand_l", ("forearm_l", "hand_l"), (0, 1, 0)),
-        ("thigh", "thigh_l", ("thigh_l", "shank_l"), (1, 0, 0)),
-        ("shank", "shank_l", ("shank_l", "foot_l"), (1, 0, 0)),
-        ("foot", "foot_l", (-1, 0, 0), (0, 0, 1)),
-    ],
-)
-def test_a_part_of_the_body_lies_upright_in_its_chart(chart, joint, down, middle):
-    """Rows run down the limb, a metre a metre, and what is in front (of arms outside, of feet above) is in the middle:
-    people paint on it. x is ahead, y left, z up."""
-    mesh, area = figure(), CHARTS[chart]
-    places = np.linalg.inv(mesh.deformer.inverse_bind)[:, :3, 3]
-    if isinstance(down[0], str):
-        down = places[J[down[1]]] - places[J[down[0]]]
-    down = np.array(down, float) / np.linalg.norm(down)
-    u, v = (mesh.uvs.astype(float) * ATLAS).T - np.array([[area.left + area.around / 2], [area.top]])
-    leading = mesh.deformer.joints[np.arange(len(u)), mesh.deformer.weights.argmax(axis=1)]
-    here = (leading == J[joint]) & (np.abs(u) < area.around / 2) & (v > 0.02) & (v < area.length - 0.02)
-    to_v = np.linalg.lstsq(np.c_[mesh.vertices[here], np.ones(here.sum())], v[here], rcond=None)[0][:3]
-    assert here.sum() > 30 and np.linalg.norm(to_v - down) < 0.2
-    front = mesh.normals[here & (np.abs(u) < 0.06 * area.around)].sum(axis=0)
-    ahead = np.array(middle, float) - down * (down @ np.array(middle, float))
-    front -= down * (down @ front)
-    assert front @ ahead > 0.95 * np.linalg.norm(front) * np.linalg.norm(ahead) > 0
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from blinkgl.scene.geometry.living import figure
-from blinkgl.scene.motion.ways import Way, way_path
+from blinkgl.scene.motion.curves import ArcLengthCurve, path_along_curve
 from blinkgl.scene.shapes.gait import CLIPS, PARENTS, J, Proportions, clip_of
 from blinkgl.scene.shapes.skeleton import Skeleton
 
@@ -80,14 +80,14 @@ def test_who_dances_or_waves_stands_on_the_ground(variant):
 @pytest.mark.parametrize("closed", [False, True])
 def test_a_way_is_gone_along_at_one_speed_with_the_nose_ahead(closed):
     points = [(0, 0, 0.5), (2, 0, 0.5), (3, 2, 0.5), (1, 3, 0.5), (-1, 1.5, 0.5)]
-    path = way_path(points, 1.3, 0, 4 * 10**9, closed=closed, start=0.2)
+    path = path_along_curve(points, 1.3, 0, 4 * 10**9, closed=closed, start=0.2)
     times = np.linspace(0, 4 * 10**9, 400).astype(np.int64)
     T, dT = (np.array([f(int(t)) for t in times]) for f in (path.pose, path.derivative))
     speed = np.linalg.norm(dT[:, :3, 3], axis=1)
     np.testing.assert_allclose(speed, 1.3, rtol=5e-3)
     np.testing.assert_allclose((T[:, :3, 0] * dT[:, :3, 3]).sum(axis=1), 1.3, rtol=5e-3)
     np.testing.assert_allclose(T[:, 2, 2], 1, atol=1e-9)
-    way = Way(points, closed)
+    way = ArcLengthCurve(points, closed)
     np.testing.assert_allclose(T[0, :3, 3], way.at(np.array([0.2 * way.length]))[0][0], atol=1e-4)
     at = way.at(np.linspace(0, way.length, 2000))[0]
     assert all(np.linalg.norm(at - p, axis=1).min() < 0.01 for p in points)
@@ -96,11 +96,11 @@ def test_a_way_is_gone_along_at_one_speed_with_the_nose_ahead(closed):
 
 
 def test_beyond_its_end_a_way_goes_straight_on():
-    path = way_path([(0, 0, 0), (1, 0, 0)], 2.0, 0, 2 * 10**9)
+    path = path_along_curve([(0, 0, 0), (1, 0, 0)], 2.0, 0, 2 * 10**9)
     np.testing.assert_allclose(path.pose(2 * 10**9)[:3, 3], [4, 0, 0], atol=1e-9)
 
 
 def test_a_nose_goes_up_with_the_way():
-    path = way_path([(0, 0, 0), (1, 0, 1)], 1.0, 0, 10**9, level=False)
+    path = path_along_curve([(0, 0, 0), (1, 0, 1)], 1.0, 0, 10**9, level=False)
     np.testing.assert_allclose(path.pose(5 * 10**8)[:3, 0], np.array([1, 0, 1]) / 2**0.5, atol=1e-9)
     np.testing.assert_allclose(path.pose(5 * 10**8)[2, 1], 0, atol=1e-9)

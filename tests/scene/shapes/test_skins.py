@@ -139,17 +139,11 @@ NAN = np.where(np.arange(2)[:, None, None] == 1, np.nan, BIND)
 @pytest.mark.parametrize(
     "said, make",
     [
-        ("has a parent that does not exist", lambda: Skeleton([-1, 7], Still(Locals.rest(2)), names=("hip", "knee"))),
-        ("the parents of joint 'hip' go in a circle", lambda: Skeleton([1, 0], Still(Locals.rest(2)), names=("hip",
-        "knee"))), ("too many joints", lambda: Skeleton(np.full(1_000_000, -1), Still(Locals.rest(1)))),
         ("joint 1 of a skin is not finite", lambda: skin_of(inverse_bind=NAN)),
-        ("not one inverse bind matrix per joint", lambda: skin_of(inverse_bind=BIND[:1])),
-        ("names a joint that is not in its skeleton", lambda: skin_of(bones=[0, 9])),
         ("the weights of vertex 1 of a skin sum to zero", lambda: skin_of(weights=[[1, 0], [0, 0]])),
         ("vertex 0 of a skin has a weight that is negative or no number", lambda: skin_of(weights=[[-1, 2], [1, 0]])),
         ("vertex 0 of a skin has a weight that is negative or no number", lambda: skin_of(weights=[[np.nan, 1], [1,
         0]])), ("vertex 1 of a skin follows a joint that does not exist", lambda: skin_of(joints=[[0, 1], [2, 0]])),
-        ("differ in shape", lambda: skin_of(joints=[[0, 1]])),
         ("too many joints and morph targets", lambda: Skin(Skeleton([-1], Still(Locals.rest(1))), [0] * 400,
         np.tile(np.eye(4), (400, 1, 1)), [[0]], [[1]])),
     ],

@@ -39,22 +39,6 @@ def pair(request):
     return request.param, [sequence_scene(template.sequence(index), index) for index in (0, 1)]
 
 
-def test_a_custom_scene_is_drawn_anew_for_each_sequence(pair):
-    """Bodies, places and the camera differ; the same sequence is the same again."""
-    name, (first, second) = pair
-    assert [o.name for o in first.objects] == [o.name for o in second.objects] and first.omissions == ()
-    assert not np.allclose(first.camera_path.pose(0), second.camera_path.pose(0))
-    moving = [(a, b) for a, b in zip(first.objects, second.objects) if not a.is_static]
-    assert len(moving) >= {"flags": 6, "falling_dice": 3}.get(name, 6)
-    for a, b in moving:
-        x, y = points_at(a, SECOND // 3), points_at(b, SECOND // 3)
-        assert x.shape != y.shape or np.abs(x - y).max() > 0.01, a.name
-    template = load_run(CONFIGS / f"scenes/{name}.yaml", ["camera.width=64", "camera.height=48"])
-    again = sequence_scene(template.sequence(0), 0)
-    for a, c in zip(first.objects, again.objects):
-        np.testing.assert_array_equal(points_at(a, SECOND // 3), points_at(c, SECOND // 3))
-
-
 def test_blinkflow_has_them_as_its_custom_scenes():
     for recipe in ("blinkflow", "blinkflow_mini"):
         text = (CONFIGS / f"{recipe}.yaml").read_text(encoding="utf-8")

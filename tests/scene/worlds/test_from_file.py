@@ -15,7 +15,7 @@ from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.raw_mesh import Z_UP, transformed
-from blinkgl.scene.worlds.from_file import from_gltf, split_rigid
+from blinkgl.scene.worlds.from_file import from_document, split_rigid
 from tests.scene.gltf_files import GltfBuilder, triangle
 from tests.shared_data import shared
 
@@ -33,7 +33,7 @@ def with_camera(builder: GltfBuilder, **node) -> GltfBuilder:
 
 def load(tmp_path, builder, **options):
     (tmp_path / "scene.glb").write_bytes(builder.glb())
-    return from_gltf(tmp_path / "scene.glb", CAMERA, 0, T1, **options)
+    return from_document(gltf.read(tmp_path / "scene.glb"), CAMERA, 0, T1, **options)
 
 
 def world(o, t=0):

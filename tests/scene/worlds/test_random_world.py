@@ -16,7 +16,6 @@ from blinkgl.config.scene import (
     RegionConfig,
     SkyConfig,
     TexturesConfig,
-    WallsConfig,
 )
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene, check_assets
@@ -58,14 +57,14 @@ def fingerprint(scene) -> bytes:
 
 
 def test_same_seed_same_arrays_whatever_was_built_before():
-    first = fingerprint(build(config(walls=True), sequence=3))
+    first = fingerprint(build(config(), sequence=3))
     pools.__globals__["_object_pool"].cache_clear()
     pools.__globals__["_texture_pool"].cache_clear()
-    assert fingerprint(build(config(walls=True), sequence=3)) == first
-    build(config(walls=True), sequence=1)
-    assert fingerprint(build(config(walls=True), sequence=3)) == first
+    assert fingerprint(build(config(), sequence=3)) == first
+    build(config(), sequence=1)
+    assert fingerprint(build(config(), sequence=3)) == first
     others = [
-        fingerprint(build(config(walls=True), **k))
+        fingerprint(build(config(), **k))
         for k in (dict(sequence=4), dict(sequence=3, seed=1), dict(sequence=3, split="test"))
     ]
     assert first not in others and len(set(others)) == 3
@@ -147,10 +146,6 @@ def test_structure(worlds):
 def test_options():
     bare = build(config(sky=None, ground=None, objects=ObjectsConfig(count=6, flying=0.0)))
     assert {o.category for o in bare.objects} == {"object"}
-    walled = build(config(walls=WallsConfig(count=3)))
-    walls = [o for o in walled.objects if o.category == "wall"]
-    assert len(walls) == 3 and all(np.abs(world_vertices(w)[:, :2]).max(axis=0).min() > 15 for w in walls)
-    assert all(world_vertices(w)[:, 2].min() == pytest.approx(0, abs=1e-9) for w in walls)
     unlit = build(config(light=LightConfig(unlit=True)))
     assert all(p.material.unlit for o in unlit.objects for p in o.parts)
     assert len(things(build(config(objects=ObjectsConfig(count=0))))) == 0

@@ -1,6 +1,6 @@
-"""Ways: a body follows a curve through points, at one speed, its x axis ahead.
+"""The key `way`: a body follows a curve through points, at one speed, its x axis ahead.
 
-    path = way_path([(0, 0, 0), (3, 0, 0), (4, 2, 0)], speed=1.3, t0_ns=0, t1_ns=2_000_000_000)
+    path = path_along_curve([(0, 0, 0), (3, 0, 0), (4, 2, 0)], speed=1.3, t0_ns=0, t1_ns=2_000_000_000)
 
 The curve is a C2 spline through the points; it is gone along by its length, so that steps of a figure, or strokes of a
 fish, fit the speed everywhere. Where it ends, the body goes straight on.
@@ -29,7 +29,7 @@ _MAX_KNOTS = 20_000
 _STEP = 0.05  # s between knots, at least so fine
 
 
-class Way:
+class ArcLengthCurve:
     """A curve by its length. points : (K, 3), neighbours apart, K >= 2, or 3 where it is closed."""
 
     def __init__(self, points: ArrayLike, closed: bool = False):
@@ -52,9 +52,10 @@ class Way:
         self.length = float(self._lengths[-1])
 
     def at(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """((N, 3) places, (N, 3) unit directions) after (N,) units along the way."""
+        """((N, 3) places, (N, 3) unit directions) after (N,) units along the curve."""
         s = np.asarray(s, np.float64)
         within = s % self.length if self.closed else np.clip(s, 0, self.length)
+        # The table gives a start; two Newton steps on the length's spline make it exact to rounding.
         u = np.interp(within, self._lengths, self._at)
         for _ in range(2):
             u = np.clip(u - (self._length(u) - within) / np.maximum(self._length(u, 1), 1e-12), 0, self._at[-1])
@@ -63,7 +64,7 @@ class Way:
         return self._curve(u) + (0 if self.closed else (s - within)[:, None] * directions), directions
 
 
-def way_path(
+def path_along_curve(
     points: ArrayLike,
     speed: float,
     t0_ns: int,
@@ -76,20 +77,22 @@ def way_path(
 ) -> KeyframePath:
     """The motion along a way over [t0, t1]. Raises ConfigError for points that coincide with the next.
 
-    points : as of :class:`Way`.   speed : units/s, > 0.   level : the body's z axis stays up; otherwise its x axis goes
-    up and down with the way, its y axis staying level.   start : share of the way that lies behind at time 0."""
+    points : as of :class:`ArcLengthCurve`.   speed : units/s, > 0.   level : the body's z axis stays up; otherwise its
+    x axis goes up and down with the way, its y axis staying level.   start : share of the way that lies behind at
+    time 0."""
     given = np.asarray(points, np.float64)
     after = np.roll(given, -1, axis=0) if closed else given[1:]
     for k in np.flatnonzero(np.abs(after - given[: len(after)]).max(axis=1) < 1e-6):
         raise ConfigError("must differ from the next point", where=f"{where}.points.{k}", value=given[k].tolist())
-    way = Way(points, closed)
+    curve = ArcLengthCurve(points, closed)
     span = (t1_ns - t0_ns) * 1e-9
     legs = len(np.asarray(points)) - (not closed)
-    step = min(way.length / (legs * _KNOTS) / speed, _STEP)
+    step = min(curve.length / (legs * _KNOTS) / speed, _STEP)
     count = min(max(math.ceil(span / step), 4), _MAX_KNOTS)
     # A step more at both ends: labels look a little beyond.
     times = np.linspace(t0_ns - span / count * 1e9, t1_ns + span / count * 1e9, count + 3).round().astype(np.int64)
-    places, ahead = way.at(start * way.length + speed * times * 1e-9)
+    places, ahead = curve.at(start * curve.length + speed * times * 1e-9)
+    # Unwrapped, or a body would turn right round where atan2 jumps from pi to -pi.
     if level:
         heading = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
         turns = Rotation.from_rotvec(heading[:, None] * [0.0, 0.0, 1.0])
@@ -99,7 +102,7 @@ def way_path(
     return KeyframePath(times, places, turns)
 
 
-def random_way(
+def random_path_along_curve(
     rng: np.random.Generator,
     t0_ns: int,
     t1_ns: int,
@@ -116,6 +119,6 @@ def random_way(
     apart = np.r_[True, np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-3 * radius]
     if apart.sum() < 2:
         return StaticPath(start_pose, t0_ns, t1_ns)
-    way = Way(points[apart])
-    behind = -speed * t0_ns * 1e-9 / way.length  # at time 0, so that it begins at t0
-    return way_path(points[apart], speed, t0_ns, t1_ns, level=flat, start=behind)
+    curve = ArcLengthCurve(points[apart])
+    behind = -speed * t0_ns * 1e-9 / curve.length  # at time 0, so that it begins at t0
+    return path_along_curve(points[apart], speed, t0_ns, t1_ns, level=flat, start=behind)

@@ -201,14 +201,6 @@ def test_noise_of_a_still_scene_comes_back(tmp_path):
     }
 
 
-@pytest.mark.parametrize("option", ["--flicker", "--edge"])
-def test_scenes_without_frames_are_refused(tmp_path, capsys, option):
-    path = still_recording(tmp_path)
-    assert run(["calibrate", str(path), "--out", str(tmp_path / "out.yaml"), option, "20,0.6"]) == 2
-    line = f"error: {option}: no scene is guessed without frames; expected --frames or --still\n"
-    assert capsys.readouterr().err == line
-
-
 FIVE = range(5)
 
 
@@ -220,20 +212,6 @@ def recovered(folder, seed: int) -> dict[str, float]:
     return {key: value / TRUE[key] - 1 for key, value in result.values.items()}
 
 
-def recovered_noise(folder, seed: int) -> dict[str, float]:
-    """The same of V2E's noise on a still scene."""
-    true = dict(leak_rate_hz=1.0, shot_noise_rate_hz=4.0)
-    # The fit sees one second. Of 48x60 pixels that holds 600 leak events between 8,000 of noise, and chance alone makes
-    # the leak uncertain by 5 to 7 %: nothing could be asked of it. These are 6.7 times as many.
-    path = still_recording(folder, seed=seed + 20, size=(120, 160), **true)
-    fixed = [key for key in emulator_config("v2e").fitted if key not in true]
-    result = calibrate(path, still=True, emulator="v2e", fixed=fixed, starts=1)
-    errors = {key: result.values[key] / value - 1 for key, value in true.items()}
-    # What it says of itself is true, too.
-    assert all(abs(errors[key]) < 3.5 * result.uncertainty[key] / true[key] for key in true), (errors, result)
-    return errors
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", FIVE)
 def test_known_values_come_back(tmp_path, seed):
@@ -241,13 +219,6 @@ def test_known_values_come_back(tmp_path, seed):
     errors = recovered(tmp_path, seed)
     assert set(errors) == {"contrast_threshold", "contrast_threshold_off", "refractory_us"}
     assert all(abs(e) <= (0.05 if key == "refractory_us" else 0.02) for key, e in errors.items()), errors
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", FIVE)
-def test_known_noise_comes_back(tmp_path, seed):
-    errors = recovered_noise(tmp_path, seed)
-    assert all(abs(e) <= 0.1 for e in errors.values()), errors
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------

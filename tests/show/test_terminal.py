@@ -39,11 +39,6 @@ def test_help_says_every_word_of_every_option(name, capsys, monkeypatch):
             assert re.sub(r"\s+", "", text) in shown, (path, text)
 
 
-def test_extras_are_named_in_help(capsys):
-    assert cli.run(["generate", "--help"]) == 0 and "[cluster]" in capsys.readouterr().out
-    assert cli.run(["import", "--help"]) == 0 and "[cycles]" in capsys.readouterr().out
-
-
 def test_texts_tables_titles_and_bars_keep_their_brackets(capsys):
     console = plain_console(width=120)
     table = Table(title="out/run[1]")
@@ -68,16 +63,3 @@ def test_texts_tables_titles_and_bars_keep_their_brackets(capsys):
         description = "data[train]/a"
 
     assert plain_column("{task.description}").render(Task()).plain == "data[train]/a"
-
-
-def test_there_is_no_other_console():
-    """Whatever is printed for people goes through blinkgl.machine.terminal; benchmarks, which
-    print their own words alone, need not."""
-    for folder in ("blinkgl", "eflow", "blinkgl/shader_debugger"):
-        for path in (ROOT / folder).rglob("*.py"):
-            if path != ROOT / "blinkgl/machine/terminal.py":
-                text = path.read_text(encoding="utf-8")
-                assert not re.search(r"(?<![\w.])(Console|TextColumn)\(|from_markup|rich_markup_mode=(?!None)", text), (
-                    path
-                )
-                assert text.count("typer.Typer(") == text.count("rich_markup_mode=None"), path

@@ -8,7 +8,7 @@ import pytest
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 from eflow.data import mvsec
 from eflow.data.mvsec import MvsecSource, propagate
-from eflow.data.sources import detect_format, open_source, read_flow
+from eflow.data.sources import open_source, read_flow
 from flow_data import SPAN, blinkflow_set, blinkgl_set, constant_flow, dsec_set, moving_events, mvsec_set
 
 
@@ -21,18 +21,6 @@ def sets(tmp_path_factory):
         "blinkflow": blinkflow_set(root / "blinkflow"),
         "mvsec": mvsec_set(root / "mvsec"),
     }
-
-
-@pytest.mark.parametrize("name", ["blinkgl", "dsec", "blinkflow", "mvsec"])
-def test_detected_and_consistent(sets, name):
-    assert detect_format(sets[name]) == name
-    source = open_source(sets[name])
-    for i in range(len(source)):
-        s = source[i]
-        assert s.old.t1 == s.new.t0 and s.new.t1 - s.new.t0 > 0
-        for w in (s.old, s.new):
-            assert len(w) and w.t.dtype == np.int64 and w.t0 <= w.t[0] and w.t[-1] < w.t1 and (np.diff(w.t) >= 0).all()
-        assert s.flow.shape == (s.height, s.width, 2) and s.flow.dtype == np.float32 and s.valid.dtype == bool
 
 
 def test_blinkgl(sets):

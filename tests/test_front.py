@@ -138,23 +138,6 @@ def test_arrays_as_mesh_and_image():
         blinkgl.generate(scene, "nowhere")
 
 
-def test_renderer_draws_what_record_records():
-    scene = box_scene()
-    recording = blinkgl.record(scene, labels=("images", "flow", "ids"))
-    with blinkgl.Renderer(scene) as renderer:
-        assert np.array_equal(renderer.image(0.05), recording.images[0])
-        frame = renderer.frame(0.05, ["flow", "ids"])
-        assert np.array_equal(frame.forward.flow, recording.flow[0]) and np.array_equal(
-            frame.ids, recording.labels[0].ids
-        )
-        half = renderer.frame(0.05, ["flow"], to=0.075)
-        assert np.median(half.forward.flow[..., 0][half.forward.valid]) == pytest.approx(
-            np.median(recording.flow[0][..., 0][recording.valid[0]]) / 2, rel=0.1
-        )
-        emulator = blinkgl.Esim(24, 32, contrast_threshold=0.2)
-        assert len(emulator.step(renderer.luminance(0.0), 0)) == 0 < len(emulator.step(renderer.luminance(0.1), 10**8))
-
-
 def test_emulators_take_a_sensor():
     assert blinkgl.V2e(4, 4, sensor="davis346").config.refractory_us == blinkgl.load_sensor("davis346").refractory_us
     assert blinkgl.Esim(4, 4, sensor="davis346", contrast_threshold=0.5).config.contrast_threshold == 0.5

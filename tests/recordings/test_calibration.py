@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import re
 
 import cv2
@@ -58,31 +57,6 @@ def files(folder, frames=None, emulator=None, shift_us: int = 0, seed: int = 9):
 
 
 # --- what is compared -------------------------------------------------------------------------------------------------
-
-
-def test_numbers_of_a_stream_against_counting_one_by_one():
-    clip = scene()
-    events = clip.simulate(emulator_config({"emulator": "esim", **TRUE}), 1)
-    s = sums(events, clip, 1, 4)
-    inside = events.window(int(clip.edges_us[1]), int(clip.edges_us[4]))
-    still = clip.still[inside.y, inside.x]
-    assert s.rates.sum() == np.count_nonzero(~still) and s.still.sum() == np.count_nonzero(still)
-    for k, p in itertools.product(range(3), (0, 1)):
-        part = events.window(int(clip.edges_us[1 + k]), int(clip.edges_us[2 + k]))
-        assert s.rates[:, k, p].sum() == np.count_nonzero((part.p == p) & ~clip.still[part.y, part.x])
-    assert s.lights.sum() == s.rates.sum()
-    gaps = []
-    for pixel in set(zip(inside.y.tolist(), inside.x.tolist())):
-        here = (inside.y == pixel[0]) & (inside.x == pixel[1])
-        gaps += list(zip(np.diff(inside.t[here]), np.diff(inside.p[here].astype(int)) != 0))
-    assert s.isi.sum() == len(gaps) and s.isi[:, 1].sum() == sum(turn for _, turn in gaps)
-    # Forty bins per decade of microseconds.
-    assert np.array_equal(
-        s.isi.sum(axis=(0, 1)), np.histogram([g for g, _ in gaps], 10 ** (np.arange(281) / 40) - 1e-6)[0]
-    )
-    whole = np.bincount(inside.y.astype(int) * W + inside.x, minlength=H * W)
-    assert s.counts.sum() == 3 * np.count_nonzero(~clip.still) and s.counts[:, 0].sum() > 0
-    assert s.still_counts[:, 0].sum() == np.count_nonzero(whole[clip.still.ravel()] == 0)
 
 
 def test_the_clock_is_found():

@@ -98,29 +98,29 @@ def test_interpolations_run_and_order_events(emulator, interpolate):
 )
 @pytest.mark.parametrize("interpolate", ["linear", "motion"])
 def test_bad_frames_are_named(frame, message, interpolate):
-    good = np.ones((H, W), np.float32)
     with pytest.raises(EventDataError, match=message):
-        all_of([good, good * 2, frame, good], fps=10, interpolate=interpolate)
+        all_of([GOOD, GOOD * 2, frame, GOOD], fps=10, interpolate=interpolate)
 
 
-def test_bad_streams():
-    good = np.ones((H, W), np.float32)
-    with pytest.raises(EventDataError, match="at least two frames.*0 frames"):
-        all_of([], fps=10)
-    with pytest.raises(EventDataError, match="at least two frames.*1 frame"):
-        all_of([good], fps=10)
-    with pytest.raises(EventDataError, match="frame 2: time stamps must increase"):
-        all_of([(good, 0), (good, 10), (good, 10)])
-    with pytest.raises(EventDataError, match="frames without times"):
-        all_of([good, good])
-    with pytest.raises(ConfigError, match="unknown emulator.*esim, v2e, voltmeter"):
-        frames_to_events([good], fps=1, emulator="iebcs")
-    with pytest.raises(ConfigError, match="unknown interpolation"):
-        frames_to_events([good], fps=1, interpolate="spline")
-    with pytest.raises(ConfigError, match="unknown transfer curve"):
-        frames_to_events([good], fps=1, gamma="rec709")
-    with pytest.raises(ConfigError, match="esim.contrast_threshold"):
-        frames_to_events([good], fps=1, emulator={"emulator": "esim", "contrast_threshold": 0})
+GOOD = np.ones((H, W), np.float32)
+
+
+@pytest.mark.parametrize(
+    "frames, options, message",
+    [
+        ([], {"fps": 10}, "at least two frames.*0 frames"),
+        ([GOOD], {"fps": 10}, "at least two frames.*1 frame"),
+        ([(GOOD, 0), (GOOD, 10), (GOOD, 10)], {}, "frame 2: time stamps must increase"),
+        ([GOOD, GOOD], {}, "frames without times"),
+        ([GOOD], {"fps": 1, "emulator": "iebcs"}, "unknown emulator.*esim, v2e, voltmeter"),
+        ([GOOD], {"fps": 1, "interpolate": "spline"}, "unknown interpolation"),
+        ([GOOD], {"fps": 1, "gamma": "rec709"}, "unknown transfer curve"),
+        ([GOOD], {"fps": 1, "emulator": {"emulator": "esim", "contrast_threshold": 0}}, "esim.contrast_threshold"),
+    ],
+)
+def test_bad_streams(frames, options, message):
+    with pytest.raises((EventDataError, ConfigError), match=message):
+        all_of(frames, **options)
 
 
 def write_video(path, frames, fps=100):

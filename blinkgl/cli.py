@@ -15,7 +15,6 @@ from typing import Annotated
 import typer
 
 from blinkgl import __version__
-from blinkgl.errors import ConfigError
 from blinkgl.machine.command_line import run_app
 from blinkgl.shader_debugger.cli import app as shader_app
 
@@ -152,14 +151,6 @@ def explain(
     return command.run(config, sequence=sequence, seed=seed, overrides=overrides or [])
 
 
-@app.command(hidden=True, context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
-def qualify() -> int:
-    """Refuse a command that earlier versions had."""
-    raise ConfigError(
-        "frames are checked where they are converted", where="qualify", accepted="blinkgl explain CONFIG or generate"
-    )
-
-
 @app.command()
 def trade(
     config: Annotated[
@@ -178,7 +169,6 @@ def trade(
         list[str] | None,
         typer.Option("--scene", metavar="TEXT", help="--suite: only scenes whose name contains this; may be repeated."),
     ] = None,
-    resume: Annotated[bool | None, typer.Option("--resume", hidden=True)] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="Fewer settings, fewer pixels, a shorter clip: minutes.")
     ] = False,
@@ -212,7 +202,6 @@ def trade(
         str | None,
         typer.Option(help="What the front is drawn over: wall (default), or cpu on a busy machine (--suite: cpu)."),
     ] = None,
-    reference: Annotated[str | None, typer.Option("--reference", hidden=True)] = None,
     reference_set: Annotated[
         list[str] | None,
         typer.Option(
@@ -226,8 +215,6 @@ def trade(
     as a table, a plot and a page."""
     from blinkgl.show import trade as command
 
-    _gone("scenes are no longer path-traced", "--reference-set", **{"--reference": reference})
-    _gone("a suite is measured in one go", "--scene for some of its scenes", **{"--resume": resume})
     if suite:
         from blinkgl.show import suite as suite_command
 
@@ -424,8 +411,6 @@ def calibrate(
     still: Annotated[
         bool, typer.Option("--still", help="No frames: a scene that stands still in constant light. Noise alone.")
     ] = False,
-    flicker: Annotated[str | None, typer.Option("--flicker", hidden=True)] = None,
-    edge: Annotated[str | None, typer.Option("--edge", hidden=True)] = None,
     emulator: Annotated[
         str,
         typer.Option("--emulator", "-e", help="esim, v2e or voltmeter; with --still also pixels: noise beside any."),
@@ -451,7 +436,6 @@ def calibrate(
     """Fit an emulator to a camera's own recording: a sensor file, and a page that says how near it comes."""
     from blinkgl.show import calibrate as command
 
-    _gone("no scene is guessed without frames", "--frames or --still", **{"--flicker": flicker, "--edge": edge})
     return command.run(
         recording,
         frames,
@@ -525,8 +509,6 @@ def import_(
     clips: Annotated[
         bool, typer.Option("--clips", help="An animation per action, not one of the scene as it plays.")
     ] = False,
-    texture_size: Annotated[int | None, typer.Option("--texture-size", hidden=True)] = None,
-    bake_seconds: Annotated[float | None, typer.Option("--bake-seconds", hidden=True)] = None,
     time_limit: Annotated[
         float, typer.Option("--time-limit", min=1, help="Seconds that Blender may take altogether.")
     ] = 900.0,
@@ -538,8 +520,6 @@ def import_(
     could not."""
     from blinkgl.show import import_ as command
 
-    given = {"--texture-size": texture_size, "--bake-seconds": bake_seconds}
-    _gone("colours are no longer baked", "colours baked in Blender", **given)
     return command.run(
         source,
         out,
@@ -555,19 +535,28 @@ def import_(
     )
 
 
-def _gone(problem: str, accepted: str, **options: object) -> None:
-    """Refuses options that earlier versions had."""
-    for option, value in options.items():
-        if value is not None:
-            raise ConfigError(problem, where=option, accepted=accepted)
-
-
 # --- frame ------------------------------------------------------------------------------------------------------------
+
+
+GONE = {
+    "qualify": "blinkgl explain CONFIG, or generate: frames are checked where they are converted",
+    "trade --reference": "--reference-set: scenes are no longer path-traced",
+    "trade --resume": "--scene for some of its scenes: a suite is measured in one go",
+    "simulate --factor": "--max-px: it was of --interpolate cubic, which is gone",
+    "calibrate --flicker": "--frames or --still: no scene is guessed without frames",
+    "calibrate --edge": "--frames or --still: no scene is guessed without frames",
+    "convert --format": "an ending that names the format: .raw is EVT3, .h5 DSEC's layout",
+    "import --texture-size": "colours baked in Blender",
+    "import --bake-seconds": "colours baked in Blender",
+    "shader time": "your driver's profiler, or blinkgl trade: passes are no longer timed",
+    "shader show --active": "all lines, as the compiler gets them",
+}
+"""What earlier versions had, and what to do instead."""
 
 
 def run(arguments: list[str]) -> int:
     """Run one command line (without the program name); returns the exit status and raises nothing a user can cause."""
-    return run_app(app, arguments, "blinkgl", "BlinkGL")
+    return run_app(app, arguments, "blinkgl", "BlinkGL", GONE)
 
 
 def main() -> None:

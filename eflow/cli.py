@@ -560,9 +560,22 @@ def _size(text: str | None) -> tuple[int, int] | None:
     return int(height), int(width)
 
 
+GONE = {
+    "bench": "python -m blinkgl.tools.bench networks",
+    "evaluate --by-density": "sets of several densities, evaluated one by one",
+    "evaluate --confidence": "no such figure: no network here says how sure it is",
+    "predict --confidence": "no such figure: no network here says how sure it is",
+    "predict --flo": "--npy",
+    "predict --h5": "--npy",
+    "import --bins": "E-RAFT's published weights: RAFT's own are no longer read",
+    "pack --store": "single precision, in which it computes",
+}
+"""What earlier versions had, and what to do instead."""
+
+
 def run(arguments: list[str]) -> int:
     """Run one command line (without the program name); returns the exit status and raises nothing a user can cause."""
-    return run_app(app, arguments, "eflow", "eflow")
+    return run_app(app, arguments, "eflow", "eflow", GONE)
 
 
 def main() -> None:

@@ -11,7 +11,7 @@ time: {duration: 0.2, label_rate: 10}
 scene:
   kind: random
   objects: {count: 3}
-  pool: {primitives: [cuboid, sphere], urdfs: false}
+  pool: {primitives: [cuboid, sphere]}
   textures: {photographs: false, max_size: 128}
 events: {emulator: esim, contrast_threshold: {uniform: [0.15, 0.3]}}
 preview: {enabled: false}

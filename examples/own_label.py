@@ -8,7 +8,7 @@ import numpy as np
 
 from blinkgl import Camera, Material, Pose, Primitive, Renderer, Scene, generate, look_at, verify
 from blinkgl.labels import Label, register, unregister
-from blinkgl.render.reference import scene_parts
+from blinkgl.render.casting import scene_parts
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import importlib
+import importlib.util
 import os
 import subprocess
 import sys
@@ -14,6 +16,13 @@ import typer
 from blinkgl import __version__, cli
 from blinkgl.errors import ConfigError
 from blinkgl.gl import ShaderError
+
+
+def gone_of(program: str) -> list[str]:
+    """Commands and options that it no longer has."""
+    if program.startswith("eflow") and importlib.util.find_spec("torch") is None:
+        return []
+    return sorted(importlib.import_module(program).GONE)
 
 
 @pytest.fixture
@@ -107,6 +116,18 @@ def test_usage_errors_are_one_line_and_2(capsys, arguments, words):
     status, out, err = outcome(capsys, *arguments)
     assert (status, out) == (2, "")
     assert err.startswith("error: ") and err.count("\n") == 1 and all(word in err for word in words)
+
+
+@pytest.mark.parametrize(("program", "words"), [(p, w) for p in ("blinkgl.cli", "eflow.cli") for w in gone_of(p)])
+def test_what_was_removed_says_what_to_do_instead(capsys, program, words):
+    """Also with a value, and where the rest of the line is not one that could be run."""
+    module = importlib.import_module(program)
+    command, dashes, option = words.partition(" --")
+    for ending in ([], ["20,0.6"]):
+        assert module.run([*command.split(), *([f"--{option}"] if dashes else []), *ending]) == 2
+        where = f"--{option}" if dashes else command
+        line = f"error: {where}: was removed; expected {module.GONE[words]}\n"
+        assert capsys.readouterr().err == line
 
 
 def test_version_and_help(capsys):

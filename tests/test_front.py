@@ -278,7 +278,6 @@ WRONG = [
     ("Primitive.pose", lambda d: b.Primitive("figure", pose="ahead")),
     ("Animation.speed", lambda d: b.Animation(speed="fast")),
     ("Animation.clip", lambda d: b.Animation(1.5)),
-    ("Animation.blend", lambda d: b.Animation(blend=b.Animation(blend=b.Animation()))),
     ("Mesh.animation", lambda d: b.Mesh("chair.obj", animation=0)),
     ("Mesh.animation", lambda d: b.Mesh("chair.glb", animation=1.5)),
     ("Mesh.deform", lambda d: b.Mesh("chair.glb", animation=0, deform=b.Deform())),
@@ -313,7 +312,7 @@ def test_what_lives_is_what_yaml_makes_of_it(tmp_path):
         b.Primitive("figure", clip="walk", coat=3, pose=b.Way([(4, 1, 0), (4, -2, 0)], start=0.1)),
         b.Primitive("cuboid", deform=b.Deform("twist", angle=40, along="x"), pose=(1, 0, 0)),
         b.Mesh(file, animation="wave", pose=(2, 0, 0)),
-        b.Mesh(file, animation=b.Animation(0, speed=2, blend=b.Animation("wave", phase=0.3), share=0.2)),
+        b.Mesh(file, animation=b.Animation(0, speed=2, phase=0.3)),
         b.Mesh(file, deform=b.Deform("breathe", amount=(0.1, 0, -0.1))),
     ]
     scene = b.Scene(b.Camera(32, 24, pose=(-3, 0, 1)), bodies, duration=0.5)

@@ -31,7 +31,7 @@ from blinkgl.labels import (
     unregister as unregister_label,
 )
 from blinkgl.labels.files import npy
-from blinkgl.render.reference import scene_parts
+from blinkgl.render.casting import scene_parts
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 
@@ -99,7 +99,7 @@ SMALL = {
     "scene": {
         "kind": "random",
         "objects": {"count": 3, "distance": [2, 4]},
-        "pool": {"primitives": ["cuboid", "sphere"], "variants": 2, "urdfs": False},
+        "pool": {"primitives": ["cuboid", "sphere"], "variants": 2},
         "textures": {"procedural": ["checks", "fbm"], "variants": 2, "photographs": False, "max_size": 64},
     },
     "events": {"emulator": "toy", "dead_us": {"uniform": [100, 2000]}},

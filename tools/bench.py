@@ -273,7 +273,7 @@ def probe_scene(kind: str, width: int, height: int) -> Scene:
 
     from blinkgl.camera import PinHole, focal_length
     from blinkgl.scene.geometry import primitives
-    from blinkgl.scene.motion.paths import SplinePath, StaticPath
+    from blinkgl.scene.motion.paths import KeyframePath, StaticPath
     from blinkgl.scene.rig import Rig
     from blinkgl.scene.surfaces.textures import procedural_texture
     from blinkgl.scene.types import Material, Mesh, Part, Scene, SceneObject
@@ -284,7 +284,7 @@ def probe_scene(kind: str, width: int, height: int) -> Scene:
     for i in range(10):
         ball = primitives.sphere(radius=0.9, segments=segments, rings=rings)
         centre = np.array([(i % 4) * 1.9 - 2.9, 5.0 + (i % 3), (i // 4) * 1.7 - 0.6])
-        path = SplinePath(times, centre + rng.normal(0, 0.2, (6, 3)), Rotation.random(6, random_state=i))
+        path = KeyframePath(times, centre + rng.normal(0, 0.2, (6, 3)), Rotation.random(6, random_state=i))
         material = Material(procedural_texture("fbm", i, 1024), unlit=True)
         objects.append(SceneObject(f"ball {i}", i + 1, (Part(ball, material),), path))
     ground, lowered = primitives.grid(width=100.0, depth=100.0, subdivisions=8), np.eye(4)
@@ -299,7 +299,8 @@ def probe_scene(kind: str, width: int, height: int) -> Scene:
     keys = np.linspace(0, 2 * SECOND, 4).astype(np.int64)
     turns = Rotation.concatenate([level * Rotation.from_rotvec(rng.normal(0, 0.05, 3)) for _ in keys])
     camera = PinHole.centred(width, height, focal_length(width, math.radians(60)))
-    return Scene(tuple(objects), Rig.alone(camera, SplinePath(keys, rng.normal(0, 0.2, (4, 3)), turns)), 0, 2 * SECOND)
+    rig = Rig.alone(camera, KeyframePath(keys, rng.normal(0, 0.2, (4, 3)), turns))
+    return Scene(tuple(objects), rig, 0, 2 * SECOND)
 
 
 # --- the measured processes -------------------------------------------------------------------------------------------

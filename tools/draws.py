@@ -231,7 +231,6 @@ def world(keys: dict[str, Any]) -> RandomSceneConfig:
             "objects": {"count": 6},
             **keys,
             "textures": {"max_size": 32, "variants": 10, "photographs": False},
-            "pool": {"urdfs": False},
         },
     )
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from blinkgl.config.base import Config, Family, Members, Refused, rule
+from blinkgl.config.base import Config, Family, Members, Refused, Removed, rule
 from blinkgl.config.trajectory import as_pair, ordered
 
 if TYPE_CHECKING:
@@ -156,7 +156,7 @@ class BreatheConfig(DeformConfig):
         return cls(**super().drawn(rng, strength, period).model_dump() | {"amount": amount})
 
 
-class ClipConfig(Config):
+class AnimationConfig(Config):
     """One clip of a glTF file, and how it runs."""
 
     clip: str | int = Field(0, description="name or index of the animation")
@@ -168,12 +168,10 @@ class ClipConfig(Config):
     phase: float = Field(0.0, ge=-1e6, le=1e6, description="s of the clip at time 0")
     loop: bool = Field(True, description="begins again at its end; false: held before its first and after its last key")
 
-
-class AnimationConfig(ClipConfig):
-    """A clip, or two at once."""
-
-    blend: ClipConfig | None = Field(None, description="a second clip, mixed with the first joint by joint")
-    share: float = Field(0.5, ge=0, le=1, description="of the second clip in the mixture")
+    removed: ClassVar = {
+        "blend": Removed("one clip; mix two in Blender and export the mixture", lambda value: value is None),
+        "share": Removed("no share: two clips are no longer mixed", lambda value: value in (0.5, None)),
+    }
 
 
 def animation_of(value: str | int | AnimationConfig | None, loop: bool = True) -> AnimationConfig | None:

@@ -13,11 +13,11 @@ scene:
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from blinkgl.config.base import Config, Refused, rule
+from blinkgl.config.base import Config, Refused, Removed, rule
 from blinkgl.config.trajectory import RateRange, SpeedRange, as_pair, ordered
 
 _Acceleration = Annotated[float, Field(ge=-1e4, le=1e4)]
@@ -67,19 +67,15 @@ class RandomPhysicsConfig(PhysicsConfig):
 
 
 class BodyConfig(Config):
-    """What the engine makes of one object. Where two surfaces meet, the larger friction and the smaller restitution
-    count. An object without this, in a scene with physics, is in the way, and what hits it has both numbers; sky is
-    never."""
+    """What the engine makes of one object. What touches is each part's convex hull (a box and a ball where the mesh is
+    one, a flat ground without end): hollows are filled. Where two surfaces meet, the larger friction and the smaller
+    restitution count. An object without this, in a scene with physics, is in the way, and what hits it has both
+    numbers; sky is never."""
 
     kind: Literal["dynamic", "fixed", "none"] = Field(
         "dynamic",
         description="dynamic: falls and is pushed; fixed: stays where it is, or on its key frames, whatever hits it; "
         "none: is not there",
-    )
-    shape: Literal["auto", "hull", "box", "sphere"] = Field(
-        "auto",
-        description="what touches: each part's convex hull, bounding box or bounding sphere; auto: box and sphere "
-        "where the mesh is one, a flat ground without end, else hull. Hollows are filled",
     )
     mass: float | None = Field(None, gt=0, le=1e12, description="kg; null: by its density")
     density: _Density = Field(700.0, description="kg/m³ (wood)")
@@ -94,6 +90,8 @@ class BodyConfig(Config):
     spin: tuple[_Spin, _Spin, _Spin] = Field(
         (0.0, 0.0, 0.0), description="angular velocity at the start about the world's axes, deg/s"
     )
+
+    removed: ClassVar = {"shape": Removed("the mesh's own hull, box or ball", lambda value: value == "auto")}
 
     @rule("kind", "velocity", "spin")
     def _only_what_moves_has_a_velocity(kind, velocity, spin):

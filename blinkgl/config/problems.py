@@ -77,8 +77,10 @@ are put into words where they are translated."""
 
 
 def _translate(model: type[BaseModel], error: ValidationError, where: str, start: Path = ()) -> ConfigError:
-    # Unknown keys first: a misspelt key usually also causes a "missing" error, and the misspelling is the cause.
-    problems = sorted(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
+    # Unknown keys first: a misspelt key usually also causes a "missing" error, and the misspelling is the cause. Then
+    # what a rule refuses: of a union ("text or a table") it says what is wrong with the table that was given.
+    order = {"extra_forbidden": 0, "value_error": 1}
+    problems = sorted(error.errors(include_url=False), key=lambda e: order.get(e["type"], 2))
     first = problems[0]
     kind, context = first["type"], first.get("ctx", {})
     path, owners, annotations, info = _locate(model, (*start, *first["loc"]), kind)

@@ -11,7 +11,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from blinkgl.config.base import Config, Refused, one_of, rule
+from blinkgl.config.base import Config, Refused, Removed, one_of, rule
 from blinkgl.config.deform import AnimationConfig, DeformConfig, RandomDeformConfig
 from blinkgl.config.lights import FOG, FogConfig, LightConfig, RandomLightsConfig
 from blinkgl.config.materials import TEXTURE_KINDS, MaterialConfig, TextureKind
@@ -70,12 +70,10 @@ class PoolConfig(Config):
         description="the axis of the folders' files that points up; auto: y for glb and gltf, "
         "z for obj, ply, stl. Resting objects stand on it",
     )
-    urdfs: Annotated[Literal["auto"] | bool, word_or_list(("auto", True, False))] = Field(
-        False,
-        description="pybullet's random_urdfs; auto uses them when the wheel is installed, so that the same YAML "
-        "gives other scenes there",
-    )
     max_faces: int = Field(50_000, ge=1, le=50_000_000, description="a mesh with more triangles is refused")
+    removed: ClassVar = {
+        "urdfs": Removed("folders: [...]", lambda value: value in (False, "auto")),
+    }
     max_file_mb: ClassVar = 512.0
     fixed: ClassVar = ("max_file_mb",)
     test_fraction: Fraction = Field(0.1, description="fraction of meshes kept for split 'test', chosen by content hash")

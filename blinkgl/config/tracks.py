@@ -17,11 +17,10 @@ class TracksConfig(Config):
     tracks.npz."""
 
     points: int = Field(256, ge=1, le=1_000_000, description="how many, at most")
-    choose: Literal["grid", "random", "surface"] = Field(
+    choose: Literal["grid", "surface"] = Field(
         "grid",
-        description="grid: what the pixels of a regular grid see at the first time; random: what places drawn in the "
-        "image see at times drawn; surface: places drawn evenly on the bodies' surfaces, of which those are kept that "
-        "are ever seen",
+        description="grid: what the pixels of a regular grid see at the first time; surface: places drawn evenly on "
+        "the bodies' surfaces, of which those are kept that are ever seen",
     )
     rate: float | None = Field(
         None,

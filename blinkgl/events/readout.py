@@ -24,8 +24,10 @@ from blinkgl.errors import EventDataError
 from blinkgl.events.packing import JIT
 from blinkgl.types.events import OPTIONAL, Events
 
-# Time on the bus is counted in ps, so that the rounding of 1 / events_per_second does not add up.
+# Time on the bus is counted in ps, so that the rounding of 1 / events_per_second does not add up; from the first event
+# on, because a clock that counts from 1970 leaves no room for them in 64 bits.
 _PS_PER_US = 1_000_000
+_NO_EVENT_YET = -(2**62)
 
 
 @numba.njit(**JIT)
@@ -69,8 +71,8 @@ class Readout:
         self._event_ps = 0 if rate is None else max(1, round(1e12 / rate))
         self._row_ps = round(config.row_ns * 1000)
         self._waiting = np.zeros(config.queue_events, np.int64)
-        # Events accepted; time from which the bus is free (always has been); its row (none).
-        self._state = np.array([0, -(2**62), -1], np.int64)
+        # Events accepted; time from which the bus is free (always has been); its row (none); µs of the first event.
+        self._state = np.array([0, -(2**62), -1, _NO_EVENT_YET], np.int64)
         self._on_bus = Events.empty()
 
     @property
@@ -83,7 +85,7 @@ class Readout:
         order from step to step; later ones wait for the next step. None: all of them, however late.
 
         ``until_us`` : the time up to which the emulator has given its events, int µs.
-        Raises EventDataError for times beyond 100 days, which picoseconds in int64 cannot hold."""
+        Raises EventDataError 100 days after the first event, which picoseconds in int64 cannot hold."""
         sent = self._serve(events) if len(events) and self._event_ps else events
         # Events that have been served are already in order and later than those still on the bus.
         if self.late:
@@ -99,16 +101,22 @@ class Readout:
 
     def _serve(self, events: Events) -> Events:
         """Return the events that find a place in the queue, with the times at which they leave the bus."""
+        if self._state[3] == _NO_EVENT_YET:
+            self._state[3] = events.t[0]
+        origin_us = int(self._state[3])
         # 2^43 us are 8.8e18 ps, just below 2^63.
-        if max(abs(int(events.t[0])), abs(int(events.t[-1]))) > 2**43:
+        if int(events.t[-1]) - origin_us > 2**43:
             raise EventDataError(
-                "event time too large for the read-out model", value=int(events.t[-1]), accepted="at most 100 days"
+                "the read-out counts from the first event",
+                value=f"{(int(events.t[-1]) - origin_us) / 8.64e10:.4g} days",
+                accepted="at most 100 days",
             )
         keep, out_us = np.empty(len(events), np.int64), np.empty(len(events), np.int64)
-        kept = _serve(events.t, events.y, self._event_ps, self._row_ps, self._waiting, self._state, keep, out_us)
+        after_us = events.t - origin_us
+        kept = _serve(after_us, events.y, self._event_ps, self._row_ps, self._waiting, self._state, keep, out_us)
         self.dropped += len(events) - kept
         keep = keep[:kept]
-        return replace(events.part(keep), t=out_us[:kept].copy())
+        return replace(events.part(keep), t=out_us[:kept] + origin_us)
 
     def state_dict(self) -> dict[str, np.ndarray]:
         return {

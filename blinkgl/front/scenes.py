@@ -76,7 +76,7 @@ class Body(Piece):
     """What falls, or is fallen on: ``Primitive("cuboid", body=Body(velocity=(1, 0, 2)))`` (docs/scenes.md, "Dynamics").
 
     kind : "dynamic" falls; "fixed" stays, or goes its way, whatever hits it; "none" is not there.
-    shape : what touches, "auto", "hull", "box" or "sphere".   mass : kg, or by density : kg/m³ (default 700).
+    mass : kg, or by density : kg/m³ (default 700).
     friction : Coulomb's coefficient.   rolling : the same of rolling, of the radius.
     restitution : share of the speed that an impact leaves.
     velocity : (3,) m/s, of the centre of mass at the start.   spin : (3,) degrees/s about the world's axes.
@@ -101,13 +101,12 @@ class Deform(Piece):
 
 
 class Animation(Piece):
-    """A clip that a glTF file's skins, morph targets and nodes play, or two at once: ``Mesh("ann.glb",
+    """A clip that a glTF file's skins, morph targets and nodes play: ``Mesh("ann.glb",
     animation=Animation("Walk", speed=1.2))``.
 
     clip : name or number of the animation.   file : another glTF file that it is taken from, whose joints have the
     same names; None: the mesh's own.   speed : of the clip's own, negative backwards.   phase : s of the clip at
     time 0.   loop : begins again at its end; False: held before its first and after its last key.
-    blend : a second :class:`Animation`, mixed with this one joint by joint.   share : of the second, 0 to 1.
     Raises ConfigError; a clip that the file does not have is found when the scene is built."""
 
     def __init__(
@@ -118,18 +117,8 @@ class Animation(Piece):
         speed: float = 1.0,
         phase: float = 0.0,
         loop: bool = True,
-        blend: Animation | None = None,
-        share: float = 0.5,
     ):
-        tree = check.given(clip=clip, file=file, speed=speed, phase=phase, loop=loop, share=share)
-        if blend is not None:
-            second = dict(check.one_of(blend, "Animation.blend", Animation, "an Animation").tree)
-            if "blend" in second:
-                raise ConfigError(
-                    "only two clips can be mixed", where="Animation.blend", accepted="an Animation without blend"
-                )
-            second.pop("share")
-            tree["blend"] = second
+        tree = check.given(clip=clip, file=file, speed=speed, phase=phase, loop=loop)
         self.tree = self._checked(AnimationConfig, tree)
 
 

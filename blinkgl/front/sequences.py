@@ -128,7 +128,7 @@ def record(source: Source, *, index: int = 0, **settings: Unpack[Settings]) -> R
     event, ``events.truth``; default: the source's.
     images : a frame camera: the name of a preset, "deblurring", or a table of ``images:``, ``{"exposure_us": 10000}``.
     imu : an inertial unit: the name of a preset, "adis16448", or a table of ``imu:``, ``{"rate": 400}``.
-    tracks : points on surfaces, followed: "grid", "random", "surface", or a table of ``tracks:``, ``{"points": 100}``.
+    tracks : points on surfaces, followed: "grid", "surface", or a table of ``tracks:``, ``{"points": 100}``.
     Raises ConfigError, AssetError, GLError, EventDataError."""
     config = _configured(source, index, settings)
     gathered = Gathered()

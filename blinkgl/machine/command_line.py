@@ -6,20 +6,24 @@ import errno
 import os
 import sys
 import traceback
+from collections.abc import Mapping
 
 import typer
 
-from blinkgl.errors import BlinkGLError
+from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.machine.extras import EXTRAS, install
 from blinkgl.machine.interrupts import interruptible
 from blinkgl.machine.terminal import never_fail_to_print
 
 
-def run_app(app: typer.Typer, arguments: list[str], program: str, project: str) -> int:
+def run_app(
+    app: typer.Typer, arguments: list[str], program: str, project: str, gone: Mapping[str, str] | None = None
+) -> int:
     """Run ``app`` with ``arguments`` and return the exit status: 2 and one line for an error of the user's or the
     machine's, 130 when interrupted, 1 and a traceback for a bug.
 
-    program : name of the command.   project : whose bug an unforeseen error is."""
+    program : name of the command.   project : whose bug an unforeseen error is.   gone : "command" or "command
+    --option" of earlier versions, and what to say to whoever still types it."""
     never_fail_to_print()
     debug = "--debug" in arguments
     arguments = [a for a in arguments if a != "--debug"] or ["--help"]
@@ -35,7 +39,23 @@ def run_app(app: typer.Typer, arguments: list[str], program: str, project: str) 
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except Exception as error:  # noqa: BLE001 - every error leaves as a line for the user
-        return _report(error, debug, project)
+        said = _said_of_gone(arguments, gone or {}) if _is_usage_error(error) else None
+        return _report(error if said is None else said, debug, project)
+
+
+def _is_usage_error(error: Exception) -> bool:
+    # typer's usage errors; their class moved between versions.
+    return hasattr(error, "format_message") and hasattr(error, "exit_code")
+
+
+def _said_of_gone(arguments: list[str], gone: Mapping[str, str]) -> ConfigError | None:
+    """The error for a command or an option of earlier versions among the arguments; None: there is none."""
+    given = {argument.partition("=")[0] for argument in arguments}
+    for words, said in gone.items():
+        command, _, option = words.partition(" --")
+        if arguments[: len(command.split())] == command.split() and (not option or f"--{option}" in given):
+            return ConfigError("was removed", where=f"--{option}" if option else command, accepted=said)
+    return None
 
 
 def _report(error: Exception, debug: bool, project: str) -> int:
@@ -75,11 +95,10 @@ def user_line(error: Exception) -> str | None:
     """Return the line for an error that the user or the machine caused; None for a bug."""
     if isinstance(error, BlinkGLError):
         return str(error)
-    # typer's usage errors; their class moved between versions.
-    if hasattr(error, "format_message") and hasattr(error, "exit_code"):
+    if _is_usage_error(error):
         context = getattr(error, "ctx", None)
         command = context.command_path if context is not None else "blinkgl"
-        message = " ".join(error.format_message().split()).rstrip(".")
+        message = " ".join(error.format_message().split()).rstrip(".")  # type: ignore[missing-attribute]
         return f"{message}; see '{command} --help'"
     if isinstance(error, ModuleNotFoundError) and error.name in EXTRAS["learn"][0]:
         return f"{error.name} is not installed; run {install(*EXTRAS['learn'][0])}"

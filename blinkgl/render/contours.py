@@ -23,8 +23,8 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from blinkgl.render.draw_items import DrawItem
     from blinkgl.render.moment import Moment
-    from blinkgl.render.resources import DrawItem
     from blinkgl.scene.types import Mesh
 
 LINE = 7

@@ -15,10 +15,10 @@ from blinkgl.render.colour import LUMA
 from blinkgl.scene.lights import is_coloured, lamps_of, quadric_of, quartic_of
 
 if TYPE_CHECKING:
+    from blinkgl.render.draw_items import DrawItem, Kind
     from blinkgl.render.moment import Moment
     from blinkgl.render.painter import Uniforms
     from blinkgl.render.passes.base import Pass
-    from blinkgl.render.resources import DrawItem, Kind
     from blinkgl.scene.types import Light
 
 EXAMPLES: tuple[dict[str, Any], ...] = (

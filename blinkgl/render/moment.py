@@ -19,7 +19,7 @@ from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate, inverse_dep
 
 if TYPE_CHECKING:
     from blinkgl.camera import CameraModel
-    from blinkgl.render.resources import DrawItem
+    from blinkgl.render.draw_items import DrawItem
     from blinkgl.scene.types import PosePath, Scene
 
 _TEXTURE_FROM_CLIP = np.array([[0.5, 0, 0, 0.5], [0, 0.5, 0, 0.5], [0, 0, 1, 0], [0, 0, 0, 1.0]])

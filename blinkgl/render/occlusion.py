@@ -1,7 +1,7 @@
 """Is the surface point seen at (x, y) still visible at the other end of its flow?
 
 Nearly everywhere the four pixels around its new place say so. Where they do not agree, beside silhouettes and where a
-surface turns away, a ray decides (:func:`blinkgl.render.reference.is_hidden`): about two pixels in a hundred of a
+surface turns away, a ray decides (:func:`blinkgl.render.casting.is_hidden`): about two pixels in a hundred of a
 crowded picture. What is thinner than a pixel passes between four pixels unseen; so near what is drawn one or two pixels
 wide (:func:`near_thin`) four that agree are not believed, either.
 """
@@ -11,7 +11,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from blinkgl.render import reference
+from blinkgl.render import casting
 from blinkgl.scene.types import Scene
 
 SEEN, HIDDEN, UNDECIDED = 0, 1, 2
@@ -158,7 +158,7 @@ def occlusion_mask(
     verdict = judged_by_samples(flow, z_there, valid, ids, depth_there, ids_there, camera.near)
     where, place, depth = undecided(verdict, flow, z_there)
     if len(where):
-        verdict.reshape(-1)[where] = reference.is_hidden(scene, t_ns, place, depth, SLACK)
+        verdict.reshape(-1)[where] = casting.is_hidden(scene, t_ns, place, depth, SLACK)
     return verdict == HIDDEN
 
 

@@ -15,11 +15,12 @@ from blinkgl.render.strokes import Strokes
 
 if TYPE_CHECKING:
     from blinkgl.gl import GLContext, Target
+    from blinkgl.render.draw_items import DrawItem, Kind
     from blinkgl.render.frames import RenderStats
     from blinkgl.render.lens import Lens
     from blinkgl.render.moment import Moment
     from blinkgl.render.passes.base import Pass, Shot
-    from blinkgl.render.resources import DrawItem, Kind, SceneResources
+    from blinkgl.render.resources import SceneResources
     from blinkgl.scene.types import Map, Scene
 
 FREE_UNIT = 8

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from blinkgl.render.reference import (
+from blinkgl.render.appearance import surface
+from blinkgl.render.casting import (
     Flow,
     Hits,
     cast,
@@ -14,7 +15,6 @@ from blinkgl.render.reference import (
     local_at,
     relative_pose_at,
     scene_parts,
-    surface,
     velocity,
     vertices_at,
 )

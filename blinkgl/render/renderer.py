@@ -22,6 +22,7 @@ from blinkgl.labels import LabelFrame, LabelRequest
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.canvas import Canvas, Frame
+from blinkgl.render.draw_items import DrawItem
 from blinkgl.render.frames import RenderStats
 from blinkgl.render.labels import Labels
 from blinkgl.render.lens import Lens
@@ -41,7 +42,7 @@ from blinkgl.render.passes import (
     one_value,
     shadow_maps,
 )
-from blinkgl.render.resources import DrawItem, SceneResources
+from blinkgl.render.resources import SceneResources
 from blinkgl.render.still import StillCanvas
 from blinkgl.scene.geometry.meshes import without_collapsed_faces
 

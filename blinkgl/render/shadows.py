@@ -21,7 +21,7 @@ from blinkgl.scene.lights import lamps_of, shadowing
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from blinkgl.render.resources import DrawItem
+    from blinkgl.render.draw_items import DrawItem
     from blinkgl.scene.types import Lamp, Scene
 
 CV_FROM_LAMP = np.diag([1.0, -1.0, -1.0, 1.0])

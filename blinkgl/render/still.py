@@ -19,8 +19,8 @@ from blinkgl.render.rectangles import Rectangle, merged
 if TYPE_CHECKING:
     from blinkgl.camera import CameraModel
     from blinkgl.gl import Target
+    from blinkgl.render.draw_items import DrawItem
     from blinkgl.render.passes.base import Shot
-    from blinkgl.render.resources import DrawItem
 
 # OpenGL's enums: GL_READ_FRAMEBUFFER, GL_DRAW_FRAMEBUFFER; depth and colour bits; GL_NEAREST.
 _READ_FRAMEBUFFER, _DRAW_FRAMEBUFFER = 0x8CA8, 0x8CA9

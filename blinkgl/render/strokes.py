@@ -13,8 +13,8 @@ from blinkgl.render.contours import CROSSING, Lines
 
 if TYPE_CHECKING:
     from blinkgl.gl import GLContext, Target
+    from blinkgl.render.draw_items import DrawItem
     from blinkgl.render.moment import Moment
-    from blinkgl.render.resources import DrawItem
 
 ROW = 512
 """Crossings in a row of the texture that holds them, each two texels: edges.glsl has the same."""

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from blinkgl.config.tracks import TracksConfig
-from blinkgl.render import reference
-from blinkgl.render.reference import Hits
+from blinkgl.render import casting
+from blinkgl.render.casting import Hits
 from blinkgl.scene.types import Scene
 
 _DRAWS = 8
@@ -47,9 +47,7 @@ def track_points(scene: Scene, config: TracksConfig, times_ns: Sequence[int], rn
     times = [int(t) for t in times_ns]
     if config.choose == "surface":
         return _of_surfaces(scene, config.points, times, rng)
-    query, hits = (
-        _of_a_grid(scene, config.points, times) if config.choose == "grid" else _drawn(scene, config.points, times, rng)
-    )
+    query, hits = _of_a_grid(scene, config.points, times)
     return _followed(scene, hits, times, query)
 
 
@@ -77,37 +75,28 @@ def places(scene: Scene, hits: Hits, t_ns: int) -> tuple[np.ndarray, np.ndarray,
     """Of the points of ``hits`` at a time: (N, 2) px, 0 behind the camera; (N, 3) world; (N,) depth; (N,) bool seen."""
     camera = scene.camera
     there = replace(hits, local=_local(scene, hits, t_ns))
-    moved = reference.applied(scene, there, lambda thing: reference.relative_pose_at(scene, thing, t_ns))
-    world = reference.applied(scene, there, lambda thing: thing.path.pose(t_ns))
+    moved = casting.applied(scene, there, lambda thing: casting.relative_pose_at(scene, thing, t_ns))
+    world = casting.applied(scene, there, lambda thing: thing.path.pose(t_ns))
     depth = moved[:, 2].copy()
     ahead = depth > 0
     xy = np.zeros((len(depth), 2))
     xy[ahead] = camera.project(moved[ahead])
     inside = ahead & ((xy >= -0.5) & (xy < [camera.width - 0.5, camera.height - 0.5])).all(axis=1)
-    seen, _ = reference.is_seen(scene, there, t_ns, moved, inside & (depth >= camera.near))
+    seen, _ = casting.is_seen(scene, there, t_ns, moved, inside & (depth >= camera.near))
     return xy, world, depth, seen
 
 
 def _local(scene: Scene, hits: Hits, t_ns: int) -> np.ndarray:
     """(N, 3) object-local positions at t_ns, of any part."""
-    out, parts = np.full((len(hits.hit), 3), np.nan), reference.scene_parts(scene)
+    out, parts = np.full((len(hits.hit), 3), np.nan), casting.scene_parts(scene)
     for p in np.unique(hits.part):
         rows, mesh = hits.part == p, parts[p][1].mesh
-        corners = reference.vertices_at(mesh, t_ns)[mesh.faces[hits.triangle[rows]]]
+        corners = casting.vertices_at(mesh, t_ns)[mesh.faces[hits.triangle[rows]]]
         out[rows] = np.einsum("nc,nck->nk", hits.bary[rows], corners)
     return out
 
 
-def _taken(hits: Hits, rows: np.ndarray) -> Hits:
-    return replace(hits, **{name: getattr(hits, name)[rows] for name in _ARRAYS})
-
-
 _ARRAYS = ("xy", "hit", "depth", "instance", "part", "triangle", "front", "bary", "local")
-
-
-def _joined(some: list[Hits]) -> Hits:
-    arrays = [np.concatenate([getattr(one, name) for one in some]) for name in _ARRAYS]
-    return Hits(arrays[0], some[0].t_ns, *arrays[1:])
 
 
 def _of_a_grid(scene: Scene, points: int, times: list[int]) -> tuple[np.ndarray, Hits]:
@@ -119,40 +108,21 @@ def _of_a_grid(scene: Scene, points: int, times: list[int]) -> tuple[np.ndarray,
     x = np.floor((np.arange(columns) + 0.5) * width / columns)
     y = np.floor((np.arange(rows) + 0.5) * height / rows)
     xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    hits = reference.cast(scene, times[0], xy)
-    hits = _taken(hits, np.flatnonzero(hits.hit))
+    hits = casting.cast(scene, times[0], xy)
+    hits = replace(hits, **{name: getattr(hits, name)[hits.hit] for name in _ARRAYS})
     return np.column_stack([np.zeros(len(hits.xy)), hits.xy[:, ::-1]]), hits
-
-
-def _drawn(scene: Scene, points: int, times: list[int], rng: np.random.Generator) -> tuple[np.ndarray, Hits]:
-    """Queries and hits of places drawn evenly in the image, at times drawn; where nothing is seen, drawn again."""
-    size = np.array([scene.camera.width, scene.camera.height])
-    queries, found, left = [np.zeros((0, 3))], [], points
-    for _ in range(_DRAWS):
-        when, xy = np.sort(rng.integers(len(times), size=left)), rng.random((left, 2)) * size - 0.5
-        for k in np.unique(when):
-            hits = reference.cast(scene, times[k], xy[when == k])
-            hits = _taken(hits, np.flatnonzero(hits.hit))
-            queries.append(np.column_stack([np.full(len(hits.xy), float(k)), hits.xy[:, ::-1]]))
-            found.append(hits)
-        left = points - sum(map(len, queries))
-        if left <= 0:
-            break
-    query, hits = np.concatenate(queries), _joined(found)
-    order = np.argsort(query[:, 0], kind="stable")
-    return query[order], _taken(hits, order)
 
 
 def _of_surfaces(scene: Scene, points: int, times: list[int], rng: np.random.Generator) -> Tracks:
     """Places drawn evenly on what is an object (else on all but the sky), as it is at the first time; of those the ones
     that are ever seen, queried when they are first."""
-    parts = reference.scene_parts(scene)
+    parts = casting.scene_parts(scene)
     own = [p for p, (thing, _) in enumerate(parts) if thing.category == "object"]
     own = own or [p for p, (thing, _) in enumerate(parts) if thing.category != "sky"]
     which, area = [np.zeros((0, 2), np.int32)], [np.zeros(0)]
     for p in own:
         mesh = parts[p][1].mesh
-        a, b, c = np.moveaxis(reference.vertices_at(mesh, times[0])[mesh.faces], 1, 0)
+        a, b, c = np.moveaxis(casting.vertices_at(mesh, times[0])[mesh.faces], 1, 0)
         area.append(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
         which.append(np.column_stack([np.full(len(a), p), np.arange(len(a))]).astype(np.int32))
     places_, ends = np.concatenate(which), np.cumsum(np.concatenate(area))
@@ -188,7 +158,7 @@ def _of_surfaces(scene: Scene, points: int, times: list[int], rng: np.random.Gen
         if left <= 0:
             break
     if not kept:
-        empty = reference.cast(scene, times[0], np.zeros((0, 2)))
+        empty = casting.cast(scene, times[0], np.zeros((0, 2)))
         return _followed(scene, empty, times, np.zeros((0, 3)))
     return replace(kept[0], **{name: np.concatenate([getattr(one, name) for one in kept]) for name in _OF_POINTS})
 

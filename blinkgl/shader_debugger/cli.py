@@ -7,8 +7,6 @@ from typing import Annotated
 
 import typer
 
-from blinkgl.errors import ConfigError
-
 app = typer.Typer(
     name="shader", no_args_is_help=True, rich_markup_mode=None, help="See what every pass wrote at a pixel, and why."
 )
@@ -149,14 +147,6 @@ def show(
     from blinkgl.shader_debugger.check import show_source
 
     typer.echo(show_source(program, define or [], stage, numbers, shaders), nl=False)
-
-
-@app.command(hidden=True, context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
-def time() -> None:
-    """Refuse a command that earlier versions had."""
-    raise ConfigError(
-        "passes are no longer timed", where="shader time", accepted="your driver's profiler, or blinkgl trade"
-    )
 
 
 @app.command()

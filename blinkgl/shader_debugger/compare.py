@@ -29,7 +29,7 @@ import numpy as np
 from blinkgl.errors import ConfigError
 from blinkgl.labels.grading import length
 from blinkgl.labels.label import Label, View
-from blinkgl.render import reference
+from blinkgl.render import appearance, casting, reference
 from blinkgl.scene.lights import is_coloured
 from blinkgl.scene.types import Material
 from blinkgl.shader_debugger.lamps import near_an_edge
@@ -114,9 +114,9 @@ def _misplaced(g, r, gpu, ref):
     of the camera's sight. Needs nothing of the ray caster, so that a wrong pose is told apart from what comes later."""
     part = gpu["part"]
     out = np.zeros((*part.shape, 2))
-    for p, (thing, _) in enumerate(reference.scene_parts(ref.scene)):
+    for p, (thing, _) in enumerate(casting.scene_parts(ref.scene)):
         y, x = np.nonzero(part == p)
-        pose = reference.relative_pose_at(ref.scene, thing, ref.when.t_ns)
+        pose = casting.relative_pose_at(ref.scene, thing, ref.when.t_ns)
         seen = ref.scene.camera.project(gpu["local"][y, x].astype(np.float64) @ pose[:3, :3].T + pose[:3, 3])
         out[y, x] = np.nan_to_num(seen - np.stack([x, y], axis=1), nan=np.inf)
     return length(out)
@@ -298,7 +298,7 @@ class Comparison:
         self._coloured = is_coloured(ref.scene.light)
         self._shadow_edges: dict[int, np.ndarray] = {}
         self.same_triangle = (gpu["part"] == ref["part"]) & ((gpu["triangle"] == ref["triangle"]) | ~frame.hit)
-        things = [thing for thing, _ in reference.scene_parts(ref.scene)]
+        things = [thing for thing, _ in casting.scene_parts(ref.scene)]
         names = [thing.name or f"object {thing.instance_id}" for thing in ref.scene.objects]
         self.objects = [
             name if names.count(name) == 1 else f"{name} (id {thing.instance_id})"
@@ -356,7 +356,7 @@ class Comparison:
             light = gpu["colour_light_rgb"] if name == "colour" else gpu["luminance_light"][..., None]
             shaded = gpu[f"{name}_albedo"].astype(np.float64) * light
             shaded = shaded + gpu[f"{name}_mirrored"] + gpu[f"{name}_emission"]
-            shaded = reference.seen_through_fog(ref.scene, ref.frame.hits(), shaded.reshape(-1, 3)).reshape(
+            shaded = appearance.seen_through_fog(ref.scene, ref.frame.hits(), shaded.reshape(-1, 3)).reshape(
                 shaded.shape
             )
             shaded = shaded if name == "colour" else shaded[..., 0]
@@ -371,7 +371,7 @@ class Comparison:
         drew nothing."""
         gpu, frame = self.gpu, self.ref.frame
         out = np.zeros((*gpu["part"].shape, 3))
-        for p, (_, part) in enumerate(reference.scene_parts(self.ref.scene)):
+        for p, (_, part) in enumerate(casting.scene_parts(self.ref.scene)):
             on = gpu["part"] == p
             uv, level = (gpu[f"{of}_{what}"][on].astype(np.float64) for what in ("uv", "level"))
             out[on] = mipmapped_albedo(part.material, np.nan_to_num(uv), level)
@@ -398,7 +398,7 @@ class Comparison:
         if lookup_of(name)[1] in ("shadow", "light", "mirrored"):
             graded &= ~self.shadow_edges(self.gpu.when.t_ns)
         if lookup_of(name)[1] in LIT:
-            for p, (_, part) in enumerate(reference.scene_parts(self.ref.scene)):
+            for p, (_, part) in enumerate(casting.scene_parts(self.ref.scene)):
                 if is_mapped(part.material):
                     graded &= self.ref.frame.part != p
         if name == "dL_dt":

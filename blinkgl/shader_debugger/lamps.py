@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from blinkgl.render import reference
+from blinkgl.render import appearance, casting, reference
 from blinkgl.render.passes.shadow import ShadowMap
 from blinkgl.render.shadows import Parallel, scale_of, view_of
 from blinkgl.scene.types import Scene
@@ -29,7 +29,7 @@ def map_of(scene: Scene, t_ns: int, map_: ShadowMap) -> tuple[np.ndarray, np.nda
     y, x = np.mgrid[0:size, 0:size].reshape(2, -1)
     if not isinstance(camera, Parallel):
         rays = camera.rays(np.stack([x, y], axis=1).astype(np.float64))
-        depth, part = reference.seen_by_lamp(scene, t_ns, pose, rays / rays[:, 2:], camera.near)
+        depth, part = appearance.seen_by_lamp(scene, t_ns, pose, rays / rays[:, 2:], camera.near)
         value = camera.near / depth
     else:
         away = FAR_AWAY * camera.depth
@@ -39,7 +39,7 @@ def map_of(scene: Scene, t_ns: int, map_: ShadowMap) -> tuple[np.ndarray, np.nda
             [(2 * (x + 0.5) / size - 1) * camera.half_x, (2 * (y + 0.5) / size - 1) * camera.half_y], axis=1
         )
         rays = np.column_stack([there / (away + 0.5 * camera.depth), np.ones(len(there))])
-        depth, part = reference.seen_by_lamp(scene, t_ns, pose, rays, 0.5 * away)
+        depth, part = appearance.seen_by_lamp(scene, t_ns, pose, rays, 0.5 * away)
         value = 1.0 - (depth - away) / camera.depth
     return np.where(part >= 0, value, 0.0).reshape(size, size), part.reshape(size, size)
 
@@ -56,7 +56,7 @@ def near_an_edge(scene: Scene, frame: reference.ReferenceFrame, maps: tuple[Shad
     """(H, W) bool: pixels whose point is so near to the edge of a shadow, or so flat to the light, that a map need not
     agree with rays."""
     out = np.zeros(frame.hit.shape, bool)
-    hits, parts = frame.hits(), reference.scene_parts(scene)
+    hits, parts = frame.hits(), casting.scene_parts(scene)
     points, normals = np.full((out.size, 3), np.nan), frame.normal.reshape(-1, 3)
     for p, (thing, part) in enumerate(parts):
         rows = hits.part == p
@@ -77,7 +77,7 @@ def near_an_edge(scene: Scene, frame: reference.ReferenceFrame, maps: tuple[Shad
             towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
         facing = (towards * normals).sum(axis=1)
         edge = np.abs(facing) < GRAZING
-        share = reference.seen_share(scene, frame.t_ns, one.lamp, points, own)
+        share = appearance.seen_share(scene, frame.t_ns, one.lamp, points, own)
         edge |= (share > 0) & (share < 1)
         for k in range(WAYS):
             angle = 2 * math.pi * k / WAYS
@@ -86,7 +86,7 @@ def near_an_edge(scene: Scene, frame: reference.ReferenceFrame, maps: tuple[Shad
             # in the plane of the surface, where it is as far aside as the lamp sees it
             slide = (aside * normals).sum(axis=1) / np.where(np.abs(facing) < GRAZING, 1.0, facing)
             there = points + aside - slide[:, None] * towards
-            edge |= reference.seen_share(scene, frame.t_ns, one.lamp, there, own) != share
+            edge |= appearance.seen_share(scene, frame.t_ns, one.lamp, there, own) != share
         out.ravel()[rows] |= edge
     return out
 
@@ -95,10 +95,10 @@ def _flat(scene: Scene, frame: reference.ReferenceFrame, rows: np.ndarray) -> np
     """(n, 3) unit normals of the triangles themselves, world axes."""
     part, triangle = frame.part.ravel()[rows], frame.triangle.ravel()[rows]
     out = np.zeros((len(rows), 3))
-    for p, (thing, own) in enumerate(reference.scene_parts(scene)):
+    for p, (thing, own) in enumerate(casting.scene_parts(scene)):
         on = part == p
         if on.any():
-            a, b, c = np.moveaxis(reference.vertices_at(own.mesh, frame.t_ns)[own.mesh.faces[triangle[on]]], 1, 0)
+            a, b, c = np.moveaxis(casting.vertices_at(own.mesh, frame.t_ns)[own.mesh.faces[triangle[on]]], 1, 0)
             normal = np.cross(b - a, c - a)
             normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
             out[on] = normal @ thing.path.pose(frame.t_ns)[:3, :3].T

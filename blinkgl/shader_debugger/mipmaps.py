@@ -12,7 +12,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from blinkgl.render import reference
+from blinkgl.render import appearance
 from blinkgl.render.colour import linear_image
 from blinkgl.scene.types import REPEAT, Material, Texture
 
@@ -52,8 +52,8 @@ def sample_trilinear(texture: Texture, uv: np.ndarray, level: np.ndarray, wrap: 
         part = (level[on] - k)[:, None]
         upper = chain[min(k + 1, len(chain) - 1)]
         out[on] = (
-            reference.sample_bilinear(chain[k], uv[on], wrap) * (1 - part)
-            + reference.sample_bilinear(upper, uv[on], wrap) * part
+            appearance.sample_bilinear(chain[k], uv[on], wrap) * (1 - part)
+            + appearance.sample_bilinear(upper, uv[on], wrap) * part
         )
     return out
 

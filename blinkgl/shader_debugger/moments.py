@@ -12,7 +12,7 @@ import numpy as np
 from blinkgl.errors import ConfigError
 from blinkgl.labels import LABELS, LabelRequest
 from blinkgl.labels.label import Label, View
-from blinkgl.render import reference
+from blinkgl.render import appearance, casting, reference
 from blinkgl.render.colour import LUMA
 from blinkgl.render.passes.shadow import ShadowMap
 from blinkgl.scene.lights import MAX_SHADOWS, shadowing
@@ -123,8 +123,8 @@ def buffers_of(scene: Scene, edged: tuple[str, ...] = ()) -> dict[str, Pass]:
     """Those of :data:`PASSES` that a scene has: of one without shadows no shadow maps, and so on.
 
     edged : pictures with filtered silhouettes that are among them."""
-    maps = len(shadowing(scene.light)) if reference.casts(scene) else 0
-    materials = [part.material for _, part in reference.scene_parts(scene) if not part.material.unlit]
+    maps = len(shadowing(scene.light)) if appearance.casts(scene) else 0
+    materials = [part.material for _, part in casting.scene_parts(scene) if not part.material.unlit]
     there = {
         "shadow": maps > 0,
         "mirrored": any(material.gloss is not None for material in materials),
@@ -322,8 +322,8 @@ class ReferenceMoment(_Lazy):
         )
         lit, mirrored, emission = (albedo.copy() for _ in range(3))
         direct, around, shadow = (light.copy() for _ in range(3))
-        xy = reference.pixel_grid(scene.camera).reshape(*shape, 2)
-        for p, (thing, part) in enumerate(reference.scene_parts(scene)):
+        xy = casting.pixel_grid(scene.camera).reshape(*shape, 2)
+        for p, (thing, part) in enumerate(casting.scene_parts(scene)):
             on = frame.part == p
             if not on.any():
                 continue
@@ -331,8 +331,8 @@ class ReferenceMoment(_Lazy):
                 uv[on] = frame.uv[on] * part.material.uv_scale
                 size[on] = part.material.texture.image.shape[1::-1]
                 corners = part.mesh.faces[frame.triangle[on]]
-                pose = reference.relative_pose_at(scene, thing, t_ns)
-                points = reference.vertices_at(part.mesh, t_ns)[corners] @ pose[:3, :3].T + pose[:3, 3]
+                pose = casting.relative_pose_at(scene, thing, t_ns)
+                points = casting.vertices_at(part.mesh, t_ns)[corners] @ pose[:3, :3].T + pose[:3, 3]
                 texels = (
                     part.mesh.uvs[corners].astype(np.float64)
                     * part.material.uv_scale
@@ -349,7 +349,7 @@ class ReferenceMoment(_Lazy):
             lit[on], light[on], shadow[on] = albedo[on], 1.0, 1.0
             if not part.material.unlit:
                 hits, rows = frame.hits(), np.flatnonzero(on.ravel())
-                sent = reference.radiated(scene, hits, rows, albedo[on], frame.normal[on], frame.uv[on])
+                sent = appearance.radiated(scene, hits, rows, albedo[on], frame.normal[on], frame.uv[on])
                 lit[on] *= sent.matt
                 weights = albedo[on] * LUMA
                 weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-30)
@@ -364,7 +364,7 @@ class ReferenceMoment(_Lazy):
                 shadow[on] = np.where(direct[on] > 0, arrives / np.maximum(direct[on], 1e-30), 1.0)
                 mirrored[on], emission[on] = sent.mirrored, sent.emission
         radiance = lit + mirrored + emission
-        in_fog = reference.seen_through_fog(scene, frame.hits(), radiance.reshape(-1, 3)).reshape(radiance.shape)
+        in_fog = appearance.seen_through_fog(scene, frame.hits(), radiance.reshape(-1, 3)).reshape(radiance.shape)
         colour = np.where(frame.hit[..., None], in_fog, frame.colour)
         return {
             "uv": uv,

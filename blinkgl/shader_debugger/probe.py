@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from blinkgl.render import reference
+from blinkgl.render import casting
 from blinkgl.render.probe import probe as reference_probe
 from blinkgl.render.renderer import Renderer
 from blinkgl.shader_debugger.compare import QUANTITIES, Comparison
@@ -39,7 +39,7 @@ def probe(gpu: GpuMoment, ref: ReferenceMoment, x: int, y: int, comparison: Comp
     """
     comparison = comparison or Comparison(gpu, ref)
     scene, when = ref.scene, gpu.when
-    parts = reference.scene_parts(scene)
+    parts = casting.scene_parts(scene)
     seen = {way: reference_probe(scene, when.t_ns, x, y, getattr(when, f"{way}_ns")) for way in ("forward", "backward")}
     drawn, true = int(gpu["part"][y, x]), int(ref["part"][y, x])
     hit = seen["forward"]
@@ -135,7 +135,7 @@ def _barycentric(parts, p, gpu, x, y, t_ns):
     if p < 0 or not 0 <= triangle < len(parts[p][1].mesh.faces):
         return None
     mesh = parts[p][1].mesh
-    a, b, c = reference.vertices_at(mesh, t_ns)[mesh.faces[triangle]]
+    a, b, c = casting.vertices_at(mesh, t_ns)[mesh.faces[triangle]]
     e1, e2, d = b - a, c - a, gpu["local"][y, x].astype(np.float64) - a
     m = np.array([[e1 @ e1, e1 @ e2], [e1 @ e2, e2 @ e2]])
     if np.linalg.det(m) <= 0:
@@ -158,7 +158,7 @@ def _positions(gpu, ref, x, y, seen) -> list[dict]:
     point = seen["forward"]
     p = int(gpu["part"][y, x])
     local = gpu["local"][y, x].astype(np.float64) if p >= 0 else None
-    thing = reference.scene_parts(scene)[p][0] if p >= 0 else None
+    thing = casting.scene_parts(scene)[p][0] if p >= 0 else None
 
     def world(t_ns):
         if thing is None:

@@ -189,7 +189,7 @@ class DebugPainter(Painter):
 @dataclass(frozen=True)
 class Inspection(ScenePass):
     """Which primitive wrote a pixel, and where on it; 0 where nothing is hit. In [..., 3] of LOCAL: number of the part
-    + 1, an index into ``reference.scene_parts``."""
+    + 1, an index into ``casting.scene_parts``."""
 
     program: ClassVar[str] = DEBUG_PROGRAM
     outputs: ClassVar[tuple[Output, ...]] = (

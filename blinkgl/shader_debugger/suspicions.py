@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from blinkgl.render import reference
 from blinkgl.render.colour import LUMA
 from blinkgl.shader_debugger.moments import PASSES, lookup_of
-from blinkgl.srgb import srgb_from_linear
+from blinkgl.srgb import linear_from_srgb, srgb_from_linear
 
 EXPLAINED = 0.9  # of the pixels that are wrong
 CLOSE = 1e-3  # relative: a candidate need not match to the last bit, other errors may be there, too
@@ -137,7 +136,7 @@ def _level(comparison, name, r, g, on) -> Candidates:
 
 
 def _albedo(comparison, name, r, g, on) -> Candidates:
-    yield "sRGB is decoded twice (the linear value is decoded again)", reference.srgb_to_linear(np.clip(r, 0, 1))
+    yield "sRGB is decoded twice (the linear value is decoded again)", linear_from_srgb(np.clip(r, 0, 1))
     yield "sRGB is not decoded", srgb_from_linear(np.clip(r, 0, 1)).astype(np.float64)
     if lookup_of(name)[0] == "colour":
         yield "red and blue are exchanged", r[:, ::-1]

@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from itertools import product
 from typing import Any
 
+from blinkgl.render.draw_items import MORE, Kind
 from blinkgl.render.lighting import EXAMPLES
 from blinkgl.render.passes import PASSES, Pass, ScenePass
-from blinkgl.render.resources import MORE, Kind
 from blinkgl.scene.shapes.table import DEFORMERS, define_of
 from blinkgl.shader_debugger.session import LOOKUPS, Inspection
 

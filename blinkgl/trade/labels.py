@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from blinkgl.labels import LabelRequest
-from blinkgl.render import reference
+from blinkgl.render import casting
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Scene
 
@@ -23,9 +23,9 @@ def flow_errors(scene: Scene, renderer: Renderer, t_ns: int, t_next_ns: int, see
     height, width = renderer.height, renderer.width
     rng = np.random.default_rng(seed)
     xy = np.stack([rng.integers(0, width, PIXELS), rng.integers(0, height, PIXELS)], axis=1)
-    hits = reference.cast(scene, t_ns, (xy[:, None] + _AROUND).reshape(-1, 2))
+    hits = casting.cast(scene, t_ns, (xy[:, None] + _AROUND).reshape(-1, 2))
     ids = hits.instance.reshape(PIXELS, len(_AROUND))
-    exact = reference.flow_to(scene, hits, t_next_ns)
+    exact = casting.flow_to(scene, hits, t_next_ns)
     flow, valid = exact.flow.reshape(PIXELS, len(_AROUND), 2)[:, 0], exact.valid.reshape(PIXELS, -1)[:, 0]
     ours = renderer.labels(t_ns, LabelRequest("ids", "flow_forward"), t_next_ns)
     x, y = xy.T

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import CAMERA_MODELS
 from blinkgl.config.scene import RandomSceneConfig
-from blinkgl.render import reference
+from blinkgl.render import casting, reference
 from blinkgl.scene.geometry.primitives import grid
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.rig import Rig
@@ -32,7 +32,7 @@ def wall(camera):
 def test_the_reference_sees_through_it(camera):
     scene = wall(camera)
     frame = reference.render(scene, 0, forward_ns=SECOND)
-    xy = reference.pixel_grid(camera).reshape(36, 48, 2)
+    xy = casting.pixel_grid(camera).reshape(36, 48, 2)
     rays = camera.rays(xy)
     points = 4.0 * rays / rays[..., 2:]
     assert frame.hit.all()

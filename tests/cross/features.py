@@ -25,7 +25,7 @@ WIDTH, HEIGHT, FPS = 32, 24, 100
 OF_PAIRS = ("disparity",)
 """Labels of stereo pairs: tests/dataset/test_rig_runs.py."""
 _POOLS = {
-    "pool": {"primitives": ["cuboid", "sphere"], "variants": 8, "urdfs": False, "test_fraction": 0.3},
+    "pool": {"primitives": ["cuboid", "sphere"], "variants": 8, "test_fraction": 0.3},
     "textures": {
         "procedural": ["checks", "fbm"],
         "variants": 8,
@@ -265,7 +265,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "nothing": NOTHING,
         "grid, noisy": {"tracks": {"points": 30, "choose": "grid"}, "imu": {"preset": "adis16448", "rate": 1000}},
         "surfaces, ideal": {"tracks": {"points": 20, "choose": "surface", "rate": 300}, "imu": {"rate": 90}},
-        "drawn": {"tracks": {"points": {"integer": [5, 9]}, "choose": "random"}},
+        "drawn": {"tracks": {"points": {"integer": [5, 9]}}},
     },
     "preview": {"off": NOTHING, "on": {"preview": {"enabled": True, "rate": 100}}},
     "time": {

@@ -17,7 +17,7 @@ RECIPE = {
     "scene": {
         "kind": "random",
         "objects": {"count": 3},
-        "pool": {"primitives": ["cuboid", "sphere"], "variants": 12, "urdfs": False, "test_fraction": 0.3},
+        "pool": {"primitives": ["cuboid", "sphere"], "variants": 12, "test_fraction": 0.3},
         "textures": {
             "procedural": ["checks", "fbm"],
             "variants": 12,

@@ -12,7 +12,7 @@ CONFIG = """
 camera: {width: 48, height: 36}
 time: {duration: 0.05, label_rate: 100}
 events: {emulator: v2e, causes: true, shot_noise_rate_hz: 100, leak_rate_hz: 50}
-scene: {kind: random, pool: {primitives: [cuboid], urdfs: false}, textures: {photographs: false, max_size: 32}}
+scene: {kind: random, pool: {primitives: [cuboid]}, textures: {photographs: false, max_size: 32}}
 """
 
 

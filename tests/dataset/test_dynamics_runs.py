@@ -25,7 +25,7 @@ FALLING = {
     "scene": {
         "kind": "random",
         "objects": {"count": 4, "distance": [2, 6]},
-        "pool": {"primitives": ["cuboid", "cone"], "variants": 8, "urdfs": False, "test_fraction": 0.3},
+        "pool": {"primitives": ["cuboid", "cone"], "variants": 8, "test_fraction": 0.3},
         "textures": {"procedural": ["checks"], "variants": 8, "photographs": False, "max_size": 32},
         "physics": {"share": 0.8, "thrown": 0.7},
     },

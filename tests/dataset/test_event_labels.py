@@ -21,7 +21,7 @@ time: {duration: 0.05, label_rate: 50}
 events: {emulator: EMULATOR}
 labels: {events: true, ids: true}
 preview: {enabled: false}
-scene: {kind: random, pool: {primitives: [cuboid], urdfs: false}, textures: {photographs: false, max_size: 32}}
+scene: {kind: random, pool: {primitives: [cuboid]}, textures: {photographs: false, max_size: 32}}
 """
 
 

@@ -29,7 +29,7 @@ RUN = {
     "timeline": {"kind": "uniform", "fps": 40},
     "scene": {
         "objects": {"count": 3, "distance": [2, 4]},
-        "pool": {"primitives": ["cuboid", "flag"], "variants": 4, "urdfs": False},
+        "pool": {"primitives": ["cuboid", "flag"], "variants": 4},
         "textures": {"procedural": ["checks"], "variants": 4, "photographs": False, "max_size": 32},
     },
     "labels": {"flow": ["forward", 0.05, -0.02, "1/100", 0.1], "float_flow": ["npy"]},

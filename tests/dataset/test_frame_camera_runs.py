@@ -18,7 +18,7 @@ RUN = {
     "time": {"duration": 0.1, "label_rate": 20, "start": 0.5},
     "scene": {
         "objects": {"count": 2, "distance": [2, 4]},
-        "pool": {"primitives": ["sphere", "cuboid"], "variants": 2, "urdfs": False},
+        "pool": {"primitives": ["sphere", "cuboid"], "variants": 2},
         "textures": {"procedural": ["checks", "fbm"], "variants": 2, "photographs": False, "max_size": 32},
         "camera_motion": {"speed": [2, 5], "rotation_rate": [60, 200]},
     },

@@ -24,7 +24,7 @@ RUN = {
     "scene": {
         "objects": {"count": 4, "distance": [2, 5]},
         "camera_motion": {"speed": 1.5, "rotation_rate": [60, 90]},
-        "pool": {"primitives": ["cuboid", "cone"], "variants": 6, "urdfs": False},
+        "pool": {"primitives": ["cuboid", "cone"], "variants": 6},
         "textures": {"procedural": ["checks"], "variants": 4, "photographs": False, "max_size": 32},
     },
     "labels": {"flow": ["forward"], "depth": True, "ids": True, "events": True},

@@ -22,7 +22,7 @@ imu: {preset: adis16448, rate: 1000, position: [0.05, 0, 0]}
 tracks: {points: 60, choose: surface, rate: 200}
 labels: {flow: [], occlusion: false}
 preview: {enabled: false}
-scene: {kind: random, pool: {primitives: [cuboid], urdfs: false}, textures: {photographs: false, max_size: 32}}
+scene: {kind: random, pool: {primitives: [cuboid]}, textures: {photographs: false, max_size: 32}}
 """
 
 
@@ -80,7 +80,7 @@ def test_explain_counts_them(tmp_path):
         (["imu.noise=1"], "imu.noise: unknown key"),
         (
             ["tracks.choose=edges"],
-            "tracks.choose: unknown choice (got 'edges'); expected 'grid', 'random' or 'surface'",
+            "tracks.choose: unknown choice (got 'edges'); expected 'grid' or 'surface'",
         ),
         (["tracks.points=1000000", "tracks.rate=10000"], "tracks.points: 1e+09 positions (got 1000000)"),
         (["frames={folders: [x], fps: 30}"], "imu: recorded frames do not tell where their camera was"),

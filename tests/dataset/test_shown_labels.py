@@ -24,7 +24,7 @@ RUN = {
     "timeline": {"kind": "uniform", "fps": 80},
     "scene": {
         "objects": {"count": 3, "distance": [2, 4]},
-        "pool": {"primitives": ["cuboid", "flag"], "variants": 4, "urdfs": False},
+        "pool": {"primitives": ["cuboid", "flag"], "variants": 4},
         "textures": {"procedural": ["checks"], "variants": 4, "photographs": False, "max_size": 32},
     },
     "labels": {"boxes": True, "semantics": {"ground": 2, "*": 1}, "scene_flow": True, "ids": True},

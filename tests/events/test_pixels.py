@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
 
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.readout import PixelsConfig, ReadoutConfig
+from blinkgl.errors import EventDataError
 from blinkgl.events import Events
 from blinkgl.events.camera import EventCamera, EventFrame
 from blinkgl.events.pixels import PixelNoise
@@ -139,6 +142,20 @@ def test_the_bus_waits_as_an_m_d_1_queue(load):
     assert abs(wait.mean() - mean) < 4 * blocks.std() / np.sqrt(200) + 0.5
     assert abs(wait.std() / np.sqrt(square - mean**2) - 1) < 0.12
     assert abs((wait == 0).mean() - (1 - load)) < 0.02, "the bus is idle for a share 1 - load of the time"
+
+
+def test_the_bus_does_not_care_from_when_the_clock_counts():
+    """A camera's file counts from 1970, and the bus counts picoseconds."""
+    rng, n, shift = np.random.default_rng(2), 3000, 1_643_243_628_734_000
+    t = np.sort(rng.integers(0, 20_000, n))
+    x, y, p = rng.integers(0, 40, n).astype(np.uint16), rng.integers(0, 30, n).astype(np.uint16), np.zeros(n, np.uint8)
+    config = ReadoutConfig(events_per_second=1e5, row_ns=300, queue_events=64)
+    early, late = Readout(config), Readout(config)
+    made, again = early.step(Events(x, y, t, p)), late.step(Events(x, y, t + shift, p))
+    assert_same(again, replace(made, t=made.t + shift))
+    assert late.dropped == early.dropped > 0
+    with pytest.raises(EventDataError, match="counts from the first event .got '110 days'.; expected at most 100"):
+        late.step(Events(x[:1], y[:1], np.array([shift + 110 * 86_400_000_000]), p[:1]))
 
 
 def test_clock_is_the_last_tick_that_has_passed():

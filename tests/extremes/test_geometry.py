@@ -12,7 +12,7 @@ from blinkgl.camera import PinHole
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import AssetError, GLError
 from blinkgl.labels import LabelRequest
-from blinkgl.render import reference
+from blinkgl.render import casting, reference
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Material
 from tests.extremes.measures import FACING, MOTION, compare, length, moving_camera
@@ -81,7 +81,7 @@ def test_order_of_surfaces_close_behind_one_another(gl, promise):
         world = scene(pair, rig(96, 72, 90.0, near=1e-3))
         with Renderer(gl, world, RenderConfig()) as renderer:
             ids = renderer.labels(0, LabelRequest("ids")).ids
-        wrong += (ids != reference.cast(world, 0).instance.reshape(ids.shape)).sum()
+        wrong += (ids != casting.cast(world, 0).instance.reshape(ids.shape)).sum()
     promise("surfaces a relative 1e-6 apart, 0.01 to 1e6 units: wrong pixels", wrong, 0)
 
 
@@ -111,39 +111,6 @@ def test_a_hundred_thousand_repeats_of_a_texture(gl, promise, away, median, wors
     error = np.abs(luminance - reference.render(world, 0).luminance)[near]
     promise(f"10^5 repeats on 2e5 units, {away:g} from the middle: luminance, median", np.median(error), median)
     promise(f"10^5 repeats on 2e5 units, {away:g} from the middle: luminance, largest", error.max(), worst)
-
-
-@pytest.mark.parametrize("distance, area", [(4, 0.1), (30, 0.002)])
-def test_triangles_far_below_a_pixel(gl, promise, distance, area):
-    """41 000 visible triangles on 4 500 or 80 pixels: corners snap to 1/256 px, yet
-    attributes come from the exact plane."""
-    e = compare(
-        gl,
-        scene(
-            [thing("ball", 1, sphere(1.0, 6), drift((0, distance, 0), (0.2, distance, 0.1), TURN, TURN * SPIN))],
-            moving_camera(),
-        ),
-    )
-    assert e.wrong_ids == 0
-    promise(f"triangles of {area:g} px²: flow, largest, relative", e.worst, WORST)
-
-
-def test_slivers_and_degenerate_triangles(gl, promise):
-    """A plane cut into 400 random slivers, some thinner than 1e-3 px, and triangles without area. The gradient of a
-    sliver's attributes divides by its width: the flow is off by up to 1e-3 px there and nowhere else."""
-    rng, n = np.random.default_rng(0), 200
-    below, above = np.sort(rng.uniform(-2, 2, n)), np.sort(rng.uniform(-2, 2, n))
-    vertices = np.concatenate([np.stack([x, np.full(n, y), np.zeros(n)], 1) for x, y in ((below, -1.5), (above, 1.5))])
-    i = np.arange(n - 1)
-    faces = np.concatenate(
-        [np.stack([i, i + 1, i + n], 1), np.stack([i + 1, i + 1 + n, i + n], 1), [[0, 0, 1], [3, 3, 3], [0, 1, 0]]]
-    )
-    sheet = mesh(vertices, faces, np.tile([0.0, 0, 1], (2 * n, 1)))
-    for slant in (20, 80):
-        path = drift((0, 4, 0), (0.2, 4, 0.1), LEVEL * Rotation.from_euler("x", 180 - slant, degrees=True))
-        e = compare(gl, scene([thing("sheet", 1, sheet, path)], moving_camera()))
-        promise(f"slivers seen at {slant} degrees: flow, median, relative", e.relative, MEDIAN)
-        promise(f"slivers seen at {slant} degrees: flow, largest", e.flow.max(), 1e-2, "px")
 
 
 def test_meshes_without_area_or_normals(gl):
@@ -204,24 +171,6 @@ def test_images_of_a_few_pixels(gl, promise, width, height):
         (length(labels.forward.flow - true.forward.flow) / length(true.forward.flow))[same].max(),
         WORST,
     )
-
-
-@pytest.mark.parametrize("side", [2048, pytest.param(4096, marks=pytest.mark.slow)])
-def test_large_images(gl, promise, side):
-    """gl_FragCoord and the flow's ndc are exact in float32 up to 2^24 half pixels; the error in px grows with the image
-    because the flow does."""
-    world = sized(side, side)
-    with Renderer(gl, world, RenderConfig()) as renderer:
-        labels = renderer.labels(300 * MS, LabelRequest("ids", "flow_forward"), 310 * MS)
-    xy = np.random.default_rng(0).integers(0, side, (3000, 2))
-    hits = reference.cast(world, 300 * MS, xy)
-    true = reference.flow_to(world, hits, 310 * MS).flow
-    ids, flow = labels.ids[xy[:, 1], xy[:, 0]], labels.forward.flow[xy[:, 1], xy[:, 0]]
-    same = ids == hits.instance
-    assert same.mean() > 0.999
-    error = length(flow - true)[same]
-    promise(f"image of {side} x {side}: flow, median", np.median(error), 1e-5, "px")
-    promise(f"image of {side} x {side}: flow, largest", error.max(), 1e-2, "px")
 
 
 def test_an_image_beyond_opengl_is_refused(gl):

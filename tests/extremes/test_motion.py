@@ -13,10 +13,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from blinkgl.config.sequence import RenderConfig
-from blinkgl.labels import LabelRequest
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.motion.paths import KeyframePath
-from blinkgl.timeline import displacement_times, uniform_times
+from blinkgl.timeline import displacement_times
 from blinkgl.timeline.speed import largest_speed
 from tests.extremes.measures import FACING, MOTION, compare, length, moving_camera
 from tests.render.render_scenes import (
@@ -147,20 +146,6 @@ def test_a_million_pixels_per_second(gl, promise, speed):
     assert np.diff(slow).min() >= 100_000  # documented saturation: never shorter than min_step_us, whatever the speed
 
 
-def test_frame_times_at_both_ends():
-    assert list(uniform_times(1e9, 5, 9)) == [5, 6, 7, 8, 9]
-    assert list(uniform_times(0.01, 10**15, 10**15 + 250 * SECOND)) == [
-        10**15,
-        10**15 + 100 * SECOND,
-        10**15 + 200 * SECOND,
-        10**15 + 250 * SECOND,
-    ]
-    day = list(uniform_times(1 / 3600, 0, 86_400 * SECOND))
-    assert len(day) == 25 and np.abs(np.diff(day) - 3600 * SECOND).max() <= 3600 * SECOND * 1e-6
-    still_day = list(displacement_times(0.5, 200_000, 10**12, 0, 86_400 * SECOND, lambda t: 0.0))
-    assert len(still_day) == 88 and still_day[-1] == 86_400 * SECOND
-
-
 @pytest.mark.parametrize("name", ["ground", "close ground", "wall comes through", "inside a box"])
 def test_surfaces_crossing_the_camera_plane(gl, promise, name):
     """A point that comes near the camera plane has w' = w + d.w small: the error of w', eps (w + |d.w|), is then large
@@ -197,13 +182,6 @@ def test_surfaces_crossing_the_camera_plane(gl, promise, name):
         5e-6,
     )
     promise(f"crossing the camera plane, {name}: velocity, largest, relative", e.velocity.max(), WORST)
-
-
-def test_everything_behind_the_camera_is_invalid_and_zero(gl):
-    world = scene([thing("wall", 1, quad(9, 9), drift((0, 2, 0), (0, -2, 0), FACING))])
-    with Renderer(gl, world, RenderConfig()) as renderer:
-        flow = renderer.labels(0, LabelRequest("flow_forward", "occlusion_forward"), SECOND).forward
-    assert not flow.valid.any() and (flow.flow == 0).all() and not flow.occluded.any()
 
 
 def test_no_motion_is_exactly_no_flow(gl, promise):

@@ -10,9 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from blinkgl.config.gl import GLConfig
-from blinkgl.config.problems import validate
-from blinkgl.errors import ConfigError, GLError
+from blinkgl.errors import GLError
 from blinkgl.gl import context as context_module, create_context, egl_devices, osmesa
 
 VERTEX = """#version 430 core
@@ -122,22 +120,6 @@ print(hashlib.sha256(colour.tobytes() + depth.tobytes()).hexdigest())
 """
 
 
-def test_two_processes_at_once_draw_the_same():
-    import os
-
-    folder = os.path.dirname(__file__)
-    workers = [
-        subprocess.Popen(
-            [sys.executable, "-c", WORKER, folder], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        for _ in range(2)
-    ]
-    outputs = [worker.communicate(timeout=120) for worker in workers]
-    assert [worker.returncode for worker in workers] == [0, 0], outputs
-    assert all(stderr == "" for _, stderr in outputs)
-    assert outputs[0][0] == outputs[1][0] != ""
-
-
 # --- failures ---------------------------------------------------------------------------------------------------------
 
 
@@ -232,26 +214,7 @@ def test_missing_gl_function(gl):
         gl._raw = raw
 
 
-def test_software_is_recognised():
-    recognised = context_module._SOFTWARE.search
-    for text in ("llvmpipe (LLVM 15.0.6, 256 bits)", "softpipe", "Google SwiftShader", "zink (llvmpipe)"):
-        assert recognised(text)
-    for text in ("NVIDIA H100 80GB HBM3/PCIe/SSE2", "AMD Radeon RX 7900 (radeonsi)", "Mesa Intel(R) UHD Graphics 620"):
-        assert not recognised(text)
-
-
 # --- config -----------------------------------------------------------------------------------------------------------
-
-
-def test_config():
-    assert validate(GLConfig, {}) == GLConfig(backend="auto", device=0)
-    assert validate(GLConfig, {"backend": "osmesa", "device": 2}, where="gl").device == 2
-    with pytest.raises(ConfigError, match="gl.backend"):
-        validate(GLConfig, {"backend": "glx"}, where="gl")
-    with pytest.raises(ConfigError, match="gl.device"):
-        validate(GLConfig, {"device": -1}, where="gl")
-    with pytest.raises(ConfigError, match="gl.backnd: unknown key; expected 'backend'"):
-        validate(GLConfig, {"backnd": "egl"}, where="gl")
 
 
 def test_devices_are_listed_without_a_context():
@@ -262,23 +225,6 @@ def test_devices_are_listed_without_a_context():
         timeout=60,
     )
     assert all(isinstance(text, str) and text for text in json.loads(done.stdout))
-
-
-def test_the_environment_of_the_process_is_left_alone():
-    """A library that sets variables changes what the caller's other libraries and child processes do."""
-    script = """if True:
-        import os
-        import cv2  # sets LD_LIBRARY_PATH itself
-        before = dict(os.environ)
-        import blinkgl, numpy as np
-        from blinkgl.gl import create_context
-        with create_context():
-            list(blinkgl.simulate([np.full((4, 4), k, np.uint8) for k in range(3)], fps=100))
-        import blinkgl.cli, blinkgl.show.simulate, blinkgl.recordings.comparison, blinkgl.show.checks
-        import blinkgl.dataset.explain, blinkgl.dataset.run, blinkgl.trade.run
-        assert dict(os.environ) == before, set(os.environ.items()) ^ set(before.items())
-    """
-    subprocess.run([sys.executable, "-c", script], check=True)
 
 
 FORK = """

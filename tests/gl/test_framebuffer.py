@@ -104,23 +104,6 @@ def test_reversed_z_keeps_float_precision(gl, kind):
     program.release()
 
 
-@pytest.mark.parametrize("kind", [True, "texture"])
-def test_nearer_surface_wins_whatever_the_order(gl, kind):
-    program, vertices = full_screen(gl, "uniform float shade; out float value; void main() { value = shade; }")
-    gl.ctx.enable_only(gl.ctx.DEPTH_TEST)
-    gl.ctx.depth_func = ">"
-    with gl.framebuffer(4, 4, ("R32F",), depth=kind) as target:
-        for near_z in (0.02, 1.0, 300.0, 1e5):
-            for order in ((1.0, 2.0), (2.0, 1.0)):
-                target.clear(depth=0.0)
-                for shade in order:  # shade 1 is nearer by 1e-6
-                    program["shade"], program["depth_w"] = shade, (0.01, near_z * (1 + (shade - 1) * 1e-6))
-                    vertices.render(vertices=3)
-                assert np.all(target.read() == 1.0), (near_z, order)
-    vertices.release()
-    program.release()
-
-
 def test_depth_of_16_bits_is_rounded_to_its_steps(gl):
     program, vertices = full_screen(gl, "out float value; void main() { value = 1.0; }")
     gl.ctx.enable_only(gl.ctx.DEPTH_TEST)
@@ -151,17 +134,6 @@ def test_depth_texture_can_be_sampled(gl):
         assert np.all(second.read() == np.float32(1.2345e-6))
     vertices.release()
     program.release()
-
-
-def test_what_was_read_before_does_not_change_what_is_copied(gl):
-    """The first attachment, whatever of the target was read last: its depth, or another attachment."""
-    one, other = gl.framebuffer(4, 3, ("R32F", "R32F")), gl.framebuffer(4, 3, ("R32F",), depth=False)
-    one.clear((0.25,), (0.75,))
-    for read in (one.read_depth, lambda: one.read(1)):
-        other.clear((0.0,))
-        read()
-        one.copy_into(other)
-        assert (other.read() == 0.25).all()
 
 
 def test_releasing_the_bound_target_leaves_a_usable_context(gl):

@@ -80,14 +80,6 @@ def test_cache(loader):
     assert loader.program("program.glsl", {"GAIN": 1.0}) is not first
 
 
-def test_clear_reads_the_files_again(gl, loader, folder):
-    assert drawn(gl, loader.program("program.glsl", {"GAIN": 1.0})) == 4.0
-    write(folder, {"include/twice.glsl": "float twice(float x) { return 3.0 * x; }"})
-    assert drawn(gl, loader.program("program.glsl", {"GAIN": 1.0})) == 4.0
-    loader.clear()
-    assert drawn(gl, loader.program("program.glsl", {"GAIN": 1.0})) == pytest.approx(9.0)
-
-
 def test_expanded_source(folder):
     source = expand("program.glsl", "fragment", {"GAIN": 2.0, "ON": True}, folder)
     lines = source.text.splitlines()
@@ -99,12 +91,6 @@ def test_expanded_source(folder):
             original = (folder / file).read_text().splitlines()[number - 1]
             assert line.replace("# include", "#include") == original or (line == "" and original.startswith("#version"))
     assert {file for file, _ in source.origin} == {"", "program.glsl", "include/value.glsl", "include/twice.glsl"}
-
-
-def test_default_and_own_version(folder):
-    write(folder, {"plain.glsl": "void main() {}\n", "newer.glsl": "\n#version 450 core\nvoid main() {}\n"})
-    assert expand("plain.glsl", "vertex", folder=folder).text.startswith("#version 430 core\n")
-    assert expand("newer.glsl", "vertex", folder=folder).text.startswith("#version 450 core\n")
 
 
 # --- compile errors ---------------------------------------------------------------------------------------------------
@@ -164,24 +150,6 @@ def test_error_formats_of_all_drivers(folder, message):
     assert ">    3 |     return twice(GAIN);" in error.detail
 
 
-def test_warnings_before_the_error_do_not_hide_it(folder):
-    sources = {stage: expand("program.glsl", stage, {"GAIN": 1.0}, folder) for stage in ("vertex", "fragment")}
-    line = sources["vertex"].origin.index(("program.glsl", 8)) + 1
-    error = translate(
-        f"GLSL Compiler failed\n\nvertex_shader\n=====\n0({line - 1}) : warning C7050: unused\n0({line}) : error "
-        "C0000: bad\n",
-        sources,
-    )
-    assert str(error) == "program.glsl:8: C0000: bad [vertex stage]"
-    assert "program.glsl:7: warning: C7050: unused" in error.detail
-
-
-def test_unknown_format_is_passed_on_whole(folder):
-    sources = {"vertex": expand("program.glsl", "vertex", {"GAIN": 1.0}, folder)}
-    error = translate("GLSL Compiler failed\n\nvertex_shader\n=====\nFehler in Zeile 3\n", sources)
-    assert str(error) == "program.glsl: GLSL Compiler failed Fehler in Zeile 3 [vertex stage]"
-
-
 def test_error_in_a_generated_line_shows_it(folder):
     sources = {"vertex": expand("program.glsl", "vertex", {"GAIN": 1.0}, folder)}
     error = translate("x\nvertex_shader\n===\n0:3(1): preprocessor error: bad define\n", sources)
@@ -221,11 +189,6 @@ def test_bad_includes(folder, line, message):
     write(folder, {"program.glsl": f"\n{line}\n"})
     with pytest.raises(ShaderError, match="^" + message):
         expand("program.glsl", "vertex", folder=folder)
-
-
-def test_trailing_comment_after_include(folder):
-    write(folder, {"program.glsl": '#include "twice.glsl" // the usual\n'})
-    assert "float twice" in expand("program.glsl", "vertex", folder=folder).text
 
 
 def test_missing_program_and_version_in_an_include(folder):

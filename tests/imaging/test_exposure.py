@@ -86,17 +86,6 @@ def test_the_lag_is_first_order_in_the_logarithm_whatever_the_rate(dt_s):
     np.testing.assert_allclose(np.log(products), expected, atol=2e-6)
 
 
-def test_a_step_of_the_light_is_followed_from_where_it_was():
-    products = settings(AUTO, [1e-9] * 200 + [4e-9] * 20, Setting(5_000_000, 1.0), 0.05)
-    late = np.log(products[200:]) - math.log(AUTO.target / 4e-9)
-    np.testing.assert_allclose(late, math.log(4.0) * np.exp(-0.05 * np.arange(21) / AUTO.lag), atol=1e-5)
-
-
-def test_without_a_lag_the_next_image_is_right():
-    at_once = AUTO.model_copy(update={"lag": 0.0})
-    assert settings(at_once, [1e-9], Setting(5_000_000, 1.0), 0.05)[1] == pytest.approx(AUTO.target / 1e-9, rel=1e-9)
-
-
 def test_time_changes_first_gain_beyond_it_and_both_keep_to_their_limits():
     config = AutoExposureConfig(target=0.2, lag=0.0, shortest_us=100, longest_us=10_000, max_gain_db=20)
     now = Setting(1_000_000, 1.0)

@@ -10,9 +10,9 @@ from blinkgl.camera import PinHole
 from blinkgl.config.images import ImagesConfig, exposure_starts
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.imaging import FrameCamera
-from blinkgl.imaging.lens import blur_px, points, samples
+from blinkgl.imaging.lens import blur_px, samples
 from blinkgl.imaging.response import decode
-from blinkgl.render.reference import sample_bilinear
+from blinkgl.render.appearance import sample_bilinear
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Light, Material
@@ -121,17 +121,6 @@ def test_rows_of_a_rolling_shutter_are_rendered_at_their_own_times(gl):
     assert np.abs(own - first).max() > 0.1, "it moves while it is read"
 
 
-def test_a_longer_exposure_blurs_each_row_over_its_own_time(gl):
-    with Renderer(gl, moving(speed=(2.0, 0, 0)), FINE) as renderer:
-        how = dict(exposure_us=60_000.0, row_us=2000.0, rate=2, **LINEAR)
-        image = camera_of(renderer, max_px=1e-3, max_instants=650, **how).take()  # cells of 200 us
-        for y in (0, 17, 35):
-            times = (2000.0 * y + 60_000.0 * (np.arange(100) + 0.5) / 100) * 1000
-            own = np.mean([renderer.colour(int(t)).read()[y].astype(np.float64) for t in times], axis=0)
-            assert np.abs(light_of(image.image)[y] - np.clip(own, 0, 1)).max() < 1.5 * STEP
-    assert image.instants == 650
-
-
 # --- the lens ---------------------------------------------------------------------------------------------------------
 
 
@@ -196,14 +185,6 @@ def test_what_is_in_focus_stays_sharp_and_a_pin_hole_costs_nothing(gl):
         )
 
 
-def test_points_of_the_lens_are_spread_evenly_in_every_stretch():
-    p = points(256, 2.0)
-    assert np.hypot(*p.T).max() <= 1.0 and len({tuple(x) for x in p.round(9)}) == 256
-    for part in (p, p[:64], p[64:128], p[100:164]):
-        assert np.abs(part.mean(axis=0)).max() < 0.12
-        assert (np.hypot(*part.T) ** 2).mean() == pytest.approx(0.5, abs=0.03), "as a disc has it"
-
-
 # --- vignetting, exposure, filters ------------------------------------------------------------------------------------
 
 
@@ -244,22 +225,6 @@ def test_gain_keeps_white_white_and_takes_fewer_photons_for_it(gl):
         electrons = 10_000 / 10 ** (gain_db / 20)
         assert x.mean() == pytest.approx(0.5, rel=5 / math.sqrt(0.5 * electrons * x.size))
         assert x.var() == pytest.approx(x.mean() / electrons, rel=0.08)
-
-
-def test_noisy_and_clean_side_by_side(gl):
-    with Renderer(gl, moving(), FINE) as renderer:
-        how = dict(
-            photon_noise=True, read_noise=5.0, gain_db=12.0, also=("clean",), exposure_us=100_000, rate=5, **LINEAR
-        )
-        image = camera_of(renderer, **how).take()
-        alone = camera_of(renderer, **{**how, "also": (), "photon_noise": False, "read_noise": 0.0}).take()
-        again, other = camera_of(renderer, **how).take(), camera_of(renderer, seed=2, **how).take()
-    np.testing.assert_array_equal(image.pictures["clean"], alone.image)
-    np.testing.assert_array_equal(image.image, again.image)
-    assert (image.image != other.image).mean() > 0.9
-    difference = light_of(image.image) - light_of(alone.image)
-    inside = (light_of(alone.image) > 0.15) & (light_of(alone.image) < 0.8)
-    assert abs(difference[inside].mean()) < 0.002 and difference[inside].std() > 0.005
 
 
 def test_black_level_bits_and_filters(gl):

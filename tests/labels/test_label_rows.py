@@ -9,7 +9,6 @@ import pytest
 
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.labels import LABELS, Flow, Flows, LabelFrame, LabelRequest, Occlusions, asked_for, grading, label_of
-from blinkgl.labels.files import Form
 from blinkgl.render.occlusion import flow_and_reach
 from blinkgl.types.boxes import Boxes, no_boxes
 
@@ -96,40 +95,6 @@ FILES = {
     "scene_flow": ["scene_flow/000007.npy"],
 }
 """The layout that docs/ and DSEC's loaders know."""
-
-
-def test_where_labels_lie():
-    assert {name: [form.file(7) for form in label.forms] for name, label in LABELS.items()} == FILES
-    assert {name: label.stamps for name, label in LABELS.items() if label.stamps} == {
-        "images": "images/timestamps.txt",
-        "flow_forward": "flow/forward_timestamps.txt",
-        "flow_backward": "flow/backward_timestamps.txt",
-        "flow_intervals": "flow/intervals_timestamps.txt",
-        "scene_flow": "scene_flow/timestamps.txt",
-    }
-    assert {name: label.shard for name, label in LABELS.items() if label.shard} == {
-        "images": "image.png",
-        "flow_forward": "flow.png",
-        "flow_backward": "back.png",
-        "occlusion_forward": "occlusion.png",
-        "flow_intervals": "flow_intervals.h5",
-        "depth": "depth.npy",
-        "disparity": "disparity.npy",
-        "ids": "ids.png",
-        "normals": "normals.npy",
-        "velocity": "velocity.npy",
-        "scene_flow": "scene_flow.npy",
-        "semantics": "semantics.png",
-        "boxes": "boxes.npz",
-    }
-
-
-def test_a_form_knows_its_own_files():
-    each = Form("flow/forward", "png")
-    assert list(each.files(2)) == ["flow/forward/000000.png", "flow/forward/000001.png"] and list(each.files(0)) == []
-    assert each.holds("flow/forward/000000.png")
-    for other in ("flow/forward.png", "flow/forward/a/0.png", "flow/forward/0.npy", "flow/forward0.png"):
-        assert not each.holds(other)
 
 
 # --- values -----------------------------------------------------------------------------------------------------------
@@ -221,28 +186,6 @@ def test_what_the_reference_says():
     assert says("velocity").tolist() == [[[1, 1], [0, 0]]] and says("depth") == 3 and says("ids") == 4
     assert says("flow_forward").tolist() == [[[1, 1], [0, 0]]] and says("flow_forward", 1) is hit
     assert np.array_equal(says("occlusion_forward"), ~hit)
-
-
-def test_how_strictly_each_is_judged():
-    """Figures of docs/, loosened by nobody unnoticed."""
-    judged = {v.name: (v.tolerance, v.statistic, v.judged_in) for label in LABELS.values() for v in label.views}
-    assert judged == {
-        "depth": (1e-5, "max", "relative"),
-        "disparity": (1e-5, "max", "relative"),
-        "id": (0.0, "max", "mismatch"),
-        "normals": (1e-3, "max", "of a unit vector"),
-        "velocity": (1e-2, "max", "px per label interval"),
-        "scene_flow": (1e-4, "max", "world units"),
-        "semantics": (0.0, "max", "mismatch"),
-        "flow_forward": (1e-2, "max", "px"),
-        "valid_forward": (0.0, "max", "mismatch"),
-        "flow_backward": (1e-2, "max", "px"),
-        "valid_backward": (0.0, "max", "mismatch"),
-        "occluded_forward": (1e-3, "mean", "fraction of pixels"),
-        "occluded_backward": (1e-3, "mean", "fraction of pixels"),
-    }
-    loose = {v.name for label in LABELS.values() for v in label.views if not v.same_triangle}
-    assert loose == {"id", "semantics", "occluded_forward", "occluded_backward"}
 
 
 def test_a_label_that_shows_itself_in_its_own_way_needs_no_reference():

@@ -38,7 +38,7 @@ RECIPE = {
     "scene": {
         "kind": "random",
         "objects": {"count": 2},
-        "pool": {"primitives": ["cuboid"], "variants": 4, "urdfs": False},
+        "pool": {"primitives": ["cuboid"], "variants": 4},
         "textures": {"procedural": ["checks", "fbm"], "variants": 4, "photographs": False, "max_size": 64},
     },
     "events": {"emulator": "esim", "contrast_threshold": 0.1},

@@ -21,7 +21,7 @@ from blinkgl.scene.shapes.skeleton import Locals, Skeleton
 from blinkgl.scene.shapes.skin import Morphs, Skin
 from blinkgl.scene.shapes.table import deformer_of
 from blinkgl.scene.types import Material
-from render_scenes import LEVEL, cube, drift, quad, rig, scene, smooth_texture, sphere, still, thing
+from render_scenes import LEVEL, drift, quad, rig, scene, smooth_texture, sphere, still, thing
 
 MS = 1_000_000
 T0, T1, T_BACK = 300 * MS, 400 * MS, 200 * MS
@@ -98,26 +98,6 @@ def test_motions_of_a_millionth_of_a_pixel(gl, kind):
     assert length(labels.velocity[off] - limit).max() <= 1e-5 * length(limit).max()
 
 
-@pytest.mark.parametrize("kind", [*FORMS, "skin", "figure"])
-def test_there_and_back_again(gl, kind):
-    """backward flow at where forward flow ends, of the same surface: back to the pixel."""
-    what = world({"skin": arm, "figure": figure_of}[kind]() if kind not in FORMS else by_formula(sphere(1.0, 4), kind))
-    _, there, off = graded(gl, what, T0, T1, T_BACK)
-    _, back, _ = graded(gl, what, T1, T1 + MS, T0)
-    y, x = np.nonzero(off & ~there.forward.occluded & (there.ids == 3))
-    at = np.stack([x, y], axis=1) + there.forward.flow[y, x]
-    x0, y0 = np.floor(at).astype(int).T
-    inside = (x0 >= 0) & (y0 >= 0) & (x0 < what.camera.width - 1) & (y0 < what.camera.height - 1)
-    at, x0, y0 = at[inside], x0[inside], y0[inside]
-    same = np.all([back.ids[y0 + j, x0 + i] == 3 for i in (0, 1) for j in (0, 1)], axis=0)
-    at, x0, y0 = at[same], x0[same], y0[same]
-    a, b = (at - np.stack([x0, y0], axis=1)).T[:, :, None]
-    f = back.backward.flow
-    mean = (1 - b) * ((1 - a) * f[y0, x0] + a * f[y0, x0 + 1]) + b * ((1 - a) * f[y0 + 1, x0] + a * f[y0 + 1, x0 + 1])
-    start = np.stack([x, y], axis=1)[inside][same]
-    assert same.sum() > (500 if kind in FORMS else 120) and np.median(length(at + mean - start)) < 5e-3
-
-
 @pytest.mark.parametrize("kind", FORMS)
 @pytest.mark.parametrize("textured", [False, True])
 def test_rate_of_luminance_is_that_of_the_frames(gl, kind, textured):
@@ -133,28 +113,6 @@ def test_rate_of_luminance_is_that_of_the_frames(gl, kind, textured):
     error = np.abs(rate - true)[off]
     assert np.abs(true[off]).max() > 0.1
     assert np.quantile(error, 0.9) < 0.03 * np.abs(true[off]).max()
-
-
-def test_a_still_camera_draws_a_body_that_only_changes_its_shape(gl):
-    what = world(by_formula(cube(1.0), "twist"), moves=False, camera_moves=False)
-    with Renderer(gl, what, RenderConfig()) as renderer, Renderer(gl, what, RenderConfig(), whole=True) as whole:
-        assert not renderer.whole
-        for t in (T0, T0 + 7 * MS, T1, T_BACK):
-            np.testing.assert_array_equal(renderer.luminance(t).view(), whole.luminance(t).read())
-            np.testing.assert_array_equal(renderer.velocity(t).read(), whole.velocity(t).read())
-        assert np.abs(renderer.velocity_of_movers(T0).read()).max() > 1
-
-
-def test_variants_are_compiled_where_a_shape_asks(gl):
-    from blinkgl.gl import create_context
-
-    with create_context() as own:
-        with Renderer(own, world(sphere(1.0, 2)), RenderConfig()) as renderer:
-            renderer.luminance(T0)
-        assert not any("DEFORM" in dict(defines) for _, defines in own.shaders.compiled)
-        with Renderer(own, world(by_formula(sphere(1.0, 2), "wave")), RenderConfig()) as renderer:
-            renderer.luminance(T0)
-        assert sum("DEFORM" in dict(defines) for _, defines in own.shaders.compiled) == 1
 
 
 # ------------------------------------------------------------------------------------------------- skins
@@ -205,32 +163,6 @@ def test_every_label_of_a_skin(gl, figure):
     error = length(labels.velocity - ref.velocity)[off] / scale
     assert np.median(error) < 2e-6 and error.max() < 1e-4
     np.testing.assert_allclose(labels.normals[off], (ref.normal @ what.camera_path.pose(T0)[:3, :3])[off], atol=5e-5)
-
-
-@pytest.mark.parametrize("figure", FIGURES)
-def test_a_skin_that_moves_by_a_millionth_of_a_pixel(gl, figure):
-    what = world(FIGURES[figure](), moves=False, camera_moves=False)
-    ref, labels, off = graded(gl, what, forward=T0 + 30, backward=T0 - 30)
-    off &= ref.instance == 3
-    for flow, true in ((labels.forward, ref.forward), (labels.backward, ref.backward)):
-        motion = length(true.flow)[off]
-        assert 1e-8 < np.median(motion) < 1e-4
-        assert np.quantile(length(flow.flow - true.flow)[off] / motion.max(), 0.99) <= 1e-5
-    limit = labels.forward.flow[off] / 30e-9
-    assert length(labels.velocity[off] - limit).max() <= 1e-4 * length(limit).max()
-
-
-@pytest.mark.parametrize("figure", FIGURES)
-def test_rate_of_luminance_of_a_skin(gl, figure):
-    what = world(FIGURES[figure](), moves=False, camera_moves=False)
-    ref = reference.render(what, T0)
-    with Renderer(gl, what, RenderConfig(antialiasing="none"), whole=True) as renderer:
-        before, after = (renderer.luminance(T0 + dt).read().astype(np.float64) for dt in (-MS, MS))
-        rate = renderer.brightness(T0).read()[..., 1].astype(np.float64)
-    off = ref.hit & (ref.instance == 3) & ~reference.silhouette_band(ref.instance, ref.depth, width=3)
-    true = (after - before) / 2e-3
-    assert np.abs(true[off]).max() > 0.1
-    assert np.quantile(np.abs(rate - true)[off], 0.9) < 0.03 * np.abs(true[off]).max()
 
 
 class Spinning:

@@ -9,14 +9,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import PinHole, Radtan
-from blinkgl.config.deform import WaveConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.contours import CROSSING, LINE, Contour, Lines
-from blinkgl.render.passes import Luminance, filtered
+from blinkgl.render.passes import Luminance
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.rig import Rig
-from blinkgl.scene.shapes.closed_forms import Wave
 from blinkgl.scene.types import Light, Material, Texture
 from blinkgl.shader_debugger.edges_twin import filtered as filtered_slowly
 from render_scenes import (
@@ -116,18 +114,6 @@ def test_what_is_hidden_does_not_show_through(gl):
     assert error.max() < 0.15 and (error > 0.02).sum() <= 4  # where three surfaces meet in a pixel
 
 
-def test_what_lies_just_under_a_surface_does_not_show_through(gl):
-    """A body inside of another one, half a hundredth of its distance below the surface."""
-    wall = polygon(np.array([(-30, -30), (30, -30), (30, 30), (-30, 30)]), 3.0, "wall", 2, GREY)
-    card = polygon(np.array([(-9.3, -7.2), (8.1, -7.9), (9.7, 8.4), (-8.8, 6.9)]), 3.015)
-    slope = replace(wall.parts[0].mesh, uvs=wall.parts[0].mesh.vertices[:, :2].astype(np.float32))
-    ramp = np.linspace(0, 1, 64, dtype=np.float32)[None, :, None].repeat(64, axis=0).repeat(3, axis=2)
-    wall = thing("wall", 2, slope, still(), Material(Texture(ramp), unlit=True, double_sided=True))
-    np.testing.assert_array_equal(
-        luminance(gl, looked_at(card, wall), "edges"), luminance(gl, looked_at(wall), "edges")
-    )
-
-
 def test_the_horizon(gl):
     """Where a floor ends, a pixel in front of the line is nearer by more than a half."""
     floor = thing("floor", 2, quad(400, 400, 4), still((0, 10, -1.0)), GREY)
@@ -163,64 +149,6 @@ def test_a_scene_of_everything_is_nearer_to_the_finest_than_with_four_samples(gl
     assert error["edges"] < 0.6 * error["ssaa2"] < 0.6 * error["none"]
 
 
-def test_bodies_that_deform_have_their_lines_where_they_are_drawn(gl):
-    shape = quad(1.0, 1.0, 24)
-    waving = Wave.of(WaveConfig(amplitude=0.1, period=0.7), shape.vertices.min(axis=0), shape.vertices.max(axis=0))
-    body = replace(shape, deformer=waving)
-    world = scene(
-        [thing("flag", 1, body, still((0, 4, 0), LEVEL), WHITE)],
-        rig(80, 60, 75.0, drift((0, 0, 0), (0.3, 0, 0.1), LEVEL)),
-    )
-    for t in (0, SECOND // 3):
-        true = finest(gl, world, 8, t)
-        assert rmse(luminance(gl, world, "edges", t), true) < 0.3 * rmse(luminance(gl, world, "none", t), true)
-
-
-def test_four_taps_keep_what_grazing_angles_hide(gl):
-    """Stripes that run into the distance: a pixel is as wide as ever and very long."""
-    image = np.zeros((64, 64, 3), np.float32)
-    image[:, (np.arange(64) // 8) % 2 == 0] = 1.0
-    ground = thing(
-        "ground", 1, quad(40, 40, 8), still((0, 0, -1.0)), Material(Texture(image), uv_scale=(10.0, 10.0), unlit=True)
-    )
-    world = scene([ground], Rig.alone(PinHole(96, 64, 90.0, 90.0, 47.5, 8.0), still(rotation=LEVEL)))
-    true = finest(gl, world)[20:60]
-    error = {name: rmse(luminance(gl, world, name)[20:60], true) for name in ("taps4", "edges", "ssaa2")}
-    assert error["edges"] < 0.7 * error["taps4"]
-
-
-def test_taps_of_a_linear_texture_are_one(gl):
-    ramp = np.repeat(np.linspace(0, 1, 256, dtype=np.float32)[None, :, None], 256, axis=0).repeat(3, axis=2)
-    body = thing(
-        "card",
-        1,
-        quad(2, 2),
-        still((0, 4, 0), Rotation.from_euler("x", 90, degrees=True)),
-        Material(Texture(ramp), unlit=True, double_sided=True),
-    )
-    world = scene([body], Rig.alone(PinHole(64, 64, 150, 150, 31.5, 31.5), still((0, 0, 0), LEVEL)))
-    np.testing.assert_allclose(
-        luminance(gl, world, "edges")[8:-8, 8:-8], luminance(gl, world, "none")[8:-8, 8:-8], atol=2e-3
-    )
-
-
-def test_light_is_never_negative(gl):
-    """Small bright things in front of each other, more lines than pixels."""
-    rng = np.random.default_rng(1)
-    cards = [
-        polygon(
-            rng.uniform(-20, 20, 2) + rng.normal(0, 1.2, (3, 2)),
-            3.0 + 0.01 * k,
-            f"card{k}",
-            k + 1,
-            replace(WHITE, base_color=(float(rng.choice([0.0, 1.0, 50.0])),) * 3),
-        )
-        for k in range(150)
-    ]
-    image = luminance(gl, looked_at(*cards), "edges")
-    assert np.isfinite(image).all() and image.min() >= 0
-
-
 def test_the_same_bits_by_any_renderer_and_after_any_other_frame(gl):
     world = mixed_scene()
     with Renderer(gl, world, EDGES) as one, Renderer(gl, world, EDGES) as other:
@@ -246,13 +174,6 @@ def test_lines_of_a_cube(gl, turn, silhouette, creases):
     found = lines_of(gl, world)
     assert found.shape[1] == LINE
     assert ((found[:, 6] == 0).sum(), (found[:, 6] == 1).sum()) == (silhouette, creases)
-
-
-def test_faces_that_share_places_but_no_vertices_are_neighbours():
-    """A cube has 24 vertices, and 12 edges besides the diagonals of its sides."""
-    contour = Contour(cube())
-    assert len(contour.corners) == 8 and len(contour.edges) == 18 and contour.sharp.sum() == 12
-    assert (contour.edges[:, 3] >= 0).all()
 
 
 def test_three_faces_at_an_edge_and_faces_without_area():
@@ -480,18 +401,6 @@ def test_the_program_does_what_its_slow_twin_does(gl, world):
     np.testing.assert_allclose(image, twin, atol=2e-4 * picture.mean(), rtol=2e-4)
 
 
-def test_nothing_to_draw(gl):
-    world = scene([thing("ball", 1, sphere(0.5), still((0, -4, 0)))])  # behind the camera
-    np.testing.assert_array_equal(luminance(gl, world, "edges"), luminance(gl, world, "none"))
-
-
-def test_the_pass_is_the_unfiltered_one_with_its_depth_kept():
-    from blinkgl.render.passes import Edged
-
-    pass_ = filtered(Luminance(samples_of("edges")))
-    assert isinstance(pass_, Edged) and pass_.of.depth == "texture" and Luminance().depth is True
-
-
 def test_through_a_lens(gl):
     """The lines are those of the flat picture, which the lens's is a mean of."""
     world = mixed_scene(80, 60)
@@ -514,20 +423,6 @@ def rough_ball(subdivisions: int, dents: float):
     shape = mesh(ball.vertices * rough[place.reshape(-1), None], ball.faces)
     paint = replace(WHITE, double_sided=False)
     return scene([thing("ball", 1, shape, drift((0, 3.4, 0), (0.4, 0, 0.1), LEVEL), paint)], rig(48, 48, 48.0))
-
-
-@pytest.mark.parametrize("subdivisions, dents", [(4, 0.01), (5, 0.005)])
-def test_small_triangles_do_not_flicker(gl, subdivisions, dents):
-    """All lines of a pixel mean the same two surfaces, whichever way they run: an outline of steps of 0.7 and 0.35 px
-    has about the error of a smooth one, and no more of it changes from frame to frame when frames come closer."""
-    world = rough_ball(subdivisions, dents)
-    times = [int(k * (SECOND // 40)) for k in range(5)]  # a seventh of a pixel each
-    true = np.stack([finest(gl, world, 8, t) for t in times])
-    off = {name: np.stack([luminance(gl, world, name, t) for t in times]) - true for name in ("none", "edges")}
-    assert rmse(off["edges"], 0) < 0.45 * rmse(off["none"], 0)
-    for step in (1, 2):
-        change = {name: rmse(np.diff(error[::step], axis=0), 0) for name, error in off.items()}
-        assert change["edges"] < 0.45 * change["none"]
 
 
 def test_seams_of_textures(gl):
@@ -568,20 +463,3 @@ def test_a_finer_grid_is_the_mean_of_a_larger_picture(gl):
         found = renderer.luminance(t_ns).read()
     expected = fine.reshape(camera.height, factor, camera.width, factor).mean(axis=(1, 3))
     np.testing.assert_allclose(found, expected, atol=2e-5 * np.abs(expected).max())
-
-
-def test_colours_of_a_finer_grid(gl):
-    world = mixed_scene(81, 61)
-    larger = world.with_camera(world.camera.resized(162, 122))
-    with Renderer(gl, larger, EDGES) as renderer:
-        fine = renderer.colour(0).read().astype(np.float64)
-    with Renderer(gl, world, RenderConfig(image_antialiasing="edges2")) as renderer:
-        found = renderer.colour(0).read()
-    np.testing.assert_allclose(found, fine.reshape(61, 2, 81, 2, 3).mean(axis=(1, 3)), atol=2e-5 * fine.max())
-
-
-def test_a_finer_grid_is_nearer_to_the_truth_than_four_times_as_many_samples(gl):
-    world = mixed_scene(80, 60)
-    true = finest(gl, world)
-    off = {name: rmse(luminance(gl, world, name), true) for name in ("edges", "edges2", "ssaa4")}
-    assert off["edges2"] < 0.75 * off["ssaa4"] and off["edges2"] < 0.6 * off["edges"], off

@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 
 import blinkgl
-from blinkgl.config.run import RunTemplate
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import ConfigError
 from blinkgl.labels import LabelRequest
-from blinkgl.render import reference
+from blinkgl.render import appearance, casting
 from blinkgl.render.colour import LUMA
 from blinkgl.render.renderer import Renderer
-from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.types import Fog, Material
 from tests.render.render_scenes import LEVEL, SECOND, cube, curve, drift, rig, scene, smooth_texture, sphere, thing
 
@@ -60,8 +58,8 @@ def test_the_reference_sees_the_same_fog(gl):
     t, where = SECOND // 2, world()
     with Renderer(gl, where, PLAIN) as renderer:
         drawn, parts = renderer.colour(t).read(), renderer.scene
-    hits = reference.cast(parts, t)
-    true = reference.surface(parts, hits).colour.reshape(drawn.shape)
+    hits = casting.cast(parts, t)
+    true = appearance.surface(parts, hits).colour.reshape(drawn.shape)
     assert np.median(np.abs(drawn - true)) < 1e-3 and (np.abs(drawn - true).max(axis=2) < 0.02).mean() > 0.95
 
 
@@ -96,12 +94,3 @@ def test_fog_from_python():
     for wrong in ((1.0,), 3.0, (0.0, 1.0), ("a", 1)):
         with pytest.raises(ConfigError):
             blinkgl.Scene(blinkgl.Camera(32, 24), fog=wrong) + blinkgl.Primitive("cuboid")
-
-
-def test_fog_of_a_configuration(tmp_path):
-    base = {"camera": {"width": 32, "height": 24}, "scene": {"objects": {"count": 1}, "fog": {"density": 0.1}}}
-    made = sequence_scene(RunTemplate(base, tmp_path).sequence(0), 0, tmp_path)
-    assert made.fog == Fog(0.1, 0.7) and made.backdrop == 0.7
-    for bad, said in (({"density": 0}, "scene.fog.density: too small"), ({}, "scene.fog.density: is required")):
-        with pytest.raises(ConfigError, match=said):
-            RunTemplate({**base, "scene": {"fog": bad}}, tmp_path).sequence(0)

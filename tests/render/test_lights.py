@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.config.deform import TwistConfig
 from blinkgl.config.sequence import RenderConfig
-from blinkgl.render import reference, resources
+from blinkgl.render import casting, draw_items, reference
 from blinkgl.render.colour import LUMA
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.lights import lamp_pose
@@ -50,7 +50,7 @@ def wall_at(distance=2.0):
     """A white wall across the camera's axis, and where each pixel's point of it is, (H, W, 3)."""
     wall = thing("wall", 1, quad(9, 9), still((0, distance, 0), Rotation.from_euler("x", 90, degrees=True)))
     world = scene([wall])
-    xy = reference.pixel_grid(world.camera)
+    xy = casting.pixel_grid(world.camera)
     points = world.camera.rays(xy) * distance @ np.asarray(LEVEL.as_matrix()).T
     return world, points.reshape(world.camera.height, world.camera.width, 3)
 
@@ -85,15 +85,6 @@ def test_a_spot_light_shines_in_its_cone(gl):
     expected = 5.0 * 1.8 / distance**3 * share
     np.testing.assert_allclose(luminance(gl, world), expected, rtol=1e-4, atol=2e-6)
     assert (share == 1).any() and (share == 0).any() and ((share > 0) & (share < 1)).sum() > 100
-
-
-def test_behind_the_surface_and_far_away_nothing_is_lit(gl):
-    world, _ = wall_at()
-    behind = Lamp("point", (3.0, 3.0, 3.0), StaticPath(lamp_pose((0, 3, 0))))
-    touching = replace(behind, path=StaticPath(lamp_pose((0, 2, 0))))
-    for lamp in (behind, touching):
-        seen = luminance(gl, replace(world, light=Light(sun=0, sky=0, lamps=(lamp,))))
-        assert np.isfinite(seen).all() and seen.max() < 0.1
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e5])
@@ -174,7 +165,7 @@ def test_flat_facets_are_lit_at_their_corners(gl, monkeypatch, finer):
         beside_rates = renderer.brightness(0).read()[..., 0]
     programs = [dict(defines) for _, defines in gl.shaders.compiled]
     assert any("FACETED" in one and one.get("AMBIENT") == ("3" if finer else "2") for one in programs)
-    monkeypatch.setattr(resources, "_Facets", lambda _: SimpleNamespace(flat=lambda _: False))
+    monkeypatch.setattr(draw_items, "_Facets", lambda _: SimpleNamespace(flat=lambda _: False))
     with Renderer(gl, world, unfiltered) as renderer:
         smooth = renderer.luminance(0).read(), renderer.colour(0).read()
     ids = reference.render(world, 0).instance
@@ -200,26 +191,6 @@ def test_one_channel_does_where_a_surface_has_one_colour(gl):
         assert hued == ({"1"} if name == "of several colours" else {None}), name
         np.testing.assert_allclose(seen, colour @ LUMA, rtol=1e-5, atol=1e-6)
         np.testing.assert_array_equal(rates, seen)
-
-
-def test_white_light_is_the_same_through_either_program(gl):
-    """The plain formula, and lamps that say the same."""
-    world = mixed_scene()
-    white = Lamp("sun", (Light().sun,) * 3, StaticPath(lamp_pose(shines=-np.array(Light().sun_direction))))
-    as_lamp = replace(world, light=Light(sun=0.0, lamps=(white,)))
-    faint = replace(world, light=Light(lamps=(replace(SUN, strength=(1e-12, 0.0, 0.0)),)))  # takes three channels
-    for t in (0, SECOND // 2):
-        plain = luminance(gl, world, t)
-        np.testing.assert_allclose(luminance(gl, as_lamp, t), plain, atol=1e-6)
-        np.testing.assert_allclose(luminance(gl, faint, t), plain, atol=1e-5)
-
-
-def test_who_asks_for_no_lights_gets_the_programs_without(gl):
-    gl.shaders.clear()
-    with Renderer(gl, mixed_scene(), PLAIN) as renderer:
-        renderer.luminance(0), renderer.brightness(0), renderer.colour(0), renderer.brightness(0, 4)
-    for _, defines in gl.shaders.compiled:
-        assert not {"LIGHTS", "HUED", "SUNS", "LAMPS", "AMBIENT"} & {name for name, _ in defines}
 
 
 MOVING = replace(POINT, path=drift((0.3, 3, 1), (0.8, 2.5, 0.4)))

@@ -10,14 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.labels import LabelRequest
-from blinkgl.render import reference
+from blinkgl.render import appearance, reference
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.geometry.tangents import split_mirrored, tangents
 from blinkgl.scene.lights import beam, lamp_pose, lamps_of
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.surfaces import gloss
 from blinkgl.scene.types import Gloss, Lamp, Light, Map, Mask, Material, Scene, Texture
-from tests.render.render_scenes import cube, drift, pose, quad, rig, scene, smooth_texture, sphere, still, thing
+from tests.render.render_scenes import drift, pose, quad, rig, scene, smooth_texture, sphere, still, thing
 
 T = 300_000_000
 Y, X = np.mgrid[0:16, 0:16] / 16 * 2 * np.pi
@@ -183,8 +183,8 @@ def test_lamps_and_surroundings_are_one(metallic, roughness):
         total[c] = (lobe * nl * ((1 - metallic) * plain + metallic * metal)).sum() * solid
     even = tuple(tuple(tuple(float(i == j == 3) for j in range(4)) for i in range(4)) for _ in range(3))
     made = scene([], light=Light(sun=0.0, sky=0.0, around=even))
-    light = reference.received(made, 0, np.zeros((1, 3)), normal)
-    _, mirrored = reference.shone(
+    light = appearance.received(made, 0, np.zeros((1, 3)), normal)
+    _, mirrored = appearance.shone(
         made, 0, light, np.zeros((1, 3)), normal, eye, albedo, np.array([metallic]), np.array([roughness])
     )
     assert mirrored[0] == pytest.approx(total, rel=0.02)
@@ -287,34 +287,3 @@ def test_light_falls_through_holes(gl):
     wrong = np.abs(drawn - known.luminance) > 0.1
     shaded = known.luminance < 0.35
     assert 0.05 < shaded[floor].mean() < 0.9 and wrong[floor].mean() < 0.03
-
-
-def test_a_hollow_body_shows_its_inside(gl):
-    """Through its holes: a closed surface with holes is drawn from behind, too."""
-    made = scene([thing("box", 1, cube(), still((0, 4, 0)), Material(uv_scale=(2, 2), mask=Mask(ALPHA)))])
-    with Renderer(gl, made, PLAIN) as renderer:
-        depth = renderer.labels(0, LabelRequest("depth")).values["depth"]
-    known = reference.render(made, 0)
-    both = known.hit & np.isfinite(depth)
-    assert (known.depth[both] > 4.5).mean() > 0.05
-    assert (np.abs(depth[both] - known.depth[both]) < 1e-3).mean() > 0.99
-
-
-def test_what_asks_for_nothing_is_drawn_by_the_same_programs(gl):
-    """No define more than before for a plain material; of one beside it only its own."""
-    plain, shiny = (thing(f"{k}", k, sphere(), still((2 * k - 3, 4, 0)), m) for k, m in
-                    enumerate((Material(TEXTURE), Material(TEXTURE, gloss=Gloss(1, 0.5))), 1))  # fmt: skip
-    asked = []
-    program = gl.program
-    try:
-        gl.program = lambda name, defines: asked.append((name, dict(defines))) or program(name, defines)
-        with Renderer(gl, scene([plain, shiny]), PLAIN) as renderer:
-            renderer.luminance(0).read()
-            renderer.labels(0, LabelRequest("depth"))
-    finally:
-        gl.program = program
-    of = {name: [d for n, d in asked if n == name] for name, _ in asked}
-    assert {"TEXTURED": 1, "LIT": 1} in of["luminance.glsl"]
-    (other,) = [d for d in of["luminance.glsl"] if "GLOSSY" in d]
-    assert other["HUED"] == 1 and other["LIGHTS"] == 1  # a coloured metal mirrors in its own colour
-    assert all("GLOSSY" not in d for d in of["label.glsl"])

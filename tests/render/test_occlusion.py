@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.labels import LabelRequest
-from blinkgl.render import reference
+from blinkgl.render import casting, reference
 from blinkgl.render.occlusion import HIDDEN, NARROW, REACH, SEEN, UNDECIDED, judged_by_samples, near_thin
 from blinkgl.render.renderer import Renderer
 from render_scenes import LEVEL, cube, drift, mixed_scene, quad, rig, scene, sphere, still, thing
@@ -86,33 +86,6 @@ def test_samples_equal_their_slow_twin(shape):
             assert found[r, c] == expected, (r, c)
             answers.add(expected)
     assert answers == ({SEEN, HIDDEN, UNDECIDED} if max(shape) > 1 else answers)
-
-
-@pytest.mark.parametrize(
-    "step, seen",
-    [
-        ((-0.5, 0), True),
-        ((-0.51, 0), False),
-        ((3.49, 0), True),
-        ((3.5, 0), False),
-        ((0, -0.5), True),
-        ((0, -0.51), False),
-        ((0, 2.49), True),
-        ((0, 2.5), False),
-    ],
-)
-def test_the_image_ends_half_a_pixel_beyond_the_outermost_centres(step, seen):
-    ids, depth = np.ones((3, 4), np.uint32), np.full((3, 4), 5.0, np.float32)
-    flow, valid = np.zeros((3, 4, 2), np.float32), np.zeros((3, 4), bool)
-    flow[0, 0], valid[0, 0] = step, True
-    assert judged_by_samples(flow, depth, valid, ids, depth, ids)[0, 0] == (SEEN if seen else HIDDEN)
-
-
-def test_without_a_near_plane_everything_in_front_is_seen():
-    ids, depth = np.ones((2, 2), np.uint32), np.full((2, 2), 1e-6, np.float32)
-    flow, valid = np.zeros((2, 2, 2), np.float32), np.ones((2, 2), bool)
-    for near, expected in ((0.0, SEEN), (float(np.float32(1e-6)), SEEN), (2e-6, HIDDEN)):
-        assert (judged_by_samples(flow, depth, valid, ids, depth, ids, near) == expected).all()
 
 
 # ------------------------------------------------------------------------------------------------- rays
@@ -211,23 +184,12 @@ def test_thin_is_what_has_others_on_both_sides_and_farther():
 def test_rays_are_asked_where_samples_do_not_agree_and_matter_there(gl, monkeypatch):
     """The two halves of the work, each seen to be needed: few rays, and many wrong pixels without them."""
     asked = []
-    true = reference.is_hidden
-    monkeypatch.setattr(reference, "is_hidden", lambda s, t, xy, z, e: asked.append(len(xy)) or true(s, t, xy, z, e))
+    true = casting.is_hidden
+    monkeypatch.setattr(casting, "is_hidden", lambda s, t, xy, z, e: asked.append(len(xy)) or true(s, t, xy, z, e))
     world = crowd()
     mask, flow, same = masks(gl, world, 300 * MS, 420 * MS)
     assert 0 < asked[0] < 0.12 * mask.size
-    monkeypatch.setattr(reference, "is_hidden", lambda s, t, xy, z, e: np.zeros(len(xy), bool))
+    monkeypatch.setattr(casting, "is_hidden", lambda s, t, xy, z, e: np.zeros(len(xy), bool))
     without, _, _ = masks(gl, world, 300 * MS, 420 * MS)
     hidden = flow.occluded & ~flow.outside & same
     assert ((without != flow.occluded) & same).sum() > 0.05 * hidden.sum()
-
-
-def test_what_is_hidden_by_the_slack_is_not():
-    """The slack is of the depth of the point: a card that much before the wall hides it, a nearer one does not."""
-    facing = LEVEL * Rotation.from_euler("x", 180, degrees=True)
-    for before, hides in ((0.5, True), (4.1e-4, True), (3.9e-4, False)):
-        world = scene(
-            [thing("card", 2, quad(2, 2), still((0, 4 - before, 0), facing))], rig(path=still((0, 0, 0), LEVEL))
-        )
-        centre = np.array([[world.camera.cx, world.camera.cy]])
-        assert reference.is_hidden(world, 0, centre, np.array([4.0]), 1e-4)[0] == hides

@@ -16,14 +16,13 @@ from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import GLError
 from blinkgl.gl.shader import ShaderError
 from blinkgl.labels import LabelRequest
-from blinkgl.render import reference
-from blinkgl.render.antialiasing import Samples
+from blinkgl.render import casting
 from blinkgl.render.canvas import DEPTH_BUFFER
 from blinkgl.render.matrices import mat4_bytes
 from blinkgl.render.moment import View
-from blinkgl.render.passes import Brightness, Colour, Geometry, Input, Luminance, Mean, Output, ScenePass, ScreenPass
+from blinkgl.render.passes import Geometry, Input, Output, ScenePass, ScreenPass
 from blinkgl.render.renderer import Renderer
-from render_scenes import LEVEL, SECOND, cube, drift, mixed_scene, pose, quad, scene, still, thing
+from render_scenes import LEVEL, SECOND, cube, drift, mixed_scene, quad, scene, still, thing
 
 PLAIN = RenderConfig(image_antialiasing="none")
 TOYS = Path(__file__).parent / "toys"
@@ -114,7 +113,7 @@ def test_a_shadow_map_is_a_pass_before_a_pass(gl):
     with Renderer(gl, world, PLAIN) as renderer:
         for t in (0, 3 * SECOND // 4):
             light = renderer.draw(Lamplight(ShadowMap(tuple(lamp))), t).read()
-            hits = reference.cast(world, t)
+            hits = casting.cast(world, t)
             floor = (hits.instance == 1).reshape(light.shape)
             box = world.objects[1].path.pose(t)[:3, 3]
             points = np.where(hits.instance[:, None] == 1, hits.local + world.objects[0].path.pose(t)[:3, 3], facing_up)
@@ -126,27 +125,6 @@ def test_a_shadow_map_is_a_pass_before_a_pass(gl):
             rim = ndimage.binary_dilation(shadow) != ndimage.binary_erosion(shadow)
             assert 30 < (floor & shadow).sum() < floor.sum() / 2
             assert not (wrong & ~rim).any() and wrong.sum() <= 0.2 * (floor & rim).sum()
-
-
-def test_what_two_inputs_read_is_drawn_once(gl):
-    """And equal passes are one pass, whoever makes them."""
-
-    @dataclass(frozen=True)
-    class Both(ScreenPass):
-        program: ClassVar[str] = str(TOYS / "edge_band.glsl")
-        inputs: ClassVar[tuple[Input, ...]] = (
-            Input("ids", EdgeBand(1), "edge"),
-            *(Input("ids", EdgeBand(2)) for _ in range(2)),
-        )
-        outputs: ClassVar[tuple[Output, ...]] = (Output("edge", "R32UI"),)
-
-        def defines(self, kind):
-            return {"REACH": 1}
-
-    with Renderer(gl, mixed_scene(), PLAIN) as renderer:
-        renderer.draw(Both(), 0)
-        assert renderer.stats.frames == 1, "the ids, for three edge bands of two kinds"
-        assert renderer.draw(EdgeBand(2), 0).texture() is renderer.draw(EdgeBand(2), 7).texture()
 
 
 def test_mistakes_of_a_pass_are_named(gl):
@@ -316,28 +294,3 @@ def test_a_moment_is_computed_once_and_shared(gl):
     assert all(times == 1 or (what == "pose" and times == 2) for (what, _), times in asked.items()), asked
     assert {t for what, t in asked if what == "pose"} == {k * interval for k in range(7)}
     assert {t for what, t in asked if what == "derivative"} == {k * interval for k in range(1, 6)}
-
-
-def test_a_moment_through_another_camera(gl):
-    """Shares what is of the place; from elsewhere nothing is shared but the objects."""
-    with Renderer(gl, mixed_scene(), PLAIN) as renderer:
-        moment = renderer.moment(SECOND // 3)
-        view = View.of(PinHole.centred(40, 30, 90.0, 80.0))
-        near, rates = moment.through(view), moment.rates
-        assert near.T_cam_obj is moment.through(view).T_cam_obj or np.array_equal(near.T_cam_obj, moment.T_cam_obj)
-        np.testing.assert_array_equal(near.mvp, view.projection @ moment.T_cam_obj)
-        np.testing.assert_array_equal(near.rates.T_world_obj, rates.T_world_obj)
-        np.testing.assert_allclose(
-            near.rates.mvp, view.projection @ np.linalg.solve(moment.view.projection, rates.mvp), atol=1e-9
-        )
-        there, h = pose((1.0, 2.0, 3.0), LEVEL), 1000
-        far = moment.from_place(view, there)
-        np.testing.assert_allclose(far.T_cam_obj, np.linalg.inv(there) @ moment.T_world_obj, atol=1e-12)
-        ahead, behind = (renderer.moment(SECOND // 3 + s).from_place(view, there) for s in (h, -h))
-        np.testing.assert_allclose(far.rates.mvp, (ahead.mvp - behind.mvp) / (2e-9 * h), rtol=1e-4, atol=1e-4)
-
-
-def test_passes_are_values():
-    assert len({Luminance(), Luminance(), Luminance(Samples(taps=4)), Brightness(), Colour()}) == 4
-    assert Mean(Luminance()) == Mean(Luminance()) and Geometry(("ids",)) != Geometry(("depth",))
-    assert [o.format for o in Mean(Luminance()).outputs] == ["R32F"]

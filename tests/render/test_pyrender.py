@@ -15,8 +15,7 @@ from blinkgl.config.sequence import RenderConfig
 from blinkgl.labels import LabelRequest
 from blinkgl.render import reference
 from blinkgl.render.renderer import Renderer
-from blinkgl.scene.types import Material, Texture
-from render_scenes import mixed_scene, quad, rig, scene, still, thing
+from render_scenes import mixed_scene
 
 if pyrender_peer.available():
     pytest.skip(pyrender_peer.available(), allow_module_level=True)
@@ -69,38 +68,6 @@ def test_depth_ids_and_colour_agree(gl, world, peer, moment):
     error = (peer["colour"][moment] - 255.0 * ours.colour)[~band]
     assert np.abs(error).max() < 4.0 and np.quantile(np.abs(error), 0.99) < 2.0
     assert np.abs(error.mean(axis=0)).max() < 0.3
-
-
-def test_flat_colours_are_equal_to_8_bit_rounding(gl):
-    """No texture, no filter: what is left is the rounding to 8 bits, half a unit."""
-    base = mixed_scene(unlit=True, textured=False)
-    sky = base.objects[0]
-    plain = replace(sky.parts[0], material=Material(base_color=(0.2, 0.4, 0.6), unlit=True))
-    base = replace(base, objects=(replace(sky, parts=(plain,)), *base.objects[1:]))
-    theirs = pyrender_peer.render(base, TIMES[:1])["colour"][0]
-    true = reference.render(base, TIMES[0])
-    with Renderer(gl, base, RenderConfig(image_antialiasing="none")) as renderer:
-        ours = renderer.colour(TIMES[0]).read()
-    band = reference.silhouette_band(true.instance, true.depth)
-    for colour in (ours, true.colour):
-        assert np.abs(theirs - 255.0 * colour)[~band].max() <= 0.501
-
-
-def test_picture_is_the_same_way_up(gl):
-    """A magnified random texture, so that mirror images and half-texel shifts cannot hide."""
-    rng = np.random.default_rng(3)
-    texels = Texture((rng.integers(0, 256, (12, 16, 3)) / 255).astype(np.float32))
-    paint = Material(texture=texels, uv_scale=(0.75, 1.25), unlit=True, double_sided=True)
-    eye = rig(path=still((0.1, 0.2, -2.5)))
-    picture = scene([thing("picture", 300, quad(3, 2.5), still(), paint)], eye)
-    theirs = pyrender_peer.render(picture, [0])
-    with Renderer(gl, picture, RenderConfig(image_antialiasing="none")) as renderer:
-        ours = renderer.colour(0).read()
-    true = reference.render(picture, 0)
-    assert true.hit.all() and (theirs["ids"] == 300).all()
-    assert np.abs(theirs["colour"][0] - 255.0 * ours).max() < 2.5  # 8-bit weights of its filter
-    assert np.abs(theirs["colour"][0] - 255.0 * true.colour).max() < 2.5
-    assert np.abs(theirs["colour"][0] - 255.0 * true.colour).mean() < 0.6
 
 
 def test_failure_is_one_line(world, monkeypatch):

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from blinkgl.render.raycast import LEAF_TRIANGLES, Holes, build_tree, join_trees, nearest_exhaustive, nearest_tree
+from blinkgl.render.raycast import LEAF_TRIANGLES, Holes, build_tree, join_trees, nearest_tree
+from exhaustive import nearest_exhaustive
 
 
 def triangles(seed: int, count: int) -> np.ndarray:

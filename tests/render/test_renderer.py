@@ -7,7 +7,6 @@ from blinkgl.camera import PinHole
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.gl import create_context
 from blinkgl.labels import LABELS, LabelRequest
-from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate
 from blinkgl.render.moment import Moment
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.geometry import primitives
@@ -79,18 +78,6 @@ def test_back_face_culling_of_closed_meshes_changes_no_pixel(gl):
         np.testing.assert_array_equal(culled, renderer.luminance(0).read())
 
 
-def test_the_same_frame_twice_is_the_same_frame(gl):
-    for _ in range(2):
-        with Renderer(gl, world(), PLAIN) as renderer:
-            first = renderer.luminance(SECOND // 3).read(), buffers(renderer.labels(SECOND // 3, ALL, SECOND, 0))
-        with Renderer(gl, world(), PLAIN) as renderer:
-            renderer.luminance(0).read()
-            again = renderer.luminance(SECOND // 3).read(), buffers(renderer.labels(SECOND // 3, ALL, SECOND, 0))
-        np.testing.assert_array_equal(first[0], again[0])
-        for name in first[1]:
-            np.testing.assert_array_equal(first[1][name], again[1][name], err_msg=name)
-
-
 def test_two_renderers_in_one_context_do_not_disturb_each_other(gl):
     """Programs, and with them uniforms such as the light, belong to the context."""
     dim, bright = world(light=Light(sun=0.1, sky=0.1)), world(light=Light(sun=1.0, sky=0.8))
@@ -118,32 +105,6 @@ def test_a_context_goes_on_after_another_one_has_ended(antialiasing):
             np.testing.assert_array_equal(again.luminance(0).read(), good)
 
 
-@pytest.mark.parametrize("factor", [2, 4])
-def test_supersampling_is_the_mean_of_a_finer_image(gl, factor):
-    """Slow twin: the same camera with n times the pixels, averaged by NumPy."""
-    scene = world()
-    c = scene.camera
-    fine = PinHole(
-        c.width * factor,
-        c.height * factor,
-        c.fx * factor,
-        c.fy * factor,
-        (c.cx + 0.5) * factor - 0.5,
-        (c.cy + 0.5) * factor - 0.5,
-        c.near,
-    )
-    with Renderer(
-        gl, scene, RenderConfig(antialiasing=f"ssaa{factor}", image_antialiasing=f"ssaa{factor}")
-    ) as renderer:
-        luminance, colour = renderer.luminance(0).read(), renderer.colour(0).read()
-    with Renderer(gl, scene.with_camera(fine), PLAIN) as renderer:
-        h, w = c.height, c.width
-        expected = renderer.luminance(0).read().reshape(h, factor, w, factor).mean(axis=(1, 3), dtype=np.float64)
-        expected_colour = renderer.colour(0).read().reshape(h, factor, w, factor, 3).mean(axis=(1, 3), dtype=np.float64)
-    np.testing.assert_allclose(luminance, expected, rtol=1e-5)
-    np.testing.assert_allclose(colour, expected_colour, rtol=1e-5)
-
-
 def test_only_what_is_asked_for_is_made(gl):
     gl.shaders.clear()
     with Renderer(gl, world(), PLAIN) as renderer:
@@ -163,13 +124,6 @@ def test_nothing_hit_is_background(gl):
         frame = renderer.labels(0, ALL, SECOND, 0)
     assert (frame.ids == 0).all() and np.isinf(frame.depth).all()
     assert not frame.forward.valid.any() and (frame.forward.flow == 0).all() and not frame.forward.occluded.any()
-
-
-def test_luminance_writes_into_the_given_array(gl):
-    with Renderer(gl, world(), PLAIN) as renderer:
-        out = np.empty((72, 96), np.float32)
-        assert renderer.luminance(0).read(out=out) is out
-        np.testing.assert_array_equal(out, renderer.luminance(0).read())
 
 
 def test_reduced_velocity_samples_the_full_one(gl):
@@ -217,31 +171,6 @@ def test_projection_puts_points_on_the_documented_pixel():
     window = (ndc[:, :2] + 1) / 2 * (640, 480) - 0.5
     np.testing.assert_allclose(window, points[:, :2] / points[:, 2:] * (500, 510) + (300, 250), atol=1e-10)
     np.testing.assert_allclose(ndc[:, 2], 0.1 / points[:, 2], rtol=1e-14)
-
-
-def test_relative_poses_keep_their_precision_far_from_the_origin():
-    near, far = curve(1, (0, 0, 0), 1, 1), curve(1, (0, 0, 0), 1, 1)
-    shift = np.zeros((4, 4))
-    shift[:3, 3] = 1e6
-    a, b = near.pose(SECOND // 2), curve(2, (1, 2, 3), 1, 1).pose(SECOND // 2)
-    moved = cam_from_obj(far.pose(SECOND // 2) + shift, b + shift)
-    np.testing.assert_allclose(moved, cam_from_obj(a, b), atol=1e-9)
-    np.testing.assert_allclose(cam_from_obj(a, b), np.linalg.inv(a) @ b, atol=1e-12)
-
-
-def test_rate_of_relative_pose_is_its_derivative_to_second_order():
-    camera, body = curve(3, (0, 0, 0), 1, 1), curve(4, (1, 5, 2), 1, 1)
-    t = 430_000_000
-    rate = cam_from_obj_rate(camera.pose(t), camera.derivative(t), body.pose(t), body.derivative(t))
-    errors = []
-    steps = [4_000_000, 2_000_000, 1_000_000]
-    for h in steps:
-        central = (
-            cam_from_obj(camera.pose(t + h), body.pose(t + h)) - cam_from_obj(camera.pose(t - h), body.pose(t - h))
-        ) / (2e-9 * h)
-        errors.append(np.abs(central - rate).max())
-    order = np.polyfit(np.log(steps), np.log(errors), 1)[0]
-    assert abs(order - 2) < 0.3
 
 
 # ---- per-pixel helpers -------------------------------------------------------------------------------------------

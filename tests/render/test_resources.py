@@ -8,17 +8,9 @@ import pytest
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import AssetError
 from blinkgl.render import resources
+from blinkgl.render.draw_items import MAX_RADIUS, DrawItem, _draw_item, _Facets, _Greys
 from blinkgl.render.renderer import Renderer
-from blinkgl.render.resources import (
-    HALF_LEAST,
-    HALF_MOST,
-    MAX_RADIUS,
-    DrawItem,
-    _draw_item,
-    _Facets,
-    _Greys,
-    half_floats,
-)
+from blinkgl.render.resources import HALF_LEAST, HALF_MOST, half_floats
 from blinkgl.scene.types import Light, Material, Mesh, Texture
 from render_scenes import cube, drift, rig, scene, still, thing
 

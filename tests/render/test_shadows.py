@@ -15,7 +15,6 @@ from blinkgl.render import reference
 from blinkgl.render.passes import shadow_maps
 from blinkgl.render.passes.shadow import ShadowMap
 from blinkgl.render.renderer import Renderer
-from blinkgl.render.shadows import Box, scale_of
 from blinkgl.scene.lights import lamp_pose
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.types import Lamp, Light, Material, Part, SceneObject
@@ -146,32 +145,6 @@ def test_each_camera_of_a_rig_has_the_shadows_that_it_sees(gl, crowd):
             np.testing.assert_array_equal(renderers[k].luminance(SECOND // 2).read(), alone[k], err_msg=str(k))
 
 
-def test_the_cameras_of_a_rig_share_a_map(gl, monkeypatch):
-    """Drawn once a time, whichever looks first."""
-    painted = []
-    monkeypatch.setattr(ShadowMap, "seen", lambda self, moment: painted.append(moment) or SEEN(self, moment))
-    near, far = (sunlit(thing("ball", 2, sphere(0.3), drift((x - 0.1, 4, 0.3), (x, 4, 0.3)))) for x in (0.0, 4.0))
-    for world in (near, far):
-        painted.clear()
-        eyes = [world.with_path(still((x, 0, 1.0), DOWN)) for x in (0.0, 0.1 if world is near else 4.0)]
-        with Renderer(gl, eyes[0], PLAIN) as left, Renderer(gl, eyes[1], PLAIN, beside=left) as right:
-            for t in (0, SECOND // 2):
-                for eye in (left, right, left, right):
-                    eye.luminance(t).read()
-        assert len(painted) == 2, painted
-
-
-def test_the_same_time_from_elsewhere_has_its_own_shadows(gl):
-    """A moment moved to another place may see shadows that the scene's camera does not."""
-    world = sunlit(*(thing(f"ball {x}", 3, sphere(0.3), drift((x - 0.1, 4, 0.3), (x, 4, 0.3))) for x in (-4.0, 4.0)))
-    here, there = (world.with_path(still((x, 0, 1.0), DOWN)) for x in (-4.0, 4.0))
-    with Renderer(gl, there, PLAIN) as alone, Renderer(gl, here, PLAIN) as renderer:
-        renderer.colour(0).read()
-        moment = renderer.moment(0)
-        moved = moment.from_place(moment.view, there.camera_path.pose(0))
-        np.testing.assert_array_equal(renderer.colour(moved).read(), alone.colour(0).read())
-
-
 def test_a_map_is_drawn_again_only_where_something_moved(gl):
     """Whatever the camera does; and it stays where it is: what does not move has the same shadow on the same place."""
     still_world = sunlit(thing("box", 2, cube(0.5), still((0.2, 4.0, 0.6))))
@@ -192,16 +165,6 @@ def test_a_map_is_drawn_again_only_where_something_moved(gl):
             seen = frame.target.read_depth()
         assert frame.changed and sum(r.area for r in frame.changed) < 0.5 * map_.texels**2
         np.testing.assert_array_equal(seen, other.draw(map_, SECOND // 4).target.read_depth())
-
-
-def test_a_map_of_16_bits_tells_a_small_part_of_a_texel():
-    """Of suns whose steps of depth are that small; a spot light's are not equal ones."""
-    lamp = Lamp("sun", (1.0, 1.0, 1.0), StaticPath())
-    for deep, texels, kind in ((8.0, 1024, "texture of 16 bits"), (2000.0, 1024, "texture"), (8.0, 32768, "texture")):
-        map_ = ShadowMap(lamp, Box((0.0, 0.0, 0.0), (8.0, 6.0, deep)), texels)
-        step, texel = 2 * deep / 65535, scale_of(lamp, map_.box, texels)[0]
-        assert map_.depth == kind and (step < texel / 32) is (kind != "texture")
-    assert ShadowMap(Lamp("spot", (1.0, 1.0, 1.0), StaticPath()), None, 64).depth == "texture"
 
 
 def test_a_still_camera_sees_shadows_move(gl):

@@ -2,25 +2,20 @@
 
 import itertools
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from blinkgl.camera import PinHole
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import GLError
-from blinkgl.events import Esim, Events
+from blinkgl.events import Events
 from blinkgl.events.camera import EventCamera, EventFrame
 from blinkgl.labels import LabelRequest
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.passes import Luminance
-from blinkgl.render.rectangles import Rectangle, merged
 from blinkgl.render.renderer import Renderer
-from blinkgl.render.resources import box_corners
-from blinkgl.render.still import screen_rectangle
-from blinkgl.scene.motion.paths import KeyframePath, StaticPath
+from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.types import Scene
 from blinkgl.timeline.speed import largest_speed
 from blinkgl.tools.bench import probe_scene
@@ -82,29 +77,6 @@ def test_a_small_mover_makes_the_events_of_the_full_redraw(gl):
     for name in "xytp":
         np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
     assert len(ours) > 1000 and np.mean(covered[8:]) <= 0.052
-
-
-def test_skipped_rows_do_not_depend_on_the_threads_share():
-    """The kernel wakes fewer threads where rows are skipped; the events are the same for any number."""
-    rng = np.random.default_rng(0)
-    frames = np.repeat(rng.uniform(0.2, 0.9, (1, 300, 400)).astype(np.float32), 5, axis=0)
-    for k in range(1, 5):
-        frames[k, 20:280, 50:350] *= rng.uniform(0.7, 1.4, (260, 300)).astype(np.float32)
-        frames[k:] = frames[k]
-    whole, part = Esim(300, 400, EsimConfig()), Esim(300, 400, EsimConfig())
-    for k, frame in enumerate(frames):
-        a, b = whole.step(frame, 1_000_000 * k), part.step(frame, 1_000_000 * k, (20, 280))
-        for name in ("x", "y", "t", "p"):
-            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
-
-
-def test_other_passes_in_between_do_not_disturb(gl):
-    world = mixed_scene(camera_moves=False)
-    with Renderer(gl, world, PLAIN) as quick, full_redraw(gl, world) as slow:
-        for t in range(0, SECOND, SECOND // 7):
-            np.testing.assert_array_equal(quick.luminance(t).view(), slow.luminance(t).read())
-            quick.velocity(t, 4)
-            quick.colour(t).view()
 
 
 @pytest.mark.parametrize("antialiasing", ["none", "edges", "edges2", "ssaa2"])
@@ -198,32 +170,6 @@ def test_changes_are_where_they_are_said_to_be(gl, antialiasing):
         assert renderer.luminance(0).changed_since(last) is None, "there was one in between"
 
 
-@pytest.mark.parametrize("antialiasing", ["none", "edges", "edges2", "ssaa2"])
-def test_nothing_moves_nothing_is_drawn(gl, antialiasing):
-    world = scene([thing("box", 1, cube(0.5), still((0, 4, 0)))])
-    with Renderer(gl, world, PLAIN.model_copy(update={"antialiasing": antialiasing})) as renderer:
-        first = renderer.luminance(0)
-        seen, drawn = first.view(), renderer.stats.triangles
-        second = renderer.luminance(SECOND)
-        assert (
-            second.changed_since(first) == []
-            and second.rows_changed_since(first) == (0, 0)
-            and renderer.stats.triangles == drawn
-        )
-        assert np.shares_memory(second.view(), seen) and (seen == second.read()).all()
-
-
-def test_an_object_through_the_camera_and_out_of_the_image(gl):
-    """Across the near plane every pixel is redrawn; out of sight nothing is, and its last place is mended."""
-    path = KeyframePath(
-        [0, SECOND // 2, SECOND], [(0, 3, 0), (0, -3, 0), (40, 3, 0)], [(0, 0, 0, 1)] * 3, interpolation="linear"
-    )
-    world = scene([thing("wall", 1, cube(0.5), still((1, 9, 0))), thing("ball", 2, sphere(0.8), path)])
-    with Renderer(gl, world, PLAIN) as quick, full_redraw(gl, world) as slow:
-        for t in range(0, SECOND + 1, SECOND // 40):
-            np.testing.assert_array_equal(quick.luminance(t).view(), slow.luminance(t).read())
-
-
 def test_a_moving_camera_or_nothing_still_is_drawn_whole(gl):
     with Renderer(gl, mixed_scene(camera_moves=True), PLAIN) as renderer:
         assert renderer.whole
@@ -250,26 +196,3 @@ def test_speed_is_a_bound_and_exact_where_nothing_is_hidden(gl):
     with Renderer(gl, alone, PLAIN) as quick, full_redraw(gl, alone) as slow:
         moved = [largest_speed(renderer.velocity_of_movers(SECOND // 2).read()) for renderer in (quick, slow)]
         assert moved[0] == pytest.approx(moved[1], rel=1e-6)
-
-
-def test_rectangles():
-    a, b, c = Rectangle(0, 0, 4, 4), Rectangle(3, 3, 6, 6), Rectangle(10, 0, 12, 2)
-    assert merged([a, c, b]) == [Rectangle(0, 0, 6, 6), c]
-    assert merged([a, b, Rectangle(5, 0, 11, 1)]) == [Rectangle(0, 0, 11, 6)]
-    assert a.meets(b) and not a.meets(c) and a.area == 16 and b.scaled(2) == Rectangle(6, 6, 12, 12)
-
-
-def test_screen_rectangle_contains_the_projection():
-    camera = PinHole(200, 100, 150.0, 150.0, 99.5, 49.5)
-    item = SimpleNamespace(corners=box_corners(np.full(3, -0.5), np.full(3, 0.5)))
-    T = np.eye(4)
-    T[:3, 3] = (1.0, -0.5, 4.0)
-    r = screen_rectangle(item, T, camera)
-    # nearest face at Z = 3.5: x from 0.5 to 1.5, y from -1 to 0
-    assert r.x0 <= 99.5 + 150 * 0.5 / 4.5 and r.x1 > 99.5 + 150 * 1.5 / 3.5 and r.y0 <= 49.5 - 150 / 3.5 and r.y1 > 49.5
-    T[2, 3] = 0.3
-    assert screen_rectangle(item, T, camera) == Rectangle(0, 0, 200, 100)
-    T[2, 3] = -3.0
-    assert screen_rectangle(item, T, camera) is None
-    T[:3, 3] = (100, 0, 4)
-    assert screen_rectangle(item, T, camera) is None

@@ -6,7 +6,7 @@ import pytest
 from blinkgl import Camera, ConfigError, Deform, Keyframes, Material, Pose, Primitive, Scene, look_at, record
 from blinkgl.config.tracks import TracksConfig
 from blinkgl.front.runs import configured
-from blinkgl.render import reference
+from blinkgl.render import casting
 from blinkgl.render.tracks import track_points
 
 RNG = np.random.default_rng
@@ -52,7 +52,7 @@ def test_of_every_pixel_they_are_the_labels(made):
     assert (hidden != tracks.occluded[:, 1])[same].sum() <= 2 and hidden[same].sum() > 100
 
 
-@pytest.mark.parametrize("choose", ["grid", "random", "surface"])
+@pytest.mark.parametrize("choose", ["grid", "surface"])
 def test_seen_is_what_a_ray_through_their_place_meets(made, choose):
     scene, times, _ = made
     moments = range(times[0], times[-1] + 1, 12_500_000)
@@ -64,11 +64,11 @@ def test_seen_is_what_a_ray_through_their_place_meets(made, choose):
             (tracks.target_points[:, k] >= -0.5) & (tracks.target_points[:, k] < [95.5, 63.5])
         ).all(axis=1)
         xy, seen = tracks.target_points[inside, k], ~tracks.occluded[inside, k]
-        hits = reference.cast(scene, t_ns, xy)
+        hits = casting.cast(scene, t_ns, xy)
         own = (hits.part == tracks.surface[inside, 0]) & (np.abs(hits.depth / tracks.depth[inside, k] - 1) < 1e-7)
         assert not tracks.occluded[~inside, k].size or tracks.occluded[~inside, k].all()
         for i in np.flatnonzero(seen != own):  # then an edge is within a hundredth of a pixel
-            around = reference.cast(scene, t_ns, xy[i] + 0.01 * np.array([(1, 0), (-1, 0), (0, 1), (0, -1)]))
+            around = casting.cast(scene, t_ns, xy[i] + 0.01 * np.array([(1, 0), (-1, 0), (0, 1), (0, -1)]))
             triangles = {(int(p), int(f)) for p, f in zip(around.part, around.triangle)}
             assert len(triangles) > 1
         looked += len(seen)
@@ -77,10 +77,11 @@ def test_seen_is_what_a_ray_through_their_place_meets(made, choose):
 
 def test_queries_are_where_their_points_are_seen(made):
     scene, times, _ = made
-    for choose in ("random", "surface"):
+    for choose in ("grid", "surface"):
         tracks = track_points(scene, TracksConfig(points=300, choose=choose), times, RNG(1))
         k, rows = tracks.query_points[:, 0].astype(int), np.arange(len(tracks.query_points))
-        assert not tracks.occluded[rows, k].any() and len(rows) <= 300 and len(set(k)) > 1
+        assert not tracks.occluded[rows, k].any() and len(rows) <= 300
+        assert (len(set(k)) > 1) == (choose == "surface"), "seen first at different times"
         assert np.abs(tracks.target_points[rows, k] - tracks.query_points[:, :0:-1]).max() < 1e-6
     again = track_points(scene, TracksConfig(points=300, choose="surface"), times, RNG(1))
     assert np.array_equal(again.target_points, tracks.target_points)
@@ -90,7 +91,7 @@ def test_a_point_goes_where_its_corner_goes(made):
     """Of the figure's skin: the corner's position by the deformer, in the world."""
     scene, times, _ = made
     tracks = track_points(scene, TracksConfig(points=500, choose="surface"), times, RNG(2))
-    parts = reference.scene_parts(scene)
+    parts = casting.scene_parts(scene)
     lively = [i for i, (p, _) in enumerate(tracks.surface) if parts[p][1].mesh.deformer is not None]
     assert len(lively) > 50
     for i in lively[:20]:
@@ -104,11 +105,11 @@ def test_a_point_goes_where_its_corner_goes(made):
 def test_nothing_to_follow_and_too_much_of_it():
     empty = Scene(Camera(16, 12), duration=0.05, label_rate=20)
     empty += Primitive("sphere", radius=0.1, pose=(-50, 0, 0))
-    for choose in ("grid", "random", "surface"):
+    for choose in ("grid", "surface"):
         tracks = record(empty, labels=[], tracks=choose).tracks
         assert tracks.target_points.shape == (0, 2, 2) and tracks.t_us.tolist() == [50_000, 100_000]
     with pytest.raises(ConfigError, match="positions"):
         record(empty, tracks={"points": 1_000_000, "rate": 10_000})
     with pytest.raises(ConfigError, match="not point tracks"):
         record(empty, tracks=7)
-    assert configured(empty, tracks="random").sequence(0).tracks.choose == "random"
+    assert configured(empty, tracks="surface").sequence(0).tracks.choose == "surface"

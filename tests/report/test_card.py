@@ -21,7 +21,7 @@ RECIPE = {
     "scene": {
         "kind": "random",
         "objects": {"count": 1},
-        "pool": {"primitives": ["cuboid"], "variants": 2, "urdfs": False},
+        "pool": {"primitives": ["cuboid"], "variants": 2},
         "textures": {"procedural": ["checks"], "variants": 2, "photographs": False, "max_size": 64},
     },
     "labels": {"flow": ["forward"], "depth": True},

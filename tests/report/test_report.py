@@ -26,7 +26,7 @@ RECIPE = {
     "scene": {
         "kind": "random",
         "objects": {"count": {"integer": [1, 3]}},
-        "pool": {"primitives": ["cuboid"], "variants": 12, "urdfs": False, "test_fraction": 0.3},
+        "pool": {"primitives": ["cuboid"], "variants": 12, "test_fraction": 0.3},
         "textures": {
             "procedural": ["checks"],
             "variants": 12,

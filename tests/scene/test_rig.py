@@ -1,28 +1,22 @@
 """Sensors on a rig: what a configuration makes of one, and two eyes in a test, which no configuration asks for yet."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import PinHole
-from blinkgl.config.events import EsimConfig
-from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.problems import validate
 from blinkgl.config.sequence import RenderConfig, SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.labels import LabelRequest
-from blinkgl.render import reference
+from blinkgl.render import casting, reference
 from blinkgl.render.renderer import Renderer
-from blinkgl.scene.build import recording, sequence_scene
+from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.geometry.primitives import cuboid, grid
-from blinkgl.scene.motion.paths import KeyframePath, OffsetPath, StaticPath
+from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.rig import Rig, Sensor
 from blinkgl.scene.surfaces.textures import procedural_texture
 from blinkgl.scene.types import Material, Part, Scene, SceneObject
-from blinkgl.sequence import EventChunk, simulate_sequence
-from blinkgl.sequence.request import SequenceRequest
 
 SECOND = 1_000_000_000
 BASELINE = 0.12
@@ -77,24 +71,6 @@ def test_a_configuration_makes_one_sensor_in_the_rigs_origin(tmp_path):
     assert scene.camera_path is scene.rig.path  # the same object: today's numbers to the last bit
 
 
-def test_a_scene_that_was_made_already_is_recorded_as_the_configuration_says(gl):
-    """By the sensor alone: events of its emulator, its labels, through its camera at its place."""
-    scene = recording(stereo().seen_by(1), CONFIG)
-    assert isinstance(scene.sensors[0].emulator, EsimConfig) and isinstance(scene.sensors[0].labels, LabelsConfig)
-
-    def events(scene):
-        with simulate_sequence(SequenceRequest(CONFIG, 0, scene=scene, labels=False), gl) as sequence:
-            assert sequence.sensor.folder == scene.sensors[0].folder
-            return [item.events for item in sequence if isinstance(item, EventChunk)]
-
-    right, left = events(scene), events(stereo().seen_by(0))
-    alone = events(replace(scene, rig=Rig.alone(CAMERA, OffsetPath(stereo().rig.path, offset(BASELINE)))))
-    assert sum(map(len, right)) > 100
-    for a, b in zip(right, alone, strict=True):
-        assert all(np.array_equal(getattr(a, c), getattr(b, c)) for c in "xytp")
-    assert [len(e) for e in left] != [len(e) for e in right]
-
-
 def test_disparity_is_focal_length_times_baseline_over_depth(gl):
     scene = stereo()
     frames = []
@@ -102,7 +78,7 @@ def test_disparity_is_focal_length_times_baseline_over_depth(gl):
         with Renderer(gl, scene.seen_by(number), RenderConfig()) as renderer:
             frames.append(renderer.labels(0, LabelRequest("depth", "ids")))
     left, right = frames
-    xy = reference.pixel_grid(CAMERA)
+    xy = casting.pixel_grid(CAMERA)
     rays = CAMERA.rays(xy)
     points = rays * left.depth.reshape(-1, 1)
     there = CAMERA.project(points - [BASELINE, 0, 0])  # in the right eye's axes
@@ -129,15 +105,6 @@ def test_each_eye_agrees_with_the_reference(gl, number):
     both = sure & truth.forward.valid
     np.testing.assert_allclose(drawn.forward.flow[both], truth.forward.flow[both], atol=2e-4)
     assert np.abs(truth.velocity).max() > 2
-
-
-def test_a_part_of_a_scene_sees_with_another_camera_and_on_another_way():
-    scene = stereo()
-    other = replace(CAMERA, fx=70.0)
-    assert [s.camera for s in scene.with_camera(other).sensors] == [other, CAMERA] and scene.sensors[0].camera is CAMERA
-    still = scene.with_path(StaticPath(np.eye(4)))
-    assert still.camera_path.is_static and still.seen_by(1).camera_path.is_static
-    np.testing.assert_array_equal(still.seen_by(1).camera_path.pose(0), offset(BASELINE))
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from blinkgl.config.scene import ExplicitSceneConfig, RandomSceneConfig
 from blinkgl.errors import ConfigError
 from blinkgl.rng import Role, generator
 from blinkgl.scene.build import build_scene
-from blinkgl.scene.lights import ambient, beam, is_coloured, lamp_pose, lamps_of, make_light, quadric_of, random_lamps
+from blinkgl.scene.lights import beam, is_coloured, lamp_pose, lamps_of, make_light, random_lamps
 from blinkgl.scene.surfaces.environment import pixel_directions
 from blinkgl.scene.types import Light
 
@@ -22,13 +22,6 @@ SPOT = {"kind": "spot", "position": [1, 2, 3], "look_at": [1, 2, 0], "strength":
 
 def light(**tree) -> Light:
     return make_light(validate(LightConfig, tree, where="scene.light"))
-
-
-def test_a_light_that_asks_for_nothing_is_the_plain_one():
-    assert light() == Light() and Light().plain and not is_coloured(Light())
-    assert not light(sun_color=[1, 0.9, 0.8]).plain and is_coloured(light(sun_color=[1, 0.9, 0.8]))
-    assert not is_coloured(light(sun_color=[0.5, 0.5, 0.5], lights=[SPOT]))
-    assert is_coloured(light(sky_color=[0.5, 0.5, 0.6]))
 
 
 def test_lamps_of_a_configuration():
@@ -55,12 +48,6 @@ def test_a_lamps_pose_is_rigid_and_shines_where_it_should(shines):
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(-R[:, 2], np.array(shines) / np.linalg.norm(shines), atol=1e-12)
     assert np.linalg.det(R) > 0
-
-
-def test_the_sky_is_half_above_and_nothing_below():
-    normals = np.array([[0, 0, 1.0], [1, 0, 0], [0, 0, -1]])
-    around = ambient(quadric_of(Light(sky=0.6, sky_color=(1, 0.5, 0))), normals)
-    np.testing.assert_allclose(around, np.outer([1, 0.5, 0], [0.6, 0.3, 0]), atol=1e-12)
 
 
 def test_a_spot_light_fades_by_the_square_of_the_cosines_ramp():

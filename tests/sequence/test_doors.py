@@ -22,7 +22,7 @@ DRAWN = {
     "scene": {
         "kind": "random",
         "objects": {"count": 3, "distance": [2, 4]},
-        "pool": {"primitives": ["cuboid"], "variants": 1, "urdfs": False},
+        "pool": {"primitives": ["cuboid"], "variants": 1},
         "textures": {"procedural": ["checks"], "variants": 2, "photographs": False, "max_size": 32},
     },
     "timeline": {"kind": "uniform", "fps": 170},

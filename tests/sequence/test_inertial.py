@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl import ConfigError
 from blinkgl.config.imu import ImuConfig
-from blinkgl.scene.motion.paths import KeyframePath, SplinePath, StaticPath
+from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.sequence.inertial import measured, place_of
 
 S = 1_000_000_000
@@ -50,7 +50,7 @@ def test_integrated_over_ten_seconds_it_gives_the_flight_back():
     rng = RNG(0)
     knots = np.arange(0, 11 * S + 1, S)
     turns = Rotation.from_rotvec(np.cumsum(rng.normal(size=(len(knots), 3)) * 0.4, axis=0))
-    path = SplinePath(knots, rng.normal(size=(len(knots), 3)), turns)
+    path = KeyframePath(knots, rng.normal(size=(len(knots), 3)), turns)
     config = ImuConfig(rate=1000, position=(0.1, -0.2, 0.05), rotation=(10, 20, 30))
     got = measured(path, config, 0, 10 * S, rng)
     T = place_of(config)

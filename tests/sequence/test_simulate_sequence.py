@@ -22,7 +22,7 @@ SMALL = {
     "scene": {
         "kind": "random",
         "objects": {"count": 3, "distance": [2, 4]},
-        "pool": {"primitives": ["cuboid", "sphere"], "variants": 2, "urdfs": False},
+        "pool": {"primitives": ["cuboid", "sphere"], "variants": 2},
         "textures": {"procedural": ["checks", "fbm"], "variants": 2, "photographs": False, "max_size": 64},
     },
     "labels": {"flow": ["forward", "backward"], "depth": True},

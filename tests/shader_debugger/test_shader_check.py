@@ -116,7 +116,6 @@ def test_show_is_what_the_compiler_gets(shader):
         (("check", "--shaders", "TMP"), ["--shaders", "no shaders in this folder"]),
         (("check", "--shaders", "CONFIG"), ["--shaders", "not a folder"]),
         (("check", "--shaders", "OLDER"), ["--shaders", "has no debug.glsl"]),
-        (("time", "CONFIG", "--repeat", "3"), ["shader time: passes are no longer timed"]),
         (("check", "nothing.glsl"), ["nothing.glsl", "label.glsl"]),
         (("check", "--backend", "vulkan"), ["gl.backend", "vulkan"]),
         (("check", "--device", "97", "--backend", "egl"), ["gl"]),

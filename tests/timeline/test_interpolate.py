@@ -156,18 +156,6 @@ def test_as_many_steps_as_the_quickest_but_a_few_pixels_ask_for(monkeypatch):
     assert count(max_px=1.0) == 3
 
 
-def test_motion_inserts_nothing_where_nothing_moves():
-    frame = scene(0)
-    statistics = interpolate.Displacement()
-    out = list(interpolate.motion([(frame, 0), (frame, 10), (frame, 20)], displacement=statistics))
-    assert [t for _, t in out] == [0, 10, 20] and statistics.inserted == 0
-
-
-def test_motion_is_bounded():
-    out = list(interpolate.motion([(scene(0), 0), (scene(16), 10**6)], max_px=0.01, most=8))
-    assert len(out) == 9
-
-
 def test_motion_of_frames_too_small_for_dense_flow():
     for size in ((16, 16), (16, 300), (300, 16), (17, 130)):
         assert len(list(interpolate.motion([(np.zeros(size, np.float32), t) for t in (0, 10)]))) == 2

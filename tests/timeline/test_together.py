@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from blinkgl.config.events import EsimConfig
-from blinkgl.config.timeline import DisplacementTimeline, UniformTimeline
+from blinkgl.config.timeline import DisplacementTimeline
 from blinkgl.events import emulator_of
 from blinkgl.timeline import make_timeline, together
 
@@ -45,15 +45,3 @@ def test_whoever_asks_first_decides_and_the_other_gets_the_same():
     first = [next(b), next(b), next(a)]
     rest = [*first[2:], *a]
     assert [first[0], first[1], *b] == rest
-
-
-def test_one_alone_stays_as_it_is():
-    alone = made(Seen(1, 1, 0), UniformTimeline(fps=100))
-    assert together([alone])[0] is alone and not alone.others
-
-
-def test_each_says_what_was_achieved_for_its_own_camera():
-    timelines = [made(Seen(100, 100, 0)), made(Seen(200, 200, 0))]
-    for name, one in zip("ab", timelines):
-        one.info = lambda name=name: {"who": name}  # type: ignore[method-assign]
-    assert [one.info() for one in together(timelines)] == [{"who": "a"}, {"who": "b"}]

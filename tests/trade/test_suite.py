@@ -34,7 +34,7 @@ WORLD = {
         "kind": "random",
         "objects": {"count": 4, "distance": [2, 5]},
         "camera_motion": {"speed": [0.5, 1.0], "rotation_rate": [40, 60]},
-        "pool": {"primitives": ["cuboid", "torus"], "variants": 2, "urdfs": False},
+        "pool": {"primitives": ["cuboid", "torus"], "variants": 2},
         "textures": {"procedural": ["checks", "bricks"], "variants": 2, "photographs": False, "max_size": 128},
     },
 }

@@ -29,7 +29,7 @@ CONFIG = {
     "scene": {
         "kind": "random",
         "objects": {"count": 3, "distance": [2, 4]},
-        "pool": {"primitives": ["cuboid", "sphere"], "variants": 4, "urdfs": False},
+        "pool": {"primitives": ["cuboid", "sphere"], "variants": 4},
         "textures": {"procedural": ["checks", "fbm"], "variants": 4, "photographs": False, "max_size": 64},
     },
 }
@@ -162,7 +162,6 @@ def test_errors(config, tmp_path, capsys):
     for arguments, message in (
         (["--only", "raytracing"], "--only, --skip: no setting is called that"),
         (["--cost", "euros"], "--cost: unknown cost"),
-        (["--reference", "cycles"], "--reference: scenes are no longer path-traced; expected --reference-set"),
         (["--set", "render.antialiasing=fxaa"], "render.antialiasing"),
     ):
         assert run(["trade", str(config), "-o", str(tmp_path / "x"), *arguments]) == 2

@@ -10,8 +10,8 @@ from blinkgl.render.passes.base import Output, Shot
 from blinkgl.render.passes.shadow import Shaded, ShadowMap
 
 if TYPE_CHECKING:
+    from blinkgl.render.draw_items import DrawItem
     from blinkgl.render.painter import Painter, Uniforms
-    from blinkgl.render.resources import DrawItem
     from blinkgl.scene.types import Scene
 
 

@@ -13,8 +13,8 @@ from blinkgl.render.passes.mean import Mean
 from blinkgl.render.rectangles import Rectangle, merged
 
 if TYPE_CHECKING:
+    from blinkgl.render.draw_items import DrawItem, Kind
     from blinkgl.render.painter import Painter
-    from blinkgl.render.resources import DrawItem, Kind
 
 SKY = 2
 _CROSSINGS_UNIT = 8

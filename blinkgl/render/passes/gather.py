@@ -20,8 +20,8 @@ from blinkgl.render.passes.velocity import Velocity
 from blinkgl.render.rectangles import Rectangle, merged
 
 if TYPE_CHECKING:
+    from blinkgl.render.draw_items import DrawItem, Kind
     from blinkgl.render.painter import Painter
-    from blinkgl.render.resources import DrawItem, Kind
 
 _FREE_UNIT = 8
 

@@ -14,8 +14,8 @@ from blinkgl.labels.shader import define_of, includes
 from blinkgl.render.passes.base import Output, Pass, ScenePass, Shot
 
 if TYPE_CHECKING:
+    from blinkgl.render.draw_items import DrawItem, Kind
     from blinkgl.render.painter import Painter, Uniforms
-    from blinkgl.render.resources import DrawItem, Kind
 
 MADE.append(includes)
 LENS_UNIT = 7

@@ -15,8 +15,8 @@ from blinkgl.render.passes.base import Output, Pass, Shot
 from blinkgl.render.passes.shadow import Shaded, ShadowMap
 
 if TYPE_CHECKING:
+    from blinkgl.render.draw_items import DrawItem, Kind
     from blinkgl.render.painter import Painter, Uniforms
-    from blinkgl.render.resources import DrawItem, Kind
     from blinkgl.scene.types import Scene
 
 

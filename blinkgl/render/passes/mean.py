@@ -10,7 +10,7 @@ from blinkgl.render.antialiasing import Samples
 from blinkgl.render.passes.base import Input, Output, Pass, ScreenPass
 
 if TYPE_CHECKING:
-    from blinkgl.render.resources import Kind
+    from blinkgl.render.draw_items import Kind
 
 
 @dataclass(frozen=True)

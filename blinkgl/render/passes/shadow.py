@@ -18,9 +18,9 @@ from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.types import Lamp
 
 if TYPE_CHECKING:
+    from blinkgl.render.draw_items import DrawItem, Kind
     from blinkgl.render.moment import Moment
     from blinkgl.render.painter import Painter, Uniforms
-    from blinkgl.render.resources import DrawItem, Kind
     from blinkgl.scene.types import Scene
 
 

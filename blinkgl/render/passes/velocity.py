@@ -12,9 +12,9 @@ from blinkgl.render.matrices import rows_xyw_bytes
 from blinkgl.render.passes.base import Output, Pass, ScenePass, Shot
 
 if TYPE_CHECKING:
+    from blinkgl.render.draw_items import DrawItem, Kind
     from blinkgl.render.moment import Moment
     from blinkgl.render.painter import Painter, Uniforms
-    from blinkgl.render.resources import DrawItem, Kind
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,6 @@ def make_mesh(
     name: str = "",
     source_hash: str = "",
     where: str | None = None,
-    max_faces: int | None = None,
     crease_degrees: float = CREASE_DEGREES,
     uv_size: float | None = None,
     project_degenerate: bool = False,
@@ -61,8 +60,8 @@ def make_mesh(
         joined.
 
     Faces without area are dropped, unused vertices removed, a closed mesh that is inside out is turned round.
-    Raises :class:`AssetError` (``where`` or ``name`` in it) for NaN or infinite vertices, indices out of range, too
-    many or no faces.
+    Raises :class:`AssetError` (``where`` or ``name`` in it) for NaN or infinite vertices, indices out of range, no
+    faces.
     """
     where, label = where or name or "mesh", name or where or "mesh"
     log = [] if log is None else log
@@ -72,8 +71,6 @@ def make_mesh(
         raise AssetError(f"vertices {vertices.shape} and faces {faces.shape} are no triangle mesh", where=where)
     if faces.size == 0:
         raise AssetError("the mesh has no faces", where=where, accepted="a mesh with triangles")
-    if max_faces is not None and len(faces) > max_faces:
-        raise AssetError("the mesh has too many faces", where=where, value=len(faces), accepted=f"at most {max_faces}")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise AssetError(f"a face refers to a vertex outside 0..{len(vertices) - 1}", where=where)
     faces = faces.astype(np.int64)

@@ -1,48 +1,33 @@
-"""What a glTF file's animations do to its shapes: clips chosen, mixed, taken from other files, and the deformers of the
-pieces that follow them."""
+"""What a glTF file's animations do to its shapes: clips chosen, taken from other files, and the deformers of the meshes
+that follow them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from blinkgl.config.deform import AnimationConfig, ClipConfig
-from blinkgl.errors import AssetError, ConfigError
+from blinkgl.config.deform import AnimationConfig
+from blinkgl.errors import ConfigError
 from blinkgl.scene.importing import gltf
-from blinkgl.scene.shapes.clips import PATHS, Blend, Clip, Playing, Track
+from blinkgl.scene.importing.raw_mesh import RawMesh, transformed
+from blinkgl.scene.shapes.clips import PATHS, Clip, Playing, Track
 from blinkgl.scene.shapes.deformer import Deformer
-from blinkgl.scene.shapes.skeleton import Motion, Skeleton, Still
+from blinkgl.scene.shapes.skeleton import Skeleton, Still
 from blinkgl.scene.shapes.skin import Morphs, Skin
 from blinkgl.scene.types import Mesh
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """One of the clips that are played at once. share : of it in the whole."""
-
-    tracks: list[Track]
-    playing: Playing
-    share: float
-
-
 class Animation:
-    """A file's clips as they are played. document : whose nodes move.   skeleton : all of its nodes, in the file's
+    """A file's clip as it is played. document : whose nodes move.   skeleton : all of its nodes, in the file's
     world."""
 
-    def __init__(self, document: gltf.Document, parts: Sequence[_Part]):
-        self.document, self._parts, self._places = document, parts, document.places
-        rest = document.rest()
-        motions: list[Motion] = [Clip(rest, part.tracks, part.playing) for part in parts]
-        self.motion = motions[0] if len(motions) == 1 else Blend(motions[0], motions[1], parts[1].share)
-        self.skeleton: Skeleton = document.skeleton(self.motion)
-        self._moved = {track.joint for part in parts for track in part.tracks if track.path in PATHS}
-
-    @property
-    def tracks(self) -> list[Track]:
-        return [track for part in self._parts for track in part.tracks]
+    def __init__(self, document: gltf.Document, tracks: list[Track], playing: Playing):
+        self.document, self.tracks, self._playing, self._places = document, tracks, playing, document.places
+        self.skeleton: Skeleton = document.skeleton(Clip(document.rest(), tracks, playing))
+        self._moved = {track.joint for track in tracks if track.path in PATHS}
 
     def moves(self, node: int) -> bool:
         """Whether a node or one that it hangs on is moved."""
@@ -64,9 +49,9 @@ class Animation:
     def sample_times(self, keys: list[np.ndarray], t0_ns: int, t1_ns: int, step: float, most: int) -> np.ndarray:
         """(N,) int64 ns in [t0, t1] to lay a path through: regular ones and, of a clip at the sequence's own times,
         the key frames (keys : s), as far as it lasts."""
-        playing = self._parts[0].playing
+        playing = self._playing
         start, end = t0_ns * 1e-9, t1_ns * 1e-9
-        plain = len(self._parts) == 1 and not playing.loop and playing.speed == 1 and playing.phase == -playing.first
+        plain = not playing.loop and playing.speed == 1 and playing.phase == -playing.first
         if plain:
             first, last = min(k[0] for k in keys), max(k[-1] for k in keys)
             start, end = max(first, min(start, last)), min(last, max(end, first))
@@ -80,20 +65,20 @@ class Animation:
     def deformer(
         self,
         node: int,
-        piece: gltf.Piece,
+        raw: RawMesh,
         source: np.ndarray,
         at_rest: np.ndarray,
         turn: np.ndarray,
         on_path: bool = False,
     ) -> Deformer | None:
-        """Of a mesh that was made of a piece of a node's mesh; None where it is rigid, or follows the object's path.
+        """Of a mesh that was made of one of a node's raw ones; None where it is rigid, or follows the object's path.
 
-        source : (W,) which of the piece's vertices each of the mesh's is.   at_rest : (4, 4) what took the piece to
-        the object's axes.
+        source : (W,) which of the raw mesh's vertices each of the mesh's is.
+        at_rest : (4, 4) what took the raw mesh to the object's axes.
         turn : (4, 4) from the file's world to the object's axes.   on_path : the object's own path moves the node."""
         skin = self.document.nodes[node].skin
-        bound = piece.binding if skin is not None else None
-        morphs = self._morphs(node, piece, source, at_rest)
+        bound = raw.binding if skin is not None else None
+        morphs = self._morphs(node, raw, source, at_rest)
         where = f"{self.document.path.name}, mesh of node '{self.document.nodes[node].name}'"
         if bound is not None and skin is not None:
             joints, bind = self.document.skin(skin)
@@ -116,39 +101,32 @@ class Animation:
             )
         return None if morphs is None else Skin.morphing(morphs, where)
 
-    def _morphs(self, node: int, piece: gltf.Piece, source: np.ndarray, at_rest: np.ndarray) -> Morphs | None:
+    def _morphs(self, node: int, raw: RawMesh, source: np.ndarray, at_rest: np.ndarray) -> Morphs | None:
         """Those targets that have a weight at any time."""
-        if piece.targets is None:
+        if raw.targets is None:
             return None
-        positions, normals = piece.targets
-        count, place = len(positions), self._places[node]
-        mine = [
-            (part.share, part.playing, [t for t in part.tracks if t.joint == place and t.path == "weights"])
-            for part in self._parts
-        ]
-        whole = self.document.morph_weights(node, max(count, 1))
-        values = [t.values[:, 1] if t.values.ndim == 3 else t.values for _, _, tracks in mine for t in tracks]
+        positions, normals = raw.targets
+        place, playing = self._places[node], self._playing
+        mine = [t for t in self.tracks if t.joint == place and t.path == "weights"]
+        whole = self.document.morph_weights(node, max(len(positions), 1))
+        values = [t.values[:, 1] if t.values.ndim == 3 else t.values for t in mine]
         used = np.flatnonzero(np.any([whole != 0, *(np.abs(v).max(axis=0) > 0 for v in values)], axis=0))
         if not len(used):
             return None
 
         def weights(t_ns: int) -> tuple[np.ndarray, np.ndarray]:
-            value, rate = np.zeros(count), np.zeros(count)
-            for share, playing, tracks in mine:
-                time, speed = playing.at(t_ns)
-                now, change = tracks[-1].at(time) if tracks else (whole, np.zeros(count))
-                value, rate = value + share * now, rate + share * speed * change
-            return value[used], rate[used]
+            time, speed = playing.at(t_ns)
+            now, change = mine[-1].at(time) if mine else (whole, np.zeros(len(whole)))
+            return now[used], speed * change[used]
 
-        moving = [playing for _, playing, tracks in mine if tracks and not playing.is_static]
-        periods = {playing.period_ns for playing in moving}
+        moving = bool(mine) and not playing.is_static
         morphs = Morphs(
             positions[used],
             None if normals is None else normals[used],
             weights,
             not moving,
-            periods.pop() if len(periods) == 1 else None,
-            max((playing.span_ns for playing in moving), default=0),
+            playing.period_ns if moving else None,
+            playing.span_ns if moving else 0,
         )
         return morphs.taken(source).transformed(at_rest[:3, :3])
 
@@ -156,65 +134,7 @@ class Animation:
 def play(document: gltf.Document, config: AnimationConfig, base: Path, where: str) -> Animation:
     """A file's animation as the configuration asks for it. where : key of the configuration.
     Raises ConfigError (a clip or file that is not there) and AssetError (what is wrong with the clip)."""
-    shares = (1.0,) if config.blend is None else (1 - config.share, config.share)
-    clips = (config,) if config.blend is None else (config, config.blend)
-    keys = (where, f"{where}.blend")
-    return Animation(
-        document, [_part(document, clip, share, base, key) for clip, share, key in zip(clips, shares, keys)]
-    )
-
-
-def rest_pieces(document: gltf.Document, node: int) -> tuple[list[gltf.Piece], np.ndarray]:
-    """(pieces of a node's mesh as the file shows them at rest, (4, 4) what takes them to the file's world): a skin has
-    its joints where its nodes are, morph targets have the weights that the file gives. What is wrong with a skin that
-    nobody plays is no reason to refuse the file: its shape as it was modelled is drawn, and that is said."""
-    mesh, skin = document.nodes[node].mesh, document.nodes[node].skin
-    assert mesh is not None
-    try:
-        pieces = document.mesh_pieces(mesh, changing=True)
-        bound = skin is not None and any(piece.binding is not None for piece in pieces)
-        joints, bind = document.skin(skin) if bound and skin is not None else ([], np.zeros((0, 4, 4)))
-        posed = [_at_rest(document, node, piece, joints, bind) for piece in pieces]
-        return posed, np.eye(4) if bound else document.world(node)
-    except AssetError as error:
-        pieces = document.mesh_pieces(mesh)  # which raises what is wrong with the rest
-        document.omissions.add(f"a pose at rest ({error.problem})")
-        return pieces, document.world(node)
-
-
-def _at_rest(
-    document: gltf.Document, node: int, piece: gltf.Piece, joints: Sequence[int], bind: np.ndarray
-) -> gltf.Piece:
-    """A piece of a node's mesh; in the file's world where there are joints."""
-    if piece.targets is not None:
-        positions, normals = piece.targets
-        weights = document.morph_weights(node, len(positions))
-        piece = replace(piece, vertices=piece.vertices + np.tensordot(weights, positions, 1), targets=None)
-        if piece.normals is not None and normals is not None:
-            piece = replace(piece, normals=piece.normals + np.tensordot(weights, normals, 1))
-    if len(joints):
-        shape = Mesh(piece.vertices, piece.faces, piece.normals, piece.uvs)  # type: ignore[arg-type]
-        if piece.binding is None:  # follows the node, and not its joints
-            return gltf.transformed(piece, document.world(node))
-        skin = Skin(document.skeleton(Still(document.rest())), joints, bind, *piece.binding, where=document.path.name)
-        turned = None if piece.normals is None else skin.normals(shape, 0)
-        piece = replace(piece, vertices=skin.positions(shape, 0), normals=turned, binding=None)
-    return piece
-
-
-def clip_names(document: gltf.Document) -> list[str]:
-    """Of a file's animations; the number of one that has none."""
-    return [str(a.get("name", i)) for i, a in enumerate(document.tree.get("animations", []))]
-
-
-def _part(document: gltf.Document, config: ClipConfig, share: float, base: Path, where: str) -> _Part:
-    theirs = document
-    if config.file is not None:
-        path = Path(config.file).expanduser()
-        path = path if path.is_absolute() else base / path
-        if not path.is_file():
-            raise ConfigError("no such file", where=f"{where}.file", value=config.file, accepted="a gltf or glb file")
-        theirs = gltf.read(path, materials=False)
+    theirs = _source(document, config.file, base, f"{where}.file")
     names = clip_names(theirs)
     index = names.index(config.clip) if config.clip in names else config.clip
     if not isinstance(index, int) or not 0 <= index < len(names):
@@ -229,7 +149,53 @@ def _part(document: gltf.Document, config: ClipConfig, share: float, base: Path,
     first, last = (min(t[0] for t in times), max(t[-1] for t in times)) if times else (0.0, 0.0)
     # A clip that is held is at its own time 0 at the sequence's: as its file says.
     phase = config.phase if config.loop else config.phase - first
-    return _Part(tracks, Playing(float(first), float(last), config.speed, float(phase), config.loop), share)
+    return Animation(document, tracks, Playing(float(first), float(last), config.speed, float(phase), config.loop))
+
+
+def _source(document: gltf.Document, file: str | None, base: Path, where: str) -> gltf.Document:
+    """The document whose clips are meant: ``document``, or another file."""
+    if file is None:
+        return document
+    path = Path(file).expanduser()
+    path = path if path.is_absolute() else base / path
+    if not path.is_file():
+        raise ConfigError("no such file", where=where, value=file, accepted="a gltf or glb file")
+    return gltf.read(path, materials=False)
+
+
+def meshes_at_rest(document: gltf.Document, node: int) -> tuple[list[RawMesh], np.ndarray]:
+    """(meshes of a node as the file shows them at rest, (4, 4) what takes them to the file's world): a skin has its
+    joints where its nodes are, morph targets have the weights that the file gives."""
+    mesh, skin = document.nodes[node].mesh, document.nodes[node].skin
+    assert mesh is not None
+    raws = document.raw_meshes(mesh)
+    bound = skin is not None and any(raw.binding is not None for raw in raws)
+    joints, bind = document.skin(skin) if bound and skin is not None else ([], np.zeros((0, 4, 4)))
+    posed = [_at_rest(document, node, raw, joints, bind) for raw in raws]
+    return posed, np.eye(4) if bound else document.world(node)
+
+
+def _at_rest(document: gltf.Document, node: int, raw: RawMesh, joints: Sequence[int], bind: np.ndarray) -> RawMesh:
+    """One of a node's meshes; in the file's world where there are joints."""
+    if raw.targets is not None:
+        positions, normals = raw.targets
+        weights = document.morph_weights(node, len(positions))
+        raw = replace(raw, vertices=raw.vertices + np.tensordot(weights, positions, 1), targets=None)
+        if raw.normals is not None and normals is not None:
+            raw = replace(raw, normals=raw.normals + np.tensordot(weights, normals, 1))
+    if len(joints):
+        shape = Mesh(raw.vertices, raw.faces, raw.normals, raw.uvs)  # type: ignore[arg-type]
+        if raw.binding is None:  # follows the node, and not its joints
+            return transformed(raw, document.world(node))
+        skin = Skin(document.skeleton(Still(document.rest())), joints, bind, *raw.binding, where=document.path.name)
+        turned = None if raw.normals is None else skin.normals(shape, 0)
+        raw = replace(raw, vertices=skin.positions(shape, 0), normals=turned, binding=None)
+    return raw
+
+
+def clip_names(document: gltf.Document) -> list[str]:
+    """Of a file's animations; the number of one that has none."""
+    return [str(a.get("name", i)) for i, a in enumerate(document.tree.get("animations", []))]
 
 
 def _by_name(theirs: gltf.Document, tracks: list[Track], mine: gltf.Document, where: str, file: str) -> list[Track]:

@@ -1,4 +1,4 @@
-"""Mesh files (obj, ply, stl through :mod:`blinkgl.scene.importing.trimesh_pieces`; glb, gltf through
+"""Mesh files (obj, ply, stl through :mod:`blinkgl.scene.importing.trimesh_files`; glb, gltf through
 :mod:`blinkgl.scene.importing.gltf`) as :class:`Asset` objects.
 
 What a file claims is checked against limits before anything is allocated for it, and nothing outside the file's own
@@ -11,15 +11,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from blinkgl.config.deform import AnimationConfig
-from blinkgl.errors import AssetError, ConfigError
-from blinkgl.scene.geometry.meshes import closed_together, concatenate, make_mesh, normalise
-from blinkgl.scene.geometry.tangents import split_mirrored
+from blinkgl.errors import AssetError
+from blinkgl.scene.geometry.meshes import concatenate, normalise
 from blinkgl.scene.importing import gltf
-from blinkgl.scene.importing.animations import clip_names, play, rest_pieces
+from blinkgl.scene.importing.animations import Animation, clip_names, meshes_at_rest, play as play_clip
+from blinkgl.scene.importing.gltf_file import buffer_contents
+from blinkgl.scene.importing.parts import DeformerOf, closed_parts, part_of
+from blinkgl.scene.importing.raw_mesh import Z_UP, RawMesh, transformed
 from blinkgl.scene.omissions import Omissions
 from blinkgl.scene.reading import MAX_BYTES, contents, reading
 from blinkgl.scene.shapes.skin import Skin, joined
@@ -27,6 +30,7 @@ from blinkgl.scene.surfaces.images import content_hash
 from blinkgl.scene.types import Material, Mesh, Part
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb", ".gltf")
+ClipOf = Callable[[gltf.Document], Animation]
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,27 +67,47 @@ def load_asset(
     source_hash: str | None = None,
     uv_size: float | None = None,
     up: str = "auto",
-    animation: AnimationConfig | None = None,
-    base: Path | str = ".",
-    where: str = "animation",
+    play: ClipOf | None = None,
 ) -> Asset:
     """One object from a file.
 
-    animation : of a glTF file, which it plays; None: it is at rest.   base : folder that paths in it start from.
-    where : its key of the
-        configuration.
-
+    play : of a glTF file, what makes the clip that it plays of it (:func:`clip_of`); None: it is at rest.
     up : the file's axis that points up and becomes z, "y" or "z"; "auto" is y for glb and gltf, whose standard says so,
         and z for the others, which say nothing.
     keep_materials : parts with the file's materials; else one part, white, with texture coordinates that can carry any
         texture (projected where the file has none or degenerate ones).
     uv_size : edge of one repeat of texture coordinates that are projected.
     Raises AssetError naming the file: missing, corrupt, NaN, no faces, more than ``max_faces`` triangles or
-    ``max_bytes`` bytes, references outside its folder, an extension required that is not drawn.
+    ``max_bytes`` bytes, references outside its folder, an extension required that is not drawn; ConfigError: ``play``
+    does not find its clip.
     """
-    with reading("mesh", str(path)):
-        given = Path(path), max_faces, max_bytes, keep_materials, max_texture, source_hash, uv_size, up
-        asset = _load(*given, animation, Path(base), where)
+    path = Path(path)
+    where = str(path)
+    with reading("mesh", where):
+        found, digest = _found(path, max_faces, max_bytes, keep_materials, max_texture, source_hash, up, play)
+        total = sum(len(raw.faces) for raw in found.raws)
+        if total > max_faces:
+            raise AssetError("the mesh has too many faces", where=where, value=total, accepted=f"at most {max_faces}")
+        has_materials = keep_materials and any(raw.material is not None for raw in found.raws)
+        parts = tuple(
+            part_of(
+                raw,
+                name=path.stem,
+                where=where,
+                source_hash=digest,
+                log=found.log,
+                materials=has_materials,
+                uv_size=uv_size,
+                deformer=deformer,
+            )
+            for raw, deformer in zip(found.raws, found.deformers, strict=True)
+            if len(raw.faces) or len(found.raws) == 1
+        )
+    if not parts:
+        raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
+    parts = closed_parts(parts) if has_materials else _one_part(parts, path.stem, digest)
+    said = tuple(dict.fromkeys(found.log)), found.omissions.lines()
+    asset = Asset(path.stem, digest, parts, has_materials, *said, tuple(found.clips))
     again = partial(
         load_asset,
         path,
@@ -94,122 +118,75 @@ def load_asset(
         source_hash=source_hash,
         uv_size=uv_size,
         up=up,
-        base=base,
-        where=where,
     )
-    return replace(asset, replay=lambda clip: again(animation=clip)) if asset.clips else asset
+    replay = lambda config: again(play=clip_of(config))
+    return replace(asset, replay=replay) if asset.clips else asset
 
 
-def _load(
-    path: Path,
-    max_faces: int,
-    max_bytes: int,
-    keep_materials: bool,
-    max_texture: int,
-    source_hash: str | None,
-    uv_size: float | None,
-    up: str,
-    animation: AnimationConfig | None,
-    base: Path,
-    key: str,
-) -> Asset:
-    where = str(path)
-    suffix = path.suffix.lower()
+def clip_of(config: AnimationConfig, base: Path | str = ".", where: str = "animation") -> ClipOf:
+    """What makes the clip that ``config`` asks for, of a document. base : folder that a path in it starts from.
+    where : its key of the configuration."""
+    return partial(play_clip, config=config, base=Path(base), where=where)
+
+
+class _Found(NamedTuple):
+    """What a file has. raws : in its own world, z up.   deformers : one of each, None: it is rigid."""
+
+    raws: list[RawMesh]
+    deformers: list[DeformerOf | None]
+    log: list[str]
+    omissions: Omissions
+    clips: list[str]
+
+
+def _found(path, max_faces, max_bytes, materials, max_texture, source_hash, up, play) -> tuple[_Found, str]:
+    """What the file has, and the hash of its content."""
+    where, suffix = str(path), path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise AssetError("unknown kind of mesh file", where=where, value=suffix, accepted=" ".join(MESH_SUFFIXES))
     data = contents(path, "mesh", max_bytes=max_bytes)
     digest = source_hash or content_hash(data, *dependencies(path, data))
-    log: list[str] = []
-    if suffix in (".glb", ".gltf"):
-        document = gltf.read(path, data, max_faces=max_faces, max_texture=max_texture, materials=keep_materials)
-        log, omissions, clips = document.log, document.omissions, clip_names(document)
-        played = None if animation is None else play(document, animation, base, key)
-        nodes, at_rest, pieces = [], [], []
-        for node in (i for i, n in document.nodes.items() if n.mesh is not None):
-            if played is not None:
-                own, world = document.mesh_pieces(document.nodes[node].mesh, changing=True), document.world(node)
-            else:
-                own, world = rest_pieces(document, node)
-            for piece in own:
-                nodes.append(node)
-                at_rest.append(world)
-                pieces.append(gltf.transformed(piece, world))
-        if clips and played is None:
-            omissions.add("animations (the rest pose is drawn)")
-    else:
-        if animation is not None:
-            raise ConfigError(
-                "only glTF files have animations", where=key, value=path.name, accepted="a gltf or glb file, or null"
-            )
-        # Here: trimesh takes as long to import as half of what else a worker needs, and most scenes have no such file.
-        from blinkgl.scene.importing.trimesh_pieces import read_pieces
+    is_gltf = suffix in (".glb", ".gltf")
+    turn = Z_UP if up == "y" or (up == "auto" and is_gltf) else None
+    if is_gltf:
+        document = gltf.read(path, data, max_faces=max_faces, max_texture=max_texture, materials=materials)
+        return _of_document(document, play, turn), digest
+    if play is not None:
+        raise AssetError("only glTF files have animations", where=where, accepted="a gltf or glb file, or no animation")
+    # Here: trimesh takes as long to import as half of what else a worker needs, and most scenes have no such file.
+    from blinkgl.scene.importing.trimesh_files import read_meshes
 
-        clips, played = [], None
-        omissions = Omissions(path.name)
-        pieces = read_pieces(path, data, suffix[1:], max_faces, max_texture if keep_materials else None, omissions)
-    if up == "y" or (up == "auto" and suffix in (".glb", ".gltf")):
-        pieces, turn = [gltf.transformed(p, gltf.Z_UP) for p in pieces], gltf.Z_UP
-    else:
-        turn = np.eye(4)
-    total = sum(len(p.faces) for p in pieces)
-    if total > max_faces:
-        raise AssetError("the mesh has too many faces", where=where, value=total, accepted=f"at most {max_faces}")
-    has_materials = keep_materials and any(p.material is not None for p in pieces)
-    parts = []
-    for number, piece in enumerate(pieces):
-        if len(piece.faces) == 0 and len(pieces) > 1:
-            continue
-        own = has_own_vertices(piece, has_materials)
-        source: list[np.ndarray] | None = [] if played is not None or own else None
-        # A palette picked by degenerate coordinates is fine with the file's own texture, useless with any other.
-        own_texture = has_materials and piece.material is not None and piece.material.texture is not None
-        mesh = make_mesh(
-            piece.vertices,
-            piece.faces,
-            normals=piece.normals,
-            uvs=piece.uvs,
-            name=path.stem,
-            source_hash=digest,
-            where=where,
-            uv_size=uv_size,
-            project_degenerate=not own_texture,
-            log=log,
-            source=source,
-        )
-        if source is not None and own:
-            mesh = with_own_vertices(mesh, piece, source)
-        if played is not None and source is not None:
-            deformer = played.deformer(nodes[number], piece, source[0], turn @ at_rest[number], turn)
-            mesh = replace(mesh, deformer=deformer)
-        material = piece.material if has_materials and piece.material is not None else Material()
-        parts.append(Part(mesh, material))
-    if not parts:
-        raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
-    if not has_materials:
-        meshes = tuple(p.mesh for p in parts)
-        whole = joined_mesh(meshes, path.stem, digest)
-        parts = [Part(mesh, Material()) for mesh in ((whole,) if whole is not None else meshes)]
-    elif closed_together(tuple(p.mesh for p in parts)):
-        parts = [Part(replace(p.mesh, closed=True), p.material) for p in parts]  # one solid, split by material
-    said = tuple(dict.fromkeys(log)), omissions.lines()
-    return Asset(path.stem, digest, tuple(parts), has_materials, *said, tuple(clips))
+    omissions = Omissions(path.name)
+    raws = read_meshes(path, data, suffix[1:], max_faces, max_texture if materials else None, omissions)
+    raws = raws if turn is None else [transformed(raw, turn) for raw in raws]
+    return _Found(raws, [None] * len(raws), [], omissions, []), digest
 
 
-def has_own_vertices(piece: gltf.Piece, materials: bool = True) -> bool:
-    """Whether a piece's vertices carry what :func:`make_mesh` knows nothing of. materials : whether it has its own."""
-    bumped = piece.material is not None and piece.material.bumps is not None
-    return materials and (piece.colours is not None or bumped)
+def _of_document(document: gltf.Document, play: ClipOf | None, turn: np.ndarray | None) -> _Found:
+    """turn : (4, 4) from the file's world to the object's axes; None: they are the same."""
+    clips, played = clip_names(document), None if play is None else play(document)
+    if clips and played is None:
+        document.omissions.add("animations (the rest pose is drawn)")
+    found = _Found([], [], document.log, document.omissions, clips)
+    for node in (i for i, n in document.nodes.items() if n.mesh is not None):
+        if played is None:
+            raws, world = meshes_at_rest(document, node)
+        else:
+            raws, world = document.raw_meshes(document.nodes[node].mesh), document.world(node)
+        for raw in raws:
+            placed = transformed(raw, world)
+            found.raws.append(placed if turn is None else transformed(placed, turn))
+            axes = np.eye(4) if turn is None else turn
+            deformer = None if played is None else partial(played.deformer, node, at_rest=axes @ world, turn=axes)
+            found.deformers.append(deformer)
+    return found
 
 
-def with_own_vertices(mesh: Mesh, piece: gltf.Piece, source: list[np.ndarray]) -> Mesh:
-    """``mesh``, made of a piece, with the colours of its vertices, and split where a normal map meets its mirror image.
-    source : which of the piece's vertices each of the mesh's is; replaced by that of the result."""
-    if piece.colours is not None:
-        mesh = replace(mesh, colours=piece.colours[source[0]].astype(np.float32))
-    if piece.material is not None and piece.material.bumps is not None:
-        mesh, index = split_mirrored(mesh)
-        source[0] = source[0][index]
-    return mesh
+def _one_part(parts: tuple[Part, ...], name: str, digest: str) -> tuple[Part, ...]:
+    """White parts as one, unless their shapes change in ways that are not one."""
+    meshes = tuple(part.mesh for part in parts)
+    whole = joined_mesh(meshes, name, digest)
+    return tuple(Part(mesh, Material()) for mesh in ((whole,) if whole is not None else meshes))
 
 
 def joined_mesh(meshes: tuple[Mesh, ...], name: str, source_hash: str) -> Mesh | None:
@@ -227,4 +204,4 @@ def dependencies(path: Path, data: bytes | None = None) -> list[bytes]:
     """Contents of the buffer files that a .gltf refers to (they are part of what it is); [] for other files."""
     if path.suffix.lower() != ".gltf":
         return []
-    return gltf.buffer_contents(path, contents(path, "mesh") if data is None else data)
+    return buffer_contents(path, contents(path, "mesh") if data is None else data)

@@ -22,9 +22,7 @@ A body that changes its shape is the convex hull of all shapes that it takes in 
 between the times that were looked at (:class:`~blinkgl.scene.shapes.deformer.Sweep`): what keeps clear of that keeps
 clear of each of them. Its path is cut like any other's; its shape goes on changing.
 
-A body wholly inside another closed mesh has a positive distance to it: that is tested once, at t0, by winding number
-(later it cannot get in without a collision), and only against objects and their closed meshes: sky, walls and ground
-may enclose.
+Surfaces collide, not solids: a body that starts wholly inside another's hollow touches nothing there.
 """
 
 from __future__ import annotations
@@ -49,21 +47,18 @@ _REQUEST = fcl.DistanceRequest()
 class Collision:
     """``first`` and ``second`` (names; the camera's is "camera") came within ``separation`` of each other at t_ns.
 
-    kind : "contact", or "inside": one lies within the other's closed mesh (at t0 only; separation 0).
     cut  : names of those that were moving and have been stopped.
     """
 
     t_ns: int
     first: str
     second: str
-    kind: str
     separation: float
     cut: tuple[str, ...]
 
     def __str__(self) -> str:
-        verb = "lies inside" if self.kind == "inside" else "touches"
         stopped = f"; stopped: {', '.join(self.cut)}" if self.cut else ""
-        return f"t={self.t_ns * 1e-9:.6f} s: {self.first} {verb} {self.second}{stopped}"
+        return f"t={self.t_ns * 1e-9:.6f} s: {self.first} touches {self.second}{stopped}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,11 +115,10 @@ def resolve_collisions(
 
 @dataclass(eq=False)
 class _Body:
-    """What the search knows about a body. vertices (V, 3), faces (F, 3): all parts, local; probes: (K, 3) one vertex
-    of each part; closed: its closed parts' (vertices, faces); pad: thickness added all round. Derived: centre, radius:
-    bounding ball, local; arm: |centre|; reach: largest distance of a vertex from the local origin, which is what
-    turning moves; hull: (H, 3) vertices of the convex hull, local; planes: (P, 4) world (n, o) with n.x <= o inside, of
-    a convex static body, else None."""
+    """What the search knows about a body. vertices (V, 3), faces (F, 3): all parts, local; pad: thickness added all
+    round. Derived: centre, radius: bounding ball, local; arm: |centre|; reach: largest distance of a vertex from the
+    local origin, which is what turning moves; hull: (H, 3) vertices of the convex hull, local; planes: (P, 4) world
+    (n, o) with n.x <= o inside, of a convex static body, else None."""
 
     name: str
     category: str
@@ -132,9 +126,7 @@ class _Body:
     path: PosePath
     vertices: np.ndarray
     faces: np.ndarray
-    probes: np.ndarray
     pad: float = 0.0
-    closed: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
     cut: bool = False
 
     @staticmethod
@@ -144,7 +136,6 @@ class _Body:
         solids = [(mesh.vertices, mesh.faces) if sweep is None else sweep.hull for mesh, sweep in zip(meshes, swept)]
         # Vertex numbers count on from part to part.
         first = np.cumsum([0] + [len(vertices) for vertices, _ in solids])
-        closed = [solid for solid, mesh, sweep in zip(solids, meshes, swept) if mesh.closed or sweep is not None]
         return _Body(
             obj.name,
             obj.category,
@@ -152,17 +143,13 @@ class _Body:
             obj.path,
             np.concatenate([vertices for vertices, _ in solids]),
             np.concatenate([faces + k for (_, faces), k in zip(solids, first)]),
-            np.array([vertices[faces[0, 0]] for vertices, faces in solids]),
             pad=max((sweep.margin for sweep in swept if sweep is not None), default=0.0),
-            closed=tuple(closed) if obj.category == "object" else (),
         )
 
     @staticmethod
     def of_camera(path: PosePath, radius: float) -> _Body:
         # A point is a triangle of three equal corners: the same exact distance routine serves it.
-        return _Body(
-            CAMERA, CAMERA, CAMERA, path, np.zeros((3, 3)), np.array([[0, 1, 2]]), np.zeros((1, 3)), pad=radius
-        )
+        return _Body(CAMERA, CAMERA, CAMERA, path, np.zeros((3, 3)), np.array([[0, 1, 2]]), pad=radius)
 
     def __post_init__(self):
         self.vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
@@ -195,13 +182,6 @@ class _Body:
             self._shape = fcl.CollisionObject(model)
         return self._shape
 
-    def encloses(self, points: np.ndarray, T: np.ndarray) -> bool:
-        """Whether a closed part contains one of the world ``points``."""
-        # World points into the body's axes; only those inside its ball can be in it.
-        local = (points - T[:3, 3]) @ T[:3, :3]
-        near = local[(np.linalg.norm(local - self.centre, axis=1) < self.radius)]
-        return any(abs(_winding(point, *part)) > 0.5 for part in self.closed for point in near)
-
 
 class _Search:
     """Conservative advancement of all pairs, the one that is next in time first."""
@@ -223,12 +203,12 @@ class _Search:
             # Either a collision now, or the next time at which to look.
             later, hit = self._advance(i, j, t)
             if hit is not None:
-                yield Collision(t, a.name, b.name, "contact", hit, self._stop(t, a, b))
+                yield Collision(t, a.name, b.name, hit, self._stop(t, a, b))
             elif later < self.t1:
                 heapq.heappush(queue, (later, i, j))
 
     def at_start(self) -> list[Collision]:
-        """Contacts and containments at t0; notes who rests on what and stops what moves."""
+        """Contacts at t0; notes who rests on what and stops what moves."""
         found = []
         for i, j in self._pairs():
             a, b = self.bodies[i], self.bodies[j]
@@ -236,19 +216,12 @@ class _Search:
             # Balls that far apart cannot touch.
             if self._ball_gap(a, b, Ta, Tb) > self._tol(a, b):
                 continue
-            if a.encloses(_moved(b.probes, Tb), Ta):
-                found.append((b, a, "inside", 0.0))
-            elif b.encloses(_moved(a.probes, Ta), Tb):
-                found.append((a, b, "inside", 0.0))
-            elif not self._rests(i, j, Ta, Tb):
+            if not self._rests(i, j, Ta, Tb):
                 separation = self._distance(a, b, Ta, Tb)
                 if separation <= self._tol(a, b):
-                    found.append((a, b, "contact", max(separation, 0.0)))
+                    found.append((a, b, max(separation, 0.0)))
         # Stopped only now: every pair is judged by the same scene.
-        return [
-            Collision(self.t0, a.name, b.name, kind, separation, self._stop(self.t0, a, b))
-            for a, b, kind, separation in found
-        ]
+        return [Collision(self.t0, a.name, b.name, separation, self._stop(self.t0, a, b)) for a, b, separation in found]
 
     def _pairs(self):
         for i, a in enumerate(self.bodies):
@@ -387,10 +360,6 @@ def _speed_along(normal: np.ndarray):
     return speed
 
 
-def _moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
-    return points @ T[:3, :3].T + T[:3, 3]
-
-
 def _heights(planes: np.ndarray, body: _Body, T: np.ndarray) -> np.ndarray:
     """Return the (P,) heights of the body's lowest point over each plane."""
     local = planes[:, :3] @ T[:3, :3]
@@ -433,19 +402,3 @@ def _face_planes(used: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> n
         opposite[:, 3] -= offset.min(axis=0)
         planes = np.vstack([planes, opposite])
     return planes
-
-
-def _winding(point: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Return the generalised winding number of a closed mesh round ``point``: 0 outside, +-1 inside (solid angles of
-    its triangles; Van Oosterom & Strackee 1983)."""
-    a, b, c = (vertices[faces[:, k]] - point for k in range(3))
-    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
-    det = np.einsum("ij,ij->i", a, np.cross(b, c))
-    dot = (
-        la * lb * lc
-        + np.einsum("ij,ij->i", a, b) * lc
-        + np.einsum("ij,ij->i", b, c) * la
-        + np.einsum("ij,ij->i", c, a) * lb
-    )
-    # Half the sum of solid angles over 2 pi: tan(angle / 2) = det / dot.
-    return float(np.arctan2(det, dot).sum() / (2 * np.pi))

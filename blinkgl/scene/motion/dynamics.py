@@ -12,13 +12,13 @@ the time between them. Both go into the path.
 **Restitution.** MuJoCo's contacts are soft: a spring with a damper, ``solref = (-stiffness, -damping)``, per mass. A
 body that meets one leaves it after about half a period of the spring, ``IMPACT_S``, with a share e of its speed that
 hangs on the damping ratio alone. Which ratio gives which e is found with the very recurrence that the engine computes,
-over all the phases in which a step can meet the surface (:func:`damping_ratio`). What is left is the phase: at the
-default rate e varies by +-0.015 where it is 0.3, by +-0.006 where it is 0.8, and by less the more steps there are.
+over all the phases in which a step can meet the surface (restitution.py). What is left is the phase: at the default
+rate e varies by +-0.015 where it is 0.3, by +-0.006 where it is 0.8, and by less the more steps there are.
 
 **Paths.** Of the steps those are kept that a cubic needs to pass all others to 2e-6 of the body's radius
-(:func:`~blinkgl.scene.motion.paths.thin`): few in flight, every one or two in an impact. So the velocity jumps there in
-the 1.6 ms that the contact lasts, nothing overshoots, and memory does not grow with the rate. A body at rest is
-asleep: its pose is constant to the bit.
+(``piecewise.thin``): few in flight, every one or two in an impact. So the velocity jumps there in the 1.6 ms that the
+contact lasts, nothing overshoots, and memory does not grow with the rate. A body at rest is asleep: its pose is
+constant to the bit.
 
 **The same again.** MuJoCo is deterministic for one build on one machine, on one thread, which is all that is used here.
 Its version is in :class:`~blinkgl.scene.types.Dynamics`, with a digest of all paths.
@@ -31,19 +31,18 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from types import ModuleType
 
 import numpy as np
-from numba import njit
-from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from blinkgl.config.physics import IN_THE_WAY, BodyConfig, PhysicsConfig
 from blinkgl.errors import ConfigError
 from blinkgl.machine.extras import install
-from blinkgl.scene.motion.paths import HermitePath, StaticPath, thin
-from blinkgl.scene.shapes.deformer import filled
+from blinkgl.scene.motion.body_shapes import Barrier, Shape, plane_of, quaternions, shapes_of
+from blinkgl.scene.motion.paths import HermitePath, StaticPath
+from blinkgl.scene.motion.piecewise import thin
+from blinkgl.scene.motion.restitution import damping_ratio
 from blinkgl.scene.types import Dynamics, PosePath, SceneObject
 
 IMPACT_S = 1.6e-3
@@ -56,7 +55,6 @@ _SINK = 1e-4  # of the smaller radius: how deep a body may be in another at the 
 _LIFT, _LIFTS = 0.01, 50  # of the same: out of how much it is lifted, and in how many turns
 _IMPEDANCE = 0.9999  # the most that MuJoCo allows: 1 would be a contact that obeys its spring exactly
 _HULL_VERTICES = 500
-_MOST_PARTS = 24  # of an object with more, all are one hull
 _SLOW_S = 5e-4  # slow is what gravity makes of rest in this time, s
 _HEAVY = 1e4  # mass of what nothing stops, of the heaviest body's
 
@@ -65,14 +63,6 @@ class Exploded(ConfigError):
     """body : name of the one that was nowhere, or too fast."""
 
     body = ""
-
-
-@dataclass(frozen=True)
-class Barrier:
-    """A plane without end that nothing passes and nobody sees: points x with ``normal . x >= offset`` are inside."""
-
-    normal: tuple[float, float, float]
-    offset: float
 
 
 def engine() -> ModuleType:
@@ -209,7 +199,7 @@ class _World:
         least = min((body.mass * body.radius**2 for body in self.dynamic), default=1.0)
         unit = max(1.0, 1e-9 / least) if weighed else 1.0
         for k, side in enumerate(self.sides):
-            self._geometry(spec, spec.worldbody, f"side {k}", _plane(side), IN_THE_WAY, 0.0, False, 1.0)
+            self._geometry(spec, spec.worldbody, f"side {k}", plane_of(side), IN_THE_WAY, 0.0, False, 1.0)
         for number, body in enumerate(self.bodies):
             T = body.path.pose(self.t0_ns)
             holder, density = spec.worldbody, body.radius**-5
@@ -218,7 +208,7 @@ class _World:
             if body.role != "fixed":
                 holder = spec.worldbody.add_body(
                     pos=T[:3, :3] @ body.centre + T[:3, 3],
-                    quat=_quaternions(T[None, :3, :3])[0],
+                    quat=quaternions(T[None, :3, :3])[0],
                     sleep=mujoco.mjtSleepPolicy.mjSLEEP_NEVER,
                     gravcomp=float(body.role == "pusher"),
                 )
@@ -329,7 +319,7 @@ class _World:
         for body in self.pushers:
             T = body.path.poses(times)
             # A pusher's velocity is what takes it to its next pose within one step.
-            q, R = _quaternions(T[:, :3, :3]), Rotation.from_matrix(T[:, :3, :3])
+            q, R = quaternions(T[:, :3, :3]), Rotation.from_matrix(T[:, :3, :3])
             p = T[:, :3, 3] + T[:, :3, :3] @ body.centre
             turns = (R[:-1].inv() * R[1:]).as_rotvec()
             found.append((body.at, np.hstack([p, q])[:-1], np.hstack([np.diff(p, axis=0), turns]) / self.step))
@@ -479,129 +469,6 @@ class _Record:
 
 def _times(steps: np.ndarray, t0_ns: int, rate: float) -> np.ndarray:
     return t0_ns + np.rint(steps * (1e9 / rate)).astype(np.int64)
-
-
-def _quaternions(R: np.ndarray) -> np.ndarray:
-    """Return the (n, 4) quaternions, w x y z, of (n, 3, 3) rotations."""
-    return Rotation.from_matrix(R).as_quat()[:, [3, 0, 1, 2]]
-
-
-# ---- restitution -----------------------------------------------------------------------------------------------------
-
-
-@lru_cache(maxsize=4096)
-def damping_ratio(restitution: float, steps: float) -> float:
-    """Of the contact of so many steps that gives back this share of the speed (0 to 1), in the mean over the phases in
-    which a step meets the surface. The strongest gives back 0.02: that is what 0 becomes."""
-    # Bisection: a larger damping ratio gives back less.
-    low, high = 0.0, 3.0
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if _given_back(middle, steps) > restitution else (low, middle)
-    return low
-
-
-@njit(cache=True)
-def _given_back(ratio: float, steps: float) -> float:
-    """Return the mean share of its speed with which a body leaves the contact, by the engine's recurrence."""
-    # w: angle of the spring per step. The contact only pushes, hence min(..., 0).
-    w, total, phases = math.pi / steps, 0.0, 16
-    for phase in range(phases):
-        # The phase is where within a step the surface is met.
-        depth, v = (phase + 0.5) / phases, 1.0
-        while depth > 0.0:
-            v += min(-(w * w * depth + 2.0 * ratio * w * v), 0.0)
-            depth += v
-        total -= v / phases
-    return total
-
-
-# ---- shapes ----------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Shape:
-    """A convex solid in a body's axes. kind : MuJoCo's, BOX, SPHERE, PLANE or MESH.   size : as MuJoCo has it: half
-    edges, radius.   vertices : (V, 3) of a MESH's hull."""
-
-    kind: str
-    size: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)
-    position: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
-    vertices: np.ndarray | None = None
-
-    @property
-    def quaternion(self) -> np.ndarray:
-        return _quaternions(self.rotation[None])[0]
-
-    def moved(self, T: np.ndarray) -> Shape:
-        return replace(self, position=T[:3, :3] @ self.position + T[:3, 3], rotation=T[:3, :3] @ self.rotation)
-
-
-def shapes_of(obj: SceneObject, config: BodyConfig) -> list[Shape]:
-    """What touches, of an object: its parts' solids in its axes; of one that deforms the hull of all its shapes."""
-    parts = [filled(part.mesh)[0] for part in obj.parts if len(part.mesh.faces)]
-    if len(parts) > _MOST_PARTS:
-        parts = [np.concatenate(parts)]
-    # A flat ground is an endless plane, which nothing falls off.
-    if obj.category == "ground" and config.shape == "auto" and config.kind == "fixed" and len(parts) == 1:
-        mesh = next(part.mesh for part in obj.parts if len(part.mesh.faces))
-        centre, axes, extent = _framed(parts[0])
-        if extent[2] < 1e-6 * extent[0]:
-            up = axes[:, 2] * (1.0 if float(mesh.normals.mean(axis=0) @ axes[:, 2]) >= 0 else -1.0)
-            return [_plane(Barrier(tuple(up), float(up @ centre)))]
-    return [_solid(points, config) for points in parts]
-
-
-def _solid(points: np.ndarray, config: BodyConfig) -> Shape:
-    low, high = points.min(axis=0), points.max(axis=0)
-    centre, half = 0.5 * (low + high), 0.5 * (high - low)
-    radii = np.linalg.norm(points - centre, axis=1)
-    # Thin in its smallest principal direction: a box of a little thickness.
-    middle, axes, extent = _framed(points)
-    if extent[2] < 0.005 * extent[0] and config.shape in ("auto", "hull"):
-        return Shape("BOX", np.maximum(extent, 0.01 * extent.max()), middle, axes)
-    if config.shape == "sphere":
-        return Shape("SPHERE", (float(radii.max()), 0, 0), centre)
-    if config.shape == "box":
-        return Shape("BOX", np.maximum(half, 1e-3 * half.max()), centre)
-    hull, volume = _hull(points)
-    # "auto": a ball or a box where the hull is one, to rounding.
-    if config.shape == "auto":
-        ball = 4 / 3 * math.pi * radii.max() ** 3
-        if np.ptp(np.linalg.norm(hull - centre, axis=1)) < 1e-4 * radii.max() and volume > 0.9 * ball:
-            return Shape("SPHERE", (float(radii.max()), 0, 0), centre)
-        if (np.abs(np.abs(hull - centre) - half) < 1e-6 * half.max()).all():
-            return Shape("BOX", half, centre)
-    return Shape("MESH", vertices=hull)
-
-
-def _hull(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the convex hull's vertices (V, 3) and its volume."""
-    try:
-        hull = ConvexHull(points)
-    except (QhullError, ValueError):
-        return np.unique(points, axis=0), 0.0
-    return points[hull.vertices], float(hull.volume)
-
-
-def _framed(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(centre (3,), axes (3, 3) as columns, a right-handed frame, half extents (3,) along them) of a box round the
-    points, along their principal axes, longest first."""
-    mean = points.mean(axis=0)
-    # Principal axes: eigenvectors of the covariance, smallest first.
-    _, axes = np.linalg.eigh(np.cov(points.T, bias=True))
-    axes = axes[:, ::-1] * np.sign(np.linalg.det(axes[:, ::-1]))
-    along = (points - mean) @ axes
-    low, high = along.min(axis=0), along.max(axis=0)
-    return mean + axes @ (0.5 * (low + high)), axes, 0.5 * (high - low)
-
-
-def _plane(side: Barrier) -> Shape:
-    """Return an endless plane whose z axis is the normal."""
-    normal = np.asarray(side.normal, dtype=np.float64)
-    rotation, _ = Rotation.align_vectors([normal], [[0.0, 0.0, 1.0]])
-    return Shape("PLANE", (1.0, 1.0, 1.0), normal * side.offset, rotation.as_matrix())
 
 
 def _shifted(by: np.ndarray) -> np.ndarray:

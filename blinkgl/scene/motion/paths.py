@@ -4,7 +4,7 @@ All of them hold their end pose outside ``[t0_ns, t1_ns]`` and have a zero deriv
 nanoseconds and are subtracted as integers before they become float seconds, so a path that starts at 10^6 s
 is as precise as (in fact: bit-identical to) the same path started at 0.
 
-    path = SplinePath([0, 500_000_000, 1_000_000_000], positions, rotations)
+    path = KeyframePath([0, 500_000_000, 1_000_000_000], positions, rotations)
     T_world_body = path.pose(250_000_000)
 
 A piecewise path is, between key frames i and i + 1 and with u the seconds since key frame i,
@@ -12,22 +12,21 @@ A piecewise path is, between key frames i and i + 1 and with u the seconds since
     p(u) = sum_k cp[i, k] u^k,      R(u) = R_i exp([phi(u)]x),   phi(u) = sum_k cr[i, k] u^k,   k = 0..3,
 
 which is what scipy's ``CubicSpline`` and ``RotationSpline`` evaluate; straight lines and slerp are the same form
-with two terms. The coefficients come from scipy; evaluation is compiled here because a renderer asks for one time
-at a time and scipy's call overhead is ten times the work.
+with two terms. The coefficients come from scipy; evaluation is compiled (piecewise.py) because a renderer asks for one
+time at a time and scipy's call overhead is ten times the work.
 """
 
 from __future__ import annotations
 
-import math
 from typing import Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from blinkgl.errors import ConfigError
+from blinkgl.scene.motion import piecewise
 from blinkgl.scene.types import PosePath
 
 # Rounding in the bounds' own arithmetic is of order 1e-15; this margin keeps them upper bounds.
@@ -108,45 +107,36 @@ class KeyframePath:
 
     def pose(self, t_ns: int) -> np.ndarray:
         T = np.empty((4, 4))
-        _pose(int(t_ns), self._knots, self._cp, self._cr, self._rot, T)
+        piecewise.pose(int(t_ns), self._knots, self._cp, self._cr, self._rot, T)
         return T
 
     def derivative(self, t_ns: int) -> np.ndarray:
         D = np.zeros((4, 4))
         t_ns = int(t_ns)
         if self.t0_ns <= t_ns <= self.t1_ns:
-            _derivative(t_ns, self._knots, self._cp, self._cr, self._rot, D)
+            piecewise.derivative(t_ns, self._knots, self._cp, self._cr, self._rot, D)
         return D
 
     def poses(self, t_ns: np.ndarray) -> np.ndarray:
         t_ns = np.ascontiguousarray(t_ns, dtype=np.int64)
         T = np.empty((len(t_ns), 4, 4))
-        _poses(t_ns, self._knots, self._cp, self._cr, self._rot, T)
+        piecewise.poses(t_ns, self._knots, self._cp, self._cr, self._rot, T)
         return T
 
     def speed_bound(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
         """See :class:`PosePath`. Rigorous: a quadratic stays in the convex hull of its Bezier points on the interval,
         and |w| = |J_r(phi) phi'| <= |phi'| because the right Jacobian of SO(3) has singular values 1 and
         |sin(|phi|/2)| / (|phi|/2) <= 1."""
-        v, w = _speed_bound(int(ta_ns), int(tb_ns), self._knots, self._cp, self._cr)
+        v, w = piecewise.speed_bound(int(ta_ns), int(tb_ns), self._knots, self._cp, self._cr)
         return v * _BOUND_MARGIN, w * _BOUND_MARGIN
 
     def approach_bound(self, normal: np.ndarray, reach: float, ta_ns: int, tb_ns: int) -> float:
         """Upper bound over [ta, tb] of |n . velocity| in units/s of the body's points within ``reach`` of its origin,
         for the world direction ``normal`` (unit). Zero (to rounding) for a body that slides and turns on a plane,
         where :meth:`speed_bound` says nothing useful."""
-        return _BOUND_MARGIN * _approach_bound(
+        return _BOUND_MARGIN * piecewise.approach_bound(
             int(ta_ns), int(tb_ns), self._knots, self._cp, self._cr, self._rot, normal, reach
         )
-
-
-class SplinePath(KeyframePath):
-    """C2 spline through way-points; arguments as in :class:`KeyframePath`."""
-
-    def __init__(
-        self, times_ns: ArrayLike, positions: ArrayLike, rotations: Rotation | ArrayLike, where: str | None = None
-    ):
-        super().__init__(times_ns, positions, rotations, "spline", where)
 
 
 class HermitePath(KeyframePath):
@@ -179,7 +169,7 @@ class HermitePath(KeyframePath):
         self._cp, self._cr = np.empty((len(knots) - 1, 4, 3)), np.empty((len(knots) - 1, 4, 3))
         for i in range(len(knots) - 1):
             j, h = i + 1, (knots[i + 1] - knots[i]) * 1e-9
-            _hermite_piece(
+            piecewise.hermite_piece(
                 h,
                 positions[i],
                 positions[j],
@@ -406,278 +396,3 @@ def _ascending(c: np.ndarray) -> np.ndarray:
     out = np.zeros((c.shape[1], 4, 3))
     out[:, : len(c)] = c[::-1].transpose(1, 0, 2)
     return out
-
-
-@njit(cache=True)
-def _hermite_piece(h, p0, p1, v0, v1, q0, q1, w0, w1, cp, cr):
-    """Fill ``cp`` and ``cr`` (4, 3), the cubics of one piece of ``h`` seconds (see the module's docstring), from
-    positions p, velocities v, quaternions q (w x y z) and body rates w at its ends. Returns the angle from the
-    first rotation to the last, rad.
-
-    phi = log(R0^T R1); the rate of phi at the end is J_r^-1(phi) w1, with J_r^-1 = I + [phi]x / 2 + k [phi]x^2,
-    k = 1 / a^2 - cot(a / 2) / (2 a), a = |phi|."""
-    # conj(q0) q1
-    w = q0[0] * q1[0] + q0[1] * q1[1] + q0[2] * q1[2] + q0[3] * q1[3]
-    x = q0[0] * q1[1] - q0[1] * q1[0] - q0[2] * q1[3] + q0[3] * q1[2]
-    y = q0[0] * q1[2] - q0[2] * q1[0] - q0[3] * q1[1] + q0[1] * q1[3]
-    z = q0[0] * q1[3] - q0[3] * q1[0] - q0[1] * q1[2] + q0[2] * q1[1]
-    s = math.sqrt(x * x + y * y + z * z)
-    # The short way round: atan2 with |w|, and the sign of w.
-    a = 2.0 * math.atan2(s, abs(w))
-    f = (a / s if s > 1e-12 else 2.0) * (1.0 if w >= 0.0 else -1.0)
-    phi = np.array([f * x, f * y, f * z])
-    # k of the inverse right Jacobian; its series below 0.01 rad, where both terms cancel.
-    k = 1.0 / (a * a) - 0.5 / (a * math.tan(0.5 * a)) if a > 1e-2 else 1.0 / 12.0 + a * a / 720.0
-    c = np.cross(phi, w1)
-    end = w1 + 0.5 * c + k * np.cross(phi, c)
-    # The cubic with these ends and slopes (Hermite).
-    for r in range(3):
-        cp[0, r], cp[1, r] = p0[r], v0[r]
-        d = p1[r] - p0[r]
-        cp[2, r] = (3.0 * d / h - 2.0 * v0[r] - v1[r]) / h
-        cp[3, r] = (v0[r] + v1[r] - 2.0 * d / h) / (h * h)
-        cr[0, r], cr[1, r] = 0.0, w0[r]
-        cr[2, r] = (3.0 * phi[r] / h - 2.0 * w0[r] - end[r]) / h
-        cr[3, r] = (w0[r] + end[r] - 2.0 * phi[r] / h) / (h * h)
-    return a
-
-
-def thin(
-    step: float,
-    positions: np.ndarray,
-    velocities: np.ndarray,
-    quaternions: np.ndarray,
-    rates: np.ndarray,
-    tolerance: float,
-    angle: float,
-) -> np.ndarray:
-    """(N,) bool: which of N poses, ``step`` seconds apart, a :class:`HermitePath` needs to pass all of them within
-    ``tolerance`` (units) and ``angle`` (rad); both ends are. Arrays as there. From each pose that is kept the next is
-    looked for by halving."""
-    # As large a step as passes all poses between, halved until it does.
-    keep = np.empty(len(positions), dtype=bool)
-    p, v, q, w = (np.ascontiguousarray(a, dtype=np.float64) for a in (positions, velocities, quaternions, rates))
-    _thin(step, p, v, q, w, tolerance, angle, keep)
-    return keep
-
-
-@njit(cache=True)
-def _thin(step, positions, velocities, quaternions, rates, tolerance, angle, keep):
-    cp, cr = np.empty((4, 3)), np.empty((4, 3))
-    last = len(positions) - 1
-    keep[:] = False
-    keep[0] = keep[last] = True
-    a = 0
-    while a < last:
-        b = last
-        while b > a + 1:
-            # From pose a to pose b over what lies between them.
-            turned = _hermite_piece(
-                (b - a) * step,
-                positions[a],
-                positions[b],
-                velocities[a],
-                velocities[b],
-                quaternions[a],
-                quaternions[b],
-                rates[a],
-                rates[b],
-                cp,
-                cr,
-            )
-            if turned < 2.0 and _passes(
-                a, b, step, positions, quaternions, cp, cr, tolerance * tolerance, math.sin(0.5 * angle)
-            ):
-                break
-            b = a + (b - a) // 2
-        keep[b] = True
-        a = b
-
-
-@njit(cache=True)
-def _passes(a, b, step, positions, quaternions, cp, cr, square, half):
-    for i in range(a + 1, b):
-        # Position by Horner's scheme, then rotation.
-        u = (i - a) * step
-        q = 0.0
-        for r in range(3):
-            d = ((cp[3, r] * u + cp[2, r]) * u + cp[1, r]) * u + cp[0, r] - positions[i, r]
-            q += d * d
-        if q > square:
-            return False
-        # exp(phi / 2) as a quaternion.
-        x = ((cr[3, 0] * u + cr[2, 0]) * u + cr[1, 0]) * u
-        y = ((cr[3, 1] * u + cr[2, 1]) * u + cr[1, 1]) * u
-        z = ((cr[3, 2] * u + cr[2, 2]) * u + cr[1, 2]) * u
-        n = math.sqrt(x * x + y * y + z * z)
-        f = math.sin(0.5 * n) / n if n > 1e-12 else 0.5
-        w, x, y, z = math.cos(0.5 * n), f * x, f * y, f * z
-        # The vector part of conj(q_i) q_a exp(phi / 2): half the angle between them.
-        o, s = quaternions[a], quaternions[i]
-        pw = o[0] * w - o[1] * x - o[2] * y - o[3] * z
-        px = o[0] * x + o[1] * w + o[2] * z - o[3] * y
-        py = o[0] * y - o[1] * z + o[2] * w + o[3] * x
-        pz = o[0] * z + o[1] * y - o[2] * x + o[3] * w
-        ex = s[0] * px - s[1] * pw - s[2] * pz + s[3] * py
-        ey = s[0] * py - s[2] * pw - s[3] * px + s[1] * pz
-        ez = s[0] * pz - s[3] * pw - s[1] * py + s[2] * px
-        if ex * ex + ey * ey + ez * ez > half * half:
-            return False
-    return True
-
-
-@njit(cache=True)
-# The piece that holds t; the first and last go on beyond their ends.
-def _piece(t, knots):
-    i = np.searchsorted(knots, t, side="right") - 1
-    return min(max(i, 0), len(knots) - 2)
-
-
-@njit(cache=True)
-def _pose(t, knots, cp, cr, rot, T):
-    t = min(max(t, knots[0]), knots[-1])
-    i = _piece(t, knots)
-    # Integer difference first, so that times far from 0 lose nothing.
-    u = (t - knots[i]) * 1e-9
-    x = ((cr[i, 3, 0] * u + cr[i, 2, 0]) * u + cr[i, 1, 0]) * u + cr[i, 0, 0]
-    y = ((cr[i, 3, 1] * u + cr[i, 2, 1]) * u + cr[i, 1, 1]) * u + cr[i, 0, 1]
-    z = ((cr[i, 3, 2] * u + cr[i, 2, 2]) * u + cr[i, 1, 2]) * u + cr[i, 0, 2]
-    q = x * x + y * y + z * z
-    # exp = c I + a [phi]x + b phi phi^T. sin(angle / 2) has no cancellation in 1 - cos at small angles.
-    if q > 1e-300:
-        angle = math.sqrt(q)
-        half = math.sin(0.5 * angle)
-        a = math.sin(angle) / angle
-        b = 2.0 * half * half / q
-        c = math.cos(angle)
-    else:
-        a, b, c = 1.0, 0.5, 1.0
-    E00, E01, E02 = c + b * x * x, b * x * y - a * z, b * x * z + a * y
-    E10, E11, E12 = b * x * y + a * z, c + b * y * y, b * y * z - a * x
-    E20, E21, E22 = b * x * z - a * y, b * y * z + a * x, c + b * z * z
-    for r in range(3):
-        r0, r1, r2 = rot[i, r, 0], rot[i, r, 1], rot[i, r, 2]
-        T[r, 0] = r0 * E00 + r1 * E10 + r2 * E20
-        T[r, 1] = r0 * E01 + r1 * E11 + r2 * E21
-        T[r, 2] = r0 * E02 + r1 * E12 + r2 * E22
-        T[r, 3] = ((cp[i, 3, r] * u + cp[i, 2, r]) * u + cp[i, 1, r]) * u + cp[i, 0, r]
-        T[3, r] = 0.0
-    T[3, 3] = 1.0
-
-
-@njit(cache=True)
-def _poses(times, knots, cp, cr, rot, T):
-    for k in range(len(times)):
-        _pose(times[k], knots, cp, cr, rot, T[k])
-
-
-@njit(cache=True)
-def _derivative(t, knots, cp, cr, rot, D):
-    """Write D = dT/dt. Body rate w = J_r(phi) phi' with the right Jacobian of SO(3), J_r = I - (1 - cos a)/a^2
-    [phi]x + (a - sin a)/a^3 [phi]x^2, a = |phi|."""
-    T = np.empty((4, 4))
-    _pose(t, knots, cp, cr, rot, T)
-    i = _piece(t, knots)
-    u = (t - knots[i]) * 1e-9
-    p, d = np.empty(3), np.empty(3)
-    for k in range(3):
-        p[k] = ((cr[i, 3, k] * u + cr[i, 2, k]) * u + cr[i, 1, k]) * u + cr[i, 0, k]
-        d[k] = (3.0 * cr[i, 3, k] * u + 2.0 * cr[i, 2, k]) * u + cr[i, 1, k]
-        D[k, 3] = (3.0 * cp[i, 3, k] * u + 2.0 * cp[i, 2, k]) * u + cp[i, 1, k]
-    q = p[0] * p[0] + p[1] * p[1] + p[2] * p[2]
-    if q > 1e-4:
-        a = math.sqrt(q)
-        k1, k2 = (1.0 - math.cos(a)) / q, (a - math.sin(a)) / (q * a)
-    else:
-        # Both differences cancel at small angles; next terms are q^3/40320 and q^3/362880, below 1e-16.
-        k1 = 0.5 - q * (1.0 / 24.0 - q / 720.0)
-        k2 = 1.0 / 6.0 - q * (1.0 / 120.0 - q / 5040.0)
-    # phi x phi', and from it J_r phi'.
-    c0, c1, c2 = p[1] * d[2] - p[2] * d[1], p[2] * d[0] - p[0] * d[2], p[0] * d[1] - p[1] * d[0]
-    w0 = d[0] - k1 * c0 + k2 * (p[1] * c2 - p[2] * c1)
-    w1 = d[1] - k1 * c1 + k2 * (p[2] * c0 - p[0] * c2)
-    w2 = d[2] - k1 * c2 + k2 * (p[0] * c1 - p[1] * c0)
-    # R' = R [w]x, column by column.
-    for r in range(3):
-        D[r, 0] = T[r, 1] * w2 - T[r, 2] * w1
-        D[r, 1] = T[r, 2] * w0 - T[r, 0] * w2
-        D[r, 2] = T[r, 0] * w1 - T[r, 1] * w0
-
-
-@njit(cache=True)
-def _quadratic_bound(c, ua, ub):
-    """Return an upper bound of |p'(u)| over [ua, ub] for the cubic p: the largest norm of the three Bezier points of
-    p'."""
-    best = 0.0
-    # The bound is that of the convex hull of the control points.
-    for corner in range(3):
-        # Blossom of a quadratic: products u u -> v w, u -> (v + w) / 2.
-        v = ub if corner == 2 else ua
-        w = ua if corner == 0 else ub
-        q = 0.0
-        for k in range(3):
-            x = 3.0 * c[3, k] * v * w + c[2, k] * (v + w) + c[1, k]
-            q += x * x
-        best = max(best, q)
-    return math.sqrt(best)
-
-
-@njit(cache=True)
-def _cubic_bound(c, ua, ub):
-    """Return an upper bound of |p(u)| over [ua, ub]: the largest norm of the four Bezier points of p."""
-    # The blossom of a cubic at (v, w, x): a control point each.
-    best = 0.0
-    for corner in range(4):
-        v = ub if corner > 0 else ua
-        w = ub if corner > 1 else ua
-        x = ub if corner > 2 else ua
-        q = 0.0
-        for k in range(3):
-            y = c[3, k] * v * w * x + (c[2, k] * (v * w + v * x + w * x) + c[1, k] * (v + w + x)) / 3.0 + c[0, k]
-            q += y * y
-        best = max(best, q)
-    return math.sqrt(best)
-
-
-@njit(cache=True)
-def _approach_bound(ta, tb, knots, cp, cr, rot, normal, reach):
-    """n . (velocity of the point x) = n . p' + x . (n x w), all in key frame i's axes, where w = J_l(phi) phi' with
-    J_l = I + a [phi]x + b [phi]x^2, 0 <= a <= 1/2, 0 <= b <= 1/6. With the parts across n, phi_n and phi'_n:
-    |n x w| <= |phi'_n| + X / 2 + |phi| X / 6,  X = |phi x phi'| <= |phi| |phi'_n| + |phi_n| |phi'|;  also <= |phi'|."""
-    if tb < knots[0] or ta > knots[-1] or tb < ta:
-        return 0.0
-    ta, tb = max(ta, knots[0]), min(tb, knots[-1])
-    best = 0.0
-    along, across, local = np.zeros((4, 3)), np.empty((4, 3)), np.empty(3)
-    for i in range(_piece(ta, knots), _piece(tb, knots) + 1):
-        # The part of [ta, tb] that lies in piece i, in its own seconds.
-        ua = (max(ta, knots[i]) - knots[i]) * 1e-9
-        ub = (min(tb, knots[i + 1]) - knots[i]) * 1e-9
-        for r in range(3):
-            local[r] = rot[i, 0, r] * normal[0] + rot[i, 1, r] * normal[1] + rot[i, 2, r] * normal[2]
-        # Coefficients along the normal and across it.
-        for k in range(4):
-            along[k, 0] = cp[i, k, 0] * normal[0] + cp[i, k, 1] * normal[1] + cp[i, k, 2] * normal[2]
-            dot = cr[i, k, 0] * local[0] + cr[i, k, 1] * local[1] + cr[i, k, 2] * local[2]
-            for r in range(3):
-                across[k, r] = cr[i, k, r] - dot * local[r]
-        phi, rate = _cubic_bound(cr[i], ua, ub), _quadratic_bound(cr[i], ua, ub)
-        rate_n = _quadratic_bound(across, ua, ub)
-        x = phi * rate_n + _cubic_bound(across, ua, ub) * rate
-        tilt = min(rate_n + 0.5 * x + phi * x / 6.0, rate)
-        best = max(best, _quadratic_bound(along, ua, ub) + reach * tilt)
-    return best
-
-
-@njit(cache=True)
-def _speed_bound(ta, tb, knots, cp, cr):
-    if tb < knots[0] or ta > knots[-1] or tb < ta:
-        return 0.0, 0.0
-    ta, tb = max(ta, knots[0]), min(tb, knots[-1])
-    speed, rate = 0.0, 0.0
-    for i in range(_piece(ta, knots), _piece(tb, knots) + 1):
-        ua = (max(ta, knots[i]) - knots[i]) * 1e-9
-        ub = (min(tb, knots[i + 1]) - knots[i]) * 1e-9
-        speed = max(speed, _quadratic_bound(cp[i], ua, ub))
-        rate = max(rate, _quadratic_bound(cr[i], ua, ub))
-    return speed, rate

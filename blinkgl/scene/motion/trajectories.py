@@ -2,9 +2,9 @@
 
     space = FreeSpace(low=(-4, -4, 0), high=(4, 4, 3), ground_z=0.0, centres=centres, radii=radii)
     rng = generator(seed, sequence, Role.TRAJECTORY)
-    path = random_path(rng, t0_ns, t1_ns, ObjectMotion(speed=(0.5, 1)), space, radius=0.3, start_pose=T_world_obj)
-    sliding = random_path(rng, t0_ns, t1_ns, ObjectMotion(), space, radius=0.3, start_pose=T_world_obj, on_ground=True)
-    camera = random_camera_path(rng, t0_ns, t1_ns, CameraMotion(), space, radius=0.2, target=(0, 0, 0.5))
+    path = random_path(rng, t0_ns, t1_ns, ObjectMotion(speed=(0.5, 1)), space, 0.3, T_world_obj)
+    sliding = random_path(rng, t0_ns, t1_ns, ObjectMotion(), space, 0.3, T_world_obj, on_ground=True)
+    camera = random_camera_path(rng, t0_ns, t1_ns, CameraMotion(), space, 0.2, (0, 0, 0.5), T_world_cam)
 
 How the configured speed is met: way-points are a random walk whose legs have about the right length, so that they
 can be rejected one by one; the spline through them is a fixed curve in space, and the *time* it takes is then
@@ -28,8 +28,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from blinkgl.config.trajectory import CameraMotion, MotionConfig, ObjectMotion
-from blinkgl.errors import ConfigError
-from blinkgl.scene.motion.paths import PausedPath, SplinePath, StaticPath, rigid
+from blinkgl.scene.motion.paths import KeyframePath, PausedPath, StaticPath, rigid
 from blinkgl.scene.types import PosePath
 
 _REDRAWS = 6  # whole paths; the one that leaves free space least is kept
@@ -90,18 +89,6 @@ class FreeSpace:
         at_a = np.linalg.norm(a - self.centres, axis=1)
         return bool(np.all((nearest >= limit) | ((at_a < limit) & (nearest >= at_a * (1 - 1e-12)))))
 
-    def sample(self, rng: np.random.Generator, radius: float, tries: int = 1000) -> np.ndarray:
-        """(3,) uniform random free point. ConfigError when none is found."""
-        points = rng.uniform(self.low, self.high, (tries, 3))
-        free = np.flatnonzero(self.depth(points, radius) <= 0.0)
-        if not len(free):
-            raise ConfigError(
-                f"no free space for a body of radius {radius:.3g} in {tries} tries",
-                where="scene",
-                accepted="fewer or smaller objects, or a larger world",
-            )
-        return points[free[0]]
-
 
 def random_path(
     rng: np.random.Generator,
@@ -110,17 +97,17 @@ def random_path(
     config: ObjectMotion,
     space: FreeSpace,
     radius: float,
-    start_pose: ArrayLike | None = None,
+    start_pose: ArrayLike,
     on_ground: bool = False,
 ) -> PosePath:
     """Motion of one object over [t0, t1].
 
     radius     : of its bounding sphere, kept clear of ``space``'s obstacles. Leave the object itself out of them.
-    start_pose : (4, 4) T_world_obj at t0; None draws a free position and a uniform rotation.
+    start_pose : (4, 4) T_world_obj at t0.
     on_ground  : it rests on the ground: its height stays and it turns about the world's vertical only.
     Returns a StaticPath for ``kind: static``, with probability ``static_share``, and for zero speed and rate.
     """
-    start = _start(rng, space, radius) if start_pose is None else rigid(start_pose)
+    start = rigid(start_pose)
     still = rng.random() < config.static_share
     speed, rate = rng.uniform(*config.speed), math.radians(rng.uniform(*config.rotation_rate))
     if config.kind == "static" or still or (speed == 0 and rate == 0):
@@ -128,7 +115,7 @@ def random_path(
     times, positions = waypoints(rng, t0_ns, t1_ns, config, space, radius, start[:3, 3], speed, flat=on_ground)
     times, positions = _refined(times, positions, rate)
     turns = _random_turns(rng, config, rate, times, start[:3, :3].T[:, 2] if on_ground else None)
-    path = SplinePath(times, positions, _rotations(start[:3, :3], turns, times, t0_ns, t1_ns, rate))
+    path = KeyframePath(times, positions, _rotations(start[:3, :3], turns, times, t0_ns, t1_ns, rate))
     return _pausing(rng, config, path, t0_ns, t1_ns)
 
 
@@ -139,43 +126,29 @@ def random_camera_path(
     config: CameraMotion,
     space: FreeSpace,
     radius: float,
-    target: PosePath | ArrayLike,
-    start_pose: ArrayLike | None = None,
+    target: ArrayLike,
+    start_pose: ArrayLike,
 ) -> PosePath:
     """Motion of the camera over [t0, t1], OpenCV axes.
 
     radius     : of the sphere round the camera centre that stays clear of obstacles (at least the near distance).
-    target     : point (3,) to look at, or a path whose origin is followed. The viewing direction stays within
-                 ``view_cone`` of it and the horizon within ``roll`` at the way-points, as far as the drawn angular
-                 rate can follow the target.
-    start_pose : (4, 4) T_world_cam at t0; None draws a free position and looks at the target.
+    target     : point (3,) to look at. The viewing direction stays within ``view_cone`` of it and the horizon within
+                 ``roll`` at the way-points, as far as the drawn angular rate allows.
+    start_pose : (4, 4) T_world_cam at t0.
     """
-    aim = target.pose if isinstance(target, PosePath) else None
-    fixed = None if aim else np.asarray(target, dtype=np.float64).reshape(3)
-
-    def look_at(t_ns: int) -> np.ndarray:
-        return aim(t_ns)[:3, 3] if aim else fixed
-
-    if start_pose is None:
-        position = space.sample(rng, radius)
-        start = np.eye(4)
-        start[:3, 3] = position
-        roll = math.radians(rng.uniform(-0.5, 0.5) * config.roll)
-        start[:3, :3] = look_rotation(look_at(t0_ns) - position) @ Rotation.from_rotvec([0, 0, roll]).as_matrix()
-    else:
-        start = rigid(start_pose)
+    start = rigid(start_pose)
     speed, rate = rng.uniform(*config.speed), math.radians(rng.uniform(*config.rotation_rate))
     if config.kind == "static" or (speed == 0 and rate == 0 and config.shake == 0):
         return StaticPath(start, t0_ns, t1_ns)
     ahead = _heading(rng, config, start)
     times, positions = waypoints(rng, t0_ns, t1_ns, config, space, radius, start[:3, 3], speed, flat=False, ahead=ahead)
     times, positions = _refined(times, positions, rate)
-    aims = np.array([look_at(int(t)) for t in times]) - positions
+    aims = np.asarray(target, np.float64).reshape(3) - positions
     turns = _camera_turns(rng, config, rate, times, start[:3, :3], aims)
     rotations = _rotations(start[:3, :3], turns, times, t0_ns, t1_ns, rate)
     if config.shake > 0:
         times, positions, rotations = _shaken(rng, config, times, positions, rotations)
-    return _pausing(rng, config, SplinePath(times, positions, rotations), t0_ns, t1_ns)
+    return _pausing(rng, config, KeyframePath(times, positions, rotations), t0_ns, t1_ns)
 
 
 def _heading(rng, config: CameraMotion, start: np.ndarray) -> np.ndarray | None:
@@ -188,7 +161,7 @@ def _heading(rng, config: CameraMotion, start: np.ndarray) -> np.ndarray | None:
     return start[:3, 0] * math.cos(angle) + start[:3, 1] * math.sin(angle)
 
 
-def _pausing(rng, config: MotionConfig, path: SplinePath, t0_ns: int, t1_ns: int) -> PosePath:
+def _pausing(rng, config: MotionConfig, path: KeyframePath, t0_ns: int, t1_ns: int) -> PosePath:
     """The path, which now and then stops for a while. Nothing is drawn where nothing ever stops."""
     if config.pauses == 0 or rng.random() >= config.pauses:
         return path
@@ -208,13 +181,6 @@ def look_rotation(direction: ArrayLike) -> np.ndarray:
     x = x / n if n > 1e-9 else np.array([1.0, 0.0, 0.0]) - z[0] * z
     x /= np.linalg.norm(x)
     return np.column_stack([x, np.cross(z, x), z])
-
-
-def _start(rng, space, radius) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, 3] = space.sample(rng, radius)
-    T[:3, :3] = Rotation.random(rng=rng).as_matrix()
-    return T
 
 
 def _unit(rng: np.random.Generator, n: int | None = None) -> np.ndarray:

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.config.trajectory import ObjectMotion
 from blinkgl.errors import ConfigError
-from blinkgl.scene.motion.paths import SplinePath, StaticPath
+from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.motion.trajectories import FreeSpace, look_rotation, waypoints
 from blinkgl.scene.types import PosePath
 
@@ -73,7 +73,7 @@ def way_path(
     level: bool = True,
     start: float = 0.0,
     where: str = "way",
-) -> SplinePath:
+) -> KeyframePath:
     """The motion along a way over [t0, t1]. Raises ConfigError for points that coincide with the next.
 
     points : as of :class:`Way`.   speed : units/s, > 0.   level : the body's z axis stays up; otherwise its x axis goes
@@ -96,7 +96,7 @@ def way_path(
     else:
         cameras = np.stack([look_rotation(direction) for direction in ahead])
         turns = Rotation.from_matrix(np.stack([cameras[:, :, 2], -cameras[:, :, 0], -cameras[:, :, 1]], axis=2))
-    return SplinePath(times, places, turns)
+    return KeyframePath(times, places, turns)
 
 
 def random_way(

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from blinkgl.scene.shapes.skeleton import Locals, Motion
+from blinkgl.scene.shapes.skeleton import Locals
 
 PATHS = ("translation", "rotation", "scale")
 KINDS = ("LINEAR", "STEP", "CUBICSPLINE")
@@ -126,29 +126,6 @@ class Clip:
         out = self.rest.copy()
         _evaluate(time, speed, self._joint, self._path, self._kind, self._first, self._times, self._values, *out)
         return out
-
-
-class Blend:
-    """Two motions of the same joints at once: ``share`` of the second, the rest of the first. Rotations are blended
-    along the shorter
-    way, by their quaternions."""
-
-    def __init__(self, first: Motion, second: Motion, share: float):
-        self.first, self.second, self.share = first, second, share
-        self.is_static = first.is_static and second.is_static
-        periods = {motion.period_ns for motion in (first, second) if not motion.is_static}
-        self.period_ns = periods.pop() if len(periods) == 1 else None
-        self.span_ns = max(first.span_ns, second.span_ns)
-
-    def locals(self, t_ns: int) -> Locals:
-        a, b, w = self.first.locals(t_ns), self.second.locals(t_ns), self.share
-        mixed = [(1 - w) * p + w * q for p, q in zip(a, b)]
-        side = np.where((a.rotation * b.rotation).sum(axis=1, keepdims=True) < 0, -w, w)
-        q, dq = (1 - w) * a.rotation + side * b.rotation, (1 - w) * a.d_rotation + side * b.d_rotation
-        length = np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-12)
-        q, dq = q / length, dq / length
-        mixed[1], mixed[4] = q, dq - q * (q * dq).sum(axis=1, keepdims=True)
-        return Locals(*mixed)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -24,7 +24,7 @@ from blinkgl.scene.geometry import BUILDERS
 from blinkgl.scene.geometry.deforming import deforming
 from blinkgl.scene.geometry.meshes import transform_mesh
 from blinkgl.scene.geometry.tangents import split_mirrored
-from blinkgl.scene.importing.mesh_files import Asset, load_asset
+from blinkgl.scene.importing.mesh_files import Asset, clip_of, load_asset
 from blinkgl.scene.lights import make_light
 from blinkgl.scene.motion.collision import resolve_collisions
 from blinkgl.scene.motion.dynamics import simulate
@@ -303,9 +303,7 @@ def _asset(
         uv_size=config.uv_size,
         keep_materials=own_materials,
         up=config.up,
-        animation=animation,
-        base=base,
-        where=animation_key,
+        play=None if animation is None else clip_of(animation, base, animation_key),
     )
 
 

@@ -1,21 +1,17 @@
-"""Finished scenes: glTF files, ``trimesh.Scene`` and ``pyrender.Scene`` objects.
+"""Finished scenes of glTF files.
 
     scene = from_gltf("room.glb", camera, t0_ns, t1_ns)
-    scene = from_trimesh(trimesh.load_scene("room.obj"), camera, t0_ns, t1_ns)
-    scene = from_pyrender(pyrender_scene, camera, t0_ns, t1_ns)
 
 ``camera`` is a :class:`~blinkgl.camera.CameraModel`. Each node that shows a mesh becomes one object; a
-node's scale is baked into its vertices, what remains is its rigid pose. Cameras, which look along -z with y up in all
-three, get OpenCV axes. glTF's world (y up) is turned z up.
+node's scale is baked into its vertices, what remains is its rigid pose. Cameras, which look along -z with y up, get
+OpenCV axes. glTF's world (y up) is turned z up.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -24,24 +20,19 @@ from blinkgl.camera import CameraModel, PinHole, focal_length
 from blinkgl.config.deform import AnimationConfig, animation_of
 from blinkgl.config.scene import FileSceneConfig
 from blinkgl.errors import AssetError, ConfigError
-from blinkgl.scene.geometry.meshes import closed_together, make_mesh
 from blinkgl.scene.importing import gltf
-from blinkgl.scene.importing.animations import Animation, clip_names, play, rest_pieces
-from blinkgl.scene.importing.mesh_files import has_own_vertices, with_own_vertices
+from blinkgl.scene.importing.animations import Animation, clip_names, meshes_at_rest, play
+from blinkgl.scene.importing.parts import DeformerOf, closed_parts, part_of
+from blinkgl.scene.importing.raw_mesh import Z_UP, RawMesh, transformed
 from blinkgl.scene.lights import MAX_LAMPS, lamp_of_gltf, make_light
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
-from blinkgl.scene.omissions import Omissions
 from blinkgl.scene.reading import reading
 from blinkgl.scene.rig import Rig
-from blinkgl.scene.shapes.deformer import Deformer
 from blinkgl.scene.surfaces.images import content_hash
-from blinkgl.scene.types import Light, Material, Part, PosePath, Scene, SceneObject
+from blinkgl.scene.types import Light, Part, PosePath, Scene, SceneObject
 from blinkgl.scene.worlds.explicit import motion_path
 from blinkgl.scene.worlds.pool import resolve
 from blinkgl.scene.worlds.sky import with_environment
-
-if TYPE_CHECKING:
-    pass
 
 CV_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])  # its own inverse
 _ANIMATION_STEP = 1 / 60  # s between the samples that a spline is laid through
@@ -109,82 +100,66 @@ def from_gltf(
     Raises AssetError (file), ConfigError (camera, animation or lights that are not there).
     """
     with reading("scene", str(path)):
-        own = lights_gain is not None
-        document = gltf.read(Path(path), max_faces=max_faces, max_texture=max_texture, lights=own)
-        return _from_document(
-            document,
-            camera,
-            t0_ns,
-            t1_ns,
-            camera_name,
-            camera_path,
-            intrinsics,
-            _animation(document, animation, Path(base)),
-            light,
-            lights_gain,
-            background,
-        )
+        document = gltf.read(Path(path), max_faces=max_faces, max_texture=max_texture, lights=lights_gain is not None)
+        playing = _animation(document, animation, Path(base))
+        if lights_gain is not None:
+            light = _with_lights(document, playing, t0_ns, t1_ns, light, lights_gain)
+        objects = _objects(document, playing, t0_ns, t1_ns)
+        if camera_path is None or intrinsics == "file":
+            index = _camera_node(document, camera_name)
+            if document.tree["cameras"][document.nodes[index].camera]["type"] == "orthographic":
+                document.omissions.add("an orthographic camera (drawn in perspective)")
+            if camera_path is None:
+                camera_path, _ = _motion(document, index, playing, t0_ns, t1_ns, CV_FROM_GL)
+            if intrinsics == "file":
+                camera = _gltf_intrinsics(document, index, camera)
+    rig, log = Rig.alone(camera, camera_path), tuple(dict.fromkeys(document.log))
+    return Scene(objects, rig, t0_ns, t1_ns, light, background, log, document.omissions.lines())
 
 
-def _from_document(
-    document: gltf.Document,
-    camera,
-    t0_ns,
-    t1_ns,
-    camera_name,
-    camera_path,
-    intrinsics,
-    animation,
-    light,
-    lights_gain,
-    background,
-) -> Scene:
-    if lights_gain is not None:
-        light = _with_lights(document, animation, t0_ns, t1_ns, light, lights_gain)
-    objects = []
+def _objects(document: gltf.Document, animation: Animation | None, t0_ns: int, t1_ns: int) -> tuple[SceneObject, ...]:
+    """An object for each node that shows a mesh, numbered from 1 on, no two of one name."""
+    made: list[SceneObject] = []
+    names: set[str] = set()
     for index, node in document.nodes.items():
         if node.mesh is None:
             continue
-        if animation is None:
-            pieces, world = rest_pieces(document, index)
-            if any(len(p.faces) for p in pieces):
-                place, baked = split_rigid(gltf.Z_UP @ world)
-                parts = _parts(pieces, baked, node.name, document.where, document.log)
-                objects.append((node.name, parts, StaticPath(place, t0_ns, t1_ns)))
-            continue
-        pieces = document.mesh_pieces(node.mesh, changing=True)
-        if not any(len(p.faces) for p in pieces):
-            continue
-        skinned = node.skin is not None and any(p.binding is not None for p in pieces)
-        if skinned or _beyond_a_path(animation, index):
-            motion, baked, on_path, turn = (
-                StaticPath(None, t0_ns, t1_ns),
-                gltf.Z_UP @ document.world(index),
-                False,
-                gltf.Z_UP,
-            )
-        else:
-            motion, baked = _motion(document, index, animation, t0_ns, t1_ns)
-            on_path, turn = True, np.eye(4)
-
-        deformer = None
-        if skinned or not on_path or any(p.targets is not None for p in pieces):
-            deformer = partial(animation.deformer, index, at_rest=baked, turn=turn, on_path=on_path)
-        parts = _parts(pieces, baked, node.name, document.where, document.log, deformer)
-        objects.append((node.name, parts, motion))
-    if not objects:
+        found = _object(document, index, animation, t0_ns, t1_ns)
+        if found is not None:
+            name = node.name if node.name not in names else f"{node.name}#{len(made)}"
+            names.add(name)
+            made.append(SceneObject(name, len(made) + 1, *found))
+    if not made:
         raise AssetError("the scene has no faces", where=document.where, accepted="a scene with a mesh")
-    if camera_path is None or intrinsics == "file":
-        index = _camera_node(document, camera_name)
-        if document.tree["cameras"][document.nodes[index].camera]["type"] == "orthographic":
-            document.omissions.add("an orthographic camera (drawn in perspective)")
-        if camera_path is None:
-            camera_path, _ = _motion(document, index, animation, t0_ns, t1_ns, CV_FROM_GL)
-        if intrinsics == "file":
-            camera = _gltf_intrinsics(document, index, camera)
-    return _scene(
-        objects, Rig.alone(camera, camera_path), t0_ns, t1_ns, light, background, document.log, document.omissions
-    )
+    return tuple(made)
+
+
+def _object(
+    document: gltf.Document, index: int, animation: Animation | None, t0_ns: int, t1_ns: int
+) -> tuple[tuple[Part, ...], PosePath] | None:
+    """(parts, path) of a node that shows a mesh; None: one without faces."""
+    node = document.nodes[index]
+    assert node.mesh is not None
+    if animation is None:
+        raws, world = meshes_at_rest(document, index)
+    else:
+        raws, world = document.raw_meshes(node.mesh), document.world(index)
+    if not any(len(raw.faces) for raw in raws):
+        return None
+    if animation is None:
+        place, baked = split_rigid(Z_UP @ world)
+        return _parts(raws, baked, node.name, document), StaticPath(place, t0_ns, t1_ns)
+    skinned = node.skin is not None and any(raw.binding is not None for raw in raws)
+    if skinned or _beyond_a_path(animation, index):
+        # The shape itself moves, in the scene's own axes.
+        baked = Z_UP @ world
+        deformer = partial(animation.deformer, index, at_rest=baked, turn=Z_UP)
+        return _parts(raws, baked, node.name, document, deformer), StaticPath(None, t0_ns, t1_ns)
+    path, baked = _motion(document, index, animation, t0_ns, t1_ns)
+    deformer = None
+    if any(raw.targets is not None for raw in raws):
+        deformer = partial(animation.deformer, index, at_rest=baked, turn=np.eye(4), on_path=True)
+    return _parts(raws, baked, node.name, document, deformer), path
 
 
 def unlit(scene: Scene) -> Scene:
@@ -211,47 +186,16 @@ def split_rigid(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return T, A
 
 
-def _scene(objects: Iterable, rig: Rig, t0_ns, t1_ns, light, background, log, omissions: Omissions) -> Scene:
-    made, names = [], set()
-    for k, (name, parts, path) in enumerate(objects):
-        name = name if name not in names else f"{name}#{k}"
-        names.add(name)
-        made.append(SceneObject(name, k + 1, parts, path))
-    return Scene(tuple(made), rig, t0_ns, t1_ns, light, background, tuple(dict.fromkeys(log)), omissions.lines())
-
-
 def _parts(
-    pieces: list[gltf.Piece],
-    baked: np.ndarray,
-    name: str,
-    where: str,
-    log: list[str],
-    deformer: Callable[[gltf.Piece, np.ndarray], Deformer | None] | None = None,
+    raws: list[RawMesh], baked: np.ndarray, name: str, document: gltf.Document, deformer: DeformerOf | None = None
 ) -> tuple[Part, ...]:
+    """Of one node. baked : (4, 4) what takes its meshes to the object's axes."""
     parts = []
-    for piece in (gltf.transformed(p, baked) for p in pieces if len(p.faces)):
-        source: list[np.ndarray] | None = [] if deformer is not None or has_own_vertices(piece) else None
-        textured = piece.material is not None and piece.material.texture is not None
-        mesh = make_mesh(
-            piece.vertices,
-            piece.faces,
-            normals=piece.normals,
-            uvs=piece.uvs,
-            name=name,
-            where=where,
-            source_hash=content_hash(piece.vertices.tobytes(), np.ascontiguousarray(piece.faces, np.int64).tobytes()),
-            project_degenerate=not textured,
-            log=log,
-            source=source,
-        )
-        if source is not None and has_own_vertices(piece):
-            mesh = with_own_vertices(mesh, piece, source)
-        if deformer is not None and source is not None:
-            mesh = replace(mesh, deformer=deformer(piece, source[0]))
-        parts.append(Part(mesh, piece.material or Material()))
-    if closed_together(tuple(p.mesh for p in parts)):
-        parts = [Part(replace(p.mesh, closed=True), p.material) for p in parts]
-    return tuple(parts)
+    for raw in (transformed(raw, baked) for raw in raws if len(raw.faces)):
+        digest = content_hash(raw.vertices.tobytes(), np.ascontiguousarray(raw.faces, np.int64).tobytes())
+        given = {"name": name, "where": document.where, "source_hash": digest, "log": document.log}
+        parts.append(part_of(raw, **given, deformer=deformer))
+    return closed_parts(parts)
 
 
 # ---- glTF
@@ -285,14 +229,14 @@ def _motion(
 ):
     """(PosePath of T_world_node @ local, matrix to bake into the node's vertices)."""
     mine = [] if animation is None else animation.tracks_of(node)
-    rest, baked = split_rigid(gltf.Z_UP @ document.world(node))
+    rest, baked = split_rigid(Z_UP @ document.world(node))
     if animation is None or not mine:
         return StaticPath(rest @ local, t0_ns, t1_ns), baked
     times = animation.sample_times([track.times for track in mine], t0_ns, t1_ns, _ANIMATION_STEP, _MAX_SAMPLES)
     place = document.places[node]
     poses, first = [], None
     for t in times:
-        T, A = split_rigid(gltf.Z_UP @ animation.skeleton.at(int(t))[0][place])
+        T, A = split_rigid(Z_UP @ animation.skeleton.at(int(t))[0][place])
         first = A if first is None else first
         poses.append(T @ local)
     if any(track.interpolation == "STEP" for track in mine):

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -163,7 +162,7 @@ def _bytes_of(loaded: Texture | Asset) -> int:
 
 
 def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_texture: int = 1024) -> Pool:
-    """Primitives, mesh folders and pybullet's URDF meshes. Loads :class:`~blinkgl.scene.importing.mesh_files.Asset`
+    """Primitives and mesh folders. Loads :class:`~blinkgl.scene.importing.mesh_files.Asset`
     objects that are centred on their bounding box and have bounding radius 1. Raises ConfigError for
     a folder that is missing or holds no mesh."""
     entries = []
@@ -173,9 +172,6 @@ def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_t
                 Entry(random_primitive_hash(kind, index), f"{kind}-{index}", "primitives", kind=kind, index=index)
             )
     folders = [(resolve(folder, base), f"{where}.folders.{i}", folder) for i, folder in enumerate(config.folders)]
-    urdfs = _random_urdfs(config.urdfs, f"{where}.urdfs")
-    if urdfs is not None:
-        folders.append((urdfs, f"{where}.urdfs", "pybullet random_urdfs"))
     limit = int(config.max_file_mb * 1e6)
     for folder, at, name in folders:
         entries += _folder_entries(folder, at, name, MESH_SUFFIXES, limit, "mesh", config.bad_assets)
@@ -292,22 +288,3 @@ def _listed(entries: Iterable[Entry]) -> tuple[Entry, ...]:
     for entry in entries:
         sources.setdefault(entry.source, {}).setdefault(entry.source_hash, entry)
     return tuple(entry for listed in sources.values() for _, entry in sorted(listed.items()))
-
-
-def _random_urdfs(setting, where: str) -> Path | None:
-    if setting is False:
-        return None
-    spec = find_spec("pybullet_data")
-    folder = (
-        Path(spec.submodule_search_locations[0]) / "random_urdfs" if spec and spec.submodule_search_locations else None
-    )
-    if folder is not None and folder.is_dir():
-        return folder
-    if setting is True:
-        raise ConfigError(
-            "pybullet's random_urdfs are not installed",
-            where=where,
-            value=True,
-            accepted="run 'pip install pybullet', or set it to auto or false",
-        )
-    return None

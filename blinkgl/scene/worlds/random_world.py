@@ -29,8 +29,9 @@ from blinkgl.scene.geometry.meshes import scale_mesh
 from blinkgl.scene.geometry.primitives import cuboid, grid
 from blinkgl.scene.importing.mesh_files import Asset
 from blinkgl.scene.lights import MAX_LAMPS, make_light, random_lamps
+from blinkgl.scene.motion.body_shapes import Barrier
 from blinkgl.scene.motion.collision import resolve_collisions
-from blinkgl.scene.motion.dynamics import Barrier, Exploded, simulate
+from blinkgl.scene.motion.dynamics import Exploded, simulate
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.motion.trajectories import FreeSpace, look_rotation, random_camera_path, random_path
 from blinkgl.scene.motion.ways import random_way

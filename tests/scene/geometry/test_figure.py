@@ -9,8 +9,7 @@ from blinkgl.errors import AssetError
 from blinkgl.scene.geometry.figure import ATLAS, CHARTS
 from blinkgl.scene.geometry.isosurface import isosurface
 from blinkgl.scene.geometry.living import figure, fish, flag
-from blinkgl.scene.geometry.meshes import closedness, normalise, transform_mesh, uvs_degenerate, weld
-from blinkgl.scene.geometry.random_primitives import random_primitive
+from blinkgl.scene.geometry.meshes import closedness, uvs_degenerate, weld
 from blinkgl.scene.shapes.gait import CLIPS, J
 
 MS = 1_000_000
@@ -55,18 +54,6 @@ def test_proportions_are_those_asked_for(keys):
     full = np.zeros((len(weights), 21))
     np.add.at(full, (np.arange(len(weights))[:, None], mesh.deformer.joints), weights)
     assert np.abs(full[mesh.faces] - full[np.roll(mesh.faces, 1, axis=1)]).sum(axis=2).max() < 1.2
-
-
-def test_parts_are_as_long_as_they_should():
-    plain, other = figure(), figure(legs=1.2, arms=0.8, build=1.3)
-    heights = [m.deformer.skeleton.at(0)[0] for m in (plain, other)]
-    knees = [T[14, 2, 3] for T in heights]
-    assert knees[1] > 1.05 * knees[0]  # of a body as high, most of whose height are legs
-    reach = [np.ptp(m.vertices[:, 1]) for m in (plain, other)]
-    assert reach[1] < reach[0]
-    assert volume(other.vertices, other.faces) > 1.15 * volume(plain.vertices, plain.faces)
-    # 75 kg or so
-    assert 0.05 < volume(plain.vertices, plain.faces) < 0.11
 
 
 def test_texture_coordinates_are_an_atlas_in_one_scale():
@@ -119,50 +106,6 @@ def test_a_part_of_the_body_lies_upright_in_its_chart(chart, joint, down, middle
     ahead = np.array(middle, float) - down * (down @ np.array(middle, float))
     front -= down * (down @ front)
     assert front @ ahead > 0.95 * np.linalg.norm(front) * np.linalg.norm(ahead) > 0
-
-
-@pytest.mark.parametrize(("build", "keys"), LIVING)
-def test_a_shape_made_larger_and_turned_is_the_larger_and_turned_shape(build, keys):
-    mesh, matrix = build(**keys), np.eye(4)
-    matrix[:3, :3] = 1.7 * np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
-    matrix[:3, 3] = [1, 2, 3]
-    moved = transform_mesh(mesh, matrix)
-    for t in (0, 333 * MS):
-        true = mesh.deformer.positions(mesh, t) @ matrix[:3, :3].T + matrix[:3, 3]
-        np.testing.assert_allclose(moved.deformer.positions(moved, t), true, atol=1e-7)
-        rate = mesh.deformer.velocity(mesh, t) @ matrix[:3, :3].T
-        np.testing.assert_allclose(moved.deformer.velocity(moved, t), rate, atol=1e-6)
-        n, m = mesh.deformer.normals(mesh, t) @ matrix[:3, :3].T, moved.deformer.normals(moved, t)
-        cosine = (n * m).sum(axis=1) / np.linalg.norm(n, axis=1) / np.linalg.norm(m, axis=1)
-        assert cosine.min() > 0.99999
-    assert moved.deformer.speed == pytest.approx(1.7 * mesh.deformer.speed)
-    assert moved.deformer.goes == mesh.deformer.goes
-    (unit,) = normalise((mesh,))
-    lengths = [np.linalg.norm(unit.deformer.positions(unit, t), axis=1).max() for t in range(0, 1000 * MS, 50 * MS)]
-    assert 0.9 < max(lengths) <= 1  # at no time does it leave the sphere that collisions know
-
-
-@pytest.mark.parametrize("kind", ["figure", "flag", "fish"])
-def test_variants_differ_and_are_always_the_same(kind):
-    first, second = random_primitive(kind, 0), random_primitive(kind, 1)
-    again = random_primitive(kind, 0)
-    np.testing.assert_array_equal(first.vertices, again.vertices)
-    t = 77 * MS
-    np.testing.assert_array_equal(first.deformer.positions(first, t), again.deformer.positions(again, t))
-    assert first.source_hash == again.source_hash != second.source_hash
-    moved = [mesh.deformer.positions(mesh, t) for mesh in (first, second)]
-    assert moved[0].shape != moved[1].shape or not np.allclose(*moved)
-
-
-def test_what_a_pool_draws_is_what_may_be_asked_for():
-    """Fish of some proportions were drawn that the builder refuses."""
-    assert all(random_primitive("fish", k).closed for k in range(64))
-    assert all(random_primitive("figure", k).deformer.span_ns > 0 for k in range(30))
-
-
-def test_all_clips_are_drawn_in_a_pool():
-    speeds = [random_primitive("figure", k).deformer.speed for k in range(6)]
-    assert sum(s > 0 for s in speeds) == 3 and sum(s == 0 for s in speeds) == 3
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.config.trajectory import CameraMotion, ObjectMotion
 from blinkgl.scene.motion.collision import resolve_collisions
-from blinkgl.scene.motion.paths import CutPath, KeyframePath, SplinePath, StaticPath
-from blinkgl.scene.motion.trajectories import FreeSpace, random_camera_path, random_path
+from blinkgl.scene.motion.paths import CutPath, KeyframePath, StaticPath
+from blinkgl.scene.motion.trajectories import FreeSpace
 from blinkgl.scene.types import Material, Mesh, Part, SceneObject
+from tests.scene.motion.starts import free_place, random_camera_path, random_path
 
 SECOND = 1_000_000_000
 FAR = StaticPath(np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1e4], [0, 0, 0, 1]]))  # a camera out of the way
@@ -88,7 +89,7 @@ def test_cube_flies_into_a_wall(speed, tolerance):
     tol = tolerance * math.sqrt(0.75)
     # Faces are 2 apart: stopped at a separation in [tol / 2, tol].
     assert (2 - tol) / speed - 2e-9 <= event.t_ns * 1e-9 <= (2 - tol / 2) / speed + 2e-9
-    assert tol / 2 * (1 - 1e-6) <= event.separation <= tol and event.cut == ("cube",) and event.kind == "contact"
+    assert tol / 2 * (1 - 1e-6) <= event.separation <= tol and event.cut == ("cube",)
 
 
 def test_a_turning_cube_touches_with_its_edge():
@@ -105,7 +106,7 @@ def test_the_camera_falls_onto_the_ground():
     # A parabola is a cubic: the not-a-knot spline through four points is the fall itself.
     g, h, r = 9.81, 2.0, 0.25
     s = np.linspace(0, 1, 4)
-    fall = SplinePath(
+    fall = KeyframePath(
         np.rint(s * SECOND).astype(np.int64),
         np.c_[0 * s, 0 * s, h - 0.5 * g * (np.rint(s * SECOND) * 1e-9) ** 2],
         Rotation.identity(4),
@@ -146,37 +147,13 @@ def test_head_on_both_stop_and_the_order_of_the_list_does_not_matter():
 # ---- no tunnelling ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("speed", [1e2, 1e4, 1e6])
-def test_a_bullet_does_not_jump_over_a_thin_plate(speed):
-    plate = body("plate", trimesh.creation.box((1e-4, 1, 1)), StaticPath())
-    bullet = body(
-        "bullet",
-        trimesh.creation.icosphere(1, radius=0.01),
-        line((-0.5 * speed, 0.1, 0), (speed, 0, 0), spin=(0, 0, 30)),
-    )
-    event = only(resolve([bullet, plate]))
-    assert event.t_ns * 1e-9 == pytest.approx(0.5, abs=0.02 / speed + 2e-9)
-
-
-def test_two_thin_fast_plates_crossing():
-    plate = trimesh.creation.box((1e-4, 1, 1))
-    a, b = body("a", plate, line((-300, 0, 0), (700, 0, 0))), body("b", plate, line((300, 0, 0), (-500, 0, 0)))
-    assert only(resolve([a, b])).t_ns * 1e-9 == pytest.approx(0.5, abs=1e-6)
-
-
-def test_a_fast_near_miss_is_a_miss():
-    plate = body("plate", trimesh.creation.box((1e-4, 1, 1)), StaticPath())
-    bullet = body("bullet", trimesh.creation.icosphere(1, radius=0.01), line((-500, 0.511, 0), (1000, 0, 0)))
-    assert not resolve([bullet, plate]).events
-
-
 def through_the_hole(offset):
     ring = body("ring", trimesh.creation.torus(1.0, 0.3, major_sections=48, minor_sections=24), StaticPath())
     return resolve([body("ball", trimesh.creation.icosphere(2, radius=0.4), line((offset, 0, -2), (0, 0, 4))), ring])
 
 
 def test_exact_triangles_let_a_ball_through_a_ring():
-    assert not through_the_hole(0.2).events and only(through_the_hole(0.4)).kind == "contact"
+    assert not through_the_hole(0.2).events and only(through_the_hole(0.4))
 
 
 # ---- later collisions see earlier cuts -------------------------------------------------------------------------------
@@ -210,7 +187,7 @@ def test_what_rests_on_the_ground_slides_lifts_off_and_sinks(support):
     assert not resolve([body("slides", BOX, rolled), base]).events
     assert not resolve([body("just above", BOX, line((0, 0, 0.5 + 1e-9), (1, 0, 0))), base]).events
     assert not resolve([body("lifts off", BOX, line((0, 0, 0.5), (0, 0, 2))), base]).events
-    hop = SplinePath([0, SECOND // 2, SECOND], [[0, 0, 0.5], [0, 0, 1], [0, 0, -2]], Rotation.identity(3))
+    hop = KeyframePath([0, SECOND // 2, SECOND], [[0, 0, 0.5], [0, 0, 1], [0, 0, -2]], Rotation.identity(3))
     for name, path in (
         ("sinks", line((0, 0, 0.5), (0, 0, -1))),
         ("hops and dives", hop),
@@ -234,41 +211,18 @@ def test_touching_ground_that_is_not_convex_or_another_body_at_the_start_is_repo
 
 
 def test_off_the_edge_of_the_ground_it_may_fall():
-    off = SplinePath([0, SECOND // 2, SECOND], [[0, 0, 0.5], [3, 0, 0.8], [4, 0, -3]], Rotation.identity(3))
+    off = KeyframePath([0, SECOND // 2, SECOND], [[0, 0, 0.5], [3, 0, 0.8], [4, 0, -3]], Rotation.identity(3))
     assert not resolve([body("cube", BOX, off), ground(size=1.5)]).events
 
 
-# ---- containment -----------------------------------------------------------------------------------------------------
-
-
-def test_a_body_inside_another_is_reported_at_the_start():
-    small, big = trimesh.creation.icosphere(1, radius=0.1), trimesh.creation.icosphere(2)
-    moving = line((0.2, 0, 0), (0.1, 0, 0))
-    for objects in (
-        [body("in", small, moving), body("out", big, StaticPath())],
-        [body("out", big, StaticPath()), body("in", small, moving)],
-    ):
-        event = only(resolve(objects))
-        assert (event.kind, event.first, event.second, event.t_ns, event.cut) == ("inside", "in", "out", 0, ("in",))
-    assert not resolve([body("in", small, moving), body("open", big, StaticPath(), closed=False)]).events
-    ring = trimesh.creation.torus(1.0, 0.3)
-    assert not resolve([body("in the hole", small, moving), body("ring", ring, StaticPath())]).events
-    parts = [trimesh.creation.icosphere(1, radius=0.1).apply_translation([5, 0, 0]), small]
-    assert only(resolve([body("two parts", parts, moving), body("out", big, StaticPath())])).kind == "inside"
-
-
-def test_the_camera_may_be_in_the_sky_but_in_no_object():
+def test_the_camera_may_be_in_the_sky():
     box = trimesh.creation.box((50, 50, 50))
-    camera = line((0, 0, 1), (1, 0, 0))
     for shape in (box, box.copy()):
         shape is box or shape.invert()
-        assert not resolve([body("sky", shape, StaticPath(), "sky")], camera).events
+        assert not resolve([body("sky", shape, StaticPath(), "sky")], line((0, 0, 1), (1, 0, 0))).events
     assert only(
         resolve([body("sky", box, StaticPath(), "sky")], line((0, 0, 0), (40, 0, 0)))
     ).t_ns * 1e-9 == pytest.approx(24.9 / 40, abs=1e-5)
-    for path in (camera, StaticPath()):  # standing still in there is as bad
-        event = only(resolve([body("cube", trimesh.creation.box((3, 3, 3)), StaticPath())], path))
-        assert event.kind == "inside" and event.first == "camera" and event.t_ns == 0
 
 
 # ---- random scenes against brute force -------------------------------------------------------------------------------
@@ -288,7 +242,7 @@ def random_scene(seed, count=7):
         shape.apply_scale(rng.uniform(0.25, 0.6))
         r = float(np.linalg.norm(shape.vertices, axis=1).max())
         start = at(rotvec=rng.normal(size=3))
-        start[:3, 3] = FreeSpace((-2, -2, 0), (2, 2, 2.5), 0.0, centres, radii).sample(rng, r)
+        start[:3, 3] = free_place(rng, FreeSpace((-2, -2, 0), (2, 2, 2.5), 0.0, centres, radii), r)
         path = random_path(
             rng,
             0,
@@ -359,27 +313,6 @@ def test_random_scenes_have_no_intersection_left_and_no_cut_without_reason(seed)
     assert again.events == result.events
 
 
-def test_the_order_of_objects_does_not_change_a_random_scene():
-    objects, camera = random_scene(11)
-    a, b = resolve(objects, camera, 0.15), resolve(objects[::-1], camera, 0.15)
-    assert len(a.events) == len(b.events) > 0
-    for x, y in zip(a.events, b.events):
-        assert {x.first, x.second} == {y.first, y.second} and abs(x.t_ns - y.t_ns) < 1_000_000
-
-
-def test_time_origin_does_not_matter():
-    late = 1_000_000 * SECOND
-    keys = np.array([[-2.0, 0, 0], [0, 0.1, 0], [2, 0, 0.1]]), Rotation.from_rotvec([[0, 0, 0], [1, 1, 0], [0, 2, 1]])
-    events = []
-    for start in (0, late):
-        path = SplinePath(np.array([0, SECOND // 2, SECOND]) + start, *keys)
-        result = resolve_collisions(
-            [body("a", BOX, path), body("b", BOX, StaticPath(at(1.5)))], FAR, 0.1, start, start + SECOND
-        )
-        events.append(only(result).t_ns - start)
-    assert events[0] == events[1]
-
-
 def test_wrong_parameters_are_programming_errors():
     for settings in (
         {"tolerance": 0},
@@ -393,12 +326,3 @@ def test_wrong_parameters_are_programming_errors():
             resolve([ground()], **settings)
     for settings in ({"tolerance": 0.1}, {"rest_margin": 0.1}, {"t1": 0}):
         assert resolve([ground()], **settings).events == ()
-
-
-def test_how_many_exact_distances_it_took_is_said():
-    """None for bodies whose bounding spheres never meet."""
-    assert resolve([body("a", plane(1.0), StaticPath())]).distance_queries == 0
-    assert (
-        resolve([ground(), body("ball", trimesh.creation.icosphere(), line([0, 0, 3], [0, 0, -4]))]).distance_queries
-        >= 1
-    )

@@ -13,7 +13,7 @@ from skinned import Swinging, arm
 
 from blinkgl.errors import AssetError
 from blinkgl.scene.geometry.meshes import transform_mesh
-from blinkgl.scene.shapes.clips import Blend, Clip, Playing, Track
+from blinkgl.scene.shapes.clips import Clip, Playing, Track
 from blinkgl.scene.shapes.skeleton import Locals, Skeleton, Still
 from blinkgl.scene.shapes.skin import Morphs, Skin, joined
 
@@ -81,16 +81,6 @@ def test_clips_loop_hold_and_run_backwards():
     assert Playing(2, 2).is_static and Playing(2, 5, 0).is_static
 
 
-def test_two_clips_at_once():
-    (_, first), (_, second) = keyed(), keyed("CUBICSPLINE")
-    for share, same in ((0.0, first), (1.0, second)):
-        a, b = (Skeleton([-1, 0, 1], motion).at(300 * MS) for motion in (Blend(first, second, share), same))
-        np.testing.assert_allclose(a, b, atol=1e-12)
-    between = Skeleton([-1, 0, 1], Blend(first, second, 0.4))
-    before, after = (between.at(300 * MS + dt)[0] for dt in (-1000, 1000))
-    np.testing.assert_allclose(between.at(300 * MS)[1], (after - before) / 2e-6, atol=1e-6)
-
-
 def test_a_skin_moves_as_its_rate_says():
     mesh = arm()
     for t in (0, 137 * MS, 812_345_678):
@@ -140,14 +130,6 @@ def test_skins_of_one_skeleton_can_be_one():
     np.testing.assert_allclose(both.positions(mesh, 300 * MS), np.vstack(parts), atol=1e-15)
     assert len(both.bones) == 3
     assert joined([one.deformer, arm().deformer]) is None  # another skeleton
-
-
-def test_no_more_joints_than_are_used_are_looked_at():
-    skin = Skin(
-        Skeleton([-1, 0], Swinging()), [0, 1], np.tile(np.eye(4), (2, 1, 1)), [[1, 0, 0, 0]] * 3, [[5, 0, 0, 0]] * 3
-    )
-    assert skin.sizes["SKIN_WEIGHTS"] == 1
-    np.testing.assert_array_equal(skin.weights, 1.0)
 
 
 BIND = np.tile(np.eye(4), (2, 1, 1))

@@ -14,7 +14,6 @@ from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.worlds.explicit import pose_matrix
 from tests.scene.gltf_files import GltfBuilder
-from tests.scene.motion.rates import body_rate
 
 CAMERA = CameraConfig(width=64, height=48)
 
@@ -88,16 +87,6 @@ def test_keyframes_are_met_and_ends_held(tmp_path):
         np.testing.assert_allclose(T[:3, 2], to_origin, atol=1e-9)
 
 
-def test_linear_interpolation(tmp_path):
-    frames = [
-        {"time": 0, "position": [0, 0, 0]},
-        {"time": 0.5, "position": [1, 0, 0]},
-        {"time": 1, "position": [1, 4, 0]},
-    ]
-    scene = build(tmp_path, objects=[{"mesh": "box", "keyframes": frames, "interpolation": "linear"}])
-    np.testing.assert_allclose(scene.objects[0].path.pose(750_000_000)[:3, 3], [1, 2, 0], atol=1e-12)
-
-
 CRASH = [
     {"mesh": "box", "name": "still", "position": [3, 0, 0]},
     {
@@ -116,16 +105,6 @@ def test_collisions_are_found_when_asked_for(tmp_path):
     stopped = build(tmp_path, objects=CRASH, collisions=True)
     assert stopped.objects[1].path.pose(10**9)[0, 3] == pytest.approx(2, abs=2e-3)
     assert ("moving" in stopped.log[0] and "t=0.4" in stopped.log[0]) or "t=0.5" in stopped.log[0]
-
-
-def test_the_camera_is_stopped_by_a_solid(tmp_path):
-    keys = [
-        {"time": 0, "position": [-3, 0, 0], "look_at": [5, 0, 0]},
-        {"time": 1, "position": [3, 0, 0], "look_at": [5, 0, 0]},
-    ]
-    scene = build(tmp_path, camera={"keyframes": keys, "interpolation": "linear"}, collisions=True)
-    end = scene.camera_path.pose(10**9)[0, 3]
-    assert -0.7 < end < -0.5, "in front of the cube's face at -0.5, by about the near distance"
 
 
 def test_overlapping_bodies_with_collisions_are_refused(tmp_path):
@@ -216,17 +195,6 @@ def test_a_turn_that_has_no_shortest_way_is_refused(tmp_path, before, after, ste
     with pytest.raises(ConfigError) as error:
         build(tmp_path, camera={"keyframes": keys})
     assert f"scene.camera: euler changes by {step} from key frame 1 to 2; it must be less than 180" in str(error.value)
-
-
-@pytest.mark.parametrize("interpolation", ["linear", "spline"])
-def test_a_turn_goes_as_far_as_is_said(tmp_path, interpolation):
-    """Two and a half turns in steps of 150 degrees: the integrated rate is 900 degrees."""
-    keys = [{"time": k / 6, "euler": [0, 0, 150 * k]} for k in range(7)]
-    path = build(tmp_path, objects=[{"mesh": "box", "keyframes": keys, "interpolation": interpolation}]).objects[0].path
-    rates = [
-        body_rate(path.pose(t), path.derivative(t))[2] for t in np.linspace(0, 1e9, 1000, endpoint=False).astype(int)
-    ]
-    assert np.degrees(np.mean(rates)) == pytest.approx(900, rel=1e-3)
 
 
 def test_a_file_keeps_its_own_materials_unless_told_otherwise(tmp_path):

@@ -127,16 +127,3 @@ def test_collisions_leave_what_falls_to_the_engine():
 def test_configurations_that_make_no_sense(changes, message):
     with pytest.raises(ConfigError, match=message):
         explicit(**changes)
-
-
-def test_the_sky_is_not_there_and_a_room_can_be_taken_out():
-    """The hull of a room is full; `kind: none` takes it out, and then the body falls on."""
-    pytest.importorskip("mujoco")
-    room = {"mesh": "box", "name": "room", "scale": 8, "position": [3, 0, 4]}
-    with pytest.raises(
-        ConfigError, match="at the start box is .* inside room, or inside its convex hull; .*kind: none"
-    ):
-        build_scene(explicit(objects=[*EXPLICIT["objects"], room]), CAMERA, 0, T1)
-    for way_out in ({"physics": {"kind": "none"}}, {"category": "sky"}):
-        scene = build_scene(explicit(objects=[*EXPLICIT["objects"], {**room, **way_out}]), CAMERA, 0, T1)
-        assert scene.objects[1].path.pose(T1)[2, 3] == pytest.approx(0.2, abs=0.02)

@@ -14,6 +14,7 @@ from blinkgl.config.scene import FileSceneConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.importing import gltf
+from blinkgl.scene.importing.raw_mesh import Z_UP, transformed
 from blinkgl.scene.worlds.from_file import from_gltf, split_rigid
 from tests.scene.gltf_files import GltfBuilder, triangle
 from tests.shared_data import shared
@@ -80,24 +81,13 @@ def test_the_hierarchy_is_composed_and_scale_is_baked(tmp_path):
     np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
 
 
-def test_mirroring_nodes_face_outwards(tmp_path):
-    builder = with_camera(GltfBuilder())
-    builder.node(mesh=builder.mesh(BOX.vertices, BOX.faces), scale=[-1, 1, 1])
-    mesh = load(tmp_path, builder).objects[0].parts[0].mesh
-    assert (
-        mesh.closed
-        and volume(mesh) == pytest.approx(6, rel=1e-6)
-        and ((mesh.normals * mesh.vertices).sum(axis=1) > 0).all()
-    )
-
-
 def test_the_camera_sees_what_gltf_says(tmp_path):
     """glTF: at (0, 0, 10) looking along -z, y up. A point to its right and up must be right and up in the image."""
     builder = with_camera(GltfBuilder(), translation=[0, 0, 10], scale=[2, 2, 2])
     builder.node(mesh=triangle(builder))
     scene = load(tmp_path, builder, intrinsics="file")
     T = scene.camera_path.pose(0)
-    X = np.linalg.inv(T) @ gltf.Z_UP @ [1, 2, 0, 1]
+    X = np.linalg.inv(T) @ Z_UP @ [1, 2, 0, 1]
     np.testing.assert_allclose(X[:3], [1, -2, 10], atol=1e-12)
     assert scene.camera.fy == pytest.approx(24 / math.tan(0.4)) and scene.camera.fx == scene.camera.fy
     assert (scene.camera.cx, scene.camera.cy, scene.camera.near) == (31.5, 23.5, 0.02)
@@ -137,44 +127,33 @@ def test_materials(tmp_path):
     # uv (0, 0) is the image's first pixel, top left, and v grows downwards: as in the file
     for part, expected in ((first, np.array(uvs)), (second, np.array(uvs) * [2, 4] + [0.25, 0.5])):
         order = np.lexsort(part.mesh.vertices.T)
-        want = np.lexsort(gltf.Z_UP[:3, :3] @ np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], float).T)
+        want = np.lexsort(Z_UP[:3, :3] @ np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], float).T)
         np.testing.assert_allclose(part.mesh.uvs[order], expected[want], atol=1e-6)
     assert third.material.texture is None and third.material.base_color == (1, 1, 1)
 
 
-def test_strips_fans_and_interleaved_buffers(tmp_path):
+def test_interleaved_buffers_and_what_is_no_triangle(tmp_path):
     builder = with_camera(GltfBuilder())
-    square = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], "f4")
-    rows = np.concatenate([square, np.tile(np.array([0, 0, 1], "f4"), (4, 1))], axis=1)
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "f4")
+    rows = np.concatenate([corners, np.tile(np.array([0, 0, 1], "f4"), (3, 1))], axis=1)
     view = builder.view(rows.tobytes())
     builder.tree["bufferViews"][view]["byteStride"] = 24
     for offset in (0, 12):
         builder.tree["accessors"].append(
-            {"bufferView": view, "byteOffset": offset, "componentType": 5126, "count": 4, "type": "VEC3"}
+            {"bufferView": view, "byteOffset": offset, "componentType": 5126, "count": 3, "type": "VEC3"}
         )
-    fan = builder.array(np.array([0, 1, 3, 2], "u1"), "SCALAR")
-    builder.tree["meshes"] = [
-        {
-            "primitives": [
-                {"attributes": {"POSITION": 0, "NORMAL": 1}, "mode": 5},
-                {"attributes": {"POSITION": 0, "NORMAL": 1}, "indices": fan, "mode": 6},
-            ]
-        },
-        {"primitives": [{"attributes": {"POSITION": 0}, "mode": 1}, {"attributes": {"POSITION": 0}, "mode": 5}]},
-    ]
+    primitives = [{"attributes": {"POSITION": 0, "NORMAL": 1}}, {"attributes": {"POSITION": 0}, "mode": 1}]
+    builder.tree["meshes"] = [{"primitives": primitives}]
     builder.node(mesh=0)
-    builder.node(mesh=1)
     scene = load(tmp_path, builder)
-    for part in scene.objects[0].parts:
-        v = part.mesh.vertices[part.mesh.faces]
-        cross = np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0])
-        assert len(cross) == 2 and np.linalg.norm(cross, axis=1).sum() / 2 == pytest.approx(1)
-        assert (part.mesh.normals[part.mesh.faces].mean(axis=1) * cross).sum(
-            axis=1
-        ).min() > 0  # both wound the same way
-    assert len(scene.objects[1].parts) == 1 and scene.omissions == (
-        "scene.glb asks for what is not drawn: points and lines",
-    )
+    (part,) = scene.objects[0].parts
+    v = part.mesh.vertices[part.mesh.faces]
+    cross = np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0])
+    np.testing.assert_allclose(part.mesh.normals[part.mesh.faces].mean(axis=1), cross, atol=1e-6)
+    assert scene.omissions == ("scene.glb asks for what is not drawn: points and lines",)
+    primitives[1]["mode"] = 5
+    with pytest.raises(AssetError, match="strips or fans of triangles .got 'mode 5'.; expected mode 4"):
+        load(tmp_path, builder)
 
 
 def animated(interpolation="LINEAR", scale=False):
@@ -219,11 +198,11 @@ def test_animation_moves_children_along(tmp_path, interpolation):
     (moon,) = load(tmp_path, animated(interpolation)).objects
     w = math.radians(120)
     for t in (0.0, 0.2, 0.37, 0.5, 0.81, 1.0):
-        expected = gltf.Z_UP[:3, :3] @ [2 * math.cos(w * t), 2 * t, -2 * math.sin(w * t)]
+        expected = Z_UP[:3, :3] @ [2 * math.cos(w * t), 2 * t, -2 * math.sin(w * t)]
         np.testing.assert_allclose(moon.path.pose(round(t * 1e9))[:3, 3], expected, atol=1e-5)
     D = moon.path.derivative(370_000_000)[:3, 3]
     np.testing.assert_allclose(
-        D, gltf.Z_UP[:3, :3] @ [-2 * w * math.sin(w * 0.37), 2, -2 * w * math.cos(w * 0.37)], atol=1e-3
+        D, Z_UP[:3, :3] @ [-2 * w * math.sin(w * 0.37), 2, -2 * w * math.cos(w * 0.37)], atol=1e-3
     )
 
 
@@ -274,7 +253,7 @@ def test_a_mirrored_node_faces_and_shines_outwards(tmp_path, flip):
     )
     document = gltf.read(tmp_path / "scene.glb")
     ((node, mesh),) = [(i, n.mesh) for i, n in document.nodes.items() if n.mesh is not None]
-    (piece,) = (gltf.transformed(p, document.world(node)) for p in document.mesh_pieces(mesh))
+    (piece,) = (transformed(p, document.world(node)) for p in document.raw_meshes(mesh))
     assert (piece.normals * piece.vertices).sum(axis=1).min() > 0
     corners = piece.vertices[piece.faces]  # before make_mesh, which would mend a closed body
     assert (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) * corners.mean(axis=1)).sum(
@@ -452,12 +431,12 @@ def test_our_reader_agrees_with_trimesh_on_real_files():
         theirs = trimesh.load_scene(path, process=False)
         document = gltf.read(path)
         meshes = [(i, n.mesh) for i, n in document.nodes.items() if n.mesh is not None]
-        mine = [gltf.transformed(p, gltf.Z_UP @ document.world(i)) for i, m in meshes for p in document.mesh_pieces(m)]
+        mine = [transformed(p, Z_UP @ document.world(i)) for i, m in meshes for p in document.raw_meshes(m)]
         corners = []
         for name in theirs.graph.nodes_geometry:
             matrix, geometry = theirs.graph[name]
             g = theirs.geometry[geometry]
-            matrix = gltf.Z_UP @ matrix
+            matrix = Z_UP @ matrix
             corners.append(
                 np.hstack(
                     [

@@ -10,7 +10,6 @@ import blinkgl
 from blinkgl import ConfigError
 from blinkgl.config.problems import validate
 from blinkgl.config.scene import ExplicitSceneConfig
-from blinkgl.dataset.plan import _hash_scene_files
 from blinkgl.errors import BlinkGLError
 from blinkgl.scene.build import build_scene, check_assets
 
@@ -69,12 +68,6 @@ def test_maps_are_what_the_files_hold(folder):
 def test_a_mask_is_the_opacity_of_a_picture_that_has_one(folder):
     np.testing.assert_array_equal(material_of(folder, mask="opacity.png").mask.alpha, HOLES)
     assert material_of(folder, mask="normal_map.png", cutoff=0.3).mask is None  # all of it is there
-
-
-def test_every_map_is_among_the_files_that_workers_compare(folder):
-    hashes: dict = {}
-    _hash_scene_files(config(**{key: f"{key}.png" for key in MAPS}, emission=[1, 1, 1]), folder, hashes)
-    assert set(hashes) == {f"{key}.png" for key in MAPS}
 
 
 @pytest.mark.parametrize(

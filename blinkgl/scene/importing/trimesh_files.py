@@ -1,4 +1,4 @@
-"""obj, ply and stl files as pieces of raw triangles."""
+"""obj, ply and stl files as raw meshes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ import trimesh
 from PIL import Image
 
 from blinkgl.errors import AssetError
-from blinkgl.scene.importing import gltf
+from blinkgl.scene.importing.gltf_file import inside
+from blinkgl.scene.importing.raw_mesh import RawMesh
 from blinkgl.scene.omissions import Omissions
 from blinkgl.scene.reading import contents
 from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash, decode_image
@@ -25,9 +26,9 @@ from blinkgl.srgb import linear_from_srgb
 logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # its warnings say nothing a user could act on
 
 
-def read_pieces(
+def read_meshes(
     path: Path, data: bytes, kind: str, max_faces: int, max_texture: int | None, omissions: Omissions
-) -> list[gltf.Piece]:
+) -> list[RawMesh]:
     """Of a file of this ``kind`` ("obj", "ply", "stl").
 
     max_texture : None leaves materials out.   omissions : is told what the file asks for and is not drawn. Raises
@@ -47,19 +48,21 @@ def read_pieces(
         )
     if max_texture is not None and resolver.refused is not None:
         raise resolver.refused
-    pieces = [
-        _piece(g, max_texture, omissions, resolver) for g in loaded.geometry.values() if isinstance(g, trimesh.Trimesh)
+    raws = [
+        _raw_mesh(g, max_texture, omissions, resolver)
+        for g in loaded.geometry.values()
+        if isinstance(g, trimesh.Trimesh)
     ]
-    if not pieces:
+    if not raws:
         raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
     if any(not isinstance(g, trimesh.Trimesh) for g in loaded.geometry.values()):
         omissions.add("points and lines")
-    return pieces
+    return raws
 
 
-def _piece(
+def _raw_mesh(
     mesh: trimesh.Trimesh, max_texture: int | None, omissions: Omissions, resolver: FolderResolver
-) -> gltf.Piece:
+) -> RawMesh:
     """Return raw triangles and material. max_texture : None leaves the material out."""
     # mesh.vertex_normals would make up what the file does not have.
     normals = mesh._cache.cache.get("vertex_normals")  # noqa: SLF001
@@ -77,9 +80,15 @@ def _piece(
                 colours = None
             elif material is not None:
                 material = replace(material, base_color=(1.0, 1.0, 1.0))
-    return gltf.Piece(
+    return RawMesh(
         np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces), normals, uvs, material, colours=colours
     )
+
+
+def _to_linear(srgb: np.ndarray) -> tuple[float, float, float]:
+    """Linear light of an sRGB colour (3,), what lies outside 0 to 1 cut off."""
+    r, g, b = (float(c) for c in linear_from_srgb(np.clip(srgb, 0, 1)))
+    return r, g, b
 
 
 def _material(visual, max_texture: int, omissions: Omissions, resolver: FolderResolver) -> Material | None:
@@ -91,13 +100,13 @@ def _material(visual, max_texture: int, omissions: Omissions, resolver: FolderRe
         colours = visual.face_colors if kind == "face" else visual.vertex_colors
         if kind == "face" and not (colours == colours[0]).all():
             omissions.add(f"{kind} colours (drawn in the most frequent one)")
-        return Material(base_color=gltf.to_linear(np.asarray(visual.main_color, float)[:3] / 255))
+        return Material(base_color=_to_linear(np.asarray(visual.main_color, float)[:3] / 255))
     image, diffuse = material.image, material.diffuse
     # An untouched default is no material; a texture is not darkened by the usual grey diffuse default.
     if image is None and material.name is None and np.array_equal(diffuse[:3], trimesh.visual.color.DEFAULT_COLOR[:3]):
         return None
     if image is None:
-        return Material(base_color=gltf.to_linear(np.asarray(diffuse, float)[:3] / 255))
+        return Material(base_color=_to_linear(np.asarray(diffuse, float)[:3] / 255))
     return Material(texture=resolver.texture(image, max_texture))
 
 
@@ -118,9 +127,9 @@ class FolderResolver(trimesh.resolvers.Resolver):
 
     def get(self, name: str) -> bytes:
         try:
-            file = gltf.inside(self.folder, str(name), self.where)
+            file = inside(self.folder, str(name), self.where)
             data = contents(file, "file")
-        except AssetError as error:  # trimesh swallows it; read_pieces raises it
+        except AssetError as error:  # trimesh swallows it; read_meshes raises it
             if "missing" in error.problem:
                 self.omissions.add(f"'{name}', which is missing")
             else:
@@ -165,7 +174,7 @@ class FolderResolver(trimesh.resolvers.Resolver):
         raise AssetError("a mesh loader wanted to write", where=self.where, value=name)
 
     def namespaced(self, namespace: str) -> FolderResolver:
-        return FolderResolver(gltf.inside(self.folder, namespace, self.where), self.where, self.kind, self.omissions)
+        return FolderResolver(inside(self.folder, namespace, self.where), self.where, self.kind, self.omissions)
 
     def keys(self) -> list[str]:
         return [p.name for p in self.folder.iterdir() if p.suffix.lower() in (".mtl", *IMAGE_SUFFIXES)]

@@ -1,0 +1,356 @@
+"""Rays that are cast at a scene in float64, the surface points that they hit, and how those move.
+
+One ray goes through each pixel centre (or any other image point); it hits the nearest triangle, and everything else
+follows from the object-local point of the hit. A mesh that deforms is a mesh of its own at each time: its vertices are
+moved in float64, and rays are cast at them there.
+
+Flow and its rounding
+---------------------
+With ``M(t) = inv(T_world_cam(t)) @ T_world_obj(t)``, the point p is at ``M p`` in camera coordinates, and
+``X1 = X0 + (M1 - M0) p``. For a pin-hole camera ``X0 = Z0 (rx, ry, 1)`` with ``rx = (x - cx) / fx`` exact, so
+
+    flow_x = fx (dX - rx dZ) / Z1,    (dX, dY, dZ) = (M1 - M0) p,    Z1 = Z0 + dZ,
+
+without subtracting two projections (:meth:`blinkgl.camera.CameraModel.displacement`). ``M1 - M0`` is formed from the
+differences of the poses, so a pose that does not change contributes exactly nothing. The point q of a
+shape that changes moves by ``M1 (q1 - q0) + (M1 - M0) q0``. What is left is about 1e-15 of the
+flow, plus the resolution of the poses themselves: a translation of size 1e6 units is stored
+to 1e-10 units, i.e. fx * 1e-10 / Z px.
+
+Back faces: a closed mesh whose material is not double-sided is not hit from behind; any other is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from blinkgl.camera import CameraModel
+from blinkgl.render.raycast import Forest, Holes, build_tree, join_trees, nearest_tree
+from blinkgl.scene.types import Mesh, Part, Scene, SceneObject
+
+# A visibility ray ends this much (relative) before the point it aims at, so that the point does not hide itself:
+# far above the rounding of a hit (1e-15), far below any separation of two surfaces that a picture could show.
+VISIBILITY_SLACK = 1e-9
+
+KEPT = 4
+"""Times whose shapes are kept, of a scene that deforms."""
+_trees: WeakKeyDictionary = WeakKeyDictionary()
+_shapes: WeakKeyDictionary = WeakKeyDictionary()
+_forests: WeakKeyDictionary = WeakKeyDictionary()
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """The surface points seen at N image points at one time.
+
+    xy : (N, 2) px.   t_ns : the time.   hit : (N,) bool.
+    depth : (N,) Z along the optical axis in world units, inf where nothing is hit.
+    instance : (N,) int32 ``instance_id``, 0 where nothing is hit.
+    part : (N,) int32 index into :func:`scene_parts`, -1 where nothing is hit.   triangle : (N,) int32 index into
+    ``mesh.faces``.   front : (N,) bool seen from the front.   bary : (N, 3) weights of the triangle's corners.
+    local : (N, 3) object-local position at ``t_ns`` (float64, nan where nothing is hit).
+    """
+
+    xy: np.ndarray
+    t_ns: int
+    hit: np.ndarray
+    depth: np.ndarray
+    instance: np.ndarray
+    part: np.ndarray
+    triangle: np.ndarray
+    front: np.ndarray
+    bary: np.ndarray
+    local: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Flow:
+    """Where the points of some :class:`Hits` are at t_ns (t').
+
+    flow : (..., 2) px, +x right, +y down, t -> t'; nan where not valid.
+    valid : hit, and in front of the camera at t' (Z' > 0), where its model sees it.
+    occluded : valid, but not visible at t': hidden by a surface, seen from its own culled side, outside the image or in
+    front of the near plane.   outside : valid, and not inside the image at t'.
+    depth : (...) Z' at t'.   hidden_by : (..., 2) int32 (part, triangle) of the nearest thing in the way, or -1.
+    """
+
+    t_ns: int
+    flow: np.ndarray
+    valid: np.ndarray
+    occluded: np.ndarray
+    outside: np.ndarray
+    depth: np.ndarray
+    hidden_by: np.ndarray
+
+
+def scene_parts(scene: Scene) -> list[tuple[SceneObject, Part]]:
+    """Every part with its object, in the order that part indices count."""
+    return [(thing, part) for thing in scene.objects for part in thing.parts]
+
+
+def pixel_grid(camera: CameraModel) -> np.ndarray:
+    """(H * W, 2) float64 pixel centres, row by row."""
+    y, x = np.mgrid[0 : camera.height, 0 : camera.width]
+    return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
+
+
+def cast(scene: Scene, t_ns: int, xy: np.ndarray | None = None) -> Hits:
+    """The nearest hit behind each image point.
+
+    xy : (N, 2) image points in px, not necessarily inside the image; every pixel centre when left out."""
+    xy = pixel_grid(scene.camera) if xy is None else np.atleast_2d(np.asarray(xy, np.float64))
+    hit, bary, depth = nearest(scene, t_ns, rays_of(scene.camera, xy)[:, :2])
+    parts = scene_parts(scene)
+    # A part's number -1 (nothing hit) indexes the added 0 at the end.
+    found = hit[:, 0] >= 0
+    ids = np.array([thing.instance_id for thing, _ in parts] + [0], np.int32)
+    local = np.full((len(xy), 3), np.nan)
+    for p, rows in by_part(hit[:, 0]):
+        mesh = parts[p][1].mesh
+        corners = vertices_at(mesh, t_ns)[mesh.faces[hit[rows, 1]]]
+        local[rows] = np.einsum("nc,nck->nk", bary[rows], corners)
+    return Hits(xy, int(t_ns), found, depth, ids[hit[:, 0]], hit[:, 0], hit[:, 1], hit[:, 2] == 1, bary, local)
+
+
+def rays_of(camera: CameraModel, xy: np.ndarray) -> np.ndarray:
+    """Return (N, 3) rays of length 1 along the optical axis; nan for a pixel without a ray that points forward."""
+    rays = camera.rays(xy)
+    # nan marks a pixel that has no ray with Z > 0.
+    return rays / np.where(rays[:, 2:] > 0, rays[:, 2:], np.nan)
+
+
+def vertices_at(mesh: Mesh, t_ns: int) -> np.ndarray:
+    """(V, 3) float64 object-local positions at a time; those of the last few are kept. Not to be written to."""
+    if mesh.deformer is None:
+        return np.asarray(mesh.vertices, np.float64)
+    kept = _shapes.setdefault(mesh, {})
+    if t_ns not in kept:
+        kept[t_ns] = mesh.deformer.positions(mesh, t_ns)
+        # The oldest shape goes; dictionaries keep the order of insertion.
+        while len(kept) > KEPT:
+            kept.pop(next(iter(kept)))
+    return kept[t_ns]
+
+
+def _forest(scene: Scene, t_ns: int) -> Forest:
+    kept = _forests.setdefault(scene, {})
+    # One forest for all times, unless some shape changes.
+    key = t_ns if any(thing.deforms for thing in scene.objects) else None
+    if key not in kept:
+        parts = scene_parts(scene)
+        trees = []
+        for _, part in parts:
+            if part.mesh.deformer is not None:
+                trees.append(build_tree(vertices_at(part.mesh, t_ns), part.mesh.faces))
+                continue
+            if part.mesh not in _trees:
+                _trees[part.mesh] = build_tree(part.mesh.vertices, part.mesh.faces)
+            trees.append(_trees[part.mesh])
+        kept[key] = join_trees(trees, [part.culled for _, part in parts], [_holes_of(part) for _, part in parts])
+        while len(kept) > KEPT:
+            kept.pop(next(iter(kept)))
+    return kept[key]
+
+
+def _holes_of(part: Part) -> Holes | None:
+    """Return a part's holes as the ray caster takes them."""
+    mask, mesh = part.material.mask, part.mesh
+    if mask is None:
+        return None
+    # The same scale as in the shader's texture coordinates.
+    uvs = mesh.uvs[mesh.faces].astype(np.float64) * np.asarray(part.material.uv_scale)
+    return Holes(uvs, mask.alpha.astype(np.float32) / np.float32(255), mask.threshold, part.material.wrap)
+
+
+def nearest(scene, t_ns, rays, far=None, skip=None, eye=None, near=None, any_will_do=False):
+    """Return (hit (N, 3) int32, bary (N, 3), depth (N,)) as described at :func:`raycast.nearest_tree`. eye, near :
+    of other rays than the camera's: (4, 4) pose where they come from, Z at which they begin.   any_will_do : as
+    there."""
+    forest = _forest(scene, int(t_ns))
+    camera_pose = scene.camera_path.pose(t_ns) if eye is None else eye
+    # relative to the camera by differences of positions, so that a common offset from the origin cancels first
+    relative = [_relative_pose(camera_pose, thing.path.pose(t_ns)) for thing, _ in scene_parts(scene)]
+    axes = np.array([m[:3, :3].T for m in relative]).reshape(-1, 3, 3)
+    origins = np.array([-m[:3, :3].T @ m[:3, 3] for m in relative]).reshape(-1, 3)
+    n = len(rays)
+    far = np.full(n, np.inf) if far is None else far
+    skip = np.full((n, 2), -1, np.int32) if skip is None else skip
+    hit, bary, depth = np.empty((n, 3), np.int32), np.zeros((n, 3)), np.empty(n)
+    nearest_tree(
+        forest,
+        origins,
+        np.ascontiguousarray(axes),
+        np.ascontiguousarray(rays),
+        float(scene.camera.near if near is None else near),
+        far,
+        skip,
+        hit,
+        bary,
+        depth,
+        any_will_do,
+    )
+    return hit, bary, depth
+
+
+def by_part(part: np.ndarray):
+    """Return (p, indices of the points on part p) for every part that was hit."""
+    return [(int(p), np.flatnonzero(part == p)) for p in np.unique(part) if p >= 0]
+
+
+def _relative_pose(camera: np.ndarray, body: np.ndarray) -> np.ndarray:
+    """Return the (4, 4) inv(camera) @ body of rigid poses."""
+    m = np.eye(4)
+    m[:3, :3] = camera[:3, :3].T @ body[:3, :3]
+    m[:3, 3] = camera[:3, :3].T @ (body[:3, 3] - camera[:3, 3])
+    return m
+
+
+def _relative_change(scene: Scene, thing: SceneObject, t0_ns: int, t1_ns: int) -> np.ndarray:
+    """Return (3, 4) M(t1) - M(t0) with M the pose in the camera's frame, from the differences of the poses."""
+    c0, c1 = scene.camera_path.pose(t0_ns), scene.camera_path.pose(t1_ns)
+    b0, b1 = thing.path.pose(t0_ns), thing.path.pose(t1_ns)
+    # M1 - M0 = C1^T (B1 - B0) + (C1 - C0)^T B0, and likewise for the translation: differences only.
+    turn = (c1[:3, :3] - c0[:3, :3]).T
+    shift = (b1[:3, 3] - b0[:3, 3]) - (c1[:3, 3] - c0[:3, 3])
+    change = np.empty((3, 4))
+    change[:, :3] = c1[:3, :3].T @ (b1[:3, :3] - b0[:3, :3]) + turn @ b0[:3, :3]
+    change[:, 3] = c1[:3, :3].T @ shift + turn @ (b0[:3, 3] - c0[:3, 3])
+    return change
+
+
+def _relative_rate(scene: Scene, thing: SceneObject, t_ns: int) -> np.ndarray:
+    """Return (3, 4) dM/dt in 1/s: the analytic twist of the body as the moving camera sees it."""
+    c, dc = scene.camera_path.pose(t_ns), scene.camera_path.derivative(t_ns)
+    b, db = thing.path.pose(t_ns), thing.path.derivative(t_ns)
+    rate = np.empty((3, 4))
+    # The product rule on C^T B and on C^T (b - c).
+    rate[:, :3] = dc[:3, :3].T @ b[:3, :3] + c[:3, :3].T @ db[:3, :3]
+    rate[:, 3] = dc[:3, :3].T @ (b[:3, 3] - c[:3, 3]) + c[:3, :3].T @ (db[:3, 3] - dc[:3, 3])
+    return rate
+
+
+def applied(scene: Scene, hits: Hits, matrix_of: Callable[[SceneObject], np.ndarray]) -> np.ndarray:
+    """(N, 3) matrix_of(object) (3, 4) applied to every object-local point; nan where nothing is hit."""
+    parts, out = scene_parts(scene), np.full((len(hits.hit), 3), np.nan)
+    for p, rows in by_part(hits.part):
+        m = matrix_of(parts[p][0])
+        out[rows] = hits.local[rows] @ m[:3, :3].T + m[:3, 3]
+    return out
+
+
+def _add_of_shapes(scene: Scene, hits: Hits, out: np.ndarray, t_ns: int, vectors_of) -> None:
+    """Adds to ``out`` (N, 3) what the shape itself does, on parts that deform: vectors_of(mesh) (V, 3) at the hit
+    point, from the object's axes to the camera's at t_ns."""
+    for p, rows in by_part(hits.part):
+        thing, part = scene_parts(scene)[p]
+        if part.mesh.deformer is not None:
+            corners = vectors_of(part.mesh)[part.mesh.faces[hits.triangle[rows]]]
+            moved = np.einsum("nc,nck->nk", hits.bary[rows], corners)
+            out[rows] += moved @ relative_pose_at(scene, thing, t_ns)[:3, :3].T
+
+
+def local_at(scene: Scene, hits: Hits, t_ns: int) -> np.ndarray:
+    """(N, 3) object-local positions of the hit points at another time."""
+    out = hits.local
+    for p, rows in by_part(hits.part):
+        mesh = scene_parts(scene)[p][1].mesh
+        if mesh.deformer is not None:
+            out = out.copy() if out is hits.local else out
+            out[rows] = np.einsum(
+                "nc,nck->nk", hits.bary[rows], vertices_at(mesh, t_ns)[mesh.faces[hits.triangle[rows]]]
+            )
+    return out
+
+
+def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
+    """Displacement of every hit point from ``hits.t_ns`` to t_ns, and whether it is seen there."""
+    camera = scene.camera
+    change = applied(scene, hits, lambda thing: _relative_change(scene, thing, hits.t_ns, t_ns))
+    _add_of_shapes(scene, hits, change, t_ns, lambda mesh: vertices_at(mesh, t_ns) - vertices_at(mesh, hits.t_ns))
+    depth = hits.depth + change[:, 2]
+    valid = hits.hit & (depth > 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # fx (dX - rx dZ) / Z1 and likewise in y, as the module's docstring derives it.
+        flow = np.where(valid[:, None], camera.displacement(rays_of(camera, hits.xy), hits.depth, change), np.nan)
+        # A lens may not see the point at its new place.
+        valid &= np.isfinite(flow).all(axis=1)
+        there = hits.xy + flow
+        inside = valid & ((there >= -0.5) & (there < [camera.width - 0.5, camera.height - 0.5])).all(axis=1)
+
+    # the ray aims at the moved point itself: through there = xy + flow it would carry that sum's rounding
+    there_hits = replace(hits, local=local_at(scene, hits, t_ns))
+    moved = applied(scene, there_hits, lambda thing: relative_pose_at(scene, thing, t_ns))
+    seen, hidden_by = is_seen(scene, hits, t_ns, moved, inside & (depth >= camera.near))
+    occluded = valid & ~seen
+    return Flow(int(t_ns), flow, valid, occluded, valid & ~inside, depth, hidden_by)
+
+
+def moved_in_space(scene: Scene, hits: Hits, t_ns: int) -> np.ndarray:
+    """(N, 3) how far every hit point moves in the world from ``hits.t_ns`` to t_ns, in the camera's axes at
+    ``hits.t_ns``; nan where nothing is hit."""
+    # The shape's own change, and the pose's.
+    own = replace(hits, local=local_at(scene, hits, t_ns) - hits.local)
+    carried = applied(scene, hits, lambda thing: (thing.path.pose(t_ns) - thing.path.pose(hits.t_ns))[:3])
+    changed = applied(scene, own, lambda thing: np.c_[thing.path.pose(t_ns)[:3, :3], np.zeros(3)])
+    return (carried + changed) @ scene.camera_path.pose(hits.t_ns)[:3, :3]
+
+
+def is_seen(
+    scene: Scene, hits: Hits, t_ns: int, moved: np.ndarray, candidate: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) bool: which of the points of ``hits`` are seen at t_ns, and (N, 2) int32 (part, triangle) of the nearest
+    thing in the way, or -1.
+
+    moved : (N, 3) where they are then, camera axes.   candidate : (N,) bool, those in the image and behind the near
+    plane; the others are not seen."""
+    candidate = candidate & _faces_camera(scene, hits, t_ns, candidate)
+    hidden_by = np.full((len(hits.hit), 2), -1, np.int32)
+    rows = np.flatnonzero(candidate)
+    skip = np.ascontiguousarray(np.stack([hits.part[rows], hits.triangle[rows]], axis=1))
+    # The ray stops a little before the point, so that its own surface does not hide it.
+    far = moved[rows, 2] * (1.0 - VISIBILITY_SLACK)
+    blocker, _, _ = nearest(scene, t_ns, moved[rows, :2] / moved[rows, 2:], far=far, skip=skip)
+    hidden_by[rows] = blocker[:, :2]
+    return candidate & (hidden_by[:, 0] < 0), hidden_by
+
+
+def is_hidden(scene: Scene, t_ns: int, xy: np.ndarray, depth: np.ndarray, slack: float) -> np.ndarray:
+    """(N,) bool: something is in front of points that are at (N, 2) ``xy`` px and (N,) ``depth`` at t_ns.
+
+    slack : what is nearer by less than this part of the depth counts as the point's own surface."""
+    far = depth * (1.0 - slack)
+    hit, _, _ = nearest(scene, t_ns, rays_of(scene.camera, xy)[:, :2], far=far, any_will_do=True)
+    return hit[:, 0] >= 0
+
+
+def velocity(scene: Scene, hits: Hits) -> np.ndarray:
+    """(N, 2) px/s image velocity of every hit point at ``hits.t_ns``, from the analytic twists."""
+    rate = applied(scene, hits, lambda thing: _relative_rate(scene, thing, hits.t_ns))
+    _add_of_shapes(scene, hits, rate, hits.t_ns, lambda mesh: mesh.deformer.velocity(mesh, hits.t_ns))
+    with np.errstate(invalid="ignore"):
+        points = rays_of(scene.camera, hits.xy) * hits.depth[:, None]
+        return np.einsum("nij,nj->ni", scene.camera.jacobian(points), rate)
+
+
+def relative_pose_at(scene: Scene, thing: SceneObject, t_ns: int) -> np.ndarray:
+    """(4, 4) T_cam_obj at t_ns."""
+    return _relative_pose(scene.camera_path.pose(t_ns), thing.path.pose(t_ns))
+
+
+def _faces_camera(scene: Scene, hits: Hits, t_ns: int, rows: np.ndarray) -> np.ndarray:
+    """Return (N,) bool: the triangle of each hit is drawn from where the camera is at t_ns (False only for culled
+    ones)."""
+    shown = np.ones(len(rows), bool)
+    for p, (thing, part) in enumerate(scene_parts(scene)):
+        on = np.flatnonzero(rows & (hits.part == p))
+        if len(on) and part.culled:
+            m = relative_pose_at(scene, thing, t_ns)
+            eye = -m[:3, :3].T @ m[:3, 3]
+            a, b, c = np.moveaxis(vertices_at(part.mesh, t_ns)[part.mesh.faces[hits.triangle[on]]], 1, 0)
+            # The eye is on the outer side of the triangle's plane.
+            shown[on] = (np.cross(b - a, c - a) * (eye - a)).sum(axis=1) > 0.0
+    return shown

@@ -1,0 +1,231 @@
+"""What of a scene is drawn: its parts in the order of their layers, and what of each makes another program."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from blinkgl.errors import AssetError
+from blinkgl.scene.lights import is_coloured
+from blinkgl.scene.shapes.deformer import Deformer
+from blinkgl.scene.shapes.table import define_of
+from blinkgl.scene.types import Light, Material, Mesh, Part, Scene, SceneObject
+
+
+class Kind(NamedTuple):
+    """What of a material, and of a shape that changes with time, makes another program. shape : macros of the
+    latter.   hued : whether its luminance takes three channels: where its colour and that of the light, or two colours
+    of its own, vary independently.   masked : it has holes.   more : of MORE, what it is to passes that are lit.
+    faceted : the corners of each of its faces have one normal; said where the light is not the plain one alone."""
+
+    textured: bool
+    lit: bool
+    two_sided: bool
+    shape: tuple[tuple[str, int], ...] = ()
+    hued: bool = False
+    masked: bool = False
+    more: tuple[str, ...] = ()
+    faceted: bool = False
+
+    def defines(self, lit: bool) -> dict[str, int]:
+        """Of its variants. lit : of a pass that is."""
+        plain = ("TEXTURED", self.textured), ("LIT", self.lit), ("TWO_SIDED", self.two_sided), ("MASKED", self.masked)
+        return {name: 1 for name, on in plain if on} | dict(self.shape) | (dict.fromkeys(self.more, 1) if lit else {})
+
+    @property
+    def whole(self) -> bool:
+        """Whether light is not a factor on its albedo, or one that its own normal does not tell: it takes the general
+        light's programs."""
+        return self.lit and (self.hued or "GLOSSY" in self.more or "BUMPED" in self.more)
+
+
+MORE = ("TINTED", "EMISSIVE", "EMISSION_MAP", "GLOSSY", "GLOSS_MAP", "BUMPED")
+
+
+def more_of(material: Material, mesh: Mesh) -> tuple[str, ...]:
+    """Those of MORE that a part asks for."""
+    lit = not material.unlit
+    gloss, emissive = material.gloss if lit else None, lit and any(material.emission)
+    on = (
+        mesh.colours is not None,
+        emissive,
+        emissive and material.emission_map is not None,
+        gloss is not None,
+        gloss is not None and gloss.map is not None,
+        lit and material.bumps is not None,
+    )
+    return tuple(name for name, one in zip(MORE, on) if one)
+
+
+def shape_of(deformer: Deformer | None) -> tuple[tuple[str, int], ...]:
+    """The macros of a deformer's variants."""
+    if deformer is None:
+        return ()
+    return (
+        ("DEFORM", 1),
+        (define_of(deformer.glsl), 1),
+        ("SHAPE_ROWS", padded_rows(deformer)),
+        *sorted(deformer.sizes.items()),
+    )
+
+
+def padded_rows(deformer: Deformer) -> int:
+    """Rows of numbers that its programs have room for: the next power of two, so that one program serves many
+    skeletons."""
+    # At least 4 rows.
+    return 1 << max(deformer.rows - 1, 3).bit_length()
+
+
+def box_corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """(8, 3) of the box between two of its corners, (3,) each."""
+    return np.array(list(itertools.product(*zip(low, high))))
+
+
+@dataclass(eq=False)
+class DrawItem:
+    """One part of one object, ready to draw.
+
+    object_index : row of a moment's matrices.   part : number of the part among those of the scene, object by object.
+    number : of this item among all, in the order of the layers.   moves : whether the object does.
+    centre, radius; low, high : bounding sphere and box, object frame; of a shape that changes those of all that it
+    sweeps.   corners : (8, 3) of the box.
+    layer : 0 objects, 1 ground and walls, 2 sky; drawn in this order so that depth rejects hidden fragments early.
+    two_sided : no culling, and the normal is turned towards the camera.   hued, faceted : as of :class:`Kind`.
+    casts : whether it throws shadows: objects and walls do, unless they are unlit (screens, skies of files).
+    extended : whether its material has more than a base colour: maps and numbers of its own to hand to programs.
+    """
+
+    object_index: int
+    mesh: Mesh
+    material: Material
+    centre: np.ndarray
+    radius: float
+    low: np.ndarray
+    high: np.ndarray
+    layer: int
+    two_sided: bool
+    lit: bool
+    moves: bool
+    part: int = -1
+    number: int = -1
+    hued: bool = False
+    casts: bool = False
+    faceted: bool = False
+
+    def __post_init__(self) -> None:
+        self.textured = self.material.texture is not None
+        self.deformer = self.mesh.deformer
+        shape, more = shape_of(self.deformer), more_of(self.material, self.mesh)
+        masked = self.material.mask is not None
+        self.kind = Kind(self.textured, self.lit, self.two_sided, shape, self.hued, masked, more, self.faceted)
+        self.extended = masked or bool(more)
+        self.corners = box_corners(self.low, self.high)
+
+
+MAX_RADIUS = 1e18
+"""Times the largest focal length, 1e9 px, still far below float32's 3e38."""
+_LAYER = {"object": 0, "ground": 1, "wall": 1, "sky": 2}
+
+
+class _Greys:
+    """Which materials take three channels of luminance; pictures are looked at where it matters, once each."""
+
+    def __init__(self, coloured_light: bool):
+        self._coloured_light = coloured_light
+        self._known: dict[int, bool] = {}
+
+    def _grey(self, values: np.ndarray) -> bool:
+        if id(values) not in self._known:
+            self._known[id(values)] = all(np.array_equal(values[..., 0], values[..., k]) for k in (1, 2))
+        return self._known[id(values)]
+
+    def hued(self, material: Material, mesh: Mesh) -> bool:
+        gloss = None if material.unlit else material.gloss
+        metal = gloss is not None and gloss.metallic > 0
+        # One channel is enough unless light, metal or vertex colours may change the hue.
+        if not (metal or mesh.colours is not None or (self._coloured_light and not material.unlit)):
+            return False
+        pictured = material.texture is not None and not self._grey(material.texture.image)
+        tinted = mesh.colours is not None and not self._grey(mesh.colours)
+        if pictured and tinted:
+            return True
+        if material.unlit:
+            return False
+        coloured = pictured or tinted
+        if gloss is None:
+            return self._coloured_light and coloured
+        # What is mirrored has another colour than what is scattered.
+        return (self._coloured_light or metal) and (coloured or len(set(material.base_color)) > 1)
+
+
+class _Facets:
+    """Which meshes have flat facets alone; each is looked at once, and none where the light is plain."""
+
+    def __init__(self, light: Light):
+        self._asked = not light.plain
+        self._known: dict[int, bool] = {}
+
+    def flat(self, mesh: Mesh) -> bool:
+        if not self._asked or mesh.deformer is not None:
+            return False
+        # Normals of each face's corners against its first one's.
+        if id(mesh) not in self._known:
+            corners = mesh.normals[mesh.faces]
+            self._known[id(mesh)] = bool((np.abs(corners[:, 1:] - corners[:, :1]) <= 1e-6).all())
+        return self._known[id(mesh)]
+
+
+def _draw_item(index: int, thing: SceneObject, part: Part, scene: Scene, grey: _Greys, facets: _Facets) -> DrawItem:
+    mesh, material, category = part.mesh, part.material, thing.category
+    if mesh.deformer is None:
+        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+        centre = (low + high) / 2
+        radius = float(np.sqrt(((mesh.vertices - centre) ** 2).sum(axis=1).max()))
+    else:
+        # Of a shape that changes the box of all that it sweeps.
+        low, high = mesh.deformer.bounds(mesh, scene.t0_ns, scene.t1_ns)
+        centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    # NaN too.
+    if not radius <= MAX_RADIUS:
+        raise AssetError(
+            "mesh is too large to be drawn in float32",
+            where=mesh.name or f"object {index}",
+            value=radius,
+            accepted=f"at most {MAX_RADIUS:g} units from its centre, all coordinates finite",
+        )
+    return DrawItem(
+        index,
+        mesh,
+        material,
+        centre,
+        radius,
+        low,
+        high,
+        _LAYER[category],
+        not part.culled,
+        not material.unlit,
+        not thing.is_static,
+        hued=grey.hued(material, mesh),
+        casts=category in ("object", "wall") and not material.unlit,
+        faceted=not material.unlit and facets.flat(mesh),
+    )
+
+
+def draw_items(scene: Scene) -> list[DrawItem]:
+    """All parts of a scene. Parts are numbered object by object; items in the order of their layers, in which they are
+    drawn."""
+    grey, facets = _Greys(is_coloured(scene.light)), _Facets(scene.light)
+    items = [
+        _draw_item(index, obj, part, scene, grey, facets)
+        for index, obj in enumerate(scene.objects)
+        for part in obj.parts
+    ]
+    for part, item in enumerate(items):
+        item.part = part
+    items.sort(key=lambda item: item.layer)
+    for number, item in enumerate(items):
+        item.number = number
+    return items

@@ -1,0 +1,141 @@
+"""A glTF 2.0 file's JSON and bytes, parsed and checked; nothing outside its own folder is read on its behalf.
+
+Reference: Khronos glTF 2.0 specification, sections 3.6 (buffers) and 4 (the GLB container).
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import struct
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+from blinkgl.errors import AssetError
+from blinkgl.scene.importing import gltf_schema
+from blinkgl.scene.reading import contents, reading
+
+
+def parse(data: bytes, where: str) -> tuple[dict, bytes]:
+    """(the JSON, of the shape that gltf_schema demands; the bytes that a GLB carries). Raises AssetError."""
+    binary = b""
+    if data[:4] == b"glTF":
+        if len(data) < 20:
+            raise AssetError("the file is truncated", where=where, value=f"{len(data)} bytes")
+        version, length = struct.unpack_from("<II", data, 4)
+        if version != 2 or length > len(data):
+            raise AssetError(
+                "the file is truncated or not glTF 2",
+                where=where,
+                value=f"version {version}, {len(data)} of {length} bytes",
+            )
+        position, chunks = 12, {}
+        while position + 8 <= length:
+            size, kind = struct.unpack_from("<II", data, position)
+            if position + 8 + size > length:
+                raise AssetError("the file is truncated inside a chunk", where=where)
+            chunks.setdefault(kind, data[position + 8 : position + 8 + size])
+            position += 8 + size
+        text, binary = chunks.get(0x4E4F534A, b""), chunks.get(0x004E4942, b"")
+    else:
+        text = data
+    try:
+        tree = json.loads(text.decode("utf-8-sig"))
+    except (ValueError, RecursionError):
+        raise AssetError("the file is no valid glTF (its JSON cannot be read)", where=where) from None
+    gltf_schema.check(tree, where)
+    if not tree["asset"]["version"].startswith("2"):
+        raise AssetError("the file is no glTF 2", where=where, value=tree["asset"]["version"])
+    return tree, binary
+
+
+def buffers_of(tree: dict, binary: bytes, path: Path) -> list[bytes]:
+    """Contents of all buffers, as long as the file says. Raises AssetError."""
+    buffers = []
+    for number, buffer in enumerate(tree.get("buffers", [])):
+        compressed = next((e for e in buffer.get("extensions", {}) if e.endswith("_meshopt_compression")), None)
+        if compressed and "uri" not in buffer:
+            raise needs(compressed, str(path))
+        data = fetch(buffer["uri"] or "", path, "buffer") if "uri" in buffer else binary if number == 0 else b""
+        if len(data) < buffer.get("byteLength", 0):
+            raise AssetError(
+                f"buffer {number} is truncated",
+                where=str(path),
+                value=len(data),
+                accepted=f"{buffer.get('byteLength')} bytes",
+            )
+        buffers.append(data)
+    return buffers
+
+
+def fetch(uri: str, path: Path, what: str) -> bytes:
+    """What a URI of the file at ``path`` holds: embedded, or a file beside it. Raises AssetError."""
+    if uri.startswith("data:"):
+        head, _, body = uri.partition(",")
+        try:
+            return (
+                base64.b64decode(body, validate=True) if head.endswith(";base64") else unquote(body).encode("latin-1")
+            )
+        except (binascii.Error, ValueError):
+            raise AssetError(f"the embedded {what} is corrupt", where=str(path)) from None
+    if "://" in uri:
+        raise AssetError(f"the {what} is on a network", where=str(path), value=uri, accepted="a file beside it")
+    return contents(inside(path.parent, unquote(uri), str(path)), what, str(path))
+
+
+def buffer_contents(path: Path, data: bytes) -> list[bytes]:
+    """The external buffers of a .gltf file, in order."""
+    with reading("scene", str(path)):
+        tree, _ = parse(data, str(path))
+        uris = [b.get("uri") or "" for b in tree.get("buffers", [])]
+        return [fetch(uri, path, "buffer") for uri in uris if uri and not uri.startswith("data:")]
+
+
+def inside(folder: Path, name: str, where: str) -> Path:
+    """The file ``name`` below ``folder``. AssetError when it is absolute, leads out by
+    ``..`` or by a link, or is missing."""
+    target = Path(folder) / name
+    try:
+        within = (
+            name
+            and "\0" not in name
+            and not Path(name).is_absolute()
+            and "\\" not in name
+            and target.resolve().is_relative_to(Path(folder).resolve())
+        )
+        found = within and target.is_file()
+    except (OSError, ValueError, RuntimeError):  # a name too long for the file system, a link to itself
+        within, found = True, False
+    if not within:
+        raise AssetError(
+            "refers to a file outside its folder", where=where, value=name, accepted="a relative path below it"
+        )
+    if not found:
+        raise AssetError("refers to a file that is missing", where=where, value=name)
+    return target
+
+
+def needs(extension: str, where: str) -> AssetError:
+    """The error for a file that cannot be read without an extension."""
+    return AssetError(
+        f"the file needs the extension {extension}, which BlinkGL does not draw",
+        where=where,
+        accepted="a glTF 2.0 export without it (uncompressed, PNG or JPEG images)",
+    )
+
+
+def item(tree: dict, key: str, index: Any, where: str) -> dict:
+    """One of a list of the file, by a reference to it."""
+    items = tree.get(key, [])
+    return items[index_of(index, len(items), key, where)]
+
+
+def index_of(index: Any, count: int, what: str, where: str) -> int:
+    """A reference, checked: one of ``count`` things."""
+    if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < count:
+        raise AssetError(
+            f"the file is no valid glTF (a reference to {what} that does not exist)", where=where, value=index
+        )
+    return index

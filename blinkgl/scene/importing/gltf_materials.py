@@ -1,0 +1,192 @@
+"""Materials and textures of a glTF 2.0 file.
+
+Reference: Khronos glTF 2.0 specification, section 3.9; extensions KHR_materials_unlit,
+KHR_materials_emissive_strength, KHR_texture_transform.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from blinkgl.scene.importing.gltf_file import fetch, index_of, item
+from blinkgl.scene.omissions import Omissions
+from blinkgl.scene.surfaces.images import content_hash, decode_alpha, decode_image, decode_numbers
+from blinkgl.scene.types import REPEAT, Gloss, Map, Mask, Material, Texture, Wrap
+
+DRAWN = {
+    "KHR_materials_unlit",
+    "KHR_materials_emissive_strength",
+    "KHR_texture_transform",
+    "KHR_mesh_quantization",
+}
+INVISIBLE_EXTENSIONS = {"KHR_xmp_json_ld", "KHR_xmp"}
+"""Nothing to be seen in these."""
+_WRAPS: dict[int, Wrap] = {33071: "clamp", 33648: "mirror"}
+_NEAREST = 9728
+INVISIBLE = Material()
+"""Of what is cut off everywhere."""
+
+
+class _Place(NamedTuple):
+    """Where a texture lies on a mesh: number of its set of coordinates, (3, 3) transform of them or None."""
+
+    coordinates: int
+    matrix: np.ndarray | None
+
+    @classmethod
+    def of(cls, info: dict) -> _Place:
+        transform = info.get("extensions", {}).get("KHR_texture_transform") or {}
+        return cls(transform.get("texCoord", info.get("texCoord", 0)), _texture_transform(transform))
+
+
+class Materials:
+    """The materials of one file, each made once. wanted : False leaves out all but the base colour, and what materials
+    ask for unsaid."""
+
+    def __init__(
+        self, tree: dict, buffers: list[bytes], path: Path, max_texture: int, wanted: bool, omissions: Omissions
+    ):
+        self.tree, self.buffers, self.path, self.max_texture = tree, buffers, path, max_texture
+        self.wanted, self.omissions, self.where = wanted, omissions, str(path)
+        self._materials: dict = {}
+        self._textures: dict = {}
+
+    def material(self, index: int | None) -> tuple[Material | None, int, np.ndarray | None]:
+        """(material, texture coordinate set, 3x3 texture transform or None)."""
+        if index is None:
+            return None, 0, None
+        if index not in self._materials:
+            m = item(self.tree, "materials", index, self.where)
+            pbr = m.get("pbrMetallicRoughness", {})
+            info = pbr.get("baseColorTexture") or {}
+            base = _Place.of(info)
+            material = Material(
+                texture=self._texture(info["index"]) if info and self.wanted else None,
+                base_color=tuple(float(c) for c in pbr.get("baseColorFactor", (1, 1, 1, 1))[:3]),
+                unlit="KHR_materials_unlit" in m.get("extensions", {}),
+                double_sided=m.get("doubleSided", False),
+            )
+            if self.wanted:
+                material, base = self._surface(material, m, pbr, base)
+            self._materials[index] = (material, base.coordinates, base.matrix)
+        return self._materials[index]
+
+    def _surface(self, material: Material, m: dict, pbr: dict, base: _Place) -> tuple[Material, _Place]:
+        """``material`` with all that glTF says of it beside its base colour, and the place of its coordinates: that of
+        the first of its textures."""
+        for name in m.get("extensions", {}):
+            if name not in DRAWN | INVISIBLE_EXTENSIONS:
+                self.omissions.add(name)
+        info = pbr.get("baseColorTexture") or {}
+        if info and material.texture is not None:
+            material = replace(material, wrap=self._wraps(info["index"]))
+        material = self._masked(material, m, pbr)
+        if material is INVISIBLE or material.unlit:
+            return material, base
+        if "occlusionTexture" in m:
+            self.omissions.add("occlusion maps")
+        emissive, bumps = m.get("emissiveTexture"), m.get("normalTexture")
+        rough = pbr.get("metallicRoughnessTexture")
+        if not info:
+            base = _Place.of(next((one for one in (rough, bumps, emissive) if one), {}))
+        strength = m.get("extensions", {}).get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
+        emission = tuple(float(c * strength) for c in m.get("emissiveFactor", (0, 0, 0)))
+        if any(emission):
+            material = replace(material, emission=emission, emission_map=self._map(emissive, base, "colour"))
+        metallic, roughness = (min(float(pbr.get(f"{key}Factor", 1)), 1.0) for key in ("metallic", "roughness"))
+        if metallic > 0 or roughness < 1 or rough:
+            material = replace(material, gloss=Gloss(metallic, roughness, self._map(rough, base, "numbers")))
+        if bumps and (bumped := self._map(bumps, base, "numbers")) is not None:
+            material = replace(material, bumps=bumped, bump_scale=float(bumps.get("scale", 1.0)))
+        return material, base
+
+    def _masked(self, material: Material, m: dict, pbr: dict) -> Material:
+        """With its holes. One that shows wholly is not masked; one that shows nowhere is INVISIBLE."""
+        mode, factor = m.get("alphaMode", "OPAQUE"), float(pbr.get("baseColorFactor", (1, 1, 1, 1))[3])
+        if mode == "OPAQUE":
+            return material
+        info = pbr.get("baseColorTexture") or {}
+        alpha = self._texture(info["index"], "alpha") if info else None
+        image = np.full((1, 1), 255, np.uint8) if alpha is None else alpha.image
+        cutoff = float(m.get("alphaCutoff", 0.5)) if mode == "MASK" else 0.5
+        least, most = (factor * float(v) / 255 for v in (image.min(), image.max()))
+        if mode == "BLEND":
+            if most < cutoff:
+                self.omissions.add("alpha BLEND (drawn opaque)")
+                return material
+            self.omissions.add("alpha BLEND (cut off at a half)" if least < cutoff else "alpha BLEND (drawn opaque)")
+        if most < cutoff:
+            return INVISIBLE
+        return replace(material, mask=Mask(image, factor, cutoff)) if least < cutoff else material
+
+    def _map(self, info: dict | None, base: _Place, kind: str) -> Map | None:
+        """A texture beside that of the base colour. kind : "colour" or "numbers"."""
+        if not info:
+            return None
+        place, texture = _Place.of(info), self._texture(info["index"], kind)
+        if texture is None:
+            return None
+        if place.coordinates != base.coordinates:
+            self.omissions.add("maps on a second set of texture coordinates (left out)")
+            return None
+        whole = np.eye(3)
+        own, first = (whole if one.matrix is None else one.matrix for one in (place, base))
+        if abs(np.linalg.det(first)) < 1e-12:
+            at = own
+        else:
+            at = own @ np.linalg.inv(first)
+        a, b, c, d, e, f = (float(v) for v in np.round(at[:2], 12).ravel())
+        return Map(texture, (a, b, c, d, e, f), self._wraps(info["index"]))
+
+    def _wraps(self, index: int) -> tuple[Wrap, Wrap]:
+        """Of a texture."""
+        sampler = item(self.tree, "textures", index, self.where).get("sampler")
+        if sampler is None:
+            return REPEAT
+        settings = item(self.tree, "samplers", sampler, self.where)
+        if settings.get("magFilter") == _NEAREST:
+            self.omissions.add("unfiltered textures (drawn smooth)")
+        s, t = (_WRAPS.get(settings.get(key, 10497), "repeat") for key in ("wrapS", "wrapT"))
+        return s, t
+
+    def _texture(self, index: int, kind: str = "colour") -> Texture | None:
+        """kind : "colour"; "numbers", as they are stored; "alpha", (h, w), None where the image is opaque."""
+        source = item(self.tree, "textures", index, self.where).get("source")
+        if source is None:
+            names = ", ".join(self.tree["textures"][index].get("extensions", {})) or "without an image"
+            self.omissions.add(f"textures of another kind ({names})")
+            return None
+        if (source, kind) not in self._textures:
+            image = item(self.tree, "images", source, self.where)
+            if "bufferView" in image:
+                v = item(self.tree, "bufferViews", image["bufferView"], self.where)
+                buffer = self.buffers[index_of(v["buffer"], len(self.buffers), "buffer", self.where)]
+                begin = v.get("byteOffset", 0)
+                data = buffer[begin : begin + v.get("byteLength", 0)]
+            else:
+                data = fetch(image.get("uri", ""), self.path, "image")
+            name = str(image.get("name") or f"image-{source}")
+            decode = {"colour": decode_image, "numbers": decode_numbers, "alpha": decode_alpha}[kind]
+            pixels = decode(data, self.max_texture, f"{self.where} (image '{name}')")
+            self._textures[source, kind] = None if pixels is None else Texture(pixels, name, content_hash(data))
+        return self._textures[source, kind]
+
+
+def _texture_transform(transform: dict | None) -> np.ndarray | None:
+    if not transform:
+        return None
+    (ox, oy), (sx, sy), r = (
+        transform.get("offset", (0, 0)),
+        transform.get("scale", (1, 1)),
+        float(transform.get("rotation", 0)),
+    )
+    c, s = np.cos(r), np.sin(r)
+    return (
+        np.array([[1, 0, ox], [0, 1, oy], [0, 0, 1]])
+        @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        @ np.diag([sx, sy, 1.0])
+    )

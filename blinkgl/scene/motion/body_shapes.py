@@ -1,0 +1,110 @@
+"""What touches of a body: its parts as the convex solids that MuJoCo knows, chosen by the mesh itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import Rotation
+
+from blinkgl.config.physics import BodyConfig
+from blinkgl.scene.shapes.deformer import filled
+from blinkgl.scene.types import SceneObject
+
+_MOST_PARTS = 24  # of an object with more, all are one hull
+
+
+@dataclass(frozen=True)
+class Barrier:
+    """A plane without end that nothing passes and nobody sees: points x with ``normal . x >= offset`` are inside."""
+
+    normal: tuple[float, float, float]
+    offset: float
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A convex solid in a body's axes. kind : MuJoCo's, BOX, SPHERE, PLANE or MESH.   size : as MuJoCo has it: half
+    edges, radius.   vertices : (V, 3) of a MESH's hull."""
+
+    kind: str
+    size: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)
+    position: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
+    vertices: np.ndarray | None = None
+
+    @property
+    def quaternion(self) -> np.ndarray:
+        return quaternions(self.rotation[None])[0]
+
+    def moved(self, T: np.ndarray) -> Shape:
+        return replace(self, position=T[:3, :3] @ self.position + T[:3, 3], rotation=T[:3, :3] @ self.rotation)
+
+
+def shapes_of(obj: SceneObject, config: BodyConfig) -> list[Shape]:
+    """What touches, of an object: its parts' solids in its axes; of one that deforms the hull of all its shapes."""
+    parts = [filled(part.mesh)[0] for part in obj.parts if len(part.mesh.faces)]
+    if len(parts) > _MOST_PARTS:
+        parts = [np.concatenate(parts)]
+    # A flat ground is an endless plane, which nothing falls off.
+    if obj.category == "ground" and config.kind == "fixed" and len(parts) == 1:
+        mesh = next(part.mesh for part in obj.parts if len(part.mesh.faces))
+        centre, axes, extent = _framed(parts[0])
+        if extent[2] < 1e-6 * extent[0]:
+            up = axes[:, 2] * (1.0 if float(mesh.normals.mean(axis=0) @ axes[:, 2]) >= 0 else -1.0)
+            return [plane_of(Barrier(tuple(up), float(up @ centre)))]
+    return [_solid(points) for points in parts]
+
+
+def _solid(points: np.ndarray) -> Shape:
+    """A box or a ball where the points are one, to rounding; else their convex hull."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    centre, half = 0.5 * (low + high), 0.5 * (high - low)
+    radii = np.linalg.norm(points - centre, axis=1)
+    # Thin in its smallest principal direction: a box of a little thickness.
+    middle, axes, extent = _framed(points)
+    if extent[2] < 0.005 * extent[0]:
+        return Shape("BOX", np.maximum(extent, 0.01 * extent.max()), middle, axes)
+    hull, volume = _hull(points)
+    ball = 4 / 3 * math.pi * radii.max() ** 3
+    if np.ptp(np.linalg.norm(hull - centre, axis=1)) < 1e-4 * radii.max() and volume > 0.9 * ball:
+        return Shape("SPHERE", (float(radii.max()), 0, 0), centre)
+    if (np.abs(np.abs(hull - centre) - half) < 1e-6 * half.max()).all():
+        return Shape("BOX", half, centre)
+    return Shape("MESH", vertices=hull)
+
+
+def _hull(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the convex hull's vertices (V, 3) and its volume."""
+    try:
+        hull = ConvexHull(points)
+    except (QhullError, ValueError):
+        return np.unique(points, axis=0), 0.0
+    return points[hull.vertices], float(hull.volume)
+
+
+def _framed(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(centre (3,), axes (3, 3) as columns, a right-handed frame, half extents (3,) along them) of a box round the
+    points, along their principal axes, longest first."""
+    mean = points.mean(axis=0)
+    # Principal axes: eigenvectors of the covariance, smallest first.
+    _, axes = np.linalg.eigh(np.cov(points.T, bias=True))
+    axes = axes[:, ::-1] * np.sign(np.linalg.det(axes[:, ::-1]))
+    along = (points - mean) @ axes
+    low, high = along.min(axis=0), along.max(axis=0)
+    return mean + axes @ (0.5 * (low + high)), axes, 0.5 * (high - low)
+
+
+def plane_of(side: Barrier) -> Shape:
+    """Return an endless plane whose z axis is the normal."""
+    normal = np.asarray(side.normal, dtype=np.float64)
+    rotation, _ = Rotation.align_vectors([normal], [[0.0, 0.0, 1.0]])
+    return Shape("PLANE", (1.0, 1.0, 1.0), normal * side.offset, rotation.as_matrix())
+
+
+def quaternions(R: np.ndarray) -> np.ndarray:
+    """Return the (n, 4) quaternions, w x y z, of (n, 3, 3) rotations."""
+    return Rotation.from_matrix(R).as_quat()[:, [3, 0, 1, 2]]

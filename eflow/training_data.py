@@ -1,0 +1,118 @@
+"""What a training reads: the sets that it draws its samples from, and those that it is judged on meanwhile."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from blinkgl.config.recipe import derived_seed
+from blinkgl.errors import ConfigError
+from eflow.config import SourceConfig, TrainConfig
+from eflow.data.dataset import FlowDataset, Mixture, collate, is_endless
+from eflow.data.sources import Source, open_source
+from eflow.infer import predict
+from eflow.metrics import frame_metrics
+from eflow.models import FlowModel
+
+
+def training_sets(
+    config: TrainConfig, start: int, rank: int, world: int, stack: contextlib.ExitStack
+) -> tuple[Mixture, list[Source]]:
+    """The order of the samples, and the open sets; what renders is ended by ``stack``. Each rank renders for itself,
+    sequences that no other has."""
+    data = config.data
+    sources = {k: open_source(s.path, s.format, dt=s.dt) for k, s in enumerate(data.train) if not s.online}
+    sizes = [len(sources[k]) if k in sources else None for k in range(len(data.train))]
+    mixture = Mixture(sizes, [s.weight for s in data.train], config.seed)
+    for k, s in enumerate(data.train):
+        if s.online:
+            from eflow.data.online import open_online  # brings the renderer
+
+            first = mixture.first(k, start * data.batch, rank, world)
+            seed = derived_seed(config.seed, f"rank {rank}") if rank else config.seed
+            sources[k] = stack.enter_context(open_online(s, seed, first=first, batch=data.batch // world))
+    return mixture, [sources[k] for k in range(len(data.train))]
+
+
+def check_sizes(dataset: FlowDataset, model: FlowModel, crop: tuple[int, int] | None) -> None:
+    """Refuses, before anything is written, what the network would refuse at the first step."""
+    sources = [source for source in dataset.sources if crop is None or is_endless(source)]
+    firsts = [source.first() if is_endless(source) else source[0] for source in sources]
+    if crop is not None:
+        sizes = {"data.crop": crop}
+    else:
+        sizes = {f"data.crop is not set, {s.name}": (s.height, s.width) for s in firsts}
+    for where, size in sizes.items():
+        if min(size) < model.least or any(side % model.divisor for side in size):
+            raise ConfigError(
+                "a size the network cannot train on",
+                where=where,
+                value=tuple(size),
+                accepted=f"multiples of {model.divisor}, at least {model.least} px: set data.crop",
+            )
+
+
+def validation_sets(config: TrainConfig, model: FlowModel) -> list[tuple[str, FlowDataset, list[int]]]:
+    """(name, set, the samples of it that are looked at) of every set that ``data.validate_on`` names."""
+    sets = []
+    for s in config.data.validate_on:
+        if s.online:
+            from eflow.data.online import held
+
+            source = held(s, config.data.validate_samples)
+        else:
+            source = open_source(s.path, s.format, dt=s.dt)
+        dataset = FlowDataset([source], model.representation, empty=config.data.empty, reads=model.reads)
+        count = min(config.data.validate_samples, len(dataset))
+        sets.append((_title(s), dataset, [int(i) for i in np.linspace(0, len(dataset) - 1, count).round()]))
+    return sets
+
+
+def _title(s: SourceConfig) -> str:
+    return Path(s.path or s.recipe).stem + (f"_dt{s.dt}" if s.dt != 1 else "")
+
+
+@torch.no_grad()
+def validate(
+    model: FlowModel,
+    ema: dict[str, Tensor] | None,
+    validation: list[tuple[str, FlowDataset, list[int]]],
+    precision: str,
+    size: int = 1,
+) -> dict[str, float]:
+    """AEE per validation set, with the averaged weights; ``zero`` is the AEE of zero flow on the same samples.
+    size : at most so many samples at once."""
+    own = {k: v.detach().clone() for k, v in model.state_dict().items()} if ema is not None else None
+    if ema is not None:
+        model.load_state_dict(ema)
+    try:
+        scores = {}
+        for name, dataset, indices in validation:
+            rows = []
+            for batch in _alike((dataset[i] for i in indices), size):
+                flows = predict(model, batch, precision=precision).flow.permute(0, 2, 3, 1).cpu().numpy()
+                truths, valids = batch["flow"].permute(0, 2, 3, 1).numpy(), (batch["valid"] & batch["mask"]).numpy()
+                for flow, truth, valid in zip(flows, truths, valids, strict=True):
+                    metrics, zero = frame_metrics(flow, truth, valid), frame_metrics(np.zeros_like(flow), truth, valid)
+                    if metrics:
+                        rows.append((metrics["AEE"], zero["AEE"]))
+            scores[f"{name}/AEE"], scores[f"{name}/zero"] = (
+                (float(v) for v in np.mean(rows, axis=0)) if rows else (float("nan"),) * 2
+            )
+        return scores
+    finally:
+        if own is not None:
+            model.load_state_dict(own)
+
+
+def _alike(samples: Iterable[dict], size: int) -> Iterator[dict]:
+    """Batches, in order, of up to ``size`` samples of one height and width."""
+    for _, group in itertools.groupby(samples, key=lambda sample: sample["new"].shape):
+        while part := list(itertools.islice(group, size)):
+            yield collate(part)

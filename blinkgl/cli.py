@@ -57,8 +57,16 @@ def doctor(
 
 
 @app.command()
+def configs() -> int:
+    """List the runs that ship: their names stand wherever a command takes a YAML file."""
+    from blinkgl.show import configs as command
+
+    return command.run()
+
+
+@app.command()
 def generate(
-    config: Annotated[str, typer.Argument(help="YAML file; see configs/ for examples.")],
+    config: Annotated[str, typer.Argument(help="YAML file, or the name of one that ships (blinkgl configs).")],
     out: Annotated[
         str, typer.Option("--out", "-o", help="Folder for the data set; sequences go to OUT/SPLIT/NAME_000000 ….")
     ],
@@ -136,7 +144,7 @@ def verify(
 
 @app.command()
 def explain(
-    config: Annotated[str, typer.Argument(help="YAML file; see configs/ for examples.")],
+    config: Annotated[str, typer.Argument(help="YAML file, or the name of one that ships (blinkgl configs).")],
     sequence: Annotated[
         int | None, typer.Option("--sequence", min=0, help="Which sequence (default: the first).")
     ] = None,
@@ -154,7 +162,10 @@ def explain(
 @app.command()
 def trade(
     config: Annotated[
-        str | None, typer.Argument(help="YAML file; see configs/ for examples. With --suite: a folder of your scenes.")
+        str | None,
+        typer.Argument(
+            help="YAML file, or the name of one that ships (blinkgl configs). With --suite: a folder of your scenes."
+        ),
     ] = None,
     out: Annotated[
         str,

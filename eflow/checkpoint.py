@@ -63,7 +63,20 @@ def write_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, st
             save_file({k: v.detach().contiguous().cpu() for k, v in tensors.items()}, path, metadata)
         except SafetensorError as error:
             raise OutputError(f"cannot write: {' '.join(str(error).split())}", where=str(path)) from error
+        _sort_header(path)
         fsync(path)
+
+
+def _sort_header(path: Path) -> None:
+    """Put the names in a file's header into order: the library writes those of the metadata as a hash map has them,
+    and two equal runs shall make equal files."""
+    with open(path, "r+b") as file:
+        size = int.from_bytes(file.read(8), "little")
+        header = json.loads(file.read(size))
+        data = json.dumps(header, sort_keys=True, separators=(",", ":"), ensure_ascii=False).encode()
+        if len(data) <= size:  # blanks at the end are part of the format
+            file.seek(8)
+            file.write(data.ljust(size))
 
 
 def metadata_of(model: FlowModel) -> dict[str, str]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -51,7 +51,7 @@ class CameraConfig(Config):
         "pinhole",
         description="radtan: OpenCV's and Kalibr's plumb bob; equidistant: their fisheye (docs/cameras.md)",
     )
-    distortion: tuple[float, ...] = Field(
+    distortion: tuple[Annotated[float, Field(ge=-1e6, le=1e6)], ...] = Field(
         (), max_length=8, description="of radtan k1, k2, p1, p2 and, if there is one, k3; of equidistant k1 to k4"
     )
     calibration: str | None = Field(

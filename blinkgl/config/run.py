@@ -24,6 +24,7 @@ from blinkgl.config.rig import (
 )
 from blinkgl.config.sensor import fill_sensor
 from blinkgl.config.sequence import SequenceConfig
+from blinkgl.config.shipped import run_file
 from blinkgl.config.trees import apply_overrides
 from blinkgl.errors import ConfigError
 
@@ -146,8 +147,10 @@ def load_run(path: str | Path, overrides: Sequence[str] = (), *, seed: int | Non
     """Reads a YAML file and the files that its scenes come from, applies ``a.b=c`` overrides (c is YAML) and an
     optional seed, checks all that can be drawn.
 
+    path : of a file, or the name of a run that ships, such as "demo" (:func:`~blinkgl.config.shipped.shipped_runs`).
     Raises ConfigError: missing or unreadable file, bad YAML (with line and column), unknown key, bad value."""
-    base = Path(path).parent
+    path = run_file(path)
+    base = path.parent
     tree = apply_overrides(with_scenes(read_table(path), base), overrides)
     tree = expanded(tree, base)
     if seed is not None:

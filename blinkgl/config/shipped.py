@@ -1,13 +1,15 @@
-"""The tables that ship with the program, by name: sensors, rigs, quality presets, emulators' recipes."""
+"""What ships with the program, by name: runs, and tables of sensors, rigs, quality presets, emulators' recipes."""
 
 from __future__ import annotations
 
 import copy
 from functools import lru_cache
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 from blinkgl.config.reader import parse_yaml
+from blinkgl.errors import ConfigError
 
 
 @lru_cache
@@ -26,3 +28,26 @@ def shipped(kind: str, name: str) -> dict[str, Any]:
 def _read(kind: str, name: str) -> dict[str, Any]:
     text = (resources.files("blinkgl.configs") / kind / f"{name}.yaml").read_text(encoding="utf-8")
     return parse_yaml(text, f"{kind}/{name}.yaml")
+
+
+_RUNS = ("*.yaml", "scenes/*.yaml", "eflow/*_data.yaml")
+
+
+@lru_cache
+def shipped_runs() -> dict[str, Path]:
+    """The files of whole runs, by name: "demo", "flags" …"""
+    folder = Path(str(resources.files("blinkgl.configs")))
+    return {path.stem: path for pattern in _RUNS for path in sorted(folder.glob(pattern))}
+
+
+def run_file(given: str | Path) -> Path:
+    """The file ``given``, or, where there is none, the shipped run that it names: "demo", "demo.yaml" and
+    "configs/demo.yaml" are one. Raises ConfigError."""
+    path = Path(given)
+    if path.exists() or path.is_symlink():
+        return path
+    shipped_one = shipped_runs().get(path.stem)
+    named = shipped_one is not None and shipped_one.as_posix().endswith(f"/{path.with_suffix('.yaml').as_posix()}")
+    if shipped_one is not None and (named or path.parent == Path()):
+        return shipped_one
+    raise ConfigError("no such file", where=str(given), accepted="a YAML file, or a name that 'blinkgl configs' lists")

@@ -59,6 +59,13 @@ def read_trajectory(path: str | os.PathLike, form: str | None = None) -> tuple[n
         except (ValueError, OverflowError):
             accepted = "t x y z qx qy qz qw" if form == "tum" else "t, x, y, z, qw, qx, qy, qz"
             raise AssetError(f"line {k} is no pose", where=str(path), value=line[:80], accepted=accepted) from None
+    if max(map(abs, times)) >= 2**62:
+        raise AssetError(
+            "times are too large: of another unit?",
+            where=str(path),
+            value=rows[-1][1][:40],
+            accepted="seconds in TUM's files, nanoseconds in EuRoC's",
+        )
     t_ns = np.array(times, np.int64)
     _check_times(t_ns, [k for k, _ in rows], path)
     quaternions = numbers[:, 3:] if form == "tum" else numbers[:, [4, 5, 6, 3]]

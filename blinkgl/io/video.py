@@ -116,6 +116,20 @@ class VideoWriter:
         self._process = None
 
 
+_CONTAINERS = (
+    "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,flv,asf,ogg,gif,apng,webp_anim,ivf,nut,dv,mxf,"
+    "yuv4mpegpipe,h264,hevc,vvc,av1,obu,m4v,mjpeg,rm,wtv"
+)
+_ALONE = ["-protocol_whitelist", "file", "-format_whitelist", _CONTAINERS]
+"""A video is the file itself: play lists and manifests (DASH, HLS, concat), which lead ffmpeg to other files and to the
+network whatever a file is called, are no containers here."""
+
+
+def _input(path: str | os.PathLike) -> str:
+    """The file for ffmpeg, to which a name with a colon would be a protocol."""
+    return f"file:{os.fspath(path)}"
+
+
 class VideoReader:
     """Frames of any video ffmpeg can decode, as (H, W, 3) uint8 RGB, one at a time.
 
@@ -132,7 +146,7 @@ class VideoReader:
             raise AssetError("no such file", where=str(path))
         _ffmpeg(AssetError, path)
         try:
-            probe = imageio_ffmpeg.read_frames(os.fspath(path))
+            probe = imageio_ffmpeg.read_frames(_input(path), input_params=_ALONE)
             meta = next(probe)
             probe.close()
         except Exception as error:  # IOError, RuntimeError, IndexError, StopIteration …
@@ -150,8 +164,9 @@ class VideoReader:
                 "-loglevel",
                 "error",
                 "-nostdin",
+                *_ALONE,
                 "-i",
-                os.fspath(self.path),
+                _input(self.path),
                 "-map",
                 "0:v:0",
                 "-fps_mode",
@@ -193,21 +208,17 @@ def read_exr(path: str | os.PathLike) -> np.ndarray:
     undecodable."""
     if not os.path.isfile(path):
         raise AssetError("no such file", where=str(path))
-    return _exr(path, str(path))
+    return decode_exr(Path(path).read_bytes(), str(path))
 
 
 def decode_exr(data: bytes, where: str) -> np.ndarray:
-    """:func:`read_exr` of what has been read already; ffmpeg finds no image in a pipe."""
-    with tempfile.TemporaryDirectory(prefix="blinkgl-exr-") as folder:
-        path = Path(folder) / "image.exr"
-        path.write_bytes(data)
-        return _exr(path, where)
-
-
-def _exr(path: str | os.PathLike, where: str) -> np.ndarray:
-    command = [_ffmpeg(AssetError, where), "-loglevel", "error", "-nostdin", "-i", os.fspath(path)]
+    """:func:`read_exr` of what has been read already."""
+    # Through a pipe, and as OpenEXR whatever it looks like: a name such as f%d.exr would be a pattern of names. ffmpeg
+    # finds no end of an image in a pipe by itself.
+    whole = ["-f", "exr_pipe", "-c:v", "exr", "-frame_size", str(len(data))]
+    command = [_ffmpeg(AssetError, where), "-loglevel", "error", *whole, "-i", "pipe:0"]
     command += ["-frames:v", "1", "-c:v", "pfm", "-f", "image2pipe", "-"]
-    result = subprocess.run(command, capture_output=True)
+    result = subprocess.run(command, input=data, capture_output=True)
     if result.returncode or not result.stdout:
         raise AssetError(f"cannot decode OpenEXR image: {_gist(result.stderr.decode(errors='replace'))}", where=where)
     return decode_pfm(result.stdout, where)

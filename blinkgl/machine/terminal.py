@@ -7,17 +7,25 @@ And what is printed where not every character can be: :func:`never_fail_to_print
 from __future__ import annotations
 
 import codecs
+import os
 import sys
 from typing import Any
 
 from rich.console import Console
 from rich.progress import TextColumn
 
+_NO_END = 10_000
+"""Columns of a file."""
+
 
 def plain_console(**options: Any) -> Console:
     """``rich.console.Console`` whose strings, in tables too, are no markup and no names of emoji (``a:bug:b`` is a
-    folder). For style pass a ``rich.text.Text`` or ``style=``."""
-    return Console(markup=False, emoji=False, **options)
+    folder). For style pass a ``rich.text.Text`` or ``style=``. Where nobody looks, in a pipe or a file, a line is as
+    long as it is: whoever searches it shall find words whole."""
+    console = Console(markup=False, emoji=False, **options)
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console.width = _NO_END
+    return console
 
 
 def say(console: Console, text: str) -> None:

@@ -11,7 +11,7 @@ app = typer.Typer(
     name="shader", no_args_is_help=True, rich_markup_mode=None, help="See what every pass wrote at a pixel, and why."
 )
 
-Config = Annotated[str, typer.Argument(help="YAML file, as for `blinkgl generate`.")]
+Config = Annotated[str, typer.Argument(help="YAML file, or the name of one that ships, as for `blinkgl generate`.")]
 Seed = Annotated[int | None, typer.Option("--seed", help="Seed of the run (default: the file's).")]
 Sequence = Annotated[
     int | None, typer.Option("--sequence", "-n", min=0, help="Number of the sequence (default: the run's first).")

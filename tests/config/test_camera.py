@@ -37,6 +37,7 @@ def test_the_keys_are_the_models():
     [
         ({"lens": "fisheye62"}, "camera.lens: unknown choice"),
         ({"lens": "radtan", "distortion": [0.1]}, "camera.distortion: radtan has other coefficients"),
+        ({"lens": "equidistant", "distortion": [1e308, 0, 0, 0]}, "camera.distortion.0: too large (got 1e+308)"),
         ({"lens": "equidistant", "distortion": [0.1] * 5}, "expected 4 of them, k1 k2 k3 k4"),
         ({"distortion": [0.1, 0, 0, 0]}, "camera.distortion: a pin-hole camera does not distort"),
         ({"lens": "radtan", "distortion": [math.nan, 0, 0, 0]}, "camera.distortion.0: not a finite number"),

@@ -6,6 +6,7 @@ none of eflow's operations (``restated`` in this file at commit 21f2ecb4): paddi
 32, column-major taps, zeros beyond the edge when flow is upsampled. ``eraft_names.json`` has names and shapes.
 """
 
+import contextlib
 import json
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from blinkgl.io.formats import write_events  # noqa: E402
 from eflow.checkpoint import load_model  # noqa: E402
 from eflow.cli import run  # noqa: E402
 from eflow.infer import predict  # noqa: E402
-from eflow.published import import_published  # noqa: E402
+from eflow.published import import_published, read_published  # noqa: E402
 from flow_data import SPAN, moving_events  # noqa: E402
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "eraft.npz"
@@ -109,6 +110,14 @@ def test_truncated_files(tmp_path):
             with pytest.raises(AssetError, match=r"cut\.tar: ") as caught:
                 import_published(tmp_path / "cut.tar", tmp_path / "x.safetensors")
             assert "\n" not in str(caught.value)
+    rng = np.random.default_rng(3)
+    for _ in range(40):  # whatever torch raises, bytes that lie included
+        damaged = bytearray(data)
+        for place in rng.integers(0, 2000, 3):
+            damaged[place] = rng.integers(256)
+        (tmp_path / "cut.tar").write_bytes(damaged)
+        with contextlib.suppress(AssetError):
+            read_published(tmp_path / "cut.tar")
     (tmp_path / "cut.tar").write_bytes(b"not a checkpoint at all")
     with pytest.raises(AssetError, match="truncated or not a checkpoint"):
         import_published(tmp_path / "cut.tar", tmp_path / "x.safetensors")

@@ -70,6 +70,10 @@ def test_resumed_equals_uninterrupted_bit_for_bit(tmp_path, data):
     train(config, tmp_path / "parts", resume=True, quiet=True)
     a, b = tensors(tmp_path / "whole"), tensors(tmp_path / "parts")
     assert a.keys() == b.keys() and all(torch.equal(a[key], b[key]) for key in a)
+    folders = [ckpt.newest(tmp_path / name) for name in ("whole", "parts")]
+    for name in ("weights", "ema", "optimizer"):  # the order of names in their headers included
+        files = [(folder / f"{name}.safetensors").read_bytes() for folder in folders]
+        assert files[0] == files[1], name
     assert any(key.endswith("exp_avg") for key in a) and any(key.startswith("ema/") for key in a)
     losses = [[(r["step"], r["loss"], r["lr"], r["epe"]) for r in log(tmp_path / d)] for d in ("whole", "parts")]
     assert losses[0] == losses[1] and len(losses[0]) == k + n

@@ -107,6 +107,13 @@ def test_float_and_deep_images(tmp_path):
     (tmp_path / "b.exr").write_bytes((tmp_path / "a.exr").read_bytes()[:300])
     with pytest.raises(AssetError, match="cannot decode OpenEXR"):
         read_any_image(tmp_path / "b.exr")
+    # A name that looks like a pattern of names is a name, and what is no OpenEXR is not read as something else.
+    (tmp_path / "f%d.exr").write_bytes((tmp_path / "a.exr").read_bytes())
+    (tmp_path / "f1.exr").write_bytes(b"no picture")
+    assert np.array_equal(read_any_image(tmp_path / "f%d.exr"), colour)
+    (tmp_path / "f1.exr").write_bytes((tmp_path / "a.png").read_bytes())
+    with pytest.raises(AssetError, match="cannot decode OpenEXR"):
+        read_any_image(tmp_path / "f1.exr")
 
 
 def image_of(shape):

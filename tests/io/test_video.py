@@ -67,6 +67,31 @@ def test_unreadable_video(tmp_path, content, message):
     assert "\n" not in str(caught.value)
 
 
+_DASH = (
+    '<MPD xmlns="urn:mpeg:dash:schema:mpd:2011" type="static" mediaPresentationDuration="PT1S" '
+    'profiles="urn:mpeg:dash:profile:isoff-on-demand:2011"><Period><AdaptationSet mimeType="video/mp4">'
+    '<Representation id="1" bandwidth="1" width="64" height="48" codecs="avc1.42c00d">'
+    "<BaseURL>{other}</BaseURL></Representation></AdaptationSet></Period></MPD>"
+)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "ffconcat version 1.0\nfile other.mp4\n",
+        _DASH,
+        "#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:0.5,\nother.mp4\n#EXT-X-ENDLIST\n",
+    ],
+    ids=["concat", "DASH", "HLS"],
+)
+@pytest.mark.parametrize("name", ["v.mp4", "v.m3u8", "v.mpd"])
+def test_a_video_leads_to_no_other_file(tmp_path, name, content):
+    write_video(tmp_path / "other.mp4")
+    (tmp_path / name).write_text(content.replace("{other}", str(tmp_path / "other.mp4")))
+    with pytest.raises(AssetError, match=f"{name}: cannot read video"):
+        list(VideoReader(tmp_path / name))
+
+
 @pytest.mark.parametrize("degrees, shape", [(0, (48, 64)), (90, (64, 48)), (180, (48, 64)), (270, (64, 48))])
 def test_rotated_video_comes_upright(tmp_path, degrees, shape):
     write_video(tmp_path / "v.mp4")

@@ -138,6 +138,7 @@ GOOD = "0 1 2 3 0 0 0 1\n0.1 1 2 3 0 0 0 1\n0.2 1 2 3 0 0 0 1\n0.3 1 2 3 0 0 0 1
         (GOOD + "0.4 1 2 3 0 0 0 0.5\n", "line 5 has no rotation"),
         ("# timestamp tx ty tz qw qx qy qz\n" + GOOD, "quaternions begin with w"),
         ("0 1 2 3 0 0 0 1\n10000000 1 2 3 0 0 0 1\n", "times of another unit"),
+        ("1403636579763555584 1 2 3 0 0 0 1\n1403636579763655584 1 2 3 0 0 0 1\n", "too large: of another unit"),
         ("1,2,3\n4,5,6\n", "line 1 is no pose"),
     ],
 )

@@ -144,7 +144,6 @@ def test_samples_of_a_reference_end_where_plain_ones_do(gl, folder):
         (["--suite", "--only", "raytracing"], "no setting is called that"),
         ([], "which scene?"),
         (["c.yaml", "--scene", "moon"], "--scene: is of the suite"),
-        (["--suite", "--resume"], "--resume: a suite is measured in one go"),
     ],
 )
 def test_bad_input(arguments, message, tmp_path, capsys):

@@ -182,6 +182,8 @@ def test_missing_binary_and_huge_files(tmp_path, content, said):
         (tmp_path / "run.yaml").write_bytes(content)
     with pytest.raises(ConfigError, match=said):
         load_run(tmp_path / "run.yaml")
+    with pytest.raises(ConfigError, match="cannot be read: not a regular file"):
+        load_run(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,8 @@ from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.dataset.verify.reproduce import differences
 from blinkgl.errors import ConfigError, OutputError
+from blinkgl.render.reference import render as by_reference
+from blinkgl.scene.build import sequence_scene
 from blinkgl.sequence import simulate_sequence
 from blinkgl.sequence.request import SequenceRequest
 from blinkgl.sequence_files.sequence_dir import read_manifest
@@ -102,6 +104,20 @@ def test_a_rig_of_one_is_the_single_camera(tmp_path):
     assert verify_dataset(rig / "out").clean
 
 
+def test_disparity_is_f_b_over_z(pair):
+    config, folder = config_of(pair), pair / "out/train/sequence_000000"
+    scene, worst = sequence_scene(config, 0, pair), []
+    for number, eye in enumerate(("left", "right")):
+        drawn = np.load(folder / eye / "disparity/000000.npy")
+        seen = scene.seen_by(number)
+        true = by_reference(seen, config.time.label_times_ns[0])
+        f, b = seen.camera.fx, 0.1
+        same = (true.depth > 0) & np.isfinite(true.depth) & _inside(true.instance)
+        worst.append(np.abs(drawn - f * b / np.where(same, true.depth, np.inf))[same].max())
+        assert same.mean() > 0.5 and drawn[same].min() > 0.3
+    assert max(worst) < 1e-4, "px"
+
+
 def test_flow_of_both_eyes_is_that_of_depth_and_poses(pair):
     folder = pair / "out/train/sequence_000000"
     for eye in ("left", "right"):
@@ -161,3 +177,14 @@ def test_a_damaged_eye_is_made_again_with_its_rig(pair, tmp_path):
 def test_one_door_for_several_sensors(pair):
     with pytest.raises(ConfigError, match="several sensors are simulated together"):
         simulate_sequence(SequenceRequest(config_of(pair)))
+
+
+def _inside(ids: np.ndarray) -> np.ndarray:
+    """Pixels whose neighbours show the same object."""
+    same = ids > 0
+    for axis in (0, 1):
+        for step in (1, -1):
+            same &= np.roll(ids, step, axis) == ids
+    same[[0, -1]] = False
+    same[:, [0, -1]] = False
+    return same

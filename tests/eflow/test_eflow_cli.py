@@ -14,6 +14,7 @@ torch = pytest.importorskip("torch")
 
 from shared_data import shared  # noqa: E402
 
+import eflow  # noqa: E402
 from blinkgl.io.formats import write_events  # noqa: E402
 from eflow import checkpoint as ckpt, submit  # noqa: E402
 from eflow.cli import run  # noqa: E402
@@ -99,6 +100,12 @@ def test_a_window_as_long_as_things_need_to_move_by_five_pixels(tmp_path, capsys
     assert 0.7 * span < 1000 * found < 1.4 * span
     assert run([*command[:-1], "soon"]) == 2
     assert "--window-ms: not a length (got 'soon'); expected milliseconds, or auto" in capsys.readouterr().err
+
+
+def test_from_eflow_import_load_model(network):
+    assert eflow.load_model(network).config.name == "ev_flownet" and eflow.Predictor.__name__ == "Predictor"
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        eflow.nothing  # noqa: B018
 
 
 def test_warm_start_runs(refined, tmp_path, capsys):

@@ -13,7 +13,6 @@ Times and paths of machines live here and nowhere else in a data set.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import os
 import shutil
@@ -29,6 +28,7 @@ from blinkgl.dataset.work import RUN_FOLDER, Message, SequenceLog
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.atomic import atomic_file, output_errors, remove_stale
 from blinkgl.io.records import parse, read_text
+from blinkgl.machine.posix import fcntl
 from blinkgl.sequence_files.sequence_dir import verify_sequence
 
 FORMAT = "blinkgl-run"
@@ -133,7 +133,8 @@ class RunFolder:
             self._logs = set(self._worker_logs())
             yield
         finally:
-            os.close(self._handle)
+            if self._handle is not None:
+                os.close(self._handle)
             with contextlib.suppress(OSError):  # what is not empty stays
                 for folder in made:
                     folder.rmdir()
@@ -145,8 +146,9 @@ class RunFolder:
             self.out.mkdir(parents=True, exist_ok=True)
         return missing
 
-    def _lock(self) -> int:
-        while True:
+    def _lock(self) -> int | None:
+        """The open folder, locked; None where the system cannot, and two runs in one folder are not told apart."""
+        while fcntl is not None:
             with output_errors(self.out):
                 handle = os.open(self.out, os.O_RDONLY | os.O_DIRECTORY)
             try:
@@ -170,6 +172,7 @@ class RunFolder:
             # Another run was refused, and took the folder away, between our opening and our locking it.
             os.close(handle)
             self._make()
+        return None
 
     def check_in_place(self) -> None:
         """OutputError when the folder that was locked is no longer the one at ``out``:
@@ -330,7 +333,9 @@ class RunFolder:
             path.write_text(json.dumps(data, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
-def _same(path: Path, handle: int) -> bool:
+def _same(path: Path, handle: int | None) -> bool:
+    if handle is None:
+        return path.is_dir()
     try:
         found, held = os.stat(path), os.fstat(handle)
     except OSError:

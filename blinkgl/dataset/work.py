@@ -19,7 +19,6 @@ import hashlib
 import importlib
 import os
 import platform
-import resource
 import time
 import traceback
 from collections.abc import Callable, Mapping
@@ -38,6 +37,7 @@ from blinkgl.dataset.plan import Plan, digest
 from blinkgl.dataset.report import SequenceReport
 from blinkgl.errors import BlinkGLError, ConfigError, OutputError, may_pass
 from blinkgl.gl import GLContext, create_context
+from blinkgl.machine.posix import peak_kib
 
 Message = dict[str, Any]
 RUN_FOLDER = ".run"
@@ -184,7 +184,7 @@ class Maker:
             "task": number,
             "bytes": size,
             "cpu_s": time.process_time() - cpu,
-            "peak_rss_kib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+            "peak_rss_kib": peak_kib(),
             "report": {**asdict(report), "path": str(report.path)},
         }
 

@@ -85,6 +85,8 @@ def _alive(pid: int) -> bool:
 
 def fsync(path: Path) -> None:
     """Flushes a file or a directory entry to the disk."""
+    if os.name == "nt":  # which opens no folders, and flushes what can be written alone
+        return
     fd = os.open(path, os.O_RDONLY)
     try:
         os.fsync(fd)

@@ -325,8 +325,14 @@ def simulate(
         str | None,
         typer.Option(
             "--sensor",
-            help="davis240c, davis346, dvxplorer, gen31_vga or imx636, or a sensor file (.yaml): its thresholds, noise "
-            "and read-out limit.",
+            help="davis240c, davis346, dvxplorer, gen31_vga or imx636, or a sensor file (.yaml): its size, thresholds, "
+            "noise and read-out limit.",
+        ),
+    ] = None,
+    size: Annotated[
+        str | None,
+        typer.Option(
+            help="WIDTHxHEIGHT that frames are cropped and scaled to (default: the sensor's, else their own)."
         ),
     ] = None,
     config: Annotated[str | None, typer.Option("--config", help="YAML file of emulator parameters.")] = None,
@@ -358,6 +364,7 @@ def simulate(
         out,
         emulator=emulator,
         sensor=sensor,
+        size=size,
         config=config,
         overrides=overrides or [],
         quiet=quiet,

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
 
 import blinkgl
 from blinkgl.config.run import RunTemplate
@@ -45,6 +46,10 @@ def test_import_brings_nothing_with_it():
     assert (
         subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
     )
+
+
+def test_the_names_of_the_package_are_those_that_it_gives():
+    assert {name for name in dir(blinkgl) if not name.startswith("__")} == set(blinkgl.__all__) - {"__version__"}
 
 
 def test_table_list_and_type_checker_agree():
@@ -115,6 +120,32 @@ def test_record_is_what_generate_writes(tmp_path):
     assert recording.t_us.tolist() == [50_000, 100_000] and recording.image_t_us.tolist() == [50_000, 100_000, 150_000]
     assert len(recording.window(0)) == np.count_nonzero((written.t >= 50_000) & (written.t < 100_000))
     assert blinkgl.verify(tmp_path / "out").clean
+
+
+def test_poses_from_matrices(tmp_path):
+    """Whoever has (4, 4) poses gives them as they are: the camera's path passes them."""
+    rng = np.random.default_rng(1)
+    turns = Rotation.from_rotvec(np.cumsum(rng.normal(0, 0.15, (5, 3)), axis=0)) * Rotation.from_euler("x", -90, True)
+    T = np.tile(np.eye(4), (5, 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = turns.as_matrix(), rng.normal(0, 1, (5, 3))
+    times = np.linspace(0, 1.2, 5)
+    camera = blinkgl.Camera(32, 24, pose=blinkgl.Keyframes.from_arrays(times, T))
+    scene = blinkgl.Scene(camera, duration=1.0) + blinkgl.Primitive("cuboid")
+    path = scene.build(scene.template().sequence(0)).camera_path
+    np.testing.assert_allclose(path.poses(np.round(times * 1e9).astype(np.int64)), T, atol=1e-7)
+    body = blinkgl.Pose.from_matrix(T[2])
+    np.testing.assert_allclose(body.tree["position"], T[2, :3, 3])
+    for wrong, said in (
+        (np.diag([1.0, 1, -1, 1]), "Pose.from_matrix: the matrix mirrors"),
+        (2 * np.eye(4), "the last row of a pose is not 0, 0, 0, 1"),
+        (np.eye(3), r"Pose.from_matrix: not such an array .*expected an array \(4, 4\)"),
+    ):
+        with pytest.raises(blinkgl.ConfigError, match=said):
+            blinkgl.Pose.from_matrix(wrong)
+    with pytest.raises(blinkgl.ConfigError, match=r"from_arrays.times_s: times do not increase"):
+        blinkgl.Keyframes.from_arrays([0, 1, 1, 2, 3], T)
+    with pytest.raises(blinkgl.ConfigError, match=r"from_arrays.T\[3\]: the matrix mirrors"):
+        blinkgl.Keyframes.from_arrays(times, np.where(np.arange(5)[:, None, None] == 3, np.diag([1.0, 1, -1, 1]), T))
 
 
 def test_arrays_as_mesh_and_image():

@@ -107,19 +107,31 @@ def convert(
 
     size : (height, width), px, where ``source`` does not say.   time_unit : as of :func:`write_events`.
     zero_time : count times from the first event. Raises AssetError, OutputError, EventDataError, ConfigError."""
-    if size is not None:
-        pair = check.one_of(size, "size", (list, tuple), "(height, width)")
-        if len(pair) != 2:
-            raise ConfigError("not two numbers", where="size", value=size, accepted="(height, width)")
-        size = (check.whole(pair[0], "size", 1, _SIDE), check.whole(pair[1], "size", 1, _SIDE))
     return formats.convert(
         check.path(source, "source"),
         check.path(target, "target"),
-        size=size,
+        size=None if size is None else _size(size),
         zero_time=bool(zero_time),
         time_unit=time_unit,
         overwrite=overwrite,
     )[1]
+
+
+def _size(size: Any) -> tuple[int, int]:
+    """(height, width), px. Raises ConfigError."""
+    pair = check.one_of(size, "size", (list, tuple), "(height, width)")
+    if len(pair) != 2:
+        raise ConfigError("not two numbers", where="size", value=size, accepted="(height, width)")
+    return check.whole(pair[0], "size", 1, _SIDE), check.whole(pair[1], "size", 1, _SIDE)
+
+
+def _sensor_size(sensor: str | None) -> tuple[int, int] | None:
+    from blinkgl.config.sensor import load_sensor
+
+    if sensor is None:
+        return None
+    camera = load_sensor(sensor)
+    return camera.height, camera.width
 
 
 def read_flow(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
@@ -280,7 +292,7 @@ def simulate(
     frames : iterable, a generator included, of (H, W) or (H, W, 3) RGB arrays with ``fps``, Hz, or of pairs (array,
     t_ns). uint8, uint16, or float (1.0 is white).
     emulator : as of :func:`record`, "esim" if not said.   seed : of its noise, 0 if not said.
-    sensor : the read-out limit of that camera, and with an emulator's name its values.
+    sensor : the read-out limit of that camera, and with an emulator's name its values; frames keep their size.
     gamma : "srgb", "linear" or an exponent; default: srgb for integers, linear for floats.
     interpolate : "linear", the default; "motion": dense flow, at most ``max_px`` (1) px a step.
     report : a SimulationReport to be filled.
@@ -301,6 +313,7 @@ def simulate_file(
     target: str | os.PathLike,
     *,
     timestamps: str | os.PathLike | None = None,
+    size: tuple[int, int] | None = None,
     preview: str | os.PathLike | None = None,
     overwrite: bool = True,
     **frames: Unpack[FrameOptions],
@@ -308,7 +321,8 @@ def simulate_file(
     """A video, a folder of images or .npy frames (N, H, W[, 3]) to an event file, as
     ``blinkgl simulate``; files appear whole or not at all.
 
-    timestamps : file of times, one a frame.   preview : a video of frames and events to write.
+    timestamps : file of times, one a frame.   size : (height, width), px, that frames are cropped and scaled to; None:
+    that of ``sensor``, or else the frames' own.   preview : a video of frames and events to write.
     frames : fps, emulator, gamma, interpolate, max_px, seed, sensor as of :func:`simulate`.
     Returns a report: frames, steps, events, lost … Raises AssetError, OutputError, EventDataError, ConfigError."""
     from blinkgl.recordings import simulation
@@ -317,6 +331,7 @@ def simulate_file(
         check.path(source, "source"),
         check.path(target, "target"),
         timestamps=None if timestamps is None else check.path(timestamps, "timestamps"),
+        size=_sensor_size(frames.get("sensor")) if size is None else _size(size),
         preview=None if preview is None else check.path(preview, "preview"),
         overwrite=overwrite,
         **_options(**frames),

@@ -28,6 +28,7 @@ from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import ConfigError, EventDataError, OutputError
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.io.frames import open_frames
+from blinkgl.recordings.fitting import Fitting
 from blinkgl.srgb import linear_from_srgb
 from blinkgl.tensors.choice import make_on_device
 from blinkgl.timeline import interpolate as between
@@ -60,6 +61,8 @@ class SimulationReport:
     """events by what caused them, "signal", "leak", "shot" and "hot"; empty unless ``causes`` of the emulator is set"""
     displacement: between.Displacement | None = None
     """for interpolate="motion" """
+    fitting: Fitting | None = None
+    """how frames became the sensor's size; None: they had it, or nobody asked"""
 
     @property
     def duration_s(self) -> float:
@@ -225,6 +228,7 @@ def file_to_events(
     *,
     fps: float | None = None,
     timestamps: str | os.PathLike | None = None,
+    size: tuple[int, int] | None = None,
     preview: str | os.PathLike | None = None,
     overwrite: bool = True,
     progress: Callable[[SimulationReport, float | None], None] | None = None,
@@ -233,6 +237,7 @@ def file_to_events(
     """Frames of ``source`` (see :func:`~blinkgl.io.frames.open_frames`) to an event file whose ending names the format
     (.h5 .raw .txt .csv .npz .npy); options as :func:`frames_to_events`. The files appear whole or not at all.
 
+    size : (height, width) of the sensor; frames of another size are cropped and scaled; None: as the frames are.
     preview : video of frames and events. progress : called with (report so far, fraction done or None) per given frame.
     """
     from blinkgl.io.atomic import atomic_file
@@ -250,8 +255,12 @@ def file_to_events(
     if preview is not None and Path(preview).resolve() == Path(target).resolve():
         raise OutputError("preview and events in the same file", where=str(preview))
     frames = open_frames(source, fps=fps, timestamps=timestamps)
-    height, width = frames.height, frames.width
+    height, width = (frames.height, frames.width) if size is None else size
     report = SimulationReport()
+    decode = Decoder("srgb" if options.get("gamma") is None else _checked_gamma(options["gamma"]))
+    if (height, width) != (frames.height, frames.width):
+        report.fitting = Fitting((frames.height, frames.width), (height, width))
+        options = {**options, "gamma": "linear"}  # scaled in linear light
     iterator = iter(frames)
     first = next(iterator)
     second = next(iterator, None)
@@ -260,7 +269,8 @@ def file_to_events(
 
     def given() -> Iterator:
         for i, (frame, t_ns, name) in enumerate(itertools.chain([first], [second] if second else [], iterator)):
-            yield frame, t_ns, f"{source}: frame {i} ({name})"
+            said = f"{source}: frame {i} ({name})"
+            yield (frame if report.fitting is None else report.fitting(decode(frame, said))), t_ns, said
 
     with contextlib.ExitStack() as stack:
         out = stack.enter_context(event_writer(target, height, width, t_offset_us=start_us, overwrite=overwrite))
@@ -278,7 +288,6 @@ def file_to_events(
                     fps=min(rate, 25.0),
                 )
             )
-        decode = Decoder("srgb" if options.get("gamma") is None else _checked_gamma(options["gamma"]))
         done = 0
         for step in simulated_steps(given(), report=report, **options):
             if video is not None:

@@ -11,16 +11,18 @@ from blinkgl.machine.terminal import plain_console, say
 
 def run(source: str, target: str, *, size: str | None = None, **options: Any) -> int:
     """``options``: of :func:`~blinkgl.io.formats.convert`. size : "WIDTHxHEIGHT"."""
-    known = None
-    if size is not None:
-        width, cross, height = size.lower().partition("x")
-        if not (
-            cross and width.isdigit() and height.isdigit() and 0 < int(width) <= 65536 and 0 < int(height) <= 65536
-        ):
-            raise ConfigError("not a size", where="--size", value=size, accepted="WIDTHxHEIGHT, e.g. 640x480")
-        known = (int(height), int(width))
-    file, count = convert(source, target, size=known, **options)
+    file, count = convert(source, target, size=size_of(size), **options)
     say(plain_console(), f"{target}: {count:,} events, {file.width}x{file.height}, from {file.format}")
     if file.causes and output_format(target) not in WITH_CAUSES:
         say(plain_console(), "the causes of the events are left out: the format cannot hold them")
     return 0
+
+
+def size_of(text: str | None) -> tuple[int, int] | None:
+    """(height, width) of what ``--size`` says. Raises ConfigError."""
+    if text is None:
+        return None
+    width, cross, height = text.lower().partition("x")
+    if not (cross and width.isdigit() and height.isdigit() and 0 < int(width) <= 65536 and 0 < int(height) <= 65536):
+        raise ConfigError("not a size", where="--size", value=text, accepted="WIDTHxHEIGHT, e.g. 640x480")
+    return int(height), int(width)

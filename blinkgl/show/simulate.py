@@ -14,6 +14,7 @@ from blinkgl.config.expansion import expanded
 from blinkgl.config.reader import parse_yaml, read_table
 from blinkgl.errors import ConfigError
 from blinkgl.machine.terminal import causes_line, plain_column, plain_console, say
+from blinkgl.show.convert import size_of
 
 if TYPE_CHECKING:
     from blinkgl.recordings.simulation import SimulationReport
@@ -22,9 +23,9 @@ if TYPE_CHECKING:
 def emulator_options(
     name: str, config: str | None, overrides: Sequence[str], sensor: str | None = None
 ) -> dict[str, Any]:
-    """``emulator`` and ``readout`` of :func:`blinkgl.simulate` from an emulator's name, an optional YAML mapping (it
-    may name the emulator itself), ``key=value`` overrides, and an optional sensor whose
-    values hold where nothing else is said."""
+    """``emulator``, ``readout`` and ``size`` of :func:`blinkgl.simulate_file` from an emulator's name, an optional YAML
+    mapping (it may name the emulator itself), ``key=value`` overrides, and an optional sensor whose values hold where
+    nothing else is said."""
     data: dict[str, Any] = {}
     if config is not None:
         data = read_table(config, "emulator parameters, key: value")
@@ -37,12 +38,13 @@ def emulator_options(
     if "recipe" in data:  # a video is one camera: the middle of what the recipe draws
         data = middle(expanded({"events": data}, Path.cwd())["events"])
     if sensor is None:
-        return {"emulator": data, "readout": None}
+        return {"emulator": data, "readout": None, "size": None}
     from blinkgl.config.sensor import load_sensor
     from blinkgl.recordings.simulation import emulator_config
 
     camera = load_sensor(sensor)
-    return {"emulator": emulator_config({**camera.values(data["emulator"]), **data}), "readout": camera.readout}
+    known = emulator_config({**camera.values(data["emulator"]), **data})
+    return {"emulator": known, "readout": camera.readout, "size": (camera.height, camera.width)}
 
 
 def run(
@@ -53,12 +55,17 @@ def run(
     sensor: str | None = None,
     config: str | None = None,
     overrides: Sequence[str] = (),
+    size: str | None = None,
     quiet: bool = False,
     **options: Any,
 ) -> int:
-    """``options``: of :func:`~blinkgl.recordings.simulation.file_to_events`."""
+    """``size``: "WIDTHxHEIGHT" in place of the sensor's.   ``options``: of
+    :func:`~blinkgl.recordings.simulation.file_to_events`."""
     from blinkgl.recordings.simulation import file_to_events
 
+    options |= emulator_options(emulator, config, overrides, sensor)
+    if size is not None:
+        options["size"] = size_of(size)
     console = plain_console(quiet=quiet)
     bar = Progress(
         plain_column("{task.description}"),
@@ -81,9 +88,7 @@ def run(
                 detail=f"{report.frames} frames, {report.events / 1e6:.2f} M events",
             )
 
-        report = file_to_events(
-            source, target, progress=progress, **emulator_options(emulator, config, overrides, sensor), **options
-        )
+        report = file_to_events(source, target, progress=progress, **options)
     _told(console, target, report)
     return 0
 
@@ -99,6 +104,8 @@ def _told(console: Console, target: str, report: SimulationReport) -> None:
         f"{100 * report.on / max(report.events, 1):.1f} % ON) from {report.frames} frames, {report.steps} emulator "
         "steps",
     )
+    if report.fitting is not None:
+        say(console, f"{report.fitting} (--size keeps another)")
     if report.displacement is not None:
         say(console, str(report.displacement))
     elif report.steps > report.frames:

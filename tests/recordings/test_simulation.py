@@ -13,6 +13,7 @@ from blinkgl.errors import ConfigError, EventDataError
 from blinkgl.events import Events, make_emulator
 from blinkgl.io.formats import open_events
 from blinkgl.io.video import VideoReader, VideoWriter
+from blinkgl.recordings.fitting import Fitting
 from blinkgl.recordings.simulation import Decoder, SimulationReport, file_to_events, frames_to_events
 from blinkgl.srgb import DECODE_8BIT
 from tests.shared_data import shared
@@ -266,6 +267,35 @@ def test_a_sensor_brings_its_parameters_and_its_read_out(tmp_path, capsys):
     assert run(command) == 0 and "lost in the sensor's read-out" in capsys.readouterr().out
     assert run([*command[:-1], str(tmp_path / "f.h5"), "--sensor", "kodak"]) == 2
     assert "unknown sensor" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("given", "part"), [((480, 640), (480, 639)), ((40, 120), (40, 53)), ((260, 346), (260, 346))])
+def test_frames_become_the_sensors_size_by_their_middle(given, part):
+    """A brightness that rises evenly in x keeps its slope per part of the picture, its middle and its mean."""
+    fit = Fitting(given, (260, 346))
+    assert fit.part == part
+    ramp = np.tile(np.linspace(0, 1, given[1], dtype=np.float32), (given[0], 1))
+    fitted = fit(ramp)
+    assert fitted.shape == (260, 346) and fitted.mean() == pytest.approx(0.5, abs=0.51 / given[1])
+    step = part[1] / given[1] / 346
+    np.testing.assert_allclose(np.diff(fitted[:, 4:-4], axis=1), step, rtol=0.05)
+
+
+def test_a_sensors_size_is_taken_and_said(tmp_path, capsys):
+    frames, out = tmp_path / "frames.npy", tmp_path / "e.npz"
+    y, x = np.mgrid[:48, :64]
+    np.save(frames, np.stack([(40 + 2 * ((x + 3 * k) % 64) + y).astype(np.uint8) for k in range(4)]))
+    command = ["simulate", str(frames), "--fps", "50", "--out", str(out), "--overwrite", "--sensor", "davis346"]
+    for more, size in (([], (260, 346)), (["--size", "20x10"], (10, 20)), (["--size", "64x48"], (48, 64))):
+        assert run([*command, *more]) == 0
+        with open_events(out) as file:
+            assert (file.height, file.width) == size
+        said = capsys.readouterr().out
+        assert (f"scaled to {size[1]}x{size[0]} (--size" in said) == (size != (48, 64))
+    report = blinkgl.simulate_file(frames, out, fps=50, sensor="davis346", size=(48, 64))
+    assert report.fitting is None
+    assert run([*command, "--size", "64"]) == 2
+    assert "--size: not a size (got '64'); expected WIDTHxHEIGHT" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

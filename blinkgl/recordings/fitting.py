@@ -1,0 +1,36 @@
+"""Frames of one size as a sensor of another would see them: the largest part of the sensor's shape, scaled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Fitting:
+    """given, wanted : (height, width), px."""
+
+    given: tuple[int, int]
+    wanted: tuple[int, int]
+
+    @property
+    def part(self) -> tuple[int, int]:
+        """(height, width) of what is used of a frame: its middle, of the wanted shape."""
+        (height, width), (wanted_height, wanted_width) = self.given, self.wanted
+        scale = min(height / wanted_height, width / wanted_width)
+        return max(1, round(wanted_height * scale)), max(1, round(wanted_width * scale))
+
+    def __call__(self, luminance: np.ndarray) -> np.ndarray:
+        """(H, W) float32 linear, as given, to the wanted size: means over areas where that is smaller."""
+        height, width = self.part
+        y, x = (self.given[0] - height) // 2, (self.given[1] - width) // 2
+        cut = luminance[y : y + height, x : x + width]
+        way = cv2.INTER_AREA if self.wanted[0] <= height else cv2.INTER_LINEAR
+        return cv2.resize(cut, self.wanted[::-1], interpolation=way)
+
+    def __str__(self) -> str:
+        named = lambda size: f"{size[1]}x{size[0]}"
+        cropped = "" if self.part == self.given else f"cropped to {named(self.part)} and "
+        return f"frames of {named(self.given)} are {cropped}scaled to {named(self.wanted)}"

@@ -3,6 +3,7 @@ second drivers, links, refusals."""
 
 import os
 import shutil
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -100,6 +101,40 @@ def test_a_link_in_the_place_of_our_folder_is_refused(tmp_path, name):
     with pytest.raises(OutputError, match=rf"out/{name}: is a symbolic link; expected a folder"):
         run_dataset(template(tmp_path), tmp_path / "out")
     assert list((tmp_path / "elsewhere").iterdir()) == []
+
+
+# ---- many sequences --------------------------------------------------------------------------------------------------
+
+
+def test_memory_does_not_grow_with_the_number_of_sequences(tmp_path):
+    """A run is planned and begun, and ends with its first message."""
+
+    class Enough(Exception): ...
+
+    def stop(name, message):
+        raise Enough
+
+    class Nothing(Inline):
+        def open(self, job):
+            super().open(job)
+            return [{"environment": {}, "assets": work.digest(self._maker.plan.check_assets())}]
+
+        def poll(self, timeout_s):
+            return [{"kind": "progress", "task": self._next[0], "error": "stop here"}]
+
+    def peak_of(sequences: int) -> int:
+        run = template(tmp_path, groups={"fly": {"output": {"sequences": sequences}}})
+        tracemalloc.start()
+        try:
+            with pytest.raises(Enough):
+                run_dataset(run, tmp_path / f"{sequences}", Nothing(), listener=Listener(stop))
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    peak_of(3)  # what is made once
+    small, large = peak_of(10), peak_of(10_000_000)
+    assert large < 1.5 * small + 1e6, f"{small} and {large} bytes"
 
 
 # ---- files deleted under a run ---------------------------------------------------------------------------------------

@@ -18,10 +18,7 @@ from blinkgl.machine.interrupts import interruptible
 from eflow.methods.table import METHODS, make_method
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from eflow.config import SourceConfig
-    from eflow.infer import StreamWindow
 
 app = typer.Typer(name="eflow", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -265,110 +262,27 @@ def predict(
     """Flow from any event file, by a network or by a method that needs no training.
 
     FWL is how much sharper the new window's events are when the flow takes them back to its start: above 1 it helps."""
-    import contextlib
-
-    import numpy as np
-
     from blinkgl.types.events import Events
     from eflow import infer
     from eflow.doubts import doubts
-    from eflow.methods.iwe import flow_warp_loss
-    from eflow.pictures import FlowVideo, events_of
+    from eflow.flow_of_file import Outputs, WindowsAsked, milliseconds, show_flows
 
     _one_of("--empty", empty, ("error", "zero"))
-    milliseconds = _milliseconds(window_ms)
+    asked = WindowsAsked(milliseconds(window_ms), start_ms, end_ms, whole)
     method = _method(checkpoint, focal, iterations=iterations, raw=raw, warm_start=warm_start)
     model = None if method is not None else _model(checkpoint, device, raw, precision, iterations)
     file = infer.open_sized(events, _size(size))
     for line in doubts(next(iter(file.chunks()), Events.empty()), file.height, file.width):
         typer.echo(f"{events}: {line}", err=True)
-    gt = infer.read_truth(truth, file.height, file.width) if truth else None
-    precision = precision if model is None else _precision(model, precision)
-
-    size_of_file = (file.height, file.width)
-    if method is not None:
-        predictor = infer.MethodPredictor(method, *size_of_file, empty=empty)
+    outputs = Outputs(out, video, npy, infer.read_truth(truth, file.height, file.width) if truth else None)
+    shape = (file.height, file.width)
+    if model is None:
+        predictor = infer.MethodPredictor(method, *shape, empty=empty)
     else:
-        predictor = infer.Predictor(model, *size_of_file, warm_start=warm_start, precision=precision, empty=empty)
-    if whole:
-        window, factor = infer.whole_file(file, ("old", "new") if model is None else model.reads)
-        stream, span = [window], window.new.t1 - window.old.t0
-    else:
-        first = next((int(c.t[0]) for c in file.chunks()), None)
-        if first is None:
-            raise BlinkGLError("holds no events", where=events)
-        at = lambda ms: None if ms is None else first + round(ms * 1000)
-        span, factor = infer.likely_span(file, predictor) if milliseconds is None else round(milliseconds * 1000), 1.0
-        if milliseconds is None:
-            typer.echo(f"windows of {span / 1000:g} ms")
-        stream = infer.windows(file, span, start_us=at(start_ms), end_us=at(end_ms))
-    count = began = 0
-    with contextlib.ExitStack() as opened:
-        writer = opened.enter_context(infer.FlowWriter(out, npy=npy)) if out else None
-        shown = FlowVideo(video, file.height, file.width, _fps(span)) if video else None
-        if shown:
-            opened.enter_context(shown)
-        for window in stream:
-            flow, tensor = predictor(window)
-            sharper = flow_warp_loss(window.new, flow)
-            flow = flow * np.float32(factor)
-            count += 1
-            line = (
-                f"t {window.t_us} us  {len(window.old) + len(window.new)} events  mean speed "
-                f"{np.hypot(*np.moveaxis(flow, -1, 0)).mean():.3f} px  FWL {sharper:.3f}"
-            )
-            if gt is not None:
-                line += _beside_truth(flow, gt, window)
-            typer.echo(line)
-            if writer:
-                writer.add(window, flow, tensor, gt)
-            if shown:
-                began = window.new.t0 if count == 1 else began
-                # Recordings may count from 1970: the video begins at 0.
-                caption = f"{(window.new.t1 - window.new.t0) / 1000:g} ms at {(window.t_us - began) / 1e6:.3f} s"
-                shown.add(caption, events_of(tensor), flow)
-        if not count:
-            raise BlinkGLError(
-                f"shorter than two windows of {span / 1000:g} ms",
-                where=events,
-                accepted="a smaller --window-ms, or --whole",
-            )
-    for path in filter(None, (out, video)):
-        typer.echo(f"written: {path}")
-
-
-def _beside_truth(flow: np.ndarray, truth: np.ndarray, window: StreamWindow) -> str:
-    """Two lines: errors over all pixels with truth, and over those with events."""
-    import numpy as np
-
-    from eflow.metrics import frame_metrics
-
-    valid, hit, lines = np.isfinite(truth).all(-1), np.zeros(truth.shape[:2], bool), ""
-    for part in (window.new, window.old):
-        hit[part.y, part.x] = True
-    for name, mask in (("all pixels", valid), ("pixels with events", valid & hit)):
-        m, zero = frame_metrics(flow, truth, mask), frame_metrics(np.zeros_like(flow), truth, mask)
-        if m:
-            lines += f"\n  {name}: AEE {m['AEE']:.3f} px, cosine {m['cosine']:.4f}; zero flow AEE {zero['AEE']:.3f} px"
-    return lines
-
-
-def _fps(span_us: int) -> float:
-    """Windows a second of video: as fast as it happened, but no more than 20."""
-    return min(20.0, 1e6 / span_us)
-
-
-def _milliseconds(text: str) -> float | None:
-    """Of --window-ms; None for "auto"."""
-    if text == "auto":
-        return None
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.001 <= value < 1e9:
-        raise ConfigError("not a length", where="--window-ms", value=text, accepted="milliseconds, or auto")
-    return value
+        precision = _precision(model, precision)
+        predictor = infer.Predictor(model, *shape, warm_start=warm_start, precision=precision, empty=empty)
+    reads = ("old", "new") if model is None else model.reads
+    show_flows(file, predictor, reads, asked, outputs, typer.echo)
 
 
 @app.command()
@@ -403,9 +317,8 @@ def import_(
     checkpoint: Annotated[str, typer.Argument(help="E-RAFT's dsec.tar, mvsec_20.tar ….")],
     out: Annotated[str, typer.Option("--out", "-o", help="New .safetensors file.")],
 ) -> None:
-    """Make a published checkpoint a file that predict, evaluate, submit and train (init_from) take.
-
-    Tensors are read and nothing else; E-RAFT's padding, border and time bins go with them."""
+    """Make a published checkpoint a file that predict, evaluate, submit and train (init_from) take. Tensors are read
+    and nothing else; E-RAFT's padding, border and time bins go with them."""
     from eflow.models import parameters_of
     from eflow.published import import_published
 

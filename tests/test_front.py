@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
 
 import blinkgl
 from blinkgl.config.run import RunTemplate
@@ -45,6 +46,10 @@ def test_import_brings_nothing_with_it():
     assert (
         subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
     )
+
+
+def test_the_names_of_the_package_are_those_that_it_gives():
+    assert {name for name in dir(blinkgl) if not name.startswith("__")} == set(blinkgl.__all__) - {"__version__"}
 
 
 def test_table_list_and_type_checker_agree():
@@ -117,6 +122,32 @@ def test_record_is_what_generate_writes(tmp_path):
     assert blinkgl.verify(tmp_path / "out").clean
 
 
+def test_poses_from_matrices(tmp_path):
+    """Whoever has (4, 4) poses gives them as they are: the camera's path passes them."""
+    rng = np.random.default_rng(1)
+    turns = Rotation.from_rotvec(np.cumsum(rng.normal(0, 0.15, (5, 3)), axis=0)) * Rotation.from_euler("x", -90, True)
+    T = np.tile(np.eye(4), (5, 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = turns.as_matrix(), rng.normal(0, 1, (5, 3))
+    times = np.linspace(0, 1.2, 5)
+    camera = blinkgl.Camera(32, 24, pose=blinkgl.Keyframes.from_arrays(times, T))
+    scene = blinkgl.Scene(camera, duration=1.0) + blinkgl.Primitive("cuboid")
+    path = scene.build(scene.template().sequence(0)).camera_path
+    np.testing.assert_allclose(path.poses(np.round(times * 1e9).astype(np.int64)), T, atol=1e-7)
+    body = blinkgl.Pose.from_matrix(T[2])
+    np.testing.assert_allclose(body.tree["position"], T[2, :3, 3])
+    for wrong, said in (
+        (np.diag([1.0, 1, -1, 1]), "Pose.from_matrix: the matrix mirrors"),
+        (2 * np.eye(4), "the last row of a pose is not 0, 0, 0, 1"),
+        (np.eye(3), r"Pose.from_matrix: not such an array .*expected an array \(4, 4\)"),
+    ):
+        with pytest.raises(blinkgl.ConfigError, match=said):
+            blinkgl.Pose.from_matrix(wrong)
+    with pytest.raises(blinkgl.ConfigError, match=r"from_arrays.times_s: times do not increase"):
+        blinkgl.Keyframes.from_arrays([0, 1, 1, 2, 3], T)
+    with pytest.raises(blinkgl.ConfigError, match=r"from_arrays.T\[3\]: the matrix mirrors"):
+        blinkgl.Keyframes.from_arrays(times, np.where(np.arange(5)[:, None, None] == 3, np.diag([1.0, 1, -1, 1]), T))
+
+
 def test_arrays_as_mesh_and_image():
     image = np.zeros((8, 8, 3), np.uint8)
     image[:, 4:] = 255
@@ -136,23 +167,6 @@ def test_arrays_as_mesh_and_image():
     assert not scene.on_disk
     with pytest.raises(blinkgl.ConfigError, match="^source: the scene holds arrays"):
         blinkgl.generate(scene, "nowhere")
-
-
-def test_renderer_draws_what_record_records():
-    scene = box_scene()
-    recording = blinkgl.record(scene, labels=("images", "flow", "ids"))
-    with blinkgl.Renderer(scene) as renderer:
-        assert np.array_equal(renderer.image(0.05), recording.images[0])
-        frame = renderer.frame(0.05, ["flow", "ids"])
-        assert np.array_equal(frame.forward.flow, recording.flow[0]) and np.array_equal(
-            frame.ids, recording.labels[0].ids
-        )
-        half = renderer.frame(0.05, ["flow"], to=0.075)
-        assert np.median(half.forward.flow[..., 0][half.forward.valid]) == pytest.approx(
-            np.median(recording.flow[0][..., 0][recording.valid[0]]) / 2, rel=0.1
-        )
-        emulator = blinkgl.Esim(24, 32, contrast_threshold=0.2)
-        assert len(emulator.step(renderer.luminance(0.0), 0)) == 0 < len(emulator.step(renderer.luminance(0.1), 10**8))
 
 
 def test_emulators_take_a_sensor():
@@ -283,6 +297,8 @@ WRONG = [
     ("path", lambda d: b.load(None)),
     ("overrides", lambda d: b.load(d / "a.yaml", "camera.width=3")),
     ("seed", lambda d: b.load(d / "a.yaml", seed="x")),
+    ("Body.restitution", lambda d: b.Body(restitution=2)),
+    ("Primitive.body", lambda d: P("cuboid", body=3.0)),
     ("Deform.kind", lambda d: b.Deform("melt")),
     ("Deform.kind", lambda d: b.Deform(7)),
     ("Deform.amplitude", lambda d: b.Deform("wave", amplitude=-1)),
@@ -345,31 +361,3 @@ def test_what_lives_is_what_yaml_makes_of_it(tmp_path):
     assert moved == pytest.approx(0.5 * walker.parts[0].mesh.deformer.speed, rel=1e-3)
     paint = b.Primitive("figure", material=b.Material(color=(1, 0, 0)))
     assert paint.material.tree["color"] == [1, 0, 0]
-
-
-# --- what falls -------------------------------------------------------------------------------------------------------
-
-
-def test_bodies_fall_as_those_of_yaml_do():
-    """The same tree, whichever object is added first; gravity is of no effect while nothing falls."""
-    pytest.importorskip("mujoco")
-    table = blinkgl.Primitive("grid", width=9.0, depth=9.0, category="ground", body=blinkgl.Body("fixed", friction=0.8))
-    die = blinkgl.Primitive("die", pose=(2, 0, 1), scale=0.2, body=blinkgl.Body(velocity=(0.5, 0, 0), spin=(0, 300, 0)))
-    still = blinkgl.Scene(blinkgl.Camera(32, 24), duration=0.5, gravity=(0, 0, -1.62)) + table
-    assert "physics" not in still.tree and "physics" not in still.tree["objects"][0]
-    scene = still + die
-    assert (
-        scene.tree["physics"] == {"gravity": [0, 0, -1.62]} and scene.tree["objects"][0]["physics"]["kind"] == "fixed"
-    )
-    built = scene.build(scene.template().sequence(0))
-    assert built.dynamics.bodies == 1
-    end = built.objects[1].path.pose(500_000_000)[:3, 3]
-    np.testing.assert_allclose(end, [2.25, 0, 1 - 0.81 * 0.25], atol=1e-6)
-    again = build_scene(
-        scene.template().sequence(0).scene, scene.template().sequence(0).camera, built.t0_ns, built.t1_ns
-    )
-    assert again.dynamics == built.dynamics
-    with pytest.raises(blinkgl.ConfigError, match=r"Body.restitution: too large \(got 2\)"):
-        blinkgl.Body(restitution=2)
-    with pytest.raises(blinkgl.ConfigError, match=r"Primitive.body: .* a Body"):
-        blinkgl.Primitive("cuboid", body=3.0)

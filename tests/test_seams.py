@@ -12,14 +12,12 @@ import pytest
 import yaml
 from pydantic import Field
 
-import blinkgl
 from blinkgl.cli import run
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.run import RunTemplate, load_run
-from blinkgl.config.sequence import LabelsConfig, SequenceConfig
+from blinkgl.config.sequence import LabelsConfig
 from blinkgl.dataset.explain import explain
 from blinkgl.dataset.generate import generate_run
-from blinkgl.errors import ConfigError
 from blinkgl.events import Emulator, Events, register
 from blinkgl.events.response import Response
 from blinkgl.events.table import EMULATORS, unregister
@@ -36,7 +34,6 @@ from blinkgl.labels.files import npy
 from blinkgl.render.casting import scene_parts
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
-from blinkgl.tools.config_docs import page
 
 # --- an emulator (docs/extending.md shows this class) ---------------------------------------------------------------
 
@@ -140,27 +137,6 @@ def test_a_toy_emulator_is_generated_and_verified(toy, tmp_path, capsys, timelin
     same = (np.diff(events.x[by_pixel].astype(int)) == 0) & (np.diff(events.y[by_pixel].astype(int)) == 0)
     assert np.diff(events.t[by_pixel])[same].min() >= int(said["dead_us"]), "no emulator but the toy has this dead time"
     assert run(["verify", str(out), "--deep"]) == 0, capsys.readouterr()
-
-
-def test_the_configuration_knows_a_toy_emulator_while_it_is_registered(tmp_path):
-    """The models were made before the toy was, and are the same afterwards."""
-    before, schema = page(), SequenceConfig.model_json_schema()
-    tree = {"events": {"emulator": "toy", "dead_us": {"uniform": [0, 2e9]}}}
-    with pytest.raises(ConfigError, match="unknown choice .*'toy'.*'esim', 'v2e', 'voltmeter'"):
-        load_run(written(tmp_path, **tree))
-    register(Toy)
-    try:
-        with pytest.raises(
-            ConfigError, match=r"events.dead_us: too large \(got 2000000000.0\); expected a number from 0 to 1e.09"
-        ):
-            load_run(written(tmp_path, **tree))
-        with pytest.raises(ConfigError, match="events.dead: unknown key; expected 'dead_us' .nearest"):
-            load_run(written(tmp_path, events={"emulator": "toy", "dead": 1}))
-        assert "## `events` with `emulator: toy`" in page()
-        assert "toy" in SequenceConfig.model_json_schema()["properties"]["events"]["discriminator"]["mapping"]
-    finally:
-        unregister("toy")
-    assert page() == before and SequenceConfig.model_json_schema() == schema
 
 
 def test_the_page_shows_this_toy():
@@ -338,25 +314,6 @@ def test_a_toy_label_is_explained(position, tmp_path, capsys):
     )
     assert not any(what == "position" for what, _ in with_it.left_out)
     assert ("position", "labels.position: false") in without.left_out
-
-
-def test_a_toy_label_at_the_front_door(position, tmp_path):
-    source = load_run(labelled(tmp_path))
-    recording = blinkgl.record(source, labels=["position", "flow"])
-    assert (
-        recording.labels[0].position.shape == (48, 64, 3)
-        and recording.labels[0].depth is None
-        and recording.images is None
-    )
-    blinkgl.generate(source, tmp_path / "door", labels=["position", "flow"])
-    np.testing.assert_array_equal(
-        np.load(tmp_path / "door/train/sequence_000000/position/000001.npy"), recording.labels[1].position
-    )
-    with blinkgl.Renderer(source) as renderer:
-        frame = renderer.frame(0.05, ["position"])
-    np.testing.assert_array_equal(frame.position, recording.labels[0].position)
-    with pytest.raises(ConfigError, match="unknown label .got 'positoin'.; expected images, depth, .*, position"):
-        blinkgl.record(source, labels=["positoin"])
 
 
 def shader(*arguments):

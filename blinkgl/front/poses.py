@@ -10,7 +10,8 @@ from typing import Any, Literal, TypeVar, get_origin
 import numpy as np
 from numpy.typing import ArrayLike
 
-from blinkgl.config.base import Config
+from blinkgl.config.base import Config, Refused
+from blinkgl.config.places import check_rigid, rigid_matrix
 from blinkgl.config.poses import KeyedMotionConfig, PoseConfig
 from blinkgl.config.problems import validate
 from blinkgl.errors import ConfigError
@@ -86,6 +87,20 @@ class Pose(Piece):
             PoseConfig, check.given(position=position, euler=euler, quaternion=quaternion, look_at=look_at)
         )
 
+    @classmethod
+    def from_matrix(cls, T: ArrayLike, where: str = "Pose.from_matrix") -> Pose:
+        """The pose of T_world_body or T_world_cam, (4, 4): from the body's axes to the world's, z up; a camera's are
+        x right, y down, z forward. Raises ConfigError: not rigid."""
+        matrix = check.array(T, where, (4, 4), "an array (4, 4)")
+        try:
+            check_rigid(check.plain(matrix), where)
+        except Refused as error:
+            raise ConfigError(error.problem, where=where, value=error.value, accepted=error.accepted) from None
+        from scipy.spatial.transform import Rotation
+
+        x, y, z, w = Rotation.from_matrix(rigid_matrix(matrix)[:3, :3]).as_quat()
+        return cls(matrix[:3, 3], quaternion=(w, x, y, z))
+
 
 def look_at(position: Vector, target: Vector) -> Pose:
     """A :class:`Pose` at ``position`` (3,) m, turned to the point ``target`` (3,) m; a camera's
@@ -112,6 +127,24 @@ class Keyframes(Piece):
         self.tree = self._checked(
             KeyedMotionConfig, {"keyframes": frames, "interpolation": check.plain(interpolation)}, keyframes="poses"
         )
+
+    @classmethod
+    def from_arrays(
+        cls, times_s: ArrayLike, T: ArrayLike, *, interpolation: Literal["spline", "linear"] = "spline"
+    ) -> Keyframes:
+        """The motion through poses at times_s, (N,) s, increasing: T is (N, 4, 4), each as of
+        :meth:`Pose.from_matrix`. Raises ConfigError."""
+        times = check.array(times_s, "Keyframes.from_arrays.times_s", (None,), "an array (N,), s")
+        poses = check.array(T, "Keyframes.from_arrays.T", (len(times), 4, 4), f"an array ({len(times)}, 4, 4)")
+        if not (np.diff(times) > 0).all():
+            raise ConfigError(
+                "times do not increase",
+                where="Keyframes.from_arrays.times_s",
+                value=times[:3].tolist(),
+                accepted="s, in order",
+            )
+        made = (Pose.from_matrix(pose, f"Keyframes.from_arrays.T[{k}]") for k, pose in enumerate(poses))
+        return cls(dict(zip(times.tolist(), made, strict=True)), interpolation=interpolation)
 
 
 class Trajectory(Piece):

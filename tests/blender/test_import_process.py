@@ -71,19 +71,21 @@ def test_what_is_refused_before_blender_starts(tmp_path, monkeypatch, name, opti
     assert not (tmp_path / "out.glb").exists()
 
 
-def test_output_that_cannot_be_is_refused_before_blender_starts(blend, tmp_path, fake):
+@pytest.mark.parametrize(
+    "out, error, said",
+    [
+        ("out.obj", ConfigError, "--out: not a GLB"),
+        ("there.glb", OutputError, "there.glb: output file exists; expected a new name, or --overwrite"),
+        ("there.glb/out.glb", OutputError, "cannot write"),
+        ("folder.glb", OutputError, "is a folder"),
+    ],
+)
+def test_output_that_cannot_be_is_refused_before_blender_starts(blend, tmp_path, fake, out, error, said):
     fake("(folder.parent / 'ran').touch()")
-    with pytest.raises(ConfigError, match="--out: not a GLB"):
-        import_scene(blend, tmp_path / "out.obj")
     (tmp_path / "there.glb").write_text("mine")
-    with pytest.raises(OutputError, match="there.glb: output file exists; expected a new name, or --overwrite"):
-        import_scene(blend, tmp_path / "there.glb")
-    (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match="cannot write"):
-        import_scene(blend, tmp_path / "file" / "out.glb")
     (tmp_path / "folder.glb").mkdir()
-    with pytest.raises(OutputError, match="is a folder"):
-        import_scene(blend, tmp_path / "folder.glb")
+    with pytest.raises(error, match=said):
+        import_scene(blend, tmp_path / out)
     assert not (tmp_path / "who").exists() and (tmp_path / "there.glb").read_text() == "mine"
 
 

@@ -163,6 +163,7 @@ def test_every_error_of_every_key_is_plain(monkeypatch, third):
                 "such as [forward]"
             ),
         ),
+        ("labels: {semantics: {'': 1}}", "labels.semantics: not a pattern of names"),
         ("labels: {depth: maybe}", "labels.depth: not true or false (got 'maybe'); expected true or false"),
         ("scene: {region: 3}", "scene.region: not a table of keys (got 3); expected a table of keys"),
         (

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from blinkgl.config.draw import draw, middle, options
 from blinkgl.config.events import EsimConfig, V2eConfig
+from blinkgl.config.expansion import load_recipe
 from blinkgl.config.problems import validate
 from blinkgl.config.run import load_run
+from blinkgl.config.shipped import shipped_names
 from blinkgl.errors import ConfigError
 from blinkgl.show.simulate import emulator_options
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "concepts.md"
 
 
 def events_of(tmp_path, text, count=400):
@@ -21,6 +27,18 @@ def events_of(tmp_path, text, count=400):
 
 def thresholds(events):
     return np.array([(e.contrast_threshold, e.contrast_threshold_off or e.contrast_threshold) for e in events]).T
+
+
+def test_every_value_of_every_recipe_has_a_source_and_the_page_names_it():
+    page = PAGE.read_text()
+    for name in shipped_names("emulators"):
+        recipe = load_recipe(name)
+        shares = recipe.events.get("shares")
+        tables = [part["value"] for part in shares] if shares else [recipe.events]
+        keys = {key for table in tables for key in table} - {"emulator", "preset"}
+        silent = {key for key in keys if key not in recipe.sources and not (key == "contrast_threshold_off" and shares)}
+        assert not silent, (name, silent)
+        assert recipe.sources and len(recipe.about) > 20 and f"`{name}`" in page
 
 
 @pytest.mark.parametrize(

@@ -172,17 +172,17 @@ def test_bad_values_name_path_value_and_what_is_accepted(tmp_path, text, message
     assert "\n" not in str(caught.value)
 
 
-def test_missing_binary_and_huge_files(tmp_path):
-    with pytest.raises(ConfigError, match="no such file"):
-        load_run(tmp_path / "absent.yaml")
-    path = tmp_path / "binary.yaml"
-    path.write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(ConfigError, match="cannot be read"):
-        load_run(path)
-    path.write_bytes(b" " * (5 << 20))
-    with pytest.raises(ConfigError, match="too large"):
-        load_run(path)
-    with pytest.raises(ConfigError, match="cannot be read"):
+@pytest.mark.parametrize(
+    "content, said",
+    [(None, "no such file"), (b"\xff\xfe\x00\x80", "cannot be read"), (b" " * (5 << 20), "too large")],
+    ids=["none", "binary", "huge"],
+)
+def test_missing_binary_and_huge_files(tmp_path, content, said):
+    if content:
+        (tmp_path / "run.yaml").write_bytes(content)
+    with pytest.raises(ConfigError, match=said):
+        load_run(tmp_path / "run.yaml")
+    with pytest.raises(ConfigError, match="cannot be read: not a regular file"):
         load_run(tmp_path)
 
 

@@ -77,40 +77,6 @@ def gathered(pool: Local, *kinds: str, seconds: float = 20.0) -> list[dict]:
     return found
 
 
-def test_tasks_go_to_who_is_free_and_come_back(job, local, tmp_path):
-    pool = local(2, [5, 7])
-    hellos = pool.open(job())
-    assert sorted(m["device"] for m in hellos) == [5, 7] and pool.free() == 2, "cards are dealt out in turn"
-    assert len({m["pid"] for m in hellos}) == 2
-    assert {m["threads"] for m in hellos} == {str(max(1, len(os.sched_getaffinity(0)) // 2))}
-    pool.submit(1, 4)
-    assert pool.free() == 1
-    pool.submit(16, 2)
-    assert pool.free() == 0
-    said = []
-    while len([m for m in said if m["kind"] != "progress"]) < 2:
-        said += pool.poll(5.0)
-    assert pool.free() == 2
-    assert {(m["kind"], m["task"], m.get("attempt")) for m in said} == {
-        ("progress", 1, None), ("done", 1, 4), ("progress", 16, None), ("failed", 16, 2)
-    }  # fmt: skip
-    assert sorted(p.name for p in (tmp_path / "out/.run/logs").iterdir()) == ["worker-0.log", "worker-1.log"]
-
-
-def test_a_worker_that_dies_costs_its_task_alone_and_is_replaced(job, local):
-    pool = local(1, [])
-    (first,) = pool.open(job())
-    pool.submit(13, 1)
-    said = gathered(pool, "failed")
-    assert [m for m in said if m["kind"] == "failed"] == [
-        {"kind": "failed", "task": 13, "error": "the worker was ended by SIGKILL", "final": False, "stop": False}
-    ]
-    second = [m for m in said if m["kind"] == "hello"] or gathered(pool, "hello")
-    assert second[0]["pid"] != first["pid"] and pool.free() == 1
-    pool.submit(2, 1)
-    assert gathered(pool, "done")[-1]["task"] == 2
-
-
 def test_a_task_that_took_too_long_is_ended_for_that_reason(job, local):
     pool = local(2, [])
     pool.open(job())

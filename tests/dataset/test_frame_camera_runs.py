@@ -1,7 +1,6 @@
 """A frame camera from the configuration to the files and those who read them."""
 
 import json
-import tarfile
 from pathlib import Path
 
 import numpy as np
@@ -9,14 +8,9 @@ import pytest
 
 from blinkgl.config.run import RunTemplate
 from blinkgl.dataset.generate import generate_run
-from blinkgl.dataset.shards import export_shards
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import AssetError
-from blinkgl.imaging import CameraImage
 from blinkgl.io.frame_camera import read_codes, read_exposures
-from blinkgl.report.collect import collect
-from blinkgl.sequence import EventChunk, GroundTruth, simulate_sequence
-from blinkgl.sequence.request import SequenceRequest
 
 RUN = {
     "seed": 5,
@@ -70,26 +64,6 @@ def test_images_are_written_beside_everything_else_and_verified(made):
     assert verify_dataset(out, deep=1).clean
 
 
-def test_images_come_in_time_between_events_and_labels(made):
-    config = template().sequence(0)
-    seen, times = [], []
-    for item in simulate_sequence(SequenceRequest(config, 0)):
-        if isinstance(item, EventChunk):
-            assert not len(item.events) or item.events.t[0] >= (times[-1] // 1000 if times else 0)
-            done_us = item.t_ns // 1000
-            assert not len(item.events) or item.events.t[-1] <= done_us
-        elif isinstance(item, (CameraImage, GroundTruth)):
-            assert item.t_ns // 1000 == done_us, "every event before it has come, and no other"
-            times.append(item.t_ns)
-            seen.append(item)
-    assert times == sorted(times)
-    images = [item for item in seen if isinstance(item, CameraImage)]
-    assert [item.k for item in images] == list(range(10)) and len(seen) == 10 + 3
-    for k in (0, 9):
-        for name, codes in images[k].pictures.items():
-            np.testing.assert_array_equal(codes, read_codes(made[0].path / f"frame_camera/{name}/{k:06d}.png"))
-
-
 @pytest.mark.parametrize("old, new", [("start_us", "begin_us"), ("500000.000", "nan")])
 def test_a_damaged_list_of_exposures_is_one_line(made, tmp_path, old, new):
     path = tmp_path / "frame_camera/exposures.csv"
@@ -97,25 +71,6 @@ def test_a_damaged_list_of_exposures_is_one_line(made, tmp_path, old, new):
     path.write_text((made[0].path / "frame_camera/exposures.csv").read_text().replace(old, new))
     with pytest.raises(AssetError, match="damaged list of exposures"):
         read_exposures(tmp_path)
-
-
-def test_the_report_and_the_shards_have_them(made, tmp_path):
-    report, out = made
-    (example,) = collect(out).examples
-    titles = [title for title, _ in example.others[:3]]
-    assert titles[0] in {f"frame camera, {e.exposure_us / 1000:g} ms" for e in read_exposures(report.path)}
-    assert titles[1:] == ["frame camera, sharp", "frame camera, clean"]
-    assert all(p.dtype == np.uint8 and p.shape == (30, 40, 3) for _, p in example.others[:3])
-    export_shards(out, tmp_path / "shards")
-    with tarfile.open(tmp_path / "shards/train-000000.tar") as tar:
-        files = {member.name: tar.extractfile(member).read() for member in tar}
-    about = json.loads(files["sequence_000000_000001.json"])
-    line = read_exposures(report.path)[about["camera"]["image"]]
-    following = read_exposures(report.path)[about["camera"]["image"] + 1]
-    assert line.end_us <= about["from_us"] < following.end_us and about["camera"]["gain_db"] == line.gain_db
-    for ending, name in (("camera", "images"), ("camera_sharp", "sharp"), ("camera_clean", "clean")):
-        path = report.path / f"frame_camera/{name}/{about['camera']['image']:06d}.png"
-        assert files[f"sequence_000000_000001.{ending}.png"] == path.read_bytes()
 
 
 def test_no_list_of_exposures_is_said(tmp_path):

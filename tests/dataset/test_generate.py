@@ -1,7 +1,6 @@
 """One YAML in, a DSEC-layout sequence out: read back by independent readers, reproducible, whole or not at all."""
 
 import hashlib
-import json
 from pathlib import Path
 
 import cv2
@@ -179,34 +178,3 @@ def test_existing_output_is_refused_before_any_work(tmp_path, capsys, monkeypatc
 
 
 # ---- the command line --------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "name, content, message",
-    [
-        ("meshes/a.obj", b"v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "NaN"),
-        ("meshes/a.obj", b"v 0 0 0\nv 1 0 0\n", "no faces"),
-        ("meshes/a.stl", bytes(80) + (10**9).to_bytes(4, "little") + bytes(50), "too many faces (got 1000000000)"),
-        ("images/a.jpg", b"\xff\xd8\xff\xe0 not an image", "corrupt"),
-    ],
-)
-def test_bad_assets_are_one_line_and_status_2_and_leave_nothing(tmp_path, capsys, name, content, message):
-    """And a mended configuration may go to the same folder afterwards."""
-    path = tmp_path / name
-    path.parent.mkdir()
-    path.write_bytes(content)
-    key = (
-        "scene.pool={primitives: [], folders: [%s]}"
-        if name.startswith("meshes")
-        else "scene.textures={procedural: false, photographs: false, folders: [%s]}"
-    )
-    out, config = tmp_path / "out", str(config_file(tmp_path))
-    for count in ("1", "2"):
-        assert (
-            run(["generate", config, "--out", str(out), "--num", count, "--set", key % json.dumps(str(path.parent))])
-            == 2
-        )
-        error = capsys.readouterr().err
-        assert error.startswith(f"error: {path}") and message in error and error.count("\n") == 1
-        assert not out.exists()
-    assert run(["generate", config, "--out", str(out), "--quiet"]) == 0

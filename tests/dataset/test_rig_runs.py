@@ -17,12 +17,10 @@ from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.dataset.verify.reproduce import differences
 from blinkgl.errors import ConfigError, OutputError
-from blinkgl.gl import create_context
 from blinkgl.render.reference import render as by_reference
 from blinkgl.scene.build import sequence_scene
 from blinkgl.sequence import simulate_sequence
 from blinkgl.sequence.request import SequenceRequest
-from blinkgl.sequence.rig import simulate_rig
 from blinkgl.sequence_files.sequence_dir import read_manifest
 
 WAY = [
@@ -179,27 +177,6 @@ def test_a_damaged_eye_is_made_again_with_its_rig(pair, tmp_path):
 def test_one_door_for_several_sensors(pair):
     with pytest.raises(ConfigError, match="several sensors are simulated together"):
         simulate_sequence(SequenceRequest(config_of(pair)))
-
-
-def test_a_sensor_moves_no_other(pair, tmp_path):
-    """What one eye records is the same whether or not there are others, at the same times of frames."""
-    alone = {**PAIR, "timeline": {"kind": "uniform", "fps": 60}, "preview": {"enabled": False}}
-    both, one = (load_run(recipe_file(tmp_path, **{**alone, **more})).sequence(0) for more in ({}, _without_right()))
-    left = [_events(config, pair) for config in (both, one)]
-    assert len(left[0]) > 500 and all(np.array_equal(getattr(left[0], k), getattr(left[1], k)) for k in "xytp")
-
-
-def _without_right():
-    labels = {key: value for key, value in PAIR["labels"].items() if key != "disparity"}
-    return {"rig": None, "labels": labels, "sensors": [{"name": "left"}, *PAIR["sensors"]]}
-
-
-def _events(config, base):
-    from blinkgl.sequence import EventChunk
-    from blinkgl.types.events import Events
-
-    with create_context() as gl, simulate_rig(SequenceRequest(config, 0, base=base), gl) as rig:
-        return Events.concatenate([i.events for m, i in rig if m.name == "left" and isinstance(i, EventChunk)])
 
 
 def _inside(ids: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ from blinkgl.cli import run
 from blinkgl.config.run import load_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import verify_dataset
+from blinkgl.dataset.verify.problems import guarded
 from blinkgl.errors import AssetError
 from blinkgl.sequence_files.sequence_dir import digest_of
 from runs import NAMES, recipe_file
@@ -348,3 +349,7 @@ def test_nothing_to_verify(tmp_path):
     for path in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(AssetError, match="no sequence found|no such data set"):
             verify_dataset(path)
+
+
+def test_a_check_that_stops_is_a_line():
+    assert guarded(lambda: 1 / 0) == ["cannot be checked: ZeroDivisionError: division by zero"]

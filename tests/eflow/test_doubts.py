@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from blinkgl.types.events import Events
+from eflow.cli import run
 from eflow.doubts import doubts
 
 
@@ -28,3 +29,10 @@ def test_a_flood_of_hot_pixels():
     (line,) = doubts(recorded(hot=0.8), 80, 100)
     assert line.startswith("40 pixels (0.5 %) have 8") and "hot pixels" in line
     assert doubts(recorded(hot=0.3), 80, 100) == []
+
+
+def test_predict_says_so_in_one_line(tmp_path, capsys):
+    e = recorded(2000, hot=0.9)
+    np.savetxt(tmp_path / "hot.txt", np.c_[e.t * 1e-6, e.x, e.y, e.p], fmt=["%.6f", "%d", "%d", "%d"])
+    command = ["predict", "contrast-translation", str(tmp_path / "hot.txt"), "--size", "100x80", "--window-ms", "40"]
+    assert run(command) == 0 and capsys.readouterr().err.count("hot.txt: 40 pixels") == 1

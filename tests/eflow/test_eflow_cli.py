@@ -14,7 +14,7 @@ torch = pytest.importorskip("torch")
 
 from shared_data import shared  # noqa: E402
 
-from blinkgl.io.flow_png import read_flow_png  # noqa: E402
+import eflow  # noqa: E402
 from blinkgl.io.formats import write_events  # noqa: E402
 from eflow import checkpoint as ckpt, submit  # noqa: E402
 from eflow.cli import run  # noqa: E402
@@ -72,26 +72,6 @@ def test_evaluate_other_data_sets(network, make, tmp_path, capsys):
     assert "1 samples" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("ending", ["h5", "raw", "txt", "npz"])
-def test_predict_any_event_file(network, tmp_path, ending, capsys):
-    events = moving_events(180, 240, 0, 4 * SPAN, n=8000)
-    file = tmp_path / f"events.{ending}"
-    write_events(file, events, 180, 240)
-    out = tmp_path / "flow"
-    assert run(["predict", network, str(file), "--out", str(out), "--npy", "--size", "240x180"]) == 0, (
-        capsys.readouterr().err
-    )
-    # from the first event on: [t0 + 1, t0 + 2) and so on as long as both windows lie inside
-    times = [line for line in (out / "timestamps.txt").read_text().splitlines() if line[0] != "#"]
-    t0 = int(events.t[0])
-    assert times[0] == f"{t0 + SPAN}, {t0 + 2 * SPAN}" and len(times) in (2, 3)
-    flow, valid = read_flow_png(out / "000000.png")
-    exact = np.load(out / "npy" / "000000.npy")
-    assert valid.all() and flow.shape == (180, 240, 2) and np.abs(flow - exact).max() <= 1 / 256
-    assert (out / "pictures/000001.png").is_file()
-    assert run(["predict", network, str(file), "--out", str(out)]) == 2
-
-
 def test_a_video_of_the_flow(network, tmp_path, capsys):
     write_events(tmp_path / "e.h5", moving_events(130, 145, 0, 4 * SPAN, n=8000), 130, 145)
     video = tmp_path / "flow.mp4"
@@ -120,6 +100,12 @@ def test_a_window_as_long_as_things_need_to_move_by_five_pixels(tmp_path, capsys
     assert 0.7 * span < 1000 * found < 1.4 * span
     assert run([*command[:-1], "soon"]) == 2
     assert "--window-ms: not a length (got 'soon'); expected milliseconds, or auto" in capsys.readouterr().err
+
+
+def test_from_eflow_import_load_model(network):
+    assert eflow.load_model(network).config.name == "ev_flownet" and eflow.Predictor.__name__ == "Predictor"
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        eflow.nothing  # noqa: B018
 
 
 def test_warm_start_runs(refined, tmp_path, capsys):

@@ -5,31 +5,10 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from blinkgl.machine import cpu  # noqa: E402
-from blinkgl.show import checks as doctor  # noqa: E402
 from eflow import precision  # noqa: E402
 from eflow.precision import precision_on  # noqa: E402
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda", 0)
-
-
-@pytest.mark.parametrize(
-    ("text", "found"),
-    [
-        ("flags\t\t: fpu avx2 avx512f avx512_bf16 amx_bf16\n", "AVX-512 BF16, AMX"),
-        ("flags : fpu avx2 avx512f\n", ""),
-        ("Features\t: fp asimd bf16\n", "Arm BF16"),
-        ("model name : x\n", ""),
-    ],
-)
-def test_instructions_are_read_from_the_kernel(text, found, tmp_path, monkeypatch):
-    (tmp_path / "cpuinfo").write_text("processor : 0\n" + text)
-    flags = cpu.cpu_flags(str(tmp_path / "cpuinfo"))
-    monkeypatch.setattr(cpu, "cpu_flags", lambda: flags)
-    assert cpu.bf16_instructions() == found
-    assert cpu.cpu_flags is not None and {c.name: c.value for c in doctor._numba()}["bf16"].startswith(
-        found or "no instructions"
-    )
 
 
 def test_bf16_where_it_is_and_fp32_elsewhere(monkeypatch, capsys):

@@ -1,9 +1,9 @@
 """Published checkpoints, written here in their layout: the same flow as their own arithmetic, and one line for
 everything else.
 
-``tests/golden/eraft.npz`` is every seventh pixel of the flow that E-RAFT's forward pass gave at commit 21f2ecb4, where
-it was restated here from the papers with none of eflow's operations: padding at the left and top to multiples of 32,
-column-major taps, zeros beyond the edge when flow is upsampled.
+``tests/golden/eraft.npz`` is every seventh pixel of the flow of E-RAFT's forward pass, restated from the papers with
+none of eflow's operations (``restated`` in this file at commit 21f2ecb4): padding at the left and top to multiples of
+32, column-major taps, zeros beyond the edge when flow is upsampled. ``eraft_names.json`` has names and shapes.
 """
 
 import contextlib
@@ -25,55 +25,27 @@ from eflow.published import import_published, read_published  # noqa: E402
 from flow_data import SPAN, moving_events  # noqa: E402
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "eraft.npz"
+NAMES = json.loads(GOLDEN.with_name("eraft_names.json").read_text())
+GAINS = {"update_block.flow_head.conv2.weight": 2.0, "update_block.mask.2.weight": 8.0}
 
 
-def published(channels: int = 15, seed: int = 0, prefix: str = "") -> dict[str, torch.Tensor]:
+def published(prefix: str = "") -> dict[str, torch.Tensor]:
     """Random weights under the names and in the shapes of E-RAFT's code."""
-    rng = np.random.default_rng(seed)
-    drawn = lambda *size: torch.from_numpy(rng.standard_normal(size, np.float32))
-    out = {}
-
-    def conv(name, inputs, outputs, kernel, gain=1.0):
-        size = (kernel, kernel) if isinstance(kernel, int) else kernel
-        out[f"{name}.weight"] = drawn(outputs, inputs, *size) * gain / np.sqrt(inputs * size[0] * size[1])
-        out[f"{name}.bias"] = 0.1 * drawn(outputs)
-
-    def norm(name, width):
-        out[f"{name}.weight"], out[f"{name}.bias"] = 1 + 0.1 * drawn(width), 0.1 * drawn(width)
-        out[f"{name}.running_mean"], out[f"{name}.running_var"] = 0.1 * drawn(width), 1 + drawn(width).abs()
-        out[f"{name}.num_batches_tracked"] = torch.tensor(7)
-
-    for tree, outputs in (("fnet", 256), ("cnet", 256)):
-        conv(f"{tree}.conv1", channels, 64, 7)
-        batch = tree == "cnet"
-        if batch:
-            norm(f"{tree}.norm1", 64)
-        width = 64
-        for layer, wide in ((1, 64), (2, 96), (3, 128)):
-            for block in (0, 1):
-                name = f"{tree}.layer{layer}.{block}"
-                conv(f"{name}.conv1", width, wide, 3, 1.4)
-                conv(f"{name}.conv2", wide, wide, 3, 1.4)
-                if batch:
-                    norm(f"{name}.norm1", wide), norm(f"{name}.norm2", wide)
-                if width != wide:
-                    conv(f"{name}.downsample.0", width, wide, 1)
-                    if batch:
-                        norm(f"{name}.downsample.1", wide)
-                        for k in ("weight", "bias", "running_mean", "running_var", "num_batches_tracked"):
-                            out[f"{name}.norm3.{k}"] = out[f"{name}.downsample.1.{k}"]  # registered twice there
-                width = wide
-        conv(f"{tree}.conv2", 128, outputs, 1)
-    block = "update_block"
-    conv(f"{block}.encoder.convc1", 324, 256, 1), conv(f"{block}.encoder.convc2", 256, 192, 3)
-    conv(f"{block}.encoder.convf1", 2, 128, 7), conv(f"{block}.encoder.convf2", 128, 64, 3)
-    conv(f"{block}.encoder.conv", 256, 126, 3)
-    for i, kernel in ((1, (1, 5)), (2, (5, 1))):
-        for letter in "zrq":
-            conv(f"{block}.gru.conv{letter}{i}", 384, 128, kernel)
-    conv(f"{block}.flow_head.conv1", 128, 256, 3), conv(f"{block}.flow_head.conv2", 256, 2, 3, 2.0)
-    conv(f"{block}.mask.0", 128, 256, 3), conv(f"{block}.mask.2", 256, 576, 1, 8.0)
-    return {prefix + k: v for k, v in out.items()}
+    rng, out = np.random.default_rng(0), {}
+    for name, shape in NAMES.items():
+        drawn = torch.from_numpy(rng.standard_normal(shape, np.float32))
+        if len(shape) == 4:
+            drawn *= GAINS.get(name, 1.2) / np.sqrt(np.prod(shape[1:]))
+        elif name.endswith("running_var"):
+            drawn = 1 + drawn.abs()
+        elif name.endswith("num_batches_tracked"):
+            drawn = torch.tensor(7)
+        else:
+            drawn = 0.1 * drawn + name.endswith("weight")
+        out[prefix + name] = drawn
+        if ".downsample.1." in name:
+            out[prefix + name.replace("downsample.1", "norm3")] = drawn  # registered twice there
+    return out
 
 
 def test_an_imported_network_gives_the_published_flow(tmp_path):
@@ -107,7 +79,9 @@ def test_predict_takes_what_import_makes(tmp_path, capsys):
 
 
 def test_rafts_own_weights_are_refused(tmp_path):
-    torch.save(published(channels=3, prefix="module."), tmp_path / "raft-things.pth")
+    weights = published(prefix="module.")
+    of_pictures = {k: v[:, :3] if k.endswith("net.conv1.weight") else v for k, v in weights.items()}
+    torch.save(of_pictures, tmp_path / "raft-things.pth")
     with pytest.raises(AssetError, match="RAFT's own weights see images and no events; expected E-RAFT's checkpoint"):
         import_published(tmp_path / "raft-things.pth", tmp_path / "r.safetensors")
 

@@ -8,7 +8,7 @@ import pytest
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 from eflow.data import mvsec
 from eflow.data.mvsec import MvsecSource, propagate
-from eflow.data.sources import detect_format, open_source, read_flow
+from eflow.data.sources import open_source, read_flow
 from flow_data import SPAN, blinkflow_set, blinkgl_set, constant_flow, dsec_set, moving_events, mvsec_set
 
 
@@ -21,18 +21,6 @@ def sets(tmp_path_factory):
         "blinkflow": blinkflow_set(root / "blinkflow"),
         "mvsec": mvsec_set(root / "mvsec"),
     }
-
-
-@pytest.mark.parametrize("name", ["blinkgl", "dsec", "blinkflow", "mvsec"])
-def test_detected_and_consistent(sets, name):
-    assert detect_format(sets[name]) == name
-    source = open_source(sets[name])
-    for i in range(len(source)):
-        s = source[i]
-        assert s.old.t1 == s.new.t0 and s.new.t1 - s.new.t0 > 0
-        for w in (s.old, s.new):
-            assert len(w) and w.t.dtype == np.int64 and w.t0 <= w.t[0] and w.t[-1] < w.t1 and (np.diff(w.t) >= 0).all()
-        assert s.flow.shape == (s.height, s.width, 2) and s.flow.dtype == np.float32 and s.valid.dtype == bool
 
 
 def test_blinkgl(sets):
@@ -179,38 +167,47 @@ def test_propagation_through_successive_fields():
 # ---- damaged and missing ---------------------------------------------------------------------------------------------
 
 
+TIMES = "flow/forward_timestamps.txt"
+
+
 def refused(match: str, call) -> None:
     with pytest.raises(BlinkGLError, match=match) as caught:
         call()
     assert "\n" not in str(caught.value)
 
 
-def test_missing_and_corrupt_event_files(tmp_path):
-    root = blinkgl_set(tmp_path / "set", sequences=1)
-    path = root / "train" / "seq_000000" / "events.h5"
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
-    refused(r"events\.h5: truncated", lambda: open_source(root)[0])
-    path.write_bytes(b"no hdf5 at all" * 100)
-    refused(r"events\.h5: not an HDF5 file", lambda: open_source(root)[0])
-    path.unlink()
-    refused("no blinkgl sequence", lambda: open_source(root))
-    refused("no such data set", lambda: open_source(tmp_path / "nowhere"))
-    (tmp_path / "empty").mkdir()
-    refused("no data set found", lambda: open_source(tmp_path / "empty"))
+def rewrite(name, change):
+    """What changes the bytes of a file of a sequence."""
+
+    def spoil(folder):
+        (folder / name).write_bytes(change((folder / name).read_bytes()))
+
+    return spoil
 
 
-def test_bad_times_and_counts(tmp_path):
+@pytest.mark.parametrize(
+    "spoil, said",
+    [
+        (rewrite("events.h5", lambda data: data[: len(data) // 2]), r"events\.h5: truncated"),
+        (rewrite("events.h5", lambda data: b"no hdf5 at all" * 100), r"events\.h5: not an HDF5 file"),
+        (lambda folder: (folder / "events.h5").unlink(), "no blinkgl sequence"),
+        (
+            rewrite(TIMES, lambda text: text.replace(b"100000, 200000", b"200000, 100000")),
+            "forward_timestamps.txt: not an interval",
+        ),
+        (rewrite(TIMES, lambda text: b"# header\nnonsense\n"), "forward_timestamps.txt: not a list"),
+        (rewrite(TIMES, lambda text: text + b"400000, 500000\n"), "differ in number"),
+    ],
+)
+def test_damaged_sequences(tmp_path, spoil, said):
     root = blinkgl_set(tmp_path, sequences=1)
-    folder = root / "train" / "seq_000000" / "flow"
-    times = folder / "forward_timestamps.txt"
-    text = times.read_text()
-    times.write_text(text.replace("100000, 200000", "200000, 100000"))
-    refused("forward_timestamps.txt: not an interval", lambda: open_source(root))
-    times.write_text("# header\nnonsense\n")
-    refused("forward_timestamps.txt: not a list", lambda: open_source(root))
-    times.write_text(text + "400000, 500000\n")
-    refused("differ in number", lambda: open_source(root))
+    spoil(root / "train" / "seq_000000")
+    refused(said, lambda: open_source(root)[0])
+
+
+def test_folders_without_data(tmp_path):
+    refused("no such data set", lambda: open_source(tmp_path / "nowhere"))
+    refused("no data set found", lambda: open_source(tmp_path))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

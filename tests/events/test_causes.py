@@ -177,3 +177,5 @@ def test_simulate_counts_by_cause(tmp_path, capsys):
     assert "by cause: signal " in capsys.readouterr().out
     with open_events(tmp_path / "a.h5") as file:
         assert file.causes
+    assert command(["simulate", str(tmp_path / "clip.npy"), "--out", str(tmp_path / "a.csv"), *options]) == 2
+    assert "csv cannot hold the causes of events" in capsys.readouterr().err

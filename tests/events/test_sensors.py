@@ -12,7 +12,7 @@ from shared_data import shared
 
 from blinkgl.config.events import V2eConfig
 from blinkgl.config.readout import ReadoutConfig
-from blinkgl.config.sensor import SensorConfig, load_sensor, sensor_names
+from blinkgl.config.sensor import SensorConfig, load_sensor, sensor_names, sensor_table
 from blinkgl.errors import ConfigError
 from blinkgl.events import Events, make_emulator
 from blinkgl.events.camera import EventCamera, EventFrame
@@ -97,6 +97,18 @@ def test_five_sensors_serve_every_emulator():
     assert load_sensor("gen31_vga").emulator("v2e") == V2eConfig(), "what has no source is the emulator's own"
     assert load_sensor("davis240c").emulator("voltmeter").k1 == 4.424
     assert load_sensor("davis346").emulator("v2e", cutoff_hz=50).cutoff_hz == 50
+
+
+def test_every_value_of_every_shipped_sensor_has_a_source():
+    for name in sensor_names():
+        table = sensor_table(name)
+        said = [
+            *(key for key in table if key not in ("name", "emulators", "readout", "sources", "uncertainty")),
+            *(f"emulators.{emulator}" for emulator in table.get("emulators", {})),
+            *(f"readout.{key}" for key in table.get("readout", {})),
+        ]
+        assert set(said) == set(table["sources"]), name
+        assert all(len(text) > 3 and "memory" not in text for text in table["sources"].values())
 
 
 def test_unknown_names_are_told():

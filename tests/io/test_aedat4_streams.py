@@ -99,6 +99,15 @@ def recorded(monkeypatch, kind, packets):
     return Aedat4Reader("e.aedat4")
 
 
+def test_damage_is_one_line(monkeypatch):
+    def decoder(path):
+        raise RuntimeError("no  such\n stream")
+
+    monkeypatch.setitem(sys.modules, "aedat", SimpleNamespace(Decoder=decoder))
+    with pytest.raises(AssetError, match="^e.aedat4: damaged AEDAT4 file: no such stream$"):
+        Aedat4Reader("e.aedat4")
+
+
 @pytest.mark.parametrize("times", [[(10, 20), (10, 20)], [(10, 5)], [(30, 40), (20, 50)]])
 def test_frames_whose_times_do_not_increase(monkeypatch, times):
     frames = [

@@ -136,8 +136,10 @@ def test_error_in_the_background_thread_reaches_the_caller(tmp_path, monkeypatch
                 writer.append(Events(events.x, events.y, np.full_like(events.t, 1000), events.p))
 
 
-def test_a_truncated_file(tmp_path):
+def test_a_truncated_file_and_none(tmp_path):
     write(tmp_path / "e.h5", random_events(100_000, 1000), chunk_sizes(0))
     (tmp_path / "e.h5").write_bytes((tmp_path / "e.h5").read_bytes()[:-5000])
     with pytest.raises(AssetError, match="truncated HDF5"):
         DsecEventReader(tmp_path / "e.h5")
+    with pytest.raises(AssetError, match="no such file"):
+        DsecEventReader(tmp_path / "none.h5")

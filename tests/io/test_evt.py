@@ -170,18 +170,24 @@ def test_evt3_as_written(tmp_path, size):
     assert written(tmp_path / "e.raw", cut(events, size)) == expected
 
 
-def test_the_writers_limits(tmp_path):
-    one = lambda t: Events(np.zeros(1, np.uint16), np.zeros(1, np.uint16), np.array([t]), np.ones(1, np.uint8))
-    for t, said in ((-1, "-1"), (1 << 34, str(1 << 34))):
-        with (
-            contextlib.closing(EvtWriter(tmp_path / "e.raw", 480, 640)) as writer,
-            pytest.raises(EventDataError, match=f"got {said}.; expected 0 to less"),
-        ):
-            writer.append(one(t))
-    with contextlib.closing(EvtWriter(tmp_path / "e.raw", 480, 640)) as writer:
-        writer.append(one((1 << 34) - 1))
-        with pytest.raises(EventDataError, match="backwards at event 1"):
-            writer.append(one(5))
+def one(t: int) -> Events:
+    return Events(np.zeros(1, np.uint16), np.zeros(1, np.uint16), np.array([t]), np.ones(1, np.uint8))
+
+
+@pytest.mark.parametrize(
+    "times, said",
+    [
+        ([-1], "got '?-1'?.; expected 0 to less"),
+        ([1 << 34], f"got '?{1 << 34}'?.; expected 0 to less"),
+        ([(1 << 34) - 1, 5], "backwards at event 1"),
+    ],
+)
+def test_times_beyond_the_writers_limits(tmp_path, times, said):
+    with pytest.raises(EventDataError, match=said):
+        written(tmp_path / "e.raw", [one(t) for t in times])
+
+
+def test_sizes_beyond_eleven_bits(tmp_path):
     EvtWriter(tmp_path / "f.raw", 2048, 2048).close()
     for size in ((2049, 10), (10, 2049)):
         with pytest.raises(EventDataError, match="EVT3 has 11-bit coordinates"):

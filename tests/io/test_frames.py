@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 
 import cv2
@@ -115,63 +116,63 @@ def test_float_and_deep_images(tmp_path):
         read_any_image(tmp_path / "f1.exr")
 
 
-def test_bad_folders(tmp_path):
-    with pytest.raises(AssetError, match="no such file or folder"):
-        open_frames(tmp_path / "none", fps=1)
-    with pytest.raises(AssetError, match="no images in the folder"):
-        open_frames(tmp_path, fps=1)
+def image_of(shape):
+    return lambda folder: cv2.imwrite(str(folder / "f1.png"), np.zeros(shape, np.uint8))
+
+
+@pytest.mark.parametrize(
+    "spoil, fps, said",
+    [
+        (shutil.rmtree, 1, "no such file or folder"),
+        (lambda f: [p.unlink() for p in f.iterdir()], 1, "no images in the folder"),
+        (lambda f: None, None, "frames without times.*expected --fps"),
+        (lambda f: None, 0, "--fps: frame rate .got 0"),
+        (lambda f: [(f / f"f{k}.png").unlink() for k in (1, 2)], 1, "at least two frames"),
+        (
+            lambda f: (f / "timestamps.txt").write_text("0\n1\n"),
+            None,
+            "one time stamp per image .got '2 stamps, 3 images'",
+        ),
+        (lambda f: (f / "timestamps.txt").write_text("0 f0.png\n1 f1.png\n"), None, "no time stamp for image f2.png"),
+        (
+            lambda f: (f / "timestamps.txt").write_text("0\n20\n10\n"),
+            None,
+            r"frame 2 \(f2.png\): time stamps must increase \(got '1e-05 s'\); expected more than 2e-05 s",
+        ),
+        (lambda f: (f / "f1.png").write_bytes(b"\x89PNG"), 1, "f1.png: cannot decode"),
+        (image_of((12, 17)), 1, r"frame 1 \(f1.png\): frame size changed \(got \(12, 17\)\)"),
+    ],
+)
+def test_bad_folders(tmp_path, spoil, fps, said):
     folder = images(tmp_path / "a")
-    with pytest.raises(EventDataError, match="frames without times.*expected --fps"):
-        open_frames(folder)
-    with pytest.raises(EventDataError, match="--fps: frame rate .got 0"):
-        open_frames(folder, fps=0)
-    with pytest.raises(EventDataError, match="at least two frames"):
-        open_frames(images(tmp_path / "one", 1), fps=1)
-    (folder / "timestamps.txt").write_text("0\n1\n")
-    with pytest.raises(EventDataError, match="one time stamp per image .got '2 stamps, 3 images'"):
-        open_frames(folder)
-    (folder / "timestamps.txt").write_text("0 f0.png\n1 f1.png\n")
-    with pytest.raises(EventDataError, match="no time stamp for image f2.png"):
-        open_frames(folder)
-    (folder / "timestamps.txt").write_text("0\n20\n10\n")
-    with pytest.raises(
-        EventDataError,
-        match=r"frame 2 \(f2.png\): time stamps must increase \(got '1e-05 s'\); expected more than 2e-05 s",
-    ):
-        list(open_frames(folder))
-    (folder / "f1.png").write_bytes(b"\x89PNG")
-    with pytest.raises(AssetError, match="f1.png: cannot decode"):
-        list(open_frames(folder, fps=1))
-    cv2.imwrite(str(folder / "f1.png"), np.zeros((12, 17), np.uint8))
-    with pytest.raises(EventDataError, match=r"frame 1 \(f1.png\): frame size changed \(got \(12, 17\)\)"):
-        list(open_frames(folder, fps=1))
+    spoil(folder)
+    with pytest.raises((AssetError, EventDataError), match=said):
+        list(open_frames(folder, fps=fps))
 
 
-def test_bad_arrays_and_files(tmp_path):
-    np.save(tmp_path / "a.npy", np.zeros((3, 4)))
-    with pytest.raises(AssetError, match="not frames"):
-        open_frames(tmp_path / "a.npy", fps=1)
-    np.save(tmp_path / "a.npy", np.zeros((3, 4, 5), np.int64))
-    with pytest.raises(AssetError, match="unsupported pixel type"):
-        open_frames(tmp_path / "a.npy", fps=1)
+@pytest.mark.parametrize(
+    "name, arrays, fps, said",
+    [
+        ("a.npy", np.zeros((3, 4)), 1, "not frames"),
+        ("a.npy", np.zeros((3, 4, 5), np.int64), 1, "unsupported pixel type"),
+        ("a.npy", np.zeros((3, 4, 5)), None, "frames without times"),
+        ("a.npz", {"other": 1}, 1, "no array 'frames'"),
+        ("a.xyz", None, 1, "unknown input"),
+    ],
+)
+def test_bad_arrays_and_files(tmp_path, name, arrays, fps, said):
+    with open(tmp_path / name, "wb") as file:
+        if arrays is not None:
+            np.savez(file, **arrays) if isinstance(arrays, dict) else np.save(file, arrays)
+    with pytest.raises((AssetError, EventDataError), match=said):
+        open_frames(tmp_path / name, fps=fps)
+
+
+def test_an_array_that_is_cut(tmp_path):
     np.save(tmp_path / "a.npy", np.zeros((3, 4, 5)))
-    with pytest.raises(EventDataError, match="frames without times"):
-        open_frames(tmp_path / "a.npy")
     (tmp_path / "a.npy").write_bytes((tmp_path / "a.npy").read_bytes()[:-10])
     with pytest.raises(AssetError, match="malformed array"):
         open_frames(tmp_path / "a.npy", fps=1)
-    np.savez(tmp_path / "a.npz", other=1)
-    with pytest.raises(AssetError, match="no array 'frames'"):
-        open_frames(tmp_path / "a.npz", fps=1)
-    (tmp_path / "a.xyz").touch()
-    with pytest.raises(AssetError, match="unknown input"):
-        open_frames(tmp_path / "a.xyz", fps=1)
-    (tmp_path / "t.txt").write_text("time\n0\nx\n")
-    with pytest.raises(EventDataError, match="line 3 is not a time stamp"):
-        read_timestamps(tmp_path / "t.txt")
-
-
-# --- which times are taken --------------------------------------------------------------------------------------------
 
 
 def times(path, **given):
@@ -212,6 +213,7 @@ def test_lines_of_times(tmp_path):
         ("header\n", "no time stamps"),
         ("1\ninf\n", "line 2 is not"),
         ("1\nnan\n", "line 2"),
+        ("time\n0\nx\n", "line 3 is not a time stamp"),
     ):
         path.write_text(text)
         with pytest.raises(EventDataError, match=said):

@@ -6,18 +6,14 @@ import signal
 import subprocess
 import sys
 
-import cv2
-import h5py
 import numpy as np
 import pytest
 
-from blinkgl import srgb
-from blinkgl.config.sequence import LabelsConfig
 from blinkgl.errors import BlinkGLError, OutputError
-from blinkgl.io import flo, images
+from blinkgl.io import images
 from blinkgl.io.atomic import atomic_file, remove_stale
 from blinkgl.labels import Flow
-from blinkgl.sequence_files.sequence_dir import SequenceWriter, read_manifest, verify_sequence
+from blinkgl.sequence_files.sequence_dir import SequenceWriter
 from tests.io.some_events import some_events
 
 H, W = 24, 32
@@ -49,39 +45,6 @@ def fill(writer: SequenceWriter, labels: int = 3, reuse: bool = True) -> None:
 def make(final, **kw) -> None:
     with SequenceWriter(final, H, W, config_yaml="seed: 0\n", **kw) as writer:
         fill(writer)
-
-
-def test_contents_read_back_independently(tmp_path):
-    make(tmp_path / "a" / "b", labels=LabelsConfig(float_flow=("npy", "flo"), flow=("forward", "backward")))
-    seq = tmp_path / "a" / "b"
-    assert [p.name for p in (tmp_path / "a").iterdir()] == ["b"]
-    assert (seq / "images/timestamps.txt").read_text() == "0\n100000\n200000\n"
-    stamps = np.loadtxt(seq / "flow/forward_timestamps.txt", delimiter=",", comments="#", dtype=np.int64)
-    assert stamps.tolist() == [[0, 100000], [100000, 200000], [200000, 300000]]
-    assert (
-        (seq / "flow/backward_timestamps.txt")
-        .read_text()
-        .startswith("# from_timestamp_us, to_timestamp_us\n100000, 0\n")
-    )
-    rng = np.random.default_rng(1)
-    image, flow = rng.random((H, W, 3)).astype(np.float32), rng.normal(size=(H, W, 2)).astype(np.float32)
-    assert np.array_equal(cv2.imread(str(seq / "images/000001.png"))[..., ::-1], srgb.to_srgb8(image))
-    rgb = cv2.imread(str(seq / "flow/forward/000001.png"), cv2.IMREAD_UNCHANGED)[..., ::-1].astype(float)
-    assert not rgb[0, 0, 2] and rgb[1:, :, 2].all()
-    assert np.abs((rgb[1:, :, :2] - 2**15) / 128 - flow[1:]).max() <= 0.5 / 128
-    full = np.load(seq / "flow/forward_npy/000001.npy")
-    assert (
-        full.shape == (H, W, 3) and full[0, 0].tolist() == [300, 300, 1] and np.array_equal(full[1:, :, :2], flow[1:])
-    )
-    assert np.array_equal(flo.read_flo(seq / "flow/forward_flo/000001.flo")[0][1:], flow[1:])
-    with h5py.File(seq / "events.h5") as file:
-        assert len(file["events/t"]) == 15_000 and len(file["ms_to_idx"]) == 301
-    with np.load(seq / "poses.npz", allow_pickle=False) as poses:
-        assert poses["T_world_cam"].shape == (1, 4, 4)
-    manifest = read_manifest(seq)
-    assert manifest["events"] == 15_000 and manifest["seed"] == 0
-    assert manifest["flow_pixels_out_of_range"] == {"forward": 3, "backward": 3}
-    assert verify_sequence(seq) == []
 
 
 @pytest.mark.parametrize("error", [ValueError("bug"), KeyboardInterrupt(), SystemExit(1)])

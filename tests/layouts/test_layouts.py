@@ -1,6 +1,5 @@
 """`blinkgl export --layout`: what other people's loaders ask for, restated in loaders.py, and what they then hold."""
 
-import errno
 import shutil
 
 import cv2
@@ -186,20 +185,6 @@ def test_tapvid(data, sequence, tmp_path):
         np.testing.assert_array_equal(frame[..., ::-1], cv2.imread(str(sequence / f"images/{k:06d}.png")))
 
 
-@pytest.mark.parametrize("layout", ["dsec", "eraft", "blinkflow"])
-def test_eflow_trains_on_it_as_on_the_sequences_themselves(layout, data, tmp_path):
-    pytest.importorskip("torch")
-    from eflow.data.sources import find_blinkflow, find_blinkgl, find_dsec
-
-    folder = exported(data, tmp_path, layout)
-    (ours,) = find_blinkgl(data)
-    (theirs,) = (find_blinkflow if layout == "blinkflow" else find_dsec)(folder)
-    shift = 7_000_000 if layout == "blinkflow" else 0
-    assert [(e.from_us + shift, e.to_us + shift) for e in theirs.entries] == [
-        (e.from_us, e.to_us) for e in ours.entries
-    ]
-
-
 @pytest.mark.parametrize(
     "layout, lines",
     [
@@ -278,17 +263,6 @@ def test_refusals(data, sequence, tmp_path):
         export_layout(tmp_path / "twice", tmp_path / "new", "eraft")
     assert not (tmp_path / "new").exists()
     assert run(["export", str(data), "--layout", "dsec", "--seed", "3", "--out", str(tmp_path / "new")]) == 2
-
-
-def test_a_full_disk_leaves_nothing(data, tmp_path, monkeypatch):
-    def full(source, folder):
-        (folder / "half").write_text("")
-        raise OSError(errno.ENOSPC, "full")
-
-    monkeypatch.setattr("blinkgl.layouts.dsec.write_rectify_map", lambda path, found: full(None, path.parent))
-    with pytest.raises(OSError):
-        export_layout(data, tmp_path / "out", "dsec")
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_another_size_is_said_and_one_sequence_is_enough(sequence, tmp_path, capsys):
@@ -372,23 +346,3 @@ def test_a_lens_that_distorts_has_its_rectify_map_and_truth_that_is_rectified(tm
     calibration = yaml.safe_load((folder / "calibration/cam_to_cam.yaml").read_text())
     assert calibration["intrinsics"]["cam0"]["distortion_coeffs"] == pytest.approx([-0.2, 0.05, 0, 0])
     assert list(dsec_sequence(folder, HEIGHT, WIDTH))
-
-
-def test_tonic_opens_events_and_makes_frames_of_them(data, sequence, tmp_path):
-    """tonic's DSEC reads `events_left/events.h5` of a recording's folder, as layout `eraft` has it. Made without its
-    constructor, which downloads a plugin for images and knows the published recordings' names alone."""
-    tonic = pytest.importorskip("tonic", reason="not an extra of ours: pip install tonic")
-    loader = pytest.importorskip("torch.utils.data").DataLoader
-    read = tonic.datasets.DSEC.__new__(tonic.datasets.DSEC)
-    read.location_on_system = str(exported(data, tmp_path, "eraft") / "test")
-    read.recording_selection, read.data_selection, read.target_selection = ["sequence_000000"], ["events_left"], []
-    read.transform = read.target_transform = read.transforms = None
-    (found,), _ = read[0]
-    mine, theirs = read_events(sequence / "events.h5"), found["events_left"]
-    same([theirs[name].astype("i8") for name in "xytp"], mine)
-    frames = tonic.transforms.ToFrame((WIDTH, HEIGHT, 2), time_window=100_000)
-    counts = frames(theirs)
-    assert counts.shape[1:] == (2, HEIGHT, WIDTH) and 0.7 * len(mine) < counts.sum() <= len(mine)
-    cut = tonic.SlicedDataset([(theirs, 0)], tonic.slicers.SliceByTime(100_000), transform=frames)
-    batches = list(loader(cut, batch_size=2, collate_fn=tonic.collation.PadTensors()))
-    assert sum(int(x.sum()) for x, _ in batches) == counts.sum()

@@ -68,24 +68,12 @@ def test_it_ends_a_wait_that_no_byte_code_interrupts():
         assert threading.Event().wait(10), "the signal was lost"
 
 
-def test_a_signal_in_plain_code_interrupts_at_once():
-    with pytest.raises(KeyboardInterrupt), interruptible(signal.SIGTERM):
-        os.kill(os.getpid(), signal.SIGTERM)
-        wait()
-
-
 def test_other_dropped_exceptions_are_still_shown(monkeypatch):
     seen = []
     monkeypatch.setattr(sys, "unraisablehook", lambda args: seen.append(args.exc_type))
     with interruptible():
         in_del(lambda: 1 / 0)
     assert seen == [ZeroDivisionError]
-
-
-def test_nothing_comes_after_the_end():
-    with interruptible():  # ends before the signal is sent again
-        in_del(lambda: os.kill(os.getpid(), signal.SIGINT))
-    time.sleep(0.15)
 
 
 def test_another_thread_is_left_alone():

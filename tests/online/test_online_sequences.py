@@ -14,7 +14,6 @@ import yaml
 from tiny_recipe import TINY
 
 from blinkgl import AssetError, ConfigError, EventDataError, GLError, OnlineSequences, StreamSample, WindowSample, load
-from blinkgl.dataset.executor import Inline
 from blinkgl.online import stream
 from blinkgl.online.job import MIX
 from blinkgl.online.share import Share, share_of_process
@@ -72,14 +71,6 @@ def test_windows_of_a_stream_follow_each_other(recipe):
     assert min(lengths) > 0 and max(lengths) < 1.5 * min(lengths)
 
 
-def test_seeds_have_sequences_of_their_own(recipe):
-    def flows(seed):
-        with OnlineSequences(recipe, workers=0, per_sequence=2, seed=seed) as sequences:
-            return {s.flow.tobytes() for s in islice(sequences, 3)}
-
-    assert len(flows(0) | flows(1)) == 6
-
-
 def test_ranks_deal_one_stream_out_between_them(recipe):
     """Block by block, so that each renders what it takes; the samples are those of one process alone."""
 
@@ -120,17 +111,6 @@ def test_what_others_say_of_a_process(recipe, monkeypatch):
     assert share_of_process() == Share(1, 2, 1)
 
 
-def test_workers_render_on_the_card_of_the_local_rank(recipe, monkeypatch):
-    made = []
-    monkeypatch.setattr(stream, "several_cards", lambda job: [3, 4, 7])
-    monkeypatch.setattr(stream, "Local", lambda workers, devices, cores: made.append(devices) or Inline())
-    for name, value in (("RANK", "9"), ("WORLD_SIZE", "16"), ("LOCAL_RANK", "4")):
-        monkeypatch.setenv(name, value)
-    for how in ({}, {"rank": 0, "world": 2}):
-        OnlineSequences(recipe, workers=1, **how).close()
-    assert made == [[4], None], "chosen by hand, each worker has another"
-
-
 def voxels(samples: list[WindowSample]):
     """Counts and flow of a batch, and its names."""
     torch = pytest.importorskip("torch")
@@ -154,37 +134,6 @@ def test_batches_are_the_same_however_many_loader_processes(recipe):
     assert found[0] == found[1] and len(found[0]) == 5
     names = [name for _, _, batch in found[0] for name in batch]
     assert len(set(names)) == 15
-
-
-def test_loader_processes_do_not_render(recipe):
-    data = pytest.importorskip("torch.utils.data")
-    with OnlineSequences(recipe, workers=0) as sequences:
-        loader = data.DataLoader(sequences.batches(2, voxels, count=1), batch_size=None, num_workers=1)
-        with pytest.raises(EventDataError, match="loader processes do not render"):
-            list(loader)
-
-
-def test_the_sparse_and_the_fast_are_left_out(recipe):
-    def lengths(**how):
-        with OnlineSequences(recipe, workers=0, window_ms=(4, 20), **how) as sequences:
-            found = list(islice(sequences, 8))
-        medians = [np.median(np.linalg.norm(s.flow[s.valid], axis=-1)) for s in found]
-        return medians, [min(len(s.old), len(s.new)) for s in found]
-
-    medians, counts = lengths()
-    limit, least = float(np.quantile(medians, 0.8)), int(np.quantile(counts, 0.3))
-    medians, counts = lengths(max_flow=limit, min_events=least)
-    assert max(medians) <= 1.2 * limit and min(counts) >= least  # the rule looks at every seventh pixel
-
-
-def test_the_end(recipe):
-    sequences = OnlineSequences(recipe, workers=1)
-    samples = iter(sequences)
-    next(samples)
-    sequences.close()
-    sequences.close()
-    with pytest.raises(EventDataError, match="closed"):
-        next(samples)
 
 
 @pytest.mark.parametrize(
@@ -246,7 +195,7 @@ def test_a_context_that_is_lost_costs_no_sample(recipe, monkeypatch):
 def test_sequences_that_fail_are_counted_and_bounded(recipe, monkeypatch):
     """Three of four: others take their place until there were too many; then one line with the numbers and the
     last."""
-    from blinkgl.online import maker, stream
+    from blinkgl.online import maker
 
     simulate, count = maker.simulate_sequence, itertools.count()
 

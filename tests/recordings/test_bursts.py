@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from blinkgl.recordings.bursts import frame_bursts, inside_any
-from blinkgl.recordings.clip import FrameReading, clip_of_frames, read_recording
-from blinkgl.recordings.simulation import emulator_config
-from blinkgl.recordings.statistics import sums
+from blinkgl.recordings.clip import read_recording
 from blinkgl.types.events import Events
-from tests.recordings.test_calibration import GAP_US, TRUE, H, W, moving, scene
+from tests.recordings.test_calibration import H, W
 from tests.shared_data import shared
 
 FRAME_US = 40_000
@@ -38,30 +36,6 @@ def test_bursts_at_the_frames_interval():
     assert 1900 <= within.sum() - 40 * np.diff(spans).sum() / 1000 <= 2150
     assert np.array_equal(within, np.any([(events.t >= begin) & (events.t < end) for begin, end in spans], axis=0))
     assert not inside_any(events.t, spans[:0]).any()
-
-
-def test_no_interval_begins_or_ends_in_a_burst():
-    frames = moving()
-    events = scene(frames).simulate(emulator_config({"emulator": "esim", **TRUE}), 1)
-    rng = np.random.default_rng(1)
-    at = [GAP_US * (k + 1) + 6000 for k in range(6)]
-    t = np.concatenate([events.t, *(rng.integers(a, a + 500, 4000) for a in at)])
-    more = t.size - len(events)
-    order = np.argsort(t, kind="stable")
-    take = lambda own, burst: np.concatenate([own, burst.astype(own.dtype)])[order]
-    x, y = rng.integers(0, W, more), rng.integers(0, H, more)
-    struck = Events(take(events.x, x), take(events.y, y), t[order], take(events.p, np.ones(more)))
-    clip = clip_of_frames(struck, frames, (H, W), FrameReading(delay_ms=0))
-    assert clip.facts["bursts"] == 6 and 0.1 < clip.facts["in_bursts"] < 0.95
-    found, undisturbed = (sums(e, clip, 0, clip.intervals) for e in (struck, events))
-    assert found.rates.sum() + found.still.sum() > undisturbed.rates.sum() + undisturbed.still.sum() + 20_000
-    gaps = 0
-    timed = ~inside_any(struck.t, clip.bursts)
-    where = struck.y.astype(int) * W + struck.x
-    for pixel in np.unique(where):
-        here = timed[where == pixel]
-        gaps += np.count_nonzero(here[1:] & here[:-1])
-    assert found.isi.sum() == gaps
 
 
 def test_of_a_davis():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import re
 
 import cv2
@@ -58,31 +57,6 @@ def files(folder, frames=None, emulator=None, shift_us: int = 0, seed: int = 9):
 
 
 # --- what is compared -------------------------------------------------------------------------------------------------
-
-
-def test_numbers_of_a_stream_against_counting_one_by_one():
-    clip = scene()
-    events = clip.simulate(emulator_config({"emulator": "esim", **TRUE}), 1)
-    s = sums(events, clip, 1, 4)
-    inside = events.window(int(clip.edges_us[1]), int(clip.edges_us[4]))
-    still = clip.still[inside.y, inside.x]
-    assert s.rates.sum() == np.count_nonzero(~still) and s.still.sum() == np.count_nonzero(still)
-    for k, p in itertools.product(range(3), (0, 1)):
-        part = events.window(int(clip.edges_us[1 + k]), int(clip.edges_us[2 + k]))
-        assert s.rates[:, k, p].sum() == np.count_nonzero((part.p == p) & ~clip.still[part.y, part.x])
-    assert s.lights.sum() == s.rates.sum()
-    gaps = []
-    for pixel in set(zip(inside.y.tolist(), inside.x.tolist())):
-        here = (inside.y == pixel[0]) & (inside.x == pixel[1])
-        gaps += list(zip(np.diff(inside.t[here]), np.diff(inside.p[here].astype(int)) != 0))
-    assert s.isi.sum() == len(gaps) and s.isi[:, 1].sum() == sum(turn for _, turn in gaps)
-    # Forty bins per decade of microseconds.
-    assert np.array_equal(
-        s.isi.sum(axis=(0, 1)), np.histogram([g for g, _ in gaps], 10 ** (np.arange(281) / 40) - 1e-6)[0]
-    )
-    whole = np.bincount(inside.y.astype(int) * W + inside.x, minlength=H * W)
-    assert s.counts.sum() == 3 * np.count_nonzero(~clip.still) and s.counts[:, 0].sum() > 0
-    assert s.still_counts[:, 0].sum() == np.count_nonzero(whole[clip.still.ravel()] == 0)
 
 
 def test_the_clock_is_found():
@@ -212,20 +186,6 @@ def recovered(folder, seed: int) -> dict[str, float]:
     return {key: value / TRUE[key] - 1 for key, value in result.values.items()}
 
 
-def recovered_noise(folder, seed: int) -> dict[str, float]:
-    """The same of V2E's noise on a still scene."""
-    true = dict(leak_rate_hz=1.0, shot_noise_rate_hz=4.0)
-    # The fit sees one second. Of 48x60 pixels that holds 600 leak events between 8,000 of noise, and chance alone makes
-    # the leak uncertain by 5 to 7 %: nothing could be asked of it. These are 6.7 times as many.
-    path = still_recording(folder, seed=seed + 20, size=(120, 160), **true)
-    fixed = [key for key in emulator_config("v2e").fitted if key not in true]
-    result = calibrate(path, still=True, emulator="v2e", fixed=fixed, starts=1)
-    errors = {key: result.values[key] / value - 1 for key, value in true.items()}
-    # What it says of itself is true, too.
-    assert all(abs(errors[key]) < 3.5 * result.uncertainty[key] / true[key] for key in true), (errors, result)
-    return errors
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", FIVE)
 def test_known_values_come_back(tmp_path, seed):
@@ -233,13 +193,6 @@ def test_known_values_come_back(tmp_path, seed):
     errors = recovered(tmp_path, seed)
     assert set(errors) == {"contrast_threshold", "contrast_threshold_off", "refractory_us"}
     assert all(abs(e) <= (0.05 if key == "refractory_us" else 0.02) for key, e in errors.items()), errors
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", FIVE)
-def test_known_noise_comes_back(tmp_path, seed):
-    errors = recovered_noise(tmp_path, seed)
-    assert all(abs(e) <= 0.1 for e in errors.values()), errors
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
 
@@ -14,7 +13,6 @@ from blinkgl.errors import EventDataError
 from blinkgl.io.formats import write_events
 from blinkgl.recordings import comparison
 from blinkgl.recordings.comparison import compare
-from blinkgl.recordings.comparison_plot import plot
 from blinkgl.types.events import Events
 from tests.shared_data import shared
 
@@ -50,33 +48,6 @@ def test_recording_with_itself_and_shifted(tmp_path):
         compare(tmp_path / "a.npz", tmp_path / "b.npz")
     result = compare(tmp_path / "a.npz", tmp_path / "b.npz", zero_time=True)
     assert result.pixel_correlation == pytest.approx(1) and np.allclose(result.polarity_correlation, 1)
-
-
-def test_polarity_sum_against_frames(tmp_path):
-    """Events made by counting thresholds of the frames' log change: correlation near 1 and the threshold comes back."""
-    rng = np.random.default_rng(0)
-    codes = np.stack([cv2.GaussianBlur(rng.random((H, W)) * 255, (0, 0), 3) for _ in range(5)])
-    codes = (codes - codes.min()) / np.ptp(codes) * 255
-    threshold, events = 0.1, []
-    base = np.log(codes[0] + 10)
-    for k in range(4):
-        n = np.rint((np.log(codes[k + 1] + 10) - base) / threshold).astype(int)
-        base += n * threshold
-        y, x = np.nonzero(n)
-        y, x, p = (np.repeat(v, np.abs(n[y, x])) for v in (y, x, n[y, x] > 0))
-        t = np.sort(rng.integers(k * 10_000, (k + 1) * 10_000, len(x)))
-        events.append(Events(x.astype(np.uint16), y.astype(np.uint16), t, p.astype(np.uint8)))
-    write_events(tmp_path / "e.h5", events, H, W)
-    np.savez(tmp_path / "f.npz", frames=(codes / 255), timestamps_us=np.arange(5) * 10_000)
-    for result in (
-        compare(tmp_path / "e.h5", tmp_path / "f.npz"),
-        compare(tmp_path / "e.h5", frames=tmp_path / "f.npz"),
-    ):
-        assert result.b is None and len(result.a.frame_correlation) == 4
-        assert result.a.frame_correlation.min() > 0.97
-        assert np.allclose(result.a.implied_threshold, threshold, rtol=0.1)
-    plot(result, tmp_path / "p.png")
-    assert (tmp_path / "p.png").stat().st_size > 10_000
 
 
 def test_slider_depth_gives_the_figures_on_its_page():

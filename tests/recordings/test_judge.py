@@ -9,7 +9,7 @@ from blinkgl.cli import run
 from blinkgl.errors import EventDataError
 from blinkgl.io.formats import write_events
 from blinkgl.recordings.comparison import compare
-from blinkgl.recordings.judge import LEAST_PATCHES, area, boosted, judge_halves, patches
+from blinkgl.recordings.judge import LEAST_PATCHES, area, boosted, judge_halves
 from blinkgl.types.events import Events
 
 H, W = 96, 128
@@ -40,20 +40,6 @@ def test_stumps_learn_what_one_feature_says_and_nothing_of_chance():
     assert area(boosted(x[:1000], label[:1000], x[1000:]), label[1000:]) > 0.9
     shuffled = rng.permutation(label)
     assert abs(area(boosted(x[:1000], shuffled[:1000], x[1000:]), shuffled[1000:]) - 0.5) < 0.08
-
-
-def test_what_is_told_of_a_patch():
-    events = Events(
-        np.array([0, 1, 0, 40, 0], np.uint16), np.array([0, 0, 0, 20, 0], np.uint16),
-        np.array([0, 500, 1500, 1600, 900_000]), np.array([1, 1, 0, 1, 1], np.uint8),
-    )  # fmt: skip
-    count, told = patches(events, (H, W), (0, 1_000_000))
-    assert count[0, 0, 0] == 3 and count[0, 1, 2] == 1 and count[14, 0, 0] == 1 and count.sum() == 5
-    on, off, skew, turns, gap, short, company, active, most, square, mean = told[0, 0, 0]
-    assert (on, off) == pytest.approx(np.log([3, 2])) and skew == pytest.approx(1 / 3)
-    assert turns == 1 and gap == pytest.approx(np.log(1500)) and short == 1
-    assert company == pytest.approx(2 / 3), "the second and the third have a neighbour that fired just before"
-    assert active == pytest.approx(np.log(3)) and most == 2 and mean == 1.5 and square == pytest.approx(4 / 3)
 
 
 def test_the_same_law_cannot_be_told_apart_and_another_can(tmp_path):

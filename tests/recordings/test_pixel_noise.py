@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import yaml
 from shared_data import shared
@@ -54,18 +53,6 @@ def test_what_is_not_there_is_not_found():
     assert set(result.untold) == {"hot_fraction", "answered", "refractory_us"}
     assert result.config.answered == 0 and result.config.hot_fraction == 0 and result.config.spread_decades < 0.1
     assert abs(result.config.rate_hz / 0.5 - 1) < 0.03
-
-
-def test_pixels_that_are_not_looked_at_do_not_count(known):
-    events = recorded(KNOWN)
-    used = np.ones(SIZE, bool)
-    used[:, :100] = False
-    busy = Events.concatenate([events, Events(*(np.repeat(c, 4000) for c in (
-        np.uint16([5]), np.uint16([7]), np.int64([10]), np.uint8([1])))) ])  # fmt: skip
-    busy = busy.part(np.argsort(busy.t, kind="stable"))
-    result = fit_pixels_of(busy, SIZE, used=used)
-    assert abs(result.config.rate_hz / KNOWN.rate_hz - 1) < 0.1
-    assert result.recorded < known.recorded
 
 
 def test_the_command_writes_a_sensor_file_that_can_be_used(tmp_path, capsys):

@@ -58,14 +58,6 @@ def test_its_figures_are_those_of_the_files(data):
     )
 
 
-def test_the_card_says_it_in_words(data):
-    text = (data / "README.md").read_text()
-    head = yaml.safe_load(text.split("---")[1])
-    assert head["license"] == "cc-by-4.0" and "event-camera" in head["tags"] and head["size_categories"] == ["n<1K"]
-    for said in ("| train | 2 | 24x16 | esim |", "events a pixel and second, median", "hdf5plugin", "here.invalid"):
-        assert said in text
-
-
 def test_somebody_elses_page_is_left_alone(data, tmp_path, capsys):
     (tmp_path / "train").symlink_to(data / "train")
     (tmp_path / "README.md").write_text("# My notes\n")

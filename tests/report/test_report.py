@@ -7,7 +7,6 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import cv2
-import jinja2
 import numpy as np
 import pytest
 import yaml
@@ -16,7 +15,7 @@ from blinkgl.cli import run
 from blinkgl.config.run import load_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.report import markup
-from blinkgl.report.charts import histogram, number, size
+from blinkgl.report.charts import histogram
 from blinkgl.report.collect import collect
 
 RECIPE = {
@@ -166,27 +165,6 @@ def test_no_data_set(tmp_path, capsys):
     assert "no sequence found" in capsys.readouterr().err
 
 
-def test_charts():
-    two = histogram(np.array([1.0] * 10 + [2.0] * 5), bins=2, span=(0.5, 2.5))
-    assert (
-        len(two.bars) == 2
-        and two.bars[0][1] == pytest.approx(2 * two.bars[1][1])
-        and two.median_x == pytest.approx(6 + 288 / 4)
-    )
-    assert histogram(np.array([])) is None and histogram(np.array([-1.0, 0.0]), log=True) is None
-    assert len(histogram(np.array([3.0, 3.0])).bars) == 1
-    assert [number(v) for v in (0.01234, 12.34, 1234.5, 12345, 2.5e6, 3e9, float("nan"))] == [
-        "0.0123",
-        "12.3",
-        "1234",
-        "12.3 k",
-        "2.5 M",
-        "3 G",
-        "-",
-    ]
-    assert [size(v) for v in (1234, 5.6e7, 1e9)] == ["0.00123 MB", "56 MB", "1 GB"]
-
-
 @pytest.fixture
 def draw():
     """A macro of charts.html, as a template uses it."""
@@ -216,8 +194,3 @@ def test_charts_are_drawn_and_strangers_words_are_escaped(draw):
         "histogram(h)", h=None
     )
     assert draw("histogram(h)", h=histogram(np.arange(9.0))).count('class="bar"') == 9
-
-
-def test_a_forgotten_value_is_an_error():
-    with pytest.raises(jinja2.UndefinedError, match="title"):
-        markup.render("report/page.html")

@@ -1,8 +1,6 @@
 """What made each event, of whole sequences: whose it is, how it moved, whether it depends on anything that it should
 not depend on."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -105,50 +103,6 @@ def test_the_events_are_those_that_come_without_it():
     told = record(scene, labels=["ids", "events"]).events
     assert plain.truth is None and told.truth is not None
     assert all(np.array_equal(getattr(plain, name), getattr(told, name)) for name in "xytp")
-
-
-@pytest.mark.slow
-def test_moved_back_by_its_velocity_an_edge_is_sharp():
-    """The variance of the image of events, over that of the same events where they lie, off by the same parts of a
-    pixel (places between pixels blur an image by themselves): five random worlds."""
-    ratios = []
-    for seed in range(5):
-        tree = {
-            "seed": seed,
-            "camera": {"width": 80, "height": 60},
-            "time": {"duration": 0.06, "label_rate": 50},
-            "scene": {
-                "kind": "random",
-                "objects": {"count": 4, "distance": [2, 5]},
-                "pool": {"primitives": ["cuboid", "sphere"]},
-                "textures": {"photographs": False, "variants": 6, "max_size": 64},
-                "camera_motion": {"speed": [2, 3], "rotation_rate": [20, 40]},
-            },
-            "labels": {"events": True, "images": False, "flow": [], "occlusion": False},
-        }
-        with simulate_sequence(SequenceRequest(RunTemplate(tree, Path(".")).sequence(0))) as sequence:
-            events = sequence.gather()
-        window = events.window(10_000, 70_000)
-        back = 1e-6 * (window.t - 40_000)[:, None] * window.truth["velocity"]
-        place = np.column_stack([window.x, window.y]).astype(float)
-        variance = [_image(one, 60, 80).var() for one in (place - back, place - (back - np.round(back)))]
-        ratios.append(variance[0] / variance[1])
-        assert (np.linalg.norm(window.truth["velocity"], axis=1) * 0.06).max() > 3, "nothing moves: it says nothing"
-    assert min(ratios) > 1.1 and np.median(ratios) > 1.4, f"variance ratios {np.round(ratios, 2)}"
-
-
-def _image(place: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Events counted at places between pixels, bilinear."""
-    image = np.zeros((height, width))
-    low = np.floor(place).astype(int)
-    part = place - low
-    for dx in (0, 1):
-        for dy in (0, 1):
-            x, y = low[:, 0] + dx, low[:, 1] + dy
-            weight = np.abs(1 - dx - part[:, 0]) * np.abs(1 - dy - part[:, 1])
-            there = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-            np.add.at(image, (y[there], x[there]), weight[there])
-    return image[4:-4, 4:-4]
 
 
 def test_what_has_no_place_for_it_says_so(tmp_path):

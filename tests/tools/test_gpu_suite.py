@@ -7,11 +7,6 @@ import json
 import re
 from pathlib import Path
 
-import numpy as np
-import pytest
-
-from blinkgl.config.events import EsimConfig
-from blinkgl.events import Esim
 from blinkgl.tools import gpu_suite
 
 ROOT = Path(__file__).parents[2]
@@ -51,41 +46,3 @@ def test_every_piece_runs_here(tmp_path, capsys, monkeypatch):
     assert all(row["frames go by"].startswith("plain") for row in rows["end_to_end"].values())
     page = (tmp_path / "gpu_suite.md").read_text()
     assert "| OpenGL: renderer | info |" in page and page in capsys.readouterr().out
-
-
-def test_what_fails_is_said_and_the_others_go_on(tmp_path, monkeypatch):
-    def broken(options):
-        """Breaks."""
-        yield {"": "one row"}
-        if options:
-            raise ValueError("no such thing")
-
-    def slow(options):
-        """Goes on and on."""
-        while True:
-            yield {"": "another"}
-
-    monkeypatch.setattr(gpu_suite, "PIECES", {"broken": broken, "slow": slow})
-    assert gpu_suite.main(["--out", str(tmp_path), "--minutes", "0.003", "--device", "cpu"]) == 1
-    pieces = json.loads((tmp_path / "gpu_suite.json").read_text())["pieces"]
-    assert pieces["broken"]["said"] == "ValueError: no such thing" and len(pieces["broken"]["rows"]) == 1
-    assert pieces["slow"]["state"] == "cut" and pieces["slow"]["rows"]
-    with pytest.raises(SystemExit):
-        gpu_suite.main(["--only", "nothing"])
-
-
-@pytest.mark.parametrize("density", gpu_suite.DENSITIES)
-def test_clips_have_the_events_that_are_asked_for(density):
-    clip, emulator = gpu_suite.noise(48, 64, density, 6), Esim(48, 64, EsimConfig(threshold_sigma=0.0))
-    counts = [len(emulator.step(frame, k * 1_000_000)) for k, frame in enumerate(clip)]
-    assert np.allclose(counts[2:], density * 48 * 64, rtol=0.25)
-
-
-def test_a_difference_is_found(monkeypatch):
-    def other(self, height, width, config, seed):
-        Esim.__init__(self, height, width, config, seed + 1)
-
-    kind = type("Other", (Esim,), {"__init__": other})
-    monkeypatch.setattr(gpu_suite, "emulator_of", lambda config: kind)
-    with pytest.raises(AssertionError, match="environment 0, step 1: . differs"):
-        gpu_suite.compared(EsimConfig(), 8, 8, 1, "cpu", 0)

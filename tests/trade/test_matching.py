@@ -7,7 +7,6 @@ import itertools
 import numpy as np
 import pytest
 
-from blinkgl.events.grids import voxel_grid
 from blinkgl.trade.matching import match_events
 from blinkgl.trade.metrics import SpeedMaps, event_errors
 from blinkgl.types.events import Events
@@ -48,14 +47,6 @@ def errors(a: Events, b: Events, limit_us: int = 1000, **options):
     return event_errors(a, b, SPEED, 0, 100_000, limit_us=limit_us, **options)
 
 
-def test_a_shift_is_the_error_in_us_and_px():
-    a = train(*range(100, 90_000, 400))
-    b = Events(a.x, a.y, a.t + 7, a.p)
-    e = errors(a, b)
-    assert e.time_median_us == e.time_p95_us == 7 and e.missed == e.extra == 0
-    assert e.shift_median_px == pytest.approx(7e-6 * 200)
-
-
 def test_dropped_and_invented_events_are_counted():
     a = random_stream(4000, 100_000, 1)
     keep = np.arange(len(a)) % 8 != 0
@@ -64,12 +55,6 @@ def test_dropped_and_invented_events_are_counted():
     assert e.missed == pytest.approx(1 / 8) and e.extra == 0 and e.time_p95_us == 0 and e.count == pytest.approx(-1 / 8)
     e = errors(b, a)
     assert e.missed == 0 and e.extra == pytest.approx(1 / 7)
-
-
-def test_pixel_and_polarity_are_not_mixed():
-    a = train(1000)
-    for other in (train(1000, p=0), train(1000, x=2), train(1000, y=1)):
-        assert pairs(a, other, 500) == []
 
 
 def cost_of(a: list[int], b: list[int], limit: int) -> float:
@@ -96,13 +81,6 @@ def test_optimal_among_all_matchings(seed):
     assert len(set(used.tolist())) == len(used) and np.abs(found.dt_us).max(initial=0) <= limit
 
 
-def test_symmetric():
-    a, b = random_stream(3000, 20_000, 2), random_stream(2500, 20_000, 3)
-    forward, backward = match_events(a, b, H, W, 300), match_events(b, a, H, W, 300)
-    assert forward.matched.sum() == backward.matched.sum()
-    assert np.abs(forward.dt_us).sum() == np.abs(backward.dt_us).sum()
-
-
 def test_window_and_mask():
     a = train(1000, 5000, 9000)
     b = stream((1, 2, 1010, 1), (1, 2, 9010, 1), (4, 3, 5000, 1))
@@ -114,21 +92,6 @@ def test_window_and_mask():
     assert (e.reference_events, e.events, e.extra) == (3, 2, 0) and e.missed == pytest.approx(1 / 3)
     empty = event_errors(train(), train(), SPEED, 0, 10, limit_us=5)
     assert np.isnan(empty.missed) and np.isnan(empty.voxel) and np.isnan(empty.time_median_us) and np.isnan(empty.count)
-
-
-def test_speed_of_the_nearest_map():
-    maps = SpeedMaps(np.array([0, 100, 200]), np.stack([np.full((H, W), v, np.float32) for v in (1, 2, 3)]))
-    zero = np.zeros(5, int)
-    assert maps.at(zero, zero, np.array([-5, 49, 51, 149, 1000])).tolist() == [1, 1, 2, 2, 3]
-
-
-def test_voxel_grid_by_hand():
-    grid = voxel_grid(stream((1, 2, 0, 1), (1, 2, 100, 1), (0, 0, 125, 0), (3, 1, 1399, 1)), 0, 1400, H, W, 15)
-    assert grid.shape == (15, H, W) and grid.dtype == np.float32
-    assert grid[0, 2, 1] == 1 and grid[1, 2, 1] == 1
-    assert grid[1, 0, 0] == pytest.approx(-0.75) and grid[2, 0, 0] == pytest.approx(-0.25)
-    assert grid[13, 1, 3] == pytest.approx(0.01, abs=1e-6) and grid[14, 1, 3] == pytest.approx(0.99, abs=1e-6)
-    assert grid.sum() == pytest.approx(2)
 
 
 def test_off_the_sensor_is_refused():

@@ -18,7 +18,7 @@ from blinkgl.errors import ConfigError
 from blinkgl.render.rectangles import Rectangle
 from blinkgl.scene.build import sequence_scene
 from blinkgl.show.suite import show
-from blinkgl.trade.measure import Density, Level, Options
+from blinkgl.trade.measure import Density, Options
 from blinkgl.trade.pareto import excess
 from blinkgl.trade.reference import FineTiles
 from blinkgl.trade.settings import Setting, suite_design
@@ -116,28 +116,6 @@ def test_standing_by_hand():
     assert (z["undominated"], round(z["excess"], 6)) == (1, 0.1), "y is better by 1.5 in cost and by 1.1 in error"
     assert x["voxel"] == pytest.approx(0.6) and x["cost"] == 1
     assert excess(row("p", 1, 0.5), [], "cpu_s", "voxel") == 0
-
-
-def test_density_halves_steps_first_and_then_doubles_samples():
-    plan, levels = Density((8, 16, 32), (0.4, 0.2, 0.1)), []
-    for moved, asked in ((None, (8, 0.4)), (0.3, (8, 0.2)), (0.03, (8, 0.1)), (0.2, (16, 0.1)), (0.2, (32, 0.1))):
-        assert plan.next(levels) == asked
-        level = Level(*asked, frames=1, seconds=1, events=None, whole=len(levels) > 2)
-        if moved is not None:
-            measures = ("time_median_us", "time_p95_us", "wrong", "voxel")
-            level.movement, level.smallest = dict.fromkeys(measures, moved), dict.fromkeys(measures, 1.0)
-        levels.append(level)
-    assert plan.next(levels) is None
-    assert not levels[2].converged, "half a movement shows nothing"
-
-
-def test_shipped_scenes_are_short_small_and_say_what_is_hard():
-    shipped = clips()
-    assert len(shipped) >= 8
-    for clip in shipped:
-        config = load_run(clip.path).sequence(0)
-        assert config.time.interval_ns <= 100_000_000 and config.camera.width <= 320, clip.name
-        assert clip.what and clip.what[0].isupper() and clip.name == config.output.name
 
 
 def test_samples_of_a_reference_end_where_plain_ones_do(gl, folder):

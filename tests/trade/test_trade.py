@@ -12,19 +12,15 @@ import pytest
 import yaml
 
 from blinkgl.cli import run
-from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.config.run import load_run
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import ConfigError
-from blinkgl.events.table import EMULATORS
-from blinkgl.render.cutouts import lattice, mask_of
-from blinkgl.render.rectangles import Rectangle
 from blinkgl.render.renderer import Renderer
 from blinkgl.trade.measure import Bench, Level, Options
 from blinkgl.trade.pareto import pareto_front
 from blinkgl.trade.reference import FineTiles
-from blinkgl.trade.run import chosen, convergence_line, trade
-from blinkgl.trade.settings import Setting, design
+from blinkgl.trade.run import convergence_line
+from blinkgl.trade.settings import Setting
 
 CONFIG = {
     "seed": 3,
@@ -61,13 +57,6 @@ def test_front_by_hand():
         )
     ]
     assert [r["n"] for r in pareto_front(rows, "c", "e")] == ["a", "b", "c"]
-
-
-def test_lattice_covers_what_it_says():
-    tiles = lattice(640, 480, 3, 2, 32, 24)
-    mask = mask_of(tiles, 480, 640)
-    assert len(tiles) == 6 and mask.sum() == 6 * 32 * 24 and tiles[0].x0 == 91
-    assert lattice(60, 48, 3, 2, 32, 24) == (Rectangle(0, 0, 60, 48),)
 
 
 def test_fine_tiles_are_the_image_itself_and_then_its_mean(gl, config):
@@ -120,82 +109,6 @@ def test_a_reference_with_more_than_the_settings(gl, config):
     assert same.errors(shaded.events, plain.events, same.speeds()).wrong > 0.02
     with pytest.raises(ConfigError, match="--reference-set: the reference differs in what it shows alone"):
         Bench(gl, template, replace(OPTIONS, reference_set=("camera.width=10",)))
-
-
-def test_no_more_time_no_finer_reference(gl, config):
-    bench = Bench(gl, load_run(config), replace(OPTIONS, reference_s=0.0))
-    assert len(bench.judge(bench.measure([Setting("uniform 100/s")]), bench.speeds())) == 1
-
-
-def test_events_are_the_same_in_every_round_and_order(gl, config):
-    bench = Bench(gl, load_run(config), OPTIONS)
-    a, b = Setting("displacement 1 px"), Setting("uniform 400/s", antialiasing="ssaa2")
-    first, second = bench.measure([a, b]), bench.measure([b, a])
-    for mine, theirs in ((first[0], second[1]), (first[1], second[0])):
-        assert (
-            len(mine.events)
-            and np.array_equal(mine.events.t, theirs.events.t)
-            and mine.frames_per_s == theirs.frames_per_s
-        )
-
-
-def test_noise_is_taken_out():
-    twins = [
-        EMULATORS[kind].noiseless(config)
-        for kind, config in (
-            ("esim", EsimConfig(contrast_threshold=0.3, threshold_jitter=0.1, refractory_us=9)),
-            ("v2e", V2eConfig(contrast_threshold=0.3, threshold_sigma=0.01)),
-            ("voltmeter", VoltmeterConfig(k1=5)),
-        )
-    ]
-    assert [t.contrast_threshold for t in twins] == [0.3, 0.3, pytest.approx(0.2)]
-    assert [(t.emulator, t.threshold_sigma, t.threshold_jitter, t.refractory_us) for t in twins] == [
-        ("esim", 0.021, 0, 0),
-        ("esim", 0.01, 0, 0),
-        ("esim", 0.021, 0, 0),
-    ]
-
-
-def test_a_noisy_emulators_settings_are_its_twins(gl, config):
-    """V2E follows straight lines alone; the events that are judged are ESIM's, which follows cubics as well."""
-    bench = Bench(
-        gl,
-        load_run(
-            config,
-            [
-                "events={emulator: v2e, contrast_threshold: 0.3}",
-                "sensor=davis346",
-                "camera.width=64",
-                "camera.height=48",
-            ],
-        ),
-        OPTIONS,
-    )
-    assert (
-        bench.config(Setting("displacement 2 px").overrides).events
-        == bench.emulator
-        == EsimConfig(contrast_threshold=0.3, threshold_sigma=0.03)
-    )
-
-
-def test_design():
-    for quick in (True, False):
-        settings = design(quick)
-        assert len(set(settings)) == len(settings) and len({s.name for s in settings}) == len(settings)
-        assert {s.antialiasing for s in settings} >= {"none", "edges", "edges2", "ssaa2"}
-    assert len(design(True)) < 20 < len(design(False))
-    assert not any("textures" in s.other for s in design(False, random_scene=False))
-
-
-def test_only_and_skip():
-    settings = design(False)
-    assert {s.antialiasing for s in chosen(settings, ["ssaa2", "taps4"], ["SSAA4"])} == {"ssaa2", "taps4"}
-    assert not any(s.size for s in chosen(settings, [], ["half size"]))
-
-
-def test_every_setting_is_a_valid_configuration(config):
-    for setting in design(False):
-        load_run(config, setting.overrides).sequence(0)
 
 
 def test_half_size_keeps_the_view(gl, config):
@@ -271,8 +184,3 @@ def test_an_unchecked_reference_is_called_that():
     assert "did NOT converge" in convergence_line(result) and "voxel grid 30 %" in convergence_line(result)
     result["sizes"]["full"]["converged"] = True
     assert "the reference converged" in convergence_line(result)
-
-
-def test_without_the_command(config):
-    result = trade(load_run(config), settings=(Setting("displacement 1 px"),), options=OPTIONS, cost="cpu_s")
-    assert result["front"] == ["displacement 1 px, none"] and result["sizes"]["full"]["clip_s"] == pytest.approx(0.02)

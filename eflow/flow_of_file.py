@@ -1,0 +1,135 @@
+"""The flow of an event file, window by window: a line each, and what is asked to be written."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from blinkgl.errors import BlinkGLError, ConfigError
+from blinkgl.io.formats import EventFile
+from eflow import infer
+from eflow.infer import StreamWindow
+from eflow.methods.iwe import flow_warp_loss
+from eflow.metrics import frame_metrics
+from eflow.pictures import FlowVideo, events_of
+
+
+@dataclass(frozen=True)
+class WindowsAsked:
+    """Which windows of a file are looked at.
+
+    milliseconds : length of each; None: as things move by about 5 px in it.   start_ms, end_ms : from and up to this
+    time after the first event; None: all of it.   whole : all of the file as one window, or its halves as a pair."""
+
+    milliseconds: float | None = 100.0
+    start_ms: float | None = None
+    end_ms: float | None = None
+    whole: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Outputs:
+    """What is written, each where it is not None: a new folder of flow and pictures, a video; truth : (H, W, 2) that
+    each flow is measured by.   npy : also float32 arrays in the folder."""
+
+    folder: str | None = None
+    video: str | None = None
+    npy: bool = False
+    truth: np.ndarray | None = None
+
+
+def milliseconds(text: str) -> float | None:
+    """Of --window-ms; None for "auto"."""
+    if text == "auto":
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.001 <= value < 1e9:
+        raise ConfigError("not a length", where="--window-ms", value=text, accepted="milliseconds, or auto")
+    return value
+
+
+def show_flows(
+    file: EventFile,
+    predictor: infer.Predictor | infer.MethodPredictor,
+    reads: Sequence[str],
+    asked: WindowsAsked,
+    outputs: Outputs,
+    say: Callable[[str], None],
+) -> None:
+    """Says a line for each window, and writes what is asked.   reads : windows of a pair that the predictor looks at.
+
+    Raises BlinkGLError: no events, or fewer than two windows of them."""
+    stream, span, factor = _windows(file, predictor, reads, asked, say)
+    count = began = 0
+    with contextlib.ExitStack() as opened:
+        writer = opened.enter_context(infer.FlowWriter(outputs.folder, npy=outputs.npy)) if outputs.folder else None
+        shown = FlowVideo(outputs.video, file.height, file.width, _fps(span)) if outputs.video else None
+        if shown:
+            opened.enter_context(shown)
+        for window in stream:
+            flow, tensor = predictor(window)
+            sharper = flow_warp_loss(window.new, flow)
+            flow = flow * np.float32(factor)
+            count += 1
+            line = (
+                f"t {window.t_us} us  {len(window.old) + len(window.new)} events  mean speed "
+                f"{np.hypot(*np.moveaxis(flow, -1, 0)).mean():.3f} px  FWL {sharper:.3f}"
+            )
+            if outputs.truth is not None:
+                line += _beside_truth(flow, outputs.truth, window)
+            say(line)
+            if writer:
+                writer.add(window, flow, tensor, outputs.truth)
+            if shown:
+                began = window.new.t0 if count == 1 else began
+                # Recordings may count from 1970: the video begins at 0.
+                caption = f"{(window.new.t1 - window.new.t0) / 1000:g} ms at {(window.t_us - began) / 1e6:.3f} s"
+                shown.add(caption, events_of(tensor), flow)
+        if not count:
+            raise BlinkGLError(
+                f"shorter than two windows of {span / 1000:g} ms",
+                where=str(file.path),
+                accepted="a smaller --window-ms, or --whole",
+            )
+    for path in filter(None, (outputs.folder, outputs.video)):
+        say(f"written: {path}")
+
+
+def _windows(file, predictor, reads, asked, say):
+    """(windows, their length in us, what a flow is multiplied with)."""
+    if asked.whole:
+        window, factor = infer.whole_file(file, reads)
+        return [window], window.new.t1 - window.old.t0, factor
+    first = next((int(c.t[0]) for c in file.chunks()), None)
+    if first is None:
+        raise BlinkGLError("holds no events", where=str(file.path))
+    if asked.milliseconds is None:
+        span = infer.likely_span(file, predictor)
+        say(f"windows of {span / 1000:g} ms")
+    else:
+        span = round(asked.milliseconds * 1000)
+    start, end = (None if ms is None else first + round(ms * 1000) for ms in (asked.start_ms, asked.end_ms))
+    return infer.windows(file, span, start_us=start, end_us=end), span, 1.0
+
+
+def _beside_truth(flow: np.ndarray, truth: np.ndarray, window: StreamWindow) -> str:
+    """Two lines: errors over all pixels with truth, and over those with events."""
+    valid, hit, lines = np.isfinite(truth).all(-1), np.zeros(truth.shape[:2], bool), ""
+    for part in (window.new, window.old):
+        hit[part.y, part.x] = True
+    for name, mask in (("all pixels", valid), ("pixels with events", valid & hit)):
+        m, zero = frame_metrics(flow, truth, mask), frame_metrics(np.zeros_like(flow), truth, mask)
+        if m:
+            lines += f"\n  {name}: AEE {m['AEE']:.3f} px, cosine {m['cosine']:.4f}; zero flow AEE {zero['AEE']:.3f} px"
+    return lines
+
+
+def _fps(span_us: int) -> float:
+    """Windows a second of video: as fast as it happened, but no more than 20."""
+    return min(20.0, 1e6 / span_us)

@@ -65,7 +65,7 @@ def events_of(renderer: Renderer, rounds: int) -> tuple[Events, list[float]]:
         rows = frame.rows_changed_since(before)
         events.append(camera.step(EventFrame(t, frame.read(), rows=rows)))
         if frame.changed is not None:
-            covered.append(sum(r.area for r in frame.changed) / (640 * 480))
+            covered.append(sum((r.x1 - r.x0) * (r.y1 - r.y0) for r in frame.changed) / (640 * 480))
     return Events.concatenate(events), covered
 
 

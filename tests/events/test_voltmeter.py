@@ -20,7 +20,7 @@ from scipy import stats
 from blinkgl.config.events import VoltmeterConfig
 from blinkgl.events import DvsVoltmeter, Events
 from blinkgl.events.philox import normal2_and_uniform
-from blinkgl.events.voltmeter import crosses, hitting_time, reached, start_voltage
+from blinkgl.events.voltmeter_model import crosses, hitting_time, reached, start_voltage
 from tests.events.clips import assert_same, run
 
 MS = 10**6

@@ -176,30 +176,21 @@ def calibrate_events(
     if frames is None:
         clip, notes, warnings = clip_of_still(events, size), [_STILL], []
     else:
-        clip = clip_of_frames(events, frames, size, reading, seed=seed)
-        if reading.delay_ms is None:
-            before = Search(clip, base, (clip.intervals + 1) // 2, seed, lambda done: say("clock", done))
-            keys = before.responding(keys)
-            before.roughly(keys, starts)
-            clip = _without_lag(clip, before, events, frames, size, reading, seed)
+        clip, before = _of_scene(events, frames, size, reading, base, keys, starts, seed, say)
         notes, warnings = _of_frames(clip, reading)
     half = (clip.intervals + 1) // 2
     halves = ((0, half), (half, clip.intervals))
     found = Search(clip, base, half, seed, lambda done: say("fitting", done))
     if before is not None:
         found.untold.update(before.untold)
-        start = before.place
+        keys, start = before.keys, before.place
     else:
         keys = found.responding(keys)
         start = found.roughly(keys, starts) if keys else np.empty(0)
     found.run(keys, start)
     say("judging", 1.0)
-    recorded = [sums(clip.events, clip, *part) for part in halves]
     streams = [clip.simulate(one, seed + 1) for one in (base, found.config())]
-    judged = [
-        [judge_half(own, sums(stream, clip, *part, own.polarity)) for own, part in zip(recorded, halves)]
-        for stream in streams
-    ]
+    judged = [_judged(clip, stream, halves) for stream in streams]
     return Calibration(
         name,
         clip,
@@ -211,13 +202,43 @@ def calibrate_events(
         found.cost,
         found.evaluations,
         halves,
-        (judged[0][0], judged[0][1]),
-        (judged[1][0], judged[1][1]),
+        judged[0],
+        judged[1],
         streams[0],
         streams[1],
         notes,
         warnings,
     )
+
+
+def _judged(clip: Clip, stream: Events, halves: tuple[tuple[int, int], tuple[int, int]]) -> tuple[Judged, Judged]:
+    """A simulation against the clip's own events, in each half."""
+
+    def of(part: tuple[int, int]) -> Judged:
+        own = sums(clip.events, clip, *part)
+        return judge_half(own, sums(stream, clip, *part, own.polarity))
+
+    return of(halves[0]), of(halves[1])
+
+
+def _of_scene(
+    events: Events,
+    frames: Sequence[tuple[np.ndarray, int, str]],
+    size: tuple[int, int],
+    reading: FrameReading,
+    base: EmulatorConfig,
+    keys: list[str],
+    starts: int,
+    seed: int,
+    say: Callable[[str, float], None],
+) -> tuple[Clip, Search | None]:
+    """The clip that the frames show, and the search that found its clock; None where the clock is known."""
+    clip = clip_of_frames(events, frames, size, reading, seed=seed)
+    if reading.delay_ms is not None:
+        return clip, None
+    search = Search(clip, base, (clip.intervals + 1) // 2, seed, lambda done: say("clock", done))
+    search.roughly(search.responding(keys), starts)
+    return _without_lag(clip, search, events, frames, size, reading, seed), search
 
 
 def _without_lag(

@@ -93,6 +93,11 @@ class Search:
         return self._at
 
     @property
+    def keys(self) -> list[str]:
+        """Of the parameters that are looked for."""
+        return self._keys
+
+    @property
     def place(self) -> np.ndarray:
         """The logarithms of the parameters where it stands."""
         return self._at

@@ -67,7 +67,10 @@ def copy_shaders(folder: Path) -> Path:
 def edit(path: Path, right: str, wrong: str) -> None:
     text = path.read_text()
     assert right in text, f"{path.name} has changed: break it in another way"
-    path.write_text(text.replace(right, wrong))
+    # As editors do: a server that watches the folder never sees half a file.
+    whole = path.with_name(f".{path.name}.new")
+    whole.write_text(text.replace(right, wrong))
+    whole.replace(path)
 
 
 MISTAKES = {

@@ -32,7 +32,8 @@ def test_what_is_neither_says_where_names_are_listed(tmp_path, monkeypatch, name
         load_run(name)
 
 
-def test_every_run_that_ships_is_listed_with_what_it_is(capsys):
+def test_every_run_that_ships_is_listed_with_what_it_is(capsys, monkeypatch):
+    monkeypatch.delenv("COLUMNS", raising=False)
     assert run(["configs"]) == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert {words[0] for words in lines} >= set(shipped_runs()) and all(len(words) > 3 for words in lines)

@@ -476,8 +476,8 @@ def _size(text: str | None) -> tuple[int, int] | None:
 GONE = {
     "bench": "python -m blinkgl.tools.bench networks",
     "evaluate --by-density": "sets of several densities, evaluated one by one",
-    "evaluate --confidence": "no such figure: no network here says how sure it is",
-    "predict --confidence": "no such figure: no network here says how sure it is",
+    "evaluate --confidence": "nothing: no network here says how sure it is",
+    "predict --confidence": "nothing: no network here says how sure it is",
     "predict --flo": "--npy",
     "predict --h5": "--npy",
     "import --bins": "E-RAFT's published weights: RAFT's own are no longer read",

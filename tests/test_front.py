@@ -291,6 +291,7 @@ WRONG = [
     ("fixed", lambda d: b.calibrate(d / "a.h5", fixed=3)),
     ("emulator", lambda d: b.calibrate(d / "a.h5", emulator="jaer")),
     ("starts", lambda d: b.calibrate(d / "a.h5", starts=0)),
+    ("gama", lambda d: b.calibrate(d / "a.h5", gama="srgb")),
     ("frame_delay_ms", lambda d: b.calibrate(d / "a.h5", frame_delay_ms="soon")),
     ("{d}/a.h5", lambda d: b.calibrate(d / "a.h5")),
     ("--still", lambda d: b.calibrate(d / "a.h5", d, still=True)),

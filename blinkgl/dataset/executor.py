@@ -27,6 +27,7 @@ from typing import Protocol
 from blinkgl.dataset.work import RUN_FOLDER, Maker, Message, Work, maker_of, thread_environment
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.gl.context import egl_devices
+from blinkgl.machine.posix import fcntl
 
 _START_S = 600.0  # compiling every kernel for the first time on a slow machine
 _STOP_S = 20.0
@@ -97,6 +98,13 @@ class Local:
     def __init__(self, workers: int, devices: list[int] | None = None, cores: int | None = None):
         if workers < 1:
             raise ConfigError("too few", where="--workers", value=workers, accepted="1 or more")
+        if fcntl is None:
+            raise ConfigError(
+                "worker processes need a POSIX system",
+                where="--workers",
+                value=workers,
+                accepted="none: this process alone",
+            )
         self.listener: Callable[[Message], None] = lambda message: None
         self._wanted, self._devices, self._cores = workers, devices, cores
         self._processes: list[_Process] = []

@@ -129,7 +129,8 @@ class Readout:
     def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
         columns = ("x", "y", "t", "p", *(k for k in OPTIONAL if f"on_bus_{k}" in state))
         known = {"waiting", "state", "dropped", *(f"on_bus_{k}" for k in columns)}
-        if set(state) != known or state["waiting"].shape != self._waiting.shape:
+        mine = {"waiting": self._waiting, "state": self._state}
+        if set(state) != known or any(state[name].shape != array.shape for name, array in mine.items()):
             raise EventDataError("saved state is of another read-out", value=sorted(state))
         self._waiting[...], self._state[...], self.dropped = state["waiting"], state["state"], int(state["dropped"][0])
         self._on_bus = Events(**{k: state[f"on_bus_{k}"].copy() for k in columns})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
@@ -251,6 +251,7 @@ def calibrate(
     keys = tuple(key for key in given if isinstance(key, str))
     if len(keys) != len(given):
         raise ConfigError("not names of keys", where="fixed", value=fixed, accepted="a list of texts")
+    _refuse_unknown(reading, ReadingOptions)
     delay = reading.get("frame_delay_ms")
     understood = FrameReading(
         reading.get("gamma", FrameReading.gamma),
@@ -349,8 +350,7 @@ def _options(
     sensor: str | None = None,
     **unknown: Any,
 ) -> dict[str, Any]:
-    for name in unknown:
-        raise ConfigError("unknown argument", where=name, accepted=", ".join(FrameOptions.__annotations__))
+    _refuse_unknown(unknown, FrameOptions)
     from blinkgl.config.sensor import load_sensor
     from blinkgl.recordings import simulation
 
@@ -367,6 +367,13 @@ def _options(
         max_px=check.number(max_px, "max_px", above=0, most=1e4),
         readout=None if camera is None else camera.readout,
     )
+
+
+def _refuse_unknown(given: Mapping[str, Any], options: type) -> None:
+    """ConfigError for an argument that is none of the ``options``."""
+    for name in given:
+        if name not in options.__annotations__:
+            raise ConfigError("unknown argument", where=name, accepted=", ".join(options.__annotations__))
 
 
 def _fps(fps: float | None) -> float | None:

@@ -118,7 +118,7 @@ class VideoWriter:
 
 _CONTAINERS = (
     "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,flv,asf,ogg,gif,apng,webp_anim,ivf,nut,dv,mxf,"
-    "yuv4mpegpipe,h264,hevc,vvc,av1,obu,m4v,mjpeg,rm,wtv"
+    "yuv4mpegpipe,h264,hevc,vvc,av1,obu,m4v,mjpeg,rm,wtv,cine"
 )
 _ALONE = ["-protocol_whitelist", "file", "-format_whitelist", _CONTAINERS]
 """A video is the file itself: play lists and manifests (DASH, HLS, concat), which lead ffmpeg to other files and to the
@@ -150,6 +150,9 @@ class VideoReader:
             meta = next(probe)
             probe.close()
         except Exception as error:  # IOError, RuntimeError, IndexError, StopIteration …
+            if "not on whitelist" in str(error):
+                accepted = "a video by itself (mp4, mov, mkv, webm, avi …), no list or manifest of others"
+                raise AssetError("cannot read video: not a container", where=str(path), accepted=accepted) from error
             raise AssetError(f"cannot read video: {_gist(str(error))}", where=str(path)) from error
         # ffmpeg turns frames upright.
         self.width, self.height = meta["size"] if meta.get("rotate", 0) % 180 == 0 else meta["size"][::-1]

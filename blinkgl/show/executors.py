@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from blinkgl.dataset.executor import Executor, Inline, Local
 from blinkgl.errors import ConfigError
-from blinkgl.machine.posix import fcntl
 
 
 def choose_executor(
@@ -19,12 +18,7 @@ def choose_executor(
             if value:
                 raise ConfigError("belongs to --executor ray", where=option, value=value)
         numbers = _devices(devices)
-        if fcntl is None and (workers or 1) > 1:
-            raise ConfigError(
-                "worker processes need a POSIX system", where="--workers", value=workers, accepted="1 on this machine"
-            )
-        alone = (workers is None and numbers is None) or fcntl is None
-        return Inline() if alone else Local(workers or 1, numbers)
+        return Inline() if workers is None and numbers is None else Local(workers or 1, numbers)
     if devices is not None:
         raise ConfigError("belongs to --executor local; Ray deals out GPUs itself", where="--devices", value=devices)
     from blinkgl.dataset.cluster import RayCluster

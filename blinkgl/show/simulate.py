@@ -105,7 +105,7 @@ def _told(console: Console, target: str, report: SimulationReport) -> None:
         "steps",
     )
     if report.fitting is not None:
-        say(console, f"{report.fitting} (--size keeps another)")
+        say(console, f"{report.fitting} (--size WIDTHxHEIGHT for another)")
     if report.displacement is not None:
         say(console, str(report.displacement))
     elif report.steps > report.frames:

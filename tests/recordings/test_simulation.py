@@ -291,7 +291,7 @@ def test_a_sensors_size_is_taken_and_said(tmp_path, capsys):
         with open_events(out) as file:
             assert (file.height, file.width) == size
         said = capsys.readouterr().out
-        assert (f"scaled to {size[1]}x{size[0]} (--size" in said) == (size != (48, 64))
+        assert (f"scaled to {size[1]}x{size[0]} (--size WIDTH" in said) == (size != (48, 64))
     report = blinkgl.simulate_file(frames, out, fps=50, sensor="davis346", size=(48, 64))
     assert report.fitting is None
     assert run([*command, "--size", "64"]) == 2

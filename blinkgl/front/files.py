@@ -295,7 +295,8 @@ def simulate(
     emulator : as of :func:`record`, "esim" if not said.   seed : of its noise, 0 if not said.
     sensor : the read-out limit of that camera, and with an emulator's name its values; frames keep their size.
     gamma : "srgb", "linear" or an exponent; default: srgb for integers, linear for floats.
-    interpolate : "linear", the default; "motion": dense flow, at most ``max_px`` (1) px a step.
+    interpolate : "linear", the default; "motion": dense flow, at most ``max_px`` (1) px a step, which frames need
+    between which things move further than 2 px (``report.guessed_over_px``).
     report : a SimulationReport to be filled.
     Raises ConfigError at once; EventDataError as frames come, naming the frame."""
     from blinkgl.recordings import simulation

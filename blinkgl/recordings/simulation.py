@@ -27,7 +27,7 @@ from blinkgl.config.problems import validate
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import ConfigError, EventDataError, OutputError
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
-from blinkgl.io.frames import open_frames
+from blinkgl.io.frames import VIDEO, open_frames
 from blinkgl.recordings.fitting import Fitting
 from blinkgl.srgb import linear_from_srgb
 from blinkgl.tensors.choice import make_on_device
@@ -61,12 +61,22 @@ class SimulationReport:
     """events by what caused them, "signal", "leak", "shot" and "hot"; empty unless ``causes`` of the emulator is set"""
     displacement: between.Displacement | None = None
     """for interpolate="motion" """
+    moved_px: list[float] = field(default_factory=list)
+    """for interpolate="linear": 99th percentile of the dense flow between a few pairs of given frames"""
+    assumed_srgb: bool = False
+    """whether the codes of images were taken as sRGB because nobody said what they are"""
     fitting: Fitting | None = None
     """how frames became the sensor's size; None: they had it, or nobody asked"""
 
     @property
     def duration_s(self) -> float:
         return (self.last_ns - self.first_ns) * 1e-9
+
+    @property
+    def guessed_over_px(self) -> float:
+        """How far things move between given frames, px, where interpolation is linear: 0 where nobody looked."""
+        # The median: dense flow fails at a cut, and where nothing has contrast.
+        return float(np.median(self.moved_px)) if self.moved_px else 0.0
 
 
 def frames_to_events(
@@ -201,6 +211,8 @@ def stepped(
     if interpolate == "motion":
         report.displacement = between.Displacement()
         stream = between.motion(stream, max_px, displacement=report.displacement)
+    else:
+        stream = between.watched(stream, report.moved_px)
     seen: list[np.ndarray] = [first[0]]
 
     def shown() -> Iterator[EventFrame]:
@@ -257,6 +269,8 @@ def file_to_events(
     frames = open_frames(source, fps=fps, timestamps=timestamps)
     height, width = (frames.height, frames.width) if size is None else size
     report = SimulationReport()
+    if options.get("gamma") is None and frames.linear:
+        options = {**options, "gamma": "linear"}
     decode = Decoder("srgb" if options.get("gamma") is None else _checked_gamma(options["gamma"]))
     if (height, width) != (frames.height, frames.width):
         report.fitting = Fitting((frames.height, frames.width), (height, width))
@@ -264,6 +278,9 @@ def file_to_events(
     iterator = iter(frames)
     first = next(iterator)
     second = next(iterator, None)
+    # A video is made to be looked at; images and arrays may be a camera's raw codes.
+    is_video = frames.path.suffix.lower() in VIDEO
+    report.assumed_srgb = options.get("gamma") is None and first[0].dtype.kind == "u" and not is_video
     start_us = first[1] // 1000
     gap_ns = (second[1] - first[1]) if second else 10**9
 

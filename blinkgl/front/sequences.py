@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 
+@check.public
 def simulate_sequence(
     source: Source,
     *,
@@ -115,6 +116,7 @@ class Recording:
         return flows
 
 
+@check.public
 def record(source: Source, *, index: int = 0, **settings: Unpack[Settings]) -> Recording:
     """Events, images and ground truth of one sequence as arrays: what :func:`generate` writes, held in memory.
 

@@ -99,7 +99,7 @@ def test_a_scene_in_python_is_the_scene_of_its_yaml():
 
 def test_record_is_what_generate_writes(tmp_path):
     scene = box_scene()
-    labels = ("images", "flow", "flow_backward", "occlusion", "depth")
+    labels = ("images", "forward", "backward", "occlusion", "depth")
     recording = blinkgl.record(scene, emulator={"emulator": "v2e", "cutoff_hz": 100}, sensor="davis346", labels=labels)
     outcome = blinkgl.generate(
         scene, tmp_path / "out", emulator={"emulator": "v2e", "cutoff_hz": 100}, sensor="davis346", labels=labels
@@ -224,7 +224,7 @@ WRONG = [
     ("Scene.duration", lambda d: S(duration=-1)),
     ("Scene.label_rate", lambda d: S(label_rate="often")),
     ("Scene.seed", lambda d: S(seed=-1)),
-    ("labels", lambda d: b.record(box_scene(), labels=[["flow"]])),
+    ("labels", lambda d: b.record(box_scene(), labels=[["forward"]])),
     ("Scene.background", lambda d: S(background="x") + P("cuboid")),
     ("Scene + …", lambda d: S() + 3),
     ("Scene.objects", lambda d: b.record(S())),
@@ -335,7 +335,9 @@ def test_wrong_calls_name_the_argument(where, call, tmp_path):
 WHAT_TO_DO = [
     (lambda: b.record(box_scene(), contrast_threshold=0.3), "expected emulator={'emulator': 'esim', 'contrast_thresh"),
     (lambda: b.record(box_scene(), emulater="esim"), "expected 'emulator' (nearest)"),
-    (lambda: b.record(box_scene(), labels="flow"), "expected a list of names of labels"),
+    (lambda: b.record(box_scene(), labels="forward"), "expected a list of names of labels"),
+    (lambda: b.record(box_scene(), labels=["flow"]), "expected 'forward', as in labels.flow of a YAML"),
+    (lambda: b.render_frame(box_scene(), 0, ["flow_backward"]), "expected 'backward', as in labels.flow of a YAML"),
     (lambda: b.record("demo.yaml"), "expected a Scene, or what load(path) gives"),
     (lambda: b.generate(box_scene(), "/tmp/x", nums=3), "expected 'num' (nearest)"),
     (lambda: b.generate(box_scene()), "missing a required argument: 'out'; expected generate(source, out, "),

@@ -15,7 +15,7 @@ from tests.test_front import box_scene
 
 TURNED = np.array([[0.0, 0, 1, 0.02], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
 RIG = Rig(
-    RigSensor("left", pair="right", labels=["flow", "depth", "disparity", "images"], tracks={"points": 20}),
+    RigSensor("left", pair="right", labels=["forward", "depth", "disparity", "images"], tracks={"points": 20}),
     RigSensor("right", pair="left", position=(0.2, 0, 0), emulator="v2e"),
     RigSensor(
         "fish", camera=Camera(40, 30, focal=28, lens="equidistant", distortion=(-0.02, 0.005, 0, 0)), euler=(0, 10, 0)
@@ -28,13 +28,13 @@ TIMELINE = Timeline("uniform", fps=60)
 
 @pytest.fixture(scope="module")
 def recorded():
-    return record_rig(box_scene(), RIG, timeline=TIMELINE, labels=["flow"])
+    return record_rig(box_scene(), RIG, timeline=TIMELINE, labels=["forward"])
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     out = tmp_path_factory.mktemp("rig") / "out"
-    assert len(blinkgl.generate(box_scene(), out, rig=RIG, timeline=TIMELINE, labels=["flow"]).made) == 1
+    assert len(blinkgl.generate(box_scene(), out, rig=RIG, timeline=TIMELINE, labels=["forward"]).made) == 1
     return out / "train/sequence_000000"
 
 

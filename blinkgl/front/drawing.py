@@ -73,7 +73,7 @@ class Renderer:
         """:class:`LabelFrame` at t s with the named buffers; "images" is its ``colour``, (H, W, 3) float32 linear.
 
         labels : as of :func:`record`, "events" left out, which is of no time.
-        to, back_to : s, where flow and flow_backward lead; default: one label interval on and back."""
+        to, back_to : s, where forward and backward lead; default: one label interval on and back."""
         if of_events := [name for name in OF_EVENTS if name in label_names(labels)]:
             raise ConfigError("is of events and not of a time", where="labels", value=of_events[0], accepted="record()")
         asked = validate(LabelsConfig, labels_tree(labels), where="labels")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, Literal, TypeVar, get_origin
 
 import numpy as np
@@ -174,7 +173,7 @@ class Trajectory(Piece):
         turn_limit: float = 7200.0,
         T_body_sensor: ArrayLike | str | os.PathLike | None = None,
     ):
-        there = Path(check.existing(file, "Trajectory.file")).expanduser().absolute()
+        there = check.path(file, "Trajectory.file").expanduser().absolute()
         tree = check.given(file=there, form=form, start=start, smooth=smooth)
         tree |= check.given(speed_limit=speed_limit, turn_limit=turn_limit)
         if isinstance(T_body_sensor, (str, os.PathLike)):
@@ -183,6 +182,7 @@ class Trajectory(Piece):
             place = check.array(T_body_sensor, "Trajectory.T_body_sensor", (4, 4), "a file, or an array (4, 4)")
             tree["T_body_sensor"] = check.plain(place)
         self.tree = self._checked(KeyedMotionConfig, {"trajectory": tree}, trajectory="")
+        check.existing(there, "Trajectory.file")
 
 
 def motion_tree(pose: Pose | Keyframes | Trajectory | Vector, where: str, others: str = "") -> dict[str, Any]:

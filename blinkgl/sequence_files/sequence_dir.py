@@ -81,7 +81,7 @@ class SequenceWriter:
     labels : ``labels:``, which says in which forms labels are written; None: each in its first.
     events : False makes no ``events.h5``.
     truth : True makes ``event_labels.h5`` beside it, of events that say what made them.
-    codec : of ``events.h5``, "zstd" or "lz4".
+    codec : of ``events.h5``, "zstd", "lz4" or "gzip".
 
     Attributes
     ----------
@@ -121,7 +121,7 @@ class SequenceWriter:
         self.info: dict[str, Any] = {}
         self.t_end_us: int | None = None
         self.lost: dict[str, int] = {}
-        self._with_events, self._with_truth, self._codec = events, truth, codec
+        self._with_events, self._with_truth, self.codec = events, truth, codec
         self._files: dict[str, dict[str, Any]] = {}
         self._promised = {name for name, on in (("events.h5", events), (EVENT_LABELS, truth)) if on}
         self._timestamps: dict[str, list[str]] = {}
@@ -140,9 +140,9 @@ class SequenceWriter:
         self._truth: EventLabelsWriter | None = None
         try:
             if self._with_truth:
-                self._truth = EventLabelsWriter(self._tmp / EVENT_LABELS)
+                self._truth = EventLabelsWriter(self._tmp / EVENT_LABELS, codec=self.codec)
             self._events = (
-                DsecEventWriter(self._tmp / "events.h5", self.height, self.width, self.t_offset_us, codec=self._codec)
+                DsecEventWriter(self._tmp / "events.h5", self.height, self.width, self.t_offset_us, codec=self.codec)
                 if self._with_events
                 else None
             )

@@ -487,8 +487,8 @@ def convert(
         str,
         typer.Argument(
             metavar="IN",
-            help="Event file: DSEC/BlinkFlow/MVSEC/Prophesee .h5, EVT2/EVT3 .raw, .aedat4, .aedat, .txt, .csv, "
-            ".npz, .npy.",
+            help="Event file: DSEC/BlinkFlow/MVSEC/Prophesee .h5, EVT2/EVT2.1/EVT3 .raw, .aedat4, .aedat, .es, "
+            ".mat, .txt, .csv, .npz, .npy.",
         ),
     ],
     target: Annotated[str, typer.Argument(metavar="OUT", help="Event file; its ending names the format.")],

@@ -13,6 +13,7 @@ from blinkgl.errors import AssetError
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import check_events, check_size, events_of, microseconds
 from blinkgl.io.images import NpzReader, numpy_errors, read_npy
+from blinkgl.io.mat import read_mat
 from blinkgl.types.events import Events
 
 DTYPE = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1")])
@@ -66,18 +67,11 @@ class MatReader(ArrayReader):
     somebody said otherwise: times are seconds where one of them has a fraction, else µs. y is as the file has it."""
 
     def _columns(self, path: str | os.PathLike) -> tuple[dict[str, np.ndarray], bool]:
-        from scipy.io import loadmat
-
-        try:
-            found = {k: v for k, v in loadmat(path, simplify_cells=True).items() if not k.startswith("__")}
-        except NotImplementedError:
-            raise AssetError("a .mat of version 7.3", where=str(path), accepted="save(…, '-v7') in MATLAB") from None
-        except Exception as error:  # noqa: BLE001 - whatever scipy's parser ends in
-            raise AssetError("damaged .mat", where=str(path), value=str(error)) from None
+        found = read_mat(path)
         structs = [one for one in found.values() if isinstance(one, dict)]
         arrays = structs[0] if len(structs) == 1 else found
         named = _named(arrays, path)
-        columns = {k: np.atleast_1d(np.asarray(arrays[name])) for k, name in named.items()}
+        columns = {k: np.asarray(arrays[name]) for k, name in named.items()}
         t = columns["t"]
         whole = t.dtype.kind != "f" or bool((np.floor(t) == t).all())
         return columns, not whole and not named["t"].endswith("_us")

@@ -142,9 +142,11 @@ def test_matlab(tmp_path):
         table = {**columns, "ts": t}
         savemat(tmp_path / f"{k}.mat", {"TD": table} if wrap else {n: v[:, None] for n, v in table.items()})
         assert same(open_events(tmp_path / f"{k}.mat").read(), e)
-    (tmp_path / "no.mat").write_bytes(b"MATLAB 5.0 MAT-file" + bytes(200))
-    with pytest.raises(AssetError, match="damaged .mat"):
-        open_events(tmp_path / "no.mat")
+    whole = (tmp_path / "0.mat").read_bytes()
+    for size in range(129, len(whole) - 100, 97):
+        (tmp_path / "cut.mat").write_bytes(whole[:size])
+        with pytest.raises(AssetError, match="damaged .mat|no column"):
+            open_events(tmp_path / "cut.mat")
     (tmp_path / "new.mat").write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + bytes([0, 2]) + b"IM" + bytes(200))
     with pytest.raises(AssetError, match="version 7.3.*expected save"):
         open_events(tmp_path / "new.mat")

@@ -1,4 +1,4 @@
-"""MATLAB's .mat of level 5 (saved by -v7 or older): arrays of numbers, and structs of them. (MAT-File Format, MathWorks.)
+"""MATLAB's .mat of level 5 (-v7 or older): arrays of numbers, and structs of them. (MAT-File Format, MathWorks.)
 
 scipy's parser of the same ends the process on damaged files, so this one checks every length against the file."""
 

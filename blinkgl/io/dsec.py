@@ -23,7 +23,7 @@ import numpy as np
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import MAX_SIDE, check_events, check_size, events_of
-from blinkgl.io.hdf5 import dataset, growing_dataset, hdf5_errors, open_hdf5, write_rows
+from blinkgl.io.hdf5 import attribute, dataset, growing_dataset, hdf5_errors, open_hdf5, write_rows
 from blinkgl.types.events import Events
 
 BLOCK = 1 << 17
@@ -283,7 +283,7 @@ class DsecEventReader:
 
     def _declared(self, name: str) -> int | None:
         """A root attribute that says the sensor's size; None without."""
-        value = self._file.attrs.get(name)
+        value = attribute(self._file, name, self.path)
         if value is not None and (np.ndim(value) or np.asarray(value).dtype.kind not in "iu"):
             raise AssetError(f"attribute '{name}' is no integer", where=str(self.path), value=value)
         return None if value is None else int(value)

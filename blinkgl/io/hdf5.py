@@ -150,6 +150,19 @@ def dataset(
     return found
 
 
+def attribute(file: h5py.File, name: str, path: Path) -> Any:
+    """The file's attribute ``name``, numbers or text; None where there is none.
+
+    Raises AssetError: of another type. h5py reads lists of any length without a look at the file, and a damaged type
+    that is taken for one ends the process."""
+    if name not in file.attrs:
+        return None
+    kind = h5py.h5a.open(file.id, name.encode()).get_type().get_class()
+    if kind not in (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.STRING):
+        raise AssetError(f"attribute '{name}' holds neither numbers nor text", where=str(path))
+    return file.attrs[name]
+
+
 def growing_dataset(
     file: h5py.File,
     name: str,

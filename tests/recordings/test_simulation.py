@@ -108,6 +108,8 @@ def test_what_integer_codes_were_taken_for_is_said(tmp_path, gamma):
     np.save(tmp_path / "v.npy", frames8())
     report = file_to_events(tmp_path / "v.npy", tmp_path / "e.h5", fps=100, gamma=gamma)
     assert report.assumed_srgb == (gamma is None)
+    sized = file_to_events(tmp_path / "v.npy", tmp_path / "e.h5", fps=100, gamma=gamma, size=(15, 20))
+    assert sized.assumed_srgb == (gamma is None)
     own = shared("data/events/aedat4/davis346_events_frames_imu.aedat4")
     file_to_events(own, tmp_path / "own.h5", gamma=gamma)
     file_to_events(own, tmp_path / "linear.h5", gamma="linear")

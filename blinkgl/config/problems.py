@@ -135,7 +135,9 @@ def _nearest(model: type[BaseModel], path: list[str], owners: list[type[BaseMode
 def nearest(name: str, known: list[str]) -> str:
     """The known name nearest to ``name``, as text; all where none is near."""
     # Who says "threshold" means "contrast_threshold" and not "threshold_sigma", which has more letters in common.
-    near = [one for one in known if one.endswith(f"_{name}")] or difflib.get_close_matches(name, known, n=1)
+    near = [one for one in known if one.endswith(f"_{name}")]
+    in_units = [one for one in known if one in [f"{name}_{unit}" for unit in ("us", "ms", "s", "hz", "px")]]
+    near = in_units or near or difflib.get_close_matches(name, known, n=1)
     return f"'{near[0]}' (nearest)" if near else "one of: " + ", ".join(known)
 
 

@@ -118,7 +118,7 @@ def _told(console: Console, target: str, report: SimulationReport) -> None:
         say(
             console,
             f"warning: things move up to {report.guessed_over_px:.0f} px between frames, and what happens in between "
-            "is guessed; expected --interpolate motion, or a faster video",
+            "is guessed: --interpolate motion, or a faster video",
         )
     if report.displacement is not None:
         say(console, str(report.displacement))

@@ -256,6 +256,24 @@ def link(ctx: moderngl.Context, sources: Mapping[str, ShaderSource]) -> moderngl
         raise translate(str(error), sources) from None
 
 
+def unused(program: moderngl.Program, name: str) -> ShaderError:
+    """The error for an attribute or a uniform that a program declares but that its compiler removed."""
+    return ShaderError(
+        f"the shader does not use '{name}' any more", where=program.extra, accepted="a program that uses it"
+    )
+
+
+class Uniforms(dict[str, Any]):
+    """The uniforms of one program by name; "" is the program itself. One that it does not have raises ShaderError."""
+
+    def __init__(self, program: moderngl.Program):
+        super().__init__({name: program[name] for name in program if isinstance(program[name], moderngl.Uniform)})
+        self[""] = program
+
+    def __missing__(self, name: str) -> Any:
+        raise unused(self[""], name)
+
+
 class ShaderLoader:
     """Compiles and caches the programs of one context.
 
@@ -286,6 +304,7 @@ class ShaderLoader:
     def _compile(self, name: str, defines: Mapping[str, Any] | None) -> moderngl.Program:
         sources = {stage: expand(name, stage, defines, self.folder) for stage in stages_of(defines)}
         program = link(self.ctx, sources)
+        program.extra = name  # for messages
         self._made[name, normalised(defines)] = {
             made: source.files[f"include/{made}"] for source in sources.values() for made in source.made
         }

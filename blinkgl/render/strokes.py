@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import moderngl
 import numpy as np
 
+from blinkgl.gl.shader import Uniforms, unused
 from blinkgl.render.contours import CROSSING, Lines
 
 if TYPE_CHECKING:
@@ -60,9 +61,10 @@ class Strokes:
         key = name, *sorted(defines.items())
         if key not in self._programs:
             program = self.gl.program(name, defines)
+            if "in_pixel" not in program:
+                raise unused(program, "in_pixel")
             array = self.gl.ctx.vertex_array(program, [(self._pixels, "4i", "in_pixel")])
-            uniforms = {one: program[one] for one in program if isinstance(program[one], moderngl.Uniform)}
-            self._programs[key] = uniforms, array
+            self._programs[key] = Uniforms(program), array
         return self._programs[key]
 
     def use(self, unit: int) -> None:

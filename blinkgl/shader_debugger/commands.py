@@ -117,7 +117,7 @@ def run_diff(
         names = names or comparison.names()
         limits = parse_tolerances(tolerances, names)
         reports = [comparison.report(name, limits.get(name)) for name in names]
-        found = verdict(reports)
+        found = verdict(reports, renderer.unused)
     if out is not None:
         from blinkgl.shader_debugger import picture
 

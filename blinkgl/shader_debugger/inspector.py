@@ -199,7 +199,7 @@ class Inspector:
         """All buffers against the reference: what ``diff`` says first, and its text."""
         comparison = self._comparison(self._when(q["t"]))
         reports = [comparison.report(name) for name in comparison.names()]
-        found = verdict(reports)
+        found = verdict(reports, self.renderer.unused)
         titles = {name: info.title for name, info in PASSES.items()}
         return _finite(
             found

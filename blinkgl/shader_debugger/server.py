@@ -11,7 +11,6 @@ import ipaddress
 import json
 import socket
 import threading
-import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
 from pathlib import Path
@@ -119,9 +118,8 @@ class _Handler(BaseHTTPRequestHandler):
         self._json(worker.call(worker.inspector.verdict, query))
 
     def _wait(self, query: dict) -> None:
-        worker, until = self.server.worker, time.monotonic() + WAIT_S
-        while (now := worker.wait(query["version"], 1.0)) == query["version"] and time.monotonic() < until:
-            pass
+        worker = self.server.worker
+        now = worker.wait(query["version"], WAIT_S)
         self._json(worker.call(worker.inspector.shaders) | {"version": now})
 
     def _json(self, value) -> None:
@@ -198,10 +196,15 @@ class DebugServer:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        self._server.shutdown()
-        self._thread.join()
-        self._server.worker.close()
-        self._server.server_close()
+        self.close()
+
+    def close(self) -> None:
+        """Ends the server; pages that wait are answered first. May be called again."""
+        if self._thread.is_alive():
+            self._server.shutdown()
+            self._thread.join()
+            self._server.worker.close()
+            self._server.server_close()
 
 
 def _listen(host: str, port: int) -> _Server:

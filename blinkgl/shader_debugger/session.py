@@ -17,7 +17,7 @@ from blinkgl.config.run import load_run
 from blinkgl.config.sequence import NS_PER_S, SequenceConfig
 from blinkgl.errors import ConfigError, GLError
 from blinkgl.gl import GLContext, ShaderLoader, create_context
-from blinkgl.gl.shader import ShaderError, expand, shader_folder
+from blinkgl.gl.shader import ShaderError, Uniforms, expand, shader_folder
 from blinkgl.render.canvas import DEPTH_BUFFER
 from blinkgl.render.painter import Painter
 from blinkgl.render.passes import Colour, Geometry, Luminance, Output, ScenePass
@@ -164,26 +164,50 @@ class _Nothing:
         pass
 
 
-class _Uniforms(dict):
+class _Uniforms(Uniforms):
+    """Notes what the program does not use any more, where a run would stop: what comes out wrong says more."""
+
+    def __init__(self, program: Any, unused: set[tuple[str, str]]):
+        super().__init__(program)
+        self._unused = unused
+
     def __missing__(self, name: str) -> _Nothing:
+        self._unused.add((self[""].extra, name))
         return _Nothing()
 
 
 class _DebugStrokes(Strokes):
-    def program(self, name, defines):
+    def __init__(self, gl: GLContext, unused: set[tuple[str, str]]):
+        super().__init__(gl)
+        self._unused = unused
+
+    def program(self, name: str, defines: dict[str, Any]) -> tuple[Any, Any]:
         uniforms, array = super().program(name, defines)
-        return _Uniforms(uniforms), array
+        return uniforms if array is None else _Uniforms(uniforms[""], self._unused), array
 
 
 class DebugPainter(Painter):
-    """Tolerates edited shaders that no longer use a uniform."""
+    """Draws with edited shaders that no longer use a uniform or an attribute of a shape, and notes which.
+
+    unused : (program, name) of each."""
 
     def __init__(self, gl: GLContext, scene: Scene, resources: Any, stats: Any):
         super().__init__(gl, scene, resources, stats)
-        self.strokes = _DebugStrokes(gl)
+        self.unused: set[tuple[str, str]] = set()
+        self.strokes = _DebugStrokes(gl, self.unused)
 
     def uniforms(self, program: Any) -> Any:
-        return _Uniforms(super().uniforms(program))
+        return _Uniforms(program, self.unused)
+
+    def draw(self, uniforms: Any, item: Any) -> None:
+        program, shape = uniforms[""], item.deformer
+        if shape is not None:
+            self.unused |= {(program.extra, name) for name in shape.attributes if name not in program}
+        super().draw(uniforms, item)
+
+    def forget(self) -> None:
+        super().forget()
+        self.unused.clear()
 
 
 @dataclass(frozen=True)
@@ -259,6 +283,11 @@ class DebugRenderer(Renderer):
 
     def __init__(self, gl: GLContext, scene: Scene, config: Any):
         super().__init__(gl, scene, config, whole=True, painter=DebugPainter)
+
+    @property
+    def unused(self) -> set[tuple[str, str]]:
+        """(program, name) of what was set so far and is not used by the edited shaders."""
+        return self._painter.unused
 
     def use_shaders(self, loader: ShaderLoader) -> None:
         """Draw with another loader's programs from now on."""

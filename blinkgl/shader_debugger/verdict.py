@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from blinkgl.shader_debugger.compare import QUANTITIES, BufferReport
 
 
-def verdict(reports: list[BufferReport]) -> dict:
+def verdict(reports: list[BufferReport], unused: Iterable[tuple[str, str]] = ()) -> dict:
     """Plain data (JSON).
 
-    passed : every buffer is within its tolerance.
+    passed : every buffer is within its tolerance, and nothing is unused.
+    unused : sorted (program, name) of uniforms and attributes that a run sets and that the programs do not use.
     first : {buffer, title, source, objects, suspicions} of the first that is not.
     objects : per object that is over a tolerance, in the order of ``first``: object, first (buffer), x, y (the worst
     pixel there), over_tolerance and pixels (of that buffer), then (the other buffers that are
@@ -46,15 +49,17 @@ def verdict(reports: list[BufferReport]) -> dict:
             "suspicions": failed[0].suspicions,
             "objects": [row["object"] for row in rows.values() if row["first"] == top.name],
         }
-    return {"passed": not failed, "first": first, "objects": list(rows.values())}
+    gone = sorted(unused)
+    return {"passed": not failed and not gone, "unused": gone, "first": first, "objects": list(rows.values())}
 
 
 def as_text(found: dict) -> list[str]:
     """Lines."""
-    if found["passed"]:
-        return []
+    lines = [f"{program}: the shader does not use '{name}' any more" for program, name in found["unused"]]
     first = found["first"]
-    lines = [
+    if first is None:
+        return lines
+    lines += [
         f"The first that is wrong: {first['title']} ({first['source']})"
         + (f", on {', '.join(first['objects'])}" if first["objects"] else "")
     ]

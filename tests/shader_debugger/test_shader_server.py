@@ -12,6 +12,9 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -256,6 +259,18 @@ def test_broken_from_the_start_is_one_error(shader, config, tmp_path):
     edit(folder / "luminance.glsl", "luminance = albedo;", "luminance = albedo")
     status, out, err = shader("serve", config, "--shaders", folder, "--port", 0)
     assert status == 2 and out == "" and err.startswith("error: luminance.glsl:")
+
+
+def test_the_end_does_not_wait_for_long_polls(config):
+    """Pages that wait for an edit are answered at once, and their threads are gone."""
+    subject = open_subject(config)
+    with ThreadPoolExecutor(2) as pages, DebugServer(subject, moment(subject)) as server:
+        polls = [pages.submit(ask, server, "/wait?version=1") for _ in range(2)]
+        while sum("process_request_thread" in thread.name for thread in threading.enumerate()) < 2:
+            time.sleep(0.01)
+        started = time.monotonic()
+        server.close()
+        assert all(poll.result()[0] == 400 for poll in polls) and time.monotonic() - started < 1
 
 
 @pytest.fixture

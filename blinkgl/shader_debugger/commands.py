@@ -22,7 +22,7 @@ from blinkgl.shader_debugger.moments import (
 )
 from blinkgl.shader_debugger.probe import as_text, probe
 from blinkgl.shader_debugger.session import Subject, When, check_pixel, open_renderer
-from blinkgl.shader_debugger.silhouettes import EDGED, edged_of
+from blinkgl.shader_debugger.twins import TWINNED, twinned_of
 from blinkgl.shader_debugger.verdict import as_text as verdict_text, verdict
 
 
@@ -67,7 +67,7 @@ def _meaningful(moment, info) -> np.ndarray | None:
         return moment[info.name] > 0
     if info.name.startswith("flow_"):
         return moment[info.name.replace("flow", "valid")]
-    everywhere = info.name in ("luminance", "log_luminance", "dL_dt", *EDGED)  # the background has them, too
+    everywhere = info.name in ("luminance", "log_luminance", "dL_dt", *TWINNED)  # the background has them, too
     if lookup_of(info.name)[1] in ("uv", "level"):
         return (
             moment["texture_size"][..., 0] > 1
@@ -108,7 +108,7 @@ def run_diff(
     from blinkgl.shader_debugger.compare import QUANTITIES
 
     if names:
-        there = buffers_of(subject.scene, edged_of(subject.config))
+        there = buffers_of(subject.scene, twinned_of(subject.config, subject.scene))
         names = [check_pass(name, [known for known in QUANTITIES if known in there]) for name in names]
     with open_renderer(subject, shaders) as renderer:
         comparison = Comparison(
@@ -117,7 +117,7 @@ def run_diff(
         names = names or comparison.names()
         limits = parse_tolerances(tolerances, names)
         reports = [comparison.report(name, limits.get(name)) for name in names]
-        found = verdict(reports, renderer.unused)
+        found = verdict(reports, renderer.unused, comparison.left_out())
     if out is not None:
         from blinkgl.shader_debugger import picture
 
@@ -196,14 +196,11 @@ def diff_text(found: dict, reports: list[BufferReport]) -> str:
     if failed:
         w = next(iter(found["objects"]), None)
         closer = f"; look closer with: probe --pixel {w['x']},{w['y']}" if w else ""
-        lines += ["", f"{len(failed)} of {len(summaries)} buffers are over their tolerance{closer}"]
+        said = f"{len(failed)} of {len(summaries)} buffers are over their tolerance{closer}"
     else:
-        lines += [
-            "",
-            f"all {len(summaries)} buffers agree with the reference"
-            if len(summaries) > 1
-            else "agrees with the reference",
-        ]
+        whole = f"all {len(summaries)} buffers agree" if len(summaries) > 1 else "agrees"
+        said = f"{whole} with the reference"
+    lines += ["", f"{said}; {found['not_graded']}"]
     return "\n".join(lines)
 
 

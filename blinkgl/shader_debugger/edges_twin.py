@@ -2,7 +2,7 @@
 
 picture, depths = frames of the pass that `edges` filters, read back
 pixels, crossings = Lines().in_pixels(moment, items, width, height)
-filtered(picture, depths, pixels, crossings, 1 / focal)
+filtered(picture, depths, pixels, crossings, 1 / focal, what the program wrote)
 """
 
 from __future__ import annotations
@@ -15,20 +15,38 @@ GAP, COVER, SAME, NEARER, DIAGONAL, ALONG, SNAP, FEW, MANY = 3.0, 6.0, 0.25, 0.0
 _AROUND = [(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
 
 
+UNDECIDED = 2.0**-22
+"""Relative: float32 may decide a comparison of depths that are nearer to each other in either way."""
+
+
 def filtered(
-    picture: np.ndarray, depths: np.ndarray, pixels: np.ndarray, crossings: np.ndarray, pixel: float
+    picture: np.ndarray,
+    depths: np.ndarray,
+    pixels: np.ndarray,
+    crossings: np.ndarray,
+    pixel: float,
+    drawn: np.ndarray,
 ) -> np.ndarray:
     """(H, W) or (H, W, C) float64: the picture with its silhouettes and creases by area.
 
     picture : (H, W) or (H, W, C) float32.   depths : (H, W) float32, near / Z.   pixels, crossings : of
-    :meth:`~blinkgl.render.contours.Lines.in_pixels`.   pixel : 1 / focal length, px."""
+    :meth:`~blinkgl.render.contours.Lines.in_pixels`.   pixel : 1 / focal length, px.
+    drawn : (H, W) or (H, W, C) what the program made of it. Where comparisons of depths are undecided the value is the
+    one that is nearest to it."""
     if picture.ndim == 3:
-        each = (filtered(picture[..., k], depths, pixels, crossings, pixel) for k in range(picture.shape[2]))
+        each = (filtered(picture[..., k], depths, pixels, crossings, pixel, drawn[..., k]) for k in range(3))
         return np.stack(list(each), axis=-1)
     out = picture.astype(np.float64)
-    of = _Pixel(out.copy(), depths.astype(np.float64), pixel)
+    # What is compared is the picture's depths with the lines'.
+    exact, *others = (
+        _Pixel(out.copy(), depths.astype(np.float64) * (1 + scale), pixel) for scale in (0.0, UNDECIDED, -UNDECIDED)
+    )
     for x, y, first, end in pixels.tolist():
-        out[y, x] = of.mean(x, y, crossings[first:end].astype(np.float64))
+        lines, written = crossings[first:end].astype(np.float64), float(drawn[y, x])
+        value = exact.mean(x, y, lines)
+        if abs(value - written) > 1e-5 * abs(written):
+            value = min([value, *(of.mean(x, y, lines) for of in others)], key=lambda one: abs(one - written))
+        out[y, x] = value
     return out
 
 

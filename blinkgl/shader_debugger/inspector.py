@@ -39,7 +39,7 @@ from blinkgl.shader_debugger.session import (
     open_folder,
     open_renderer,
 )
-from blinkgl.shader_debugger.silhouettes import EDGED, edged_of
+from blinkgl.shader_debugger.twins import TWINNED, twinned_of
 from blinkgl.shader_debugger.verdict import verdict
 
 POLL_S = 0.15  # between two looks at the shader files
@@ -100,10 +100,10 @@ class Inspector:
         return made
 
     def _buffers(self):
-        return buffers_of(self.subject.scene, edged_of(self.subject.config))
+        return buffers_of(self.subject.scene, twinned_of(self.subject.config, self.subject.scene))
 
     def _array(self, when: When, name: str, source: str) -> np.ndarray:
-        if name in EDGED:  # whose reference is what the twin makes of the GPU's own
+        if name in TWINNED:  # whose reference is what the twin makes of the GPU's own
             return self.gpu(when)[name if source == "gpu" else f"{name}_twin"]
         return (self.gpu(when) if source == "gpu" else self.reference(when))[name]
 
@@ -199,7 +199,7 @@ class Inspector:
         """All buffers against the reference: what ``diff`` says first, and its text."""
         comparison = self._comparison(self._when(q["t"]))
         reports = [comparison.report(name) for name in comparison.names()]
-        found = verdict(reports, self.renderer.unused)
+        found = verdict(reports, self.renderer.unused, comparison.left_out())
         titles = {name: info.title for name, info in PASSES.items()}
         return _finite(
             found

@@ -8,10 +8,12 @@ loose tolerance: it finds wrong coordinates, a wrong texture or a wrong level, n
 
 from __future__ import annotations
 
+from itertools import product
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from blinkgl.camera import CameraModel
 from blinkgl.render import appearance
 from blinkgl.render.colour import linear_image
 from blinkgl.scene.types import REPEAT, Material, Texture
@@ -64,3 +66,72 @@ def mipmapped_albedo(material: Material, uv: np.ndarray, level: np.ndarray) -> n
     if material.texture is None:
         return np.broadcast_to(base, (len(uv), 3)).copy()
     return sample_trilinear(material.texture, uv, level, material.wrap) * base
+
+
+def footprint(points: np.ndarray, texels: np.ndarray, rays: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+    """(N,) log2 of the texels that one pixel step covers on the planes of N triangles.
+
+    points : (N, 3, 3) corners, camera axes.   texels : (N, 3, 2) texture coordinates of the corners, in texels.
+    rays : (N, 3) through the pixels.   slopes : (N, 3, 2) their derivatives by x and y, 1/px.
+    With b = inv([A B C]) r the coordinates are (sum b_i u_i) / (sum b_i); the adjugate does, its scale cancels."""
+    rows = _adjugates(points)
+    weights = np.einsum("nij,nj->ni", rows, rays)
+    total = weights.sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        here = np.einsum("ni,nik->nk", weights, texels) / total[:, None]
+        steps = []
+        for axis in (0, 1):
+            slope = np.einsum("nij,nj->ni", rows, slopes[:, :, axis])  # d weights / d pixel
+            change = np.einsum("ni,nik->nk", slope, texels) - here * slope.sum(axis=1)[:, None]
+            steps.append(np.linalg.norm(change / total[:, None], axis=1))
+        return np.log2(np.maximum(steps[0], steps[1]))
+
+
+def _adjugates(points: np.ndarray) -> np.ndarray:
+    """(N, 3, 3) inverse of (N, 3, 3) corners as columns, times their determinant."""
+    return np.cross(points[:, (1, 2, 0)], points[:, (2, 0, 1)])
+
+
+def level_range(points: np.ndarray, texels: np.ndarray, xy: np.ndarray, camera: CameraModel) -> np.ndarray:
+    """(N, 2) smallest and largest level that OpenGL 4.6 allows for a look-up at (N, 2) pixels; -inf and inf where a
+    neighbour looks past the horizon of the triangle's plane. points, texels : as of :func:`footprint`.
+
+    Derivatives are differences between the 2 x 2 pixels of a quad, of either of its rows and columns (GLSL 4.60,
+    section 8.14.1). Of m_u = max(|du/dx|, |du/dy|), and m_v likewise, the scale may be anything from max(m_u, m_v) to
+    m_u + m_v (OpenGL 4.6, section 8.14.1)."""
+    rows, corner = _adjugates(points), 2 * (xy // 2)
+    there = {}
+    for x, y in product((0, 1), repeat=2):
+        weights = np.einsum("nij,nj->ni", rows, camera.rays(corner + [x, y]))
+        total = weights.sum(axis=1)
+        # The sign of the sum is that of the triangle's side; between two signs lies the horizon.
+        there[x, y] = np.einsum("ni,nik->nk", weights, texels) / total[:, None], np.sign(total)
+    along = np.abs([there[1, k][0] - there[0, k][0] for k in (0, 1)])
+    down = np.abs([there[k, 1][0] - there[k, 0][0] for k in (0, 1)])
+    low = np.maximum(along.min(axis=0), down.min(axis=0)).max(axis=1)
+    high = np.maximum(along.max(axis=0), down.max(axis=0)).sum(axis=1)
+    whole = np.abs(sum(side for _, side in there.values())) == 4
+    with np.errstate(divide="ignore"):
+        return np.log2(np.where(whole[:, None], np.stack([low, high], axis=1), [0.0, np.inf]))
+
+
+MISPLACED = 0.01 + 2.0**-8.5
+"""px: how far a surface of triangles that are no needles may be misplaced: by what float32 rounds, and by half a
+diagonal step of the grid of 1/256 px that corners are snapped to (guard.glsl)."""
+_ROUNDING = 8 * 2.0**-24
+"""Of a corner's place in the picture: a row of the matrix rounds four products and three sums, the division once."""
+
+
+def needles(points: np.ndarray, camera: CameraModel) -> np.ndarray:
+    """(N,) >= 1: how many times :data:`MISPLACED` float32 may misplace the surface of N triangles. points : (N, 3, 3)
+    corners, camera axes.
+
+    Where a corner is off by e, the shares of the corners are off by e / height, and the surface by that times the
+    longest side. 1 for triangles through the near plane, which are clipped."""
+    whole = (points[..., 2] > camera.near).all(axis=1)
+    px = camera.project(np.where(whole[:, None, None], points, [0.0, 0.0, 1.0]))
+    sides = px - np.roll(px, 1, axis=1)
+    area = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0])
+    extent = np.maximum(np.abs(px).max(axis=(1, 2)), max(camera.width, camera.height))
+    off = _ROUNDING * extent * (sides**2).sum(axis=2).max(axis=1) / np.maximum(area, 1e-12)
+    return np.where(whole, np.maximum(off / MISPLACED, 1.0), 1.0)

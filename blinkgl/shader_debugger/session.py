@@ -12,7 +12,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from blinkgl.camera.drawing import seen_through
 from blinkgl.config.run import load_run
 from blinkgl.config.sequence import NS_PER_S, SequenceConfig
 from blinkgl.errors import ConfigError, GLError
@@ -20,13 +19,13 @@ from blinkgl.gl import GLContext, ShaderLoader, create_context
 from blinkgl.gl.shader import ShaderError, Uniforms, expand, shader_folder
 from blinkgl.render.canvas import DEPTH_BUFFER
 from blinkgl.render.painter import Painter
-from blinkgl.render.passes import Colour, Geometry, Luminance, Output, ScenePass
+from blinkgl.render.passes import Colour, Luminance, Output, ScenePass
 from blinkgl.render.passes.shadow import ShadowMap
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.strokes import Strokes
 from blinkgl.scene.build import check_assets, sequence_scene
 from blinkgl.scene.types import Scene
-from blinkgl.shader_debugger.silhouettes import edged_of
+from blinkgl.shader_debugger.twins import pass_of, places_of, twinned_of
 
 DEBUG_PROGRAM = "debug.glsl"
 STEP_FRACTION = 100  # the step of dL/dt is this part of the label interval
@@ -71,16 +70,16 @@ def open_subject(
     config: str, *, seed: int | None = None, sequence: int | None = None, overrides: list[str] | tuple = ()
 ) -> Subject:
     """The sequence that ``blinkgl generate CONFIG --seed SEED`` would make under number
-    ``sequence`` (default: its first). Of a lens that distorts it is the flat picture that is drawn for it.
+    ``sequence`` (default: its first), of a recipe with groups in its first group.
 
     Raises ConfigError and AssetError."""
     template = load_run(config, overrides, seed=seed)
+    if "groups" in template.tree:
+        template = template.groups[0].template
     index = template.sequence(0).output.first_index if sequence is None else sequence
     one = template.sequence(index)
     check_assets(one.scene, template.base, one.output.split)
-    scene = sequence_scene(one, index, template.base)
-    scene = scene.with_camera(seen_through(scene.camera))
-    return Subject(str(config), one, index, scene)
+    return Subject(str(config), one, index, sequence_scene(one, index, template.base))
 
 
 def moment(subject: Subject, seconds: float | None = None, step_us: float | None = None) -> When:
@@ -277,9 +276,11 @@ class DebugRenderer(Renderer):
     """The production renderer, with passes of its own. Always draws whole frames: what is kept from an earlier frame
     may be other shaders' work.
 
-    edged : which pictures with filtered silhouettes are shown and compared, see :mod:`silhouettes`."""
+    twinned : which pictures that are made of others are shown and compared, see :mod:`twins`.
+    as_configured : whether pictures are those of a generation run."""
 
-    edged: tuple[str, ...] = ()
+    twinned: tuple[str, ...] = ()
+    as_configured = False
 
     def __init__(self, gl: GLContext, scene: Scene, config: Any):
         super().__init__(gl, scene, config, whole=True, painter=DebugPainter)
@@ -294,10 +295,22 @@ class DebugRenderer(Renderer):
         self.forget()
         self.gl.shaders = loader
 
+    def at_pixels(self, flat: np.ndarray) -> np.ndarray:
+        """(H, W[, C]) of the camera's picture: itself, or of the flat picture that is drawn for a lens the pixels that
+        the lens looks at."""
+        places = places_of(self.scene.camera)
+        return flat if places is None else flat[places[..., 1], places[..., 0]]
+
+    def picture(self, what: str, t_ns: int) -> np.ndarray:
+        """(H, W) "luminance" or (H, W, 3) "colour", float32: one sample at the pixel's centre, or ``as_configured``."""
+        if self.as_configured:
+            return (self.colour if what == "colour" else self.luminance)(t_ns).read()
+        return self.at_pixels(self.draw(pass_of(self, what), t_ns).read())
+
     def inspect(self, t_ns: int) -> dict[str, np.ndarray]:
         """The outputs of debug.glsl, see :class:`Inspection`."""
         frame = self.draw(Inspection(), t_ns)
-        return {name: frame.read(name) for name in frame.names}
+        return {name: self.at_pixels(frame.read(name)) for name in frame.names}
 
     def lookups(self, name: str, t_ns: int) -> dict[str, np.ndarray]:
         """What the pass "luminance" or "colour" looks up and multiplies, float32, as its own source says it (variant
@@ -319,9 +332,10 @@ class DebugRenderer(Renderer):
                 "shipped file",
             )
         frame = self.draw(replace(LOOKUPS[name], shadows=self._shadows), t_ns)
-        lookup, albedo, terms = frame.read("lookup"), frame.read("albedo"), frame.read("terms")
+        read = {output: self.at_pixels(frame.read(output)) for output in frame.names}
+        lookup, albedo, terms = read["lookup"], read["albedo"], read["terms"]
         return {
-            "result": frame.read(name),
+            "result": read[name],
             "uv": lookup[..., :2],
             "level": lookup[..., 2],
             "light": lookup[..., 3],
@@ -330,9 +344,9 @@ class DebugRenderer(Renderer):
             "direct": terms[..., 0],
             "shadow": terms[..., 1],
             "around": terms[..., 2],
-            "mirrored": frame.read("mirrored")[..., :3],
-            "emission": frame.read("emission")[..., :3],
-            "light_rgb": frame.read("light")[..., :3],
+            "mirrored": read["mirrored"][..., :3],
+            "emission": read["emission"][..., :3],
+            "light_rgb": read["light"][..., :3],
         }
 
     @property
@@ -353,7 +367,7 @@ class DebugRenderer(Renderer):
         """Buffers of label.glsl as the shader wrote them, without the masks of ground truth, by
         the names of their labels: depth, ids …"""
         ends = {way: t for way, t in (("forward", forward_ns), ("backward", backward_ns)) if t is not None}
-        frame = self.draw(Geometry(names), t_ns, ends)
+        frame = self.draw(self.geometry(names), t_ns, ends)
         return {name: frame.read(name) for name in names}
 
 
@@ -370,5 +384,5 @@ def open_renderer(subject: Subject, shaders: str | None = None, *, as_configured
         if not as_configured:
             config = config.model_copy(update={"antialiasing": "none", "image_antialiasing": "none"})
         with DebugRenderer(gl, subject.scene, config) as renderer:
-            renderer.edged = edged_of(subject.config)
+            renderer.twinned, renderer.as_configured = twinned_of(subject.config, subject.scene), as_configured
             yield renderer

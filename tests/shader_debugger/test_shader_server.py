@@ -23,7 +23,7 @@ from PIL import Image
 from blinkgl.shader_debugger.moments import buffers_of
 from blinkgl.shader_debugger.server import LOCAL, DebugServer, host_allowed
 from blinkgl.shader_debugger.session import moment, open_subject
-from blinkgl.shader_debugger.silhouettes import edged_of
+from blinkgl.shader_debugger.twins import twinned_of
 from debugger_scene import HEIGHT, WIDTH, copy_shaders, edit
 
 
@@ -39,7 +39,7 @@ def served(config, tmp_path_factory):
 def buffers(config: str) -> dict:
     """What the page has of this configuration."""
     subject = open_subject(config)
-    return buffers_of(subject.scene, edged_of(subject.config))
+    return buffers_of(subject.scene, twinned_of(subject.config, subject.scene))
 
 
 def ask(server, path: str, method: str = "GET", host: str | None = None):
@@ -319,7 +319,7 @@ def test_the_page_in_chromium(served, shader, config):
     """Values of a pixel are those of the command line; a verdict on good shaders, and on broken ones."""
     server, folder = served
     page = page_of(server, "fault", "t=0.3", "x=40", "y=45")
-    assert 'data-ready="yes"' in page and 'data-shown="0.3"' in page and "all 29 buffers agree" in page
+    assert 'data-ready="yes"' in page and 'data-shown="0.3"' in page and "all 28 buffers agree" in page
     status, out, _ = shader("probe", config, "--shaders", folder, "--time", 0.3, "--pixel", "40,45")
     assert status == 0
     for name, info in buffers(config).items():

@@ -69,7 +69,7 @@ class Painter:
         self._programs: dict[Pass, Programs] = {}
         self._covers: dict[Pass, tuple[Uniforms, moderngl.VertexArray]] = {}
         self._culling = False
-        self.strokes = Strokes(gl)
+        self.strokes = Strokes(gl, self.uniforms)
 
     def begin(self, target: Target, background: tuple[float, ...] = ()) -> None:
         """Draw into ``target`` from now on, which is cleared: the first attachment to

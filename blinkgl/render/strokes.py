@@ -3,7 +3,7 @@ at all of them for."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import moderngl
@@ -22,10 +22,10 @@ ROW = 512
 
 
 class Strokes:
-    """Of one renderer. lines : the contours that it draws."""
+    """Of one renderer. lines : the contours that it draws.   uniforms : table of a program's, for who draws."""
 
-    def __init__(self, gl: GLContext):
-        self.gl, self.lines = gl, Lines()
+    def __init__(self, gl: GLContext, uniforms: Callable[[moderngl.Program], Uniforms] = Uniforms):
+        self.gl, self.lines, self._uniforms = gl, Lines(), uniforms
         self._count = 0
         self._pixels: moderngl.Buffer | None = None
         self._crossings: moderngl.Texture | None = None
@@ -64,7 +64,7 @@ class Strokes:
             if "in_pixel" not in program:
                 raise unused(program, "in_pixel")
             array = self.gl.ctx.vertex_array(program, [(self._pixels, "4i", "in_pixel")])
-            self._programs[key] = Uniforms(program), array
+            self._programs[key] = self._uniforms(program), array
         return self._programs[key]
 
     def use(self, unit: int) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from blinkgl.errors import OutputError
 from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.images import encode_npy
 from blinkgl.shader_debugger.compare import BufferReport, Comparison, parse_tolerances
 from blinkgl.shader_debugger.moments import (
     MAPS,
@@ -47,12 +48,7 @@ def write_passes(
         gpu = GpuMoment(renderer, when, subject.log_eps)
         for name in names:
             info, array = PASSES[name], gpu[name]
-            with (
-                atomic_file(folder / f"{name}.npy") as temporary,
-                output_errors(folder / f"{name}.npy"),
-                temporary.open("wb") as file,
-            ):
-                np.save(file, np.ascontiguousarray(array), allow_pickle=False)
+            _save(folder / f"{name}.npy", array)
             rgb, legend = pictures.picture(info.kind, array, hit=_meaningful(gpu, info))
             picture.save_labelled(folder / f"{name}.png", info, rgb, legend, f"{caption}, {renderer.gl.renderer}")
             paths += [folder / f"{name}.npy", folder / f"{name}.png"]
@@ -75,6 +71,11 @@ def _meaningful(moment, info) -> np.ndarray | None:
             else moment[f"{info.name.rpartition('_')[0]}_count"] > 0
         )
     return moment["id"] != 0 if info.kind in ("scalar", "depth", "signed", "motion") and not everywhere else None
+
+
+def _save(path: Path, array: np.ndarray) -> None:
+    with atomic_file(path) as temporary, output_errors(path):
+        temporary.write_bytes(encode_npy(array))
 
 
 def _folder(out: str) -> Path:
@@ -123,9 +124,7 @@ def run_diff(
 
         folder = _folder(out)
         for report in reports:
-            path = folder / f"{report.quantity.name}_error.npy"
-            with atomic_file(path) as temporary, output_errors(path), temporary.open("wb") as file:
-                np.save(file, report.errors, allow_pickle=False)
+            _save(folder / f"{report.quantity.name}_error.npy", report.errors)
         title = (
             f"GPU against the float64 reference: {Path(subject.path).name}, sequence {subject.index}, t = "
             f"{when.t_ns * 1e-9:.6g} s"

@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -35,7 +34,6 @@ from blinkgl.labels.label import Label, View
 from blinkgl.render import appearance, casting, reference
 from blinkgl.scene.lights import is_coloured, lamps_of, shadowing
 from blinkgl.scene.types import Material
-from blinkgl.shader_debugger.lamps import near_an_edge
 from blinkgl.shader_debugger.mipmaps import MISPLACED, mipmapped_albedo
 from blinkgl.shader_debugger.moments import (
     MAPS,
@@ -106,7 +104,7 @@ def _pixels_of_texture(g, r, gpu, ref):
 def _beyond_the_range(g, r, gpu, ref):
     """How far a level is outside of what OpenGL allows, moved by what ``r`` is beside the level itself; below 0 the
     texture is magnified, and all levels do the same."""
-    low, high = (np.maximum(ref["level_range"][..., k] + (r - ref["level"]), 0.0) for k in (0, 1))
+    low, high = (np.maximum(ref["levels"][..., k] + (r - ref["level"]), 0.0) for k in (0, 2))
     return np.maximum(np.maximum(low - np.maximum(g, 0.0), g - high), 0.0)
 
 
@@ -292,23 +290,17 @@ class BufferReport:
 
 
 def _at(errors: np.ndarray, q: float) -> float:
-    if not errors.size:
-        return 0.0
-    k = min(errors.size - 1, int(np.ceil(q * errors.size)) - 1 if q < 1 else errors.size - 1)
-    return float(np.partition(errors, max(k, 0))[max(k, 0)])
+    # One of the errors themselves, since between a finite one and inf there is no number.
+    return float(np.quantile(errors, q, method="inverted_cdf")) if errors.size else 0.0
 
 
 def histogram(errors: np.ndarray) -> dict[str, int]:
     """Counts per decade: "0", "<1e-8", "1e-8", … (from this power of ten up to the next), "inf"."""
     finite = errors[(errors > 0) & np.isfinite(errors)]
-    decades = np.clip(np.floor(np.log10(finite)).astype(int), -9, 9)
-    out = {"0": int((errors == 0).sum())}
-    for d in range(-9, 10):
-        if n := int((decades == d).sum()):
-            out["<1e-8" if d == -9 else f"1e{d:+d}"] = n
-    if n := int(np.isinf(errors).sum()):
-        out["inf"] = n
-    return out
+    decades, counts = np.unique(np.clip(np.floor(np.log10(finite)), -9, 9).astype(int), return_counts=True)
+    named = {"<1e-8" if d == -9 else f"1e{d:+d}": int(n) for d, n in zip(decades, counts)}
+    beyond = int(np.isinf(errors).sum())
+    return {"0": int((errors == 0).sum())} | named | ({"inf": beyond} if beyond else {})
 
 
 def is_mapped(material: Material) -> bool:
@@ -342,14 +334,6 @@ class Comparison:
         index = {id(thing): i for i, thing in enumerate(ref.scene.objects)}
         self._object_of_part = np.array([index[id(thing)] for thing in things] + [len(names)], np.intp)
 
-    def of(self, gpu: GpuMoment) -> Comparison:
-        """The same of another picture of the same moment, whose surfaces lie where they were."""
-        other = copy(self)
-        other.gpu = gpu
-        # What was cached is of the GPU's own shadow maps.
-        other.__dict__.pop("shares", None)
-        return other
-
     def owner(self, name: str) -> np.ndarray:
         """(H, W) number of the object that a pixel's error in buffer ``name`` is put down to: the one that should be
         there, or, for the local position, the one that was drawn."""
@@ -379,11 +363,8 @@ class Comparison:
     @cached_property
     def shadow_edges(self) -> np.ndarray:
         """(H, W) bool: where shadows of maps differ from those of rays, by their texels or by how soft they are."""
-        frame, maps = self.ref.frame, self.ref.maps
-        if not maps:
-            return np.zeros(frame.hit.shape, bool)
         if self.shares is None:
-            return near_an_edge(self.ref.scene, frame, maps)
+            return self.ref.shadow_edges
         return np.abs(self._seen_past(self.shares[0]) - self.ref["shadow"]) > 1e-3
 
     def _seen_past(self, shares: np.ndarray) -> np.ndarray:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import shutil
 import tempfile
 import threading
-from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,6 @@ from blinkgl.shader_debugger.diagnostics import Diagnostic, diagnose
 from blinkgl.shader_debugger.moments import (
     PASSES,
     GpuMoment,
-    ReferenceMoment,
     buffers_of,
     check_pass,
     open_reference,
@@ -73,9 +72,11 @@ class Inspector:
         self._shaders = shaders
         self.generation = 1
         self.errors: list[Diagnostic] = []
-        self._gpu: OrderedDict[tuple[int, int], GpuMoment] = OrderedDict()
-        self._reference: OrderedDict[int, ReferenceMoment] = OrderedDict()
         self._shown = when
+        # Scrubbing goes back and forth between a few moments.
+        self.gpu = lru_cache(KEPT)(lambda when: GpuMoment(self.renderer, when, subject.log_eps))
+        self.reference = lru_cache(KEPT)(lambda when: open_reference(subject, when, self.renderer.maps))
+        self.comparison = lru_cache(KEPT)(lambda when: Comparison(self.gpu(when), self.reference(when)))
 
     def open(self) -> None:
         """Makes the context and draws once. Raises GLError."""
@@ -111,22 +112,9 @@ class Inspector:
         self._shown = moment(self.subject, seconds, self.step_us) if seconds is not None else self.first
         return self._shown
 
-    def gpu(self, when: When) -> GpuMoment:
-        key = (self.generation, when.t_ns)
-        return _kept(self._gpu, key, lambda: GpuMoment(self.renderer, when, self.subject.log_eps))
-
-    def reference(self, when: When) -> ReferenceMoment:
-        return _kept(self._reference, when.t_ns, lambda: open_reference(self.subject, when, self.renderer.maps))
-
-    def _comparison(self, when: When) -> Comparison:
-        gpu, ref = self.gpu(when), self.reference(when)
-        if not hasattr(ref, "comparison") or ref.comparison.gpu is not gpu:
-            ref.comparison = Comparison(gpu, ref)
-        return ref.comparison
-
     # ---- answers -----------------------------------------------------------------------------------------------
 
-    def state(self) -> dict:
+    def state(self, q: dict[str, Any]) -> dict:
         """What the page shows around the pictures."""
         scene, config, gl = self.subject.scene, self.subject.config, self.renderer.gl
         return {
@@ -197,7 +185,7 @@ class Inspector:
 
     def verdict(self, q: dict[str, Any]) -> dict:
         """All buffers against the reference: what ``diff`` says first, and its text."""
-        comparison = self._comparison(self._when(q["t"]))
+        comparison = self.comparison(self._when(q["t"]))
         reports = [comparison.report(name) for name in comparison.names()]
         found = verdict(reports, self.renderer.unused, comparison.left_out())
         titles = {name: info.title for name, info in PASSES.items()}
@@ -214,11 +202,9 @@ class Inspector:
         """The CLI's probe, with the CLI's text of every number."""
         when = self._when(q["t"])
         x, y = check_pixel(self.subject.scene, f"{q['x']},{q['y']}")
-        comparison = self._comparison(when)
+        comparison = self.comparison(when)
         found = probe(comparison.gpu, comparison.ref, x, y, comparison)
-        for row in found["buffers"]:
-            row |= {f"{side}_text": _numbers(row[side]) for side in SOURCES}
-        for row in found["positions"]:
+        for row in (*found["buffers"], *found["positions"]):
             row |= {f"{side}_text": _numbers(row[side]) for side in SOURCES}
         found["surface_text"] = {side: _surface_text(found["surface"][side]) for side in SOURCES}
         return _finite(found)
@@ -244,7 +230,8 @@ class Inspector:
             self.errors = []
             self.generation += 1
             old.clear()
-            self._gpu.clear()
+            self.gpu.cache_clear()
+            self.comparison.cache_clear()
             return
         self.renderer.use_shaders(old)
         new.clear()
@@ -266,15 +253,6 @@ class Inspector:
             except OSError:
                 pass
         return tuple(out)
-
-
-def _kept(cache: OrderedDict, key, make):
-    if key not in cache:
-        cache[key] = make()
-        while len(cache) > KEPT:
-            cache.popitem(last=False)
-    cache.move_to_end(key)
-    return cache[key]
 
 
 class Worker:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from itertools import product
 from weakref import WeakKeyDictionary
 
+import cv2
 import numpy as np
 
 from blinkgl.camera import CameraModel
@@ -26,21 +27,10 @@ def mip_chain(texture: Texture) -> list[Texture]:
     if texture not in _chains:
         levels = [linear_image(texture.image)]
         while max(levels[-1].shape[:2]) > 1:
-            levels.append(_half(_half(levels[-1]).swapaxes(0, 1)).swapaxes(0, 1))
+            height, width = (max(1, size // 2) for size in levels[-1].shape[:2])
+            levels.append(cv2.resize(levels[-1], (width, height), interpolation=cv2.INTER_LINEAR))
         _chains[texture] = [Texture(np.ascontiguousarray(level), texture.name) for level in levels]
     return _chains[texture]
-
-
-def _half(image: np.ndarray) -> np.ndarray:
-    """Half as many rows (rounded down, at least one), sampled bilinearly at their centres."""
-    size = len(image)
-    if size == 1:
-        return image
-    new = size // 2
-    at = (np.arange(new) + 0.5) * size / new - 0.5
-    low = np.clip(np.floor(at).astype(int), 0, size - 2)
-    part = (at - low).astype(np.float32)[:, None, None]
-    return image[low] * (1 - part) + image[low + 1] * part
 
 
 def sample_trilinear(texture: Texture, uv: np.ndarray, level: np.ndarray, wrap: tuple[str, str] = REPEAT) -> np.ndarray:
@@ -68,51 +58,32 @@ def mipmapped_albedo(material: Material, uv: np.ndarray, level: np.ndarray) -> n
     return sample_trilinear(material.texture, uv, level, material.wrap) * base
 
 
-def footprint(points: np.ndarray, texels: np.ndarray, rays: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """(N,) log2 of the texels that one pixel step covers on the planes of N triangles.
+def levels(points: np.ndarray, texels: np.ndarray, xy: np.ndarray, camera: CameraModel) -> np.ndarray:
+    """(N, 3) least, usual and greatest level that OpenGL 4.6 allows for a look-up at (N, 2) pixels; -inf, inf, inf
+    where a neighbour looks past the horizon of the triangle's plane.
 
     points : (N, 3, 3) corners, camera axes.   texels : (N, 3, 2) texture coordinates of the corners, in texels.
-    rays : (N, 3) through the pixels.   slopes : (N, 3, 2) their derivatives by x and y, 1/px.
-    With b = inv([A B C]) r the coordinates are (sum b_i u_i) / (sum b_i); the adjugate does, its scale cancels."""
-    rows = _adjugates(points)
-    weights = np.einsum("nij,nj->ni", rows, rays)
-    total = weights.sum(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        here = np.einsum("ni,nik->nk", weights, texels) / total[:, None]
-        steps = []
-        for axis in (0, 1):
-            slope = np.einsum("nij,nj->ni", rows, slopes[:, :, axis])  # d weights / d pixel
-            change = np.einsum("ni,nik->nk", slope, texels) - here * slope.sum(axis=1)[:, None]
-            steps.append(np.linalg.norm(change / total[:, None], axis=1))
-        return np.log2(np.maximum(steps[0], steps[1]))
-
-
-def _adjugates(points: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) inverse of (N, 3, 3) corners as columns, times their determinant."""
-    return np.cross(points[:, (1, 2, 0)], points[:, (2, 0, 1)])
-
-
-def level_range(points: np.ndarray, texels: np.ndarray, xy: np.ndarray, camera: CameraModel) -> np.ndarray:
-    """(N, 2) smallest and largest level that OpenGL 4.6 allows for a look-up at (N, 2) pixels; -inf and inf where a
-    neighbour looks past the horizon of the triangle's plane. points, texels : as of :func:`footprint`.
 
     Derivatives are differences between the 2 x 2 pixels of a quad, of either of its rows and columns (GLSL 4.60,
-    section 8.14.1). Of m_u = max(|du/dx|, |du/dy|), and m_v likewise, the scale may be anything from max(m_u, m_v) to
-    m_u + m_v (OpenGL 4.6, section 8.14.1)."""
-    rows, corner = _adjugates(points), 2 * (xy // 2)
-    there = {}
-    for x, y in product((0, 1), repeat=2):
-        weights = np.einsum("nij,nj->ni", rows, camera.rays(corner + [x, y]))
-        total = weights.sum(axis=1)
-        # The sign of the sum is that of the triangle's side; between two signs lies the horizon.
-        there[x, y] = np.einsum("ni,nik->nk", weights, texels) / total[:, None], np.sign(total)
-    along = np.abs([there[1, k][0] - there[0, k][0] for k in (0, 1)])
-    down = np.abs([there[k, 1][0] - there[k, 0][0] for k in (0, 1)])
-    low = np.maximum(along.min(axis=0), down.min(axis=0)).max(axis=1)
-    high = np.maximum(along.max(axis=0), down.max(axis=0)).sum(axis=1)
-    whole = np.abs(sum(side for _, side in there.values())) == 4
-    with np.errstate(divide="ignore"):
-        return np.log2(np.where(whole[:, None], np.stack([low, high], axis=1), [0.0, np.inf]))
+    section 8.14.1). Usual is log2 of the longer of the two (OpenGL 4.6, section 8.14.1, eq. 8.7). With m_u =
+    max(|du/dx|, |du/dy|), and m_v likewise, it may be taken of anything from max(m_u, m_v) to m_u + m_v."""
+    # With b = inv([A B C]) r the coordinates are (sum b_i u_i) / (sum b_i); the adjugate does, its scale cancels.
+    rows, corner = np.cross(points[:, (1, 2, 0)], points[:, (2, 0, 1)]), 2 * (xy // 2)
+    there, sides = {}, 0.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for x, y in product((0, 1), repeat=2):
+            weights = np.einsum("nij,nj->ni", rows, camera.rays(corner + [x, y]))
+            total = weights.sum(axis=1)
+            there[x, y] = np.einsum("ni,nik->nk", weights, texels) / total[:, None]
+            sides = sides + np.sign(total)
+        along = np.abs([there[1, k] - there[0, k] for k in (0, 1)])
+        down = np.abs([there[k, 1] - there[k, 0] for k in (0, 1)])
+        low = np.maximum(along.min(axis=0), down.min(axis=0)).max(axis=1)
+        high = np.maximum(along.max(axis=0), down.max(axis=0)).sum(axis=1)
+        usual = np.hypot(*np.moveaxis([along, down], -1, 0)).mean(axis=1).max(axis=0)
+        # The sum's sign is that of the plane's side that is seen; between two signs lies the horizon.
+        whole = np.abs(sides)[:, None] == 4
+        return np.log2(np.where(whole, np.stack([low, usual, high], axis=1), [0.0, np.inf, np.inf]))
 
 
 MISPLACED = 0.01 + 2.0**-8.5

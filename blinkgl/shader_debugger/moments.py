@@ -19,8 +19,8 @@ from blinkgl.render.colour import LUMA
 from blinkgl.render.passes.shadow import ShadowMap
 from blinkgl.scene.lights import MAX_SHADOWS, lamps_of, shadowing
 from blinkgl.scene.types import Part, Scene, SceneObject
-from blinkgl.shader_debugger.lamps import map_of
-from blinkgl.shader_debugger.mipmaps import footprint, level_range, mipmapped_albedo, needles
+from blinkgl.shader_debugger.lamps import map_of, near_an_edge
+from blinkgl.shader_debugger.mipmaps import levels, mipmapped_albedo, needles
 from blinkgl.shader_debugger.session import LOOKUPS as LOOKUP_PASSES, DebugRenderer, Subject, When
 from blinkgl.shader_debugger.twins import TWINNED, drawn, places_of, twin_of
 
@@ -173,10 +173,6 @@ class _Lazy:
             self._made.update(self._make(name))
         return self._made[name]
 
-    def keep(self, other: _Lazy, names: Iterable[str]) -> None:
-        """Takes these buffers from another moment in place of making them."""
-        self._made |= {name: other[name] for name in names}
-
     def _make(self, name: str) -> dict[str, np.ndarray]:
         raise NotImplementedError
 
@@ -276,6 +272,11 @@ class ReferenceMoment(_Lazy):
         when = self.when
         return reference.render(self.seen, when.t_ns, forward_ns=when.forward_ns, backward_ns=when.backward_ns)
 
+    @cached_property
+    def shadow_edges(self) -> np.ndarray:
+        """(H, W) bool: where hard shadows of maps differ from those of rays."""
+        return near_an_edge(self.scene, self.frame, self.maps)
+
     @property
     def frame(self) -> reference.ReferenceFrame:
         """What is drawn: without a lens :attr:`labels`."""
@@ -360,9 +361,8 @@ class ReferenceMoment(_Lazy):
             size = material.texture.image.shape[1::-1]
             out["texture_size"][on] = size
             texels, xy = mesh.uvs[corners].astype(np.float64) * material.uv_scale * size, frame.xy[on]
-            rays, slopes = scene.camera.rays(xy), scene.camera.ray_jacobian(xy)
-            out["level"][on] = footprint(points, texels, rays, slopes) + self.mip_bias
-            out["level_range"][on] = level_range(points, texels, xy, scene.camera) + self.mip_bias
+            out["levels"][on] = levels(points, texels, xy, scene.camera) + self.mip_bias
+            out["level"][on] = out["levels"][on][:, 1]
         out["albedo"][on] = mipmapped_albedo(material, out["uv"][on], out["level"][on])
         if mesh.colours is not None:
             out["albedo"][on] *= np.einsum("nc,nck->nk", frame.bary[on], mesh.colours[corners].astype(np.float64))
@@ -398,8 +398,8 @@ class ReferenceMoment(_Lazy):
 
 _COMPONENTS = {
     **dict.fromkeys(("level", "direct", "shadow", "around", "light", "needles"), 0),
-    **dict.fromkeys(("uv", "level_range", "texture_size"), 2),
-    **dict.fromkeys(("albedo", "mirrored", "emission", "lit"), 3),
+    **dict.fromkeys(("uv", "texture_size"), 2),
+    **dict.fromkeys(("levels", "albedo", "mirrored", "emission", "lit"), 3),
 }
 """Of what :meth:`ReferenceMoment._surface` makes; 0: (H, W)."""
 

@@ -83,7 +83,8 @@ class _Handler(BaseHTTPRequestHandler):
                 return self._send(200, resources.files(__package__).joinpath("page", name).read_bytes(), kind)
             if parts.path not in ROUTES:
                 return self._error(404, "no such page")
-            getattr(self, "_" + parts.path[1:])(read_query(parts.path, parts.query))
+            route, query = parts.path[1:], read_query(parts.path, parts.query)
+            self._wait(query) if route == "wait" else self._answer(route, query)
         except BlinkGLError as error:
             self._error(400, str(error))
         except OSError:  # a browser that left in the middle, or takes for ever
@@ -93,29 +94,17 @@ class _Handler(BaseHTTPRequestHandler):
 
     do_HEAD = do_GET
 
-    def _state(self, query: dict) -> None:
+    def _answer(self, route: str, query: dict) -> None:
+        """What the inspector's method of that name makes of a query: a picture and its legend, or JSON."""
         worker = self.server.worker
-        self._json(
-            worker.call(worker.inspector.state) | worker.call(worker.inspector.shaders) | {"version": worker.version}
-        )
-
-    def _image(self, query: dict) -> None:
-        self._picture(self.server.worker.inspector.image, query)
-
-    def _difference(self, query: dict) -> None:
-        self._picture(self.server.worker.inspector.difference, query)
-
-    def _picture(self, make, query: dict) -> None:
-        png, legend = self.server.worker.call(make, query)
-        self._send(200, png, "image/png", {"X-Legend": json.dumps(legend)})
-
-    def _probe(self, query: dict) -> None:
-        worker = self.server.worker
-        self._json(worker.call(worker.inspector.probe, query))
-
-    def _verdict(self, query: dict) -> None:
-        worker = self.server.worker
-        self._json(worker.call(worker.inspector.verdict, query))
+        made = worker.call(getattr(worker.inspector, route), query)
+        if isinstance(made, tuple):
+            png, legend = made
+            self._send(200, png, "image/png", {"X-Legend": json.dumps(legend)})
+            return
+        if route == "state":
+            made |= worker.call(worker.inspector.shaders) | {"version": worker.version}
+        self._json(made)
 
     def _wait(self, query: dict) -> None:
         worker = self.server.worker

@@ -16,13 +16,12 @@ from blinkgl.config.run import load_run
 from blinkgl.config.sequence import NS_PER_S, SequenceConfig
 from blinkgl.errors import ConfigError, GLError
 from blinkgl.gl import GLContext, ShaderLoader, create_context
-from blinkgl.gl.shader import ShaderError, Uniforms, expand, shader_folder
+from blinkgl.gl.shader import Uniforms, shader_folder
 from blinkgl.render.canvas import DEPTH_BUFFER
 from blinkgl.render.painter import Painter
 from blinkgl.render.passes import Colour, Luminance, Output, ScenePass
 from blinkgl.render.passes.shadow import ShadowMap
 from blinkgl.render.renderer import Renderer
-from blinkgl.render.strokes import Strokes
 from blinkgl.scene.build import check_assets, sequence_scene
 from blinkgl.scene.types import Scene
 from blinkgl.shader_debugger.twins import pass_of, places_of, twinned_of
@@ -175,16 +174,6 @@ class _Uniforms(Uniforms):
         return _Nothing()
 
 
-class _DebugStrokes(Strokes):
-    def __init__(self, gl: GLContext, unused: set[tuple[str, str]]):
-        super().__init__(gl)
-        self._unused = unused
-
-    def program(self, name: str, defines: dict[str, Any]) -> tuple[Any, Any]:
-        uniforms, array = super().program(name, defines)
-        return uniforms if array is None else _Uniforms(uniforms[""], self._unused), array
-
-
 class DebugPainter(Painter):
     """Draws with edited shaders that no longer use a uniform or an attribute of a shape, and notes which.
 
@@ -193,7 +182,6 @@ class DebugPainter(Painter):
     def __init__(self, gl: GLContext, scene: Scene, resources: Any, stats: Any):
         super().__init__(gl, scene, resources, stats)
         self.unused: set[tuple[str, str]] = set()
-        self.strokes = _DebugStrokes(gl, self.unused)
 
     def uniforms(self, program: Any) -> Any:
         return _Uniforms(program, self.unused)
@@ -316,21 +304,7 @@ class DebugRenderer(Renderer):
         """What the pass "luminance" or "colour" looks up and multiplies, float32, as its own source says it (variant
         SHOW_LOOKUP): result (H, W[, 3]) as the pass writes it; uv (H, W, 2); level, count (H, W), the number of
         look-ups; light, and its terms direct, shadow, around (H, W); albedo, mirrored, emission, light_rgb (H, W, 3).
-        One sample at the pixel's centre whatever the anti-aliasing; 0 where nothing is hit.
-
-        Raises ShaderError when the source shows nothing (a copy that is older than the debugger)."""
-        program = LOOKUPS[name].program
-        if "show_lookup(" not in "".join(
-            line
-            for line in expand(program, "fragment", {}, self.gl.shaders.folder).text.splitlines()
-            if not line.startswith("void")
-        ):
-            raise ShaderError(
-                "does not show what it looks up",
-                where=program,
-                accepted='#include "lookup.glsl" and show_lookup(albedo, light, …) under #ifdef SHOW_LOOKUP, as in the '
-                "shipped file",
-            )
+        One sample at the pixel's centre whatever the anti-aliasing; 0 where nothing is hit."""
         frame = self.draw(replace(LOOKUPS[name], shadows=self._shadows), t_ns)
         read = {output: self.at_pixels(frame.read(output)) for output in frame.names}
         lookup, albedo, terms = read["lookup"], read["albedo"], read["terms"]

@@ -165,27 +165,23 @@ def test_derivative_of_luminance_of_a_sliding_cosine(gl):
     assert np.abs(measured - true).max() < 0.01 * largest
 
 
-def test_reference_mip_level_of_a_facing_plane():
-    """texels per px = texels per unit * Z / f, at every pixel; and an oblique one by brute force."""
-    focal, depth, per_unit = (120.0, 110.0), 4.0, 64.0
+@pytest.mark.parametrize("angle, beside", [(0, 0.0), (45, 0.5)])
+def test_mip_levels_of_a_facing_plane(angle, beside):
+    """texels per px = texels per unit * Z / f; the axes of a texture that is turned are both shorter and longer."""
+    focal, depth, per_unit = 120.0, 4.0, 64.0
     points = np.array([[[-1, -1, depth], [1, -1, depth], [0, 1.5, depth]]])
-    texels = points[:, :, :2] * per_unit
-    ray = np.array([[0.02, -0.01, 1.0]])
-    slopes = np.array([[[1 / focal[0], 0.0], [0.0, 1 / focal[1]], [0.0, 0.0]]])
-    assert mipmaps.footprint(points, texels, ray, slopes)[0] == pytest.approx(
-        np.log2(per_unit * depth / 110.0), abs=1e-12
-    )
-    points[0, 2, 2] = 9.0
+    turn = Rotation.from_euler("z", angle, degrees=True).as_matrix()[:2, :2]
+    camera, pixel = PinHole(64, 48, focal, focal, 31.5, 23.5), np.array([[40, 20]])
+    low, usual, high = mipmaps.levels(points, points[..., :2] @ turn * per_unit, pixel, camera)[0]
+    assert usual == pytest.approx(np.log2(per_unit * depth / focal), abs=1e-9)
+    assert (usual - low, high - usual) == pytest.approx((beside, 1 - beside), abs=1e-9)
 
-    def where(rx, ry):
-        b = np.linalg.solve(points[0].T, [rx, ry, 1.0])
-        return b @ texels[0] / b.sum()
 
-    h = 1e-6
-    x = (where(0.02 + h, -0.01) - where(0.02 - h, -0.01)) / (2 * h) / focal[0]
-    y = (where(0.02, -0.01 + h) - where(0.02, -0.01 - h)) / (2 * h) / focal[1]
-    brute = np.log2(max(np.linalg.norm(x), np.linalg.norm(y)))
-    assert mipmaps.footprint(points, texels, ray, slopes)[0] == pytest.approx(brute, abs=1e-6)
+def test_a_mip_level_beside_the_horizon_is_anything():
+    """The plane y = 1, seen at eye level: of a quad's two rows one looks past its end."""
+    points = np.array([[[-1.0, 1.0, 1.0], [1.0, 1.0, 1.0], [0.0, 1.0, 50.0]]])
+    levels = mipmaps.levels(points, points[..., ::2], np.array([[3, 4]]), PinHole(8, 8, 10.0, 10.0, 3.5, 4.5))
+    assert levels.tolist() == [[-np.inf, np.inf, np.inf]]
 
 
 # ------------------------------------------------------------------------------------------------- edges

@@ -30,11 +30,10 @@ class Judge:
     def wrong(self, loader: ShaderLoader) -> list[str]:
         """Those of the first pass that has one."""
         gpu = moments.GpuMoment(self.renderer, self.when, self.log_eps)
-        gpu.keep(self.right, ("part", "triangle", "local"))
-        comparison = self.comparison.of(gpu)
         ours = self.renderer.gl.shaders
         self.renderer.use_shaders(loader)
         try:
+            comparison = compare.Comparison(gpu, self.comparison.ref)
             for of in ("shadow_map", "luminance", "colour"):
                 names = [n for n in comparison.names() if n.startswith(of) and n not in LOOKUPS]
                 if found := [n for n in names if not comparison.report(n).passed]:

@@ -45,7 +45,7 @@ def write_passes(
     )
     with open_renderer(subject, shaders, as_configured=True) as renderer:
         folder = _folder(out)  # not before there is something to put into it
-        gpu = GpuMoment(renderer, when, subject.log_eps)
+        gpu = GpuMoment(renderer, when)
         for name in names:
             info, array = PASSES[name], gpu[name]
             _save(folder / f"{name}.npy", array)
@@ -63,7 +63,7 @@ def _meaningful(moment, info) -> np.ndarray | None:
         return moment[info.name] > 0
     if info.name.startswith("flow_"):
         return moment[info.name.replace("flow", "valid")]
-    everywhere = info.name in ("luminance", "log_luminance", "dL_dt", *TWINNED)  # the background has them, too
+    everywhere = info.name in ("luminance", *TWINNED)  # the background has them, too
     if lookup_of(info.name)[1] in ("uv", "level"):
         return (
             moment["texture_size"][..., 0] > 1
@@ -91,7 +91,7 @@ def run_probe(subject: Subject, when: When, pixel: str, shaders: str | None = No
     """What ``blinkgl shader probe`` prints."""
     x, y = check_pixel(subject.scene, pixel)
     with open_renderer(subject, shaders) as renderer:
-        found = probe(GpuMoment(renderer, when, subject.log_eps), open_reference(subject, when, renderer.maps), x, y)
+        found = probe(GpuMoment(renderer, when), open_reference(subject, when, renderer.maps), x, y)
     return json.dumps(_finite(found)) if as_json else as_text(found)
 
 
@@ -112,9 +112,7 @@ def run_diff(
         there = buffers_of(subject.scene, twinned_of(subject.config, subject.scene))
         names = [check_pass(name, [known for known in QUANTITIES if known in there]) for name in names]
     with open_renderer(subject, shaders) as renderer:
-        comparison = Comparison(
-            GpuMoment(renderer, when, subject.log_eps), open_reference(subject, when, renderer.maps)
-        )
+        comparison = Comparison(GpuMoment(renderer, when), open_reference(subject, when, renderer.maps))
         names = names or comparison.names()
         limits = parse_tolerances(tolerances, names)
         reports = [comparison.report(name, limits.get(name)) for name in names]

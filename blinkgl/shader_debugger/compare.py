@@ -29,7 +29,7 @@ import numpy as np
 from trimesh.triangles import points_to_barycentric
 
 from blinkgl.errors import ConfigError
-from blinkgl.labels.grading import length
+from blinkgl.labels.grading import length, motion_per_interval
 from blinkgl.labels.label import Label, View
 from blinkgl.render import appearance, casting, reference
 from blinkgl.scene.lights import is_coloured, lamps_of, shadowing
@@ -119,6 +119,10 @@ def _of_the_picture(g, r, gpu, ref):
     return length(g.astype(np.float64) - r) / np.maximum(max(size.mean(), 1e-12), size)
 
 
+def _per_interval(g, r, gpu, ref):
+    return motion_per_interval(g, r, gpu.when.interval_s)
+
+
 def _misplaced(g, r, gpu, ref):
     """(H, W) px from each pixel's centre to where the point drawn there lies by the true poses, or, where that is more,
     from that point to the plane of the triangle that was drawn, as it is then; inf where it is out of sight. Needs
@@ -196,6 +200,7 @@ _SHADED = (
         Quantity(name, "of the pixel or mean", 2e-3, _of_the_picture, same_triangle=False, note=_GATHERED)
         for name in LENSED
     ),
+    Quantity("velocity_pass", "px per label interval", 0.01, _per_interval),
 )
 
 

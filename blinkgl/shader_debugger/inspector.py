@@ -66,15 +66,15 @@ class _Loader(ShaderLoader):
 class Inspector:
     """Buffers, pictures and probes of one subject. Every method but the constructor belongs to the worker's thread."""
 
-    def __init__(self, subject: Subject, when: When, shaders: str | None, step_us: float | None = None):
-        self.subject, self.first, self.step_us = subject, when, step_us
+    def __init__(self, subject: Subject, when: When, shaders: str | None):
+        self.subject, self.first = subject, when
         self.folder = open_folder(shaders)
         self._shaders = shaders
         self.generation = 1
         self.errors: list[Diagnostic] = []
         self._shown = when
         # Scrubbing goes back and forth between a few moments.
-        self.gpu = lru_cache(KEPT)(lambda when: GpuMoment(self.renderer, when, subject.log_eps))
+        self.gpu = lru_cache(KEPT)(lambda when: GpuMoment(self.renderer, when))
         self.reference = lru_cache(KEPT)(lambda when: open_reference(subject, when, self.renderer.maps))
         self.comparison = lru_cache(KEPT)(lambda when: Comparison(self.gpu(when), self.reference(when)))
 
@@ -95,7 +95,7 @@ class Inspector:
     # ---- moments -----------------------------------------------------------------------------------------------
 
     def _draw_all(self, when: When) -> GpuMoment:
-        made = GpuMoment(self.renderer, when, self.subject.log_eps)
+        made = GpuMoment(self.renderer, when)
         for name in self._buffers():
             made[name]
         return made
@@ -109,7 +109,7 @@ class Inspector:
         return (self.gpu(when) if source == "gpu" else self.reference(when))[name]
 
     def _when(self, seconds: float | None) -> When:
-        self._shown = moment(self.subject, seconds, self.step_us) if seconds is not None else self.first
+        self._shown = moment(self.subject, seconds) if seconds is not None else self.first
         return self._shown
 
     # ---- answers -----------------------------------------------------------------------------------------------

@@ -76,8 +76,7 @@ _SHADED = (
     Pass("colour_lens", "colour, lens", "linear radiance", "light", "gather.glsl"),
     Pass("luminance_edges", "luminance, edges", "linear", "scalar", "edges.glsl"),
     Pass("colour_edges", "colour, edges", "linear radiance", "light", "edges.glsl"),
-    Pass("log_luminance", "log luminance", "ln(L + log_eps)", "scalar", "luminance.glsl, then the logarithm"),
-    Pass("dL_dt", "dL/dt", "1/s", "signed", "luminance.glsl at two times, difference quotient"),
+    Pass("velocity_pass", "velocity for the time sampling", "px/s", "motion", "velocity.glsl"),
 )
 
 
@@ -189,19 +188,16 @@ class GpuMoment(_Lazy):
     Conventions: depth inf, flow 0 and id 0 where nothing is hit; velocity 0 there.
     """
 
-    def __init__(self, renderer: DebugRenderer, when: When, log_eps: float):
+    def __init__(self, renderer: DebugRenderer, when: When):
         super().__init__()
-        self.renderer, self.when, self.log_eps = renderer, when, log_eps
+        self.renderer, self.when = renderer, when
 
     def _make(self, name):
         draw, when = self.renderer, self.when
         if name in ("colour", "luminance"):
             return {name: draw.picture(name, when.t_ns)}
-        if name == "log_luminance":
-            return {name: np.log(self["luminance"] + np.float32(self.log_eps))}
-        if name == "dL_dt":
-            change = draw.picture("luminance", when.after_ns) - draw.picture("luminance", when.before_ns)
-            return {name: change / np.float32(when.step_s)}
+        if name == "velocity_pass":
+            return {name: draw.velocity(when.t_ns).read()}
         own = draw.at_pixels if name.partition("_")[2].startswith("edges") else np.asarray
         if name in TWINNED:
             return {name: own(drawn(draw, name, when.t_ns))}
@@ -245,7 +241,7 @@ class ReferenceMoment(_Lazy):
 
     The level of a look-up is log2 of the longer of the texel footprints of one pixel step in x and y (OpenGL 4.6,
     section 8.14, eq. 8.7), from the exact derivatives of uv on the triangle's plane, plus ``mip_bias``; a GPU takes it
-    from 2 x 2 pixels. The albedo, and what follows from it (colour, luminance, log_luminance, dL_dt), is sampled at
+    from 2 x 2 pixels. The albedo, and what follows from it (colour, luminance), is sampled at
     that level by the CPU twin in :mod:`mipmaps`, because the reference itself has no mip maps; its own values, at full
     resolution, are albedo_level0, colour_level0 and luminance_level0.   texture_size : (H, W,
     2) texels, 1 where there is no texture.
@@ -256,15 +252,12 @@ class ReferenceMoment(_Lazy):
     shadow_map_0 … : as ``maps``, those of the renderer, lie.
     """
 
-    def __init__(
-        self, scene: Scene, when: When, log_eps: float, mip_bias: float = 0.0, maps: tuple[ShadowMap, ...] = ()
-    ):
+    def __init__(self, scene: Scene, when: When, mip_bias: float = 0.0, maps: tuple[ShadowMap, ...] = ()):
         super().__init__()
         self.maps = maps
-        self.seen, self.when, self.log_eps, self.mip_bias = scene, when, log_eps, mip_bias
+        self.seen, self.when, self.mip_bias = scene, when, mip_bias
         self._places = places_of(scene.camera)
         self.scene = scene if self._places is None else scene.with_camera(seen_through(scene.camera))
-        self._others: dict[int, reference.ReferenceFrame] = {}
 
     @cached_property
     def labels(self) -> reference.ReferenceFrame:
@@ -277,19 +270,12 @@ class ReferenceMoment(_Lazy):
         """(H, W) bool: where hard shadows of maps differ from those of rays."""
         return near_an_edge(self.scene, self.frame, self.maps)
 
-    @property
+    @cached_property
     def frame(self) -> reference.ReferenceFrame:
         """What is drawn: without a lens :attr:`labels`."""
-        return self.at(self.when.t_ns)
-
-    def at(self, t_ns: int) -> reference.ReferenceFrame:
-        """What is drawn at another time."""
-        if self._places is None and t_ns == self.when.t_ns:
+        if self._places is None:
             return self.labels
-        if t_ns not in self._others:
-            xy = None if self._places is None else self._places.astype(np.float64)
-            self._others[t_ns] = reference.render(self.scene, t_ns, xy=xy)
-        return self._others[t_ns]
+        return reference.render(self.scene, self.when.t_ns, xy=self._places.astype(np.float64))
 
     def _make(self, name):
         if (found := view_of(name)) is not None:
@@ -309,24 +295,27 @@ class ReferenceMoment(_Lazy):
             return {name: frame.part}
         if name == "local":
             return {name: np.where(frame.hit[..., None], frame.local, 0.0)}
-        if name == "log_luminance":
-            return {name: np.log(self["luminance"] + self.log_eps)}
-        if name == "dL_dt":
-            before, after = (self._surface(t)["luminance"] for t in (self.when.before_ns, self.when.after_ns))
-            return {name: (after - before) / self.when.step_s}
+        if name == "velocity_pass":
+            return {name: self["velocity"] if self._places is None else self._velocity_drawn()}
         of, what = lookup_of(name)
         if of:
             grey = of == "luminance" and what in ("albedo", "mirrored", "emission")
             return {name: luma_of(self[what]) if grey else self[what]}
         if name in (*_COMPONENTS, "lamps", "matt", "colour", "luminance"):
-            return self._surface(self.when.t_ns)
+            return self._surface()
         return {
             f"next_depth_{way}": np.where(self.labels.hit, getattr(self.labels, way).depth, 0.0)
             for way in ("forward", "backward")
         }
 
-    def _surface(self, t_ns: int) -> dict[str, np.ndarray]:
-        frame = self.at(t_ns)
+    def _velocity_drawn(self) -> np.ndarray:
+        """(H, W, 2) px/s, in the lens's pixels, at the centres of the flat picture's."""
+        xy = self.seen.camera.project(self.scene.camera.rays(self._places.astype(np.float64)))
+        hits = casting.cast(self.seen, self.when.t_ns, xy.reshape(-1, 2))
+        return np.nan_to_num(casting.velocity(self.seen, hits)).reshape(xy.shape)
+
+    def _surface(self) -> dict[str, np.ndarray]:
+        frame = self.frame
         out = {name: np.zeros((*frame.hit.shape, n) if n else frame.hit.shape) for name, n in _COMPONENTS.items()}
         out["texture_size"][:] = out["needles"][:] = 1.0
         out["lamps"] = np.zeros((*frame.hit.shape, len(lamps_of(self.scene.light))))
@@ -406,7 +395,7 @@ _COMPONENTS = {
 
 def open_reference(subject: Subject, when: When, maps: tuple[ShadowMap, ...] = ()) -> ReferenceMoment:
     """What the GPU should write for this subject. maps : of the renderer that draws it."""
-    return ReferenceMoment(subject.scene, when, subject.log_eps, subject.config.render.mip_bias, maps)
+    return ReferenceMoment(subject.scene, when, subject.config.render.mip_bias, maps)
 
 
 def luma_of(albedo: np.ndarray) -> np.ndarray:

@@ -156,11 +156,10 @@ class DebugServer:
         shaders: str | None = None,
         host: str = "127.0.0.1",
         port: int = 0,
-        step_us: float | None = None,
     ):
         self._server = _listen(host, port)
         try:
-            self._server.worker = Worker(Inspector(subject, when, shaders, step_us))
+            self._server.worker = Worker(Inspector(subject, when, shaders))
         except BaseException:
             self._server.server_close()
             raise
@@ -208,11 +207,9 @@ def _listen(host: str, port: int) -> _Server:
         ) from None
 
 
-def serve(
-    subject: Subject, when: When, shaders: str | None, host: str, port: int, step_us: float | None = None
-) -> None:
+def serve(subject: Subject, when: When, shaders: str | None, host: str, port: int) -> None:
     """Serves until interrupted."""
-    with DebugServer(subject, when, shaders, host, port, step_us) as server:
+    with DebugServer(subject, when, shaders, host, port) as server:
         folder = server.folder
         print(f"{server.url}  (Ctrl-C ends it; watching {folder})", flush=True)
         if host not in LOCAL:

@@ -27,7 +27,6 @@ from blinkgl.scene.types import Scene
 from blinkgl.shader_debugger.twins import pass_of, places_of, twinned_of
 
 DEBUG_PROGRAM = "debug.glsl"
-STEP_FRACTION = 100  # the step of dL/dt is this part of the label interval
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,26 +38,14 @@ class Subject:
     index: int
     scene: Scene
 
-    @property
-    def log_eps(self) -> float:
-        """What the emulator adds to the luminance before the logarithm."""
-        return float(getattr(self.config.events, "log_eps", 1e-3))
-
 
 @dataclass(frozen=True)
 class When:
-    """Times in ns: the moment, the other ends of its flows, and the two times whose difference quotient is dL/dt."""
+    """Times in ns: the moment, and the other ends of its flows."""
 
     t_ns: int
     forward_ns: int
     backward_ns: int
-    before_ns: int
-    after_ns: int
-
-    @property
-    def step_s(self) -> float:
-        """Seconds between before and after."""
-        return (self.after_ns - self.before_ns) * 1e-9
 
     @property
     def interval_s(self) -> float:
@@ -81,11 +68,11 @@ def open_subject(
     return Subject(str(config), one, index, sequence_scene(one, index, template.base))
 
 
-def moment(subject: Subject, seconds: float | None = None, step_us: float | None = None) -> When:
+def moment(subject: Subject, seconds: float | None = None) -> When:
     """The times that belong to a moment ``seconds`` on the sequence's clock (default: the first label).
 
     Flows run one label interval forward and backward; beyond the sequence's ends the poses are held, as everywhere.
-    Raises ConfigError for a time outside the sequence or a step that is not positive."""
+    Raises ConfigError for a time outside the sequence."""
     timing, scene = subject.config.time, subject.scene
     if seconds is None:
         t_ns = timing.label_times_ns[0]
@@ -98,14 +85,7 @@ def moment(subject: Subject, seconds: float | None = None, step_us: float | None
                 value=seconds,
                 accepted=f"{scene.t0_ns / NS_PER_S:g} to {scene.t1_ns / NS_PER_S:g} s",
             )
-    if step_us is None:
-        step = max(1000, timing.interval_ns // STEP_FRACTION)
-    elif math.isfinite(step_us * 1000) and step_us * 1000 >= 1:
-        step = round(step_us * 1000)
-    else:
-        raise ConfigError("not a time step", where="--step", value=step_us, accepted="at least 0.001 µs")
-    before, after = max(scene.t0_ns, t_ns - step), min(scene.t1_ns, t_ns + step)
-    return When(t_ns, t_ns + timing.interval_ns, t_ns - timing.interval_ns, before, after)
+    return When(t_ns, t_ns + timing.interval_ns, t_ns - timing.interval_ns)
 
 
 def check_pixel(scene: Scene, text: str) -> tuple[int, int]:

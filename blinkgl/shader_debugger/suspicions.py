@@ -205,7 +205,7 @@ def _edges(comparison, name, r, g, on) -> Candidates:
 def _motion(comparison, name, r, g, on) -> Candidates:
     gpu, ref, camera = comparison.gpu, comparison.ref, comparison.ref.scene.camera
     yield "in clip units instead of px (0.5 * image_size is missing)", r * 2 / np.array([camera.width, camera.height])
-    if name == "velocity":
+    if name.startswith("velocity"):
         yield "the perspective division is missing (not divided by Z)", r * ref["depth"][on][:, None]
         yield "per label interval instead of per second", r * gpu.when.interval_s
         return
@@ -227,6 +227,6 @@ _SPECIFIC = {
     "luminance": _shaded,
     "colour": _shaded,
     **dict.fromkeys(("luminance_edges", "rate_edges", "colour_edges"), _edges),
-    **dict.fromkeys(("velocity", "flow_forward", "flow_backward"), _motion),
+    **dict.fromkeys(("velocity", "velocity_pass", "flow_forward", "flow_backward"), _motion),
 }
 """Mistakes of a look-up, or of a buffer, by its name."""

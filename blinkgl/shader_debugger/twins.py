@@ -12,10 +12,10 @@ from scipy import ndimage
 from blinkgl.camera import CameraModel
 from blinkgl.camera.drawing import seen_through
 from blinkgl.config.sequence import SequenceConfig
+from blinkgl.render import lens
 from blinkgl.render.antialiasing import Samples, samples_of
 from blinkgl.render.casting import pixel_grid
 from blinkgl.render.contours import Lines
-from blinkgl.render.lens import steps_of
 from blinkgl.render.passes import Colour, Edged, Gather, Luminance, Pass
 from blinkgl.render.passes.edged import SKY
 from blinkgl.scene.types import Scene
@@ -44,8 +44,8 @@ def places_of(camera: CameraModel) -> np.ndarray | None:
     flat = seen_through(camera)
     if flat is camera:
         return None
-    xy = flat.project(camera.rays(pixel_grid(camera)))
-    return np.floor(xy + 0.5).astype(np.intp).reshape(camera.height, camera.width, 2)
+    # Of float32 places, as gather.glsl has them: which side of a pixel's border a ray is on hangs on the last bit.
+    return np.floor(lens.places_of(camera, flat, camera.width, camera.height).places).astype(np.intp)
 
 
 def pass_of(renderer: DebugRenderer, what: str, samples: Samples = Samples()) -> Pass:
@@ -92,7 +92,7 @@ def _gathered(picture: np.ndarray, camera: CameraModel) -> np.ndarray:
     rays = camera.rays(grid)
     # To first order, as the shader has it: the place of the pixel's centre and its two derivatives.
     place, slopes = flat.project(rays), flat.jacobian(rays) @ camera.ray_jacobian(grid)
-    columns, rows = steps_of(camera, 1)
+    columns, rows = lens.steps_of(camera, 1)
     channels = np.moveaxis(np.atleast_3d(picture).astype(np.float64), 2, 0)
     total = np.zeros((len(channels), len(grid)))
     for across in (np.arange(columns) + 0.5) / columns - 0.5:

@@ -23,13 +23,13 @@ class Judge:
     """Names the buffers of one moment that are over their tolerance with other shaders."""
 
     def __init__(self, renderer, subject, when):
-        self.renderer, self.when, self.log_eps = renderer, when, subject.log_eps
-        self.right = moments.GpuMoment(renderer, when, subject.log_eps)
+        self.renderer, self.when = renderer, when
+        self.right = moments.GpuMoment(renderer, when)
         self.comparison = compare.Comparison(self.right, moments.open_reference(subject, when, renderer.maps))
 
     def wrong(self, loader: ShaderLoader) -> list[str]:
         """Those of the first pass that has one."""
-        gpu = moments.GpuMoment(self.renderer, self.when, self.log_eps)
+        gpu = moments.GpuMoment(self.renderer, self.when)
         ours = self.renderer.gl.shaders
         self.renderer.use_shaders(loader)
         try:

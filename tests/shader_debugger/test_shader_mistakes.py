@@ -23,7 +23,7 @@ class Judge:
 
     def __init__(self, path: str, overrides: tuple[str, ...]):
         subject = open_subject(path, overrides=overrides)
-        self.when, self.log_eps = moment(subject), subject.log_eps
+        self.when = moment(subject)
         self._context = open_renderer(subject)
         self.renderer = self._context.__enter__()
         self.reference = moments.open_reference(subject, self.when, self.renderer.maps)
@@ -36,7 +36,7 @@ class Judge:
         """The verdict on the shaders of a folder, up to the first buffer that is wrong; None: on those that ship."""
         self.renderer.gl.make_current()
         self.renderer.use_shaders(ShaderLoader(self.renderer.gl.ctx, folder) if folder else self.shipped)
-        gpu = moments.GpuMoment(self.renderer, self.when, self.log_eps)
+        gpu = moments.GpuMoment(self.renderer, self.when)
         comparison = compare.Comparison(gpu, self.reference)
         reports = []
         for name in comparison.names():

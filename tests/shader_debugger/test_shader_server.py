@@ -319,7 +319,7 @@ def test_the_page_in_chromium(served, shader, config):
     """Values of a pixel are those of the command line; a verdict on good shaders, and on broken ones."""
     server, folder = served
     page = page_of(server, "fault", "t=0.3", "x=40", "y=45")
-    assert 'data-ready="yes"' in page and 'data-shown="0.3"' in page and "all 28 buffers agree" in page
+    assert 'data-ready="yes"' in page and 'data-shown="0.3"' in page and "all 29 buffers agree" in page
     status, out, _ = shader("probe", config, "--shaders", folder, "--time", 0.3, "--pixel", "40,45")
     assert status == 0
     for name, info in buffers(config).items():

@@ -29,12 +29,17 @@ class Finding:
 
 @dataclass
 class Result:
-    """renderer : what compiled.   programs : name -> number of variants.   errors : findings, each once."""
+    """renderer : what compiled.   programs : name -> number of variants.   found : by program and message."""
 
     renderer: str = ""
     seconds: float = 0.0
     programs: dict[str, int] = field(default_factory=dict)
-    errors: list[Finding] = field(default_factory=list)
+    found: dict[tuple[str, Diagnostic], Finding] = field(default_factory=dict)
+
+    @property
+    def errors(self) -> list[Finding]:
+        """Each once, in the order in which they were met."""
+        return list(self.found.values())
 
     def as_dict(self) -> dict:
         return {
@@ -77,19 +82,10 @@ def check_program(ctx: moderngl.Context, folder: Any, name: str, result: Result)
         except ShaderError as error:
             for diagnostic in dict.fromkeys(diagnose(error, sources, folder)):
                 if diagnostic.kind == "error":
-                    _add(result.errors, diagnostic, name, defines)
+                    found = result.found.setdefault((name, diagnostic), Finding(diagnostic, name, example=defines))
+                    found.count += 1
             continue
         program.release()
-
-
-def _add(findings: list[Finding], diagnostic: Diagnostic, program: str, defines: dict) -> None:
-    for found in findings:
-        if found.program == program and found.diagnostic == diagnostic:
-            break
-    else:
-        found = Finding(diagnostic, program, 0, dict(defines))
-        findings.append(found)
-    found.count += 1
 
 
 def _programs(files: list[str], shaders: str | None):

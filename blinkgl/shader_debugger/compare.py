@@ -104,7 +104,9 @@ def _pixels_of_texture(g, r, gpu, ref):
 def _beyond_the_range(g, r, gpu, ref):
     """How far a level is outside of what OpenGL allows, moved by what ``r`` is beside the level itself; below 0 the
     texture is magnified, and all levels do the same."""
-    low, high = (np.maximum(ref["levels"][..., k] + (r - ref["level"]), 0.0) for k in (0, 2))
+    with np.errstate(invalid="ignore"):
+        moved = np.where(r == ref["level"], 0.0, r - ref["level"])
+    low, high = (np.maximum(ref["levels"][..., k] + moved, 0.0) for k in (0, 2))
     return np.maximum(np.maximum(low - np.maximum(g, 0.0), g - high), 0.0)
 
 

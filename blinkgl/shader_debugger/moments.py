@@ -53,7 +53,7 @@ def _lookups(name: str, program: str) -> tuple[Pass, ...]:
         Pass(f"{name}_uv", f"uv of {name}", "texture repeats", "uv", source),
         Pass(f"{name}_level", f"level of {name}", "log2(texels per px)", "scalar", source),
         Pass(f"{name}_albedo", f"albedo of {name}", "linear", "light", source),
-        Pass(f"{name}_direct", f"lamps of {name}", "irradiance factor, without shadows", "scalar", source),
+        Pass(f"{name}_direct", f"lamps of {name}", "irradiance factor", "scalar", source),
         Pass(f"{name}_shadow", f"shadow factor of {name}", "share of the lamps' light", "scalar", source),
         Pass(f"{name}_around", f"environment of {name}", "irradiance factor", "scalar", source),
         Pass(f"{name}_light", f"light of {name}", "irradiance factor", "scalar", source),

@@ -70,6 +70,7 @@ def check(files: list[str], shaders: str | None = None, backend: str = "auto", d
 
 def check_program(ctx: moderngl.Context, folder: Any, name: str, result: Result) -> None:
     """Adds every variant of one program to ``result``."""
+    # Programs that no pass draws are somebody's own: they are compiled as they stand.
     wanted = variants(name)
     wanted = [{}] if wanted is None else wanted + lookups(name)  # [{}]: somebody's own program, as it stands
     result.programs[name] = len(wanted)
@@ -80,6 +81,7 @@ def check_program(ctx: moderngl.Context, folder: Any, name: str, result: Result)
                 sources[stage] = expand(name, stage, defines, folder)
             program = link(ctx, sources)
         except ShaderError as error:
+            # A name that is wrong in an include is reported by every stage that includes it.
             for diagnostic in dict.fromkeys(diagnose(error, sources, folder)):
                 if diagnostic.kind == "error":
                     found = result.found.setdefault((name, diagnostic), Finding(diagnostic, name, example=defines))
@@ -93,6 +95,7 @@ def _programs(files: list[str], shaders: str | None):
     folder = open_folder(shaders)
     if files and shaders is None:  # a file of another folder brings its folder along
         first = Path(files[0]).resolve()
+        # An include lies below include/, at any depth; a program lies in the folder itself.
         home = next((folder.parent for folder in first.parents if folder.name == "include"), first.parent)
         if first.is_file() and home != folder.resolve():
             folder = open_folder(str(home))
@@ -117,6 +120,7 @@ def _programs(files: list[str], shaders: str | None):
                 value=text,
                 accepted="one of " + ", ".join(str(p.relative_to(folder)) for p in known),
             )
+        # Of an include all programs are compiled that it is part of.
         wanted = (
             [path.name]
             if path.parent == folder

@@ -103,6 +103,7 @@ def diff(
     subject = _subject(config, seed, sequence, overrides)
     found, reports = commands.run_diff(subject, _when(subject, time), names, tolerance or [], shaders, out)
     typer.echo(commands.diff_json(found, reports) if json else commands.diff_text(found, reports))
+    # For scripts: 0 says that all that was graded agrees.
     if not found["passed"]:
         raise typer.Exit(DIFFERENT)
 

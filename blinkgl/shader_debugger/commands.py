@@ -44,7 +44,8 @@ def write_passes(
         f"{Path(subject.path).name}, sequence {subject.index}, seed {subject.config.seed}, t = {when.t_ns * 1e-9:.6g} s"
     )
     with open_renderer(subject, shaders, as_configured=True) as renderer:
-        folder = _folder(out)  # not before there is something to put into it
+        # A folder is not made for a run that cannot draw.
+        folder = _folder(out)
         gpu = GpuMoment(renderer, when)
         for name in names:
             info, array = PASSES[name], gpu[name]
@@ -108,6 +109,7 @@ def run_diff(
     Returns what :func:`verdict.verdict` says, and the reports."""
     from blinkgl.shader_debugger.compare import QUANTITIES
 
+    # Names are checked before anything is drawn.
     if names:
         there = buffers_of(subject.scene, twinned_of(subject.config, subject.scene))
         names = [check_pass(name, [known for known in QUANTITIES if known in there]) for name in names]
@@ -178,6 +180,7 @@ def diff_text(found: dict, reports: list[BufferReport]) -> str:
         ]
         lines += [f"  it looks as if: {text}" for text in s["suspicions"]]
         top = max([1, *s["histogram"].values()])
+        # A logarithm, or one wrong pixel would have no bar beside ten thousand right ones.
         bars = {
             name: max(1, round(40 * np.log1p(count) / np.log1p(top))) for name, count in s["histogram"].items() if count
         }

@@ -97,6 +97,7 @@ def _relative(g, r, gpu, ref):
 def _pixels_of_texture(g, r, gpu, ref):
     """How far the texture is shifted, in px: at a grazing angle one pixel spans many repeats, and so does float32's
     rounding. Whole repeats are no shift."""
+    # A texture repeats: float32 tells its place, not how many repeats it is away.
     shift = g.astype(np.float64) - r
     return length((shift - np.rint(shift)) * ref["texture_size"]) / np.exp2(ref["level"])
 
@@ -105,6 +106,7 @@ def _beyond_the_range(g, r, gpu, ref):
     """How far a level is outside of what OpenGL allows, moved by what ``r`` is beside the level itself; below 0 the
     texture is magnified, and all levels do the same."""
     with np.errstate(invalid="ignore"):
+        # Both are infinite beside a horizon, where any level is right.
         moved = np.where(r == ref["level"], 0.0, r - ref["level"])
     low, high = (np.maximum(ref["levels"][..., k] + moved, 0.0) for k in (0, 2))
     return np.maximum(np.maximum(low - np.maximum(g, 0.0), g - high), 0.0)
@@ -117,6 +119,7 @@ def _of_the_lamps(g, r, gpu, ref):
 
 def _of_the_picture(g, r, gpu, ref):
     """Where it is bright of the pixel itself, else of what the picture has in the mean."""
+    # In the dark a part of nearly nothing would be a large error.
     size = length(r)
     return length(g.astype(np.float64) - r) / np.maximum(max(size.mean(), 1e-12), size)
 
@@ -138,6 +141,7 @@ def _misplaced(g, r, gpu, ref):
         aside = np.linalg.norm(camera.project(there) - ref.frame.xy[y, x], axis=1)
         corners = casting.vertices_at(one.mesh, ref.when.t_ns)[one.mesh.faces[gpu["triangle"][y, x].astype(int) - 1]]
         with np.errstate(all="ignore"):
+            # Of the plane, not of the triangle: how far along it the point lies is said by ``aside``.
             shares = points_to_barycentric(corners, local, method="cross")
             off = np.linalg.norm(local - np.einsum("nc,nck->nk", shares, corners), axis=1)
             off *= camera.px_per_slope / there[:, 2]
@@ -338,6 +342,7 @@ class Comparison:
             name if names.count(name) == 1 else f"{name} (id {thing.instance_id})"
             for name, thing in zip(names, ref.scene.objects)
         ] + [NOTHING]
+        # Objects may have several parts, and a name may be given twice.
         index = {id(thing): i for i, thing in enumerate(ref.scene.objects)}
         self._object_of_part = np.array([index[id(thing)] for thing in things] + [len(names)], np.intp)
 
@@ -360,6 +365,7 @@ class Comparison:
         """(2, lamps, H, W) least and greatest share of each lamp that is seen past its soft shadow; None where there
         are none."""
         ref, lamps = self.ref, lamps_of(self.ref.scene.light)
+        # All maps of a scene are soft or none is.
         if not any(one.soft for one in ref.maps):
             return None
         out = np.ones((2, len(lamps), *ref.frame.hit.shape))
@@ -465,6 +471,7 @@ class Comparison:
             graded &= self.same_triangle if view_of(name) is None else self._same_label
         of, what = lookup_of(name)
         if what in LIT:
+            # The reference looks maps up at full resolution, a GPU in mip maps.
             mapped = [p for p, (_, part) in enumerate(casting.scene_parts(self.ref.scene)) if is_mapped(part.material)]
             graded &= ~np.isin(self.ref.frame.part, mapped)
             # Light is told in the luminance of what it falls on: on black it has none.
@@ -477,6 +484,7 @@ class Comparison:
         quantity, errors, graded = QUANTITIES[name], self.errors(name), self.graded(name)
         band = ~graded if name in MAPS else self.band & ~graded
         inside = errors[graded]
+        # Nothing to grade is nothing wrong; the verdict counts it.
         value = (float(inside.mean()) if quantity.statistic == "mean" else float(inside.max())) if inside.size else 0.0
         report = BufferReport(
             quantity, self.tolerance(name) if tolerance is None else tolerance, errors, graded, band, value
@@ -491,6 +499,7 @@ class Comparison:
         g, r = self.pair(name)
         owner = np.full(report.errors.shape, len(self.objects) - 1) if name in MAPS else self.owner(name)
         out = []
+        # Objects are told apart, since a mistake of one variant is that of some objects alone.
         for k in np.unique(owner[report.graded]):
             rows = np.flatnonzero((report.graded & (owner == k)).ravel())
             errors = report.errors.ravel()[rows]

@@ -50,6 +50,7 @@ def diagnose(error: ShaderError, sources: Mapping[str, ShaderSource], folder: An
         return found
     said = str(error).removeprefix(f"{error.where}: ")
     if error.log and sources:  # linking: no lines, but names
+        # The later stage first: it is the one that asks for what the earlier does not give.
         for stage in reversed(sources):
             for name in _QUOTED.findall(said):
                 if place := _declaration(sources[stage], name):
@@ -69,6 +70,7 @@ def _line(text: str, number: int) -> str:
 def _column(text: str, message: str, column: int) -> int:
     """A name that the message quotes, if the line has it: drivers count columns after their
     preprocessor squeezed the blanks."""
+    # Drivers count columns after their preprocessor, names stay.
     for name in _QUOTED.findall(message):
         if match := re.search(rf"\b{re.escape(name.split('.')[0])}\b", text):
             return match.start() + 1
@@ -94,11 +96,13 @@ def excerpt(folder: Any, file: str, line: int, column: int = 0, around: int = 2)
     try:
         lines = path.read_text(encoding="utf-8").split("\n")
     except (OSError, UnicodeDecodeError):
+        # What the table of labels or shapes makes lies in no file.
         lines = made_includes().get(file.removeprefix("include/"), "").split("\n")
     out = []
     for i in range(max(1, line - around), min(len(lines), line + around) + 1):
         out.append(f"{'>' if i == line else ' '} {i:4d} | {lines[i - 1]}")
         if i == line and column:
+            # Tabs stay tabs, so that the caret stands below its column however wide they are shown.
             pad = re.sub(r"[^\t]", " ", lines[i - 1][: column - 1])
             out.append(f"       | {pad}^")
     return "\n".join(out)

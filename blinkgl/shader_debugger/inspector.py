@@ -96,6 +96,7 @@ class Inspector:
 
     def _draw_all(self, when: When) -> GpuMoment:
         made = GpuMoment(self.renderer, when)
+        # Programs compile when they are first drawn with: all are, so that an error shows now.
         for name in self._buffers():
             made[name]
         return made
@@ -173,6 +174,7 @@ class Inspector:
         with np.errstate(invalid="ignore"):
             change = np.where(a == b, 0.0, a - b)
         values = np.abs(pictures.component(change, which))
+        # A scale from the least to the greatest difference; without any, some scale.
         some = values[np.isfinite(values) & (values > 0)]
         low, high = (float(v) for v in (np.quantile(some, 0.01), some.max())) if some.size else (1e-12, 1.0)
         low, high = min(low, 0.999 * high) if q["low"] is None else q["low"], high if q["high"] is None else q["high"]
@@ -220,6 +222,7 @@ class Inspector:
         try:
             self._draw_all(self._shown)
         except ShaderError as error:
+            # The same message comes from each stage that includes the line.
             found = dict.fromkeys(diagnose(error, self._sources(new), new.folder))
             self.errors = [d for d in found if d.kind == "error"][:MOST_ERRORS]
         except Exception as error:  # noqa: BLE001 - an edit that compiles but cannot be drawn with: not the tool's end
@@ -248,6 +251,7 @@ class Inspector:
         out = []
         for path in files_of(self.folder):
             try:
+                # Editors replace a file by renaming: it may be gone for a moment, or have another inode.
                 info = path.stat()
                 out.append((str(path), info.st_mtime_ns, info.st_size, info.st_ino))
             except OSError:
@@ -281,6 +285,7 @@ class Worker:
     def _watch(self) -> None:
         seen = last = self.inspector.stamps()
         while not self._stop.wait(POLL_S):
+            # Two looks alike mean that nobody is writing just now.
             last, stamps = self.inspector.stamps(), last
             if stamps == last != seen:  # not while an editor is still writing: a file is empty for a moment
                 seen = stamps

@@ -27,10 +27,12 @@ def map_of(scene: Scene, t_ns: int, map_: ShadowMap) -> tuple[np.ndarray, np.nda
     camera, size = view.camera, map_.texels
     y, x = np.mgrid[0:size, 0:size].reshape(2, -1)
     if not isinstance(camera, Parallel):
+        # Texels are pixels of the lamp's camera.
         rays = camera.rays(np.stack([x, y], axis=1).astype(np.float64))
         depth, part = appearance.seen_by_lamp(scene, t_ns, pose, rays / rays[:, 2:], camera.near)
         value = camera.near / depth
     else:
+        # The ray caster has rays from one point: from far enough away they are parallel.
         away = FAR_AWAY * camera.depth
         pose = pose.copy()
         pose[:3, 3] -= away * pose[:3, 2]
@@ -39,6 +41,7 @@ def map_of(scene: Scene, t_ns: int, map_: ShadowMap) -> tuple[np.ndarray, np.nda
         )
         rays = np.column_stack([there / (away + 0.5 * camera.depth), np.ones(len(there))])
         depth, part = appearance.seen_by_lamp(scene, t_ns, pose, rays, 0.5 * away)
+        # Depth is reversed, 1 at the side of the lamp.
         value = 1.0 - (depth - away) / camera.depth
     return np.where(part >= 0, value, 0.0).reshape(size, size), part.reshape(size, size)
 
@@ -68,6 +71,7 @@ def near_an_edge(scene: Scene, frame: reference.ReferenceFrame, maps: tuple[Shad
             towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
         facing = (towards * normals).sum(axis=1)
         edge = np.abs(facing) < GRAZING
+        # A shadow's edge is where a neighbour, as far aside as the map smooths, sees another share.
         share = appearance.seen_share(scene, frame.t_ns, one.lamp, points, own)
         edge |= (share > 0) & (share < 1)
         for k in range(WAYS):
@@ -76,6 +80,7 @@ def near_an_edge(scene: Scene, frame: reference.ReferenceFrame, maps: tuple[Shad
             aside = aside * (texel * SMOOTHED)[:, None]
             # in the plane of the surface, where it is as far aside as the lamp sees it
             slide = (aside * normals).sum(axis=1) / np.where(np.abs(facing) < GRAZING, 1.0, facing)
+            # Moved along the light until it is on the surface's own plane again.
             there = points + aside - slide[:, None] * towards
             edge |= appearance.seen_share(scene, frame.t_ns, one.lamp, there, own) != share
         out.ravel()[rows] |= edge

@@ -25,6 +25,7 @@ _chains: WeakKeyDictionary = WeakKeyDictionary()
 def mip_chain(texture: Texture) -> list[Texture]:
     """Linear-light float32 levels 0, 1, … down to 1 x 1."""
     if texture not in _chains:
+        # Mip maps are means of light, not of its sRGB code.
         levels = [linear_image(texture.image)]
         while max(levels[-1].shape[:2]) > 1:
             height, width = (max(1, size // 2) for size in levels[-1].shape[:2])
@@ -36,6 +37,7 @@ def mip_chain(texture: Texture) -> list[Texture]:
 def sample_trilinear(texture: Texture, uv: np.ndarray, level: np.ndarray, wrap: tuple[str, str] = REPEAT) -> np.ndarray:
     """(N, 3) linear light at (N, 2) texture coordinates and (N,) levels (below 0: level 0)."""
     chain = mip_chain(texture)
+    # A magnified texture has the finest level, and beyond 1 x 1 there is none.
     level = np.clip(np.nan_to_num(level), 0.0, len(chain) - 1)
     low = np.floor(level).astype(int)
     out = np.empty((len(uv), 3))
@@ -78,6 +80,7 @@ def levels(points: np.ndarray, texels: np.ndarray, xy: np.ndarray, camera: Camer
             sides = sides + np.sign(total)
         along = np.abs([there[1, k] - there[0, k] for k in (0, 1)])
         down = np.abs([there[k, 1] - there[k, 0] for k in (0, 1)])
+        # The least that either row and either column can give, and the most.
         low = np.maximum(along.min(axis=0), down.min(axis=0)).max(axis=1)
         high = np.maximum(along.max(axis=0), down.max(axis=0)).sum(axis=1)
         usual = np.hypot(*np.moveaxis([along, down], -1, 0)).mean(axis=1).max(axis=0)
@@ -100,8 +103,10 @@ def needles(points: np.ndarray, camera: CameraModel) -> np.ndarray:
     Where a corner is off by e, the shares of the corners are off by e / height, and the surface by that times the
     longest side. 1 for triangles through the near plane, which are clipped."""
     whole = (points[..., 2] > camera.near).all(axis=1)
+    # A corner behind the camera is not in the picture: any place in front will do for those left out.
     px = camera.project(np.where(whole[:, None, None], points, [0.0, 0.0, 1.0]))
     sides = px - np.roll(px, 1, axis=1)
+    # Twice the triangle's area is its longest side times its height.
     area = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0])
     extent = np.maximum(np.abs(px).max(axis=(1, 2)), max(camera.width, camera.height))
     off = _ROUNDING * extent * (sides**2).sum(axis=2).max(axis=1) / np.maximum(area, 1e-12)

@@ -96,6 +96,7 @@ class OfLabels(Mapping[str, _T]):
             for label in LABELS.values()
             for view in label.views
         ]
+        # Motion comes last: it hangs on all that is before it.
         surface, motion = ([one for early, one in views if early is which] for which in (True, False))
         return {one.name: one for one in (*self._before, *surface, *self._shaded, *motion)}
 
@@ -126,6 +127,7 @@ def buffers_of(scene: Scene, twinned: tuple[str, ...] = ()) -> dict[str, Pass]:
     """Those of :data:`PASSES` that a scene has: of one without shadows no shadow maps, and so on.
 
     twinned : of :data:`twins.TWINNED` those that are among them."""
+    # A lamp without anything that casts has no map.
     maps = len(shadowing(scene.light)) if appearance.casts(scene) else 0
     materials = [part.material for _, part in casting.scene_parts(scene) if not part.material.unlit]
     there = {
@@ -198,6 +200,7 @@ class GpuMoment(_Lazy):
             return {name: draw.picture(name, when.t_ns)}
         if name == "velocity_pass":
             return {name: draw.velocity(when.t_ns).read()}
+        # ``edges`` writes a flat picture, a lens its own pixels.
         own = draw.at_pixels if name.partition("_")[2].startswith("edges") else np.asarray
         if name in TWINNED:
             return {name: own(drawn(draw, name, when.t_ns))}
@@ -229,6 +232,7 @@ class GpuMoment(_Lazy):
 
     def _labels(self):
         when = self.when
+        # All at once, so that they are drawn in one go.
         ask = LabelRequest(*(name for name, label in LABELS.items() if label.views))
         frame = self.renderer.labels(when.t_ns, ask, when.forward_ns, when.backward_ns)
         return {view.name: view.of(frame.values[name]) for name in ask for view in LABELS[name].views}
@@ -298,6 +302,7 @@ class ReferenceMoment(_Lazy):
         if name == "velocity_pass":
             return {name: self["velocity"] if self._places is None else self._velocity_drawn()}
         of, what = lookup_of(name)
+        # The event pass has textures of one channel.
         if of:
             grey = of == "luminance" and what in ("albedo", "mirrored", "emission")
             return {name: luma_of(self[what]) if grey else self[what]}
@@ -310,6 +315,7 @@ class ReferenceMoment(_Lazy):
 
     def _velocity_drawn(self) -> np.ndarray:
         """(H, W, 2) px/s, in the lens's pixels, at the centres of the flat picture's."""
+        # The lens's pixel of a flat one, in fractions.
         xy = self.seen.camera.project(self.scene.camera.rays(self._places.astype(np.float64)))
         hits = casting.cast(self.seen, self.when.t_ns, xy.reshape(-1, 2))
         return np.nan_to_num(casting.velocity(self.seen, hits)).reshape(xy.shape)
@@ -326,6 +332,7 @@ class ReferenceMoment(_Lazy):
                 self._look_up(out, frame, thing, part, on)
                 self._light_up(out, frame, part, on)
         radiance = out["lit"] + out["mirrored"] + out["emission"]
+        # Fog lies between the surface and the camera: after all light.
         in_fog = appearance.seen_through_fog(self.scene, frame.hits(), radiance.reshape(-1, 3)).reshape(radiance.shape)
         out["colour"] = np.where(frame.hit[..., None], in_fog, frame.colour)
         out["luminance"] = out["colour"] @ LUMA
@@ -343,6 +350,7 @@ class ReferenceMoment(_Lazy):
         scene, mesh, material = self.scene, part.mesh, part.material
         corners = mesh.faces[frame.triangle[on]]
         pose = casting.relative_pose_at(scene, thing, frame.t_ns)
+        # In the camera's axes, as the shape is at this time.
         points = casting.vertices_at(mesh, frame.t_ns)[corners] @ pose[:3, :3].T + pose[:3, 3]
         out["needles"][on] = needles(points, scene.camera)
         if material.texture is not None:  # else the GPU has no coordinates either
@@ -379,6 +387,7 @@ class ReferenceMoment(_Lazy):
         )
         light = seen(sent.matt)
         out["light"][on], out["around"][on], out["direct"][on] = light, around, direct
+        # Each lamp by itself, so that shares of soft shadows can be put in their place.
         out["lamps"][on] = np.einsum("knc,nc->nk", sent.light.open, weights)
         out["matt"][on] = np.where(arrives + around > 0, light / np.maximum(arrives + around, 1e-30), 1.0)
         out["shadow"][on] = np.where(direct > 0, arrives / np.maximum(direct, 1e-30), 1.0)

@@ -88,6 +88,7 @@ def _title(figure: Figure, ends: tuple[float, float], y: float, texts: tuple[str
 def save_labelled(path: Path, info: Pass, rgb: np.ndarray, legend: dict, caption: str) -> None:
     """One buffer: title with unit, the pixels enlarged by a whole factor, colour bar, caption."""
     height, width = rgb.shape[:2]
+    # Whole factors, or pixels would be of different sizes.
     factor = max(1, round(700 / width))
     w, h, top, bottom = width * factor, height * factor, 46, 74
     W, H = w + 40, h + top + bottom
@@ -127,6 +128,7 @@ def save_errors(path: Path, reports: list, caption: str) -> None:
     for report in reports:
         errors = np.clip(np.where(report.errors > 0, report.errors, 1e-9), 1e-9, 1e2)
         rgb, legend = picture("depth", errors, which="length", colours=ERROR_MAP, low=1e-9, high=1e2)
+        # Greyed, not left out: a shape is easier to find with what is around it.
         rgb[~report.graded] = (rgb[~report.graded] * 0.35 + 255 * 0.3).astype(np.uint8)
         verdict = "ok" if report.passed else "over tolerance"
         unit = f"{report.quantity.statistic} {report.value:.2g} {report.quantity.unit}: {verdict}"

@@ -19,6 +19,7 @@ def ulps(gpu: np.ndarray, ref: np.ndarray) -> float:
     """Largest |gpu - ref| in units of float32's spacing at ref (per component); inf where one is not finite."""
     g, r = np.atleast_1d(np.asarray(gpu, np.float64)), np.atleast_1d(np.asarray(ref, np.float64))
     with np.errstate(all="ignore"):
+        # The distance of two neighbouring float32 at the reference's value.
         apart = np.abs(g - r) / np.spacing(np.abs(r).astype(np.float32)).astype(np.float64)
     # Equal is no difference, of infinities, too; nan is what one of them leaves.
     return float(np.where(g == r, 0.0, np.nan_to_num(apart, nan=np.inf, posinf=np.inf)).max())
@@ -161,6 +162,7 @@ def _positions(gpu, ref, x, y, point, seen) -> list[dict]:
     add("world, t", world(when.t_ns), point.world)
     add("camera, t", None, point.camera)
     window = gpu["window"][y, x].astype(np.float64)
+    # gl_FragCoord has all that the GPU knows of the clip position: w is 1 / Z there.
     ndc = window[:2] / size * 2 - 1
     clip = np.array([*ndc, window[2], 1.0]) / window[3] if window[3] else None
     add("clip, t", clip, P @ [*point.camera, 1.0] if point.hit else None)
@@ -205,11 +207,13 @@ def _gpu_reason(gpu: GpuMoment, way: str, x: int, y: int) -> str:
         return ""
     renderer: Renderer = gpu.renderer
     xt, yt = x + float(flow[0]), y + float(flow[1])
+    # What leaves the picture is occluded, whatever else is there.
     if not (-0.5 <= xt < renderer.width - 0.5 and -0.5 <= yt < renderer.height - 0.5):
         return f"outside the image at t' (x' = {xt:.3f}, y' = {yt:.3f})"
     if w < renderer.scene.camera.near:
         return f"in front of the near plane at t' (Z' = {w:.6g} < {renderer.scene.camera.near:g})"
     there = gpu.renderer.raw(getattr(gpu.when, f"{way}_ns"), "depth", "ids")
+    # The pixel that holds the point then.
     xn, yn = int(np.floor(xt + 0.5)), int(np.floor(yt + 0.5))
     other = int(there["ids"][yn, xn])
     names = {thing.instance_id: thing.name for thing in renderer.scene.objects}

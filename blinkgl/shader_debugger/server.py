@@ -54,6 +54,7 @@ def host_allowed(header: str | None, bound: str, port: int) -> bool:
         return False
     if name in LOCAL or name == bound.lower():
         return bool(name)
+    # A literal address cannot be another site's name (DNS rebinding).
     if bound in ("0.0.0.0", "::"):
         try:
             ipaddress.ip_address(name)
@@ -73,6 +74,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         self.close_connection = True
+        # Two Host headers may be read differently by a proxy: neither is believed.
         hosts = self.headers.get_all("Host") or [None]
         if len(hosts) != 1 or not host_allowed(hosts[0], self.server.bound, self.server.server_port):
             return self._error(403, "this Host is not served here")
@@ -139,6 +141,7 @@ class _Server(ThreadingHTTPServer):
 
     def __init__(self, host: str, port: int):
         self.bound = host
+        # Before the socket is made: IPv6 addresses are told by their colons.
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         super().__init__((host, port), _Handler)
 
@@ -157,6 +160,7 @@ class DebugServer:
         host: str = "127.0.0.1",
         port: int = 0,
     ):
+        # First of all: a taken port is said before a scene is built.
         self._server = _listen(host, port)
         try:
             self._server.worker = Worker(Inspector(subject, when, shaders))

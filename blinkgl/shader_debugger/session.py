@@ -60,10 +60,12 @@ def open_subject(
 
     Raises ConfigError and AssetError."""
     template = load_run(config, overrides, seed=seed)
+    # Only a group has numbered sequences; the first stands for the recipe.
     if "groups" in template.tree:
         template = template.groups[0].template
     index = template.sequence(0).output.first_index if sequence is None else sequence
     one = template.sequence(index)
+    # Before the scene is built, so that a missing file is said in a moment.
     check_assets(one.scene, template.base, one.output.split)
     return Subject(str(config), one, index, sequence_scene(one, index, template.base))
 
@@ -167,6 +169,7 @@ class DebugPainter(Painter):
         return _Uniforms(program, self.unused)
 
     def draw(self, uniforms: Any, item: Any) -> None:
+        # Attributes that a program lacks are left out silently where vertex arrays are made.
         program, shape = uniforms[""], item.deformer
         if shape is not None:
             self.unused |= {(program.extra, name) for name in shape.attributes if name not in program}
@@ -267,6 +270,7 @@ class DebugRenderer(Renderer):
         """(H, W[, C]) of the camera's picture: itself, or of the flat picture that is drawn for a lens the pixels that
         the lens looks at."""
         places = places_of(self.scene.camera)
+        # Indexed by a whole array of rows and of columns: a copy of the lens's size.
         return flat if places is None else flat[places[..., 1], places[..., 0]]
 
     def picture(self, what: str, t_ns: int) -> np.ndarray:

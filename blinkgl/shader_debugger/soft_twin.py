@@ -33,6 +33,7 @@ def share_range(
     depths : (texels, texels) float32, the map as the GPU made it."""
     rows, points, _ = lit_points(scene, frame)
     view, pose = view_of(one.lamp, one.box, one.texels, one.lamp.path.pose(frame.t_ns))
+    # Row vectors times R are R^T times columns: into the lamp's camera axes.
     there = (points - pose[:3, 3]) @ pose[:3, :3]
     normals = frame.normal.reshape(-1, 3)[rows] @ pose[:3, :3]
     at = _Place(one, view.projection, there, normals)
@@ -50,6 +51,7 @@ class _Place:
 
     def __init__(self, one: ShadowMap, projection: np.ndarray, there: np.ndarray, normals: np.ndarray):
         clip = np.column_stack([there, np.ones(len(there))]) @ projection.T
+        # As the shader divides: 1 of a sun, the depth of a spot light.
         w = np.maximum(clip[:, 3], 1e-6)
         self.size, self.sun = one.texels, one.lamp.kind == "sun"
         self.xy, self.depth = (clip[:, :2] / w[:, None] + 1) / 2, clip[:, 2] / w
@@ -59,8 +61,10 @@ class _Place:
         unit = self.per_unit if self.sun else self.depth / w
         through = normals[:, 2] if self.sun else (normals * there).sum(axis=1) / w**2
         through = np.where(np.abs(through) > LEAST_SLOPE, through, LEAST_SLOPE)
+        # What a unit of the map, 0 to 1, is on the plane at distance 1, or of a sun in world units.
         across = 2 / np.array([projection[0, 0], projection[1, 1]])
         self.slope = normals[:, :2] * across * (unit / through)[:, None]
+        # Towards the lamp a surface is spared its own shadow by this much at most, and by ``least`` at least.
         self.most = FARTHEST * self.texel * unit
         self.least = np.abs(self.slope).sum(axis=1) / self.size + SPARE * self.texel * unit
 
@@ -72,14 +76,18 @@ class _Place:
     def share(self, depths: np.ndarray, moved: np.ndarray) -> np.ndarray:
         """(N,) share of the lamp that is seen. moved : (3,) of all places, and of all depths in parts."""
         xy, depth = self.xy + moved[:2], self.depth + moved[2] * (1.0 if self.sun else self.depth)
+        # How far aside a blocker may stand: the sun's cone up to the map's near side, or the lamp's disc.
         reach = self.width * (1 - depth) / self.per_unit if self.sun else self.width
         search = np.clip(0.5 * reach / self.texel, 1.0, WIDEST) / self.size
         blockers, count = np.zeros(len(xy)), np.zeros(len(xy))
+        # Every second tap is enough to find what is in the way.
         for seed in SEEDS[::2]:
             aside = seed * search[:, None]
+            # ivec2() cuts off towards zero.
             found = _fetched(depths, np.trunc((xy + aside) * self.size).astype(np.intp), empty=True)
             hides = found > self._limit(depth, aside)
             blockers, count = blockers + np.where(hides, found, 0.0), count + hides
+        # The penumbra's width, by similar triangles from the mean blocker.
         blocker = blockers / np.maximum(count, 1)
         if self.sun:
             width = self.width * (blocker - depth) / self.per_unit

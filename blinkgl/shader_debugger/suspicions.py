@@ -39,6 +39,7 @@ def suspicions(comparison: Any, report: Any) -> list[str]:
     about = report.graded & np.isin(owner, np.unique(owner[wrong]))
     g, r = gpu.astype(np.float64)[about], np.asarray(right, np.float64)[about]
     with np.errstate(all="ignore"):
+        # What is known by name goes before what any two numbers would fit.
         for candidates in (
             _mistakes(comparison, name, r, g, about),
             _fitted(name, r[wrong[about]], g[wrong[about]], r),
@@ -56,6 +57,7 @@ def _share(comparison, report, gpu, right, about, candidate) -> float:
     about : (H, W) bool, the pixels that the candidate is of."""
     quantity, before = report.quantity, report.errors[about]
     image = np.array(right, np.float64)
+    # A candidate is tried as if it were right: what is left of the error then?
     candidate = np.broadcast_to(candidate, image[about].shape)
     image[about] = candidate
     error = quantity.error(gpu, image, comparison.gpu, comparison.ref)[about]
@@ -63,6 +65,7 @@ def _share(comparison, report, gpu, right, about, candidate) -> float:
     # Look-ups have a unit of their own, and zeros that mean nothing.
     if lookup_of(quantity.name)[1] not in ("uv", "level", "albedo"):
         fits |= _size(gpu.astype(np.float64)[about] - candidate) <= CLOSE * _size(candidate)
+    # A mistake that all pixels should show, and few do, is another one.
     wrong = before > report.limit
     meant = quantity.error(image, np.asarray(right, np.float64), comparison.gpu, comparison.ref)[about] > report.limit
     if wrong.sum() < SEEN * meant.sum():
@@ -97,6 +100,7 @@ def _fitted(name, r, g, everywhere) -> Candidates:
     everywhere : right values of all pixels that they are of."""
     if lookup_of(name)[1] in ("uv", "level"):
         return
+    # A ratio of two zeros says nothing.
     ratios = _typical(np.where(np.abs(r) > 1e-6, g / r, np.nan))
     if r.ndim == 2 and r.shape[1] == 2:
         yield f"x is {ratios[0]:.4g} times, y {ratios[1]:.4g} times the right value", everywhere * ratios
@@ -121,6 +125,7 @@ def _depth(comparison, name, r, g, on) -> Candidates:
     yield "window depth near / Z instead of Z", camera.near / r
     y, x = np.nonzero(on)
     rays = camera.rays(np.stack([x, y], axis=1))
+    # Length of the ray (X, Y, Z) / Z.
     along = np.linalg.norm(rays, axis=1) / rays[:, 2]
     yield "distance along the ray instead of depth along the optical axis", r * along
 
@@ -144,7 +149,8 @@ def _uv(comparison, name, r, g, on) -> Candidates:
 
 def _level(comparison, name, r, g, on) -> Candidates:
     bias = float(np.round(_typical(g - r)[0], 2))
-    bias = round(bias) if abs(bias - round(bias)) < 0.15 else bias  # drivers approximate the level
+    # A driver's own logarithm is up to 0.086 too small.
+    bias = round(bias) if abs(bias - round(bias)) < 0.15 else bias
     than = "coarser" if bias > 0 else "finer"
     yield f"a mip bias of {bias:+g} (levels that are {than} than one texel a pixel)", r + bias
     yield "always level 0: no mip maps", np.zeros_like(r)
@@ -187,6 +193,7 @@ def _shaded(comparison, name, r, g, on) -> Candidates:
         rays = casting.rays_of(comparison.ref.scene.camera, comparison.ref.frame.xy[on])
         distance = depth * np.linalg.norm(rays, axis=1)
         arrives, of_depth = (np.exp(-fog.density * way).reshape(-1, *[1] * (r.ndim - 1)) for way in (distance, depth))
+        # Solved for the light before the fog: L' = L T + F (1 - T).
         clear = (r - fog.radiance * (1 - arrives)) / arrives
         yield "the fog is missing", clear
         yield "fog of the depth, not of the distance", fog.radiance + (clear - fog.radiance) * of_depth

@@ -32,6 +32,7 @@ TWINNED = EDGED + LENSED
 def twinned_of(config: SequenceConfig, scene: Scene) -> tuple[str, ...]:
     """Those of :data:`TWINNED` that a generation run draws: with ``edges2`` on a finer grid, of which the image's own
     pixels are looked at here."""
+    # A lens's flat picture is filtered before the lens looks at it, as without one.
     drawn = (config.render.antialiasing, config.render.image_antialiasing)
     edged = tuple(name for name, kind in zip(EDGED, drawn, strict=True) if samples_of(kind).edges)
     return edged + (() if places_of(scene.camera) is None else LENSED)
@@ -79,6 +80,7 @@ def twin_of(renderer: DebugRenderer, name: str, t_ns: int) -> tuple[np.ndarray, 
     if name in LENSED:
         return renderer.at_pixels(plain), _gathered(plain, renderer.scene.camera)
     depths, moment = frame.target.read_depth(), frame.moment
+    # The sky has no silhouette of its own: others stand before it.
     items = [item for item in moment.visible if item.layer != SKY]
     pixels, crossings = Lines().in_pixels(moment, items, frame.width, frame.height)
     pixel = 2 / (frame.width * abs(moment.view.projection[0, 0]))
@@ -93,10 +95,12 @@ def _gathered(picture: np.ndarray, camera: CameraModel) -> np.ndarray:
     # To first order, as the shader has it: the place of the pixel's centre and its two derivatives.
     place, slopes = flat.project(rays), flat.jacobian(rays) @ camera.ray_jacobian(grid)
     columns, rows = lens.steps_of(camera, 1)
+    # map_coordinates takes one channel at a time.
     channels = np.moveaxis(np.atleast_3d(picture).astype(np.float64), 2, 0)
     total = np.zeros((len(channels), len(grid)))
     for across in (np.arange(columns) + 0.5) / columns - 0.5:
         for down in (np.arange(rows) + 0.5) / rows - 0.5:
+            # Rows before columns, whole numbers at the pixels' centres.
             there = (place + slopes @ [across, down])[:, ::-1].T
             total += [ndimage.map_coordinates(channel, there, order=1, mode="nearest") for channel in channels]
     mean = total.T.reshape(camera.height, camera.width, -1) / (columns * rows)

@@ -23,6 +23,7 @@ def verdict(reports: list[BufferReport], unused: Iterable[tuple[str, str]] = (),
     failed = sorted((r for r in reports if not r.passed), key=lambda r: order.index(r.quantity.name))
     rows: dict[str, dict] = {}
     for report in failed:
+        # Each object by the first buffer that is wrong on it, the others behind.
         for one in report.objects:
             if not one["over_tolerance"]:
                 continue
@@ -67,6 +68,7 @@ def _not_graded(reports: list[BufferReport], left_out: list[str]) -> str:
     counts = {report.quantity.name: (int((~report.graded).sum()), report.graded.size) for report in reports}
     # What most buffers leave out are silhouettes; those that leave out more are named.
     shares = [count / size for count, size in counts.values()]
+    # A hundredth more are pixels on the sides of triangles.
     usual = float(np.median(shares)) + 0.01
     most = max((one for one in counts.values() if one[0] <= usual * one[1]), key=lambda one: one[0] / one[1])
     line = f"not graded: up to {most[0]} of {most[1]} px of a buffer"

@@ -419,7 +419,8 @@ class Comparison:
             return gpu[name], np.clip(gpu[name], low, high)
         if what == "light" and ref.maps:
             # Of the pass's own shadows, which are graded before.
-            return gpu[name], ref["matt"] * (ref["direct"] * gpu[f"{of}_shadow"] + ref["around"])
+            darker = ref["direct"] * (gpu[f"{of}_shadow"] - ref["shadow"])
+            return gpu[name], ref["light"] + ref["matt"] * darker
         if name in ("luminance", "colour"):
             return gpu[name], self._shaded(name)
         if np.shape(gpu[name]) != np.shape(ref[name]):

@@ -8,7 +8,8 @@ Start: cli.py (the commands), then session.py:
     moments.py    every buffer of that moment, from the GPU and from the float64 reference, by the same names
     twins.py      pictures made of pictures: what `edges` puts together (edges_twin.py) and what a lens sees
     lamps.py      shadow maps in float64, and where they may be off; soft_twin.py: soft shadows
-    compare.py    one against the other, with tolerances and the silhouette band
+    quantities.py how each buffer is graded, and with which tolerance
+    compare.py    one against the other, at which pixels
     suspicions.py what the error looks like
     verdict.py    what is wrong first, on which object
     probe.py      everything about one pixel

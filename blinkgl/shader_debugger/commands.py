@@ -107,7 +107,7 @@ def run_diff(
     """Compares the named buffers (default: all that can be); with ``out`` also writes
     diff.png and NAME_error.npy there.
     Returns what :func:`verdict.verdict` says, and the reports."""
-    from blinkgl.shader_debugger.compare import QUANTITIES
+    from blinkgl.shader_debugger.quantities import QUANTITIES
 
     # Names are checked before anything is drawn.
     if names:

@@ -9,9 +9,10 @@ from trimesh.triangles import points_to_barycentric
 from blinkgl.render import casting
 from blinkgl.render.probe import probe as reference_probe
 from blinkgl.render.renderer import Renderer
-from blinkgl.shader_debugger.compare import QUANTITIES, Comparison
+from blinkgl.shader_debugger.compare import Comparison
 from blinkgl.shader_debugger.lamps import place_in
 from blinkgl.shader_debugger.moments import MAPS, PASSES, GpuMoment, ReferenceMoment, buffers_of
+from blinkgl.shader_debugger.quantities import QUANTITIES
 from blinkgl.shader_debugger.twins import TWINNED
 
 

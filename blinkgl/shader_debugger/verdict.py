@@ -6,7 +6,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from blinkgl.shader_debugger.compare import QUANTITIES, BufferReport
+from blinkgl.shader_debugger.compare import BufferReport
+from blinkgl.shader_debugger.quantities import QUANTITIES
 
 
 def verdict(reports: list[BufferReport], unused: Iterable[tuple[str, str]] = (), left_out: Iterable[str] = ()) -> dict:

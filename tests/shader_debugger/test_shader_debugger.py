@@ -15,7 +15,7 @@ from blinkgl.gl import create_context
 from blinkgl.labels import LabelRequest
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
-from blinkgl.shader_debugger import compare, mipmaps, moments, probe, twins
+from blinkgl.shader_debugger import compare, mipmaps, moments, probe, quantities, twins
 from blinkgl.shader_debugger.session import moment, open_renderer, open_subject
 from debugger_scene import HEIGHT, LOOKUP_MISTAKES, MISTAKES, WIDTH, edit
 
@@ -98,7 +98,7 @@ def both(config):
 
 def test_every_buffer_agrees(both):
     gpu, _, _, reports = both
-    assert set(reports) == set(compare.QUANTITIES) & set(moments.buffers_of(both[1].scene, gpu.renderer.twinned))
+    assert set(reports) == set(quantities.QUANTITIES) & set(moments.buffers_of(both[1].scene, gpu.renderer.twinned))
     assert gpu.renderer.twinned == ("luminance_edges",)  # of the default
     for name, report in reports.items():
         assert report.passed, (name, report.value)

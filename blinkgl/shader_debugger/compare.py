@@ -227,13 +227,15 @@ class Comparison:
 
     def names(self) -> list[str]:
         """Every buffer that can be graded here."""
-        return [name for name in self._there() if name not in self.left_out()]
+        left_out = self.left_out()
+        return [name for name in self._there if name not in left_out]
 
     def left_out(self) -> list[str]:
         """Buffers that are not graded here at all: how anisotropic filtering looks up is left to the driver."""
         isotropic = self.gpu.renderer.config.anisotropy <= 1
-        return [name for name in self._there() if not isotropic and name in NEEDS_ISOTROPIC]
+        return [name for name in self._there if not isotropic and name in NEEDS_ISOTROPIC]
 
+    @cached_property
     def _there(self) -> list[str]:
         there = buffers_of(self.ref.seen, self.gpu.renderer.twinned)
         return [name for name in QUANTITIES if name in there]

@@ -248,8 +248,16 @@ def test_edits_are_taken_errors_keep_the_last_good_program(served):
     )
     assert depth_at(server) == pytest.approx(2 * before, rel=1e-6)  # the last good program
 
+    vertex = folder / "include/vertex.glsl"
+    whole = vertex.read_text()
+    edit(vertex, "vec3 position = in_position;", "vec3 position = vec3(0.0);")
     label.write_text(good)
-    mended = next_version(server, broken["version"])
+    unused = next_version(server, broken["version"])
+    assert unused["generation"] == now["generation"]
+    assert "the shader does not use 'in_position' any more" in unused["errors"][0]["text"]
+
+    vertex.write_text(whole)
+    mended = next_version(server, unused["version"])
     assert mended["errors"] == [] and mended["generation"] == now["generation"] + 1
     assert depth_at(server) == before
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib import resources
@@ -42,7 +42,7 @@ _NAME = re.compile(r"(?!gl_|GL_)[A-Za-z](?!\w*__)\w*$")
 # Where drivers put the line number: Mesa "0:12(5): error: …", NVIDIA "0(12) : error C1503: …", AMD/Intel/Apple "ERROR:
 # 0:12: …".
 _MESSAGES = (
-    re.compile(r"\d+:(?P<line>\d+)\(\d+\): (?:preprocessor )?(?P<kind>error|warning): (?P<text>.*)"),
+    re.compile(r"\d+:(?P<line>\d+)\((?P<column>\d+)\): (?:preprocessor )?(?P<kind>error|warning): (?P<text>.*)"),
     re.compile(r"\d+\((?P<line>\d+)\) : (?P<kind>error|warning) (?P<text>.*)"),
     re.compile(r"(?P<kind>ERROR|WARNING): \d+:(?P<line>\d+): (?P<text>.*)"),
 )
@@ -256,6 +256,24 @@ def link(ctx: moderngl.Context, sources: Mapping[str, ShaderSource]) -> moderngl
         raise translate(str(error), sources) from None
 
 
+def unused(program: moderngl.Program, name: str) -> ShaderError:
+    """The error for an attribute or a uniform that a program declares but that its compiler removed."""
+    return ShaderError(
+        f"the shader does not use '{name}' any more", where=program.extra, accepted="a program that uses it"
+    )
+
+
+class Uniforms(dict[str, Any]):
+    """The uniforms of one program by name; "" is the program itself. One that it does not have raises ShaderError."""
+
+    def __init__(self, program: moderngl.Program):
+        super().__init__({name: program[name] for name in program if isinstance(program[name], moderngl.Uniform)})
+        self[""] = program
+
+    def __missing__(self, name: str) -> Any:
+        raise unused(self[""], name)
+
+
 class ShaderLoader:
     """Compiles and caches the programs of one context.
 
@@ -286,6 +304,7 @@ class ShaderLoader:
     def _compile(self, name: str, defines: Mapping[str, Any] | None) -> moderngl.Program:
         sources = {stage: expand(name, stage, defines, self.folder) for stage in stages_of(defines)}
         program = link(self.ctx, sources)
+        program.extra = name  # for messages
         self._made[name, normalised(defines)] = {
             made: source.files[f"include/{made}"] for source in sources.values() for made in source.made
         }
@@ -301,12 +320,11 @@ class ShaderLoader:
 def translate(log: str, sources: Mapping[str, ShaderSource]) -> ShaderError:
     """moderngl's error text as a ShaderError that speaks of the files the user wrote."""
     stage = next((m[1] for m in map(_STAGE_HEADER.match, log.splitlines()) if m), None)
-    source = sources.get(stage or "")
     name = next(iter(sources.values())).name
     first: ShaderError | None = None
     blocks: list[str] = []
-    for message in filter(None, map(_parse, log.splitlines())):
-        line, kind, text = message
+    for own, line, _, kind, text in messages(log):
+        source = sources.get(own)
         if source is None:
             continue
         file, number = source.locate(line)
@@ -322,12 +340,18 @@ def translate(log: str, sources: Mapping[str, ShaderSource]) -> ShaderError:
     return first
 
 
-def _parse(line: str) -> tuple[int, str, str] | None:
-    for pattern in _MESSAGES:
-        match = pattern.match(line.strip())
-        if match:
-            return int(match["line"]), match["kind"].lower(), match["text"]
-    return None
+def messages(log: str) -> Iterator[tuple[str, int, int, str, str]]:
+    """(stage, line, column, kind, text) of each message of a compiler, line and column of what it compiled, from 1.
+
+    stage : "" where the log does not say.   column : 0 where the driver does not say.   kind : error or warning."""
+    stage = ""
+    for line in map(str.strip, log.splitlines()):
+        if header := _STAGE_HEADER.match(line):
+            stage = header[1]
+        for match in filter(None, (pattern.match(line) for pattern in _MESSAGES)):
+            column = int(match.groupdict().get("column") or 0)
+            yield stage, int(match["line"]), column, match["kind"].lower(), match["text"]
+            break
 
 
 def _line(text: str, number: int) -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import moderngl
 import numpy as np
 
+from blinkgl.gl.shader import Uniforms
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.lighting import Lighting
 from blinkgl.render.matrices import linear_xyw_bytes
@@ -32,8 +33,6 @@ MATERIAL_UNITS = {
     )
 }
 """Texture units of what a material has beside a base colour."""
-Uniforms = dict[str, Any]
-"""name -> moderngl.Uniform of one program; "" is the program itself."""
 
 
 class Programs(dict["Kind", Uniforms]):
@@ -70,7 +69,7 @@ class Painter:
         self._programs: dict[Pass, Programs] = {}
         self._covers: dict[Pass, tuple[Uniforms, moderngl.VertexArray]] = {}
         self._culling = False
-        self.strokes = Strokes(gl)
+        self.strokes = Strokes(gl, self.uniforms)
 
     def begin(self, target: Target, background: tuple[float, ...] = ()) -> None:
         """Draw into ``target`` from now on, which is cleared: the first attachment to
@@ -99,7 +98,7 @@ class Painter:
 
     def uniforms(self, program: moderngl.Program) -> Uniforms:
         """The table that a pass sets values in."""
-        return {name: program[name] for name in program if isinstance(program[name], moderngl.Uniform)} | {"": program}
+        return Uniforms(program)
 
     def place(self, uniforms: Uniforms, item: DrawItem, moment: Moment) -> None:
         """Sets what every program that draws the scene takes: matrices, depths and, where it has them, the light."""

@@ -61,14 +61,17 @@ def render(
     *,
     forward_ns: int | None = None,
     backward_ns: int | None = None,
+    xy: np.ndarray | None = None,
 ) -> ReferenceFrame:
-    """Every buffer at t_ns, with the flow to forward_ns and to backward_ns where given."""
-    camera = scene.camera
-    hits = cast(scene, t_ns)
+    """Every buffer at t_ns, with the flow to forward_ns and to backward_ns where given.
+
+    xy : (H, W, 2) px that are looked at, of a picture of another size than the camera's; None: all pixels' centres."""
+    shape = (scene.camera.height, scene.camera.width) if xy is None else xy.shape[:2]
+    hits = cast(scene, t_ns, None if xy is None else xy.reshape(-1, 2))
     looks = surface(scene, hits)
 
     def image(values):
-        return values.reshape(camera.height, camera.width, *values.shape[1:])
+        return values.reshape(*shape, *values.shape[1:])
 
     def flow(to_ns):
         if to_ns is None:

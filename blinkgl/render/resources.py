@@ -12,7 +12,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError
 from blinkgl.gl import GLContext
-from blinkgl.gl.shader import MADE
+from blinkgl.gl.shader import MADE, unused
 from blinkgl.render.colour import LUMA, linear_image, luminance_image
 from blinkgl.render.draw_items import DrawItem, draw_items, padded_rows
 from blinkgl.scene.geometry.tangents import tangents
@@ -85,6 +85,8 @@ class Shape:
 
     def use(self, program: moderngl.Program, unit: int) -> None:
         """Of the program that is drawn with next. unit : first texture unit that is free."""
+        if "Shape" not in program:
+            raise unused(program, "Shape")
         program["Shape"].binding = self.BINDING
         self._buffer.bind_to_uniform_block(self.BINDING)
         for offset, (name, texture) in enumerate(self._textures.items()):
@@ -138,6 +140,9 @@ class SceneResources:
         key = (id(program), id(item.mesh), item.material.uv_scale, whole)
         if key not in self._vaos:
             vertices, indices = self._mesh_buffers(item.mesh, item.material.uv_scale, whole)
+            # OpenGL would draw nothing, or refuse an empty vertex.
+            if "in_position" not in program:
+                raise unused(program, "in_position")
             formats, names = [], []
             for name, fmt, size in _ATTRIBUTES:
                 used = name in program

@@ -3,12 +3,13 @@ at all of them for."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import moderngl
 import numpy as np
 
+from blinkgl.gl.shader import Uniforms, unused
 from blinkgl.render.contours import CROSSING, Lines
 
 if TYPE_CHECKING:
@@ -21,10 +22,10 @@ ROW = 512
 
 
 class Strokes:
-    """Of one renderer. lines : the contours that it draws."""
+    """Of one renderer. lines : the contours that it draws.   uniforms : table of a program's, for who draws."""
 
-    def __init__(self, gl: GLContext):
-        self.gl, self.lines = gl, Lines()
+    def __init__(self, gl: GLContext, uniforms: Callable[[moderngl.Program], Uniforms] = Uniforms):
+        self.gl, self.lines, self._uniforms = gl, Lines(), uniforms
         self._count = 0
         self._pixels: moderngl.Buffer | None = None
         self._crossings: moderngl.Texture | None = None
@@ -60,9 +61,10 @@ class Strokes:
         key = name, *sorted(defines.items())
         if key not in self._programs:
             program = self.gl.program(name, defines)
+            if "in_pixel" not in program:
+                raise unused(program, "in_pixel")
             array = self.gl.ctx.vertex_array(program, [(self._pixels, "4i", "in_pixel")])
-            uniforms = {one: program[one] for one in program if isinstance(program[one], moderngl.Uniform)}
-            self._programs[key] = uniforms, array
+            self._programs[key] = self._uniforms(program), array
         return self._programs[key]
 
     def use(self, unit: int) -> None:

@@ -6,9 +6,10 @@ Start: cli.py (the commands), then session.py:
 
     session.py    one moment of the scene that a generation run would render; the shader folder; the OpenGL side
     moments.py    every buffer of that moment, from the GPU and from the float64 reference, by the same names
-    silhouettes.py what `antialiasing: edges` puts together, and its slow twin
-    lamps.py      shadow maps in float64, and where they may be off
-    compare.py    one against the other, with tolerances and the silhouette band
+    twins.py      pictures made of pictures: what `edges` puts together (edges_twin.py) and what a lens sees
+    lamps.py      shadow maps in float64, and where they may be off; soft_twin.py: soft shadows
+    quantities.py how each buffer is graded, and with which tolerance
+    compare.py    one against the other, at which pixels
     suspicions.py what the error looks like
     verdict.py    what is wrong first, on which object
     probe.py      everything about one pixel

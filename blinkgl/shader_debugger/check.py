@@ -29,12 +29,17 @@ class Finding:
 
 @dataclass
 class Result:
-    """renderer : what compiled.   programs : name -> number of variants.   errors : findings, each once."""
+    """renderer : what compiled.   programs : name -> number of variants.   found : by program and message."""
 
     renderer: str = ""
     seconds: float = 0.0
     programs: dict[str, int] = field(default_factory=dict)
-    errors: list[Finding] = field(default_factory=list)
+    found: dict[tuple[str, Diagnostic], Finding] = field(default_factory=dict)
+
+    @property
+    def errors(self) -> list[Finding]:
+        """Each once, in the order in which they were met."""
+        return list(self.found.values())
 
     def as_dict(self) -> dict:
         return {
@@ -65,6 +70,7 @@ def check(files: list[str], shaders: str | None = None, backend: str = "auto", d
 
 def check_program(ctx: moderngl.Context, folder: Any, name: str, result: Result) -> None:
     """Adds every variant of one program to ``result``."""
+    # Programs that no pass draws are somebody's own: they are compiled as they stand.
     wanted = variants(name)
     wanted = [{}] if wanted is None else wanted + lookups(name)  # [{}]: somebody's own program, as it stands
     result.programs[name] = len(wanted)
@@ -75,21 +81,13 @@ def check_program(ctx: moderngl.Context, folder: Any, name: str, result: Result)
                 sources[stage] = expand(name, stage, defines, folder)
             program = link(ctx, sources)
         except ShaderError as error:
+            # A name that is wrong in an include is reported by every stage that includes it.
             for diagnostic in dict.fromkeys(diagnose(error, sources, folder)):
                 if diagnostic.kind == "error":
-                    _add(result.errors, diagnostic, name, defines)
+                    found = result.found.setdefault((name, diagnostic), Finding(diagnostic, name, example=defines))
+                    found.count += 1
             continue
         program.release()
-
-
-def _add(findings: list[Finding], diagnostic: Diagnostic, program: str, defines: dict) -> None:
-    for found in findings:
-        if found.program == program and found.diagnostic == diagnostic:
-            break
-    else:
-        found = Finding(diagnostic, program, 0, dict(defines))
-        findings.append(found)
-    found.count += 1
 
 
 def _programs(files: list[str], shaders: str | None):
@@ -97,6 +95,7 @@ def _programs(files: list[str], shaders: str | None):
     folder = open_folder(shaders)
     if files and shaders is None:  # a file of another folder brings its folder along
         first = Path(files[0]).resolve()
+        # An include lies below include/, at any depth; a program lies in the folder itself.
         home = next((folder.parent for folder in first.parents if folder.name == "include"), first.parent)
         if first.is_file() and home != folder.resolve():
             folder = open_folder(str(home))
@@ -121,6 +120,7 @@ def _programs(files: list[str], shaders: str | None):
                 value=text,
                 accepted="one of " + ", ".join(str(p.relative_to(folder)) for p in known),
             )
+        # Of an include all programs are compiled that it is part of.
         wanted = (
             [path.name]
             if path.parent == folder

@@ -9,6 +9,7 @@ import numpy as np
 
 from blinkgl.errors import OutputError
 from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.images import encode_npy
 from blinkgl.shader_debugger.compare import BufferReport, Comparison, parse_tolerances
 from blinkgl.shader_debugger.moments import (
     MAPS,
@@ -22,7 +23,7 @@ from blinkgl.shader_debugger.moments import (
 )
 from blinkgl.shader_debugger.probe import as_text, probe
 from blinkgl.shader_debugger.session import Subject, When, check_pixel, open_renderer
-from blinkgl.shader_debugger.silhouettes import EDGED, edged_of
+from blinkgl.shader_debugger.twins import TWINNED, twinned_of
 from blinkgl.shader_debugger.verdict import as_text as verdict_text, verdict
 
 
@@ -43,16 +44,12 @@ def write_passes(
         f"{Path(subject.path).name}, sequence {subject.index}, seed {subject.config.seed}, t = {when.t_ns * 1e-9:.6g} s"
     )
     with open_renderer(subject, shaders, as_configured=True) as renderer:
-        folder = _folder(out)  # not before there is something to put into it
-        gpu = GpuMoment(renderer, when, subject.log_eps)
+        # A folder is not made for a run that cannot draw.
+        folder = _folder(out)
+        gpu = GpuMoment(renderer, when)
         for name in names:
             info, array = PASSES[name], gpu[name]
-            with (
-                atomic_file(folder / f"{name}.npy") as temporary,
-                output_errors(folder / f"{name}.npy"),
-                temporary.open("wb") as file,
-            ):
-                np.save(file, np.ascontiguousarray(array), allow_pickle=False)
+            _save(folder / f"{name}.npy", array)
             rgb, legend = pictures.picture(info.kind, array, hit=_meaningful(gpu, info))
             picture.save_labelled(folder / f"{name}.png", info, rgb, legend, f"{caption}, {renderer.gl.renderer}")
             paths += [folder / f"{name}.npy", folder / f"{name}.png"]
@@ -67,7 +64,7 @@ def _meaningful(moment, info) -> np.ndarray | None:
         return moment[info.name] > 0
     if info.name.startswith("flow_"):
         return moment[info.name.replace("flow", "valid")]
-    everywhere = info.name in ("luminance", "log_luminance", "dL_dt", *EDGED)  # the background has them, too
+    everywhere = info.name in ("luminance", *TWINNED)  # the background has them, too
     if lookup_of(info.name)[1] in ("uv", "level"):
         return (
             moment["texture_size"][..., 0] > 1
@@ -75,6 +72,11 @@ def _meaningful(moment, info) -> np.ndarray | None:
             else moment[f"{info.name.rpartition('_')[0]}_count"] > 0
         )
     return moment["id"] != 0 if info.kind in ("scalar", "depth", "signed", "motion") and not everywhere else None
+
+
+def _save(path: Path, array: np.ndarray) -> None:
+    with atomic_file(path) as temporary, output_errors(path):
+        temporary.write_bytes(encode_npy(array))
 
 
 def _folder(out: str) -> Path:
@@ -90,7 +92,7 @@ def run_probe(subject: Subject, when: When, pixel: str, shaders: str | None = No
     """What ``blinkgl shader probe`` prints."""
     x, y = check_pixel(subject.scene, pixel)
     with open_renderer(subject, shaders) as renderer:
-        found = probe(GpuMoment(renderer, when, subject.log_eps), open_reference(subject, when, renderer.maps), x, y)
+        found = probe(GpuMoment(renderer, when), open_reference(subject, when, renderer.maps), x, y)
     return json.dumps(_finite(found)) if as_json else as_text(found)
 
 
@@ -105,27 +107,24 @@ def run_diff(
     """Compares the named buffers (default: all that can be); with ``out`` also writes
     diff.png and NAME_error.npy there.
     Returns what :func:`verdict.verdict` says, and the reports."""
-    from blinkgl.shader_debugger.compare import QUANTITIES
+    from blinkgl.shader_debugger.quantities import QUANTITIES
 
+    # Names are checked before anything is drawn.
     if names:
-        there = buffers_of(subject.scene, edged_of(subject.config))
+        there = buffers_of(subject.scene, twinned_of(subject.config, subject.scene))
         names = [check_pass(name, [known for known in QUANTITIES if known in there]) for name in names]
     with open_renderer(subject, shaders) as renderer:
-        comparison = Comparison(
-            GpuMoment(renderer, when, subject.log_eps), open_reference(subject, when, renderer.maps)
-        )
+        comparison = Comparison(GpuMoment(renderer, when), open_reference(subject, when, renderer.maps))
         names = names or comparison.names()
         limits = parse_tolerances(tolerances, names)
         reports = [comparison.report(name, limits.get(name)) for name in names]
-        found = verdict(reports)
+        found = verdict(reports, renderer.unused, comparison.left_out())
     if out is not None:
         from blinkgl.shader_debugger import picture
 
         folder = _folder(out)
         for report in reports:
-            path = folder / f"{report.quantity.name}_error.npy"
-            with atomic_file(path) as temporary, output_errors(path), temporary.open("wb") as file:
-                np.save(file, report.errors, allow_pickle=False)
+            _save(folder / f"{report.quantity.name}_error.npy", report.errors)
         title = (
             f"GPU against the float64 reference: {Path(subject.path).name}, sequence {subject.index}, t = "
             f"{when.t_ns * 1e-9:.6g} s"
@@ -181,6 +180,7 @@ def diff_text(found: dict, reports: list[BufferReport]) -> str:
         ]
         lines += [f"  it looks as if: {text}" for text in s["suspicions"]]
         top = max([1, *s["histogram"].values()])
+        # A logarithm, or one wrong pixel would have no bar beside ten thousand right ones.
         bars = {
             name: max(1, round(40 * np.log1p(count) / np.log1p(top))) for name, count in s["histogram"].items() if count
         }
@@ -196,14 +196,11 @@ def diff_text(found: dict, reports: list[BufferReport]) -> str:
     if failed:
         w = next(iter(found["objects"]), None)
         closer = f"; look closer with: probe --pixel {w['x']},{w['y']}" if w else ""
-        lines += ["", f"{len(failed)} of {len(summaries)} buffers are over their tolerance{closer}"]
+        said = f"{len(failed)} of {len(summaries)} buffers are over their tolerance{closer}"
     else:
-        lines += [
-            "",
-            f"all {len(summaries)} buffers agree with the reference"
-            if len(summaries) > 1
-            else "agrees with the reference",
-        ]
+        whole = f"all {len(summaries)} buffers agree" if len(summaries) > 1 else "agrees"
+        said = f"{whole} with the reference"
+    lines += ["", f"{said}; {found['not_graded']}"]
     return "\n".join(lines)
 
 

@@ -5,7 +5,7 @@ What is graded, and with which tolerance
 Pixels in the silhouette band (``reference.silhouette_band``: within one pixel of an id change or a jump in depth) are
 reported apart: there a pixel centre may fall on either side of an edge. Off the band a buffer is graded where both
 sides see the same triangle; where they see neighbouring ones (a pixel centre on a shared
-edge) only ids and masks are graded.
+edge) only ids and masks are graded. Pictures that are made of others (:mod:`twins`) are graded at every pixel.
 
 Order: the buffers are graded in the order in which a pass makes them: where the surface is (local position, depth, id),
 what the pass looks up there (coordinates, level, albedo), the light, and their product. Each look-up is the pass's own,
@@ -20,174 +20,44 @@ anisotropic filtering (``render.anisotropy`` > 1) level and albedo are left out.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from copy import copy
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
 from blinkgl.errors import ConfigError
-from blinkgl.labels.grading import length
-from blinkgl.labels.label import Label, View
 from blinkgl.render import appearance, casting, reference
-from blinkgl.scene.lights import is_coloured
+from blinkgl.scene.lights import is_coloured, lamps_of, shadowing
 from blinkgl.scene.types import Material
-from blinkgl.shader_debugger.lamps import near_an_edge
 from blinkgl.shader_debugger.mipmaps import mipmapped_albedo
 from blinkgl.shader_debugger.moments import (
     MAPS,
-    PASSES,
     GpuMoment,
-    OfLabels,
     ReferenceMoment,
     buffers_of,
     check_pass,
     lookup_of,
     luma_of,
+    view_of,
 )
-from blinkgl.shader_debugger.silhouettes import EDGED
+from blinkgl.shader_debugger.quantities import QUANTITIES, Quantity
+from blinkgl.shader_debugger.soft_twin import share_range
 from blinkgl.shader_debugger.suspicions import suspicions
+from blinkgl.shader_debugger.twins import TWINNED
 
 WORST = 10  # objects told apart in a report
 NOTHING = "nothing hit"
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """How one buffer is graded. error : (what the GPU wrote, the reference, both moments) -> (H, W) >= 0 in ``unit``.
-
-    statistic : "max" of the graded pixels' errors, or "mean" (the fraction of pixels, for
-    masks), must not exceed ``tolerance``.
-    fit : error, in tolerances, that is left to a suspicion that explains the buffer.
-    """
-
-    name: str
-    unit: str
-    tolerance: float
-    error: Callable
-    statistic: str = "max"
-    same_triangle: bool = True
-    note: str = ""
-    fit: float = 10.0
-
-    @property
-    def title(self) -> str:
-        return PASSES[self.name].title
-
-    @property
-    def source(self) -> str:
-        return PASSES[self.name].source
-
-
-def _absolute(g, r, gpu, ref):
-    return length(g.astype(np.float64) - r)
-
-
-def _relative(g, r, gpu, ref):
-    return length(g.astype(np.float64) - r) / np.maximum(1.0, length(r))
-
-
-def _per_step(g, r, gpu, ref):
-    return length(g.astype(np.float64) - r) * gpu.when.step_s
-
-
-def _pixels_of_texture(g, r, gpu, ref):
-    """How far the texture is shifted, in px: at a grazing angle one pixel spans many repeats, and so does float32's
-    rounding. Whole repeats are no shift."""
-    shift = g.astype(np.float64) - r
-    return length((shift - np.rint(shift)) * ref["texture_size"]) / np.exp2(ref["level"])
-
-
-def _of_the_lamps(g, r, gpu, ref):
-    """What a wrong shadow does to the light: where a lamp hardly shines nobody sees its shadow."""
-    return np.abs(g.astype(np.float64) - r) * np.minimum(ref["direct"], 1.0)
-
-
-def _of_the_picture(g, r, gpu, ref):
-    """Where it is bright of the pixel itself, else of what the picture has in the mean."""
-    size = length(r)
-    return length(g.astype(np.float64) - r) / np.maximum(max(size.mean(), 1e-12), size)
-
-
-def _misplaced(g, r, gpu, ref):
-    """(H, W) px from each pixel's centre to where the point drawn there lies by the true poses; inf where that is out
-    of the camera's sight. Needs nothing of the ray caster, so that a wrong pose is told apart from what comes later."""
-    part = gpu["part"]
-    out = np.zeros((*part.shape, 2))
-    for p, (thing, _) in enumerate(casting.scene_parts(ref.scene)):
-        y, x = np.nonzero(part == p)
-        pose = casting.relative_pose_at(ref.scene, thing, ref.when.t_ns)
-        seen = ref.scene.camera.project(gpu["local"][y, x].astype(np.float64) @ pose[:3, :3].T + pose[:3, 3])
-        out[y, x] = np.nan_to_num(seen - np.stack([x, y], axis=1), nan=np.inf)
-    return length(out)
-
-
-_TWIN = "against a CPU twin of mip-mapped sampling at the GPU's own uv and level; drivers may make mip maps differently"
-_SHADING = "against the GPU's own albedo times its own light, and what it adds"
-_MAPPED = "not graded where a map says how a surface shines, which the reference has without mip maps"
-_LEVEL = "drivers may approximate the level (OpenGL 4.6, 8.14.1)"
-_EDGES = "not graded near the edge of a shadow, nor where light grazes: there a map is off by its texels"
-_MAP = "off its silhouettes"
-_FILTERED = "at all pixels, against a float64 twin on the GPU's own unfiltered picture and depths (edges_twin.py)"
-_MIPS = "against a CPU twin of mip-mapped sampling; drivers may make mip maps differently, hence the loose tolerance"
-
-
-def _shading(name: str, unit: str) -> tuple[Quantity, ...]:
-    """The steps of one pass that shades."""
-    return (
-        Quantity(f"{name}_uv", "px of shifted texture", 0.01, _pixels_of_texture, fit=2.0),
-        Quantity(f"{name}_level", "levels", 0.6, _absolute, note=_LEVEL, fit=1.0),
-        # sRGB textures of 8 bits: llvmpipe rounds each of their mip levels to 8 bits again, 0.025 after ten
-        Quantity(f"{name}_albedo", "linear", 0.05 if name == "colour" else 0.03, _absolute, note=_TWIN, fit=1.0),
-        Quantity(f"{name}_direct", "1", 1e-4, _relative, note=_MAPPED),
-        Quantity(f"{name}_shadow", "light", 1e-3, _of_the_lamps, note=_EDGES),
-        Quantity(f"{name}_around", "1", 1e-4, _relative, note=_MAPPED),
-        Quantity(f"{name}_light", "1", 1e-4, _relative, note=_MAPPED),
-        # a highlight is steep: float32's normal is 1e-7 off, and a mirror's lobe 0.0025 wide
-        Quantity(f"{name}_mirrored", "linear", 2e-3, _relative, note=_MAPPED),
-        Quantity(f"{name}_emission", "linear", 1e-4, _relative, note=_MAPPED),
-        Quantity(name, unit, 1e-4, _absolute, note=_SHADING),
-    )
-
-
-_BEFORE = (
-    Quantity(
-        "local",
-        "px of misplaced surface",
-        0.01,
-        _misplaced,
-        same_triangle=False,
-        note="how far from its pixel the point that was drawn lies by the true poses",
-    ),
-)
-_SHADED = (
-    *(Quantity(name, "depth", 1e-3, _absolute, same_triangle=False, note=_MAP) for name in MAPS),
-    *_shading("luminance", "linear"),
-    *_shading("colour", "linear radiance"),
-    *(
-        Quantity(name, "of the pixel or mean", 1e-4, _of_the_picture, same_triangle=False, note=_FILTERED)
-        for name in EDGED
-    ),
-    Quantity("dL_dt", "luminance over the step", 0.05, _per_step, note=_MIPS),
-)
-
-
-def _of_label(label: Label, view: View) -> Quantity:
-    def error(g, r, gpu, ref):
-        return view.error(g, r, gpu.when.interval_s)
-
-    return Quantity(view.name, view.judged_in, view.tolerance, error, view.statistic, view.same_triangle, view.note)
-
-
-QUANTITIES = OfLabels(_of_label, _BEFORE, _SHADED)
-"""In the order in which a pass makes them: the first that is wrong is where to look."""
+NEVER = 2.0
+"""A second difference is at most twice the largest of its values."""
+SIDE = 1e-4
+"""Share of a corner below which a point may be taken for one of the neighbouring triangle."""
 LIT = ("direct", "shadow", "around", "light", "mirrored", "emission")
 MAP_JUMP = 0.005
 """A second difference of a shadow map above this part of its depth is an edge."""
 COLOURED = 10.0
 """In coloured light a term is weighed by the colours of the albedo, which mip maps of 8 bits know no better: so much
 wider are tolerances."""
-NEEDS_ISOTROPIC = ("luminance_level", "luminance_albedo", "colour_level", "colour_albedo", "dL_dt")
+NEEDS_ISOTROPIC = ("luminance_level", "luminance_albedo", "colour_level", "colour_albedo")
 
 
 def parse_tolerances(texts: list[str], names: list[str]) -> dict[str, float]:
@@ -254,6 +124,7 @@ class BufferReport:
             "passed": self.passed,
             "off_silhouettes": stats(inside),
             "silhouette_band": stats(band),
+            "not_graded": int((~self.graded).sum()),
             "histogram": histogram(inside),
             "objects": self.objects,
             "suspicions": self.suspicions,
@@ -262,23 +133,17 @@ class BufferReport:
 
 
 def _at(errors: np.ndarray, q: float) -> float:
-    if not errors.size:
-        return 0.0
-    k = min(errors.size - 1, int(np.ceil(q * errors.size)) - 1 if q < 1 else errors.size - 1)
-    return float(np.partition(errors, max(k, 0))[max(k, 0)])
+    # One of the errors themselves, since between a finite one and inf there is no number.
+    return float(np.quantile(errors, q, method="inverted_cdf")) if errors.size else 0.0
 
 
 def histogram(errors: np.ndarray) -> dict[str, int]:
     """Counts per decade: "0", "<1e-8", "1e-8", … (from this power of ten up to the next), "inf"."""
     finite = errors[(errors > 0) & np.isfinite(errors)]
-    decades = np.clip(np.floor(np.log10(finite)).astype(int), -9, 9)
-    out = {"0": int((errors == 0).sum())}
-    for d in range(-9, 10):
-        if n := int((decades == d).sum()):
-            out["<1e-8" if d == -9 else f"1e{d:+d}"] = n
-    if n := int(np.isinf(errors).sum()):
-        out["inf"] = n
-    return out
+    decades, counts = np.unique(np.clip(np.floor(np.log10(finite)), -9, 9).astype(int), return_counts=True)
+    named = {"<1e-8" if d == -9 else f"1e{d:+d}": int(n) for d, n in zip(decades, counts)}
+    beyond = int(np.isinf(errors).sum())
+    return {"0": int((errors == 0).sum())} | named | ({"inf": beyond} if beyond else {})
 
 
 def is_mapped(material: Material) -> bool:
@@ -293,44 +158,68 @@ class Comparison:
 
     def __init__(self, gpu: GpuMoment, ref: ReferenceMoment):
         self.gpu, self.ref = gpu, ref
-        frame = ref.frame
-        self.band = reference.silhouette_band(frame.instance, frame.depth)
+        flat, seen = ref.frame, ref.labels
+        self.band = reference.silhouette_band(seen.instance, seen.depth)
         self._coloured = is_coloured(ref.scene.light)
-        self._shadow_edges: dict[int, np.ndarray] = {}
-        self.same_triangle = (gpu["part"] == ref["part"]) & ((gpu["triangle"] == ref["triangle"]) | ~frame.hit)
+        self.same_triangle = (gpu["part"] == ref["part"]) & ((gpu["triangle"] == ref["triangle"]) | ~flat.hit)
+        self._same_label = self.same_triangle
+        if seen is not flat:
+            # Pixels that a lens looks at are unevenly far from each other: only its own depths say where they jump.
+            self.band |= reference.silhouette_band(flat.instance, flat.depth, jump=NEVER)
+            # Which triangle a lens's ray met on the GPU is no buffer; off the sides both met the same one.
+            self._same_label = (seen.bary.min(axis=-1) > SIDE) | ~seen.hit
         things = [thing for thing, _ in casting.scene_parts(ref.scene)]
         names = [thing.name or f"object {thing.instance_id}" for thing in ref.scene.objects]
         self.objects = [
             name if names.count(name) == 1 else f"{name} (id {thing.instance_id})"
             for name, thing in zip(names, ref.scene.objects)
         ] + [NOTHING]
+        # Objects may have several parts, and a name may be given twice.
         index = {id(thing): i for i, thing in enumerate(ref.scene.objects)}
         self._object_of_part = np.array([index[id(thing)] for thing in things] + [len(names)], np.intp)
-
-    def of(self, gpu: GpuMoment) -> Comparison:
-        """The same of another picture of the same moment, whose surfaces lie where they were."""
-        other = copy(self)
-        other.gpu = gpu
-        return other
 
     def owner(self, name: str) -> np.ndarray:
         """(H, W) number of the object that a pixel's error in buffer ``name`` is put down to: the one that should be
         there, or, for the local position, the one that was drawn."""
-        return self._object_of_part[(self.gpu if name == "local" else self.ref)["part"]]
+        part = self.gpu["part"] if name == "local" else self._frame(name).part
+        return self._object_of_part[part]
+
+    def _frame(self, name: str) -> reference.ReferenceFrame:
+        return self.ref.frame if view_of(name) is None else self.ref.labels
 
     def tolerance(self, name: str) -> float:
         """Of a buffer of this scene, where nobody says another."""
         wider = COLOURED if lookup_of(name)[1] in ("direct", "around", "light") and self._coloured else 1.0
         return wider * QUANTITIES[name].tolerance
 
-    def shadow_edges(self, t_ns: int) -> np.ndarray:
-        """(H, W) bool: where shadows are not graded."""
-        if t_ns not in self._shadow_edges:
-            frame, maps = self.ref.at(t_ns), self.ref.maps
-            self._shadow_edges[t_ns] = (
-                near_an_edge(self.ref.scene, frame, maps) if maps else np.zeros(frame.hit.shape, bool)
-            )
-        return self._shadow_edges[t_ns]
+    @cached_property
+    def shares(self) -> np.ndarray | None:
+        """(2, lamps, H, W) least and greatest share of each lamp that is seen past its soft shadow; None where there
+        are none."""
+        ref, lamps = self.ref, lamps_of(self.ref.scene.light)
+        # All maps of a scene are soft or none is.
+        if not any(one.soft for one in ref.maps):
+            return None
+        out = np.ones((2, len(lamps), *ref.frame.hit.shape))
+        for one, k, name in zip(ref.maps, shadowing(ref.scene.light), MAPS):
+            out[:, k] = share_range(ref.scene, ref.frame, one, self.gpu[name])
+        return out
+
+    @cached_property
+    def shadow_edges(self) -> np.ndarray:
+        """(H, W) bool: where shadows of maps differ from those of rays, by their texels or by how soft they are."""
+        if self.shares is None:
+            return self.ref.shadow_edges
+        # A highlight may be of a lamp that hardly counts among all: no lamp's penumbra is left in.
+        penumbra = ((self.shares[0] > 0) & (self.shares[1] < 1)).any(axis=0)
+        return penumbra | (np.abs(self._seen_past(self.shares[0]) - self.ref["shadow"]) > 1e-4)
+
+    def _seen_past(self, shares: np.ndarray) -> np.ndarray:
+        """(H, W) share of all lamps' light of (lamps, H, W) shares of each."""
+        each = self.ref["lamps"]
+        total = each.sum(axis=-1)
+        arrives = (each * np.moveaxis(shares, 0, -1)).sum(axis=-1)
+        return np.where(total > 0, arrives / np.maximum(total, 1e-30), 1.0)
 
     def map_band(self, name: str) -> np.ndarray:
         """(texels, texels) bool: silhouettes of a shadow map."""
@@ -340,31 +229,50 @@ class Comparison:
 
     def names(self) -> list[str]:
         """Every buffer that can be graded here."""
-        renderer = self.gpu.renderer
-        isotropic, there = renderer.config.anisotropy <= 1, buffers_of(self.ref.scene, renderer.edged)
-        return [name for name in QUANTITIES if name in there and (isotropic or name not in NEEDS_ISOTROPIC)]
+        left_out = self.left_out()
+        return [name for name in self._there if name not in left_out]
+
+    def left_out(self) -> list[str]:
+        """Buffers that are not graded here at all: how anisotropic filtering looks up is left to the driver."""
+        isotropic = self.gpu.renderer.config.anisotropy <= 1
+        return [name for name in self._there if not isotropic and name in NEEDS_ISOTROPIC]
+
+    @cached_property
+    def _there(self) -> list[str]:
+        there = buffers_of(self.ref.seen, self.gpu.renderer.twinned)
+        return [name for name in QUANTITIES if name in there]
 
     def pair(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """(GPU, what it is graded against); equal shapes."""
         gpu, ref = self.gpu, self.ref
         of, what = lookup_of(name)
-        if name in EDGED:
+        if name in TWINNED:
             return gpu[name], gpu[f"{name}_twin"]
         if what == "albedo":
             return gpu[name], self.twin(of)
+        if what == "shadow" and self.shares is not None:
+            low, high = (self._seen_past(shares) for shares in self.shares)
+            return gpu[name], np.clip(gpu[name], low, high)
+        if what == "light" and ref.maps:
+            # Of the pass's own shadows, which are graded before.
+            darker = ref["direct"] * (gpu[f"{of}_shadow"] - ref["shadow"])
+            return gpu[name], ref["light"] + ref["matt"] * darker
         if name in ("luminance", "colour"):
-            light = gpu["colour_light_rgb"] if name == "colour" else gpu["luminance_light"][..., None]
-            shaded = gpu[f"{name}_albedo"].astype(np.float64) * light
-            shaded = shaded + gpu[f"{name}_mirrored"] + gpu[f"{name}_emission"]
-            shaded = appearance.seen_through_fog(ref.scene, ref.frame.hits(), shaded.reshape(-1, 3)).reshape(
-                shaded.shape
-            )
-            shaded = shaded if name == "colour" else shaded[..., 0]
-            hit = ref.frame.hit if name == "luminance" else ref.frame.hit[..., None]
-            return gpu[name], np.where(hit, shaded, ref[name])
+            return gpu[name], self._shaded(name)
         if np.shape(gpu[name]) != np.shape(ref[name]):
             raise TypeError(f"label '{name}': `reference` gives {np.shape(ref[name])} and not {np.shape(gpu[name])}")
         return gpu[name], ref[name]
+
+    def _shaded(self, name: str) -> np.ndarray:
+        """What a pass makes of its own albedo, its own light, and what it adds."""
+        gpu, ref = self.gpu, self.ref
+        light = gpu["colour_light_rgb"] if name == "colour" else gpu["luminance_light"][..., None]
+        shaded = gpu[f"{name}_albedo"].astype(np.float64) * light
+        shaded = shaded + gpu[f"{name}_mirrored"] + gpu[f"{name}_emission"]
+        in_fog = appearance.seen_through_fog(ref.scene, ref.frame.hits(), shaded.reshape(-1, 3)).reshape(shaded.shape)
+        if name == "luminance":
+            return np.where(ref.frame.hit, in_fog[..., 0], ref[name])
+        return np.where(ref.frame.hit[..., None], in_fog, ref[name])
 
     def twin(self, of: str) -> np.ndarray:
         """(H, W, 3) float64 albedo that pass ``of`` should have found with its own coordinates and level; 0 where it
@@ -382,40 +290,44 @@ class Comparison:
         return out if of == "colour" else luma_of(out)
 
     def errors(self, name: str) -> np.ndarray:
-        """(H, W) float64 in the quantity's unit; inf where the GPU wrote nan."""
+        """(H, W) float64 in the quantity's unit; inf where the GPU wrote nan. On needles it is as much smaller as
+        float32 may misplace their surface further."""
         g, r = self.pair(name)
         error = QUANTITIES[name].error(g, r, self.gpu, self.ref)
-        return np.where(np.isnan(error), np.inf, error)
+        error = np.where(np.isnan(error), np.inf, error)
+        return error / self.ref["needles"] if name == "local" or QUANTITIES[name].same_triangle else error
+
+    def graded(self, name: str) -> np.ndarray:
+        """(H, W) bool: pixels at which a buffer is graded."""
+        if name in MAPS:
+            return ~self.map_band(name)
+        if name in TWINNED:
+            return np.ones_like(self.band)
+        graded = ~self.band
+        if QUANTITIES[name].same_triangle:
+            graded &= self.same_triangle if view_of(name) is None else self._same_label
+        of, what = lookup_of(name)
+        if what in LIT:
+            # The reference looks maps up at full resolution, a GPU in mip maps.
+            mapped = [p for p, (_, part) in enumerate(casting.scene_parts(self.ref.scene)) if is_mapped(part.material)]
+            graded &= ~np.isin(self.ref.frame.part, mapped)
+            # Light is told in the luminance of what it falls on: on black it has none.
+            graded &= ~self.ref.frame.hit | (self.ref["albedo"].any(axis=-1) & self.gpu[f"{of}_albedo"].any(axis=-1))
+        if what == "mirrored" or (what == "shadow" and self.shares is None):
+            graded &= ~self.shadow_edges
+        return graded
 
     def report(self, name: str, tolerance: float | None = None) -> BufferReport:
-        quantity = QUANTITIES[name]
-        errors = self.errors(name)
-        of_map = name in MAPS
-        band = self.map_band(name) if of_map else np.zeros_like(self.band) if name in EDGED else self.band
-        graded = ~band
-        if quantity.same_triangle:
-            graded &= self.same_triangle
-        if lookup_of(name)[1] in ("shadow", "light", "mirrored"):
-            graded &= ~self.shadow_edges(self.gpu.when.t_ns)
-        if lookup_of(name)[1] in LIT:
-            for p, (_, part) in enumerate(casting.scene_parts(self.ref.scene)):
-                if is_mapped(part.material):
-                    graded &= self.ref.frame.part != p
-        if name == "dL_dt":
-            for t_ns in (self.gpu.when.before_ns, self.gpu.when.after_ns):
-                other, drawn = self.ref.at(t_ns), self.gpu.renderer.inspect(t_ns)
-                graded &= ~reference.silhouette_band(other.instance, other.depth) & (other.part == self.ref["part"])
-                graded &= (drawn["TRIANGLE"] == other.triangle + 1) & (drawn["LOCAL"][..., 3] == other.part + 1)
-                graded &= ~self.shadow_edges(t_ns)
-        if name == "local":
-            graded &= self.gpu["part"] >= 0
+        quantity, errors, graded = QUANTITIES[name], self.errors(name), self.graded(name)
+        band = ~graded if name in MAPS else self.band & ~graded
         inside = errors[graded]
+        # Nothing to grade is nothing wrong; the verdict counts it.
         value = (float(inside.mean()) if quantity.statistic == "mean" else float(inside.max())) if inside.size else 0.0
         report = BufferReport(
             quantity, self.tolerance(name) if tolerance is None else tolerance, errors, graded, band, value
         )
         report.objects = self._per_object(report)
-        if not report.passed and not of_map and name != "local":
+        if not report.passed and name not in (*MAPS, "local"):
             report.suspicions = suspicions(self, report)
         return report
 
@@ -424,6 +336,7 @@ class Comparison:
         g, r = self.pair(name)
         owner = np.full(report.errors.shape, len(self.objects) - 1) if name in MAPS else self.owner(name)
         out = []
+        # Objects are told apart, since a mistake of one variant is that of some objects alone.
         for k in np.unique(owner[report.graded]):
             rows = np.flatnonzero((report.graded & (owner == k)).ravel())
             errors = report.errors.ravel()[rows]
@@ -440,7 +353,7 @@ class Comparison:
                     "error": float(errors.max()),
                     "gpu": g[y, x].tolist(),
                     "reference": r[y, x].tolist(),
-                    "triangle": -1 if name in MAPS else int(self.ref["triangle"][y, x]) - 1,
+                    "triangle": -1 if name in MAPS else int(self._frame(name).triangle[y, x]),
                 }
             )
         return sorted(out, key=lambda one: -one["max"])[:WORST]

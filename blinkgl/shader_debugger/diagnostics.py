@@ -7,15 +7,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from blinkgl.gl.shader import ShaderError, ShaderSource, made_includes
+from blinkgl.gl.shader import ShaderError, ShaderSource, made_includes, messages
 
-# Mesa "0:12(5): error: …", NVIDIA "0(12) : error C1503: …", AMD, Intel, Apple "ERROR: 0:12: …".
-_MESSAGES = (
-    re.compile(r"\d+:(?P<line>\d+)\((?P<column>\d+)\): (?:preprocessor )?(?P<kind>error|warning): (?P<text>.*)"),
-    re.compile(r"\d+\((?P<line>\d+)\) : (?P<kind>error|warning) (?P<text>.*)"),
-    re.compile(r"(?P<kind>ERROR|WARNING): \d+:(?P<line>\d+): (?P<text>.*)"),
-)
-_STAGE = re.compile(r"(vertex|fragment)_shader$")
 _QUOTED = re.compile(r"[`'\"]([A-Za-z_][\w.]*)['\"]")
 
 
@@ -42,59 +35,31 @@ class Diagnostic:
 def diagnose(error: ShaderError, sources: Mapping[str, ShaderSource], folder: Any) -> list[Diagnostic]:
     """Every message behind a ShaderError. ``sources``: by stage, empty when the program could
     not even be put together."""
-    found, stage = [], ""
-    for line in error.log.splitlines():
-        if header := _STAGE.match(line.strip()):
-            stage = header[1]
-        match = next(filter(None, (p.match(line.strip()) for p in _MESSAGES)), None)
-        if match and stage in sources:
-            number = int(match["line"])
-            file, own = sources[stage].locate(number)
-            text = _line(sources[stage].text, number)
-            column = _column(text, match["text"], int(match.groupdict().get("column") or 0))
-            if not file:  # a line that nobody wrote: an include guard, a #define
-                found.append(
-                    Diagnostic(
-                        sources[stage].name,
-                        0,
-                        0,
-                        match["kind"].lower(),
-                        match["text"],
-                        stage,
-                        f"generated line: {text}",
-                    )
-                )
-                continue
-            found.append(
-                Diagnostic(
-                    file, own, column, match["kind"].lower(), match["text"], stage, excerpt(folder, file, own, column)
-                )
-            )
+    found = []
+    for stage, number, column, kind, text in messages(error.log):
+        if stage not in sources:
+            continue
+        source = sources[stage]
+        line, (file, own) = _line(source.text, number), source.locate(number)
+        if not file:  # a line that nobody wrote: an include guard, a #define
+            found.append(Diagnostic(source.name, 0, 0, kind, text, stage, f"generated line: {line}"))
+            continue
+        column = _column(line, text, column)
+        found.append(Diagnostic(file, own, column, kind, text, stage, excerpt(folder, file, own, column)))
     if any(d.kind == "error" for d in found):
         return found
+    said = str(error).removeprefix(f"{error.where}: ")
     if error.log and sources:  # linking: no lines, but names
-        text = " ".join(
-            line.strip() for line in error.log.splitlines() if line.strip(" =") and not _STAGE.match(line.strip())
-        )
+        # The later stage first: it is the one that asks for what the earlier does not give.
         for stage in reversed(sources):
-            for name in _QUOTED.findall(text):
+            for name in _QUOTED.findall(said):
                 if place := _declaration(sources[stage], name):
-                    return [Diagnostic(*place, "error", text, stage, excerpt(folder, *place))]
-        return [Diagnostic(next(iter(sources.values())).name, 0, 0, "error", text)]
-    file, _, line = (error.where or "").rpartition(":")
-    if file and line.isdigit():
-        return [
-            Diagnostic(
-                file,
-                int(line),
-                1,
-                "error",
-                str(error).removeprefix(f"{error.where}: "),
-                "",
-                excerpt(folder, file, int(line), 1),
-            )
-        ]
-    return [Diagnostic(error.where or "shaders", 0, 0, "error", str(error).removeprefix(f"{error.where}: "))]
+                    return [Diagnostic(*place, "error", said, stage, excerpt(folder, *place))]
+        return [Diagnostic(next(iter(sources.values())).name, 0, 0, "error", said)]
+    file, _, number = (error.where or "").rpartition(":")
+    if file and number.isdigit():
+        return [Diagnostic(file, int(number), 1, "error", said, "", excerpt(folder, file, int(number), 1))]
+    return [Diagnostic(error.where or "shaders", 0, 0, "error", said)]
 
 
 def _line(text: str, number: int) -> str:
@@ -105,6 +70,7 @@ def _line(text: str, number: int) -> str:
 def _column(text: str, message: str, column: int) -> int:
     """A name that the message quotes, if the line has it: drivers count columns after their
     preprocessor squeezed the blanks."""
+    # Drivers count columns after their preprocessor, names stay.
     for name in _QUOTED.findall(message):
         if match := re.search(rf"\b{re.escape(name.split('.')[0])}\b", text):
             return match.start() + 1
@@ -130,11 +96,13 @@ def excerpt(folder: Any, file: str, line: int, column: int = 0, around: int = 2)
     try:
         lines = path.read_text(encoding="utf-8").split("\n")
     except (OSError, UnicodeDecodeError):
+        # What the table of labels or shapes makes lies in no file.
         lines = made_includes().get(file.removeprefix("include/"), "").split("\n")
     out = []
     for i in range(max(1, line - around), min(len(lines), line + around) + 1):
         out.append(f"{'>' if i == line else ' '} {i:4d} | {lines[i - 1]}")
         if i == line and column:
+            # Tabs stay tabs, so that the caret stands below its column however wide they are shown.
             pad = re.sub(r"[^\t]", " ", lines[i - 1][: column - 1])
             out.append(f"       | {pad}^")
     return "\n".join(out)

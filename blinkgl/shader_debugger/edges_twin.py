@@ -2,7 +2,7 @@
 
 picture, depths = frames of the pass that `edges` filters, read back
 pixels, crossings = Lines().in_pixels(moment, items, width, height)
-filtered(picture, depths, pixels, crossings, 1 / focal)
+filtered(picture, depths, pixels, crossings, 1 / focal, what the program wrote)
 """
 
 from __future__ import annotations
@@ -15,20 +15,39 @@ GAP, COVER, SAME, NEARER, DIAGONAL, ALONG, SNAP, FEW, MANY = 3.0, 6.0, 0.25, 0.0
 _AROUND = [(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
 
 
+UNDECIDED = 2.0**-22
+"""Relative: float32 may decide a comparison of depths that are nearer to each other in either way."""
+
+
 def filtered(
-    picture: np.ndarray, depths: np.ndarray, pixels: np.ndarray, crossings: np.ndarray, pixel: float
+    picture: np.ndarray,
+    depths: np.ndarray,
+    pixels: np.ndarray,
+    crossings: np.ndarray,
+    pixel: float,
+    drawn: np.ndarray,
 ) -> np.ndarray:
     """(H, W) or (H, W, C) float64: the picture with its silhouettes and creases by area.
 
     picture : (H, W) or (H, W, C) float32.   depths : (H, W) float32, near / Z.   pixels, crossings : of
-    :meth:`~blinkgl.render.contours.Lines.in_pixels`.   pixel : 1 / focal length, px."""
+    :meth:`~blinkgl.render.contours.Lines.in_pixels`.   pixel : 1 / focal length, px.
+    drawn : (H, W) or (H, W, C) what the program made of it. Where comparisons of depths are undecided the value is the
+    one that is nearest to it."""
     if picture.ndim == 3:
-        each = (filtered(picture[..., k], depths, pixels, crossings, pixel) for k in range(picture.shape[2]))
+        each = (filtered(picture[..., k], depths, pixels, crossings, pixel, drawn[..., k]) for k in range(3))
         return np.stack(list(each), axis=-1)
     out = picture.astype(np.float64)
-    of = _Pixel(out.copy(), depths.astype(np.float64), pixel)
+    # What is compared is the picture's depths with the lines'.
+    exact, *others = (
+        _Pixel(out.copy(), depths.astype(np.float64) * (1 + scale), pixel) for scale in (0.0, UNDECIDED, -UNDECIDED)
+    )
     for x, y, first, end in pixels.tolist():
-        out[y, x] = of.mean(x, y, crossings[first:end].astype(np.float64))
+        # Only where the exact value is not what was written do the others have to be computed.
+        lines, written = crossings[first:end].astype(np.float64), float(drawn[y, x])
+        value = exact.mean(x, y, lines)
+        if abs(value - written) > 1e-5 * abs(written):
+            value = min([value, *(of.mean(x, y, lines) for of in others)], key=lambda one: abs(one - written))
+        out[y, x] = value
     return out
 
 
@@ -55,6 +74,7 @@ class _Pixel:
         change, shares, sizes = 0.0, 0.0, 0.0
         creases, bent, towards = 0.0, 0.0, np.zeros(2)
         for share, turn, room, depth, lx, ly, further, kind in crossings.tolist():
+            # A crease or a seam: both sides are on one surface, so only their shares are added up here.
             if kind > 0.5:
                 seam = kind > 1.5
                 if depth * (1 - (GAP * self.pixel if seam else SAME)) <= own <= depth * (1 + COVER * self.pixel):
@@ -62,11 +82,13 @@ class _Pixel:
                     towards += share * np.array([lx, ly])
                     bent += 0.0 if seam else abs(share)
                 continue
+            # A silhouette: its share moves light from what is behind to what is in front.
             found = self._sides(x, y, own, room, depth, np.array([lx, ly]), further, kind < -0.5)
             if found is None:
                 continue
             front, back, inside = found
             on_left = room > 0
+            # A centre on the line itself is on the side of what was drawn there.
             if abs(room) < SNAP and on_left != ((kind < -0.5) != inside):
                 share += (turn - _turn(turn, not on_left)) / 8
             change += share * (front - back)
@@ -78,9 +100,11 @@ class _Pixel:
         elif shares > 1:
             change /= shares
         result = plain + change
+        # A tangle of lines: the nearer to MANY, the more of the mean of the pixels around.
         part = min(max((sizes - FEW) / (MANY - FEW), 0.0), 1.0)
         around = sum((2 - abs(dx)) * (2 - abs(dy)) / 16 * self._light(x + dx, y + dy) for dx, dy in _AROUND)
         result += part * part * (3 - 2 * part) * (around - result)
+        # Creases: towards the pixels on their other side, as far as these are of the same surface.
         if towards.any():
             level = (SAME if bent > 0 else COVER * self.pixel) * own
             towards /= np.hypot(*towards)
@@ -151,6 +175,7 @@ class _Pixel:
             known = abs(front_depth - depth) < SAME * depth or horizon
             front, back = self._light(*there), self._light(*other)
         if not known:
+            # Narrower than a pixel: looked for along the line, one pixel at a time, to both ends.
             onwards = np.array([left[1], -left[0]]) / max(abs(left))
             for k in range(2 * ALONG):
                 steps = (k % 2 * 2 - 1) * (k // 2 + 2)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import shutil
 import tempfile
 import threading
-from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,6 @@ from blinkgl.shader_debugger.diagnostics import Diagnostic, diagnose
 from blinkgl.shader_debugger.moments import (
     PASSES,
     GpuMoment,
-    ReferenceMoment,
     buffers_of,
     check_pass,
     open_reference,
@@ -39,7 +38,7 @@ from blinkgl.shader_debugger.session import (
     open_folder,
     open_renderer,
 )
-from blinkgl.shader_debugger.silhouettes import EDGED, edged_of
+from blinkgl.shader_debugger.twins import TWINNED, twinned_of
 from blinkgl.shader_debugger.verdict import verdict
 
 POLL_S = 0.15  # between two looks at the shader files
@@ -67,15 +66,17 @@ class _Loader(ShaderLoader):
 class Inspector:
     """Buffers, pictures and probes of one subject. Every method but the constructor belongs to the worker's thread."""
 
-    def __init__(self, subject: Subject, when: When, shaders: str | None, step_us: float | None = None):
-        self.subject, self.first, self.step_us = subject, when, step_us
+    def __init__(self, subject: Subject, when: When, shaders: str | None):
+        self.subject, self.first = subject, when
         self.folder = open_folder(shaders)
         self._shaders = shaders
         self.generation = 1
         self.errors: list[Diagnostic] = []
-        self._gpu: OrderedDict[tuple[int, int], GpuMoment] = OrderedDict()
-        self._reference: OrderedDict[int, ReferenceMoment] = OrderedDict()
         self._shown = when
+        # Scrubbing goes back and forth between a few moments.
+        self.gpu = lru_cache(KEPT)(lambda when: GpuMoment(self.renderer, when))
+        self.reference = lru_cache(KEPT)(lambda when: open_reference(subject, when, self.renderer.maps))
+        self.comparison = lru_cache(KEPT)(lambda when: Comparison(self.gpu(when), self.reference(when)))
 
     def open(self) -> None:
         """Makes the context and draws once. Raises GLError."""
@@ -94,39 +95,27 @@ class Inspector:
     # ---- moments -----------------------------------------------------------------------------------------------
 
     def _draw_all(self, when: When) -> GpuMoment:
-        made = GpuMoment(self.renderer, when, self.subject.log_eps)
+        made = GpuMoment(self.renderer, when)
+        # Programs compile when they are first drawn with: all are, so that an error shows now.
         for name in self._buffers():
             made[name]
         return made
 
     def _buffers(self):
-        return buffers_of(self.subject.scene, edged_of(self.subject.config))
+        return buffers_of(self.subject.scene, twinned_of(self.subject.config, self.subject.scene))
 
     def _array(self, when: When, name: str, source: str) -> np.ndarray:
-        if name in EDGED:  # whose reference is what the twin makes of the GPU's own
+        if name in TWINNED:  # whose reference is what the twin makes of the GPU's own
             return self.gpu(when)[name if source == "gpu" else f"{name}_twin"]
         return (self.gpu(when) if source == "gpu" else self.reference(when))[name]
 
     def _when(self, seconds: float | None) -> When:
-        self._shown = moment(self.subject, seconds, self.step_us) if seconds is not None else self.first
+        self._shown = moment(self.subject, seconds) if seconds is not None else self.first
         return self._shown
-
-    def gpu(self, when: When) -> GpuMoment:
-        key = (self.generation, when.t_ns)
-        return _kept(self._gpu, key, lambda: GpuMoment(self.renderer, when, self.subject.log_eps))
-
-    def reference(self, when: When) -> ReferenceMoment:
-        return _kept(self._reference, when.t_ns, lambda: open_reference(self.subject, when, self.renderer.maps))
-
-    def _comparison(self, when: When) -> Comparison:
-        gpu, ref = self.gpu(when), self.reference(when)
-        if not hasattr(ref, "comparison") or ref.comparison.gpu is not gpu:
-            ref.comparison = Comparison(gpu, ref)
-        return ref.comparison
 
     # ---- answers -----------------------------------------------------------------------------------------------
 
-    def state(self) -> dict:
+    def state(self, q: dict[str, Any]) -> dict:
         """What the page shows around the pictures."""
         scene, config, gl = self.subject.scene, self.subject.config, self.renderer.gl
         return {
@@ -185,6 +174,7 @@ class Inspector:
         with np.errstate(invalid="ignore"):
             change = np.where(a == b, 0.0, a - b)
         values = np.abs(pictures.component(change, which))
+        # A scale from the least to the greatest difference; without any, some scale.
         some = values[np.isfinite(values) & (values > 0)]
         low, high = (float(v) for v in (np.quantile(some, 0.01), some.max())) if some.size else (1e-12, 1.0)
         low, high = min(low, 0.999 * high) if q["low"] is None else q["low"], high if q["high"] is None else q["high"]
@@ -197,9 +187,9 @@ class Inspector:
 
     def verdict(self, q: dict[str, Any]) -> dict:
         """All buffers against the reference: what ``diff`` says first, and its text."""
-        comparison = self._comparison(self._when(q["t"]))
+        comparison = self.comparison(self._when(q["t"]))
         reports = [comparison.report(name) for name in comparison.names()]
-        found = verdict(reports)
+        found = verdict(reports, self.renderer.unused, comparison.left_out())
         titles = {name: info.title for name, info in PASSES.items()}
         return _finite(
             found
@@ -214,11 +204,9 @@ class Inspector:
         """The CLI's probe, with the CLI's text of every number."""
         when = self._when(q["t"])
         x, y = check_pixel(self.subject.scene, f"{q['x']},{q['y']}")
-        comparison = self._comparison(when)
+        comparison = self.comparison(when)
         found = probe(comparison.gpu, comparison.ref, x, y, comparison)
-        for row in found["buffers"]:
-            row |= {f"{side}_text": _numbers(row[side]) for side in SOURCES}
-        for row in found["positions"]:
+        for row in (*found["buffers"], *found["positions"]):
             row |= {f"{side}_text": _numbers(row[side]) for side in SOURCES}
         found["surface_text"] = {side: _surface_text(found["surface"][side]) for side in SOURCES}
         return _finite(found)
@@ -234,6 +222,7 @@ class Inspector:
         try:
             self._draw_all(self._shown)
         except ShaderError as error:
+            # The same message comes from each stage that includes the line.
             found = dict.fromkeys(diagnose(error, self._sources(new), new.folder))
             self.errors = [d for d in found if d.kind == "error"][:MOST_ERRORS]
         except Exception as error:  # noqa: BLE001 - an edit that compiles but cannot be drawn with: not the tool's end
@@ -244,7 +233,8 @@ class Inspector:
             self.errors = []
             self.generation += 1
             old.clear()
-            self._gpu.clear()
+            self.gpu.cache_clear()
+            self.comparison.cache_clear()
             return
         self.renderer.use_shaders(old)
         new.clear()
@@ -261,20 +251,12 @@ class Inspector:
         out = []
         for path in files_of(self.folder):
             try:
+                # Editors replace a file by renaming: it may be gone for a moment, or have another inode.
                 info = path.stat()
                 out.append((str(path), info.st_mtime_ns, info.st_size, info.st_ino))
             except OSError:
                 pass
         return tuple(out)
-
-
-def _kept(cache: OrderedDict, key, make):
-    if key not in cache:
-        cache[key] = make()
-        while len(cache) > KEPT:
-            cache.popitem(last=False)
-    cache.move_to_end(key)
-    return cache[key]
 
 
 class Worker:
@@ -303,6 +285,7 @@ class Worker:
     def _watch(self) -> None:
         seen = last = self.inspector.stamps()
         while not self._stop.wait(POLL_S):
+            # Two looks alike mean that nobody is writing just now.
             last, stamps = self.inspector.stamps(), last
             if stamps == last != seen:  # not while an editor is still writing: a file is empty for a moment
                 seen = stamps

@@ -13,9 +13,8 @@ from blinkgl.scene.types import Scene
 
 FAR_AWAY = 1e5
 """From where a sun's rays come, times the depth of its map: parallel to 1e-5."""
-HARD, SOFT = 1.5, 24.0
-"""Texels from the edge of a shadow in which a map's own differs from the rays': what an edge is smoothed over, and how
-far soft shadows look."""
+SMOOTHED = 1.5
+"""Texels from the edge of a hard shadow in which a map's own differs from the rays': what an edge is smoothed over."""
 WAYS = 8
 GRAZING = 0.1
 """Cosine at a surface that light passes so flatly that it is given up to sixteen texels of room."""
@@ -28,10 +27,12 @@ def map_of(scene: Scene, t_ns: int, map_: ShadowMap) -> tuple[np.ndarray, np.nda
     camera, size = view.camera, map_.texels
     y, x = np.mgrid[0:size, 0:size].reshape(2, -1)
     if not isinstance(camera, Parallel):
+        # Texels are pixels of the lamp's camera.
         rays = camera.rays(np.stack([x, y], axis=1).astype(np.float64))
         depth, part = appearance.seen_by_lamp(scene, t_ns, pose, rays / rays[:, 2:], camera.near)
         value = camera.near / depth
     else:
+        # The ray caster has rays from one point: from far enough away they are parallel.
         away = FAR_AWAY * camera.depth
         pose = pose.copy()
         pose[:3, 3] -= away * pose[:3, 2]
@@ -40,6 +41,7 @@ def map_of(scene: Scene, t_ns: int, map_: ShadowMap) -> tuple[np.ndarray, np.nda
         )
         rays = np.column_stack([there / (away + 0.5 * camera.depth), np.ones(len(there))])
         depth, part = appearance.seen_by_lamp(scene, t_ns, pose, rays, 0.5 * away)
+        # Depth is reversed, 1 at the side of the lamp.
         value = 1.0 - (depth - away) / camera.depth
     return np.where(part >= 0, value, 0.0).reshape(size, size), part.reshape(size, size)
 
@@ -53,19 +55,11 @@ def place_in(map_: ShadowMap, t_ns: int, point: np.ndarray) -> np.ndarray:
 
 
 def near_an_edge(scene: Scene, frame: reference.ReferenceFrame, maps: tuple[ShadowMap, ...]) -> np.ndarray:
-    """(H, W) bool: pixels whose point is so near to the edge of a shadow, or so flat to the light, that a map need not
-    agree with rays."""
+    """(H, W) bool: pixels whose point is so near to the edge of a hard shadow, or so flat to the light, that a map need
+    not agree with rays."""
     out = np.zeros(frame.hit.shape, bool)
-    hits, parts = frame.hits(), casting.scene_parts(scene)
-    points, normals = np.full((out.size, 3), np.nan), frame.normal.reshape(-1, 3)
-    for p, (thing, part) in enumerate(parts):
-        rows = hits.part == p
-        if rows.any() and not part.material.unlit:
-            pose = thing.path.pose(frame.t_ns)
-            points[rows] = hits.local[rows] @ pose[:3, :3].T + pose[:3, 3]
-    rows = np.flatnonzero(np.isfinite(points).all(axis=1))
-    own = np.column_stack([hits.part[rows], hits.triangle[rows]])
-    points, normals = points[rows], _flat(scene, frame, rows)
+    rows, points, own = lit_points(scene, frame)
+    normals = _flat(scene, frame, rows)
     for one in maps:
         pose = one.lamp.path.pose(frame.t_ns)
         wide, wider, _, _ = scale_of(one.lamp, one.box, one.texels)
@@ -77,18 +71,34 @@ def near_an_edge(scene: Scene, frame: reference.ReferenceFrame, maps: tuple[Shad
             towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
         facing = (towards * normals).sum(axis=1)
         edge = np.abs(facing) < GRAZING
+        # A shadow's edge is where a neighbour, as far aside as the map smooths, sees another share.
         share = appearance.seen_share(scene, frame.t_ns, one.lamp, points, own)
         edge |= (share > 0) & (share < 1)
         for k in range(WAYS):
             angle = 2 * math.pi * k / WAYS
             aside = math.cos(angle) * pose[:3, 0] + math.sin(angle) * pose[:3, 1]
-            aside = aside * (texel * (SOFT if one.soft else HARD))[:, None]
+            aside = aside * (texel * SMOOTHED)[:, None]
             # in the plane of the surface, where it is as far aside as the lamp sees it
             slide = (aside * normals).sum(axis=1) / np.where(np.abs(facing) < GRAZING, 1.0, facing)
+            # Moved along the light until it is on the surface's own plane again.
             there = points + aside - slide[:, None] * towards
             edge |= appearance.seen_share(scene, frame.t_ns, one.lamp, there, own) != share
         out.ravel()[rows] |= edge
     return out
+
+
+def lit_points(scene: Scene, frame: reference.ReferenceFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(n,) numbers of the pixels that show something that is lit, their (n, 3) points, world axes, and (n, 2) part and
+    triangle."""
+    hits = frame.hits()
+    points = np.full((len(hits.hit), 3), np.nan)
+    for p, (thing, part) in enumerate(casting.scene_parts(scene)):
+        rows = hits.part == p
+        if rows.any() and not part.material.unlit:
+            pose = thing.path.pose(frame.t_ns)
+            points[rows] = hits.local[rows] @ pose[:3, :3].T + pose[:3, 3]
+    rows = np.flatnonzero(np.isfinite(points).all(axis=1))
+    return rows, points[rows], np.column_stack([hits.part[rows], hits.triangle[rows]])
 
 
 def _flat(scene: Scene, frame: reference.ReferenceFrame, rows: np.ndarray) -> np.ndarray:

@@ -8,10 +8,13 @@ loose tolerance: it finds wrong coordinates, a wrong texture or a wrong level, n
 
 from __future__ import annotations
 
+from itertools import product
 from weakref import WeakKeyDictionary
 
+import cv2
 import numpy as np
 
+from blinkgl.camera import CameraModel
 from blinkgl.render import appearance
 from blinkgl.render.colour import linear_image
 from blinkgl.scene.types import REPEAT, Material, Texture
@@ -22,28 +25,19 @@ _chains: WeakKeyDictionary = WeakKeyDictionary()
 def mip_chain(texture: Texture) -> list[Texture]:
     """Linear-light float32 levels 0, 1, … down to 1 x 1."""
     if texture not in _chains:
+        # Mip maps are means of light, not of its sRGB code.
         levels = [linear_image(texture.image)]
         while max(levels[-1].shape[:2]) > 1:
-            levels.append(_half(_half(levels[-1]).swapaxes(0, 1)).swapaxes(0, 1))
+            height, width = (max(1, size // 2) for size in levels[-1].shape[:2])
+            levels.append(cv2.resize(levels[-1], (width, height), interpolation=cv2.INTER_LINEAR))
         _chains[texture] = [Texture(np.ascontiguousarray(level), texture.name) for level in levels]
     return _chains[texture]
-
-
-def _half(image: np.ndarray) -> np.ndarray:
-    """Half as many rows (rounded down, at least one), sampled bilinearly at their centres."""
-    size = len(image)
-    if size == 1:
-        return image
-    new = size // 2
-    at = (np.arange(new) + 0.5) * size / new - 0.5
-    low = np.clip(np.floor(at).astype(int), 0, size - 2)
-    part = (at - low).astype(np.float32)[:, None, None]
-    return image[low] * (1 - part) + image[low + 1] * part
 
 
 def sample_trilinear(texture: Texture, uv: np.ndarray, level: np.ndarray, wrap: tuple[str, str] = REPEAT) -> np.ndarray:
     """(N, 3) linear light at (N, 2) texture coordinates and (N,) levels (below 0: level 0)."""
     chain = mip_chain(texture)
+    # A magnified texture has the finest level, and beyond 1 x 1 there is none.
     level = np.clip(np.nan_to_num(level), 0.0, len(chain) - 1)
     low = np.floor(level).astype(int)
     out = np.empty((len(uv), 3))
@@ -64,3 +58,56 @@ def mipmapped_albedo(material: Material, uv: np.ndarray, level: np.ndarray) -> n
     if material.texture is None:
         return np.broadcast_to(base, (len(uv), 3)).copy()
     return sample_trilinear(material.texture, uv, level, material.wrap) * base
+
+
+def levels(points: np.ndarray, texels: np.ndarray, xy: np.ndarray, camera: CameraModel) -> np.ndarray:
+    """(N, 3) least, usual and greatest level that OpenGL 4.6 allows for a look-up at (N, 2) pixels; -inf, inf, inf
+    where a neighbour looks past the horizon of the triangle's plane.
+
+    points : (N, 3, 3) corners, camera axes.   texels : (N, 3, 2) texture coordinates of the corners, in texels.
+
+    Derivatives are differences between the 2 x 2 pixels of a quad, of either of its rows and columns (GLSL 4.60,
+    section 8.14.1). Usual is log2 of the longer of the two (OpenGL 4.6, section 8.14.1, eq. 8.7). With m_u =
+    max(|du/dx|, |du/dy|), and m_v likewise, it may be taken of anything from max(m_u, m_v) to m_u + m_v."""
+    # With b = inv([A B C]) r the coordinates are (sum b_i u_i) / (sum b_i); the adjugate does, its scale cancels.
+    rows, corner = np.cross(points[:, (1, 2, 0)], points[:, (2, 0, 1)]), 2 * (xy // 2)
+    there, sides = {}, 0.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for x, y in product((0, 1), repeat=2):
+            weights = np.einsum("nij,nj->ni", rows, camera.rays(corner + [x, y]))
+            total = weights.sum(axis=1)
+            there[x, y] = np.einsum("ni,nik->nk", weights, texels) / total[:, None]
+            sides = sides + np.sign(total)
+        along = np.abs([there[1, k] - there[0, k] for k in (0, 1)])
+        down = np.abs([there[k, 1] - there[k, 0] for k in (0, 1)])
+        # The least that either row and either column can give, and the most.
+        low = np.maximum(along.min(axis=0), down.min(axis=0)).max(axis=1)
+        high = np.maximum(along.max(axis=0), down.max(axis=0)).sum(axis=1)
+        usual = np.hypot(*np.moveaxis([along, down], -1, 0)).mean(axis=1).max(axis=0)
+        # The sum's sign is that of the plane's side that is seen; between two signs lies the horizon.
+        whole = np.abs(sides)[:, None] == 4
+        return np.log2(np.where(whole, np.stack([low, usual, high], axis=1), [0.0, np.inf, np.inf]))
+
+
+MISPLACED = 0.01 + 2.0**-8.5
+"""px: how far a surface of triangles that are no needles may be misplaced: by what float32 rounds, and by half a
+diagonal step of the grid of 1/256 px that corners are snapped to (guard.glsl)."""
+_ROUNDING = 8 * 2.0**-24
+"""Of a corner's place in the picture: a row of the matrix rounds four products and three sums, the division once."""
+
+
+def needles(points: np.ndarray, camera: CameraModel) -> np.ndarray:
+    """(N,) >= 1: how many times :data:`MISPLACED` float32 may misplace the surface of N triangles. points : (N, 3, 3)
+    corners, camera axes.
+
+    Where a corner is off by e, the shares of the corners are off by e / height, and the surface by that times the
+    longest side. 1 for triangles through the near plane, which are clipped."""
+    whole = (points[..., 2] > camera.near).all(axis=1)
+    # A corner behind the camera is not in the picture: any place in front will do for those left out.
+    px = camera.project(np.where(whole[:, None, None], points, [0.0, 0.0, 1.0]))
+    sides = px - np.roll(px, 1, axis=1)
+    # Twice the triangle's area is its longest side times its height.
+    area = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0])
+    extent = np.maximum(np.abs(px).max(axis=(1, 2)), max(camera.width, camera.height))
+    off = _ROUNDING * extent * (sides**2).sum(axis=2).max(axis=1) / np.maximum(area, 1e-12)
+    return np.where(whole, np.maximum(off / MISPLACED, 1.0), 1.0)

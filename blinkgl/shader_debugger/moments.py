@@ -5,22 +5,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
 
+from blinkgl.camera.drawing import seen_through
 from blinkgl.errors import ConfigError
 from blinkgl.labels import LABELS, LabelRequest
 from blinkgl.labels.label import Label, View
 from blinkgl.render import appearance, casting, reference
 from blinkgl.render.colour import LUMA
 from blinkgl.render.passes.shadow import ShadowMap
-from blinkgl.scene.lights import MAX_SHADOWS, shadowing
-from blinkgl.scene.types import Scene
-from blinkgl.shader_debugger.lamps import map_of
-from blinkgl.shader_debugger.mipmaps import mipmapped_albedo
+from blinkgl.scene.lights import MAX_SHADOWS, lamps_of, shadowing
+from blinkgl.scene.types import Part, Scene, SceneObject
+from blinkgl.shader_debugger.lamps import map_of, near_an_edge
+from blinkgl.shader_debugger.mipmaps import levels, mipmapped_albedo, needles
 from blinkgl.shader_debugger.session import LOOKUPS as LOOKUP_PASSES, DebugRenderer, Subject, When
-from blinkgl.shader_debugger.silhouettes import EDGED, edged, twin_of
+from blinkgl.shader_debugger.twins import TWINNED, drawn, places_of, twin_of
 
 _T = TypeVar("_T")
 
@@ -51,7 +53,7 @@ def _lookups(name: str, program: str) -> tuple[Pass, ...]:
         Pass(f"{name}_uv", f"uv of {name}", "texture repeats", "uv", source),
         Pass(f"{name}_level", f"level of {name}", "log2(texels per px)", "scalar", source),
         Pass(f"{name}_albedo", f"albedo of {name}", "linear", "light", source),
-        Pass(f"{name}_direct", f"lamps of {name}", "irradiance factor, without shadows", "scalar", source),
+        Pass(f"{name}_direct", f"lamps of {name}", "irradiance factor", "scalar", source),
         Pass(f"{name}_shadow", f"shadow factor of {name}", "share of the lamps' light", "scalar", source),
         Pass(f"{name}_around", f"environment of {name}", "irradiance factor", "scalar", source),
         Pass(f"{name}_light", f"light of {name}", "irradiance factor", "scalar", source),
@@ -62,7 +64,7 @@ def _lookups(name: str, program: str) -> tuple[Pass, ...]:
 
 _BEFORE = (
     Pass("triangle", "triangle of its part", "0: nothing hit", "ids", "debug.glsl OUT_TRIANGLE"),
-    Pass("local", "local position", "object axes", "scalar", "debug.glsl OUT_LOCAL"),
+    Pass("local", "local position", "object axes", "scalar", "include/vertex.glsl, include/deform"),
 )
 _SHADED = (
     *(Pass(name, name.replace("_", " "), "depth, 0: nothing casts", "scalar", "shadow.glsl") for name in MAPS),
@@ -70,10 +72,11 @@ _SHADED = (
     Pass("luminance", "luminance", "linear", "scalar", "luminance.glsl"),
     *_lookups("colour", LOOKUP_PASSES["colour"].program),
     Pass("colour", "colour", "linear radiance", "light", "colour.glsl"),
+    Pass("luminance_lens", "luminance, lens", "linear", "scalar", "gather.glsl"),
+    Pass("colour_lens", "colour, lens", "linear radiance", "light", "gather.glsl"),
     Pass("luminance_edges", "luminance, edges", "linear", "scalar", "edges.glsl"),
     Pass("colour_edges", "colour, edges", "linear radiance", "light", "edges.glsl"),
-    Pass("log_luminance", "log luminance", "ln(L + log_eps)", "scalar", "luminance.glsl, then the logarithm"),
-    Pass("dL_dt", "dL/dt", "1/s", "signed", "luminance.glsl at two times, difference quotient"),
+    Pass("velocity_pass", "velocity for the time sampling", "px/s", "motion", "velocity.glsl"),
 )
 
 
@@ -93,6 +96,7 @@ class OfLabels(Mapping[str, _T]):
             for label in LABELS.values()
             for view in label.views
         ]
+        # Motion comes last: it hangs on all that is before it.
         surface, motion = ([one for early, one in views if early is which] for which in (True, False))
         return {one.name: one for one in (*self._before, *surface, *self._shaded, *motion)}
 
@@ -119,10 +123,11 @@ def _of_label(label: Label, view: View) -> Pass:
 PASSES = OfLabels(_of_label, _BEFORE, _SHADED)
 
 
-def buffers_of(scene: Scene, edged: tuple[str, ...] = ()) -> dict[str, Pass]:
+def buffers_of(scene: Scene, twinned: tuple[str, ...] = ()) -> dict[str, Pass]:
     """Those of :data:`PASSES` that a scene has: of one without shadows no shadow maps, and so on.
 
-    edged : pictures with filtered silhouettes that are among them."""
+    twinned : of :data:`twins.TWINNED` those that are among them."""
+    # A lamp without anything that casts has no map.
     maps = len(shadowing(scene.light)) if appearance.casts(scene) else 0
     materials = [part.material for _, part in casting.scene_parts(scene) if not part.material.unlit]
     there = {
@@ -135,7 +140,7 @@ def buffers_of(scene: Scene, edged: tuple[str, ...] = ()) -> dict[str, Pass]:
         for name, info in PASSES.items()
         if there.get(lookup_of(name)[1], True)
         and name not in MAPS[maps:]
-        and (name not in EDGED or name in edged)
+        and (name not in TWINNED or name in twinned)
         and ((found := view_of(name)) is None or found[0].can_be_of(scene))
     }
 
@@ -169,10 +174,6 @@ class _Lazy:
             self._made.update(self._make(name))
         return self._made[name]
 
-    def keep(self, other: _Lazy, names: Iterable[str]) -> None:
-        """Takes these buffers from another moment in place of making them."""
-        self._made |= {name: other[name] for name in names}
-
     def _make(self, name: str) -> dict[str, np.ndarray]:
         raise NotImplementedError
 
@@ -181,31 +182,31 @@ class GpuMoment(_Lazy):
     """What the GPU wrote. Besides :data:`PASSES`: part (H, W) int32, -1: nothing hit; window (H, W, 4) gl_FragCoord;
     next_depth_forward|backward (H, W), the depth at t' that the flow program returns; luminance_count, colour_count (H,
     W), the number of texture look-ups at the pixel; colour_light_rgb (H, W, 3), its light in colour; NAME_plain and
-    NAME_twin of what :data:`silhouettes.EDGED` has.
+    NAME_twin of what :data:`twins.TWINNED` has.
+
+    Behind a lens labels are in the lens's pixels; of all that is drawn as a flat picture a pixel is the one that the
+    lens looks at.
 
     Conventions: depth inf, flow 0 and id 0 where nothing is hit; velocity 0 there.
     """
 
-    def __init__(self, renderer: DebugRenderer, when: When, log_eps: float):
+    def __init__(self, renderer: DebugRenderer, when: When):
         super().__init__()
-        self.renderer, self.when, self.log_eps = renderer, when, log_eps
+        self.renderer, self.when = renderer, when
 
     def _make(self, name):
         draw, when = self.renderer, self.when
-        if name == "colour":
-            return {name: draw.colour(when.t_ns).read()}
-        if name == "luminance":
-            return {name: draw.luminance(when.t_ns).read()}
-        if name == "log_luminance":
-            return {name: np.log(self["luminance"] + np.float32(self.log_eps))}
-        if name == "dL_dt":
-            change = draw.luminance(when.after_ns).read() - draw.luminance(when.before_ns).read()
-            return {name: change / np.float32(when.step_s)}
-        if name in EDGED:
-            return {name: edged(draw, name, when.t_ns)}
-        if (of := name.removesuffix("_plain").removesuffix("_twin")) in EDGED:
+        if name in ("colour", "luminance"):
+            return {name: draw.picture(name, when.t_ns)}
+        if name == "velocity_pass":
+            return {name: draw.velocity(when.t_ns).read()}
+        # ``edges`` writes a flat picture, a lens its own pixels.
+        own = draw.at_pixels if name.partition("_")[2].startswith("edges") else np.asarray
+        if name in TWINNED:
+            return {name: own(drawn(draw, name, when.t_ns))}
+        if (of := name.removesuffix("_plain").removesuffix("_twin")) in TWINNED:
             plain, twin = twin_of(draw, of, when.t_ns)
-            return {f"{of}_plain": plain, f"{of}_twin": twin}
+            return {f"{of}_plain": own(plain), f"{of}_twin": own(twin)}
         if name in MAPS:
             return {name: draw.shadow_map(MAPS.index(name), when.t_ns)}
         if name in ("triangle", "part", "local", "window"):
@@ -231,6 +232,7 @@ class GpuMoment(_Lazy):
 
     def _labels(self):
         when = self.when
+        # All at once, so that they are drawn in one go.
         ask = LabelRequest(*(name for name, label in LABELS.items() if label.views))
         frame = self.renderer.labels(when.t_ns, ask, when.forward_ns, when.backward_ns)
         return {view.name: view.of(frame.values[name]) for name in ask for view in LABELS[name].views}
@@ -238,53 +240,55 @@ class GpuMoment(_Lazy):
 
 class ReferenceMoment(_Lazy):
     """What the GPU should have written, float64, by :mod:`blinkgl.render.reference`.
-    ``frame``: the reference's own frame.
+
+    scene : as it is drawn, behind a lens as the flat picture.   seen : as the camera sees it.   maps : of shadows.
 
     The level of a look-up is log2 of the longer of the texel footprints of one pixel step in x and y (OpenGL 4.6,
     section 8.14, eq. 8.7), from the exact derivatives of uv on the triangle's plane, plus ``mip_bias``; a GPU takes it
-    from 2 x 2 pixels. The albedo, and what follows from it (colour, luminance, log_luminance, dL_dt), is sampled at
+    from 2 x 2 pixels. The albedo, and what follows from it (colour, luminance), is sampled at
     that level by the CPU twin in :mod:`mipmaps`, because the reference itself has no mip maps; its own values, at full
     resolution, are albedo_level0, colour_level0 and luminance_level0.   texture_size : (H, W,
     2) texels, 1 where there is no texture.
+    lamps : (H, W, lamps) what each sends, without shadows.   matt : light over what arrives: less than 1 under a gloss.
     light, and its terms : of the luminance of what the surface is made of: coloured light takes of each colour as much
     as it has.
     uv, level, albedo, light … : what both passes should look up; luminance_albedo is the luminance of albedo.
     shadow_map_0 … : as ``maps``, those of the renderer, lie.
     """
 
-    def __init__(
-        self, scene: Scene, when: When, log_eps: float, mip_bias: float = 0.0, maps: tuple[ShadowMap, ...] = ()
-    ):
+    def __init__(self, scene: Scene, when: When, mip_bias: float = 0.0, maps: tuple[ShadowMap, ...] = ()):
         super().__init__()
         self.maps = maps
-        self.scene, self.when, self.log_eps, self.mip_bias = scene, when, log_eps, mip_bias
-        self._frame: reference.ReferenceFrame | None = None
-        self._others: dict[int, reference.ReferenceFrame] = {}
+        self.seen, self.when, self.mip_bias = scene, when, mip_bias
+        self._places = places_of(scene.camera)
+        self.scene = scene if self._places is None else scene.with_camera(seen_through(scene.camera))
 
-    @property
+    @cached_property
+    def labels(self) -> reference.ReferenceFrame:
+        """What the camera's pixels see, with flow."""
+        when = self.when
+        return reference.render(self.seen, when.t_ns, forward_ns=when.forward_ns, backward_ns=when.backward_ns)
+
+    @cached_property
+    def shadow_edges(self) -> np.ndarray:
+        """(H, W) bool: where hard shadows of maps differ from those of rays."""
+        return near_an_edge(self.scene, self.frame, self.maps)
+
+    @cached_property
     def frame(self) -> reference.ReferenceFrame:
-        if self._frame is None:
-            self._frame = reference.render(
-                self.scene, self.when.t_ns, forward_ns=self.when.forward_ns, backward_ns=self.when.backward_ns
-            )
-        return self._frame
-
-    def at(self, t_ns: int) -> reference.ReferenceFrame:
-        """The frame of another time, without flow."""
-        if t_ns == self.when.t_ns:
-            return self.frame
-        if t_ns not in self._others:
-            self._others[t_ns] = reference.render(self.scene, t_ns)
-        return self._others[t_ns]
+        """What is drawn: without a lens :attr:`labels`."""
+        if self._places is None:
+            return self.labels
+        return reference.render(self.scene, self.when.t_ns, xy=self._places.astype(np.float64))
 
     def _make(self, name):
-        frame = self.frame
         if (found := view_of(name)) is not None:
             label, view = found
             try:
-                return {name: np.asarray(view.reference(self.scene, frame))}
+                return {name: np.asarray(view.reference(self.seen, self.labels))}
             except Exception as error:
                 raise TypeError(f"label '{label.name}': `reference` fails: {error}") from error
+        frame = self.frame
         if name.endswith("_level0"):
             return {name: getattr(frame, name.removesuffix("_level0"))}
         if name in MAPS:
@@ -295,119 +299,115 @@ class ReferenceMoment(_Lazy):
             return {name: frame.part}
         if name == "local":
             return {name: np.where(frame.hit[..., None], frame.local, 0.0)}
-        if name == "log_luminance":
-            return {name: np.log(self["luminance"] + self.log_eps)}
-        if name == "dL_dt":
-            before, after = (self._surface(t)["luminance"] for t in (self.when.before_ns, self.when.after_ns))
-            return {name: (after - before) / self.when.step_s}
+        if name == "velocity_pass":
+            return {name: self["velocity"] if self._places is None else self._velocity_drawn()}
         of, what = lookup_of(name)
+        # The event pass has textures of one channel.
         if of:
             grey = of == "luminance" and what in ("albedo", "mirrored", "emission")
             return {name: luma_of(self[what]) if grey else self[what]}
-        if name in (*LOOKUPS, "colour", "luminance", "texture_size"):
-            return self._surface(self.when.t_ns)
+        if name in (*_COMPONENTS, "lamps", "matt", "colour", "luminance"):
+            return self._surface()
         return {
-            f"next_depth_{way}": np.where(frame.hit, getattr(frame, way).depth, 0.0) for way in ("forward", "backward")
+            f"next_depth_{way}": np.where(self.labels.hit, getattr(self.labels, way).depth, 0.0)
+            for way in ("forward", "backward")
         }
 
-    def _surface(self, t_ns: int) -> dict[str, np.ndarray]:
-        frame, scene = self.at(t_ns), self.scene
-        shape = frame.hit.shape
-        uv, light, level, albedo, size = (
-            np.zeros((*shape, 2)),
-            np.zeros(shape),
-            np.zeros(shape),
-            np.zeros((*shape, 3)),
-            np.ones((*shape, 2)),
-        )
-        lit, mirrored, emission = (albedo.copy() for _ in range(3))
-        direct, around, shadow = (light.copy() for _ in range(3))
-        xy = casting.pixel_grid(scene.camera).reshape(*shape, 2)
-        for p, (thing, part) in enumerate(casting.scene_parts(scene)):
+    def _velocity_drawn(self) -> np.ndarray:
+        """(H, W, 2) px/s, in the lens's pixels, at the centres of the flat picture's."""
+        # The lens's pixel of a flat one, in fractions.
+        xy = self.seen.camera.project(self.scene.camera.rays(self._places.astype(np.float64)))
+        hits = casting.cast(self.seen, self.when.t_ns, xy.reshape(-1, 2))
+        return np.nan_to_num(casting.velocity(self.seen, hits)).reshape(xy.shape)
+
+    def _surface(self) -> dict[str, np.ndarray]:
+        frame = self.frame
+        out = {name: np.zeros((*frame.hit.shape, n) if n else frame.hit.shape) for name, n in _COMPONENTS.items()}
+        out["texture_size"][:] = out["needles"][:] = 1.0
+        out["lamps"] = np.zeros((*frame.hit.shape, len(lamps_of(self.scene.light))))
+        out["matt"] = np.ones(frame.hit.shape)
+        for p, (thing, part) in enumerate(casting.scene_parts(self.scene)):
             on = frame.part == p
-            if not on.any():
-                continue
-            if part.material.texture is not None:  # else the GPU has no coordinates either
-                uv[on] = frame.uv[on] * part.material.uv_scale
-                size[on] = part.material.texture.image.shape[1::-1]
-                corners = part.mesh.faces[frame.triangle[on]]
-                pose = casting.relative_pose_at(scene, thing, t_ns)
-                points = casting.vertices_at(part.mesh, t_ns)[corners] @ pose[:3, :3].T + pose[:3, 3]
-                texels = (
-                    part.mesh.uvs[corners].astype(np.float64)
-                    * part.material.uv_scale
-                    * part.material.texture.image.shape[1::-1]
-                )
-                level[on] = (
-                    footprint(points, texels, scene.camera.rays(xy[on]), scene.camera.ray_jacobian(xy[on]))
-                    + self.mip_bias
-                )
-            albedo[on] = mipmapped_albedo(part.material, uv[on], level[on])
-            if part.mesh.colours is not None:
-                corners = part.mesh.colours[part.mesh.faces[frame.triangle[on]]].astype(np.float64)
-                albedo[on] *= np.einsum("nc,nck->nk", frame.bary[on], corners)
-            lit[on], light[on], shadow[on] = albedo[on], 1.0, 1.0
-            if not part.material.unlit:
-                hits, rows = frame.hits(), np.flatnonzero(on.ravel())
-                sent = appearance.radiated(scene, hits, rows, albedo[on], frame.normal[on], frame.uv[on])
-                lit[on] *= sent.matt
-                weights = albedo[on] * LUMA
-                weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-30)
+            if on.any():
+                self._look_up(out, frame, thing, part, on)
+                self._light_up(out, frame, part, on)
+        radiance = out["lit"] + out["mirrored"] + out["emission"]
+        # Fog lies between the surface and the camera: after all light.
+        in_fog = appearance.seen_through_fog(self.scene, frame.hits(), radiance.reshape(-1, 3)).reshape(radiance.shape)
+        out["colour"] = np.where(frame.hit[..., None], in_fog, frame.colour)
+        out["luminance"] = out["colour"] @ LUMA
+        return out
 
-                def seen(light, weights=weights):
-                    return (light * weights).sum(axis=1)
+    def _look_up(
+        self,
+        out: dict[str, np.ndarray],
+        frame: reference.ReferenceFrame,
+        thing: SceneObject,
+        part: Part,
+        on: np.ndarray,
+    ) -> None:
+        """Writes where on a part the pixels ``on`` are, and the albedo that is looked up there."""
+        scene, mesh, material = self.scene, part.mesh, part.material
+        corners = mesh.faces[frame.triangle[on]]
+        pose = casting.relative_pose_at(scene, thing, frame.t_ns)
+        # In the camera's axes, as the shape is at this time.
+        points = casting.vertices_at(mesh, frame.t_ns)[corners] @ pose[:3, :3].T + pose[:3, 3]
+        out["needles"][on] = needles(points, scene.camera)
+        if material.texture is not None:  # else the GPU has no coordinates either
+            out["uv"][on] = frame.uv[on] * material.uv_scale
+            size = material.texture.image.shape[1::-1]
+            out["texture_size"][on] = size
+            texels, xy = mesh.uvs[corners].astype(np.float64) * material.uv_scale * size, frame.xy[on]
+            out["levels"][on] = levels(points, texels, xy, scene.camera) + self.mip_bias
+            out["level"][on] = out["levels"][on][:, 1]
+        out["albedo"][on] = mipmapped_albedo(material, out["uv"][on], out["level"][on])
+        if mesh.colours is not None:
+            out["albedo"][on] *= np.einsum("nc,nck->nk", frame.bary[on], mesh.colours[corners].astype(np.float64))
 
-                light[on], around[on], direct[on] = (
-                    seen(one) for one in (sent.matt, sent.light.around, sent.light.open.sum(axis=0))
-                )
-                arrives = seen(sent.light.direct.sum(axis=0))
-                shadow[on] = np.where(direct[on] > 0, arrives / np.maximum(direct[on], 1e-30), 1.0)
-                mirrored[on], emission[on] = sent.mirrored, sent.emission
-        radiance = lit + mirrored + emission
-        in_fog = appearance.seen_through_fog(scene, frame.hits(), radiance.reshape(-1, 3)).reshape(radiance.shape)
-        colour = np.where(frame.hit[..., None], in_fog, frame.colour)
-        return {
-            "uv": uv,
-            "light": light,
-            "level": level,
-            "albedo": albedo,
-            "direct": direct,
-            "shadow": shadow,
-            "around": around,
-            "mirrored": mirrored,
-            "emission": emission,
-            "colour": colour,
-            "luminance": colour @ LUMA,
-            "texture_size": size,
-        }
+    def _light_up(
+        self, out: dict[str, np.ndarray], frame: reference.ReferenceFrame, part: Part, on: np.ndarray
+    ) -> None:
+        """Writes the light of the pixels ``on`` of a part, whose albedo is known, and its terms."""
+        albedo = out["albedo"][on]
+        out["lit"][on], out["light"][on], out["shadow"][on] = albedo, 1.0, 1.0
+        if part.material.unlit:
+            return
+        rows = np.flatnonzero(on.ravel())
+        sent = appearance.radiated(self.scene, frame.hits(), rows, albedo, frame.normal[on], frame.uv[on])
+        out["lit"][on] *= sent.matt
+        # Light is told in the luminance of what it falls on: coloured light takes of each colour as much as it has.
+        weights = albedo * LUMA
+        weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-30)
+
+        def seen(light):
+            return (light * weights).sum(axis=1)
+
+        direct, arrives, around = (
+            seen(one) for one in (sent.light.open.sum(axis=0), sent.light.direct.sum(axis=0), sent.light.around)
+        )
+        light = seen(sent.matt)
+        out["light"][on], out["around"][on], out["direct"][on] = light, around, direct
+        # Each lamp by itself, so that shares of soft shadows can be put in their place.
+        out["lamps"][on] = np.einsum("knc,nc->nk", sent.light.open, weights)
+        out["matt"][on] = np.where(arrives + around > 0, light / np.maximum(arrives + around, 1e-30), 1.0)
+        out["shadow"][on] = np.where(direct > 0, arrives / np.maximum(direct, 1e-30), 1.0)
+        out["mirrored"][on], out["emission"][on] = sent.mirrored, sent.emission
+
+
+_COMPONENTS = {
+    **dict.fromkeys(("level", "direct", "shadow", "around", "light", "needles"), 0),
+    **dict.fromkeys(("uv", "texture_size"), 2),
+    **dict.fromkeys(("levels", "albedo", "mirrored", "emission", "lit"), 3),
+}
+"""Of what :meth:`ReferenceMoment._surface` makes; 0: (H, W)."""
 
 
 def open_reference(subject: Subject, when: When, maps: tuple[ShadowMap, ...] = ()) -> ReferenceMoment:
     """What the GPU should write for this subject. maps : of the renderer that draws it."""
-    return ReferenceMoment(subject.scene, when, subject.log_eps, subject.config.render.mip_bias, maps)
+    return ReferenceMoment(subject.scene, when, subject.config.render.mip_bias, maps)
 
 
 def luma_of(albedo: np.ndarray) -> np.ndarray:
     """(..., 3) grey of the luminance of (..., 3) albedo: what the event pass, whose textures
     have one channel, shows as its albedo."""
     return np.repeat((albedo @ LUMA)[..., None], 3, axis=-1)
-
-
-def footprint(points: np.ndarray, texels: np.ndarray, rays: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """(N,) log2 of the texels that one pixel step covers on the planes of N triangles.
-
-    points : (N, 3, 3) corners, camera axes.   texels : (N, 3, 2) texture coordinates of the corners, in texels.
-    rays : (N, 3) through the pixels.   slopes : (N, 3, 2) their derivatives by x and y, 1/px.
-    With b = inv([A B C]) r the coordinates are (sum b_i u_i) / (sum b_i); the adjugate does, its scale cancels."""
-    a, b, c = points[:, 0], points[:, 1], points[:, 2]
-    rows = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
-    weights = np.einsum("nij,nj->ni", rows, rays)
-    total = weights.sum(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        here = np.einsum("ni,nik->nk", weights, texels) / total[:, None]
-        steps = []
-        for axis in (0, 1):
-            slope = np.einsum("nij,nj->ni", rows, slopes[:, :, axis])  # d weights / d pixel
-            change = np.einsum("ni,nik->nk", slope, texels) - here * slope.sum(axis=1)[:, None]
-            steps.append(np.linalg.norm(change / total[:, None], axis=1))
-        return np.log2(np.maximum(steps[0], steps[1]))

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -40,24 +42,16 @@ def _legend(figure: Figure, box: tuple[float, float, float, float], legend: dict
     """Draws the colour bar, or what stands for it, into box (x, y, w, h in figure fractions)."""
     kind = legend["kind"]
     if kind == "bar":
+        scale = (LogNorm if legend["log"] else Normalize)(legend["low"], legend["high"])
         axes = figure.add_axes(box)
-        low, high = legend["low"], legend["high"]
-        axes.pcolormesh(
-            np.geomspace(low, high, 257) if legend["log"] else np.linspace(low, high, 257),
-            [0, 1],
-            np.linspace(0, 1, 256)[None],
-            cmap=legend["map"],
-            rasterized=True,
-        )
-        axes.set_xlim(low, high), axes.set_yticks([])
+        bar = figure.colorbar(ScalarMappable(scale, legend["map"]), cax=axes, orientation="horizontal")
+        bar.outline.set_visible(False)
         if legend["log"]:
-            ticks = [float(f"{v:.1g}") for v in np.geomspace(low, high, 5)[1:-1]]
-            axes.set_xscale("log"), axes.set_xticks(ticks, [f"{v:g}" for v in ticks]), axes.minorticks_off()
-        else:
-            axes.locator_params(axis="x", nbins=5)
+            # matplotlib would name powers of ten alone, of which a scale of depths may have one.
+            ticks = [float(f"{v:.1g}") for v in np.geomspace(legend["low"], legend["high"], 5)[1:-1]]
+            bar.set_ticks(ticks, labels=[f"{v:g}" for v in ticks], minor=False)
+            bar.minorticks_off()
         axes.tick_params(axis="x", labelsize=size, colors=MUTED, length=2, pad=1)
-        for spine in axes.spines.values():
-            spine.set_visible(False)
         return
     x, y, _, h = box
     text = {
@@ -94,6 +88,7 @@ def _title(figure: Figure, ends: tuple[float, float], y: float, texts: tuple[str
 def save_labelled(path: Path, info: Pass, rgb: np.ndarray, legend: dict, caption: str) -> None:
     """One buffer: title with unit, the pixels enlarged by a whole factor, colour bar, caption."""
     height, width = rgb.shape[:2]
+    # Whole factors, or pixels would be of different sizes.
     factor = max(1, round(700 / width))
     w, h, top, bottom = width * factor, height * factor, 46, 74
     W, H = w + 40, h + top + bottom
@@ -133,6 +128,7 @@ def save_errors(path: Path, reports: list, caption: str) -> None:
     for report in reports:
         errors = np.clip(np.where(report.errors > 0, report.errors, 1e-9), 1e-9, 1e2)
         rgb, legend = picture("depth", errors, which="length", colours=ERROR_MAP, low=1e-9, high=1e2)
+        # Greyed, not left out: a shape is easier to find with what is around it.
         rgb[~report.graded] = (rgb[~report.graded] * 0.35 + 255 * 0.3).astype(np.uint8)
         verdict = "ok" if report.passed else "over tolerance"
         unit = f"{report.quantity.statistic} {report.value:.2g} {report.quantity.unit}: {verdict}"

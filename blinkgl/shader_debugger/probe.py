@@ -4,28 +4,26 @@ invalid or occluded when it is."""
 from __future__ import annotations
 
 import numpy as np
+from trimesh.triangles import points_to_barycentric
 
 from blinkgl.render import casting
 from blinkgl.render.probe import probe as reference_probe
 from blinkgl.render.renderer import Renderer
-from blinkgl.shader_debugger.compare import QUANTITIES, Comparison
+from blinkgl.shader_debugger.compare import Comparison
 from blinkgl.shader_debugger.lamps import place_in
-from blinkgl.shader_debugger.moments import MAPS, PASSES, GpuMoment, ReferenceMoment, buffers_of, lookup_of
-from blinkgl.shader_debugger.silhouettes import EDGED
+from blinkgl.shader_debugger.moments import MAPS, PASSES, GpuMoment, ReferenceMoment, buffers_of
+from blinkgl.shader_debugger.quantities import QUANTITIES
+from blinkgl.shader_debugger.twins import TWINNED
 
 
 def ulps(gpu: np.ndarray, ref: np.ndarray) -> float:
     """Largest |gpu - ref| in units of float32's spacing at ref (per component); inf where one is not finite."""
     g, r = np.atleast_1d(np.asarray(gpu, np.float64)), np.atleast_1d(np.asarray(ref, np.float64))
-    if not (np.isfinite(g) | (g == r)).all() or not (np.isfinite(r) | (g == r)).all():
-        return float("inf")
-    same = g == r
-    spacing = np.spacing(np.abs(r).astype(np.float32)).astype(np.float64)
-    return float(
-        np.where(
-            same, 0.0, np.abs(np.where(same, 0.0, g - np.where(same, 0.0, r))) / np.where(same, 1.0, spacing)
-        ).max()
-    )
+    with np.errstate(all="ignore"):
+        # The distance of two neighbouring float32 at the reference's value.
+        apart = np.abs(g - r) / np.spacing(np.abs(r).astype(np.float32)).astype(np.float64)
+    # Equal is no difference, of infinities, too; nan is what one of them leaves.
+    return float(np.where(g == r, 0.0, np.nan_to_num(apart, nan=np.inf, posinf=np.inf)).max())
 
 
 def probe(gpu: GpuMoment, ref: ReferenceMoment, x: int, y: int, comparison: Comparison | None = None) -> dict:
@@ -38,11 +36,12 @@ def probe(gpu: GpuMoment, ref: ReferenceMoment, x: int, y: int, comparison: Comp
     why : per direction, the reference's reason and the GPU's own for invalid or occluded ("": seen at both times).
     """
     comparison = comparison or Comparison(gpu, ref)
-    scene, when = ref.scene, gpu.when
+    scene, when = ref.seen, gpu.when
     parts = casting.scene_parts(scene)
     seen = {way: reference_probe(scene, when.t_ns, x, y, getattr(when, f"{way}_ns")) for way in ("forward", "backward")}
     drawn, true = int(gpu["part"][y, x]), int(ref["part"][y, x])
-    hit = seen["forward"]
+    # Behind a lens the pixel of the flat picture that it looks at; what is later is of the lens's own ray.
+    hit = reference_probe(ref.scene, when.t_ns, *ref.frame.xy[y, x])
     return {
         "pixel": [x, y],
         "t_s": when.t_ns * 1e-9,
@@ -50,7 +49,7 @@ def probe(gpu: GpuMoment, ref: ReferenceMoment, x: int, y: int, comparison: Comp
         "band": bool(comparison.band[y, x]),
         "buffers": [
             _row(name, gpu, ref, comparison, x, y)
-            for name in buffers_of(scene, gpu.renderer.edged)
+            for name in buffers_of(scene, gpu.renderer.twinned)
             if name not in ("triangle", "local", *MAPS)
         ],  # told below
         "surface": {
@@ -60,7 +59,7 @@ def probe(gpu: GpuMoment, ref: ReferenceMoment, x: int, y: int, comparison: Comp
             "reference": _surface(parts, true, hit.triangle, hit.bary)
             | ({"front": hit.front, "corners": _plain(hit.corners)} if hit.hit else {}),
         },
-        "positions": _positions(gpu, ref, x, y, seen) if true >= 0 or drawn >= 0 else [],
+        "positions": _positions(gpu, ref, x, y, hit, seen) if true >= 0 or drawn >= 0 else [],
         "why": {
             way: {"reference": seen[way].why, "gpu": _gpu_reason(gpu, way, x, y)} for way in ("forward", "backward")
         },
@@ -72,7 +71,7 @@ def _plain(values):
 
 
 def _row(name, gpu, ref, comparison, x, y) -> dict:
-    g, r = (side[y, x] for side in (comparison.pair(name) if name in EDGED else (gpu[name], ref[name])))
+    g, r = (side[y, x] for side in (comparison.pair(name) if name in TWINNED else (gpu[name], ref[name])))
     row = {
         "name": name,
         "title": PASSES[name].title,
@@ -96,10 +95,8 @@ def _row(name, gpu, ref, comparison, x, y) -> dict:
     if name in comparison.names() and name in QUANTITIES:
         quantity = QUANTITIES[name]
         error = float(comparison.errors(name)[y, x])
-        skipped = (comparison.band[y, x] and name not in EDGED) or (
-            lookup_of(name)[1] in ("shadow", "light", "mirrored") and comparison.shadow_edges(gpu.when.t_ns)[y, x]
-        )
-        row["ok"] = None if skipped else error <= (comparison.tolerance(name) if quantity.statistic == "max" else 0.5)
+        limit = comparison.tolerance(name) if quantity.statistic == "max" else 0.5
+        row["ok"] = bool(error <= limit) if comparison.graded(name)[y, x] else None
         if name in ("luminance", "colour"):
             row["note"] = (
                 "of the GPU's own albedo and light: "
@@ -130,21 +127,18 @@ def _surface(parts, p, triangle, bary) -> dict:
 
 
 def _barycentric(parts, p, gpu, x, y, t_ns):
-    """Of the GPU's interpolated local position in the triangle it drew; float64 solve of float32 data."""
+    """Of the GPU's interpolated local position in the triangle it drew; None: it has no area."""
     triangle = int(gpu["triangle"][y, x]) - 1
     if p < 0 or not 0 <= triangle < len(parts[p][1].mesh.faces):
         return None
     mesh = parts[p][1].mesh
-    a, b, c = casting.vertices_at(mesh, t_ns)[mesh.faces[triangle]]
-    e1, e2, d = b - a, c - a, gpu["local"][y, x].astype(np.float64) - a
-    m = np.array([[e1 @ e1, e1 @ e2], [e1 @ e2, e2 @ e2]])
-    if np.linalg.det(m) <= 0:
-        return None
-    v, w = np.linalg.solve(m, [e1 @ d, e2 @ d])
-    return np.array([1 - v - w, v, w])
+    corners = casting.vertices_at(mesh, t_ns)[mesh.faces[triangle]]
+    with np.errstate(all="ignore"):
+        shares = points_to_barycentric(corners[None], gpu["local"][y, x].astype(np.float64)[None], method="cross")[0]
+    return shares if np.isfinite(shares).all() else None
 
 
-def _positions(gpu, ref, x, y, seen) -> list[dict]:
+def _positions(gpu, ref, x, y, point, seen) -> list[dict]:
     """The GPU's clip position is what it used: gl_FragCoord at t; at t' the position and
     depth that its flow implies."""
     scene, when = ref.scene, gpu.when
@@ -155,7 +149,6 @@ def _positions(gpu, ref, x, y, seen) -> list[dict]:
     def add(name, g, r):
         rows.append({"name": name, "gpu": _plain(g), "reference": _plain(r)})
 
-    point = seen["forward"]
     p = int(gpu["part"][y, x])
     local = gpu["local"][y, x].astype(np.float64) if p >= 0 else None
     thing = casting.scene_parts(scene)[p][0] if p >= 0 else None
@@ -170,6 +163,7 @@ def _positions(gpu, ref, x, y, seen) -> list[dict]:
     add("world, t", world(when.t_ns), point.world)
     add("camera, t", None, point.camera)
     window = gpu["window"][y, x].astype(np.float64)
+    # gl_FragCoord has all that the GPU knows of the clip position: w is 1 / Z there.
     ndc = window[:2] / size * 2 - 1
     clip = np.array([*ndc, window[2], 1.0]) / window[3] if window[3] else None
     add("clip, t", clip, P @ [*point.camera, 1.0] if point.hit else None)
@@ -182,7 +176,7 @@ def _positions(gpu, ref, x, y, seen) -> list[dict]:
         there = ndc + gpu[f"flow_{way}"][y, x] * 2 / size
         add(
             f"clip, {label}",
-            [there[0] * w, there[1] * w, scene.camera.near, w] if p >= 0 else None,
+            [there[0] * w, there[1] * w, scene.camera.near, w] if p >= 0 and scene is ref.seen else None,
             P @ [*later.camera_to, 1.0] if later.camera_to is not None else None,
         )
         add(
@@ -214,11 +208,13 @@ def _gpu_reason(gpu: GpuMoment, way: str, x: int, y: int) -> str:
         return ""
     renderer: Renderer = gpu.renderer
     xt, yt = x + float(flow[0]), y + float(flow[1])
+    # What leaves the picture is occluded, whatever else is there.
     if not (-0.5 <= xt < renderer.width - 0.5 and -0.5 <= yt < renderer.height - 0.5):
         return f"outside the image at t' (x' = {xt:.3f}, y' = {yt:.3f})"
     if w < renderer.scene.camera.near:
         return f"in front of the near plane at t' (Z' = {w:.6g} < {renderer.scene.camera.near:g})"
     there = gpu.renderer.raw(getattr(gpu.when, f"{way}_ns"), "depth", "ids")
+    # The pixel that holds the point then.
     xn, yn = int(np.floor(xt + 0.5)), int(np.floor(yt + 0.5))
     other = int(there["ids"][yn, xn])
     names = {thing.instance_id: thing.name for thing in renderer.scene.objects}

@@ -52,6 +52,7 @@ def _number(key: str, text: str) -> float | None:
         value = float(text) if text else None
     except ValueError:
         value = math.nan
+    # NaN is not below anything.
     if value is not None and not abs(value) <= LARGEST:
         raise ConfigError(
             "not a number", where=key, value=text, accepted=f"a number between -{LARGEST:g} and {LARGEST:g}, or nothing"
@@ -98,6 +99,7 @@ def read_query(route: str, text: str) -> dict[str, Any]:
             "the question is too long", where=route, value=len(text), accepted=f"at most {LONGEST} characters"
         )
     given: dict[str, str] = {}
+    # A parameter that is given twice is read differently everywhere.
     for key, value in parse_qsl(text, keep_blank_values=True):
         if key not in readers or key in given:
             raise ConfigError(

@@ -11,7 +11,6 @@ import ipaddress
 import json
 import socket
 import threading
-import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
 from pathlib import Path
@@ -55,6 +54,7 @@ def host_allowed(header: str | None, bound: str, port: int) -> bool:
         return False
     if name in LOCAL or name == bound.lower():
         return bool(name)
+    # A literal address cannot be another site's name (DNS rebinding).
     if bound in ("0.0.0.0", "::"):
         try:
             ipaddress.ip_address(name)
@@ -74,6 +74,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         self.close_connection = True
+        # Two Host headers may be read differently by a proxy: neither is believed.
         hosts = self.headers.get_all("Host") or [None]
         if len(hosts) != 1 or not host_allowed(hosts[0], self.server.bound, self.server.server_port):
             return self._error(403, "this Host is not served here")
@@ -84,7 +85,8 @@ class _Handler(BaseHTTPRequestHandler):
                 return self._send(200, resources.files(__package__).joinpath("page", name).read_bytes(), kind)
             if parts.path not in ROUTES:
                 return self._error(404, "no such page")
-            getattr(self, "_" + parts.path[1:])(read_query(parts.path, parts.query))
+            route, query = parts.path[1:], read_query(parts.path, parts.query)
+            self._wait(query) if route == "wait" else self._answer(route, query)
         except BlinkGLError as error:
             self._error(400, str(error))
         except OSError:  # a browser that left in the middle, or takes for ever
@@ -94,34 +96,21 @@ class _Handler(BaseHTTPRequestHandler):
 
     do_HEAD = do_GET
 
-    def _state(self, query: dict) -> None:
+    def _answer(self, route: str, query: dict) -> None:
+        """What the inspector's method of that name makes of a query: a picture and its legend, or JSON."""
         worker = self.server.worker
-        self._json(
-            worker.call(worker.inspector.state) | worker.call(worker.inspector.shaders) | {"version": worker.version}
-        )
-
-    def _image(self, query: dict) -> None:
-        self._picture(self.server.worker.inspector.image, query)
-
-    def _difference(self, query: dict) -> None:
-        self._picture(self.server.worker.inspector.difference, query)
-
-    def _picture(self, make, query: dict) -> None:
-        png, legend = self.server.worker.call(make, query)
-        self._send(200, png, "image/png", {"X-Legend": json.dumps(legend)})
-
-    def _probe(self, query: dict) -> None:
-        worker = self.server.worker
-        self._json(worker.call(worker.inspector.probe, query))
-
-    def _verdict(self, query: dict) -> None:
-        worker = self.server.worker
-        self._json(worker.call(worker.inspector.verdict, query))
+        made = worker.call(getattr(worker.inspector, route), query)
+        if isinstance(made, tuple):
+            png, legend = made
+            self._send(200, png, "image/png", {"X-Legend": json.dumps(legend)})
+            return
+        if route == "state":
+            made |= worker.call(worker.inspector.shaders) | {"version": worker.version}
+        self._json(made)
 
     def _wait(self, query: dict) -> None:
-        worker, until = self.server.worker, time.monotonic() + WAIT_S
-        while (now := worker.wait(query["version"], 1.0)) == query["version"] and time.monotonic() < until:
-            pass
+        worker = self.server.worker
+        now = worker.wait(query["version"], WAIT_S)
         self._json(worker.call(worker.inspector.shaders) | {"version": now})
 
     def _json(self, value) -> None:
@@ -152,6 +141,7 @@ class _Server(ThreadingHTTPServer):
 
     def __init__(self, host: str, port: int):
         self.bound = host
+        # Before the socket is made: IPv6 addresses are told by their colons.
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         super().__init__((host, port), _Handler)
 
@@ -169,11 +159,11 @@ class DebugServer:
         shaders: str | None = None,
         host: str = "127.0.0.1",
         port: int = 0,
-        step_us: float | None = None,
     ):
+        # First of all: a taken port is said before a scene is built.
         self._server = _listen(host, port)
         try:
-            self._server.worker = Worker(Inspector(subject, when, shaders, step_us))
+            self._server.worker = Worker(Inspector(subject, when, shaders))
         except BaseException:
             self._server.server_close()
             raise
@@ -198,10 +188,15 @@ class DebugServer:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        self._server.shutdown()
-        self._thread.join()
-        self._server.worker.close()
-        self._server.server_close()
+        self.close()
+
+    def close(self) -> None:
+        """Ends the server; pages that wait are answered first. May be called again."""
+        if self._thread.is_alive():
+            self._server.shutdown()
+            self._thread.join()
+            self._server.worker.close()
+            self._server.server_close()
 
 
 def _listen(host: str, port: int) -> _Server:
@@ -216,11 +211,9 @@ def _listen(host: str, port: int) -> _Server:
         ) from None
 
 
-def serve(
-    subject: Subject, when: When, shaders: str | None, host: str, port: int, step_us: float | None = None
-) -> None:
+def serve(subject: Subject, when: When, shaders: str | None, host: str, port: int) -> None:
     """Serves until interrupted."""
-    with DebugServer(subject, when, shaders, host, port, step_us) as server:
+    with DebugServer(subject, when, shaders, host, port) as server:
         folder = server.folder
         print(f"{server.url}  (Ctrl-C ends it; watching {folder})", flush=True)
         if host not in LOCAL:

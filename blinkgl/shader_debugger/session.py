@@ -12,24 +12,21 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from blinkgl.camera.drawing import seen_through
 from blinkgl.config.run import load_run
 from blinkgl.config.sequence import NS_PER_S, SequenceConfig
 from blinkgl.errors import ConfigError, GLError
 from blinkgl.gl import GLContext, ShaderLoader, create_context
-from blinkgl.gl.shader import ShaderError, expand, shader_folder
+from blinkgl.gl.shader import Uniforms, shader_folder
 from blinkgl.render.canvas import DEPTH_BUFFER
 from blinkgl.render.painter import Painter
-from blinkgl.render.passes import Colour, Geometry, Luminance, Output, ScenePass
+from blinkgl.render.passes import Colour, Luminance, Output, ScenePass
 from blinkgl.render.passes.shadow import ShadowMap
 from blinkgl.render.renderer import Renderer
-from blinkgl.render.strokes import Strokes
 from blinkgl.scene.build import check_assets, sequence_scene
 from blinkgl.scene.types import Scene
-from blinkgl.shader_debugger.silhouettes import edged_of
+from blinkgl.shader_debugger.twins import pass_of, places_of, twinned_of
 
 DEBUG_PROGRAM = "debug.glsl"
-STEP_FRACTION = 100  # the step of dL/dt is this part of the label interval
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,26 +38,14 @@ class Subject:
     index: int
     scene: Scene
 
-    @property
-    def log_eps(self) -> float:
-        """What the emulator adds to the luminance before the logarithm."""
-        return float(getattr(self.config.events, "log_eps", 1e-3))
-
 
 @dataclass(frozen=True)
 class When:
-    """Times in ns: the moment, the other ends of its flows, and the two times whose difference quotient is dL/dt."""
+    """Times in ns: the moment, and the other ends of its flows."""
 
     t_ns: int
     forward_ns: int
     backward_ns: int
-    before_ns: int
-    after_ns: int
-
-    @property
-    def step_s(self) -> float:
-        """Seconds between before and after."""
-        return (self.after_ns - self.before_ns) * 1e-9
 
     @property
     def interval_s(self) -> float:
@@ -71,23 +56,25 @@ def open_subject(
     config: str, *, seed: int | None = None, sequence: int | None = None, overrides: list[str] | tuple = ()
 ) -> Subject:
     """The sequence that ``blinkgl generate CONFIG --seed SEED`` would make under number
-    ``sequence`` (default: its first). Of a lens that distorts it is the flat picture that is drawn for it.
+    ``sequence`` (default: its first), of a recipe with groups in its first group.
 
     Raises ConfigError and AssetError."""
     template = load_run(config, overrides, seed=seed)
+    # Only a group has numbered sequences; the first stands for the recipe.
+    if "groups" in template.tree:
+        template = template.groups[0].template
     index = template.sequence(0).output.first_index if sequence is None else sequence
     one = template.sequence(index)
+    # Before the scene is built, so that a missing file is said in a moment.
     check_assets(one.scene, template.base, one.output.split)
-    scene = sequence_scene(one, index, template.base)
-    scene = scene.with_camera(seen_through(scene.camera))
-    return Subject(str(config), one, index, scene)
+    return Subject(str(config), one, index, sequence_scene(one, index, template.base))
 
 
-def moment(subject: Subject, seconds: float | None = None, step_us: float | None = None) -> When:
+def moment(subject: Subject, seconds: float | None = None) -> When:
     """The times that belong to a moment ``seconds`` on the sequence's clock (default: the first label).
 
     Flows run one label interval forward and backward; beyond the sequence's ends the poses are held, as everywhere.
-    Raises ConfigError for a time outside the sequence or a step that is not positive."""
+    Raises ConfigError for a time outside the sequence."""
     timing, scene = subject.config.time, subject.scene
     if seconds is None:
         t_ns = timing.label_times_ns[0]
@@ -100,14 +87,7 @@ def moment(subject: Subject, seconds: float | None = None, step_us: float | None
                 value=seconds,
                 accepted=f"{scene.t0_ns / NS_PER_S:g} to {scene.t1_ns / NS_PER_S:g} s",
             )
-    if step_us is None:
-        step = max(1000, timing.interval_ns // STEP_FRACTION)
-    elif math.isfinite(step_us * 1000) and step_us * 1000 >= 1:
-        step = round(step_us * 1000)
-    else:
-        raise ConfigError("not a time step", where="--step", value=step_us, accepted="at least 0.001 µs")
-    before, after = max(scene.t0_ns, t_ns - step), min(scene.t1_ns, t_ns + step)
-    return When(t_ns, t_ns + timing.interval_ns, t_ns - timing.interval_ns, before, after)
+    return When(t_ns, t_ns + timing.interval_ns, t_ns - timing.interval_ns)
 
 
 def check_pixel(scene: Scene, text: str) -> tuple[int, int]:
@@ -164,26 +144,40 @@ class _Nothing:
         pass
 
 
-class _Uniforms(dict):
+class _Uniforms(Uniforms):
+    """Notes what the program does not use any more, where a run would stop: what comes out wrong says more."""
+
+    def __init__(self, program: Any, unused: set[tuple[str, str]]):
+        super().__init__(program)
+        self._unused = unused
+
     def __missing__(self, name: str) -> _Nothing:
+        self._unused.add((self[""].extra, name))
         return _Nothing()
 
 
-class _DebugStrokes(Strokes):
-    def program(self, name, defines):
-        uniforms, array = super().program(name, defines)
-        return _Uniforms(uniforms), array
-
-
 class DebugPainter(Painter):
-    """Tolerates edited shaders that no longer use a uniform."""
+    """Draws with edited shaders that no longer use a uniform or an attribute of a shape, and notes which.
+
+    unused : (program, name) of each."""
 
     def __init__(self, gl: GLContext, scene: Scene, resources: Any, stats: Any):
         super().__init__(gl, scene, resources, stats)
-        self.strokes = _DebugStrokes(gl)
+        self.unused: set[tuple[str, str]] = set()
 
     def uniforms(self, program: Any) -> Any:
-        return _Uniforms(super().uniforms(program))
+        return _Uniforms(program, self.unused)
+
+    def draw(self, uniforms: Any, item: Any) -> None:
+        # Attributes that a program lacks are left out silently where vertex arrays are made.
+        program, shape = uniforms[""], item.deformer
+        if shape is not None:
+            self.unused |= {(program.extra, name) for name in shape.attributes if name not in program}
+        super().draw(uniforms, item)
+
+    def forget(self) -> None:
+        super().forget()
+        self.unused.clear()
 
 
 @dataclass(frozen=True)
@@ -253,46 +247,53 @@ class DebugRenderer(Renderer):
     """The production renderer, with passes of its own. Always draws whole frames: what is kept from an earlier frame
     may be other shaders' work.
 
-    edged : which pictures with filtered silhouettes are shown and compared, see :mod:`silhouettes`."""
+    twinned : which pictures that are made of others are shown and compared, see :mod:`twins`.
+    as_configured : whether pictures are those of a generation run."""
 
-    edged: tuple[str, ...] = ()
+    twinned: tuple[str, ...] = ()
+    as_configured = False
 
     def __init__(self, gl: GLContext, scene: Scene, config: Any):
         super().__init__(gl, scene, config, whole=True, painter=DebugPainter)
+
+    @property
+    def unused(self) -> set[tuple[str, str]]:
+        """(program, name) of what was set so far and is not used by the edited shaders."""
+        return self._painter.unused
 
     def use_shaders(self, loader: ShaderLoader) -> None:
         """Draw with another loader's programs from now on."""
         self.forget()
         self.gl.shaders = loader
 
+    def at_pixels(self, flat: np.ndarray) -> np.ndarray:
+        """(H, W[, C]) of the camera's picture: itself, or of the flat picture that is drawn for a lens the pixels that
+        the lens looks at."""
+        places = places_of(self.scene.camera)
+        # Indexed by a whole array of rows and of columns: a copy of the lens's size.
+        return flat if places is None else flat[places[..., 1], places[..., 0]]
+
+    def picture(self, what: str, t_ns: int) -> np.ndarray:
+        """(H, W) "luminance" or (H, W, 3) "colour", float32: one sample at the pixel's centre, or ``as_configured``."""
+        if self.as_configured:
+            return (self.colour if what == "colour" else self.luminance)(t_ns).read()
+        return self.at_pixels(self.draw(pass_of(self, what), t_ns).read())
+
     def inspect(self, t_ns: int) -> dict[str, np.ndarray]:
         """The outputs of debug.glsl, see :class:`Inspection`."""
         frame = self.draw(Inspection(), t_ns)
-        return {name: frame.read(name) for name in frame.names}
+        return {name: self.at_pixels(frame.read(name)) for name in frame.names}
 
     def lookups(self, name: str, t_ns: int) -> dict[str, np.ndarray]:
         """What the pass "luminance" or "colour" looks up and multiplies, float32, as its own source says it (variant
         SHOW_LOOKUP): result (H, W[, 3]) as the pass writes it; uv (H, W, 2); level, count (H, W), the number of
         look-ups; light, and its terms direct, shadow, around (H, W); albedo, mirrored, emission, light_rgb (H, W, 3).
-        One sample at the pixel's centre whatever the anti-aliasing; 0 where nothing is hit.
-
-        Raises ShaderError when the source shows nothing (a copy that is older than the debugger)."""
-        program = LOOKUPS[name].program
-        if "show_lookup(" not in "".join(
-            line
-            for line in expand(program, "fragment", {}, self.gl.shaders.folder).text.splitlines()
-            if not line.startswith("void")
-        ):
-            raise ShaderError(
-                "does not show what it looks up",
-                where=program,
-                accepted='#include "lookup.glsl" and show_lookup(albedo, light, …) under #ifdef SHOW_LOOKUP, as in the '
-                "shipped file",
-            )
+        One sample at the pixel's centre whatever the anti-aliasing; 0 where nothing is hit."""
         frame = self.draw(replace(LOOKUPS[name], shadows=self._shadows), t_ns)
-        lookup, albedo, terms = frame.read("lookup"), frame.read("albedo"), frame.read("terms")
+        read = {output: self.at_pixels(frame.read(output)) for output in frame.names}
+        lookup, albedo, terms = read["lookup"], read["albedo"], read["terms"]
         return {
-            "result": frame.read(name),
+            "result": read[name],
             "uv": lookup[..., :2],
             "level": lookup[..., 2],
             "light": lookup[..., 3],
@@ -301,9 +302,9 @@ class DebugRenderer(Renderer):
             "direct": terms[..., 0],
             "shadow": terms[..., 1],
             "around": terms[..., 2],
-            "mirrored": frame.read("mirrored")[..., :3],
-            "emission": frame.read("emission")[..., :3],
-            "light_rgb": frame.read("light")[..., :3],
+            "mirrored": read["mirrored"][..., :3],
+            "emission": read["emission"][..., :3],
+            "light_rgb": read["light"][..., :3],
         }
 
     @property
@@ -324,7 +325,7 @@ class DebugRenderer(Renderer):
         """Buffers of label.glsl as the shader wrote them, without the masks of ground truth, by
         the names of their labels: depth, ids …"""
         ends = {way: t for way, t in (("forward", forward_ns), ("backward", backward_ns)) if t is not None}
-        frame = self.draw(Geometry(names), t_ns, ends)
+        frame = self.draw(self.geometry(names), t_ns, ends)
         return {name: frame.read(name) for name in names}
 
 
@@ -341,5 +342,5 @@ def open_renderer(subject: Subject, shaders: str | None = None, *, as_configured
         if not as_configured:
             config = config.model_copy(update={"antialiasing": "none", "image_antialiasing": "none"})
         with DebugRenderer(gl, subject.scene, config) as renderer:
-            renderer.edged = edged_of(subject.config)
+            renderer.twinned, renderer.as_configured = twinned_of(subject.config, subject.scene), as_configured
             yield renderer

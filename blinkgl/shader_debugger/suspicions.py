@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from blinkgl.render import casting
 from blinkgl.render.colour import LUMA
 from blinkgl.shader_debugger.moments import PASSES, lookup_of
 from blinkgl.srgb import linear_from_srgb, srgb_from_linear
@@ -19,6 +20,7 @@ EXPLAINED = 0.9  # of the pixels that are wrong
 CLOSE = 1e-3  # relative: a candidate need not match to the last bit, other errors may be there, too
 BETTER = 0.5  # an explained pixel's error, as a part of what it was
 MOST = 3  # suspicions of one buffer
+SEEN = 0.5  # of the pixels that a mistake would make wrong, those that are
 
 Candidates = Iterator[tuple[str, np.ndarray]]
 
@@ -32,28 +34,43 @@ def suspicions(comparison: Any, report: Any) -> list[str]:
     wrong = report.graded & (report.errors > report.limit)
     if PASSES[name].kind in ("mask", "ids") or not wrong.any():
         return []
-    g, r = gpu.astype(np.float64)[wrong], np.asarray(right, np.float64)[wrong]
+    owner = comparison.owner(name)
+    # A mistake is made everywhere on an object, not just where it is seen to be wrong.
+    about = report.graded & np.isin(owner, np.unique(owner[wrong]))
+    g, r = gpu.astype(np.float64)[about], np.asarray(right, np.float64)[about]
     with np.errstate(all="ignore"):
-        for candidates in (_mistakes(comparison, name, r, g, wrong), _fitted(name, r, g)):
-            shares = [(_share(comparison, report, gpu, right, wrong, made), text) for text, made in candidates]
+        # What is known by name goes before what any two numbers would fit.
+        for candidates in (
+            _mistakes(comparison, name, r, g, about),
+            _fitted(name, r[wrong[about]], g[wrong[about]], r),
+        ):
+            shares = [(_share(comparison, report, gpu, right, about, made), text) for text, made in candidates]
             found = sorted((one for one in shares if one[0] >= EXPLAINED), key=lambda one: -one[0])
             if found:
                 return [f"{text} (fits {100 * share:.1f} % of the wrong pixels)" for share, text in found[:MOST]]
     return []
 
 
-def _share(comparison, report, gpu, right, wrong, candidate) -> float:
-    """The part of the wrong pixels that a candidate explains."""
-    quantity, before = report.quantity, report.errors[wrong]
+def _share(comparison, report, gpu, right, about, candidate) -> float:
+    """The part of the wrong pixels that a candidate explains; 0 where it would make far more pixels wrong than are.
+
+    about : (H, W) bool, the pixels that the candidate is of."""
+    quantity, before = report.quantity, report.errors[about]
     image = np.array(right, np.float64)
-    candidate = np.broadcast_to(candidate, image[wrong].shape)
-    image[wrong] = candidate
-    error = quantity.error(gpu, image, comparison.gpu, comparison.ref)[wrong]
+    # A candidate is tried as if it were right: what is left of the error then?
+    candidate = np.broadcast_to(candidate, image[about].shape)
+    image[about] = candidate
+    error = quantity.error(gpu, image, comparison.gpu, comparison.ref)[about]
     fits = error <= quantity.fit * (report.tolerance or np.finfo(np.float32).eps)
     # Look-ups have a unit of their own, and zeros that mean nothing.
     if lookup_of(quantity.name)[1] not in ("uv", "level", "albedo"):
-        fits |= _size(gpu.astype(np.float64)[wrong] - candidate) <= CLOSE * _size(candidate)
-    return float((fits & ((error < BETTER * before) | np.isinf(before))).mean())
+        fits |= _size(gpu.astype(np.float64)[about] - candidate) <= CLOSE * _size(candidate)
+    # A mistake that all pixels should show, and few do, is another one.
+    wrong = before > report.limit
+    meant = quantity.error(image, np.asarray(right, np.float64), comparison.gpu, comparison.ref)[about] > report.limit
+    if wrong.sum() < SEEN * meant.sum():
+        return 0.0
+    return float((fits & ((error < BETTER * before) | np.isinf(before)))[wrong].mean())
 
 
 def _size(values: np.ndarray) -> np.ndarray:
@@ -78,16 +95,18 @@ def _mistakes(comparison, name, r, g, on) -> Candidates:
         yield "x and y are exchanged", r[:, ::-1]
 
 
-def _fitted(name, r, g) -> Candidates:
-    """Candidates with numbers taken from the wrong pixels themselves: for what is no usual mistake."""
+def _fitted(name, r, g, everywhere) -> Candidates:
+    """Candidates with numbers taken from the wrong pixels themselves, ``r`` and ``g``, for what is no usual mistake.
+    everywhere : right values of all pixels that they are of."""
     if lookup_of(name)[1] in ("uv", "level"):
         return
+    # A ratio of two zeros says nothing.
     ratios = _typical(np.where(np.abs(r) > 1e-6, g / r, np.nan))
     if r.ndim == 2 and r.shape[1] == 2:
-        yield f"x is {ratios[0]:.4g} times, y {ratios[1]:.4g} times the right value", r * ratios
+        yield f"x is {ratios[0]:.4g} times, y {ratios[1]:.4g} times the right value", everywhere * ratios
         return
     factor = float(np.median(ratios))
-    yield f"{factor:.4g} times the right value", r * factor
+    yield f"{factor:.4g} times the right value", everywhere * factor
 
 
 def _typical(values: np.ndarray) -> np.ndarray:
@@ -106,6 +125,7 @@ def _depth(comparison, name, r, g, on) -> Candidates:
     yield "window depth near / Z instead of Z", camera.near / r
     y, x = np.nonzero(on)
     rays = camera.rays(np.stack([x, y], axis=1))
+    # Length of the ray (X, Y, Z) / Z.
     along = np.linalg.norm(rays, axis=1) / rays[:, 2]
     yield "distance along the ray instead of depth along the optical axis", r * along
 
@@ -129,7 +149,8 @@ def _uv(comparison, name, r, g, on) -> Candidates:
 
 def _level(comparison, name, r, g, on) -> Candidates:
     bias = float(np.round(_typical(g - r)[0], 2))
-    bias = round(bias) if abs(bias - round(bias)) < 0.15 else bias  # drivers approximate the level
+    # A driver's own logarithm is up to 0.086 too small.
+    bias = round(bias) if abs(bias - round(bias)) < 0.15 else bias
     than = "coarser" if bias > 0 else "finer"
     yield f"a mip bias of {bias:+g} (levels that are {than} than one texel a pixel)", r + bias
     yield "always level 0: no mip maps", np.zeros_like(r)
@@ -167,6 +188,16 @@ def _shaded(comparison, name, r, g, on) -> Candidates:
     yield "the light is multiplied twice", albedo * light**2
     yield "the albedo is missing (light alone)", np.broadcast_to(light, r.shape)
     yield "encoded as sRGB: the light is not linear", srgb_from_linear(np.clip(r, 0, 1)).astype(np.float64)
+    if (fog := comparison.ref.scene.fog) is not None:
+        depth = comparison.ref.frame.depth[on]
+        rays = casting.rays_of(comparison.ref.scene.camera, comparison.ref.frame.xy[on])
+        distance = depth * np.linalg.norm(rays, axis=1)
+        arrives, of_depth = (np.exp(-fog.density * way).reshape(-1, *[1] * (r.ndim - 1)) for way in (distance, depth))
+        # Solved for the light before the fog: L' = L T + F (1 - T).
+        clear = (r - fog.radiance * (1 - arrives)) / arrives
+        yield "the fog is missing", clear
+        yield "fog of the depth, not of the distance", fog.radiance + (clear - fog.radiance) * of_depth
+        yield "fog that hides what should arrive", fog.radiance + (clear - fog.radiance) * (1 - arrives)
 
 
 def _edges(comparison, name, r, g, on) -> Candidates:
@@ -181,7 +212,7 @@ def _edges(comparison, name, r, g, on) -> Candidates:
 def _motion(comparison, name, r, g, on) -> Candidates:
     gpu, ref, camera = comparison.gpu, comparison.ref, comparison.ref.scene.camera
     yield "in clip units instead of px (0.5 * image_size is missing)", r * 2 / np.array([camera.width, camera.height])
-    if name == "velocity":
+    if name.startswith("velocity"):
         yield "the perspective division is missing (not divided by Z)", r * ref["depth"][on][:, None]
         yield "per label interval instead of per second", r * gpu.when.interval_s
         return
@@ -203,6 +234,6 @@ _SPECIFIC = {
     "luminance": _shaded,
     "colour": _shaded,
     **dict.fromkeys(("luminance_edges", "rate_edges", "colour_edges"), _edges),
-    **dict.fromkeys(("velocity", "flow_forward", "flow_backward"), _motion),
+    **dict.fromkeys(("velocity", "velocity_pass", "flow_forward", "flow_backward"), _motion),
 }
 """Mistakes of a look-up, or of a buffer, by its name."""

@@ -24,6 +24,7 @@ def kinds() -> list[Kind]:
         for deformer in DEFORMERS.values()
         for sizes in deformer.examples
     }
+    # Of materials each extra by itself, and all of them on a shape that changes.
     surfaces = [Kind(True, False, False, masked=True, more=("TINTED",), hued=True)]
     for hued in (False, True):
         surfaces += [Kind(True, True, False, hued=hued, more=more) for more in SURFACES]
@@ -63,6 +64,7 @@ def _defines(program: str, passes: Iterable[type[Pass]]) -> list[dict[str, Any]]
         for pass_ in one.every_kind() if one.program == program else ():
             for kind in kinds() if isinstance(pass_, ScenePass) else [None]:
                 plain = pass_.defines(kind) | (kind.defines(pass_.lit) if kind is not None else {})
+                # Fog does not look at the material: the plainest and the fullest stand for all.
                 foggy = pass_.lit and kind in (KINDS[0], KINDS[-1])
                 for more in (*_lights(pass_, kind), *([{"FOG": 1}] if foggy else [])):
                     defines = plain | more

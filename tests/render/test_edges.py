@@ -389,8 +389,8 @@ def filtered_twice(gl, world, t_ns: int) -> tuple[np.ndarray, np.ndarray, np.nda
         moment = renderer.moment(t_ns)
         pixels, crossings = Lines().in_pixels(moment, moment.visible, renderer.width, renderer.height)
         focal = 0.5 * renderer.width * abs(moment.view.projection[0, 0])
-        twin = filtered_slowly(picture, depths, pixels, crossings, 1 / focal)
-        return picture, renderer.luminance(t_ns).read(), twin
+        written = renderer.luminance(t_ns).read()
+        return picture, written, filtered_slowly(picture, depths, pixels, crossings, 1 / focal, written)
 
 
 @pytest.mark.parametrize("world", WORLDS)

@@ -245,14 +245,3 @@ def test_another_part_of_the_same_lens(gl):
             true = reference.render(scene.with_camera(part), T)
             hit = true.hit
             within(np.abs(depth[hit] / true.depth[hit] - 1), 5e-6)
-
-
-def test_the_shader_debugger_looks_at_the_flat_picture(tmp_path):
-    from blinkgl.shader_debugger.session import open_subject
-
-    config = tmp_path / "run.yaml"
-    config.write_text(
-        "camera: {width: 32, height: 24, lens: radtan, distortion: [-0.2, 0, 0, 0]}\nscene: {objects: {count: 1}}"
-    )
-    camera = open_subject(str(config)).scene.camera
-    assert isinstance(camera, PinHole) and camera.width > 45

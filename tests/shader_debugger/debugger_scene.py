@@ -135,7 +135,7 @@ LOOKUP_MISTAKES = {
     ),
     "width and height exchanged": (
         [("include/motion.glsl", "* INVERSE_DEPTH * 0.5 * image_size;", "* INVERSE_DEPTH * 0.5 * image_size.yx;")],
-        "velocity",
+        "velocity_pass",
         "x is 0.75 times, y 1.333 times",
         {"floor", "ball", "box", "passing"},
     ),

@@ -23,18 +23,17 @@ class Judge:
     """Names the buffers of one moment that are over their tolerance with other shaders."""
 
     def __init__(self, renderer, subject, when):
-        self.renderer, self.when, self.log_eps = renderer, when, subject.log_eps
-        self.right = moments.GpuMoment(renderer, when, subject.log_eps)
+        self.renderer, self.when = renderer, when
+        self.right = moments.GpuMoment(renderer, when)
         self.comparison = compare.Comparison(self.right, moments.open_reference(subject, when, renderer.maps))
 
     def wrong(self, loader: ShaderLoader) -> list[str]:
         """Those of the first pass that has one."""
-        gpu = moments.GpuMoment(self.renderer, self.when, self.log_eps)
-        gpu.keep(self.right, ("part", "triangle", "local"))
-        comparison = self.comparison.of(gpu)
+        gpu = moments.GpuMoment(self.renderer, self.when)
         ours = self.renderer.gl.shaders
         self.renderer.use_shaders(loader)
         try:
+            comparison = compare.Comparison(gpu, self.comparison.ref)
             for of in ("shadow_map", "luminance", "colour"):
                 names = [n for n in comparison.names() if n.startswith(of) and n not in LOOKUPS]
                 if found := [n for n in names if not comparison.report(n).passed]:

@@ -12,6 +12,9 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -20,7 +23,7 @@ from PIL import Image
 from blinkgl.shader_debugger.moments import buffers_of
 from blinkgl.shader_debugger.server import LOCAL, DebugServer, host_allowed
 from blinkgl.shader_debugger.session import moment, open_subject
-from blinkgl.shader_debugger.silhouettes import edged_of
+from blinkgl.shader_debugger.twins import twinned_of
 from debugger_scene import HEIGHT, WIDTH, copy_shaders, edit
 
 
@@ -36,7 +39,7 @@ def served(config, tmp_path_factory):
 def buffers(config: str) -> dict:
     """What the page has of this configuration."""
     subject = open_subject(config)
-    return buffers_of(subject.scene, edged_of(subject.config))
+    return buffers_of(subject.scene, twinned_of(subject.config, subject.scene))
 
 
 def ask(server, path: str, method: str = "GET", host: str | None = None):
@@ -245,8 +248,16 @@ def test_edits_are_taken_errors_keep_the_last_good_program(served):
     )
     assert depth_at(server) == pytest.approx(2 * before, rel=1e-6)  # the last good program
 
+    vertex = folder / "include/vertex.glsl"
+    whole = vertex.read_text()
+    edit(vertex, "vec3 position = in_position;", "vec3 position = vec3(0.0);")
     label.write_text(good)
-    mended = next_version(server, broken["version"])
+    unused = next_version(server, broken["version"])
+    assert unused["generation"] == now["generation"]
+    assert "the shader does not use 'in_position' any more" in unused["errors"][0]["text"]
+
+    vertex.write_text(whole)
+    mended = next_version(server, unused["version"])
     assert mended["errors"] == [] and mended["generation"] == now["generation"] + 1
     assert depth_at(server) == before
 
@@ -256,6 +267,18 @@ def test_broken_from_the_start_is_one_error(shader, config, tmp_path):
     edit(folder / "luminance.glsl", "luminance = albedo;", "luminance = albedo")
     status, out, err = shader("serve", config, "--shaders", folder, "--port", 0)
     assert status == 2 and out == "" and err.startswith("error: luminance.glsl:")
+
+
+def test_the_end_does_not_wait_for_long_polls(config):
+    """Pages that wait for an edit are answered at once, and their threads are gone."""
+    subject = open_subject(config)
+    with ThreadPoolExecutor(2) as pages, DebugServer(subject, moment(subject)) as server:
+        polls = [pages.submit(ask, server, "/wait?version=1") for _ in range(2)]
+        while sum("process_request_thread" in thread.name for thread in threading.enumerate()) < 2:
+            time.sleep(0.01)
+        started = time.monotonic()
+        server.close()
+        assert all(poll.result()[0] == 400 for poll in polls) and time.monotonic() - started < 1
 
 
 @pytest.fixture

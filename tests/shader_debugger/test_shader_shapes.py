@@ -6,6 +6,10 @@ import json
 
 import pytest
 
+from blinkgl.gl import ShaderLoader, create_context
+from blinkgl.gl.shader import ShaderError
+from blinkgl.render.renderer import Renderer
+from blinkgl.shader_debugger.session import open_subject
 from debugger_scene import edit
 from tests.scene.gltf_files import arm_file
 
@@ -136,7 +140,7 @@ def test_shapes_that_change_are_what_the_reference_makes_of_them(shader, living)
     status, out, _ = shader("diff", living, "--json")
     reports = {b["buffer"]: b for b in json.loads(out)["buffers"]}
     assert status == 0, [name for name, report in reports.items() if not report["passed"]]
-    assert {"flow_forward", "flow_backward", "velocity", "normals", "depth", "id", "local", "dL_dt"} <= reports.keys()
+    assert {"flow_forward", "flow_backward", "velocity", "normals", "depth", "id", "local"} <= reports.keys()
     status, out, _ = shader("probe", living, "--pixel", "20,18")
     assert status == 0 and not [line for line in out.splitlines() if line.startswith("!!")]
 
@@ -159,3 +163,33 @@ def test_a_mistake_in_a_term_is_found(shader, living, shaders, mutant):
         assert not reports[buffer]["passed"], buffer
         if who is not None:
             assert reports[buffer]["objects"][0]["object"] == who, buffer  # the worst first
+
+
+@pytest.mark.parametrize(
+    "wrong, status, words",
+    [
+        # With every vertex at one place the compiler leaves no attribute at all.
+        ("return vec3(0.0);", 2, "error: debug.glsl: the shader does not use 'in_position' any more"),
+        ("return p;", 1, "label.glsl: the shader does not use 'in_weights_0' any more"),
+    ],
+)
+def test_what_the_compiler_removed_is_named(shader, living, shaders, wrong, status, words):
+    edit(shaders / SKIN, "return vec4(p + skin_morphed(0, 0), 1.0) * skin_blend(0);", wrong)
+    got, out, err = shader("diff", living, "--shaders", shaders, "--pass", "depth", "--pass", "local")
+    assert got == status and "Traceback" not in err
+    assert any(line.startswith(words) for line in (out + err).splitlines()), out + err
+
+
+def test_a_run_with_edited_shaders_names_what_they_do_not_use(living, shaders):
+    """As `generate` draws: without the debugger's painter, which goes on."""
+    edit(shaders / SKIN, "return vec4(p + skin_morphed(0, 0), 1.0) * skin_blend(0);", "return vec3(0.0);")
+    subject = open_subject(living)
+    with create_context() as gl:
+        gl.shaders = ShaderLoader(gl.ctx, shaders)
+        with Renderer(gl, subject.scene, subject.config.render) as renderer:
+            with pytest.raises(ShaderError, match=r"^luminance.glsl: the shader does not use 'in_position' any more"):
+                renderer.luminance(0)
+            gl.shaders.clear()
+            edit(shaders / "include/motion.glsl", "vec3 d = rate * vec4(local, 1.0);", "vec3 d = local;")
+            with pytest.raises(ShaderError, match=r"^velocity.glsl: the shader does not use 'rate' any more"):
+                renderer.velocity(0)

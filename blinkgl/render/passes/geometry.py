@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from blinkgl.gl.shader import MADE
+from blinkgl.gl.shader import MADE, ShaderError
 from blinkgl.labels import LABELS
 from blinkgl.labels.shader import define_of, includes
 from blinkgl.render.passes.base import Output, Pass, ScenePass, Shot
@@ -117,7 +117,10 @@ class Geometry(ScenePass):
             # A uniform that the compiler removed is not in the program.
             try:
                 uniforms[name]
-            except KeyError:
+            except ShaderError:
+                # A file of the shader folder that somebody edited is no mistake of the label's class.
+                if LABELS[label].glsl is None:
+                    raise
                 raise TypeError(f"label '{label}': `uniforms` gives '{name}', which its `glsl` does not use") from None
 
     @classmethod

@@ -196,9 +196,11 @@ async function compare() {
     const found = await (await get("verdict", { t })).json();
     compared = t;
     box.className = found.passed ? "good" : "bad";
-    box.textContent = found.passed ? `t = ${t} s: all ${found.compared} buffers agree with the reference`
-      : `t = ${t} s: the first that is wrong is ${found.first.title} (${found.first.source})` +
-        found.first.suspicions.slice(0, 1).map((s) => `; it looks as if: ${s}`).join("");
+    const unused = found.unused.map(([program, name]) => `${program}: the shader does not use '${name}' any more`);
+    const said = found.first ? `the first that is wrong is ${found.first.title} (${found.first.source})` +
+        found.first.suspicions.slice(0, 1).map((s) => `; it looks as if: ${s}`).join("")
+      : `all ${found.compared} buffers agree with the reference`;
+    box.textContent = `t = ${t} s: ${[...unused, said, found.not_graded].join("; ")}`;
     table.replaceChildren(row(["object", "first wrong", "px over", "of", "worst at", "then also", "looks as if"], "th"));
     for (const o of found.objects) {
       const place = element("a", `${o.x}, ${o.y}`);

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field
 
-from blinkgl.config.base import Config, Refused, one_of, rule
+from blinkgl.config.base import Config, Refused, Removed, one_of, rule
 from blinkgl.config.materials import Radiance
 from blinkgl.config.values import (
     Color,
@@ -80,8 +80,8 @@ class EnvironmentConfig(Config):
         1.0, description="factor on its radiance, which is exposed so that its 90th percentile is 0.8"
     )
     heading: float = Field(0.0, ge=-360, le=360, description="degrees by which it is turned from +x towards +y")
-    visible: bool = Field(True, description="whether it is drawn, as a box around everything")
-    size: float = Field(100.0, gt=0, le=1e6, description="edge of that box, m; it stands around the world's origin")
+    visible: bool = Field(True, description="whether it is drawn, as a sky at infinity")
+    removed: ClassVar = {"size": Removed("no size: a panorama is at infinity", lambda value: value == 100)}
 
 
 class LightConfig(Config):

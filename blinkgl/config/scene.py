@@ -113,7 +113,8 @@ class SkyConfig(Config):
     brightness: PositiveRange = Field((0.6, 1.1), description="factor on the texture's radiance; uniform")
     panoramas: Paths = Field(
         (),
-        description="equirectangular images or folders of them (jpg, png, hdr, exr) used instead of the texture pool",
+        description="equirectangular images or folders of them (jpg, png, hdr, exr) drawn at infinity in the place of "
+        "the box, whose size is the ground's alone then",
     )
     lights: bool = Field(
         False,

@@ -8,6 +8,7 @@ import numpy as np
 
 from blinkgl.labels import grading
 from blinkgl.labels.label import Drawn, Label
+from blinkgl.scene.types import FARTHEST
 
 if TYPE_CHECKING:
     from blinkgl.render.reference import ReferenceFrame
@@ -18,7 +19,7 @@ _SHARE = 0.95
 
 
 class Depth(Label):
-    """(H, W) float32 world units along the optical axis; inf: nothing hit."""
+    """(H, W) float32 world units along the optical axis; inf: nothing hit, or a panorama's sky."""
 
     name = "depth"
     unit, kind = "world units", "depth"
@@ -28,7 +29,7 @@ class Depth(Label):
 
     def finish(self, drawn: Drawn) -> np.ndarray:
         raw = drawn.raw("depth")
-        return np.where(raw > 0, raw, np.float32(np.inf))
+        return np.where((raw > 0) & (raw < FARTHEST), raw, np.float32(np.inf))
 
     def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
-        return frame.depth
+        return np.where(frame.depth < FARTHEST, frame.depth, np.inf)

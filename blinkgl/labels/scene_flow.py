@@ -37,6 +37,8 @@ class SceneFlow(Label):
         to_camera = now.T_world_cam[:3, :3].T
         # Differences of poses, so that what stands still has exactly nothing.
         change = to_camera @ (then.T_world_obj - now.T_world_obj)[:, :3]
+        # A sky at infinity stands still: its box is only drawn where the camera is.
+        change[[thing.at_infinity for thing in shot.scene.objects]] = 0.0
         of_clip = to_camera @ then.T_world_cam[:3, :3] @ np.linalg.inv(then.view.projection[[0, 1, 3], :3])
         return {"change_in_space": change, "space_from_clip": np.tile(of_clip, (len(change), 1, 1))}
 

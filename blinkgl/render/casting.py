@@ -303,9 +303,16 @@ def moved_in_space(scene: Scene, hits: Hits, t_ns: int) -> np.ndarray:
     ``hits.t_ns``; nan where nothing is hit."""
     # The shape's own change, and the pose's.
     own = replace(hits, local=local_at(scene, hits, t_ns) - hits.local)
-    carried = applied(scene, hits, lambda thing: (thing.path.pose(t_ns) - thing.path.pose(hits.t_ns))[:3])
+    carried = applied(scene, hits, lambda thing: _pose_change(thing, hits.t_ns, t_ns))
     changed = applied(scene, own, lambda thing: np.c_[thing.path.pose(t_ns)[:3, :3], np.zeros(3)])
     return (carried + changed) @ scene.camera_path.pose(hits.t_ns)[:3, :3]
+
+
+def _pose_change(thing: SceneObject, t0_ns: int, t1_ns: int) -> np.ndarray:
+    """(3, 4) difference of two poses; zero of a sky at infinity, whose box is only drawn where the camera is."""
+    if thing.at_infinity:
+        return np.zeros((3, 4))
+    return (thing.path.pose(t1_ns) - thing.path.pose(t0_ns))[:3]
 
 
 def is_seen(

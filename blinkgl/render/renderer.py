@@ -91,7 +91,9 @@ class Renderer:
         )
         self._painter = painter(gl, scene, resources, self.stats)
         self._painter.lens = Lens.of(gl, scene.camera)
-        self._moments = Moments(scene, self.items, None if beside is None else beside._moments.bodies)  # noqa: SLF001
+        # A sky at infinity is around each camera, elsewhere for every one.
+        shared = beside is not None and not any(o.at_infinity for o in scene.objects)
+        self._moments = Moments(scene, self.items, beside._moments.bodies if shared else None)  # noqa: SLF001
         self._canvases: dict[tuple[Pass, int, int], Canvas] = {}
         self._common: dict[tuple[Pass, int, int], Canvas] = {} if beside is None else beside._common  # noqa: SLF001
         self._last: dict[Pass, Frame] = {} if beside is None else beside._last  # noqa: SLF001

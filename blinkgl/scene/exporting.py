@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from blinkgl.camera import PinHole
 from blinkgl.errors import OutputError
 from blinkgl.scene.lights import LUMENS_PER_WATT
-from blinkgl.scene.types import Lamp, Map, Material, Mesh, Part, PosePath, Scene, SceneObject, Texture, Wrap
+from blinkgl.scene.types import FARTHEST, Lamp, Map, Material, Mesh, Part, PosePath, Scene, SceneObject, Texture, Wrap
 from blinkgl.srgb import to_srgb8
 
 ANIMATION = "sequence"
@@ -27,6 +27,8 @@ _LONGEST = 2**32 - 1
 _FLOAT, _BYTE, _INDEX = 5126, 5121, 5125
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 _WRAPS: dict[Wrap, int] = {"repeat": 10497, "mirror": 33648, "clamp": 33071}
+_SKY = 100.0
+"""World units of a glTF file that stand for ``FARTHEST`` there: players have a far plane."""
 _Y_UP = [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
 """Quaternion x, y, z, w from the world, z up, to glTF's axes."""
 _CV_TO_GL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -93,6 +95,9 @@ class _Writer:
     def _object(self, one: SceneObject) -> int:
         extras = {"instance_id": one.instance_id, "category": one.category}
         node = self._node(one.name, one.path, extras=extras, mesh=self._mesh(one))
+        if one.at_infinity:
+            self.lists["nodes"][node]["scale"] = [_SKY / FARTHEST] * 3
+            self.said.append(f"the sky's distance: it is a box at {16 * _SKY:g} units around the camera")
         if one.deforms:
             count = len(self.shape_times_ns)
             self._animate(node, "weights", self.shape_times_ns, np.eye(count, dtype=np.float32).reshape(-1))

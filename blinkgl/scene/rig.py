@@ -16,7 +16,7 @@ from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import ConfigError
-from blinkgl.scene.motion.paths import OffsetPath
+from blinkgl.scene.motion.paths import OffsetPath, SharedOriginPath
 from blinkgl.scene.types import PosePath
 
 
@@ -68,6 +68,11 @@ class Rig:
         if np.array_equal(sensor.T_rig_cam, np.eye(4)):
             return self.path
         return OffsetPath(self.path, sensor.T_rig_cam)
+
+    def path_of_sky(self) -> PosePath:
+        """T_world_sky over time, of the sky that the first sensor sees: at infinity all directions are the same
+        wherever the camera is, as in a box that is always around it."""
+        return SharedOriginPath(self.path_of(self.sensors[0]))
 
     def with_first(self, **changes: Any) -> Rig:
         """With other values in the first sensor."""

@@ -87,6 +87,9 @@ class Texture:
 
 
 Wrap = Literal["repeat", "mirror", "clamp"]
+FARTHEST = 2.0**36
+"""World units: what is farther along the optical axis has an infinite depth. A sky is a box 16 times as large: a power
+of two, by which float32 multiplies without rounding, and whose square is far below float32's limit."""
 REPEAT: tuple[Wrap, Wrap] = ("repeat", "repeat")
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 
@@ -177,13 +180,17 @@ class Part:
 @dataclass(frozen=True, eq=False)
 class SceneObject:
     """A body on its path, rigid but for parts that deform. ``instance_id`` >= 1 is what the id pass writes (0 is
-    'nothing hit')."""
+    'nothing hit').
+
+    at_infinity : a sky whose points are at no distance but in a direction. Its vertices are :data:`FARTHEST` from its
+    origin or farther, and the scene puts it around whichever camera looks (:meth:`Rig.path_of_sky`)."""
 
     name: str
     instance_id: int
     parts: tuple[Part, ...]
     path: PosePath
     category: Literal["object", "ground", "wall", "sky"] = "object"
+    at_infinity: bool = False
 
     @property
     def deforms(self) -> bool:
@@ -327,6 +334,12 @@ class Scene:
     omissions: tuple[str, ...] = field(default=())
     dynamics: Dynamics | None = None
     fog: Fog | None = None
+
+    def __post_init__(self) -> None:
+        if any(thing.at_infinity for thing in self.objects):
+            sky = self.rig.path_of_sky()
+            placed = tuple(replace(thing, path=sky) if thing.at_infinity else thing for thing in self.objects)
+            object.__setattr__(self, "objects", placed)
 
     @property
     def backdrop(self) -> float:

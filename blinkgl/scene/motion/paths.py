@@ -297,6 +297,34 @@ class OffsetPath:
         return (v + w * self._arm) * _BOUND_MARGIN, w
 
 
+class SharedOriginPath:
+    """A body that stays where another is and does not turn with it: the sky around a camera."""
+
+    def __init__(self, path: PosePath):
+        self.path, self.t0_ns, self.t1_ns = path, path.t0_ns, path.t1_ns
+
+    @property
+    def is_static(self) -> bool:
+        return self.path.is_static
+
+    def pose(self, t_ns: int) -> np.ndarray:
+        return self.poses(np.array([t_ns], np.int64))[0]
+
+    def derivative(self, t_ns: int) -> np.ndarray:
+        out = self.path.derivative(t_ns)
+        out[:3, :3] = 0.0
+        return out
+
+    def poses(self, t_ns: np.ndarray) -> np.ndarray:
+        out = np.tile(np.eye(4), (len(t_ns), 1, 1))
+        # One by one: the renderer asks the camera's path for one pose, and both have to be the same to the last bit.
+        out[:, :3, 3] = [self.path.pose(int(t))[:3, 3] for t in t_ns]
+        return out
+
+    def speed_bound(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
+        return self.path.speed_bound(ta_ns, tb_ns)[0], 0.0
+
+
 def smoothed(
     t_ns: np.ndarray, positions: np.ndarray, rotations: Rotation, aside_ns: int
 ) -> tuple[np.ndarray, Rotation]:

@@ -40,7 +40,7 @@ from blinkgl.scene.shapes.deformer import filled, gait
 from blinkgl.scene.surfaces.images import SKY_SIDES
 from blinkgl.scene.types import Lamp, Light, Material, Mesh, Part, PosePath, Scene, SceneObject
 from blinkgl.scene.worlds.pool import Pool, object_pool, texture_pool
-from blinkgl.scene.worlds.sky import PANORAMA_INSET, Panorama, drawn_panorama, panorama_light, sky_box
+from blinkgl.scene.worlds.sky import Panorama, drawn_panorama, panorama_light, panorama_sky, sky_box
 
 _PLACEMENTS = 300  # positions tried for an object before it is left out
 _CAMERA_PATHS = 6  # camera paths tried for one that runs into nothing; the last is cut where it does
@@ -86,7 +86,8 @@ def random_world(
         )
         items.append((one.name, "object", one.parts, path))
     scene_objects = tuple(
-        SceneObject(name, k + 1, parts, motion, category) for k, (name, category, parts, motion) in enumerate(items)
+        SceneObject(name, k + 1, parts, motion, category, category == "sky" and panorama is not None)
+        for k, (name, category, parts, motion) in enumerate(items)
     )
     camera_paths = (
         random_camera_path(rng_motion, t0_ns, t1_ns, config.camera_motion, room.for_camera(), clearance, target, T_cam)
@@ -431,18 +432,17 @@ def _sides(config: RandomSceneConfig, floor: float) -> list[Barrier]:
 
 
 def _sky(config: SkyConfig, textures: Pool, rng, split, base, log) -> tuple[tuple[Part, ...], Panorama | None]:
-    """The box around everything, and the panorama that is on it."""
+    """The box around everything and None, or a sky at infinity and the panorama that is on it."""
     brightness = float(rng.uniform(*config.brightness))
-    repeats, inset = _log_uniform(rng, config.repeat), 1.0
-    panorama = None
+    repeats = _log_uniform(rng, config.repeat)
     if config.panoramas:
         panorama = drawn_panorama(config, rng, split, textures.test_fraction, base, brightness)
-        images, repeats, inset = panorama.sides, 1.0, PANORAMA_INSET
-    elif config.per_face:
+        return panorama_sky(panorama.sides, brightness), panorama
+    if config.per_face:
         images = [textures.draw(rng, split, log) for _ in SKY_SIDES]
     else:
         images = [textures.draw(rng, split, log)] * len(SKY_SIDES)
-    return sky_box(config.size, config.subdivisions, images, brightness, repeats, inset), panorama
+    return sky_box(config.size, config.subdivisions, images, brightness, repeats), None
 
 
 def _shift(z: float) -> np.ndarray:

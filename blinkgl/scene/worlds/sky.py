@@ -1,4 +1,4 @@
-"""The sky as a box of pictures around everything, and a panorama as both picture and light."""
+"""The sky: a box of pictures around everything, or a panorama at infinity, which can be the light, too."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from blinkgl.scene.surfaces.images import (
     load_panorama,
     shrink,
 )
-from blinkgl.scene.types import Light, Material, Mesh, Part, SceneObject, Texture
+from blinkgl.scene.types import FARTHEST, Light, Material, Mesh, Part, SceneObject, Texture
 from blinkgl.scene.worlds.pool import files_below, resolve, split_of
 
 _MARGIN = 1 / 16
@@ -57,8 +57,15 @@ def sky_box(
     return tuple(parts)
 
 
+def panorama_sky(textures: Sequence[Texture], brightness: float) -> tuple[Part, ...]:
+    """A panorama of :func:`panorama_textures` as the parts of a sky at infinity.
+
+    The box is so large that a view of 140 degrees, too, has no side nearer than ``FARTHEST`` along its axis."""
+    return sky_box(32 * FARTHEST, 4, textures, brightness, 1.0, PANORAMA_INSET)
+
+
 def panorama_textures(image: np.ndarray, name: str, digest: str) -> list[Texture]:
-    """Six textures for :func:`sky_box` of an equirectangular image, to be shown with :data:`PANORAMA_INSET`."""
+    """Six textures of an equirectangular image, for :func:`panorama_sky`."""
     sides = cube_faces(image, max(image.shape[1] // 4, 1), _MARGIN)
     return [
         Texture(side, f"{name} side {k}", content_hash(digest.encode(), bytes([k]))) for k, side in enumerate(sides)
@@ -90,9 +97,9 @@ def with_environment(
         image = shrink(load_image(file), 4096)
         image = np.roll(image, -round(config.heading / 360 * image.shape[1]), axis=1)
         textures = panorama_textures(image, file.stem, content_hash(contents(file, "image"), repr(config).encode()))
-        parts = sky_box(config.size, 4, textures, config.strength, 1.0, PANORAMA_INSET)
+        parts = panorama_sky(textures, config.strength)
         number = 1 + max((thing.instance_id for thing in objects), default=0)
-        objects = (*objects, SceneObject("sky", number, parts, StaticPath(), "sky"))
+        objects = (*objects, SceneObject("sky", number, parts, StaticPath(), "sky", at_infinity=True))
     return light, objects
 
 

@@ -15,7 +15,7 @@ PIP = .venv/bin/python -m pip --disable-pip-version-check
 INSTALL = PYTHONWARNINGS=ignore $(PIP) install --quiet --no-build-isolation -c constraints.txt
 COVERED = if [ -f .coverage ]; then .venv/bin/python -m coverage report --sort=cover --skip-covered | tail -n 40; \
 	else echo "coverage: not measured here yet (make coverage)"; fi
-INPUTS = setup.cfg pyproject.toml constraints.txt tools/setup.sh Makefile
+INPUTS = setup.cfg setup.py pyproject.toml constraints.txt tools/setup.sh Makefile
 
 .PHONY: demo test lint format coverage docs slow bench fuzz doctor setup opengl clean
 .DELETE_ON_ERROR:

@@ -347,7 +347,9 @@ def simulate(
     ] = None,
     gamma: Annotated[
         str | None,
-        typer.Option(help="srgb, linear or an exponent (default: srgb for integer pixels, linear for floats)."),
+        typer.Option(
+            help="srgb, linear or an exponent (default: linear for floats and frames of a recording, else srgb)."
+        ),
     ] = None,
     interpolate: Annotated[str, typer.Option(help="Between frames: linear, or motion (dense-flow warp).")] = "linear",
     max_px: Annotated[float, typer.Option(min=0.01, help="motion: largest displacement per step, px.")] = 1.0,
@@ -389,7 +391,9 @@ def compare(
     out: Annotated[str | None, typer.Option("--out", "-o", help="Folder for compare.json and compare.png.")] = None,
     fps: Annotated[float | None, typer.Option(help="Frame rate of the frames.")] = None,
     timestamps: Annotated[str | None, typer.Option(help="Frame times.")] = None,
-    gamma: Annotated[str, typer.Option(help="Of the frames: linear, srgb or an exponent.")] = "linear",
+    gamma: Annotated[
+        str, typer.Option(help="Of the frames: linear, srgb or an exponent (simulate takes integers as srgb).")
+    ] = "linear",
     frame_delay_ms: Annotated[float, typer.Option(help="Added to the frame times, ms.")] = 0.0,
     interval_ms: Annotated[float, typer.Option(min=0.001, help="Interval where there are no frames, ms.")] = 20.0,
     zero_time: Annotated[bool, typer.Option("--zero-time", help="Count both from their first event.")] = False,
@@ -440,7 +444,9 @@ def calibrate(
     ] = None,
     fps: Annotated[float | None, typer.Option(help="Frame rate of the frames.")] = None,
     timestamps: Annotated[str | None, typer.Option(help="Frame times.")] = None,
-    gamma: Annotated[str, typer.Option(help="Of the frames: linear, srgb or an exponent.")] = "linear",
+    gamma: Annotated[
+        str, typer.Option(help="Of the frames: linear, srgb or an exponent (simulate takes integers as srgb).")
+    ] = "linear",
     interpolate: Annotated[str, typer.Option(help="Between frames: motion (dense-flow warp) or linear.")] = "motion",
     max_px: Annotated[float, typer.Option(min=0.01, help="motion: largest displacement per step, px.")] = 1.0,
     frame_delay_ms: Annotated[
@@ -481,8 +487,8 @@ def convert(
         str,
         typer.Argument(
             metavar="IN",
-            help="Event file: DSEC/BlinkFlow/MVSEC/Prophesee .h5, EVT2/EVT3 .raw, .aedat4, .aedat, .txt, .csv, "
-            ".npz, .npy.",
+            help="Event file: DSEC/BlinkFlow/MVSEC/Prophesee .h5, EVT2/EVT2.1/EVT3 .raw, .aedat4, .aedat, .es, "
+            ".mat, .txt, .csv, .npz, .npy.",
         ),
     ],
     target: Annotated[str, typer.Argument(metavar="OUT", help="Event file; its ending names the format.")],

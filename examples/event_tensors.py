@@ -19,7 +19,7 @@ def main(out: Path) -> None:
     scene = Scene(Camera(160, 120, pose=flight), duration=0.1) + Primitive(
         "cuboid", material=Material(procedural="bricks")
     )
-    recording = record(scene, labels=["flow"])
+    recording = record(scene, labels=["forward"])
     events, t0, t1 = recording.window(0), int(recording.t_us[0]), int(recording.image_t_us[1])
 
     last = np.full((120, 160), -np.inf)

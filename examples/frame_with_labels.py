@@ -24,7 +24,7 @@ def main(out: Path) -> None:
 
     with Renderer(scene) as renderer:
         image = renderer.image(0.1)
-        frame = renderer.frame(0.1, ["depth", "ids", "flow", "occlusion"], to=0.15)  # flow from 0.10 s to 0.15 s
+        frame = renderer.frame(0.1, ["depth", "ids", "forward", "occlusion"], to=0.15)  # flow from 0.10 s to 0.15 s
     np.savez(out / "labels.npz", depth=frame.depth, ids=frame.ids, flow=frame.forward.flow, valid=frame.forward.valid)
 
     speed = np.linalg.norm(frame.forward.flow, axis=-1)

@@ -29,7 +29,7 @@ def main(out: Path) -> None:
     bends = Deform("bend", angle=25, period=0.8)
     scene += Primitive("cuboid", extents=(0.4, 0.4, 1.4), material=tower, pose=(2.8, 0.95, 0.7), deform=bends)
 
-    recording = record(scene, labels=("images", "flow", "ids"))
+    recording = record(scene, labels=("images", "forward", "ids"))
     imageio.imwrite(out / "living.png", recording.images[1])
     label = recording.labels[0]
     np.savez(out / "recording.npz", t=recording.events.t, flow=recording.flow[0], ids=label.ids)

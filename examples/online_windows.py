@@ -26,7 +26,7 @@ def samples(scene: Scene) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]
     """Of every label: signed counts of the events until the next one (BINS, H, W), the flow until
     then (2, H, W), px, and its mask (H, W)."""
     truth, window = None, []
-    for item in simulate_sequence(scene, labels=["flow"]):
+    for item in simulate_sequence(scene, labels=["forward"]):
         if isinstance(item, EventChunk):
             window.append(item.events)
         elif isinstance(item, GroundTruth):  # every event before its time has come, and no other

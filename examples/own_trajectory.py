@@ -22,7 +22,7 @@ def main(out: Path) -> None:
     flight = Keyframes({t: look_at(position(t), (0, 0, 0)) for t in times}, interpolation="spline")
     scene = Scene(Camera(160, 120, fov=50, pose=flight), duration=0.3, label_rate=10, background=0.1)
     scene += Primitive("cylinder", radius=0.5, height=3, material=Material(procedural="glyphs", uv_scale=(4, 4)))
-    recording = record(scene, timeline=Timeline("uniform", fps=400), labels=["flow"])
+    recording = record(scene, timeline=Timeline("uniform", fps=400), labels=["forward"])
 
     middle = recording.flow[0][50:70, 76:84]
     np.save(out / "middle.npy", middle)

@@ -99,7 +99,7 @@ def test_a_scene_in_python_is_the_scene_of_its_yaml():
 
 def test_record_is_what_generate_writes(tmp_path):
     scene = box_scene()
-    labels = ("images", "flow", "flow_backward", "occlusion", "depth")
+    labels = ("images", "forward", "backward", "occlusion", "depth")
     recording = blinkgl.record(scene, emulator={"emulator": "v2e", "cutoff_hz": 100}, sensor="davis346", labels=labels)
     outcome = blinkgl.generate(
         scene, tmp_path / "out", emulator={"emulator": "v2e", "cutoff_hz": 100}, sensor="davis346", labels=labels
@@ -208,7 +208,7 @@ WRONG = [
     ("Mesh.faces", lambda d: b.Mesh(vertices=triangle["vertices"], faces=[[0, 1, 7]])),
     ("Mesh.vertices", lambda d: b.Mesh(vertices=[[0, 1], [2]], faces=[[0, 1, 2]])),
     ("Mesh.uvs", lambda d: b.Mesh(**triangle, uvs=[[0, 0]])),
-    ("scene.meshes.mesh0.file", lambda d: b.record(S() + b.Mesh(d / "none.obj"))),
+    ("Mesh.file", lambda d: b.record(S() + b.Mesh(d / "none.obj"))),
     ("Material.image", lambda d: M(np.zeros((4, 4)))),
     ("Material.image", lambda d: M(np.full((4, 4, 3), -1.0))),
     ("Material.color", lambda d: M(color="red")),
@@ -218,13 +218,13 @@ WRONG = [
     ("Light.shadow_size", lambda d: b.Light(shadow_size=3)),
     ("Light.environment", lambda d: b.Light(environment="park.hdr")),
     ("Light.environment.map", lambda d: b.Light(environment={"heading": 3})),
-    ("scene.light.environment.map", lambda d: b.record(box_scene(light=b.Light(environment={"map": "none.hdr"})))),
+    ("Light.environment.map", lambda d: b.record(box_scene(light=b.Light(environment={"map": "none.hdr"})))),
     ("Scene.camera", lambda d: S("camera")),
     ("Scene.objects[0]", lambda d: S(objects=["box"])),
     ("Scene.duration", lambda d: S(duration=-1)),
     ("Scene.label_rate", lambda d: S(label_rate="often")),
     ("Scene.seed", lambda d: S(seed=-1)),
-    ("labels", lambda d: b.record(box_scene(), labels=[["flow"]])),
+    ("labels", lambda d: b.record(box_scene(), labels=[["forward"]])),
     ("Scene.background", lambda d: S(background="x") + P("cuboid")),
     ("Scene + …", lambda d: S() + 3),
     ("Scene.objects", lambda d: b.record(S())),
@@ -330,6 +330,46 @@ def test_wrong_calls_name_the_argument(where, call, tmp_path):
     assert line.startswith(where.format(d=tmp_path) + ": ") and "\n" not in line, line
     assert len(line) < 400 and "pydantic" not in line
     assert list(tmp_path.iterdir()) == [], "half-written"
+
+
+WHAT_TO_DO = [
+    (lambda: b.record(box_scene(), contrast_threshold=0.3), "expected emulator={'emulator': 'esim', 'contrast_thresh"),
+    (lambda: b.record(box_scene(), emulater="esim"), "expected 'emulator' (nearest)"),
+    (lambda: b.record(box_scene(), labels="forward"), "expected a list of names of labels"),
+    (lambda: b.record(box_scene(), labels=["flow"]), "expected 'forward', as in labels.flow of a YAML"),
+    (lambda: b.render_frame(box_scene(), 0, ["flow_backward"]), "expected 'backward', as in labels.flow of a YAML"),
+    (lambda: b.record("demo.yaml"), "expected a Scene, or what load(path) gives"),
+    (lambda: b.generate(box_scene(), "/tmp/x", nums=3), "expected 'num' (nearest)"),
+    (lambda: b.generate(box_scene()), "missing a required argument: 'out'; expected generate(source, out, "),
+    (lambda: b.Mesh("none.glb"), "Mesh.file: no such file (got 'none.glb')"),
+    (lambda: M("none.png"), "Material.image: no such file (got 'none.png')"),
+    (lambda: M(np.full((4, 4, 3), 255.0)), "values beyond 1 (got 255.0); expected 0 to 1, or uint8 sRGB"),
+    (lambda: M(colour=(1, 0, 0)), "expected 'color' (nearest)"),
+    (lambda: P("cuboid", (0, 0, 1)), "too many positional arguments; expected Primitive(kind, material, pose, "),
+    (lambda: P("cuboid", size=1), "expected one of extents"),
+    (lambda: b.Pose(positions=(1, 2, 3)), "expected 'position' (nearest)"),
+    (lambda: b.look_at((0, 0, 0)), "expected look_at(position, target)"),
+    (lambda: C(pose=np.eye(4)), "Camera.pose: a matrix"),
+    (lambda: C(fovy=60), "expected 'fov' (nearest)"),
+    (lambda: b.Trajectory("none.txt"), "Trajectory.file: no such file"),
+    (lambda: b.Light(environment={"map": "none.hdr"}), "Light.environment.map: no such file"),
+    (lambda: S(durations=3), "expected 'duration' (nearest)"),
+    (lambda: b.Timeline("uniform", framerate=100), "expected one of: fps, kind"),
+    (lambda: b.Esim(4, 4, threshold=0.2), "expected 'contrast_threshold' (nearest)"),
+    (b.Esim, "missing a required argument: 'height'"),
+    (lambda: b.simulate("clip.mp4", fps=30), "of a file, simulate_file"),
+    (lambda: b.simulate_file("clip.mp4", "a.h5", sensors="davis346"), "expected 'sensor' (nearest)"),
+    (lambda: b.read_events("a.h5", t_start=3), "expected one of: path, truth"),
+    (lambda: b.OnlineSequences("demo.yaml", window=3), "expected 'window_ms' (nearest)"),
+]
+
+
+@pytest.mark.parametrize("call, said", WHAT_TO_DO, ids=[str(k) for k in range(len(WHAT_TO_DO))])
+def test_wrong_calls_say_what_to_do(call, said):
+    """Unknown and missing arguments, too, end in a line that says what is called how."""
+    with pytest.raises(BlinkGLError) as caught:
+        call()
+    assert said in str(caught.value) and "\n" not in str(caught.value)
 
 
 # --- what changes its shape, and goes its way -------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""The wheel and the editable install are complete: command, shaders, configs, tools, outside the repository too.
+"""The wheel and the editable install are complete: command, shaders, configs, outside the repository too.
 
 Both go into fresh virtual environments that see this one's packages (through a .pth, which does not activate this one's
 editable install), so nothing is fetched; but for the slow test, whose environment is empty.
@@ -25,14 +25,14 @@ PACKAGES = {
     "eflow": "eflow",
     "shaders": "blinkgl/shaders",
     "configs": "blinkgl/configs",
-    "tools": "blinkgl/tools",
 }
+URL = "https://here.invalid/blinkgl"
 NETWORK = ("model.safetensors", "card.yaml")
 
 PROBE = """
 import json, sys
 from importlib import metadata, resources
-import blinkgl, blinkgl.tools, eflow
+import blinkgl, eflow
 from blinkgl.gl import create_context
 shaders, configs = resources.files("blinkgl.shaders"), resources.files("blinkgl.configs")
 names = sorted(entry.name for entry in shaders.iterdir() if entry.name.endswith(".glsl"))
@@ -50,9 +50,9 @@ def source(tmp_path_factory):
     """A copy of what a build reads: building in the repository would leave files there, and
     two test processes collide."""
     copy = tmp_path_factory.mktemp("source")
-    for name in ("setup.cfg", "pyproject.toml", "README.md", "LICENSE"):
+    for name in ("setup.cfg", "setup.py", "pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(REPOSITORY / name, copy)
-    for name in PACKAGES:
+    for name in (*PACKAGES, "tools"):
         shutil.copytree(REPOSITORY / name, copy / name, ignore=shutil.ignore_patterns("__pycache__", "*.egg-info"))
     return copy
 
@@ -72,7 +72,7 @@ with create_context() as gl, Renderer(gl, sequence_scene(config, 0, template.bas
 
 
 def run(*command: str | Path, cwd: Path, compiled: bool = False) -> str:
-    environment = {
+    environment = {"BLINKGL_URL": URL} | {
         key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
     }
     if not compiled:  # which takes half a minute, and is not what is looked at
@@ -132,14 +132,20 @@ def test_wheel(source, tmp_path):
     for name in NETWORK:  # whatever is shipped
         (source / "eflow" / "weights" / "toy").mkdir(parents=True, exist_ok=True)
         (source / "eflow" / "weights" / "toy" / name).write_bytes(b"")
-    run(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", tmp_path / "dist", source, cwd=tmp_path)
-    (wheel,) = (tmp_path / "dist").iterdir()
+    # The sdist, and the wheel from what is in it.
+    run(sys.executable, "-m", "build", "--no-isolation", "--outdir", tmp_path / "dist", source, cwd=tmp_path)
+    (wheel,) = (tmp_path / "dist").glob("*.whl")
     assert wheel.name == f"blinkgl-{blinkgl.__version__}-py3-none-any.whl"
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
+        (metadata,) = (archive.read(name).decode() for name in names if name.endswith("METADATA"))
+    for line in ("Author: The BlinkGL authors", "License: MIT", f"Project-URL: Source, {URL}\n", "Classifier: Typing"):
+        assert line in metadata
+    relative = re.findall(r"\]\((?!https?:|#)[^)]*", metadata)
+    assert not relative and f"({URL}/raw/HEAD/docs/images/demo.jpg)" in metadata
     missing = (expected_files() | {f"eflow/weights/toy/{name}" for name in NETWORK}) - names
     assert not missing, f"not in the wheel (packages and package_data in setup.cfg): {sorted(missing)}"
-    assert not [name for name in names if name.startswith(("tests/", "docs/"))]
+    assert not [name for name in names if name.startswith(("tests/", "docs/", "blinkgl/tools"))]
     assert any(name.endswith("LICENSE") for name in names)
     bin_ = fresh_environment(tmp_path / "venv")
     run(

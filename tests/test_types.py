@@ -35,7 +35,7 @@ events: Events = recording.window(0)
 emulator = Esim(24, 32, seed=1, contrast_threshold=0.2)
 more: Events = emulator.step(np.zeros((24, 32), np.float32), 0)
 with Renderer(scene) as renderer:
-    frame: LabelFrame = renderer.frame(0.05, ["flow", "depth"], to=0.1)
+    frame: LabelFrame = renderer.frame(0.05, ["forward", "depth"], to=0.1)
     picture: np.ndarray = renderer.image(0.05)
 blinkgl.write_events(Path("a.h5"), events, 24, 32)
 again: Events = blinkgl.read_events("a.h5")

@@ -122,15 +122,21 @@ def _translate(model: type[BaseModel], error: ValidationError, where: str, start
 def _nearest(model: type[BaseModel], path: list[str], owners: list[type[BaseModel]]) -> str:
     """What an unknown key may have been: the nearest known one, or the sibling kind that has it."""
     known = sorted({name for owner in owners for name in owner.model_fields})
-    near = difflib.get_close_matches(path[-1], known, n=1)
-    if near:
-        return f"'{near[0]}' (nearest)"
+    if (near := nearest(path[-1], known)).endswith("(nearest)"):
+        return near
     here: list[Any] = members(model)
     for step in path[:-1]:
         here = [x for a in here for x in below(a, step)]
     others = [tag_of(m) for m in here if is_model(m) and m not in owners and path[-1] in m.model_fields]
     also = "".join(f"; it is a key of {key}: {value}" for key, value in filter(None, others))
-    return "one of: " + ", ".join(known) + also
+    return near + also
+
+
+def nearest(name: str, known: list[str]) -> str:
+    """The known name nearest to ``name``, as text; all where none is near."""
+    # Who says "threshold" means "contrast_threshold" and not "threshold_sigma", which has more letters in common.
+    near = [one for one in known if one.endswith(f"_{name}")] or difflib.get_close_matches(name, known, n=1)
+    return f"'{near[0]}' (nearest)" if near else "one of: " + ", ".join(known)
 
 
 def _locate(

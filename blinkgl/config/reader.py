@@ -163,7 +163,8 @@ def read_yaml(path: str | Path) -> Any:
     where = str(path)
     try:
         if path.exists() and not path.is_file():
-            raise ConfigError("cannot be read: not a regular file", where=where, accepted="a YAML file")
+            problem = "is a folder" if path.is_dir() else "cannot be read: not a regular file"
+            raise ConfigError(problem, where=where, accepted="a YAML file")
         if path.stat().st_size > MAX_BYTES:
             raise ConfigError(
                 "file is too large for a configuration", where=where, accepted=f"at most {MAX_BYTES} bytes"

@@ -180,10 +180,10 @@ class OutputConfig(Config):
     first_index: int = Field(
         0, ge=0, le=10_000_000, description="number of the first; sequence n depends on the seed and n alone"
     )
-    compression: Literal["zstd", "lz4"] = Field(
+    compression: Literal["zstd", "lz4", "gzip"] = Field(
         "zstd",
-        description="of events.h5, inside Blosc: zstd as DSEC's files; lz4 is written faster and some percent larger "
-        "(docs/results.md)",
+        description="of events.h5 and event_labels.h5: zstd inside Blosc, as DSEC's files; lz4, too, written faster "
+        "and some percent larger; gzip, which h5py reads without hdf5plugin, written slower",
     )
 
 

@@ -4,6 +4,7 @@
     .run/recipe.yaml    the recipe with all overrides      .run/assets.json   content hashes of the pools' files
     .run/costs.jsonl    one line per sequence made: wall seconds by stage, CPU seconds, bytes, memory, attempts
     .run/failed.json    sequences that were set aside, and why
+    .run/checksums.json SHA-256 of the files above, as the run left them
     .run/logs/          one log per sequence, one per worker
     .run/damaged/       what was found under a sequence's name and was not whole
 
@@ -17,7 +18,7 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -27,11 +28,15 @@ from blinkgl.dataset.plan import Plan, Task
 from blinkgl.dataset.work import RUN_FOLDER, Message, SequenceLog
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.atomic import atomic_file, output_errors, remove_stale
-from blinkgl.io.records import parse, read_text
+from blinkgl.io.records import parse, read_text, shown
 from blinkgl.machine.posix import fcntl
-from blinkgl.sequence_files.sequence_dir import verify_sequence
+from blinkgl.sequence_files.sequence_dir import digest_of, verify_sequence
 
 FORMAT = "blinkgl-run"
+CHECKSUMS = "checksums.json"
+_BEGUN = ("run.json", "recipe.yaml", "assets.json")
+_ENDED = ("costs.jsonl", "failed.json")
+"""Records that are whole when a run begins, and when it ends."""
 
 
 class _Run(BaseModel):
@@ -39,7 +44,8 @@ class _Run(BaseModel):
 
     model_config = ConfigDict(strict=True, extra="allow")
     format: Literal["blinkgl-run"]
-    format_version: Literal[1]
+    format_version: Literal[1, 2]
+    """1: without checksums.json"""
     groups: dict[str, str]
     environment: dict[str, str]
     mixed: list[dict[str, dict[str, str]]] = []
@@ -66,7 +72,7 @@ class _Cost(BaseModel):
 
 
 _TABLE = TypeAdapter(dict[str, str])
-_RECORDS = {"run.json": TypeAdapter(_Run), "assets.json": _TABLE, "failed.json": _TABLE}
+_RECORDS = {"run.json": TypeAdapter(_Run), "assets.json": _TABLE, "failed.json": _TABLE, CHECKSUMS: _TABLE}
 _COST = TypeAdapter(_Cost)
 
 
@@ -252,7 +258,7 @@ class RunFolder:
             "run.json",
             {
                 "format": FORMAT,
-                "format_version": 1,
+                "format_version": 2,
                 "groups": known["groups"],
                 "environment": known["environment"],
                 "mixed": later,
@@ -263,12 +269,43 @@ class RunFolder:
         self._write("assets.json", assets)
         with atomic_file(self.path / "recipe.yaml") as path, output_errors(path):
             path.write_text(plan.recipe_text(), encoding="utf-8")
+        # Costs and failures are written as the run goes on: until it ends they have no checksum.
+        self.seal(_BEGUN)
         self.begun = True
+
+    def seal(self, names: Sequence[str]) -> None:
+        """Writes the checksums of those records that there are. Raises OutputError."""
+        with output_errors(self.path):
+            there = [name for name in names if (self.path / name).is_file()]
+            self._write(CHECKSUMS, {name: digest_of(self.path / name)["sha256"] for name in there})
+
+    def altered(self) -> list[str]:
+        """Records that are not what the run wrote, one line each. Runs of format_version 1 have no checksums, but a
+        list of them that is there counts."""
+        path = self.path / CHECKSUMS
+        try:
+            text = read_text(path)
+        except FileNotFoundError:
+            record = self.read("run.json")
+            old = record is None or record["format_version"] == 1
+            return [] if old else [f"{RUN_FOLDER}/{CHECKSUMS}: missing"]
+        known = self.read(CHECKSUMS) or {}
+        if text != _text(known):
+            return [f"{RUN_FOLDER}/{CHECKSUMS}: not as it was written"]
+        lines = [f"{name}: has no checksum" for name in _BEGUN if name not in known and (self.path / name).exists()]
+        for name, digest in known.items():
+            if name not in (*_BEGUN, *_ENDED):
+                lines.append(f"{CHECKSUMS}: names {shown(name)}, which is no record")
+            elif not (self.path / name).is_file():
+                lines.append(f"{name}: missing")
+            elif digest_of(self.path / name)["sha256"] != digest:
+                lines.append(f"{name}: checksum differs")
+        return [f"{RUN_FOLDER}/{line}" for line in lines]
 
     def forget(self, plan: Plan, keep_logs: bool) -> None:
         """Takes back :meth:`begin` for a run of which nothing came. What was put away stays:
         it is not ours to delete."""
-        for name in ("run.json", "recipe.yaml", "assets.json", "failed.json", "costs.jsonl"):
+        for name in (*_BEGUN, *_ENDED, CHECKSUMS):
             (self.path / name).unlink(missing_ok=True)
         (self.out / "index.jsonl").unlink(missing_ok=True)
         if not keep_logs:
@@ -301,6 +338,7 @@ class RunFolder:
         with contextlib.suppress(OutputError):
             if still or before:
                 self._write("failed.json", still)
+            self.seal((*_BEGUN, *_ENDED))
 
     def costs(self) -> list[dict[str, Any]]:
         """The last line of each sequence; a line cut by a crash is left out."""
@@ -330,7 +368,11 @@ class RunFolder:
 
     def _write(self, name: str, data: dict[str, Any]) -> None:
         with atomic_file(self.path / name) as path, output_errors(path):
-            path.write_text(json.dumps(data, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+            path.write_text(_text(data), encoding="utf-8")
+
+
+def _text(data: dict[str, Any]) -> str:
+    return json.dumps(data, indent=1, sort_keys=True) + "\n"
 
 
 def _same(path: Path, handle: int | None) -> bool:

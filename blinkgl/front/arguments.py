@@ -2,16 +2,62 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import math
 import numbers
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
+from blinkgl.config.events import EmulatorConfig
+from blinkgl.config.problems import nearest
 from blinkgl.errors import ConfigError
+
+Given = ParamSpec("Given")
+Made = TypeVar("Made")
+
+
+def public(function: Callable[Given, Made]) -> Callable[Given, Made]:
+    """Decorate a public function: an argument that is unknown, missing or one too many raises ConfigError."""
+    signature = inspect.signature(function)
+    name = function.__qualname__.removesuffix(".__init__")
+    prefix = f"{name}." if function.__name__ == "__init__" else ""
+    known = [key for key, one in signature.parameters.items() if key != "self" and one.kind is not one.VAR_KEYWORD]
+    more = [str(one.annotation) for one in signature.parameters.values() if one.kind is one.VAR_KEYWORD]
+    for options in (re.fullmatch(r"Unpack\[(\w+)\]", text) for text in more):
+        if options is not None:
+            known += inspect.unwrap(function).__globals__[options[1]].__annotations__
+            more = []
+
+    @functools.wraps(function)
+    def called(*args: Given.args, **kwargs: Given.kwargs) -> Made:
+        # What other keywords a function takes, it checks itself.
+        for key in () if more else kwargs:
+            if key not in known:
+                raise unknown_argument(key, known, prefix)
+        try:
+            signature.bind(*args, **kwargs)
+        except TypeError as error:
+            raise ConfigError(str(error), where=name, accepted=f"{name}({', '.join(known)})") from None
+        return function(*args, **kwargs)
+
+    return called
+
+
+def unknown_argument(name: str, known: Iterable[str], prefix: str = "") -> ConfigError:
+    """The error of an argument that is none of the ``known``: the nearest of them, or where an emulator's key goes."""
+    for kind, model in EmulatorConfig.members.models.items():
+        if name in model.model_fields and "emulator" in known:
+            accepted = f"emulator={{'emulator': '{kind}', '{name}': …}}"
+            break
+    else:
+        accepted = nearest(name, list(known))
+    return ConfigError("unknown argument", where=prefix + name, accepted=accepted)
 
 
 def plain(value: Any) -> Any:
@@ -37,6 +83,13 @@ def path(value: Any, where: str) -> Path:
     if not isinstance(value, (str, os.PathLike)) or not str(value):
         raise ConfigError("not a path", where=where, value=value, accepted="text or a pathlib.Path")
     return Path(value)
+
+
+def existing(value: Any, where: str) -> str:
+    """The path of a file that is there, as text. Raises ConfigError."""
+    if not path(value, where).expanduser().is_file():
+        raise ConfigError("no such file", where=where, value=os.fspath(value), accepted="an existing file")
+    return os.fspath(value)
 
 
 def number(
@@ -74,7 +127,8 @@ def seed(value: Any, where: str = "seed") -> int:
 def one_of(value: Any, where: str, kinds: type | tuple[type, ...], accepted: str) -> Any:
     """``value`` where it is of one of the classes. Raises ConfigError."""
     if not isinstance(value, kinds):
-        raise ConfigError(f"not {accepted}", where=where, value=value, accepted=accepted)
+        kind = type(value).__name__
+        raise ConfigError(f"not accepted: {kind}", where=where, value=value, accepted=accepted)
     return value
 
 

@@ -30,6 +30,7 @@ class Renderer:
     outside them everything stands still.
     Raises ConfigError, AssetError, GLError."""
 
+    @check.public
     def __init__(self, source: Source, *, index: int = 0, quality: str | None = None):
         self.config = configured(source, quality=quality).sequence(check.whole(index, "index", 0, MAX_INDEX))
         if self.config.frames is not None:
@@ -72,7 +73,7 @@ class Renderer:
         """:class:`LabelFrame` at t s with the named buffers; "images" is its ``colour``, (H, W, 3) float32 linear.
 
         labels : as of :func:`record`, "events" left out, which is of no time.
-        to, back_to : s, where flow and flow_backward lead; default: one label interval on and back."""
+        to, back_to : s, where forward and backward lead; default: one label interval on and back."""
         if of_events := [name for name in OF_EVENTS if name in label_names(labels)]:
             raise ConfigError("is of events and not of a time", where="labels", value=of_events[0], accepted="record()")
         asked = validate(LabelsConfig, labels_tree(labels), where="labels")
@@ -92,6 +93,7 @@ def _ns(seconds: float, where: str) -> int:
     return math.floor(check.number(seconds, where, least=-_LATEST_S, most=_LATEST_S) * 1e9 + 0.5)
 
 
+@check.public
 def render_frame(
     source: Source, t: float, labels: Sequence[str | float] = ("images",), *, index: int = 0, to: float | None = None
 ) -> LabelFrame:

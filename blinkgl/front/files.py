@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 _SIDE = 65535
 
 
+@check.public
 def open_events(path: str | os.PathLike) -> EventFile:
     """An event file for reading in pieces: ``with open_events(path) as file: for events in file.chunks(): …``;
     ``height``, ``width`` in px, None where the file does not say (``file.sized()`` finds out), times in µs.
@@ -35,6 +36,7 @@ def open_events(path: str | os.PathLike) -> EventFile:
     return formats.open_events(check.path(path, "path"))
 
 
+@check.public
 def read_events(path: str | os.PathLike, *, truth: bool = False) -> Events:
     """All :class:`Events` of a file, t in µs, in memory.
 
@@ -49,6 +51,7 @@ def read_events(path: str | os.PathLike, *, truth: bool = False) -> Events:
     return with_truth(events, 0, check.path(path, "path").parent)
 
 
+@check.public
 def write_events(
     path: str | os.PathLike,
     events: Events | Iterable[Events],
@@ -94,6 +97,7 @@ def _chunks(events: Any) -> Iterator[Events]:
     return checked()
 
 
+@check.public
 def convert(
     source: str | os.PathLike,
     target: str | os.PathLike,
@@ -134,6 +138,7 @@ def _sensor_size(sensor: str | None) -> tuple[int, int] | None:
     return camera.height, camera.width
 
 
+@check.public
 def read_flow(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
     """flow (H, W, 2) float32 px, +x right, +y down (0 where invalid), and valid (H, W) bool,
     of a .png (DSEC), .flo or .npy file.
@@ -142,6 +147,7 @@ def read_flow(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
     return flow_files.read_flow(check.path(path, "path"))
 
 
+@check.public
 def write_flow(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray | None = None) -> int:
     """Writes flow (H, W, 2) px and valid (H, W) bool (default: all) as .png (DSEC's 16
     bit), .flo or .npy, by the ending.
@@ -159,6 +165,7 @@ def write_flow(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray | No
     return flow_files.write_flow(check.path(path, "path"), field.astype(np.float32), mask.astype(bool))
 
 
+@check.public
 def read_trajectory(path: str | os.PathLike, *, form: str | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Times (N,) int64 ns and poses T_world_body (N, 4, 4) float64 of TUM's text or EuRoC's CSV.
 
@@ -169,6 +176,7 @@ def read_trajectory(path: str | os.PathLike, *, form: str | None = None) -> tupl
     return trajectories.read_trajectory(check.path(path, "path"), form)
 
 
+@check.public
 def write_trajectory(path: str | os.PathLike, t_ns: np.ndarray, poses: np.ndarray) -> None:
     """Writes poses (N, 4, 4) at t_ns (N,) whole ns as TUM's text, t x y z qx qy qz qw: those of a sequence's
     ``poses.npz`` are ``t_ns`` and ``T_world_cam``. Raises OutputError, ConfigError."""
@@ -181,6 +189,7 @@ def write_trajectory(path: str | os.PathLike, t_ns: np.ndarray, poses: np.ndarra
     trajectories.write_trajectory(check.path(path, "path"), times, placed.astype(np.float64))
 
 
+@check.public
 def compare(
     a: str | os.PathLike,
     b: str | os.PathLike | None = None,
@@ -220,6 +229,7 @@ class ReadingOptions(TypedDict, total=False):
     frame_delay_ms: float | None
 
 
+@check.public
 def calibrate(
     recording: str | os.PathLike,
     frames: str | os.PathLike | None = None,
@@ -251,7 +261,6 @@ def calibrate(
     keys = tuple(key for key in given if isinstance(key, str))
     if len(keys) != len(given):
         raise ConfigError("not names of keys", where="fixed", value=fixed, accepted="a list of texts")
-    _refuse_unknown(reading, ReadingOptions)
     delay = reading.get("frame_delay_ms")
     understood = FrameReading(
         reading.get("gamma", FrameReading.gamma),
@@ -285,6 +294,7 @@ class FrameOptions(TypedDict, total=False):
     sensor: str | None
 
 
+@check.public
 def simulate(
     frames: Iterable, *, report: SimulationReport | None = None, **frame_options: Unpack[FrameOptions]
 ) -> Iterator[Events]:
@@ -295,13 +305,16 @@ def simulate(
     emulator : as of :func:`record`, "esim" if not said.   seed : of its noise, 0 if not said.
     sensor : the read-out limit of that camera, and with an emulator's name its values; frames keep their size.
     gamma : "srgb", "linear" or an exponent; default: srgb for integers, linear for floats.
-    interpolate : "linear", the default; "motion": dense flow, at most ``max_px`` (1) px a step.
+    interpolate : "linear", the default; "motion": dense flow, at most ``max_px`` (1) px a step, which frames need
+    between which things move further than 2 px (``report.guessed_over_px``).
     report : a SimulationReport to be filled.
     Raises ConfigError at once; EventDataError as frames come, naming the frame."""
     from blinkgl.recordings import simulation
 
-    if not isinstance(frames, Iterable):
-        raise ConfigError("not frames", where="frames", value=frames, accepted="an iterable of arrays")
+    if not isinstance(frames, Iterable) or isinstance(frames, (str, os.PathLike)):
+        raise ConfigError(
+            "not frames", where="frames", value=frames, accepted="an iterable of arrays; of a file, simulate_file"
+        )
     return simulation.frames_to_events(
         _frames(frames),
         report=report,
@@ -309,6 +322,7 @@ def simulate(
     )
 
 
+@check.public
 def simulate_file(
     source: str | os.PathLike,
     target: str | os.PathLike,
@@ -348,9 +362,7 @@ def _options(
     max_px: float = 1.0,
     seed: int = 0,
     sensor: str | None = None,
-    **unknown: Any,
 ) -> dict[str, Any]:
-    _refuse_unknown(unknown, FrameOptions)
     from blinkgl.config.sensor import load_sensor
     from blinkgl.recordings import simulation
 
@@ -367,13 +379,6 @@ def _options(
         max_px=check.number(max_px, "max_px", above=0, most=1e4),
         readout=None if camera is None else camera.readout,
     )
-
-
-def _refuse_unknown(given: Mapping[str, Any], options: type) -> None:
-    """ConfigError for an argument that is none of the ``options``."""
-    for name in given:
-        if name not in options.__annotations__:
-            raise ConfigError("unknown argument", where=name, accepted=", ".join(options.__annotations__))
 
 
 def _fps(fps: float | None) -> float | None:

@@ -26,6 +26,10 @@ class Piece:
 
     tree: dict[str, Any]
 
+    def __init_subclass__(cls) -> None:
+        if "__init__" in vars(cls):
+            cls.__init__ = check.public(cls.__init__)
+
     def _checked(self, model: type[Config], tree: dict[str, Any], **renamed: str) -> dict[str, Any]:
         """``tree`` as it is, when the model takes it. renamed : what keys of the model are
         called as arguments; "": by their own keys."""
@@ -102,6 +106,7 @@ class Pose(Piece):
         return cls(matrix[:3, 3], quaternion=(w, x, y, z))
 
 
+@check.public
 def look_at(position: Vector, target: Vector) -> Pose:
     """A :class:`Pose` at ``position`` (3,) m, turned to the point ``target`` (3,) m; a camera's
     horizon is level. Raises ConfigError."""
@@ -168,20 +173,24 @@ class Trajectory(Piece):
         turn_limit: float = 7200.0,
         T_body_sensor: ArrayLike | str | os.PathLike | None = None,
     ):
-        tree = check.given(file=os.fspath(check.path(file, "file").absolute()), form=form, start=start, smooth=smooth)
+        there = check.path(file, "Trajectory.file").expanduser().absolute()
+        tree = check.given(file=there, form=form, start=start, smooth=smooth)
         tree |= check.given(speed_limit=speed_limit, turn_limit=turn_limit)
         if isinstance(T_body_sensor, (str, os.PathLike)):
-            tree["T_body_sensor"] = os.fspath(check.path(T_body_sensor, "T_body_sensor").absolute())
+            tree["T_body_sensor"] = os.fspath(check.path(T_body_sensor, "Trajectory.T_body_sensor").absolute())
         elif T_body_sensor is not None:
             place = check.array(T_body_sensor, "Trajectory.T_body_sensor", (4, 4), "a file, or an array (4, 4)")
             tree["T_body_sensor"] = check.plain(place)
         self.tree = self._checked(KeyedMotionConfig, {"trajectory": tree}, trajectory="")
+        check.existing(there, "Trajectory.file")
 
 
 def motion_tree(pose: Pose | Keyframes | Trajectory | Vector, where: str, others: str = "") -> dict[str, Any]:
     """A position alone is a pose. others : what else may be given, for the message."""
     if isinstance(pose, (Pose, Keyframes, Trajectory)):
         return pose.tree
+    if np.shape(pose) == (4, 4):
+        raise ConfigError("a matrix", where=where, value=pose, accepted="Pose.from_matrix(T)")
     check.one_of(
         pose, where, (list, tuple, np.ndarray), f"a Pose, Keyframes, Trajectory, {others}or a position of three numbers"
     )

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 
+@check.public
 def simulate_rig(
     source: Source, rig: Rig | str | None = None, *, index: int = 0, **settings: Unpack[Settings]
 ) -> RigSequence:
@@ -70,6 +71,7 @@ class RigRecording:
         return self.cameras[name]
 
 
+@check.public
 def record_rig(
     source: Source, rig: Rig | str | None = None, *, index: int = 0, **settings: Unpack[Settings]
 ) -> RigRecording:

@@ -48,6 +48,7 @@ class Timeline:
     values : keys of that kind, see ``timeline:`` in docs/configuration.md.
     Raises ConfigError."""
 
+    @check.public
     def __init__(self, kind: str = "displacement", **values: Any):
         self.tree = {"kind": check.plain(kind), **check.plain(values)}
         try:
@@ -60,6 +61,7 @@ class Timeline:
         return f"Timeline({', '.join(f'{k}={v!r}' for k, v in self.tree.items())})"
 
 
+@check.public
 def load(path: str | os.PathLike, overrides: Sequence[str] = (), *, seed: int | None = None) -> RunTemplate:
     """The run that a YAML file describes, checked: what :func:`generate`, :func:`record`, :func:`render_frame` take.
 
@@ -85,6 +87,7 @@ class Settings(TypedDict, total=False):
     tracks: TrackSettings | None
 
 
+@check.public
 def generate(
     source: Source,
     out: str | os.PathLike,
@@ -121,6 +124,7 @@ def generate(
     return run_dataset(template, check.path(out, "out"), executor, num=num, resume=bool(resume))
 
 
+@check.public
 def verify(folder: str | os.PathLike, *, deep: int = 0, seed: int = 0) -> Verification:
     """Looks through a data set; ``.clean`` says whether all is well, ``.problems`` what is not, by sequence.
 
@@ -143,9 +147,7 @@ _SECTIONS: dict[str, tuple[str, Callable[[Any], Any]]] = {
 
 def configured(source: Source, rig: Rig | str | None = None, **settings: Unpack[Settings]) -> RunTemplate:
     """``source`` as a run, with what is given here laid over it. Raises ConfigError."""
-    check.one_of(source, "source", (Scene, RunTemplate), "a Scene, or what load() gives")
-    if strange := [name for name in settings if name not in _SECTIONS]:
-        raise ConfigError("unknown argument", where=strange[0], accepted=", ".join(_SECTIONS))
+    check.one_of(source, "source", (Scene, RunTemplate), "a Scene, or what load(path) gives")
     template = source.template() if isinstance(source, Scene) else source
     own: dict[str, Any] = {}
     for name, (key, read) in _SECTIONS.items():

@@ -230,7 +230,7 @@ class Mesh(_Object):
     material : :class:`Material`; default: the file's own, or white.   pose, scale, name,
     category, body, deform : as of :class:`Primitive`.
     animation : of a glTF file, what it plays: a clip's name or number, looped, or an :class:`Animation`; None: nothing.
-    Raises ConfigError; a missing or damaged file raises when the scene is built."""
+    Raises ConfigError; a damaged file raises when the scene is built."""
 
     def __init__(
         self,
@@ -264,6 +264,8 @@ class Mesh(_Object):
         if animation is not None and deform is not None:
             raise ConfigError("a body deforms by one thing", where="Mesh.deform", accepted="deform or animation")
         self.tree = self._placed(name, material, pose, scale, category, body, deform, animation)
+        if file is not None:
+            check.existing(file, "Mesh.file")
         self.tree.setdefault("name", "mesh" if file is None else Path(file).stem)
 
 

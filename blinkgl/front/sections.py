@@ -65,15 +65,19 @@ def section_tree(key: str, given: Any) -> dict[str, Any]:
     return tree
 
 
+_FORMER = {"flow": "'forward', as in labels.flow of a YAML", "flow_backward": "'backward', as in labels.flow of a YAML"}
 OF_EVENTS = ("events",)
 """Labels that are of events and not of a time."""
 
 
 def label_names(labels: Sequence[str | float]) -> set[str | float]:
     """Names, and intervals of flow, s. Raises ConfigError: no such label (:mod:`blinkgl.labels`)."""
-    known = [*dict.fromkeys(label.said for label in LABELS.values()), *OF_EVENTS]
+    # Intervals are asked for by numbers.
+    known = [*dict.fromkeys(one.said for one in LABELS.values() if one.said != "flow_intervals"), *OF_EVENTS]
     wanted = check.one_of(labels, "labels", (list, tuple, set, frozenset), "a list of names of labels")
     for name in wanted:
+        if isinstance(name, str) and name in _FORMER:
+            raise ConfigError("has another name", where="labels", value=name, accepted=_FORMER[name])
         if name not in known and not is_interval(name):
             raise ConfigError("unknown label", where="labels", value=name, accepted=", ".join(known))
     return set(wanted)

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 
+@check.public
 def simulate_sequence(
     source: Source,
     *,
@@ -111,10 +112,11 @@ class Recording:
     def _forward(self) -> list[Flow]:
         flows = [label.forward for label in self.labels if label.forward is not None]
         if len(flows) < len(self.labels):
-            raise ConfigError("the recording has no forward flow", where="labels", accepted="'flow' among them")
+            raise ConfigError("the recording has no forward flow", where="labels", accepted="'forward' among them")
         return flows
 
 
+@check.public
 def record(source: Source, *, index: int = 0, **settings: Unpack[Settings]) -> Recording:
     """Events, images and ground truth of one sequence as arrays: what :func:`generate` writes, held in memory.
 
@@ -123,7 +125,7 @@ def record(source: Source, *, index: int = 0, **settings: Unpack[Settings]) -> R
     sensor : camera whose size, emulator values and read-out are taken, such as "davis346".
     timeline : :class:`Timeline`.
     quality : "fast", "balanced" (the default), "accurate" or "reference".
-    labels : names of labels, such as images, flow, flow_backward, occlusion, depth
+    labels : names of labels, such as images, forward and backward (flow), occlusion, depth
     (docs/configuration.md has all), and numbers: intervals of ``flow_intervals``, s; "events": what made each
     event, ``events.truth``; default: the source's.
     images : a frame camera: the name of a preset, "deblurring", or a table of ``images:``, ``{"exposure_us": 10000}``.

@@ -31,7 +31,7 @@ class Light(Piece):
     environment : a panorama in the place of sun and sky, as ``light.environment``: ``{"map": "park.hdr"}``.
     shadows : "off", "hard" or "soft".   sun_size : degrees, softens.   shadow_size : texels a side of a shadow map.
     unlit : radiance = albedo everywhere.
-    Raises ConfigError; a panorama that is missing is found when the scene is built."""
+    Raises ConfigError."""
 
     def __init__(
         self,
@@ -52,6 +52,8 @@ class Light(Piece):
                 check.one_of(one, f"Light.lights[{k}]", Mapping, "a table")
             tree["lights"] = [check.given(**one) for one in lights]
         self.tree = self._checked(LightConfig, tree, sun_elevation="elevation", sun_azimuth="azimuth")
+        if environment is not None:
+            check.existing(tree["environment"]["map"], "Light.environment.map")
 
 
 @signed_by(MaterialConfig, texture="image")
@@ -59,7 +61,7 @@ class Material(Piece):
     """A surface: ``color`` times at most one texture, matt or with a gloss, and light of its own.
 
     image : an image file (sRGB; .hdr is linear), or an array: (h, w, 3) uint8 sRGB, or
-    float, linear light; row 0 is the top.
+    float, linear light from 0 to 1; row 0 is the top.
     color : (3,) linear factor.   procedural, seed : kind and number of a made-up texture, such as "bricks".
     photograph : one that scikit-image brings, such as "astronaut".   uv_scale : (2,) repeats.
     max_size : px, longer sides of a file are reduced.
@@ -69,7 +71,7 @@ class Material(Piece):
     normal_map : x to the right in the picture, y up, z outwards, 0 to 255 for -1 to 1; ``normal_scale`` times its x, y.
     mask : what is there: holes where it is below ``cutoff`` (0 to 1).
     Maps are files, or arrays (h, w, 3) uint8, of the mask (h, w) uint8.
-    Raises ConfigError; a missing file is found when the scene is built."""
+    Raises ConfigError."""
 
     def __init__(self, image: str | os.PathLike | np.ndarray | None = None, **keys: Any):
         maps = {key: keys[key] for key in MAPS if keys.get(key) is not None}
@@ -81,6 +83,9 @@ class Material(Piece):
                 raise ConfigError("only one of image, procedural, photograph may be given", where="Material.image")
         tree = check.given(**{**keys, "texture": image, **{key: f"<{key}>" for key in self.maps}})
         self.tree = self._checked(MaterialConfig, tree, texture="image")
+        for key, file in {"image": image, **maps}.items():
+            if file is not None and _is_file(file):
+                check.existing(file, f"Material.{key}")
 
 
 def _is_file(given: Any) -> bool:
@@ -101,13 +106,17 @@ def _map(given: Any, key: str) -> np.ndarray:
 
 
 def _texture(image: Any) -> data.Texture:
-    accepted = "a file, or an array (h, w, 3), uint8 sRGB or float linear light >= 0"
+    accepted = "a file, or an array (h, w, 3), uint8 sRGB or float linear light from 0 to 1"
     pixels = check.array(image, "Material.image", (None, None, 3), accepted)
     if not pixels.size or max(pixels.shape) > 16384:
         raise ConfigError(
             "size out of range", where="Material.image", value=pixels.shape, accepted="1 to 16384 rows and columns"
         )
     if pixels.dtype != np.uint8:
+        if pixels.dtype.kind == "f" and pixels.max() > 1:
+            raise ConfigError(
+                "values beyond 1", where="Material.image", value=float(pixels.max()), accepted="0 to 1, or uint8 sRGB"
+            )
         if pixels.dtype.kind != "f" or not (np.isfinite(pixels).all() and pixels.min() >= 0):
             raise ConfigError(
                 "pixels cannot be used", where="Material.image", value=str(pixels.dtype), accepted=accepted

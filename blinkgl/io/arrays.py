@@ -1,5 +1,5 @@
-"""Events as NumPy files: .npz with x, y, t, p (and cause, where known), or .npy with a structured array. Whole
-recordings in memory, unlike the others."""
+"""Events as NumPy files: .npz with x, y, t, p (and cause, where known), or .npy with a structured array; read also
+MATLAB's .mat with such variables. Whole recordings in memory, unlike the others."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from blinkgl.errors import AssetError
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import check_events, check_size, events_of, microseconds
 from blinkgl.io.images import NpzReader, numpy_errors, read_npy
+from blinkgl.io.mat import read_mat
 from blinkgl.types.events import Events
 
 DTYPE = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1")])
 _NAMES = {
-    "t": ("t", "ts", "timestamp", "timestamps"),
+    "t": ("t", "ts", "timestamp", "timestamps", "t_us", "ts_us", "timestamps_us"),
     "x": ("x",),
     "y": ("y",),
     "p": ("p", "polarity", "polarities", "pol", "on"),
@@ -33,25 +34,47 @@ class ArrayReader:
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)
         self.height = self.width = None
-        with numpy_errors(path):
-            if self.path.suffix.lower() == ".npy":
-                table = read_npy(path)
-                columns = {k: table[name] for k, name in _named(table.dtype.names or (), path).items()}
-            else:
-                with NpzReader(path) as arrays:
-                    columns = {k: arrays[name] for k, name in _named(arrays.names, path).items()}
-                    if "height" in arrays and "width" in arrays:
-                        self.height, self.width = (_declared(arrays[k], k, path) for k in ("height", "width"))
+        columns, in_seconds = self._columns(path)
         check_size(self.height, self.width, str(path))
         t = columns["t"]
-        if t.dtype.kind == "f" and t.ndim == 1:
+        if in_seconds and t.dtype.kind == "f" and t.ndim == 1:
             columns["t"] = microseconds(t, str(path))
         self._events = events_of(*(columns[k] for k in "xytp"), str(path), cause=columns.get("cause"), signed=True)
         self.causes = self._events.cause is not None
 
+    def _columns(self, path: str | os.PathLike) -> tuple[dict[str, np.ndarray], bool]:
+        """The columns of the file, and whether times that are floats are seconds."""
+        with numpy_errors(path):
+            if self.path.suffix.lower() == ".npy":
+                table = read_npy(path)
+                named = _named(table.dtype.names or (), path)
+                columns = {k: table[name] for k, name in named.items()}
+            else:
+                with NpzReader(path) as arrays:
+                    named = _named(arrays.names, path)
+                    columns = {k: arrays[name] for k, name in named.items()}
+                    if "height" in arrays and "width" in arrays:
+                        self.height, self.width = (_declared(arrays[k], k, path) for k in ("height", "width"))
+        return columns, not named["t"].endswith("_us")
+
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
         for i in range(0, len(self._events), size):
             yield self._events.part(slice(i, i + size))
+
+
+class MatReader(ArrayReader):
+    """``.mat`` of version 7 or older with variables, or one struct, of such names. MATLAB's numbers are floats unless
+    somebody said otherwise: times are seconds where one of them has a fraction, else µs. y is as the file has it."""
+
+    def _columns(self, path: str | os.PathLike) -> tuple[dict[str, np.ndarray], bool]:
+        found = read_mat(path)
+        structs = [one for one in found.values() if isinstance(one, dict)]
+        arrays = structs[0] if len(structs) == 1 else found
+        named = _named(arrays, path)
+        columns = {k: np.asarray(arrays[name]) for k, name in named.items()}
+        t = columns["t"]
+        whole = t.dtype.kind != "f" or bool((np.floor(t) == t).all())
+        return columns, not whole and not named["t"].endswith("_us")
 
 
 class ArrayWriter:
@@ -94,7 +117,7 @@ def _named(names: Iterable[str], path) -> dict[str, str]:
             f"no column '{missing[0]}'",
             where=str(path),
             value=list(names) or "a plain array",
-            accepted="x, y, t, p in an .npz or a structured .npy",
+            accepted="x, y, t, p in an .npz, a .mat or a structured .npy",
         )
     return found
 

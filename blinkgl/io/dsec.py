@@ -14,7 +14,7 @@ import queue
 import threading
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import h5py
 import hdf5plugin
@@ -23,7 +23,7 @@ import numpy as np
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import MAX_SIDE, check_events, check_size, events_of
-from blinkgl.io.hdf5 import blosc_dataset, dataset, hdf5_errors, open_hdf5, write_rows
+from blinkgl.io.hdf5 import attribute, dataset, growing_dataset, hdf5_errors, open_hdf5, write_rows
 from blinkgl.types.events import Events
 
 BLOCK = 1 << 17
@@ -50,7 +50,7 @@ class DsecEventWriter:
         own readers ignore.
     t_offset_us : image-clock time of relative time 0. Events before it, or 2^32 µs (71.6 minutes) or more after it, are
         refused: the format's u4 cannot hold them.
-    codec : "zstd", as the published files, or "lz4".
+    codec : "zstd", as the published files, "lz4" or "gzip".
     """
 
     def __init__(
@@ -85,10 +85,10 @@ class DsecEventWriter:
             # Whole chunks only: no cache, a full disk shows at once.
             self._file = h5py.File(self.path, "w", rdcc_nbytes=0)
             self._columns = {
-                k: blosc_dataset(self._file, f"events/{k}", (0,), dtype, (BLOCK,), codec)
+                k: growing_dataset(self._file, f"events/{k}", (0,), dtype, (BLOCK,), codec)
                 for k, dtype in _COLUMNS.items()
             }
-            self._ms_to_idx = blosc_dataset(self._file, "ms_to_idx", (0,), np.uint64, (1 << 13,), codec)
+            self._ms_to_idx = growing_dataset(self._file, "ms_to_idx", (0,), np.uint64, (1 << 13,), codec)
             self._file.create_dataset("t_offset", data=np.int64(self.t_offset_us), track_times=False)
             # Compression runs beside the simulation; a full queue makes append wait.
             self._file.attrs["height"], self._file.attrs["width"] = self.height, self.width
@@ -196,7 +196,7 @@ class DsecEventWriter:
         """The first events say whether there are causes."""
         if self.count == 0 and events.cause is not None:
             with output_errors(self.path):
-                self._columns["cause"] = blosc_dataset(
+                self._columns["cause"] = growing_dataset(
                     self._file, "events/cause", (0,), np.uint8, (BLOCK,), self._codec
                 )
             self._block = _new_block(self._columns)
@@ -283,7 +283,7 @@ class DsecEventReader:
 
     def _declared(self, name: str) -> int | None:
         """A root attribute that says the sensor's size; None without."""
-        value = self._file.attrs.get(name)
+        value = attribute(self._file, name, self.path)
         if value is not None and (np.ndim(value) or np.asarray(value).dtype.kind not in "iu"):
             raise AssetError(f"attribute '{name}' is no integer", where=str(self.path), value=value)
         return None if value is None else int(value)
@@ -357,15 +357,20 @@ class DsecEventReader:
         self.close()
 
 
-def write_rectify_map(path: str | os.PathLike, rectify_map: np.ndarray) -> None:
+def write_rectify_map(path: str | os.PathLike, rectify_map: np.ndarray, codec: str = "zstd") -> None:
     """``rectify_map``: (H, W, 2) float32, ``map[y, x] = (x_rect, y_rect)``. A simulated pin-hole camera's is the
-    identity; loaders such as E-RAFT's insist on the file."""
+    identity; loaders such as E-RAFT's insist on the file. codec : "gzip", which h5py
+    alone reads, or another, which is Blosc's zstd."""
+    if codec == "gzip":
+        packed: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+    else:
+        packed = {"compression": hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.SHUFFLE)}
     with output_errors(path), h5py.File(path, "w") as file:
         file.create_dataset(
             "rectify_map",
             data=np.asarray(rectify_map, np.float32),
             track_times=False,
-            compression=hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.SHUFFLE),
+            **packed,
         )
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError
 from blinkgl.io.atomic import output_errors
-from blinkgl.io.hdf5 import blosc_dataset, dataset, hdf5_errors, open_hdf5, write_rows
+from blinkgl.io.hdf5 import dataset, growing_dataset, hdf5_errors, open_hdf5, write_rows
 from blinkgl.types.events import TOLD, TRUTH, Events
 
 EVENT_LABELS = "event_labels.h5"
@@ -29,14 +29,14 @@ class EventLabelsWriter:
     """Takes the events that ``events.h5`` is given and writes what made them. The same events give the same bytes
     however they were chunked. Raises OutputError: the disk refuses; what is written is then of no use."""
 
-    def __init__(self, path: str | os.PathLike):
-        self.path = Path(path)
+    def __init__(self, path: str | os.PathLike, *, codec: str = "zstd"):
+        self.path, self._codec = Path(path), codec
         self._held: list[Events] = []
         self._fill = self._written = 0
         with output_errors(self.path):
             self._file = h5py.File(self.path, "w", rdcc_nbytes=0)
             self._columns = {
-                name: blosc_dataset(self._file, name, (0, *shape), base, (BLOCK, *shape))
+                name: growing_dataset(self._file, name, (0, *shape), base, (BLOCK, *shape), codec)
                 for name, (base, shape) in {name: _parts(TRUTH[name]) for name in TOLD}.items()
             }
 
@@ -49,7 +49,9 @@ class EventLabelsWriter:
             raise TypeError("event labels: events that do not say what made them")
         if not self._held and not self._written and events.cause is not None:
             with output_errors(self.path):
-                self._columns["cause"] = blosc_dataset(self._file, "cause", (0,), np.uint8, (BLOCK,))
+                self._columns["cause"] = growing_dataset(
+                    self._file, "cause", (0,), np.uint8, (BLOCK,), codec=self._codec
+                )
         self._held.append(events)
         self._fill += len(events)
         while self._fill >= BLOCK:

@@ -1,8 +1,11 @@
-"""Prophesee's EVT2 (32-bit words, read only) and EVT3 (16-bit words), decoded and encoded by numba kernels.
+"""Prophesee's EVT2, EVT2.1 (32- and 64-bit words, read only) and EVT3 (16-bit words), by numba kernels.
 
 EVT2: type in bits 31..28 (0 OFF, 1 ON, 8 TIME_HIGH = t >> 6); t low 27..22, x 21..11, y 10..0.
+EVT2.1: upper half as a word of EVT2, lower half a mask: bit k is an event at x + k. Sensors whose header says
+"endianness=legacy" (IMX636) send the upper half first, each half little-endian.
 EVT3: type in bits 15..12: 0 ADDR_Y, 2 ADDR_X (polarity bit 11), 3 VECT_BASE_X, 4 VECT_12, 5 VECT_8, 6 TIME_LOW (t &
-0xfff), 8 TIME_HIGH (t >> 12 & 0xfff): 24 bits of µs, wrapping every 16.8 s. (Prophesee, "EVT 2.0 / 3.0 format" pages.)
+0xfff), 8 TIME_HIGH (t >> 12 & 0xfff): 24 bits of µs, wrapping every 16.8 s.
+(Prophesee, "EVT 2.0 / 2.1 / 3.0 format" pages.)
 
 Like other encoders of a ready event list we write EVT3's single events only, no vectors; the reader knows both.
 """
@@ -22,7 +25,7 @@ from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import check_events, check_size, refuse_causes
 from blinkgl.types.events import Events
 
-_WORD = {"evt2": np.dtype("<u4"), "evt3": np.dtype("<u2")}
+_WORD = {"evt2": np.dtype("<u4"), "evt21": np.dtype("<u8"), "evt3": np.dtype("<u2")}
 _MAX_SIDE = 2048
 _LONGEST_LINE = 4096
 _MAX_TIME = 1 << 34
@@ -90,7 +93,7 @@ class EvtWriter:
 
 
 class EvtReader:
-    """Header and events of an EVT2/EVT3 file. ``height`` and ``width`` are None when the header does not say.
+    """Header and events of an EVT2/EVT2.1/EVT3 file. ``height`` and ``width`` are None when the header does not say.
 
     As the format asks for, events before the first TIME_HIGH have no time and are left out, and
     triggers and vendors' words are passed over.
@@ -104,9 +107,10 @@ class EvtReader:
         version = re.search(r"^% evt (\d+\.?\d*)", header, re.M) or re.search(r"^% format EVT(\d+)", header, re.M)
         if not version:
             raise AssetError("not an EVT file: header without '% evt'", where=str(path))
-        self.version = "evt" + version.group(1).removesuffix(".0")  # 2.1 has 64-bit words: another format
+        self.version = "evt" + version.group(1).removesuffix(".0").replace(".", "")
         if self.version not in _WORD:
-            raise AssetError("unsupported EVT version", where=str(path), value=version.group(1), accepted="2 or 3")
+            raise AssetError("unsupported EVT version", where=str(path), value=version.group(1), accepted="2, 2.1 or 3")
+        self._upper_first = "endianness=legacy" in header
         geometry = re.search(r"^% geometry (\d{1,9})x(\d{1,9})\b", header, re.M)
         sizes = {k: re.search(rf"{k}=(\d{{1,9}})\b", header) for k in ("height", "width")}
         self.height = int(geometry.group(2)) if geometry else int(sizes["height"].group(1)) if sizes["height"] else None
@@ -118,10 +122,10 @@ class EvtReader:
         dtype = _WORD[self.version]
         # EVT2: time high, wraps.  EVT3: time high, y, low, vector base x, polarity, wraps.  -1: no time yet.  Last:
         # events without a time.
-        state = np.array([-1, 0, 0] if self.version == "evt2" else [-1, 0, 0, 0, 0, 0, 0], np.int64)
+        state = np.array([-1, 0, 0, 0, 0, 0, 0] if self.version == "evt3" else [-1, 0, 0], np.int64)
         position = self._start
         # Words decode to at most so many events: a vector of EVT3 holds twelve.
-        decode, most = (_decode_evt2, 1) if self.version == "evt2" else (_decode_evt3, 12)
+        most = {"evt2": 1, "evt21": 32, "evt3": 12}[self.version]
         with open(self.path, "rb") as file:
             file.seek(self._start)
             # A file that ends within a word is truncated, which is said after its whole words.
@@ -134,7 +138,7 @@ class EvtReader:
                     np.empty(most * len(raw), np.uint8),
                 )
                 t = np.empty(most * len(raw), np.int64)
-                n, bad = decode(raw, state, x, y, t, p)
+                n, bad = self._decode(raw, state, x, y, t, p)
                 if bad >= 0:
                     raise AssetError(
                         f"damaged at byte {position + bad * dtype.itemsize}: no {self.version.upper()} word can "
@@ -152,6 +156,14 @@ class EvtReader:
                     )
         if state[0] < 0 and state[-1]:
             raise AssetError(f"{state[-1]} events and no TIME_HIGH word, so no times", where=str(self.path))
+
+    def _decode(self, raw, state, x, y, t, p) -> tuple[int, int]:
+        if self.version == "evt3":
+            return _decode_evt3(raw, state, x, y, t, p)
+        if self.version == "evt2":
+            return _decode_evt2(raw, np.ones(len(raw), np.uint32), state, x, y, t, p)
+        upper, lower = (raw.view("<u4")[half::2].copy() for half in ((0, 1) if self._upper_first else (1, 0)))
+        return _decode_evt2(upper, lower, state, x, y, t, p)
 
 
 def _read_header(path: Path) -> tuple[str, int]:
@@ -180,8 +192,10 @@ def _read_header(path: Path) -> tuple[str, int]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _decode_evt2(words, state, x, y, t, p):
-    """Returns (events, index of the first word of an unknown type or -1)."""
+def _decode_evt2(words, masks, state, x, y, t, p):
+    """Returns (events, index of the first word of an unknown type, or whose mask leaves the 11 bits of x; -1: none).
+
+    masks : bit k is an event at the word's x + k; of EVT2 that is 1."""
     n, bad = 0, -1
     high, wraps, untimed = state
     for i in range(len(words)):
@@ -198,9 +212,19 @@ def _decode_evt2(words, state, x, y, t, p):
             if high < 0:
                 untimed += 1
                 continue
-            x[n], y[n], p[n] = (word >> 11) & 0x7FF, word & 0x7FF, kind
-            t[n] = (((wraps << 28) | high) << 6) | ((word >> 22) & 63)
-            n += 1
+            mask, column = np.int64(masks[i]), (word >> 11) & 0x7FF
+            while mask:
+                if mask & 1:
+                    if column > 0x7FF:
+                        bad = i
+                        break
+                    x[n], y[n], p[n] = column, word & 0x7FF, kind
+                    t[n] = (((wraps << 28) | high) << 6) | ((word >> 22) & 63)
+                    n += 1
+                mask >>= 1
+                column += 1
+            if bad >= 0:
+                break
         elif kind != 10 and kind < 14:  # 10 external trigger, 14 others, 15 continued
             bad = i
             break

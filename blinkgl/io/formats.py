@@ -70,6 +70,8 @@ FORMATS = {
         EventFormat(
             "csv", (".csv",), "text", "TextReader", "TextWriter", fixed={"separator": ","}, takes=("time_unit",)
         ),
+        EventFormat("es", (".es",), "event_stream", "EventStreamReader"),
+        EventFormat("mat", (".mat",), "arrays", "MatReader"),
         EventFormat("npz", (".npz",), "arrays", "ArrayReader", "ArrayWriter", causes=True),
         EventFormat("npy", (".npy",), "arrays", "ArrayReader", "ArrayWriter", causes=True),
     )
@@ -187,7 +189,7 @@ def open_events(path: str | os.PathLike) -> EventFile:
     if path.suffix.lower() in HDF5:
         kind = _held(path)
     reader = FORMATS[kind].open(path)
-    kind = getattr(reader, "version", kind)  # of a .raw file, which says whether it is EVT2 or EVT3
+    kind = getattr(reader, "version", kind)  # of a .raw file, which says whether it is EVT2, EVT2.1 or EVT3
     return EventFile(path, kind, reader.height, reader.width, getattr(reader, "t_offset_us", 0), reader)
 
 

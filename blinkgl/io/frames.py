@@ -24,8 +24,9 @@ _STAMP_FILES = ("timestamps.txt", "images.txt", "timestamps.csv")
 class FrameSource:
     """Frames with their times.
 
-    height, width : px. count : number of frames, None when unknown before the end. times_known : False where only
-    ``fps`` given by the user can time the frames. Iterating yields (frame, t_ns, name): frame (H, W) or (H, W, 3) RGB
+    height, width : px. count : number of frames, None when unknown before the end. linear : whether codes
+    are known to be proportional to light (a camera's own frames beside its events). Iterating yields (frame, t_ns,
+    name): frame (H, W) or (H, W, 3) RGB
     of uint8, uint16 or float32; t_ns int, strictly increasing; name for messages.
 
     Raises (while iterating): AssetError for an undecodable frame, EventDataError for a changed size or times that do
@@ -38,6 +39,7 @@ class FrameSource:
     count: int | None
     fps: float | None
     _frames: Callable[[], Iterator[tuple[np.ndarray, int | None, str]]] = field(repr=False)
+    linear: bool = False
 
     def __iter__(self) -> Iterator[tuple[np.ndarray, int, str]]:
         last = None
@@ -245,7 +247,7 @@ def _recording(path: Path, fps: float | None, timestamps) -> FrameSource:
                 )
             yield frame.image, None if fps else times[i] if times is not None else frame.t_us * 1000, f"#{i}"
 
-    return FrameSource(path, *first.image.shape[:2], None, fps, frames)
+    return FrameSource(path, *first.image.shape[:2], None, fps, frames, linear=True)
 
 
 def _stamps(name: str, values: np.ndarray) -> list[int]:

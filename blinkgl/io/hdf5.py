@@ -15,6 +15,7 @@ import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import h5py
 import hdf5plugin
@@ -149,7 +150,20 @@ def dataset(
     return found
 
 
-def blosc_dataset(
+def attribute(file: h5py.File, name: str, path: Path) -> Any:
+    """The file's attribute ``name``, numbers or text; None where there is none.
+
+    Raises AssetError: of another type. h5py reads lists of any length without a look at the file, and a damaged type
+    that is taken for one ends the process."""
+    if name not in file.attrs:
+        return None
+    kind = h5py.h5a.open(file.id, name.encode()).get_type().get_class()
+    if kind not in (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.STRING):
+        raise AssetError(f"attribute '{name}' holds neither numbers nor text", where=str(path))
+    return file.attrs[name]
+
+
+def growing_dataset(
     file: h5py.File,
     name: str,
     shape: tuple[int, ...],
@@ -157,20 +171,27 @@ def blosc_dataset(
     chunks: tuple[int, ...],
     codec: str = "zstd",
 ) -> h5py.Dataset:
-    """A new data set that grows along its first axis: Blosc level 1 with bit shuffle (filter 32001). codec : of
-    :data:`CODECS`; zstd as in DSEC's files."""
-    packed = hdf5plugin.Blosc(cname=codec, clevel=_LEVEL, shuffle=_BIT_SHUFFLE)
+    """A new data set that grows along its first axis. codec : of :data:`CODECS`, packed by Blosc, level 1 with bit
+    shuffle (filter 32001), zstd as in DSEC's files; or "gzip", level 1 with byte shuffle, which every HDF5 unpacks."""
+    if codec == "gzip":
+        packed: dict[str, Any] = {"compression": "gzip", "compression_opts": _LEVEL, "shuffle": True}
+    else:
+        packed = {"compression": hdf5plugin.Blosc(cname=codec, clevel=_LEVEL, shuffle=_BIT_SHUFFLE)}
     return file.create_dataset(
-        name, shape, dtype, maxshape=(None, *shape[1:]), chunks=chunks, track_times=False, compression=packed
+        name, shape, dtype, maxshape=(None, *shape[1:]), chunks=chunks, track_times=False, **packed
     )
 
 
 def write_rows(data: h5py.Dataset, start: int, rows: np.ndarray) -> None:
-    """``data[start:] = rows`` for a data set of :func:`blosc_dataset`, which grows to hold them.
+    """``data[start:] = rows`` for a data set of :func:`growing_dataset`, which grows to hold them.
 
-    Chunks are compressed here, each by one thread, instead of inside HDF5. There Blosc would take the user's
+    Blosc's chunks are compressed here, each by one thread, instead of inside HDF5. There Blosc would take the user's
     ``BLOSC_NTHREADS``, and with more than one thread stores its blocks in the order they finish:
     bytes would differ from run to run."""
+    if data.compression == "gzip":
+        data.resize(start + len(rows), axis=0)
+        data[start:] = rows
+        return
     step, codec = data.chunks[0], data.id.get_create_plist().get_filter(0)[2][6]
     begin = start // step * step
     rows = np.ascontiguousarray(rows, data.dtype)

@@ -20,7 +20,7 @@ import h5py
 import numpy as np
 
 from blinkgl.errors import AssetError
-from blinkgl.io.hdf5 import blosc_dataset, dataset, hdf5_errors, open_hdf5, write_rows
+from blinkgl.io.hdf5 import dataset, growing_dataset, hdf5_errors, open_hdf5, write_rows
 
 SHAPES: dict[str, tuple[tuple[int | None, ...], str]] = {
     "flow": ((None, None, None, 2), "f"),
@@ -40,7 +40,7 @@ def encode_intervals(t_ns: int, interval_ns: np.ndarray, arrays: Mapping[str, np
         file.create_dataset("from_us", data=np.int64(t_ns // 1000), track_times=False)
         for name, array in arrays.items():
             array = array.view(np.uint8) if array.dtype == bool else array
-            data = blosc_dataset(file, name, (0, *array.shape[1:]), array.dtype, (1, *array.shape[1:]))
+            data = growing_dataset(file, name, (0, *array.shape[1:]), array.dtype, (1, *array.shape[1:]))
             for k, one in enumerate(array):
                 write_rows(data, k, one[None])
     return buffer.getvalue()

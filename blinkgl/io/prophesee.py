@@ -17,7 +17,7 @@ import numpy as np
 from blinkgl.errors import AssetError
 from blinkgl.io import ecf
 from blinkgl.io.columns import check_size, events_of
-from blinkgl.io.hdf5 import hdf5_errors, open_hdf5
+from blinkgl.io.hdf5 import attribute, hdf5_errors, open_hdf5
 from blinkgl.types.events import Events
 
 DATASET = "CD/events"
@@ -33,7 +33,7 @@ class PropheseeReader:
         with open_hdf5(self.path) as file, hdf5_errors(self.path):
             table = self._table(file)
             self.count = len(table)
-            geometry = file.attrs.get("geometry", b"")
+            geometry = attribute(file, "geometry", self.path)
             text = geometry.decode("latin-1") if isinstance(geometry, bytes) else str(geometry)
         found = re.fullmatch(r"(\d{1,9})x(\d{1,9})", text)
         self.height, self.width = (int(found[2]), int(found[1])) if found else (None, None)
@@ -76,7 +76,8 @@ class PropheseeReader:
     def _table(self, file: h5py.File) -> h5py.Dataset:
         table = file.get(DATASET)
         named = isinstance(table, h5py.Dataset) and table.ndim == 1 and table.dtype.names
-        if not named or not {"x", "y", "p", "t"} <= set(table.dtype.names):
+        whole = named and all(name in named and table.dtype[name].kind in "iu" for name in "xypt")
+        if not whole:
             raise AssetError(f"no table '{DATASET}' of x, y, p, t", where=str(self.path))
         if ecf.FILTER in (filters := _filters(table)) and len(filters) > 1:
             raise AssetError(

@@ -6,10 +6,12 @@ model asks for or with one line that says what is wrong.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+import re
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, TypeAdapter, ValidationError
@@ -64,6 +66,26 @@ def parse(text: str, model: TypeAdapter | None = None) -> Any:
         raise ValueError("nested too deeply") from None
     except json.JSONDecodeError as error:
         raise ValueError(f"not JSON: {error.msg.lower()} at line {error.lineno}") from None
+
+
+SEAL = "record_sha256"
+_OPEN = "0" * 64
+
+
+def sealed(record: Mapping[str, Any], default: Callable[[Any], Any] | None = None) -> str:
+    """The JSON text of a record with a hash of itself: SHA-256 of the text with zeros in the hash's place."""
+    text = json.dumps({**record, SEAL: _OPEN}, indent=1, sort_keys=True, default=default) + "\n"
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    return text.replace(f'"{SEAL}": "{_OPEN}"', f'"{SEAL}": "{digest}"')
+
+
+def seal_problem(text: str) -> str | None:
+    """What is wrong with the hash that a sealed record has of itself; None where it is right."""
+    found = re.search(rf'"{SEAL}": "([0-9a-f]{{64}})"', text)
+    if found is None:
+        return f"'{SEAL}' is missing"
+    whole = text[: found.start(1)] + _OPEN + text[found.end(1) :]
+    return None if hashlib.sha256(whole.encode()).hexdigest() == found[1] else "checksum differs"
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

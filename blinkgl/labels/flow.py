@@ -35,7 +35,7 @@ class FlowTo(Label):
         self.off = "not in labels.flow"
         self.stamps, self.shard = f"flow/{towards}_timestamps.txt", "flow.png" if towards == "forward" else "back.png"
 
-    said = property(lambda self: "flow" if self.towards == "forward" else self.name)
+    said = property(lambda self: self.towards)
 
     def asked(self, labels: LabelsConfig) -> bool:
         return self.towards in labels.flow

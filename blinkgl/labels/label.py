@@ -187,7 +187,7 @@ class Label:
 
     @property
     def said(self) -> str:
-        """Its name in Python calls, ``labels=["depth", …]``."""
+        """Its name in Python calls, ``labels=["depth", …]``: the word that asks for it in a YAML."""
         return self.name
 
     def intervals(self, labels: LabelsConfig) -> tuple[int, ...]:

@@ -60,9 +60,17 @@ class Dsec(Layout):
     """Training sequences with flow, and of a stereo rig with disparity."""
 
     name = "dsec"
-    about = "DSEC's provider and event slicer, bflow, E-RAFT's training loaders, eflow"
+    about = "DSEC's event slicer, bflow's loader of DSEC, eflow"
     size = (480, 640)
     needs = (forward_flow, _rectified)
+    splits = ("train", "test")
+
+    def opened_by(self, out: Path) -> str:
+        """DSEC's own provider asserts a folder of disparities and both eyes' events in every training sequence."""
+        folders = [*out.glob("train/*")]
+        if folders and all((f / "disparity/event").is_dir() and (f / "events/right").is_dir() for f in folders):
+            return f"DSEC's provider, {self.about}"
+        return f"{self.about} (not DSEC's provider, which asks for 'rig: stereo' and 'labels: {{disparity: true}}')"
 
     def write(self, source: Source, folder: Path) -> list[str]:
         said: list[str] = []
@@ -120,9 +128,9 @@ def write_events(source: Source, folder: Path) -> None:
     copy(source.folder / "events.h5", folder / "events.h5")
     camera = source.camera
     flat = camera is None or isinstance(camera, PinHole)
-    write_rectify_map(
-        folder / "rectify_map.h5", identity_rectify_map(source.height, source.width) if flat else rectify_map(camera)
-    )
+    table = identity_rectify_map(source.height, source.width) if flat else rectify_map(camera)
+    # Beside events that h5py alone reads, the map must not ask for a plugin either.
+    write_rectify_map(folder / "rectify_map.h5", table, codec=source.codec)
 
 
 def write_flow(source: Source, towards: str, folder: Path) -> None:

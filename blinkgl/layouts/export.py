@@ -14,10 +14,11 @@ from blinkgl.layouts.table import layout_of
 
 @dataclass(frozen=True)
 class Exported:
-    """sequences : how many.   said : what a person should know of, a line each."""
+    """sequences : how many.   said : what a person should know of, a line each.   opened_by : which loaders open it."""
 
     sequences: int
     said: tuple[str, ...]
+    opened_by: str
 
 
 def export_layout(root: str | Path, out: str | Path, layout: str) -> Exported:
@@ -40,7 +41,9 @@ def export_layout(root: str | Path, out: str | Path, layout: str) -> Exported:
         for source, place in zip(sources, places):
             (folder / place).mkdir(parents=True, exist_ok=True)
             said += row.write(source, folder / place)
-    return Exported(len(sources), tuple(said))
+        for split in row.splits:
+            (folder / split).mkdir(exist_ok=True)
+    return Exported(len(sources), tuple(said), row.opened_by(out))
 
 
 def _refuse_what_lacks(row: Layout, source: Source) -> None:

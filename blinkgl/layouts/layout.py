@@ -24,12 +24,18 @@ class Layout:
     """One layout; a row of the table is an instance.
 
     name : as ``--layout`` has it.   about : what opens it, for tables.   size : (height, width) that its loaders have
-    written into their code, None: any; other sizes are exported and said.   needs : what its loaders ask for."""
+    written into their code, None: any; other sizes are exported and said.   needs : what its loaders ask for.
+    splits : folders that its loaders want to be there, empty or not."""
 
     name: str
     about: str
     size: tuple[int, int] | None = None
     needs: tuple[Need, ...] = ()
+    splits: tuple[str, ...] = ()
+
+    def opened_by(self, out: Path) -> str:
+        """What opens the export in the folder ``out``: some loaders ask for more than the layout does."""
+        return self.about
 
     def missing(self, source: Source) -> list[Missing]:
         """What ``source`` lacks and its loaders cannot do without."""

@@ -165,8 +165,15 @@ class Source:
     @property
     def rectified(self) -> bool:
         """Whether labels are in the pixels of the rectified picture: of a lens that distorts, on request."""
-        labels = read_table(self.folder / "config.yaml").get("labels") or {}
-        return isinstance(self.camera, PinHole) or labels.get("pixels") == "rectified"
+        return isinstance(self.camera, PinHole) or self._configured("labels", "pixels") == "rectified"
+
+    @property
+    def codec(self) -> str:
+        """What its events are packed with."""
+        return str(self._configured("output", "compression") or "zstd")
+
+    def _configured(self, section: str, key: str) -> Any:
+        return (read_table(self.folder / "config.yaml").get(section) or {}).get(key)
 
     def _lines(self, name: str) -> list[str]:
         lines = read_text(self.folder / name).splitlines()

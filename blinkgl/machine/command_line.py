@@ -99,6 +99,8 @@ def user_line(error: Exception) -> str | None:
         context = getattr(error, "ctx", None)
         command = context.command_path if context is not None else "blinkgl"
         message = " ".join(error.format_message().split()).rstrip(".")  # type: ignore[missing-attribute]
+        if type(error).__name__ == "NoArgsIsHelpError" and context is not None:  # whose message is the whole help
+            message = f"Missing command, one of {', '.join(context.command.commands)}"
         return f"{message}; see '{command} --help'"
     if isinstance(error, ModuleNotFoundError) and error.name in EXTRAS["learn"][0]:
         return f"{error.name} is not installed; run {install(*EXTRAS['learn'][0])}"

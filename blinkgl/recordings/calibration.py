@@ -339,6 +339,10 @@ def _of_frames(clip: Clip, reading: FrameReading) -> tuple[list[str], list[str]]
             else "taken to go in a straight line: what moved further than a pixel is wrong there."
         ),
     ]
+    notes.append(
+        f"The frames' codes were taken as `--gamma {reading.gamma}`: simulate such frames with that, too, or the "
+        "fitted thresholds are of another light."
+    )
     if "bursts" in facts:
         notes.append(
             f"{100 * facts['in_bursts']:.0f} % of the events come in {facts['bursts']:.0f} bursts of one polarity, all "

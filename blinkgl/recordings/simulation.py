@@ -16,7 +16,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numba
 import numpy as np
@@ -27,12 +27,15 @@ from blinkgl.config.problems import validate
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import ConfigError, EventDataError, OutputError
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
-from blinkgl.io.frames import open_frames
+from blinkgl.io.frames import VIDEO, open_frames
 from blinkgl.recordings.fitting import Fitting
 from blinkgl.srgb import linear_from_srgb
 from blinkgl.tensors.choice import make_on_device
 from blinkgl.timeline import interpolate as between
 from blinkgl.types.events import Events, count_causes, named_causes
+
+if TYPE_CHECKING:
+    from blinkgl.sequence_files.preview import PreviewWriter
 
 INTERPOLATIONS = ("linear", "motion")
 _LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
@@ -61,12 +64,34 @@ class SimulationReport:
     """events by what caused them, "signal", "leak", "shot" and "hot"; empty unless ``causes`` of the emulator is set"""
     displacement: between.Displacement | None = None
     """for interpolate="motion" """
+    moved_px: list[float] = field(default_factory=list)
+    """for interpolate="linear": 99th percentile of the dense flow between a few pairs of given frames"""
+    assumed_srgb: bool = False
+    """whether the codes of images were taken as sRGB because nobody said what they are"""
     fitting: Fitting | None = None
     """how frames became the sensor's size; None: they had it, or nobody asked"""
 
     @property
     def duration_s(self) -> float:
         return (self.last_ns - self.first_ns) * 1e-9
+
+    def add(self, t_ns: int, events: Events, camera: EventCamera) -> None:
+        """Count what the emulator made of a frame at t_ns."""
+        self.first_ns = t_ns if self.steps == 0 else self.first_ns
+        self.steps += 1
+        self.last_ns = t_ns
+        self.events += len(events)
+        self.on += int(np.count_nonzero(events.p))
+        self.saturated, self.lost, self.late = camera.saturated, camera.dropped, camera.late
+        if camera.emulator.causes:
+            new = named_causes(count_causes(events))
+            self.causes = {cause: self.causes.get(cause, 0) + count for cause, count in new.items()}
+
+    @property
+    def guessed_over_px(self) -> float:
+        """How far things move between given frames, px, where interpolation is linear: 0 where nobody looked."""
+        # The median: dense flow fails at a cut, and where nothing has contrast.
+        return float(np.median(self.moved_px)) if self.moved_px else 0.0
 
 
 def frames_to_events(
@@ -201,6 +226,8 @@ def stepped(
     if interpolate == "motion":
         report.displacement = between.Displacement()
         stream = between.motion(stream, max_px, displacement=report.displacement)
+    else:
+        stream = between.watched(stream, report.moved_px)
     seen: list[np.ndarray] = [first[0]]
 
     def shown() -> Iterator[EventFrame]:
@@ -208,17 +235,8 @@ def stepped(
             seen[0] = luminance
             yield EventFrame(t_ns, luminance)
 
-    by_cause = count_causes(Events.empty())
     for t_ns, events in emulate(shown(), camera):
-        report.first_ns = t_ns if report.steps == 0 else report.first_ns
-        report.steps += 1
-        report.last_ns = t_ns
-        report.events += len(events)
-        report.on += int(np.count_nonzero(events.p))
-        report.saturated, report.lost, report.late = camera.saturated, camera.dropped, camera.late
-        if camera.emulator.causes:
-            by_cause += count_causes(events)
-            report.causes = named_causes(by_cause)
+        report.add(t_ns, events, camera)
         yield Step(t_ns, events, seen[0])
 
 
@@ -240,54 +258,41 @@ def file_to_events(
     size : (height, width) of the sensor; frames of another size are cropped and scaled; None: as the frames are.
     preview : video of frames and events. progress : called with (report so far, fraction done or None) per given frame.
     """
-    from blinkgl.io.atomic import atomic_file
-    from blinkgl.io.formats import WITH_CAUSES, event_writer, output_format
-    from blinkgl.sequence_files.preview import PreviewWriter
+    from blinkgl.io.formats import event_writer
 
-    kind = output_format(target)
-    if getattr(emulator_config(options.get("emulator", EmulatorConfig.members.default)), "causes", False):
-        if kind not in WITH_CAUSES:
-            raise OutputError(
-                f"{kind} cannot hold the causes of events",
-                where=str(target),
-                accepted=".h5, .npz or .npy, or an emulator without causes",
-            )
+    _check_target(target, options.get("emulator", EmulatorConfig.members.default))
     if preview is not None and Path(preview).resolve() == Path(target).resolve():
         raise OutputError("preview and events in the same file", where=str(preview))
     frames = open_frames(source, fps=fps, timestamps=timestamps)
     height, width = (frames.height, frames.width) if size is None else size
     report = SimulationReport()
-    decode = Decoder("srgb" if options.get("gamma") is None else _checked_gamma(options["gamma"]))
+    if options.get("gamma") is None and frames.linear:
+        options = {**options, "gamma": "linear"}
+    said = options.get("gamma") is not None
+    decode = Decoder(_checked_gamma(options["gamma"]) if said else "srgb")
     if (height, width) != (frames.height, frames.width):
         report.fitting = Fitting((frames.height, frames.width), (height, width))
         options = {**options, "gamma": "linear"}  # scaled in linear light
     iterator = iter(frames)
     first = next(iterator)
     second = next(iterator, None)
+    # A video is made to be looked at; images and arrays may be a camera's raw codes.
+    is_video = frames.path.suffix.lower() in VIDEO
+    report.assumed_srgb = not said and first[0].dtype.kind == "u" and not is_video
     start_us = first[1] // 1000
     gap_ns = (second[1] - first[1]) if second else 10**9
 
     def given() -> Iterator:
         for i, (frame, t_ns, name) in enumerate(itertools.chain([first], [second] if second else [], iterator)):
-            said = f"{source}: frame {i} ({name})"
-            yield (frame if report.fitting is None else report.fitting(decode(frame, said))), t_ns, said
+            where = f"{source}: frame {i} ({name})"
+            yield (frame if report.fitting is None else report.fitting(decode(frame, where))), t_ns, where
 
     with contextlib.ExitStack() as stack:
         out = stack.enter_context(event_writer(target, height, width, t_offset_us=start_us, overwrite=overwrite))
         video = None
         if preview is not None:
-            rate = min(1e9 / gap_ns, 100.0)
-            video = stack.enter_context(
-                PreviewWriter(
-                    stack.enter_context(atomic_file(preview, overwrite=overwrite)),
-                    height,
-                    width,
-                    t0_us=start_us,
-                    flow=False,
-                    rate_hz=rate,
-                    fps=min(rate, 25.0),
-                )
-            )
+            shown = _preview(preview, height, width, start_us, gap_ns, overwrite)
+            video = stack.enter_context(shown)
         done = 0
         for step in simulated_steps(given(), report=report, **options):
             if video is not None:
@@ -302,6 +307,37 @@ def file_to_events(
                 progress(report, min(done / frames.count, 1.0) if frames.count else None)
         out.t_end_us = report.last_ns // 1000
     return report
+
+
+def _check_target(target: str | os.PathLike, emulator: str | EmulatorConfig | dict) -> None:
+    """Raises OutputError: no event file's ending, or of a format that cannot hold what the emulator says."""
+    from blinkgl.io.formats import WITH_CAUSES, output_format
+
+    kind = output_format(target)
+    if getattr(emulator_config(emulator), "causes", False) and kind not in WITH_CAUSES:
+        raise OutputError(
+            f"{kind} cannot hold the causes of events",
+            where=str(target),
+            accepted=".h5, .npz or .npy, or an emulator without causes",
+        )
+
+
+@contextlib.contextmanager
+def _preview(
+    path: str | os.PathLike, height: int, width: int, start_us: int, gap_ns: int, overwrite: bool
+) -> Iterator[PreviewWriter]:
+    """A video of frames and events, at the frames' rate up to 100 Hz, that appears whole or not at all."""
+    from blinkgl.io.atomic import atomic_file
+    from blinkgl.sequence_files.preview import PreviewWriter
+
+    rate = min(1e9 / gap_ns, 100.0)
+    with (
+        atomic_file(path, overwrite=overwrite) as temporary,
+        PreviewWriter(
+            temporary, height, width, t0_us=start_us, flow=False, rate_hz=rate, fps=min(rate, 25.0)
+        ) as writer,
+    ):
+        yield writer
 
 
 class Decoder:

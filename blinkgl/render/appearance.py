@@ -17,7 +17,7 @@ from blinkgl.scene.geometry.tangents import tangents
 from blinkgl.scene.lights import ambient, beam, lamps_of, quadric_of, quartic_of, shadowing, surroundings_of
 from blinkgl.scene.shapes.deformer import normals_at
 from blinkgl.scene.surfaces import gloss
-from blinkgl.scene.types import REPEAT, Lamp, Map, Material, Part, Scene, SceneObject, Texture
+from blinkgl.scene.types import REPEAT, Lamp, Map, Material, Part, Scene, Texture
 from blinkgl.srgb import linear_from_srgb
 
 LUMA = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709, of linear R, G, B
@@ -288,32 +288,12 @@ def seen_by_lamp(
     scene: Scene, t_ns: int, eye: np.ndarray, rays: np.ndarray, near: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """What a shadow map should hold: (N,) depth along the axis of a lamp that looks from the (4, 4) pose ``eye`` along
-    (N, 3) rays of length 1 there, inf where nothing casts, and (N,) number of the part among all that cast, -1.
-
-    Of closed meshes it is the nearest side that faces away from the lamp."""
+    (N, 3) rays of length 1 there, inf where nothing casts, and (N,) number of the part among all that cast, -1."""
     casters, _ = _casters(scene)
     if not casters.objects:
         return np.full(len(rays), np.inf), np.full(len(rays), -1, np.int32)
-    if casters not in _inside_out:
-        # Seen from inside, so that a face away from the lamp counts as front.
-        _inside_out[casters] = replace(casters, objects=tuple(_turned_out(thing) for thing in casters.objects))
-    turned = _inside_out[casters]
-    hit, _, depth = nearest(turned, t_ns, np.ascontiguousarray(rays[:, :2]), eye=eye, near=near)
+    hit, _, depth = nearest(casters, t_ns, np.ascontiguousarray(rays[:, :2]), eye=eye, near=near)
     return depth, hit[:, 0]
-
-
-_inside_out: WeakKeyDictionary = WeakKeyDictionary()
-
-
-def _turned_out(thing: SceneObject) -> SceneObject:
-    """Return the object with the faces of one-sided parts turned round."""
-    parts = (
-        replace(part, mesh=replace(part.mesh, faces=np.ascontiguousarray(part.mesh.faces[:, ::-1])))
-        if part.culled
-        else part
-        for part in thing.parts
-    )
-    return replace(thing, parts=tuple(parts))
 
 
 def casts(scene: Scene) -> bool:

@@ -13,7 +13,7 @@ from blinkgl.errors import AssetError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.labels import LABELS
 from blinkgl.report.charts import number, size
-from blinkgl.report.collect import Collected, collect
+from blinkgl.report.collect import Collected, collect, task_of
 from blinkgl.sequence_files.index import write_index
 from blinkgl.sequence_files.sequence_dir import read_manifest
 
@@ -52,23 +52,29 @@ def write_card(root: str | Path, *, licence: str | None = None, url: str | None 
 
 def facts_of(found: Collected) -> list[Fact]:
     """Rates, displacements and event density, of every sequence or of the sample that reports look at."""
-    sequences = [s for s in found.sequences if s["duration_us"]]
-    seconds = sum(s["duration_us"] for s in sequences) / 1e6
-    facts = [Fact("simulated time", seconds, "s"), Fact("sequences", len(found.sequences), "")]
-    if not sequences:
+    cameras = [s for s in found.sequences if s["duration_us"]]
+    # Rates are of one camera: two that see a second make twice the events.
+    seconds = sum(s["duration_us"] for s in cameras) / 1e6
+    simulated_us = found.simulated_us
+    facts = [
+        Fact("simulated time", sum(simulated_us.values()) / 1e6, "s"),
+        Fact("sequences", len(simulated_us), ""),
+        Fact("cameras", len(found.sequences), ""),
+    ]
+    if not cameras:
         return facts
-    labels, frames = (sum(s[key] or 0 for s in sequences) for key in ("labels", "frames"))
+    labels, frames = (sum(s[key] or 0 for s in cameras) for key in ("labels", "frames"))
     rate = found.quantities.get("rate", np.zeros(0))
     facts += [
         # A sequence begins an interval before its first label.
-        Fact("labels a second", (labels + len(sequences)) / seconds, "Hz"),
+        Fact("labels a second", (labels + len(cameras)) / seconds, "Hz"),
         Fact("frames rendered a second", frames / seconds, "Hz"),
-        Fact("events", sum(s["events"] or 0 for s in sequences), ""),
-        Fact("events a second", sum(s["events"] or 0 for s in sequences) / seconds, "1/s"),
+        Fact("events", sum(s["events"] or 0 for s in cameras), ""),
+        Fact("events a second", sum(s["events"] or 0 for s in cameras) / seconds, "1/s"),
     ]
     if len(rate):
         facts += [Fact(f"events a pixel and second, {w}", v, "1/s") for w, v in _spread(rate)]
-        per_label = rate * seconds / max(labels + len(sequences), 1)
+        per_label = rate * seconds / max(labels + len(cameras), 1)
         facts.append(Fact("events a pixel and label interval, mean", float(per_label.mean()), ""))
     for key, name, unit in (
         ("displacement", "flow over a label interval", "px"),
@@ -107,14 +113,15 @@ def card_of(found: Collected, facts: list[Fact], licence: str | None, url: str |
         "Events of simulated cameras with exact ground truth, rendered by BlinkGL.",
         *(() if url is None else ("", url)),
         "",
-        "| split | sequences | sizes | emulators |",
-        "|---|---|---|---|",
+        "| split | sequences | cameras | sizes | emulators |",
+        "|---|---|---|---|---|",
     ]
     for split in sorted(splits, key=str):
         those = [s for s in found.sequences if s["split"] == split]
         sizes = ", ".join(sorted({f"{s['width']}x{s['height']}" for s in those}))
         emulators = ", ".join(sorted({str(s["emulator"]) for s in those}))
-        lines.append(f"| {split} | {len(those):,} | {sizes} | {emulators} |")
+        made = len({task_of(s) for s in those})
+        lines.append(f"| {split} | {made:,} | {len(those):,} | {sizes} | {emulators} |")
     lines += ["", "| measured | | |", "|---|---|---|"]
     lines += [f"| {f.name} | {number(f.value)} | {f.unit} |" for f in facts]
     lines += ["", f"On disk {size(sum(s['bytes'] for s in found.sequences))}. " + _licence(licence), "", "## Files", ""]

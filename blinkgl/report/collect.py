@@ -61,6 +61,7 @@ class Collected:
 
     root: Path
     sequences: list[dict[str, Any]]
+    """lines of the index: a line a camera, so of a rig's sequence several"""
     plan: Plan | None
     environment: dict[str, str]
     failed: dict[str, str]
@@ -71,6 +72,14 @@ class Collected:
     unreadable: list[str] = field(default_factory=list)
     damaged: set[str] = field(default_factory=set)
     """paths of sequences that are not what their manifests say: counted, but no file of theirs is opened"""
+
+    @property
+    def simulated_us(self) -> dict[str, int]:
+        """Simulated time of each sequence, µs, by its folder. Cameras of a rig share it: it counts once."""
+        spans: dict[str, int] = {}
+        for line in self.sequences:
+            spans[task_of(line)] = max(spans.get(task_of(line), 0), line["duration_us"] or 0)
+        return spans
 
 
 def task_of(line: dict[str, Any]) -> str:

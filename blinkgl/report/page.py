@@ -36,14 +36,15 @@ def build_report(found: Collected) -> str:
     groups = _groups(found)
     kinds = Counter(f"{x['split']}, {x['emulator']}" for x in sequences)
     sizes = Counter(f"{x['width']}×{x['height']}" for x in sequences)
-    seconds = sum(x["duration_us"] or 0 for x in sequences) / 1e6
+    simulated_us = found.simulated_us
     return render(
         "report/data_set.html",
         title=f"Data set {found.root.resolve().name}",
         most_listed=_MAX_LISTED,
         tiles=[
-            (f"{len(sequences):,}", "sequences"),
-            (f"{seconds:,.4g} s", "simulated"),
+            (f"{len(simulated_us):,}", "sequences"),
+            *([(f"{len(sequences):,}", "cameras")] if len(sequences) > len(simulated_us) else []),
+            (f"{sum(simulated_us.values()) / 1e6:,.4g} s", "simulated"),
             (number(sum(x["events"] or 0 for x in sequences)), "events"),
             *_causes(sequences),
             (f"{sum(x['labels'] or 0 for x in sequences):,}", "flow labels"),

@@ -22,6 +22,6 @@ _TOLERANCE = 1e-3
 def write_lens(writer: SequenceWriter, camera: CameraModel) -> None:
     """All of them, into a sequence that is being written."""
     one = Calibrated(camera)
-    writer.external(RECTIFY_MAP, partial(write_rectify_map, rectify_map=rectify_map(camera)))
+    writer.external(RECTIFY_MAP, partial(write_rectify_map, rectify_map=rectify_map(camera), codec=writer.codec))
     writer.text(CAM_TO_CAM, cam_to_cam_yaml([one]))
     writer.text(CAMCHAIN, camchain_yaml({"cam0": one}))

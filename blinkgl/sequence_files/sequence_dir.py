@@ -23,7 +23,6 @@ Float flow stands in folders of its own because DSEC loaders take every file of 
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import shutil
 import threading
@@ -52,7 +51,17 @@ from blinkgl.io.frame_camera import (
     picture_file,
     stamps_txt,
 )
-from blinkgl.io.records import InsidePath, entries_below, open_regular, parse, read_text, shown
+from blinkgl.io.records import (
+    SEAL,
+    InsidePath,
+    entries_below,
+    open_regular,
+    parse,
+    read_text,
+    seal_problem,
+    sealed,
+    shown,
+)
 from blinkgl.labels import Form, Label, label_of
 from blinkgl.types.events import Events
 
@@ -81,7 +90,7 @@ class SequenceWriter:
     labels : ``labels:``, which says in which forms labels are written; None: each in its first.
     events : False makes no ``events.h5``.
     truth : True makes ``event_labels.h5`` beside it, of events that say what made them.
-    codec : of ``events.h5``, "zstd" or "lz4".
+    codec : of ``events.h5``, "zstd", "lz4" or "gzip".
 
     Attributes
     ----------
@@ -121,7 +130,7 @@ class SequenceWriter:
         self.info: dict[str, Any] = {}
         self.t_end_us: int | None = None
         self.lost: dict[str, int] = {}
-        self._with_events, self._with_truth, self._codec = events, truth, codec
+        self._with_events, self._with_truth, self.codec = events, truth, codec
         self._files: dict[str, dict[str, Any]] = {}
         self._promised = {name for name, on in (("events.h5", events), (EVENT_LABELS, truth)) if on}
         self._timestamps: dict[str, list[str]] = {}
@@ -140,9 +149,9 @@ class SequenceWriter:
         self._truth: EventLabelsWriter | None = None
         try:
             if self._with_truth:
-                self._truth = EventLabelsWriter(self._tmp / EVENT_LABELS)
+                self._truth = EventLabelsWriter(self._tmp / EVENT_LABELS, codec=self.codec)
             self._events = (
-                DsecEventWriter(self._tmp / "events.h5", self.height, self.width, self.t_offset_us, codec=self._codec)
+                DsecEventWriter(self._tmp / "events.h5", self.height, self.width, self.t_offset_us, codec=self.codec)
                 if self._with_events
                 else None
             )
@@ -308,13 +317,13 @@ class SequenceWriter:
                     self._files[name] = digest_of(path)
             manifest = {
                 "format": self.kind,
-                "format_version": 1,
+                "format_version": 2,
                 **self._about(),
                 **self.info,
                 "files": self._files,
             }
             path = self._tmp / MANIFEST
-            path.write_text(json.dumps(manifest, indent=1, sort_keys=True, default=_plain) + "\n", encoding="utf-8")
+            path.write_text(sealed(manifest, default=_plain), encoding="utf-8")
             fsync(path)
             for folder in sorted({p.parent for p in self._tmp.rglob("*")}, reverse=True):
                 fsync(folder)
@@ -374,7 +383,8 @@ class _Common(BaseModel):
     key that its maker left out is None."""
 
     model_config = ConfigDict(strict=True, extra="allow")
-    format_version: Literal[1]
+    format_version: Literal[1, 2]
+    """1: without a hash of itself"""
     events: int = Field(ge=0, le=_LARGEST)
     t_offset_us: int = Field(ge=-_LARGEST, le=_LARGEST)
     duration_us: int | None = Field(None, ge=0, le=_LARGEST)
@@ -457,6 +467,16 @@ def read_manifest(folder: str | os.PathLike) -> dict[str, Any]:
         raise AssetError("no manifest", where=str(path)) from None
     except ValueError as error:
         raise AssetError(f"damaged manifest: {error}", where=str(path)) from None
+
+
+def manifest_problems(folder: str | os.PathLike) -> list[str]:
+    """Whether a manifest is what was written, by its hash of itself. Those of format_version 1 have none."""
+    text = read_text(Path(folder) / MANIFEST)
+    record = parse(text)
+    if record["format_version"] == 1 and SEAL not in record:
+        return []
+    problem = seal_problem(text)
+    return [] if problem is None else [f"{MANIFEST}: {problem}"]
 
 
 def digest_of(path: Path) -> dict[str, Any]:

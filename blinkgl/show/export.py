@@ -43,7 +43,7 @@ def run(
             shards = f"{len(counts)} shard{'s' * (len(counts) != 1)}"
             say(console, f"{out}/{split}-*.tar: {sum(counts):,} samples in {shards}")
         return 0
-    row = layout_of(layout)
+    layout_of(layout)  # an unknown one is refused before what others have no use for
     for name, value in (("--shard-mb", shard_mb), ("--seed", seed)):
         if value is not None:
             raise ConfigError(f"layout '{layout}' has no shards", where=name, value=value, accepted=f"it with {SHARDS}")
@@ -51,5 +51,5 @@ def run(
         done = export_layout(root, out, layout)
     for line in done.said:
         say(console, line)
-    say(console, f"{out}: {done.sequences:,} sequence{'s' * (done.sequences != 1)} for {row.about}")
+    say(console, f"{out}: {done.sequences:,} sequence{'s' * (done.sequences != 1)} for {done.opened_by}")
     return 0

@@ -19,6 +19,9 @@ from blinkgl.show.convert import size_of
 if TYPE_CHECKING:
     from blinkgl.recordings.simulation import SimulationReport
 
+FAR_PX = 2.0
+"""px between frames above which linear interpolation is warned of: at 2 px it loses up to 20 % of the events."""
+
 
 def emulator_options(
     name: str, config: str | None, overrides: Sequence[str], sensor: str | None = None
@@ -106,6 +109,17 @@ def _told(console: Console, target: str, report: SimulationReport) -> None:
     )
     if report.fitting is not None:
         say(console, f"{report.fitting} (--size WIDTHxHEIGHT for another)")
+    if report.assumed_srgb:
+        say(
+            console,
+            "integer codes taken as sRGB (--gamma linear for raw frames, as calibrate and compare take them)",
+        )
+    if report.guessed_over_px > FAR_PX:
+        say(
+            console,
+            f"warning: things move up to {report.guessed_over_px:.0f} px between frames, and what happens in between "
+            "is guessed; expected --interpolate motion, or a faster video",
+        )
     if report.displacement is not None:
         say(console, str(report.displacement))
     elif report.steps > report.frames:

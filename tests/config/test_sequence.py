@@ -182,7 +182,7 @@ def test_missing_binary_and_huge_files(tmp_path, content, said):
         (tmp_path / "run.yaml").write_bytes(content)
     with pytest.raises(ConfigError, match=said):
         load_run(tmp_path / "run.yaml")
-    with pytest.raises(ConfigError, match="cannot be read: not a regular file"):
+    with pytest.raises(ConfigError, match="is a folder; expected a YAML file"):
         load_run(tmp_path)
 
 

@@ -15,6 +15,7 @@ from blinkgl.dataset.executor import Inline
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import ConfigError
+from blinkgl.io.records import sealed
 from runs import recipe_file
 
 FALLING = {
@@ -61,7 +62,7 @@ def test_verify_deep_says_when_the_engine_differs(made, tmp_path):
     other = manifest(data / "train/fall_000001")["files"]["poses.npz"]
     shutil.copy(data / "train/fall_000001/poses.npz", folder / "poses.npz")
     forged["files"]["poses.npz"] = other
-    path.write_text(json.dumps(forged))
+    path.write_text(sealed(forged))
     (data / "index.jsonl").unlink(missing_ok=True)
     shutil.rmtree(data / "train/fall_000001")
     shutil.rmtree(data / ".run")
@@ -71,7 +72,7 @@ def test_verify_deep_says_when_the_engine_differs(made, tmp_path):
     assert "train/fall_000000" not in found.problems
     # The same engine, and other poses: that is damage, as with every other sequence.
     forged["versions"]["mujoco"] = sys.modules["mujoco"].__version__
-    path.write_text(json.dumps(forged))
+    path.write_text(sealed(forged))
     assert any("poses.npz: differs" in line for line in verify_dataset(data, deep=3).problems["train/fall_000000"])
 
 

@@ -98,7 +98,7 @@ def test_explain_python_and_shards(made):
     names = [name for name, _ in sample(folder_of(made), 0)]
     assert any(name.endswith(".flow_intervals.h5") for name in names)
     with Renderer(load(made / "run.yaml")) as renderer:
-        frame = renderer.frame(0.1, labels=["flow", 0.02, -0.01, "occlusion"], to=0.12)
+        frame = renderer.frame(0.1, labels=["forward", 0.02, -0.01, "occlusion"], to=0.12)
         assert np.array_equal(frame.flow_intervals.over(0.02).flow, frame.forward.flow)
         assert np.array_equal(frame.occlusion_intervals.occluded[1], frame.forward.occluded)
         with pytest.raises(KeyError, match="no flow over 0.5 s; there is flow over -0.01, 0.02 s"):

@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import signal
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -16,10 +17,12 @@ import pytest
 from blinkgl.cli import run
 from blinkgl.config.run import load_run
 from blinkgl.dataset.run import run_dataset
+from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.dataset.verify.problems import guarded
 from blinkgl.errors import AssetError
-from blinkgl.sequence_files.sequence_dir import digest_of
+from blinkgl.io.records import sealed
+from blinkgl.sequence_files.sequence_dir import digest_of, manifest_problems, verify_sequence
 from runs import NAMES, recipe_file
 
 
@@ -41,7 +44,7 @@ def forge(folder: Path, name: str, **changes) -> None:
     manifest = json.loads(path.read_text())
     if name:
         manifest["files"][name] = digest_of(folder / name)
-    path.write_text(json.dumps({**manifest, **changes}))
+    path.write_text(sealed({**manifest, **changes}))
 
 
 def drop(sequence: Path, name: str) -> None:
@@ -49,7 +52,7 @@ def drop(sequence: Path, name: str) -> None:
     (sequence / name).unlink()
     manifest = json.loads((sequence / "manifest.json").read_text())
     del manifest["files"][name]
-    (sequence / "manifest.json").write_text(json.dumps(manifest))
+    (sequence / "manifest.json").write_text(sealed(manifest))
 
 
 @contextlib.contextmanager
@@ -233,6 +236,90 @@ def renumber(sequence: Path, number: int) -> None:
     forge(sequence, "", sequence=number)
 
 
+RECORDS = (f"{NAMES[0]}/manifest.json", *(f".run/{name}.json" for name in ("run", "assets", "checksums")))
+RECORDS += (".run/costs.jsonl", ".run/recipe.yaml")
+
+
+@pytest.fixture(scope="module")
+def stereo(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("stereo")
+    run_dataset(load_run(recipe_file(folder, rig="stereo")), folder / "out", num=1)
+    return folder / "out"
+
+
+def edited(path: Path, data: bytes, at: int, bit: int) -> None:
+    path.write_bytes(data[:at] + bytes([data[at] ^ 1 << bit]) + data[at + 1 :])
+
+
+@pytest.mark.parametrize("record", RECORDS)
+def test_an_edited_byte_of_a_record_is_noticed(data, record):
+    """Any byte: of values that nothing else is compared with, of names, of blanks."""
+    path, rng = data / record, np.random.default_rng(0)
+    whole = path.read_bytes()
+    for at in (0, len(whole) - 1, *rng.integers(0, len(whole), 2).tolist()):
+        edited(path, whole, at, int(rng.integers(0, 8)))
+        assert not verify_dataset(data).clean, at
+    path.write_bytes(whole)
+    assert verify_dataset(data).clean
+
+
+@pytest.mark.slow
+def test_every_edited_byte_of_every_record_is_noticed(sound, stereo, tmp_path):
+    """One bit of each byte, a rig's records included; what is called are the checks that ``verify`` ends with."""
+    checked = 0
+    for source in (sound, stereo):
+        root = Path(shutil.copytree(source, tmp_path / source.parent.name))
+        for path in (*root.rglob("manifest.json"), *(p for p in (root / ".run").iterdir() if p.is_file())):
+            own = RunFolder(root).altered if path.parent.name == ".run" else partial(look_at_records, path.parent, root)
+            whole = path.read_bytes()
+            for at in range(len(whole)):
+                edited(path, whole, at, at % 8)
+                assert guarded(own), (path, at)
+            path.write_bytes(whole)
+            assert not guarded(own)
+            checked += len(whole)
+    assert checked > 20_000
+
+
+def look_at_records(folder: Path, root: Path) -> list[str]:
+    """Of a sequence's manifest, and of those of its rig's cameras."""
+    above = folder.parent if (folder.parent / "rig.yaml").exists() else folder
+    return manifest_problems(folder) or verify_sequence(above, checksums=False)
+
+
+def test_data_sets_without_hashes_of_their_records_are_verified_as_before(data):
+    """Those of format_version 1; but a record that says 1 and has a hash is held to it."""
+    for name in NAMES[:2]:
+        manifest = json.loads((data / name / "manifest.json").read_text())
+        del manifest["record_sha256"]
+        (data / name / "manifest.json").write_text(json.dumps(manifest | {"format_version": 1}))
+    record = json.loads((data / ".run/run.json").read_text())
+    (data / ".run/run.json").write_text(json.dumps(record | {"format_version": 1}))
+    assert ".run/run.json: checksum differs" in verify_dataset(data).problems["."]
+    (data / ".run/checksums.json").unlink()
+    assert verify_dataset(data, deep=4).clean
+    (data / ".run/run.json").write_text(json.dumps(record))
+    assert verify_dataset(data).problems == {".": [".run/checksums.json: missing"]}
+
+
+def test_a_rigs_manifest_is_held_to_its_hash(stereo, tmp_path):
+    """Its hashes of sources and its group are compared with nothing else."""
+    data = Path(shutil.copytree(stereo, tmp_path / "data"))
+    path = next(data.glob("train/*/manifest.json"))
+    record = json.loads(path.read_text())
+    assert verify_dataset(data).clean
+    texts = [json.dumps({**record, "group": "another"}, indent=1, sort_keys=True) + "\n"]
+    text = json.dumps(record, indent=1, sort_keys=True) + "\n"
+    at = text.index("_hash")
+    at = text.index('"', text.index(":", at)) + 1
+    texts.append(text[:at] + chr(ord(text[at]) ^ 1) + text[at + 1 :])
+    for edited_text in texts:
+        assert edited_text != text
+        path.write_text(edited_text)
+        name = path.parent.relative_to(data).as_posix()
+        assert verify_dataset(data).problems == {name: ["manifest.json: checksum differs"]}
+
+
 DEEP = "[" * 100_000
 LONG = "n" * 5000
 MANIFESTS = [
@@ -250,7 +337,7 @@ MANIFESTS = [
     {"files": None},
     {"files": {"a\x00b": None}},
     {"format": "other"},
-    {"format_version": 2},
+    {"format_version": 3},
     {"sequence": -1},
     {"sequence": 1.5},
     {"sequence": 10**30},

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import h5py
 import hdf5plugin  # noqa: F401 - registers Blosc
 import numpy as np
@@ -45,6 +48,22 @@ def slicer_reference(file: h5py.File, t_start_us: int, t_end_us: int) -> dict[st
     t = file["events/t"][window].astype(np.int64)
     keep = (t >= start) & (t < end)
     return {k: file[f"events/{k}"][window][keep] for k in "xyp"} | {"t": t[keep] + offset}
+
+
+def test_gzip_is_read_by_h5py_alone(tmp_path):
+    """In a process that has no Blosc."""
+    events = some_events(1000, 0, 50_000, 480, 640)
+    with DsecEventWriter(tmp_path / "e.h5", 480, 640, codec="gzip") as writer:
+        writer.append(events.part(slice(300)))
+        writer.append(events.part(slice(300, None)))
+    with DsecEventReader(tmp_path / "e.h5") as reader:
+        assert same(reader.slice(0, 50_000), events)
+    alone = (
+        "import h5py, sys; f = h5py.File(sys.argv[1]); f.visititems(lambda k, d: hasattr(d, 'shape') and d[()]);"
+        "assert 'hdf5plugin' not in sys.modules; print(f['events/x'][:].sum(), len(f['ms_to_idx']))"
+    )
+    said = subprocess.run([sys.executable, "-c", alone, str(tmp_path / "e.h5")], capture_output=True, text=True)
+    assert said.stdout.split() == [str(events.x.sum(dtype=int)), "51"], said.stderr
 
 
 @pytest.mark.parametrize("n, duration", [(0, 5000), (1, 5000), (300_000, 250_000), (200, 400_000)])

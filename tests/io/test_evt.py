@@ -74,6 +74,29 @@ def test_random_words_of_evt2(tmp_path, block):
 
 
 @pytest.mark.parametrize("block", [1, 7, 1 << 17])
+@pytest.mark.parametrize("order", ["little", "legacy"])
+def test_random_words_of_evt21(tmp_path, block, order):
+    """A word is one of EVT2's and a mask of 32 pixels to the right; the halves lie in either order."""
+    rng = np.random.default_rng(3)
+    words, single = [], []
+    for _ in range(200):
+        kind = int(rng.choice([0, 1, 8, 10], p=[0.4, 0.4, 0.15, 0.05]))
+        mask, upper = int(rng.integers(0, 1 << 32)), kind << 28 | int(rng.integers(0, 1 << 28)) & ~(31 << 11)
+        words += [upper, mask] if order == "legacy" else [mask, upper]
+        single += [upper + (k << 11) for k in range(32) if mask >> k & 1] if kind < 2 else [upper]
+    path = tmp_path / "e.raw"
+    header = f"% evt 2.1\n% format EVT21;endianness={order};height=320;width=320\n% end\n"
+    path.write_bytes(header.encode() + np.array(words, "<u4").tobytes())
+    reader = EvtReader(path)
+    rows = [
+        row
+        for e in reader.chunks(block)
+        for row in zip(e.x.tolist(), e.y.tolist(), e.t.tolist(), e.p.tolist(), strict=True)
+    ]
+    assert rows == slow_evt2(single) and len(rows) > 1000 and (reader.height, reader.width) == (320, 320)
+
+
+@pytest.mark.parametrize("block", [1, 7, 1 << 17])
 def test_random_words_of_evt3(tmp_path, block):
     """Times that go on and that fall (a turn of the counter, or a word out of order), vectors one after the other."""
     rng = np.random.default_rng(2)

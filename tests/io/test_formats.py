@@ -5,11 +5,12 @@ from __future__ import annotations
 import h5py
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.io.formats import convert, open_events, write_events
 from blinkgl.types.events import Events
-from tests.io.some_events import same
+from tests.io.some_events import same, some_events
 from tests.shared_data import shared
 
 H, W = 480, 640
@@ -111,6 +112,52 @@ def test_real_recordings(tmp_path, name, kind, size, count):
     assert same(open_events(tmp_path / "e.h5").read(), events)
 
 
+def test_event_stream(tmp_path):
+    """Gaps longer than a byte holds, padding, and events that lie across two reads."""
+    e = some_events(500, 0, 60_000, 180, 240)
+    data, last = bytearray(b"Event Stream" + bytes([2, 0, 0, 1]) + (240).to_bytes(2, "little") + bytes([180, 0])), 0
+    for x, y, t, p in zip(e.x.tolist(), e.y.tolist(), e.t.tolist(), e.p.tolist(), strict=True):
+        gap, last = t - last, t
+        data += b"\xff" * (gap // 127) + b"\xfe" + bytes([gap % 127 << 1 | p])
+        data += x.to_bytes(2, "little") + y.to_bytes(2, "little")
+    (tmp_path / "e.es").write_bytes(data)
+    with open_events(tmp_path / "e.es") as file:
+        assert (file.height, file.width) == (180, 240) and same(file.read(), e)
+        assert same(Events.concatenate(list(file._reader.chunks(7))), e)
+    (tmp_path / "e.es").write_bytes(data[:-1])
+    with pytest.raises(AssetError, match="the last event is not whole"):
+        open_events(tmp_path / "e.es").read()
+    (tmp_path / "e.es").write_bytes(bytes(data).replace(bytes([2, 0, 0, 1]), bytes([2, 0, 0, 2]), 1))
+    with pytest.raises(AssetError, match=r"version 2, type 2.*expected version 2, type 1 \(DVS\)"):
+        open_events(tmp_path / "e.es")
+
+
+def test_matlab(tmp_path):
+    """A recording's variables; MATLAB's doubles, as µs and as s; a struct; what is no such file."""
+    real = open_events(shared("data/events/evbench_davis240/seq_0001_e.mat")).read()
+    assert len(real) == 132_784 and int(real.t[0]) == 274_260_989 and real.x.max() == 189
+    e = some_events(50, 0, 60_000, 180, 240)
+    columns = {"x": e.x * 1.0, "y": e.y * 1.0, "p": e.p * 2.0 - 1}
+    for k, (t, wrap) in enumerate(((e.t * 1.0, False), (e.t * 1e-6, False), (e.t * 1.0, True))):
+        table = {**columns, "ts": t}
+        savemat(tmp_path / f"{k}.mat", {"TD": table} if wrap else {n: v[:, None] for n, v in table.items()})
+        assert same(open_events(tmp_path / f"{k}.mat").read(), e)
+    whole = (tmp_path / "0.mat").read_bytes()
+    for size in range(129, len(whole) - 100, 97):
+        (tmp_path / "cut.mat").write_bytes(whole[:size])
+        with pytest.raises(AssetError, match="damaged .mat|no column"):
+            open_events(tmp_path / "cut.mat")
+    (tmp_path / "new.mat").write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + bytes([0, 2]) + b"IM" + bytes(200))
+    with pytest.raises(AssetError, match="version 7.3.*expected save"):
+        open_events(tmp_path / "new.mat")
+
+
+def test_times_named_by_their_unit_are_microseconds(tmp_path):
+    e = some_events(50, 0, 60_000, 180, 240)
+    np.savez(tmp_path / "e.npz", x=e.x, y=e.y, t_us=e.t * 1.0, p=e.p)
+    assert same(open_events(tmp_path / "e.npz").read(), e)
+
+
 def test_blinkflow_and_mvsec(tmp_path):
     events = random_events(5000, duration_us=3_000_000)
     with h5py.File(tmp_path / "blinkflow.h5", "w") as file:  # u8 times, no t_offset, table without the final ms
@@ -143,8 +190,8 @@ def _bad(tmp_path, name, data):
     "name, data, message",
     [
         ("e.raw", b"\x00\x01" * 100, "without '% evt'"),
-        ("e.raw", b"% evt 2.1\n% end\n", "unsupported EVT version"),
-        ("e.raw", b"% format EVT21;width=1\n% end\n", "unsupported EVT version"),
+        ("e.raw", b"% evt 2.2\n% end\n", "unsupported EVT version"),
+        ("e.raw", b"% format EVT22;width=1\n% end\n", "unsupported EVT version"),
         ("e.raw", b"% evt 4.0\n% end\n", "unsupported EVT version"),
         ("e.raw", b"% evt 2.0\n% end\n" + b"\0" * 7, "truncated: 3 stray bytes"),
         ("e.h5", b"\x89HDF", "not an HDF5"),

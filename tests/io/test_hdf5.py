@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import AssetError, BlinkGLError
-from blinkgl.io.dsec import identity_rectify_map, write_rectify_map
 from blinkgl.io.formats import open_events
-from blinkgl.io.hdf5 import blosc_dataset, dataset, open_hdf5, write_rows
+from blinkgl.io.hdf5 import dataset, growing_dataset, open_hdf5, write_rows
 from eflow.data.sources import FolderSource
 from tests.io.test_columns import dsec, mvsec
 
@@ -134,7 +133,8 @@ def test_a_filter_that_is_not_installed_is_named(tmp_path):
 def test_blosc_without_its_parameters_does_not_crash(tmp_path):
     """Found by the fuzz: the filter reads them without asking how many there are."""
     path = tmp_path / "m.h5"
-    write_rectify_map(path, identity_rectify_map(24, 32))
+    with h5py.File(path, "w") as file:
+        write_rows(growing_dataset(file, "d", (0,), np.float32, (64,)), 0, np.zeros(64, np.float32))
     data = bytearray(path.read_bytes())
     at = data.find(struct.pack("<H", hdf5plugin.Blosc.filter_id))
     assert struct.unpack_from("<HH", data, at + 4) == (1, 7)  # optional, seven parameters
@@ -142,9 +142,24 @@ def test_blosc_without_its_parameters_does_not_crash(tmp_path):
     path.write_bytes(data)
     with (
         open_hdf5(path) as file,
-        pytest.raises(AssetError, match="m.h5: damaged HDF5 file: dataset 'rectify_map' lacks what Blosc needs"),
+        pytest.raises(AssetError, match="m.h5: damaged HDF5 file: dataset 'd' lacks what Blosc needs"),
     ):
-        dataset(file, "rectify_map", path, shape=(24, 32, 2), kinds="f")
+        dataset(file, "d", path, shape=(64,), kinds="f")
+
+
+@pytest.mark.parametrize("reader, name", [("CD/events", "geometry"), (None, "height")])
+def test_a_list_for_an_attribute_is_not_read(tmp_path, reader, name):
+    """A flipped bit makes one of a text, and h5py ends the process."""
+    path = dsec(tmp_path / "e.h5")
+    with h5py.File(path, "r+") as file:
+        if reader is not None:
+            file[reader] = np.zeros(3, [("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")])
+        file.attrs.pop(name, None)
+        value = np.empty((), object)
+        value[()] = np.arange(3, dtype=np.int8)
+        file.attrs.create(name, value, dtype=h5py.vlen_dtype(np.int8))
+    with pytest.raises(AssetError, match=f"e.h5: attribute '{name}' holds neither numbers nor text"):
+        open_events(path)
 
 
 def test_rows_written_here_are_those_of_the_filter(tmp_path):
@@ -157,7 +172,7 @@ def test_rows_written_here_are_those_of_the_filter(tmp_path):
     cuts = [0, 10, 4096, 5000, 12_000, len(rows)]
     for name in "ab":
         with h5py.File(tmp_path / name, "w", rdcc_nbytes=0) as file:
-            data = blosc_dataset(file, "d", (0,), np.uint64, (4096,))
+            data = growing_dataset(file, "d", (0,), np.uint64, (4096,))
             for i, j in itertools.pairwise(cuts):
                 if name == "a":
                     write_rows(data, i, rows[i:j])

@@ -44,7 +44,7 @@ def test_each_is_asked_for_by_its_own_name_in_python():
         got = set(asked_for(LabelsConfig(**tree)))
         assert got - {f"flow_{label.towards or 'intervals'}"} <= {name} and name in got
     said = {name: label.said for name, label in LABELS.items()}
-    assert said["flow_forward"] == "flow" and said["flow_backward"] == "flow_backward" and said["depth"] == "depth"
+    assert said["flow_forward"] == "forward" and said["flow_backward"] == "backward" and said["depth"] == "depth"
     assert said["occlusion_forward"] == said["occlusion_backward"] == "occlusion"
     tree = {"flow": ["forward"]}
     LABELS["flow_backward"].ask(tree)

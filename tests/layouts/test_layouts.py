@@ -110,6 +110,14 @@ def test_dsec(data, sequence, tmp_path):
     assert calibration["intrinsics"]["cam0"]["camera_matrix"] == [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
     assert calibration["intrinsics"]["camRect0"]["resolution"] == [WIDTH, HEIGHT]
     assert not (folder / "disparity").exists() and not (folder / "events/right").exists()
+    assert (tmp_path / "dsec/test").is_dir(), "bflow's provider asserts both splits"
+
+
+def test_dsecs_provider_is_named_where_it_finds_what_it_asserts(data, stereo, tmp_path):
+    """It asserts a folder of disparities: a monocular data set is not for it."""
+    opened_by = [export_layout(one, tmp_path / one.name, "dsec").opened_by for one in (data, stereo)]
+    assert "(not DSEC's provider, which asks for 'rig: stereo'" in opened_by[0]
+    assert opened_by[1].startswith("DSEC's provider, ")
 
 
 def test_eraft(data, sequence, tmp_path):

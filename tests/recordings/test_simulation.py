@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -84,6 +86,35 @@ def test_interpolations_run_and_order_events(emulator, interpolate):
     assert len(events) and np.all(np.diff(events.t) >= 0) and events.t[-1] <= 40_000
     assert report.frames == 5 and (report.steps == 5 if interpolate == "linear" else report.steps > 5)
     assert (report.displacement is not None) == (interpolate == "motion")
+
+
+@pytest.mark.parametrize("step_px, said", [(9, True), (1, False)])
+def test_slow_video_is_said(tmp_path, capsys, step_px, said):
+    """Events between frames that things jump over are guessed: one line says how far, and what to do."""
+    texture = cv2.GaussianBlur(np.random.default_rng(0).random((80, 160)) * 255, (0, 0), 3)
+    frames = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    np.save(tmp_path / "v.npy", np.stack([frames[:, step_px * i : step_px * i + 100] for i in range(4)]))
+    command = ["simulate", str(tmp_path / "v.npy"), "--fps", "30", "--out"]
+    assert run([*command, str(tmp_path / "e.h5")]) == 0
+    warned = re.search(r"warning: things move up to (\d+) px between frames", capsys.readouterr().out)
+    assert (warned is not None) == said and (not said or abs(int(warned[1]) - step_px) <= 1)
+    assert run([*command, str(tmp_path / "m.h5"), "--interpolate", "motion"]) == 0
+    assert "things move" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("gamma", [None, "srgb", "linear"])
+def test_what_integer_codes_were_taken_for_is_said(tmp_path, gamma):
+    """A recording's own frames are linear; codes of images are taken as sRGB, and the report says where nobody did."""
+    np.save(tmp_path / "v.npy", frames8())
+    report = file_to_events(tmp_path / "v.npy", tmp_path / "e.h5", fps=100, gamma=gamma)
+    assert report.assumed_srgb == (gamma is None)
+    sized = file_to_events(tmp_path / "v.npy", tmp_path / "e.h5", fps=100, gamma=gamma, size=(15, 20))
+    assert sized.assumed_srgb == (gamma is None)
+    own = shared("data/events/aedat4/davis346_events_frames_imu.aedat4")
+    file_to_events(own, tmp_path / "own.h5", gamma=gamma)
+    file_to_events(own, tmp_path / "linear.h5", gamma="linear")
+    alike = same(open_events(tmp_path / "own.h5").read(), open_events(tmp_path / "linear.h5").read())
+    assert alike == (gamma != "srgb")
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,8 @@
 
 Each frame has a sun of its own, a ball, a box, an open sheet and a standing box over a floor. Of the pixels that
 the sun could light, off silhouettes and more than two pixels from the edge of a shadow: how many are dark and should be
-lit (acne), how many lit and should be dark (floating). The sheet, which is in its own way, is the hard case.
+lit (acne), how many lit and should be dark (floating). The sheet, which is in its own way, is the hard case. Where
+things stand on each other, lit pixels are counted up to the very line (leaks).
 """
 
 from __future__ import annotations
@@ -15,13 +16,19 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import PinHole
 from blinkgl.config.sequence import RenderConfig
+from blinkgl.labels.frames import LabelRequest
 from blinkgl.render import reference
+from blinkgl.render.appearance import seen_share
+from blinkgl.render.passes import shadow_maps
 from blinkgl.render.renderer import Renderer
+from blinkgl.render.shadows import scale_of
 from blinkgl.scene.geometry.primitives import cuboid, grid, icosphere
+from blinkgl.scene.lights import lamp_pose
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.motion.trajectories import look_rotation
 from blinkgl.scene.rig import Rig
-from blinkgl.scene.types import Light, Material, Part, Scene, SceneObject
+from blinkgl.scene.types import Lamp, Light, Material, Part, Scene, SceneObject
+from blinkgl.shader_debugger.lamps import lit_points
 
 SKY = 0.2
 
@@ -64,3 +71,62 @@ def faults(gl, scene: Scene) -> tuple[int, int, int]:
     graded = ref.hit & ~edge & (sun > 0.05)
     share = (seen - (open_ - sun)) / np.maximum(sun, 1e-9)
     return int(graded.sum()), int((graded & ~dark & (share < 0.9)).sum()), int((graded & dark & (share > 0.1)).sum())
+
+
+def contact_frame(rng: np.random.Generator, kind: str, shadows: str) -> Scene:
+    """A scene of one moment in which things stand on the ground and on each other: boxes, a stack, a thin plate, what
+    is as small as a foot; and two boxes far away, so that a sun's map is as coarse as that of a whole world."""
+
+    def body(number, mesh, place, turn=0.0, category="object"):
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = Rotation.from_euler("z", turn).as_matrix(), place
+        return SceneObject(f"{number}", number, (Part(mesh, Material()),), StaticPath(T), category)
+
+    elevation, azimuth = rng.uniform(0.35, 1.3), rng.uniform(-math.pi, math.pi)
+    flat = math.cos(elevation)
+    towards = np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)])
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = look_rotation(np.array([0, 3.2, -1.3])), (0, 0, 1.4)
+    boxes = (
+        ((0.5, 0.4, 0.6), (-0.8, 3.2, 0.3)),
+        ((0.6, 0.6, 0.3), (0.5, 2.9, 0.15)),
+        ((0.3, 0.3, 0.3), (0.5, 2.9, 0.45)),
+        ((0.6, 0.4, 0.02), (-0.1, 2.4, 0.01)),
+        ((0.25, 0.1, 0.07), (0.1, 3.6, 0.035)),
+        ((0.3, 0.3, 0.3), (-6.0, 8.0, 0.15)),
+        ((0.3, 0.3, 0.3), (6.0, 9.0, 0.15)),
+    )
+    ground = body(1, grid(width=20, depth=20), (0, 5, 0), category="ground")
+    standing = (
+        body(k, cuboid(extents=size), place, rng.uniform(-3, 3)) for k, (size, place) in enumerate(boxes, start=2)
+    )
+    light = Light(tuple(towards), 1.0, SKY, shadows=shadows, shadow_size=1024)
+    if kind == "spot":
+        pose = StaticPath(lamp_pose([0, 3, 0] + 4 * towards, -towards))
+        lamp = Lamp("spot", (12.0, 12.0, 12.0), pose, inner=0.6, outer=0.7)
+        light = replace(light, sun=0.0, lamps=(lamp,))
+    camera = PinHole.centred(200, 150, 170.0)
+    return Scene((ground, *standing), Rig.alone(camera, StaticPath(T)), 0, 1, light=light)
+
+
+def leaks(gl, scene: Scene) -> tuple[int, int]:
+    """(pixels whose way to the lamp is blocked, a texel of its map aside, too; how many of them are lit)."""
+    bare = replace(scene, light=replace(scene.light, shadows="off"))
+    ref = reference.render(bare, 0)
+    dark = reference.render(replace(bare, light=replace(bare.light, sun=0.0, lamps=())), 0).luminance
+    sun = ref.luminance - dark
+    with Renderer(gl, scene, RenderConfig(image_antialiasing="none")) as renderer:
+        seen = renderer.luminance(0).read().astype(np.float64)
+        ids = renderer.labels(0, LabelRequest("ids")).ids
+        (map_,) = shadow_maps(scene, renderer.items)
+    rows, points, own = lit_points(scene, ref)
+    pose, (wide, wider, _, _) = map_.lamp.path.pose(0), scale_of(map_.lamp, map_.box, map_.texels)
+    hard = replace(scene, light=replace(scene.light, shadows="hard"))  # one ray to the lamp's middle
+    texel = wide + wider * ((pose[:3, 3] - points) @ pose[:3, 2])
+    blocked = np.ones(len(rows), bool)
+    for k in range(9):
+        angle, far = 2 * math.pi * k / 8, min(k, 1)
+        aside = far * (math.cos(angle) * pose[:3, 0] + math.sin(angle) * pose[:3, 1])
+        blocked &= seen_share(hard, 0, map_.lamp, points + aside * texel[:, None], own) == 0
+    graded = blocked & ((sun > 0.05) & (ids == ref.instance)).ravel()[rows]
+    return int(graded.sum()), int((graded & ((seen - dark) > 0.1 * sun).ravel()[rows]).sum())

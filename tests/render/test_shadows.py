@@ -19,7 +19,7 @@ from blinkgl.scene.lights import lamp_pose
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.types import Lamp, Light, Material, Part, SceneObject
 from render_scenes import LEVEL, SECOND, cube, curve, drift, quad, rig, scene, sphere, still, thing
-from shadow_faults import faults, frame as random_frame
+from shadow_faults import contact_frame, faults, frame as random_frame, leaks
 
 PLAIN = RenderConfig(image_antialiasing="none")
 SEEN = ShadowMap.seen
@@ -200,3 +200,13 @@ def test_faults_over_random_frames(gl, frames):
     assert graded.min() > 1000
     assert acne.sum() <= 1e-4 * graded.sum() and floating.sum() <= 1e-4 * graded.sum()
     assert (acne / graded).max() < 2e-3 and (floating / graded).max() < 2e-3
+
+
+@pytest.mark.parametrize("shadows", ["hard", "soft"])
+@pytest.mark.parametrize("kind", ["sun", "spot"])
+def test_no_light_along_the_line_where_something_stands(gl, kind, shadows):
+    """Boxes on the ground, a stack, a plate 2 cm thick, something as small as a foot."""
+    rng = np.random.default_rng(5)
+    blocked, lit = np.sum([leaks(gl, contact_frame(rng, kind, shadows)) for _ in range(3)], axis=0)
+    assert blocked > 600
+    assert lit <= 1e-3 * blocked

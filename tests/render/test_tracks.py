@@ -30,7 +30,7 @@ def living() -> Scene:
 def made():
     """(scene as it is drawn, its label times, what was drawn)"""
     source = living()
-    drawn = record(source, labels=["flow", "flow_backward", "occlusion", "ids", "depth"], tracks={"points": 96 * 64})
+    drawn = record(source, labels=["forward", "backward", "occlusion", "ids", "depth"], tracks={"points": 96 * 64})
     config = drawn.config
     return source.build(config), list(config.time.label_times_ns), drawn
 

@@ -1,5 +1,7 @@
 """The card of a data set."""
 
+import re
+
 import numpy as np
 import pytest
 import yaml
@@ -9,8 +11,9 @@ from blinkgl.config.run import load_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.errors import AssetError
 from blinkgl.io.flow_png import read_flow_png
-from blinkgl.report.card import facts_of, write_card
-from blinkgl.report.collect import collect
+from blinkgl.report.card import card_of, facts_of, write_card
+from blinkgl.report.collect import Collected, collect
+from blinkgl.report.page import build_report
 from blinkgl.sequence_files.index import read_index
 
 RECIPE = {
@@ -56,6 +59,21 @@ def test_its_figures_are_those_of_the_files(data):
     assert facts["events a pixel and px of flow"] == pytest.approx(
         facts["events a pixel and second, median"] / facts["image speed, median"]
     )
+
+
+def test_cameras_of_a_rig_are_one_sequence(tmp_path, monkeypatch):
+    """Five stereo sequences of 1.1 s are five sequences, ten cameras and 5.5 s, on the card and on the page."""
+    line = {"duration_us": 1_100_000, "labels": 10, "frames": 30, "events": 1000, "bytes": 1, "emulator": "esim"}
+    line |= {"split": "train", "width": 24, "height": 16}
+    eyes = [line | {"path": f"train/s_{k}/{eye}", "sensor": eye} for k in range(5) for eye in ("left", "right")]
+    found = Collected(tmp_path, eyes, None, {}, {}, [])
+    facts = {fact.name: fact.value for fact in facts_of(found)}
+    assert (facts["sequences"], facts["cameras"], facts["simulated time"]) == (5, 10, pytest.approx(5.5))
+    assert facts["labels a second"] == pytest.approx(10)
+    monkeypatch.setattr("blinkgl.report.card._files", lambda found: [])  # there are none
+    assert "| train | 5 | 10 | 24x16 | esim |" in card_of(found, facts_of(found), None, None)
+    page = re.sub(r"<[^>]*>\s*", " ", build_report(found))
+    assert re.search(r"\b5 +sequences +10 +cameras +5.5 s +simulated", page)
 
 
 def test_somebody_elses_page_is_left_alone(data, tmp_path, capsys):

@@ -76,7 +76,7 @@ def scene(pose) -> Scene:
 
 @pytest.mark.parametrize("name", ["tum.txt", "euroc.csv"])
 def test_the_camera_flies_it(flight, name):
-    drawn = record(scene(Trajectory(flight / name)), labels=["flow"], imu={"rate": 100, "gravity": (0, 0, 0)})
+    drawn = record(scene(Trajectory(flight / name)), labels=["forward"], imu={"rate": 100, "gravity": (0, 0, 0)})
     path = scene(Trajectory(flight / name)).build(drawn.config).camera_path
     t = np.linspace(0, 0.25, 41)
     assert np.allclose(path.poses((t * 1e9).astype(np.int64)), circle(t), atol=1e-6)

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.verify.cross_checks import against_run, index, strangers, twins
 from blinkgl.dataset.verify.problems import Known, Verification, guarded
 from blinkgl.dataset.verify.reproduce import made_again
@@ -66,6 +67,7 @@ def verify_dataset(
         for name, lines in twins(known, result).items():
             result.add(name, lines)
         result.add(".", guarded(lambda: against_run(root, folders, known, result)))
+        result.add(".", guarded(RunFolder(root).altered))
     sound = [name for name in known if name not in result.problems]
     if deep and sound:
         chosen = sorted(np.random.default_rng(seed).permutation(len(sound))[:deep])

@@ -75,6 +75,8 @@ def made_again(
 def _compared(name: str, one: Known, made: Path, result: Verification) -> list[str]:
     """The sequence against itself made again: bit by bit, or as far as two machines can agree."""
     lines = differences(one.folder, made)
+    if one.manifest["format_version"] == 1:  # theirs have no hash of themselves, which ours have
+        lines = [line for line in lines if not line.endswith(f"{MANIFEST}: differs")]
     if not lines:
         return []
     manifest = read_manifest(made)

@@ -10,7 +10,7 @@ from blinkgl.config.sequence import SequenceConfig
 from blinkgl.dataset.verify.config_checks import bound, files_of_rig, misnamed, not_asked_for, said_of, times_of, unlike
 from blinkgl.dataset.verify.problems import Known, guarded
 from blinkgl.io.records import shown
-from blinkgl.sequence_files.sequence_dir import MANIFEST, read_manifest, verify_sequence
+from blinkgl.sequence_files.sequence_dir import MANIFEST, manifest_problems, read_manifest, verify_sequence
 
 _REQUIRED = {"duration_us": int, "seed": int, "sequence": int, "split": str, "labels": int}
 
@@ -40,6 +40,8 @@ def look(folder: Path, name: str) -> tuple[list[str], Known | None]:
             problems = look_at_sensor(manifest, config)
         else:
             problems = bound(name, manifest, config)
+        # Last: what else is found says more than that something was edited.
+        problems = problems or manifest_problems(folder)
         if not problems:
             found.append(Known(folder, manifest, config))
         return problems

@@ -70,12 +70,6 @@ class ShadowMap(ScenePass):
     def items(self, moment: Moment) -> list[DrawItem]:
         return [item for item in moment.visible if item.casts]
 
-    def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
-        # Faces that look away from the lamp, see shadow.glsl.
-        painter.gl.ctx.cull_face = "front"
-        super().paint(painter, shot, items)
-        painter.gl.ctx.cull_face = "back"
-
     @classmethod
     def every_kind(cls) -> Iterator[Pass]:
         white = (1.0, 1.0, 1.0)

@@ -172,8 +172,8 @@ class Sweep:
         for t in self.times:
             points = np.ascontiguousarray(self.deformer.positions(self.mesh, t))
             inside += _reach(points, halves, order, reach) / len(self.times)
-        # A little apart, so that flat ones have an inside.
-        reach += 1e-6 * float(np.linalg.norm(self.high - self.low))
+        # A little apart, so that flat ones have an inside, and those that an animation shrinks to a point.
+        reach += 1e-6 * (float(np.linalg.norm(self.high - self.low)) or 1.0)
         corners = HalfspaceIntersection(np.column_stack([directions, -reach]), inside).intersections
         hull = ConvexHull(corners)
         vertices = corners[hull.vertices]

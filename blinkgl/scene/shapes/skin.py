@@ -324,6 +324,14 @@ def _check_bones(inverse_bind: np.ndarray, where: str) -> None:
             where=where,
             value=inverse_bind[first].tolist(),
         )
+    # One that flattens all that follows it is no inverse of anything; the ranks are those of the turning parts.
+    if (flat := np.flatnonzero(np.linalg.matrix_rank(inverse_bind[:, :3, :3]) < 3)).size:
+        raise AssetError(
+            f"the inverse bind matrix of joint {flat[0]} of a skin is singular",
+            where=where,
+            value=inverse_bind[flat[0]].tolist(),
+            accepted="a matrix with an inverse",
+        )
 
 
 def _streams(joints: np.ndarray, weights: np.ndarray) -> dict[str, np.ndarray]:

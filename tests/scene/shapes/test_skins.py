@@ -140,6 +140,7 @@ NAN = np.where(np.arange(2)[:, None, None] == 1, np.nan, BIND)
     "said, make",
     [
         ("joint 1 of a skin is not finite", lambda: skin_of(inverse_bind=NAN)),
+        ("joint 0 of a skin is singular", lambda: skin_of(inverse_bind=BIND * 0)),
         ("the weights of vertex 1 of a skin sum to zero", lambda: skin_of(weights=[[1, 0], [0, 0]])),
         ("vertex 0 of a skin has a weight that is negative or no number", lambda: skin_of(weights=[[-1, 2], [1, 0]])),
         ("vertex 0 of a skin has a weight that is negative or no number", lambda: skin_of(weights=[[np.nan, 1], [1,

@@ -49,6 +49,14 @@ SHAPES = {
 }
 
 
+def test_a_shape_that_is_shrunk_to_a_point_has_a_hull():
+    mesh = icosphere(subdivisions=1)
+    gone = Morphs(-mesh.vertices[None], None, lambda t_ns: (np.ones(1), np.zeros(1)), False, MS, MS)
+    mesh = replace(mesh, deformer=Skin.morphing(gone))
+    corners, _ = mesh.deformer.sweep(mesh, 0, MS).hull
+    assert len(corners) > 3 and np.abs(corners).max() < 1e-5
+
+
 @pytest.mark.parametrize("name", SHAPES)
 def test_no_shape_leaves_what_it_is_said_to_sweep(name):
     """Box and hull with its margin, at 97 times that are not those that were looked at; the margin is no excuse,

@@ -1,0 +1,80 @@
+"""Event Stream (.es) by Marcireau, version 2, of a DVS: one byte of time and polarity, then x and y, 16 bits each.
+
+The byte is (time since the event before, µs) << 1 | polarity; 0xff: 127 µs pass without an event, 0xfe: padding.
+(neuromorphic-paris/event_stream, the format's page.) y is as the file has it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import numba
+import numpy as np
+
+from blinkgl.errors import AssetError
+from blinkgl.io.columns import check_size
+from blinkgl.types.events import Events
+
+_HEADER = 20
+_DVS = 1
+
+
+class EventStreamReader:
+    """Size and events of an .es file. Raises AssetError: not of version 2, not of a DVS, truncated."""
+
+    def __init__(self, path: str | os.PathLike):
+        self.path = Path(path)
+        with open(path, "rb") as file:
+            header = file.read(_HEADER)
+        if len(header) < _HEADER or not header.startswith(b"Event Stream"):
+            raise AssetError("not an Event Stream file", where=str(path))
+        if header[12] != 2 or header[15] != _DVS:
+            raise AssetError(
+                "unsupported Event Stream",
+                where=str(path),
+                value=f"version {header[12]}, type {header[15]}",
+                accepted="version 2, type 1 (DVS)",
+            )
+        self.width, self.height = (int.from_bytes(header[i : i + 2], "little") for i in (16, 18))
+        check_size(self.height, self.width, str(path))
+
+    def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
+        """All events, as decoded from ``size`` bytes at a time."""
+        # Time, bytes of the event at hand so far, its polarity, x and y.
+        state = np.zeros(5, np.int64)
+        with open(self.path, "rb") as file:
+            file.seek(_HEADER)
+            while data := file.read(size):
+                most = len(data) // 5 + 1
+                made = Events(*(np.empty(most, dtype) for dtype in (np.uint16, np.uint16, np.int64, np.uint8)))
+                n = _decode(np.frombuffer(data, np.uint8), state, made.x, made.y, made.t, made.p)
+                yield made.part(slice(n)).copy()
+        if state[1]:
+            raise AssetError("truncated: the last event is not whole", where=str(self.path))
+
+
+@numba.njit(cache=True, nogil=True)
+def _decode(data, state, x, y, t, p):
+    """Returns how many events became whole."""
+    n = 0
+    time, got, polarity, column, row = state
+    for byte in data:
+        value = np.int64(byte)
+        if got == 0:
+            if value == 255:
+                time += 127
+            elif value != 254:
+                time += value >> 1
+                polarity, column, row, got = value & 1, 0, 0, 1
+        else:
+            if got <= 2:
+                column |= value << (8 * (got - 1))
+            else:
+                row |= value << (8 * (got - 3))
+            got += 1
+            if got == 5:
+                x[n], y[n], t[n], p[n] = column, row, time, polarity
+                n, got = n + 1, 0
+    state[0], state[1], state[2], state[3], state[4] = time, got, polarity, column, row
+    return n

@@ -53,11 +53,19 @@ def _lookups(name: str, program: str) -> tuple[Pass, ...]:
         Pass(f"{name}_uv", f"uv of {name}", "texture repeats", "uv", source),
         Pass(f"{name}_level", f"level of {name}", "log2(texels per px)", "scalar", source),
         Pass(f"{name}_albedo", f"albedo of {name}", "linear", "light", source),
-        Pass(f"{name}_direct", f"lamps of {name}", "irradiance factor", "scalar", source),
-        Pass(f"{name}_shadow", f"shadow factor of {name}", "share of the lamps' light", "scalar", source),
-        Pass(f"{name}_around", f"environment of {name}", "irradiance factor", "scalar", source),
-        Pass(f"{name}_light", f"light of {name}", "irradiance factor", "scalar", source),
-        Pass(f"{name}_mirrored", f"mirrored light of {name}", "linear", "light", source),
+        Pass(f"{name}_direct", f"lamps of {name}", "irradiance factor", "scalar", f"{program}, include/lights.glsl"),
+        Pass(
+            f"{name}_shadow",
+            f"shadow factor of {name}",
+            "share of the lamps' light",
+            "scalar",
+            f"{program}, include/shadows.glsl",
+        ),
+        Pass(
+            f"{name}_around", f"environment of {name}", "irradiance factor", "scalar", f"{program}, include/lights.glsl"
+        ),
+        Pass(f"{name}_light", f"light of {name}", "irradiance factor", "scalar", f"{program}, include/light.glsl"),
+        Pass(f"{name}_mirrored", f"mirrored light of {name}", "linear", "light", f"{program}, include/surface.glsl"),
         Pass(f"{name}_emission", f"emission of {name}", "linear", "light", source),
     )
 
@@ -69,14 +77,20 @@ _BEFORE = (
 _SHADED = (
     *(Pass(name, name.replace("_", " "), "depth, 0: nothing casts", "scalar", "shadow.glsl") for name in MAPS),
     *_lookups("luminance", LOOKUP_PASSES["luminance"].program),
-    Pass("luminance", "luminance", "linear", "scalar", "luminance.glsl"),
+    Pass("luminance", "luminance", "linear", "scalar", "luminance.glsl, include/fog.glsl"),
     *_lookups("colour", LOOKUP_PASSES["colour"].program),
-    Pass("colour", "colour", "linear radiance", "light", "colour.glsl"),
+    Pass("colour", "colour", "linear radiance", "light", "colour.glsl, include/fog.glsl"),
     Pass("luminance_lens", "luminance, lens", "linear", "scalar", "gather.glsl"),
     Pass("colour_lens", "colour, lens", "linear radiance", "light", "gather.glsl"),
     Pass("luminance_edges", "luminance, edges", "linear", "scalar", "edges.glsl"),
     Pass("colour_edges", "colour, edges", "linear radiance", "light", "edges.glsl"),
-    Pass("velocity_pass", "velocity for the time sampling", "px/s", "motion", "velocity.glsl"),
+    Pass(
+        "velocity_pass",
+        "velocity for the time sampling",
+        "px/s",
+        "motion",
+        "velocity.glsl, include/motion.glsl, include/lens.glsl",
+    ),
 )
 
 

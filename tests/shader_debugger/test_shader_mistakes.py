@@ -77,7 +77,7 @@ def test_right_shaders_pass_at_an_odd_size(shader, name):
 LENS, SHADOWS, SKIN = (f"include/{name}.glsl" for name in ("lens", "shadows", "deform/skin"))
 MISTAKES = {
     # name: (lens, file, right, wrong, title of the first buffer that is wrong, words of the verdict)
-    "radial term counted once": ("radtan", LENS, "2.0 * u.x * u.x * slope", "u.x * u.x * slope", "velocity", ""),
+    "radial term counted once": ("radtan", LENS, "2.0 * u.x * u.x * slope", "u.x * u.x * slope", "velocity", LENS),
     "tangential terms exchanged": (
         "radtan",
         "include/lens_far.glsl",
@@ -92,7 +92,7 @@ MISTAKES = {
         "lens_g_rate(t) / (1.0 + r * r)",
         "lens_g_rate(t)",
         "velocity",
-        "",
+        LENS,
     ),
     "pixel's corner for its centre": (
         "radtan",
@@ -102,15 +102,29 @@ MISTAKES = {
         "luminance, lens",
         "",
     ),
-    "radius for diameter": ("radtan", SHADOWS, "clamp(0.5 * width / texel", "clamp(width / texel", "shadow factor", ""),
-    "one tap too few": ("radtan", SHADOWS, "i < taps; ++i", "i < taps - 1; ++i", "shadow factor", ""),
+    "radius for diameter": (
+        "radtan",
+        SHADOWS,
+        "clamp(0.5 * width / texel",
+        "clamp(width / texel",
+        "shadow factor",
+        "include/shadows.glsl",
+    ),
+    "one tap too few": (
+        "radtan",
+        SHADOWS,
+        "i < taps; ++i",
+        "i < taps - 1; ++i",
+        "shadow factor",
+        "include/shadows.glsl",
+    ),
     "blocker seen from itself": (
         "radtan",
         SHADOWS,
         "max(blocker / at.z - 1.0, 0.0)",
         "max(1.0 - at.z / blocker, 0.0)",
         "shadow factor",
-        "",
+        "include/shadows.glsl",
     ),
     "matrix of the map transposed": (
         "radtan",
@@ -118,7 +132,7 @@ MISTAKES = {
         "vec4(position, 1.0) * shadow_rows[i]",
         "shadow_rows[i] * vec4(position, 1.0)",
         "shadow factor",
-        "",
+        "include/shadows.glsl",
     ),
     "the next joint": ("radtan", SKIN, "int(joint + 0.5)", "int(joint + 1.5)", "local position", "arm"),
     "normal by a wrong cofactor": (

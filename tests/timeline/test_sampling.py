@@ -23,11 +23,11 @@ def test_uniform_end_is_included_even_off_the_grid():
     assert list(uniform_times(1000.0, 0, 2_500_000)) == [0, 1 * MS, 2 * MS, 2_500_000]
 
 
-@pytest.mark.parametrize("speed, expected", [(0.0, 20 * MS), (100.0, 5 * MS), (1e9, 1 * MS)])
+@pytest.mark.parametrize("speed, expected", [(0.0, 20 * MS), (100.0, 49 * MS // 10), (1e9, 1 * MS)])
 def test_constant_speed_gives_the_obvious_step(speed, expected):
     times = list(displacement_times(0.5, 1 * MS, 20 * MS, 0, 200 * MS, lambda t: speed))
     assert times[0] == 0 and times[-1] == 200 * MS
-    assert set(np.diff(times)) == {expected}
+    assert set(np.diff(times)[:-1]) == {expected} and 0 < times[-1] - times[-2] <= expected
 
 
 def test_acceleration_inside_a_step_is_noticed():
@@ -49,3 +49,13 @@ def test_bound_and_order_hold_for_any_oscillation(max_px, mean, swing, rate, t0)
     assert (steps > 0).all() and (steps <= high).all() and (steps[:-1] >= low).all()
     for a, step, b in zip(times[:-1], steps, times[1:]):
         assert max(speed(a), speed(b)) * step <= max_px * 1e9 * (1 + 1e-6) or step <= low
+
+
+@pytest.mark.parametrize("speed", [lambda t: 100 + 60 * np.sin(t / 3e7), lambda t: 5e-6 * t, lambda t: 300 - 2e-6 * t])
+def test_few_steps_are_refused_where_the_pace_changes_smoothly(speed):
+    """A tenth more paces than frames at most, and a tenth more frames than the bound takes."""
+    asked = []
+    times = list(displacement_times(0.5, MS // 10, 20 * MS, 0, 100 * MS, lambda t: asked.append(t) or speed(t)))
+    least = np.trapezoid(speed(np.linspace(0, 100 * MS, 10_001)), dx=1e-5) / 0.5
+    assert len(asked) <= 1.1 * len(times)
+    assert len(times) <= 1.1 * least + 2

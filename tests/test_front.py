@@ -48,6 +48,15 @@ def test_import_brings_nothing_with_it():
     )
 
 
+def test_reading_events_waits_for_no_emulator():
+    """Nor for SciPy and the configuration: a program that reads one file starts at once."""
+    code = (
+        "import sys; from blinkgl import read_events; print({'numba', 'scipy', 'pydantic', 'cv2'} & set(sys.modules))"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "set()"
+
+
 def test_the_names_of_the_package_are_those_that_it_gives():
     assert {name for name in dir(blinkgl) if not name.startswith("__")} == set(blinkgl.__all__) - {"__version__"}
 

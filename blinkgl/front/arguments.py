@@ -14,8 +14,6 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from blinkgl.config.events import EmulatorConfig
-from blinkgl.config.problems import nearest
 from blinkgl.errors import ConfigError
 
 Given = ParamSpec("Given")
@@ -51,6 +49,9 @@ def public(function: Callable[Given, Made]) -> Callable[Given, Made]:
 
 def unknown_argument(name: str, known: Iterable[str], prefix: str = "") -> ConfigError:
     """The error of an argument that is none of the ``known``: the nearest of them, or where an emulator's key goes."""
+    from blinkgl.config.events import EmulatorConfig
+    from blinkgl.config.problems import nearest
+
     for kind, model in EmulatorConfig.members.models.items():
         if name in model.model_fields and "emulator" in known:
             accepted = f"emulator={{'emulator': '{kind}', '{name}': …}}"

@@ -1,4 +1,6 @@
-"""Events and flow in files, frames to events, two recordings side by side."""
+"""Events and flow in files, frames to events, two recordings side by side.
+
+What a function needs is imported when it is called: whoever reads one event file waits for no emulator."""
 
 from __future__ import annotations
 
@@ -10,14 +12,14 @@ import numpy as np
 
 from blinkgl.errors import ConfigError, EventDataError
 from blinkgl.front import arguments as check
-from blinkgl.front.sections import EmulatorSettings, events_tree
-from blinkgl.io import flow as flow_files, formats, trajectories
+from blinkgl.io import formats
 from blinkgl.io.formats import EventFile
 from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
+    from blinkgl.front.sections import EmulatorSettings
     from blinkgl.recordings.calibration import Calibration
     from blinkgl.recordings.comparison import Comparison
     from blinkgl.recordings.simulation import SimulationReport
@@ -144,6 +146,8 @@ def read_flow(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
     of a .png (DSEC), .flo or .npy file.
 
     Raises AssetError: missing, damaged, or no flow."""
+    from blinkgl.io import flow as flow_files
+
     return flow_files.read_flow(check.path(path, "path"))
 
 
@@ -154,6 +158,8 @@ def write_flow(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray | No
 
     Returns how many valid pixels the format could not hold; they are stored as invalid. Raises
     OutputError, ConfigError."""
+    from blinkgl.io import flow as flow_files
+
     field = check.array(flow, "flow", (None, None, 2), "an array (H, W, 2), px")
     mask = (
         np.ones(field.shape[:2], bool)
@@ -171,6 +177,8 @@ def read_trajectory(path: str | os.PathLike, *, form: str | None = None) -> tupl
 
     form : "tum" or "euroc"; None: EuRoC's where lines have commas.
     Raises AssetError, naming the line: no pose, times that do not increase, a gap."""
+    from blinkgl.io import trajectories
+
     if form not in (None, *trajectories.FORMATS):
         raise ConfigError("unknown form", where="form", value=form, accepted="tum, euroc or None")
     return trajectories.read_trajectory(check.path(path, "path"), form)
@@ -180,6 +188,8 @@ def read_trajectory(path: str | os.PathLike, *, form: str | None = None) -> tupl
 def write_trajectory(path: str | os.PathLike, t_ns: np.ndarray, poses: np.ndarray) -> None:
     """Writes poses (N, 4, 4) at t_ns (N,) whole ns as TUM's text, t x y z qx qy qz qw: those of a sequence's
     ``poses.npz`` are ``t_ns`` and ``T_world_cam``. Raises OutputError, ConfigError."""
+    from blinkgl.io import trajectories
+
     times = check.array(t_ns, "t_ns", (None,), "an array (N,) of whole ns")
     placed = check.array(poses, "poses", (len(times), 4, 4), f"an array ({len(times)}, 4, 4)")
     if times.dtype.kind not in "iu" or (np.diff(times) <= 0).any():
@@ -253,6 +263,7 @@ def calibrate(
     of the frames' times.   gamma : of their codes, "linear", "srgb" or an exponent.   interpolate : between them,
     "motion" or "linear".   max_px : of "motion", px.   frame_delay_ms : added to their times, ms; None: found.
     starts : of the search.   Raises AssetError, EventDataError, ConfigError."""
+    from blinkgl.front.sections import events_tree
     from blinkgl.recordings import calibration
     from blinkgl.recordings.clip import FrameReading
 
@@ -364,6 +375,7 @@ def _options(
     sensor: str | None = None,
 ) -> dict[str, Any]:
     from blinkgl.config.sensor import load_sensor
+    from blinkgl.front.sections import events_tree
     from blinkgl.recordings import simulation
 
     tree = events_tree(emulator)

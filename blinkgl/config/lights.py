@@ -88,8 +88,8 @@ class LightConfig(Config):
     """A sun and a sky, white as long as nobody says otherwise: E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 n_z), and
     lights beside them."""
 
-    sun: float = Field(0.9, ge=0, le=1e9, description="strength of the sun, radiance of a white facing surface")
-    sky: float = Field(0.6, ge=0, le=1e9, description="strength of the sky")
+    sun: float = Field(0.6, ge=0, le=1e9, description="strength of the sun, radiance of a white facing surface")
+    sky: float = Field(0.4, ge=0, le=1e9, description="strength of the sky")
     sun_elevation: float | None = Field(
         None,
         ge=-90,

@@ -287,6 +287,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
     "output": {
         "train": NOTHING,
         "test": {"output": {"split": "test", "name": "probe", "first_index": 1, "compression": "lz4"}},
+        "for h5py alone": {"output": {"compression": "gzip"}},
     },
     "seed": {"the group's": NOTHING, "its own": {"seed": 2**62 + 1}},
 }

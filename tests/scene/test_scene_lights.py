@@ -24,6 +24,16 @@ def light(**tree) -> Light:
     return make_light(validate(LightConfig, tree, where="scene.light"))
 
 
+def test_nothing_white_is_clipped_in_the_default_light():
+    """However it faces the sun and the sky."""
+    normals = np.random.default_rng(0).normal(size=(1000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    made = Light()
+    around = made.sky * (0.5 + 0.5 * normals[:, 2])
+    received = made.sun * np.maximum(0, normals @ made.sun_direction) + around
+    assert 0.9 < received.max() <= 1.0
+
+
 def test_lamps_of_a_configuration():
     made = light(
         lights=[
@@ -34,7 +44,7 @@ def test_lamps_of_a_configuration():
         sun_color=[1, 0.5, 0.25],
     )
     sun, other, point, spot = lamps_of(made)  # as the shader has them
-    assert sun.strength == pytest.approx((0.9, 0.45, 0.225)) and sun.size == pytest.approx(math.radians(0.53))
+    assert sun.strength == pytest.approx((0.6, 0.3, 0.15)) and sun.size == pytest.approx(math.radians(0.53))
     np.testing.assert_allclose(sun.path.pose(0)[:3, 2], made.sun_direction, atol=1e-12)
     np.testing.assert_allclose(other.path.pose(0)[:3, 2], [0, 1, 0], atol=1e-12)
     assert point.strength == (2, 1, 0) and point.reach == 9 and point.path.pose(5)[:3, 3].tolist() == [0, 0, 2]

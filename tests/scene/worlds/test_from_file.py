@@ -333,7 +333,7 @@ def test_lights_of_a_file(tmp_path):
     assert lamp.strength == pytest.approx([0.2 / math.pi, 0.1 / math.pi, 0.0])  # 68.3 cd / 683 lm/W, twice
     np.testing.assert_allclose(lamp.path.pose(0)[:3, 3], [1, -3, 2], atol=1e-9)
     np.testing.assert_allclose(lamp.path.pose(0)[:3, 2], [0, 0, 1], atol=1e-7)  # shines down
-    assert scene.light.sun == 0 and scene.light.sky == 0.6 and not scene.omissions
+    assert scene.light.sun == 0 and scene.light.sky == 0.4 and not scene.omissions
     plain = file_scene(tmp_path, lit())
     assert plain.light.plain and "lights (the configuration's sun and sky shine)" in plain.omissions[0]
     sun = lit(lights=[{"type": "directional"}, {"type": "point", "range": 4.0}])

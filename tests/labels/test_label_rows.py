@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -210,3 +211,15 @@ def test_disparity_is_f_b_over_z_of_any_sign_of_b():
         drawn, true = of(baseline)
         assert drawn.dtype == np.float32 and drawn.tolist() == [[0, 4, 2]] and true.tolist() == [[0, 4, 2]]
     assert not of(None)[0].any()
+
+
+@pytest.mark.parametrize("name", ["flow_intervals", "occlusion_intervals"])
+def test_intervals_come_back_from_their_file(name, tmp_path):
+    """Their time, too, which the file has in whole µs."""
+    (form,) = LABELS[name].forms
+    value = replace(whole(name), t_ns=7_000_000)
+    (tmp_path / "one.h5").write_bytes(form.encode(value))
+    back = form.read(tmp_path / "one.h5")
+    assert back.t_ns == value.t_ns
+    for key in ("interval_ns", *LABELS[name].arrays):
+        np.testing.assert_array_equal(getattr(back, key), getattr(value, key))

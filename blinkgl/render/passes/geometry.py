@@ -70,7 +70,8 @@ class Geometry(ScenePass):
             if "target_size" in uniforms:
                 uniforms["target_size"].value = shot.size
             # Uniforms of the lens: which ray looks at a fragment, and its model.
-            if self.lens and painter.lens is not None:
+            if self.lens:
+                assert painter.lens is not None
                 painter.lens.set(uniforms, shot, LENS_UNIT)
             # Values of the labels, of this item's object.
             for name, (_, rows) in values.items():

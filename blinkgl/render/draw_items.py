@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -95,6 +96,7 @@ class DrawItem:
     layer : 0 objects, 1 ground and walls, 2 sky; drawn in this order so that depth rejects hidden fragments early.
     two_sided : no culling, and the normal is turned towards the camera.   hued, faceted : as of :class:`Kind`.
     casts : whether it throws shadows: objects and walls do, unless they are unlit (screens, skies of files).
+    facet_slope : tangent of the angle between its facets and the normals that smooth them.
     extended : whether its material has more than a base colour: maps and numbers of its own to hand to programs.
     """
 
@@ -114,6 +116,7 @@ class DrawItem:
     hued: bool = False
     casts: bool = False
     faceted: bool = False
+    facet_slope: float = 0.0
 
     def __post_init__(self) -> None:
         self.textured = self.material.texture is not None
@@ -162,11 +165,26 @@ class _Greys:
 
 
 class _Facets:
-    """Which meshes have flat facets alone; each is looked at once, and none where the light is plain."""
+    """Which meshes have flat facets alone, and how far normals are from those of the facets that they smooth; each is
+    looked at once, and none where the light is plain."""
 
     def __init__(self, light: Light):
-        self._asked = not light.plain
+        self._asked, self._shadows = not light.plain, light.shadows != "off"
         self._known: dict[int, bool] = {}
+        self._slopes: dict[int, float] = {}
+
+    def slope(self, mesh: Mesh) -> float:
+        """Return the tangent of the angle that 95 % of the corners keep to their facet; 0 without shadows."""
+        if not self._shadows:
+            return 0.0
+        if id(mesh) not in self._slopes:
+            a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+            flat = np.cross(b - a, c - a)
+            flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)
+            cosine = np.einsum("fk,fck->fc", flat, mesh.normals[mesh.faces].astype(np.float64))
+            angle = math.acos(min(1.0, max(0.1, float(np.quantile(cosine, 0.05)))))
+            self._slopes[id(mesh)] = math.tan(angle)
+        return self._slopes[id(mesh)]
 
     def flat(self, mesh: Mesh) -> bool:
         if not self._asked or mesh.deformer is not None:
@@ -211,6 +229,7 @@ def _draw_item(index: int, thing: SceneObject, part: Part, scene: Scene, grey: _
         hued=grey.hued(material, mesh),
         casts=category in ("object", "wall") and not material.unlit,
         faceted=not material.unlit and facets.flat(mesh),
+        facet_slope=0.0 if material.unlit else facets.slope(mesh),
     )
 
 

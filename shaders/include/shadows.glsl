@@ -14,6 +14,7 @@ uniform vec4 shadow_scale[SHADOWS];      // width of a texel: .x + .y w, world u
 #ifdef SOFT
 #define SHADOW_MAP sampler2D
 #else
+uniform float facet_slope; // tangent of the angle between facets of the mesh and the normals that smooth them
 #define SHADOW_MAP sampler2DShadow
 #endif
 uniform SHADOW_MAP shadow_map_0;
@@ -119,6 +120,8 @@ float shadow(int k, vec3 n, float facing, vec3 aside)
 #else
     // The four texels that an edge is smoothed over are up to one away in x and y, together at most sqrt(2) slopes.
     float slant = sqrt(max(1.0 - facing * facing, 0.0)) / facing;
+    // The facets themselves are steeper than the normals that are smoothed over them: tan of the sum of both angles.
+    slant = slant * facet_slope < 1.0 ? (slant + facet_slope) / (1.0 - slant * facet_slope) : FARTHEST;
     c.z = max(c.z + min(1.5 * slant + SPARE, FARTHEST) * texel * unit, 0.0); // 0: behind all that casts
 #define SEEN(map) texture(map, c)
 #endif

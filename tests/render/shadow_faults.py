@@ -22,7 +22,7 @@ from blinkgl.render.appearance import seen_share
 from blinkgl.render.passes import shadow_maps
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.shadows import scale_of
-from blinkgl.scene.geometry.primitives import cuboid, grid, icosphere
+from blinkgl.scene.geometry.primitives import capsule, cone, cuboid, cylinder, grid, icosphere, torus
 from blinkgl.scene.lights import lamp_pose
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.motion.trajectories import look_rotation
@@ -57,6 +57,25 @@ def frame(rng: np.random.Generator, size: int) -> Scene:
     )
     light = Light(towards, 1.0, SKY, shadows="hard", shadow_size=size)
     return Scene(objects, Rig.alone(PinHole.centred(96, 72, 90.0), StaticPath(T)), 0, 1, light)
+
+
+def coarse_frame(rng: np.random.Generator, size: int) -> Scene:
+    """The same over bodies of few triangles with smooth normals."""
+    scene = frame(rng, size)
+    meshes = (
+        (icosphere(subdivisions=1), (-0.9, 4.5, 0.8)),
+        (torus(), (0.9, 4.0, 0.8)),
+        (capsule(radius=0.1, height=0.6, segments=8, rings=4), (0.1, 3.6, 0.9)),
+        (cone(segments=10), (0.1, 5.5, 0.6)),
+        (cylinder(radius=0.04, height=1.2, segments=10), (-0.3, 3.3, 0.9)),
+        (icosphere(radius=0.15, subdivisions=2), (0.4, 3.2, 0.7)),
+    )
+    bodies = []
+    for number, (mesh, place) in enumerate(meshes, start=2):
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = Rotation.random(rng=rng).as_matrix(), place
+        bodies.append(SceneObject(f"{number}", number, (Part(mesh, Material()),), StaticPath(T)))
+    return replace(scene, objects=(scene.objects[0], *bodies))
 
 
 def faults(gl, scene: Scene) -> tuple[int, int, int]:

@@ -19,7 +19,7 @@ from blinkgl.scene.lights import lamp_pose
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.types import Lamp, Light, Material, Part, SceneObject
 from render_scenes import LEVEL, SECOND, cube, curve, drift, quad, rig, scene, sphere, still, thing
-from shadow_faults import contact_frame, faults, frame as random_frame, leaks
+from shadow_faults import coarse_frame, contact_frame, faults, frame as random_frame, leaks
 
 PLAIN = RenderConfig(image_antialiasing="none")
 SEEN = ShadowMap.seen
@@ -210,3 +210,11 @@ def test_no_light_along_the_line_where_something_stands(gl, kind, shadows):
     blocked, lit = np.sum([leaks(gl, contact_frame(rng, kind, shadows)) for _ in range(3)], axis=0)
     assert blocked > 600
     assert lit <= 1e-3 * blocked
+
+
+def test_what_few_triangles_make_round_is_not_in_its_own_shadow(gl):
+    """The facets are steeper to the light than the normals that are smoothed over them."""
+    rng = np.random.default_rng(0)
+    graded, acne, _ = np.sum([faults(gl, coarse_frame(rng, 1024)) for _ in range(12)], axis=0)
+    assert graded > 20_000
+    assert acne <= 1e-4 * graded

@@ -122,6 +122,8 @@ class Shaded(ScenePass):
             rows = np.stack([moment.texture_from_obj[item.object_index] for moment in seen])
             uniforms["shadow_rows"].write(rows.tobytes())
             uniforms["shadow_scale"].write(_scales(self.shadows).tobytes())
+            if "facet_slope" in uniforms:
+                uniforms["facet_slope"].value = item.facet_slope
             if "shadow_plane" in uniforms:
                 uniforms["shadow_plane"].write(planes_of(rows, _scales(self.shadows)).astype(np.float32).tobytes())
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -164,7 +163,7 @@ def test_flat_facets_are_lit_at_their_corners(gl, monkeypatch, finer):
         beside_rates = renderer.brightness(0).read()[..., 0]
     programs = [dict(defines) for _, defines in gl.shaders.compiled]
     assert any("FACETED" in one and one.get("AMBIENT") == ("3" if finer else "2") for one in programs)
-    monkeypatch.setattr(draw_items, "_Facets", lambda _: SimpleNamespace(flat=lambda _: False))
+    monkeypatch.setattr(draw_items._Facets, "flat", lambda *_: False)
     with Renderer(gl, world, unfiltered) as renderer:
         smooth = renderer.luminance(0).read(), renderer.colour(0).read()
     ids = reference.render(world, 0).instance

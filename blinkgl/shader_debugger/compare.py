@@ -27,7 +27,8 @@ import numpy as np
 
 from blinkgl.errors import ConfigError
 from blinkgl.render import appearance, casting, reference
-from blinkgl.scene.lights import is_coloured, lamps_of, shadowing
+from blinkgl.render.colour import LUMA
+from blinkgl.scene.lights import lamps_of, shadowing
 from blinkgl.scene.types import Material
 from blinkgl.shader_debugger.mipmaps import mipmapped_albedo
 from blinkgl.shader_debugger.moments import (
@@ -54,9 +55,6 @@ SIDE = 1e-4
 LIT = ("direct", "shadow", "around", "light", "mirrored", "emission")
 MAP_JUMP = 0.005
 """A second difference of a shadow map above this part of its depth is an edge."""
-COLOURED = 10.0
-"""In coloured light a term is weighed by the colours of the albedo, which mip maps of 8 bits know no better: so much
-wider are tolerances."""
 NEEDS_ISOTROPIC = ("luminance_level", "luminance_albedo", "colour_level", "colour_albedo")
 
 
@@ -160,7 +158,6 @@ class Comparison:
         self.gpu, self.ref = gpu, ref
         flat, seen = ref.frame, ref.labels
         self.band = reference.silhouette_band(seen.instance, seen.depth)
-        self._coloured = is_coloured(ref.scene.light)
         self.same_triangle = (gpu["part"] == ref["part"]) & ((gpu["triangle"] == ref["triangle"]) | ~flat.hit)
         self._same_label = self.same_triangle
         if seen is not flat:
@@ -186,11 +183,6 @@ class Comparison:
 
     def _frame(self, name: str) -> reference.ReferenceFrame:
         return self.ref.frame if view_of(name) is None else self.ref.labels
-
-    def tolerance(self, name: str) -> float:
-        """Of a buffer of this scene, where nobody says another."""
-        wider = COLOURED if lookup_of(name)[1] in ("direct", "around", "light") and self._coloured else 1.0
-        return wider * QUANTITIES[name].tolerance
 
     @cached_property
     def shares(self) -> np.ndarray | None:
@@ -295,6 +287,14 @@ class Comparison:
         g, r = self.pair(name)
         error = QUANTITIES[name].error(g, r, self.gpu, self.ref)
         error = np.where(np.isnan(error), np.inf, error)
+        if lookup_of(name)[1] in ("direct", "around", "light"):
+            # Coloured light is told in the luminance of what it falls on: a mean over three channels, weighed by an
+            # albedo that is graded by itself. With other weights the mean moves by the channels' spread at most.
+            of, albedo = lookup_of(name)[0], self.ref["albedo"]
+            weights = np.abs(self.gpu["colour_albedo"] - albedo) @ LUMA
+            if of == "luminance":  # whose own albedo is grey, so that of its colours only the sum is known
+                weights = weights + np.abs(self.gpu["luminance_albedo"] - luma_of(albedo))[..., 0]
+            error = np.maximum(error - self.ref["spread"] * weights, 0.0)
         return error / self.ref["needles"] if name == "local" or QUANTITIES[name].same_triangle else error
 
     def graded(self, name: str) -> np.ndarray:
@@ -324,7 +324,7 @@ class Comparison:
         # Nothing to grade is nothing wrong; the verdict counts it.
         value = (float(inside.mean()) if quantity.statistic == "mean" else float(inside.max())) if inside.size else 0.0
         report = BufferReport(
-            quantity, self.tolerance(name) if tolerance is None else tolerance, errors, graded, band, value
+            quantity, quantity.tolerance if tolerance is None else tolerance, errors, graded, band, value
         )
         report.objects = self._per_object(report)
         if not report.passed and name not in (*MAPS, "local"):

@@ -403,13 +403,16 @@ class ReferenceMoment(_Lazy):
         out["light"][on], out["around"][on], out["direct"][on] = light, around, direct
         # Each lamp by itself, so that shares of soft shadows can be put in their place.
         out["lamps"][on] = np.einsum("knc,nc->nk", sent.light.open, weights)
+        terms = sent.light.open.sum(axis=0), sent.light.around, sent.matt
+        spread = np.max([np.ptp(one, axis=1) for one in terms], axis=0)
+        out["spread"][on] = spread / np.maximum(albedo @ LUMA, 1e-30)
         out["matt"][on] = np.where(arrives + around > 0, light / np.maximum(arrives + around, 1e-30), 1.0)
         out["shadow"][on] = np.where(direct > 0, arrives / np.maximum(direct, 1e-30), 1.0)
         out["mirrored"][on], out["emission"][on] = sent.mirrored, sent.emission
 
 
 _COMPONENTS = {
-    **dict.fromkeys(("level", "direct", "shadow", "around", "light", "needles"), 0),
+    **dict.fromkeys(("level", "direct", "shadow", "around", "light", "spread", "needles"), 0),
     **dict.fromkeys(("uv", "texture_size"), 2),
     **dict.fromkeys(("levels", "albedo", "mirrored", "emission", "lit"), 3),
 }

@@ -95,7 +95,7 @@ def _row(name, gpu, ref, comparison, x, y) -> dict:
     if name in comparison.names() and name in QUANTITIES:
         quantity = QUANTITIES[name]
         error = float(comparison.errors(name)[y, x])
-        limit = comparison.tolerance(name) if quantity.statistic == "max" else 0.5
+        limit = quantity.tolerance if quantity.statistic == "max" else 0.5
         row["ok"] = bool(error <= limit) if comparison.graded(name)[y, x] else None
         if name in ("luminance", "colour"):
             row["note"] = (

@@ -348,11 +348,15 @@ def simulate(
     gamma: Annotated[
         str | None,
         typer.Option(
-            help="srgb, linear or an exponent (default: linear for floats and frames of a recording, else srgb)."
+            help="srgb, linear or an exponent (default: linear for floats and a recording's frames, for grey images "
+            "of the sensor's size what its own frames are, else srgb)."
         ),
     ] = None,
     interpolate: Annotated[str, typer.Option(help="Between frames: linear, or motion (dense-flow warp).")] = "linear",
     max_px: Annotated[float, typer.Option(min=0.01, help="motion: largest displacement per step, px.")] = 1.0,
+    keep_noise: Annotated[
+        bool, typer.Option("--keep-noise", help="Make events of the frames' own noise, too (default: none).")
+    ] = False,
     seed: Annotated[int, typer.Option(help="Seed of the emulator.")] = 0,
     preview: Annotated[str | None, typer.Option(help="Also write a video of frames and events, .mp4.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
@@ -375,6 +379,7 @@ def simulate(
         gamma=gamma,
         interpolate=interpolate,
         max_px=max_px,
+        keep_noise=keep_noise,
         seed=seed,
         preview=preview,
         overwrite=overwrite,
@@ -392,7 +397,7 @@ def compare(
     fps: Annotated[float | None, typer.Option(help="Frame rate of the frames.")] = None,
     timestamps: Annotated[str | None, typer.Option(help="Frame times.")] = None,
     gamma: Annotated[
-        str, typer.Option(help="Of the frames: linear, srgb or an exponent (simulate takes integers as srgb).")
+        str, typer.Option(help="Of the frames: linear, as a camera's own are, srgb or an exponent.")
     ] = "linear",
     frame_delay_ms: Annotated[float, typer.Option(help="Added to the frame times, ms.")] = 0.0,
     interval_ms: Annotated[float, typer.Option(min=0.001, help="Interval where there are no frames, ms.")] = 20.0,
@@ -445,7 +450,7 @@ def calibrate(
     fps: Annotated[float | None, typer.Option(help="Frame rate of the frames.")] = None,
     timestamps: Annotated[str | None, typer.Option(help="Frame times.")] = None,
     gamma: Annotated[
-        str, typer.Option(help="Of the frames: linear, srgb or an exponent (simulate takes integers as srgb).")
+        str, typer.Option(help="Of the frames: linear, as a camera's own are, srgb or an exponent.")
     ] = "linear",
     interpolate: Annotated[str, typer.Option(help="Between frames: motion (dense-flow warp) or linear.")] = "motion",
     max_px: Annotated[float, typer.Option(min=0.01, help="motion: largest displacement per step, px.")] = 1.0,

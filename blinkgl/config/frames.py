@@ -41,6 +41,11 @@ class FramesConfig(Config):
         "motion", description="between frames: as `blinkgl simulate --interpolate`"
     )
     max_px: float = Field(1.0, gt=0, le=1e3, description="motion: largest displacement per step, px")
+    keep_noise: bool = Field(
+        False,
+        description="make events of the images' own noise, too: otherwise it is found from the first images, and what "
+        "it explains makes none (images without noise are taken as they are)",
+    )
     max_displacement: float | None = Field(
         17.0,
         gt=0,

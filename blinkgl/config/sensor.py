@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import copy
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Discriminator, Field, Tag
 
@@ -63,6 +63,11 @@ class SensorConfig(Config):
     height: int = Field(ge=1, le=65535, description="Rows, px.")
     pixel_pitch_um: float | None = Field(
         None, gt=0, le=1000, description="Distance between pixel centres, micrometres."
+    )
+    frame_gamma: Literal["linear", "srgb"] | Annotated[float, Field(gt=0, le=10)] | None = Field(
+        None,
+        description="Curve from the codes of the camera's own frames to light: `linear`, `srgb` or an exponent. Grey "
+        "images of the sensor's size are taken for its own where nobody says what they are.",
     )
     contrast_threshold: float | None = Field(None, ge=0.001, le=10, description="Nominal ON threshold, ln units.")
     contrast_threshold_off: float | None = Field(

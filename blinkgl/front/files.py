@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from blinkgl.front.sections import EmulatorSettings
     from blinkgl.recordings.calibration import Calibration
     from blinkgl.recordings.comparison import Comparison
-    from blinkgl.recordings.simulation import SimulationReport
+    from blinkgl.recordings.simulation import FrameUse, SimulationReport
 
 _SIDE = 65535
 
@@ -301,6 +301,7 @@ class FrameOptions(TypedDict, total=False):
     gamma: str | float | None
     interpolate: str
     max_px: float
+    keep_noise: bool
     seed: int
     sensor: str | None
 
@@ -315,7 +316,9 @@ def simulate(
     t_ns). uint8, uint16, or float (1.0 is white).
     emulator : as of :func:`record`, "esim" if not said.   seed : of its noise, 0 if not said.
     sensor : the read-out limit of that camera, and with an emulator's name its values; frames keep their size.
-    gamma : "srgb", "linear" or an exponent; default: srgb for integers, linear for floats.
+    gamma : "srgb", "linear" or an exponent; default: linear for floats, srgb for integers but grey ones of the size
+    of ``sensor``, which are taken for its own (``report.assumed_gamma``).   keep_noise : make events of the noise of
+    integer frames, too, which otherwise makes none (``report.noise``).
     interpolate : "linear", the default; "motion": dense flow, at most ``max_px`` (1) px a step, which frames need
     between which things move further than 2 px (``report.guessed_over_px``).
     report : a SimulationReport to be filled.
@@ -326,11 +329,8 @@ def simulate(
         raise ConfigError(
             "not frames", where="frames", value=frames, accepted="an iterable of arrays; of a file, simulate_file"
         )
-    return simulation.frames_to_events(
-        _frames(frames),
-        report=report,
-        **_options(**frame_options),
-    )
+    use, options = _options(**frame_options)
+    return simulation.frames_to_events(_frames(frames), report=report, **vars(use), **options)
 
 
 @check.public
@@ -349,10 +349,11 @@ def simulate_file(
 
     timestamps : file of times, one a frame.   size : (height, width), px, that frames are cropped and scaled to; None:
     that of ``sensor``, or else the frames' own.   preview : a video of frames and events to write.
-    frames : fps, emulator, gamma, interpolate, max_px, seed, sensor as of :func:`simulate`.
+    frames : fps, emulator, gamma, interpolate, max_px, keep_noise, seed, sensor as of :func:`simulate`.
     Returns a report: frames, steps, events, lost … Raises AssetError, OutputError, EventDataError, ConfigError."""
     from blinkgl.recordings import simulation
 
+    use, options = _options(**frames)
     return simulation.file_to_events(
         check.path(source, "source"),
         check.path(target, "target"),
@@ -360,7 +361,8 @@ def simulate_file(
         size=_sensor_size(frames.get("sensor")) if size is None else _size(size),
         preview=None if preview is None else check.path(preview, "preview"),
         overwrite=overwrite,
-        **_options(**frames),
+        use=use,
+        **options,
     )
 
 
@@ -371,9 +373,11 @@ def _options(
     gamma: str | float | None = None,
     interpolate: str = "linear",
     max_px: float = 1.0,
+    keep_noise: bool = False,
     seed: int = 0,
     sensor: str | None = None,
-) -> dict[str, Any]:
+) -> tuple[FrameUse, dict[str, Any]]:
+    """How frames become light, and what :func:`frames_to_events` takes beside it."""
     from blinkgl.config.sensor import load_sensor
     from blinkgl.front.sections import events_tree
     from blinkgl.recordings import simulation
@@ -382,13 +386,17 @@ def _options(
     camera = None if sensor is None else load_sensor(sensor)
     if camera is not None:
         tree = {**camera.values(tree.get("emulator", "esim")), **tree}
-    return dict(
+    use = simulation.FrameUse(
+        gamma,
+        interpolate,
+        check.number(max_px, "max_px", above=0, most=1e4),
+        bool(keep_noise),
+        simulation.own_frames(camera),
+    )
+    return use, dict(
         fps=_fps(fps),
-        gamma=gamma,
-        interpolate=interpolate,
         emulator=simulation.emulator_config(tree),
         seed=check.seed(seed),
-        max_px=check.number(max_px, "max_px", above=0, most=1e4),
         readout=None if camera is None else camera.readout,
     )
 

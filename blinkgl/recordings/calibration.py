@@ -65,7 +65,8 @@ class Calibration:
     config : the emulator as fitted; before : as it was.   values, uncertainty : of the fitted keys (a standard
     deviation, in the key's unit).   untold : why the others were not fitted, by key.   halves : intervals of the half
     that was fitted, and of that which was not.   judged_before, judged : one of each half.   simulated_before,
-    simulated : events of the whole clip.   warnings : what the recording lacks, though a fit was possible."""
+    simulated : events of the whole clip.   gamma : of the frames' codes; None: there were none.   warnings : what the
+    recording lacks, though a fit was possible."""
 
     recording: str
     clip: Clip
@@ -82,6 +83,7 @@ class Calibration:
     simulated_before: Events
     simulated: Events
     notes: list[str]
+    gamma: str | float | None = None
     warnings: list[str] = field(default_factory=list)
 
     def sensor(self) -> dict[str, Any]:
@@ -94,6 +96,7 @@ class Calibration:
             "name": os.path.splitext(file)[0],
             "width": width,
             "height": height,
+            **({} if self.gamma is None else {"frame_gamma": self.gamma}),
             "emulators": {name: {k: _short(v) for k, v in told.items()}},
             "sources": {
                 f"emulators.{name}": f"blinkgl calibrate, fitted to the first {seconds[0]:.3g} s of {file}; in the "
@@ -207,6 +210,7 @@ def calibrate_events(
         streams[0],
         streams[1],
         notes,
+        None if frames is None else reading.gamma,
         warnings,
     )
 
@@ -340,8 +344,8 @@ def _of_frames(clip: Clip, reading: FrameReading) -> tuple[list[str], list[str]]
         ),
     ]
     notes.append(
-        f"The frames' codes were taken as `--gamma {reading.gamma}`: simulate such frames with that, too, or the "
-        "fitted thresholds are of another light."
+        f"The frames' codes were taken as `--gamma {reading.gamma}`; the sensor file tells `simulate`, which takes "
+        "grey images of the sensor's size for the camera's own."
     )
     if "bursts" in facts:
         notes.append(

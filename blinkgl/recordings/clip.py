@@ -7,7 +7,7 @@ A clip may hold some tiles of the sensor only, stacked on one another: emulators
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -21,11 +21,14 @@ from blinkgl.io.formats import open_events
 from blinkgl.io.frames import RECORDING, open_frames
 from blinkgl.recordings.bursts import frame_bursts, inside_any
 from blinkgl.recordings.comparison import BLUR_PX, LOG_OFFSET
-from blinkgl.recordings.simulation import Decoder
+from blinkgl.recordings.frame_noise import LOOKED_AT, Steadied
+from blinkgl.recordings.simulation import Decoder, noise_of
 from blinkgl.timeline.interpolate import Displacement, motion
 from blinkgl.types.events import Events
 
 TILE_PX = 32
+SETTLING = 3
+"""Intervals between frames that the first frame is shown before it counts: slow pixels come to rest in them."""
 MOST_PIXEL_STEPS = 3_000_000
 """Pixels times frames that a clip holds at most, float32: what a fit of a minute or two has time for."""
 STILL = 0.04
@@ -123,7 +126,7 @@ def clip_of_frames(
 
     frames : (array, t_ns, name), at the middle of their exposures.   size : (height, width) of the events' sensor.
     Raises EventDataError: frames of another size, no common time, saturated frames, clocks that do not match."""
-    grey, clock, full = _greys(frames, size, reading)
+    grey, steady, clock, full = _greys(frames, size, reading)
     facts: dict[str, float] = {"saturated": float(full.mean())}
     bursts = frame_bursts(events, float(np.median(np.diff(clock)))) if len(clock) > 1 else np.empty((0, 2), np.int64)
     if len(bursts):
@@ -138,12 +141,8 @@ def clip_of_frames(
     first, last = _one_exposure(inside, change, clock, ~full, events, reading.name)
     if last - first < len(inside):
         facts["other_exposure"] = len(inside) - (last - first)
-    grey, logs, clock, change = (
-        grey[first : last + 1],
-        logs[first : last + 1],
-        clock[first : last + 1],
-        change[first:last],
-    )
+    grey = steady(grey[first : last + 1])
+    logs, clock, change = logs[first : last + 1], clock[first : last + 1], change[first:last]
     edges = clock.copy()
     edges[0], edges[-1] = max(clock[0], events.t[0]), min(clock[-1], events.t[-1] + 1)
     path = _path(grey, clock, reading, facts)
@@ -169,10 +168,11 @@ def clip_of_frames(
 
 def _greys(
     frames: Iterable[tuple[np.ndarray, int, str]], size: tuple[int, int], reading: FrameReading
-) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-    """The frames' luminance, their times in µs, and (H, W) bool, which pixels were saturated in any of them."""
+) -> tuple[list[np.ndarray], Callable[[list[np.ndarray]], list[np.ndarray]], np.ndarray, np.ndarray]:
+    """The frames' luminance, what takes their noise from them, their times in µs, and (H, W) bool, which pixels were
+    saturated in any of them."""
     decode = Decoder(reading.gamma)
-    grey, times, full = [], [], np.zeros(size, bool)
+    grey, times, full, first = [], [], np.zeros(size, bool), []
     for frame, t_ns, name in frames:
         if frame.shape[:2] != size:
             raise EventDataError(
@@ -184,6 +184,8 @@ def _greys(
         if frame.dtype.kind == "u":
             top = frame >= np.iinfo(frame.dtype).max
             full |= top.any(axis=2) if top.ndim == 3 else top
+        if len(first) < LOOKED_AT:
+            first.append(frame)
         grey.append(decode(frame, name))
         times.append(t_ns)
     if full.mean() > MOST_SATURATED:
@@ -193,7 +195,9 @@ def _greys(
             value=f"{100 * full.mean():.0f} %",
             accepted=f"at most {100 * MOST_SATURATED:.0f} % (a shorter exposure)",
         )
-    return grey, np.array(times, np.int64) // 1000, full
+    noise = noise_of(first, decode) if first else None
+    steady = lambda lights: lights if noise is None else list(map(Steadied(noise), lights))
+    return grey, steady, np.array(times, np.int64) // 1000, full
 
 
 def _delay(found_us: int, correlation: float, reading: FrameReading) -> int:
@@ -241,7 +245,8 @@ def _path(
     # part of the same picture, from which the light goes over to the first frame.
     height, width = grey[0].shape[:2]
     other = np.roll(grey[0], (height // 3, width // 3), (0, 1))
-    return [(other, int(2 * clock[0] - clock[1]) * 1000), *path]
+    begin, interval = int(clock[0]) * 1000, int(clock[1] - clock[0]) * 1000
+    return [(other, begin - (SETTLING + 1) * interval), (path[0][0], begin - SETTLING * interval), *path]
 
 
 def clip_of_still(events: Events, size: tuple[int, int], *, luminance: float = DARK_BACKGROUND, parts: int = 8) -> Clip:

@@ -13,10 +13,10 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numba
 import numpy as np
@@ -29,17 +29,46 @@ from blinkgl.errors import ConfigError, EventDataError, OutputError
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.io.frames import VIDEO, open_frames
 from blinkgl.recordings.fitting import Fitting
+from blinkgl.recordings.frame_noise import LOOKED_AT, FrameNoise, Steadied, caveats, frame_noise
 from blinkgl.srgb import linear_from_srgb
 from blinkgl.tensors.choice import make_on_device
 from blinkgl.timeline import interpolate as between
 from blinkgl.types.events import Events, count_causes, named_causes
 
 if TYPE_CHECKING:
+    from blinkgl.config.sensor import SensorConfig
     from blinkgl.sequence_files.preview import PreviewWriter
 
+_SPARSE = 8
+"""Rows and columns for one of which a frame's brightness is taken."""
 INTERPOLATIONS = ("linear", "motion")
 _LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
 """ITU-R BT.709, on linear light."""
+
+
+class OwnFrames(NamedTuple):
+    """What a sensor's own frames are: grey, of the sensor's (height, width), their codes by this curve to light."""
+
+    size: tuple[int, int]
+    gamma: str | float
+
+
+def own_frames(sensor: SensorConfig | None) -> OwnFrames | None:
+    """What is known of a sensor's own frames."""
+    if sensor is None or sensor.frame_gamma is None:
+        return None
+    return OwnFrames((sensor.height, sensor.width), sensor.frame_gamma)
+
+
+@dataclass(frozen=True)
+class FrameUse:
+    """How given frames become light; see :func:`frames_to_events`."""
+
+    gamma: str | float | None = None
+    interpolate: str = "linear"
+    max_px: float = 1.0
+    keep_noise: bool = False
+    own: OwnFrames | None = None
 
 
 @dataclass
@@ -66,10 +95,14 @@ class SimulationReport:
     """for interpolate="motion" """
     moved_px: list[float] = field(default_factory=list)
     """for interpolate="linear": 99th percentile of the dense flow between a few pairs of given frames"""
-    assumed_srgb: bool = False
-    """whether the codes of images were taken as sRGB because nobody said what they are"""
+    assumed_gamma: str | float | None = None
+    """what integer codes were taken for, because nobody said it: the curve of the sensor's own frames, or "srgb" """
     fitting: Fitting | None = None
     """how frames became the sensor's size; None: they had it, or nobody asked"""
+    noise: FrameNoise | None = None
+    """the frames' own, from which no events were made; None: exact frames, or it was kept"""
+    caveats: list[str] = field(default_factory=list)
+    """what is wrong with the frames, a line each: few codes, clipped, flicker"""
 
     @property
     def duration_s(self) -> float:
@@ -102,6 +135,8 @@ def frames_to_events(
     gamma: str | float | None = None,
     interpolate: str = "linear",
     max_px: float = 1.0,
+    keep_noise: bool = False,
+    own: OwnFrames | None = None,
     seed: int = 0,
     readout: ReadoutConfig | None = None,
     report: SimulationReport | None = None,
@@ -114,9 +149,14 @@ def frames_to_events(
         triples (a :class:`~blinkgl.io.frames.FrameSource` is that). uint8, uint16 (full scale
         1.0) or float (1.0 is white, more is fine).
     emulator : name of one ("esim", "v2e", "voltmeter"), or a config of one.
-    gamma : "srgb", "linear", or an exponent N (luminance = code^N). Default: srgb for integers, linear for floats.
+    gamma : "srgb", "linear", or an exponent N (luminance = code^N). Default: linear for floats; for integers that of
+        ``own`` where frames are like these, else srgb.
     interpolate : "linear": the given frames, between which the emulators are linear themselves; "motion":
         dense-flow warp with at most ``max_px`` per step (see :mod:`blinkgl.timeline.interpolate`).
+    keep_noise : make events of the noise of integer frames, too; else it is found from the first frames and what it
+        explains makes none (:mod:`blinkgl.recordings.frame_noise`). Floats, and frames without noise, are taken as
+        they are.
+    own : what frames of the sensor's own are like; None: nobody knows.
     seed : of the emulator. readout : what is behind the pixels (``load_sensor(name).readout``); None:
     nothing. report : filled as it goes.
 
@@ -127,17 +167,8 @@ def frames_to_events(
     ConfigError : unknown emulator, gamma or interpolation.
     """
     report = report if report is not None else SimulationReport()
-    steps = simulated_steps(
-        frames,
-        fps=fps,
-        emulator=emulator,
-        gamma=gamma,
-        interpolate=interpolate,
-        max_px=max_px,
-        seed=seed,
-        readout=readout,
-        report=report,
-    )
+    use = FrameUse(gamma, interpolate, max_px, keep_noise, own)
+    steps = simulated_steps(frames, use, fps=fps, emulator=emulator, seed=seed, readout=readout, report=report)
     return (step.events for step in steps if len(step.events))
 
 
@@ -148,96 +179,141 @@ class Step(NamedTuple):
     t_ns: int
     events: Events
     frame: np.ndarray
+    decode: Decoder
+
+    def luminance(self) -> np.ndarray:
+        """(H, W) float32, linear."""
+        return self.decode(self.frame, "") if self.frame.dtype == np.uint8 else self.frame
 
 
 def simulated_steps(
     frames: Iterable,
+    use: FrameUse,
     *,
     report: SimulationReport,
     fps: float | None = None,
     emulator: str | EmulatorConfig = EmulatorConfig.members.default,
-    gamma: str | float | None = None,
-    interpolate: str = "linear",
-    max_px: float = 1.0,
     seed: int = 0,
     readout: ReadoutConfig | None = None,
+    fitting: Fitting | None = None,
 ) -> Iterator[Step]:
-    """As :func:`frames_to_events`, every step of it."""
+    """As :func:`frames_to_events`, every step of it. fitting : frames to the sensor's size; None: they have it."""
     config = emulator_config(emulator)
-    if interpolate not in INTERPOLATIONS:
+    if use.interpolate not in INTERPOLATIONS:
         raise ConfigError(
-            "unknown interpolation", where="interpolate", value=interpolate, accepted=", ".join(INTERPOLATIONS)
+            "unknown interpolation", where="interpolate", value=use.interpolate, accepted=", ".join(INTERPOLATIONS)
         )
-    return _run(timed(frames, fps), config, _checked_gamma(gamma), interpolate, max_px, seed, readout, report)
+    use = replace(use, gamma=_checked_gamma(use.gamma))
+    return _run(timed(frames, fps), use, config, seed, readout, report, fitting)
 
 
-def _run(frames, config, gamma, interpolate, max_px, seed, readout, report) -> Iterator[Step]:
+def _run(frames, use, config, seed, readout, report, fitting) -> Iterator[Step]:
     first = next(frames, None)
     if first is None:
         raise EventDataError("events need at least two frames", value="0 frames")
-    camera = EventCamera(config, readout, *first[0].shape[:2], seed, make=make_on_device)
-    yield from stepped(
-        itertools.chain([first], frames),
-        camera,
-        gamma=gamma,
-        interpolate=interpolate,
-        max_px=max_px,
-        report=report,
-    )
+    size = first[0].shape[:2] if fitting is None else fitting.wanted
+    camera = EventCamera(config, readout, *size, seed, make=make_on_device)
+    yield from stepped(itertools.chain([first], frames), camera, use, report=report, fitting=fitting)
 
 
 def stepped(
     frames: Iterator[tuple[np.ndarray, int, str]],
     camera: EventCamera,
+    use: FrameUse,
     *,
-    gamma: str | float | None,
-    interpolate: str,
-    max_px: float,
     report: SimulationReport | None = None,
+    fitting: Fitting | None = None,
 ) -> Iterator[Step]:
     """Frames (array, t_ns, name), those in between included, through an event camera. Raises
     EventDataError as :func:`frames_to_events`."""
     report = report if report is not None else SimulationReport()
-    first = next(frames)
-    decode = Decoder(gamma)
-    table = interpolate == "linear" and first[0].dtype == np.uint8 and first[0].ndim == 2
-    if table:
-        camera.emulator.set_decode(decode.table(np.uint8))
+    given = _Given(frames, use, report, fitting)
+    if given.by_codes:
+        camera.emulator.set_decode(given.decode.table(np.uint8))
+    stream = iter(given)
+    if use.interpolate == "motion":
+        report.displacement = between.Displacement()
+        stream = between.motion(stream, use.max_px, displacement=report.displacement)
+    else:
+        stream = between.watched(stream, report.moved_px)
+    seen: list[np.ndarray] = []
 
-    def luminances() -> Iterator[tuple[np.ndarray, int]]:
-        shape = first[0].shape
-        last = None
-        for frame, t_ns, name in itertools.chain([first], frames):
-            if frame.shape != shape:
+    def shown() -> Iterator[EventFrame]:
+        for luminance, t_ns in stream:
+            seen[:] = [luminance]
+            yield EventFrame(t_ns, luminance)
+
+    for t_ns, events in emulate(shown(), camera):
+        report.add(t_ns, events, camera)
+        yield Step(t_ns, events, seen[0], given.decode)
+
+
+class _Given:
+    """The given frames' light, (luminance, t_ns) as they come: decoded, of the sensor's size, without their noise.
+
+    by_codes : whether frames stay the codes that they are, for an emulator that has a table of them."""
+
+    def __init__(
+        self,
+        frames: Iterator[tuple[np.ndarray, int, str]],
+        use: FrameUse,
+        report: SimulationReport,
+        fitting: Fitting | None,
+    ):
+        self._fitting, self._report = fitting, report
+        ahead = list(itertools.islice(frames, LOOKED_AT))
+        self._frames, self._first = itertools.chain(ahead, frames), [frame for frame, _, _ in ahead]
+        self._shape = ahead[0][0].shape
+        gamma = use.gamma
+        if gamma is None and ahead[0][0].dtype.kind == "u":
+            own = use.own is not None and self._shape == use.own.size
+            gamma = report.assumed_gamma = use.own.gamma if own else "srgb"
+        self.decode = Decoder(gamma)
+        if not use.keep_noise:
+            report.noise = noise_of(self._first, self.decode, fitting)
+        self._steadied = None if report.noise is None else Steadied(report.noise)
+        dtype, axes = ahead[0][0].dtype, ahead[0][0].ndim
+        exact = report.noise is None and fitting is None
+        self.by_codes = use.interpolate == "linear" and dtype == np.uint8 and axes == 2 and exact
+
+    def __iter__(self) -> Iterator[tuple[np.ndarray, int]]:
+        last, name, brightness = None, "", []
+        for frame, t_ns, name in self._frames:
+            if frame.shape != self._shape:
                 raise EventDataError(
-                    "frame size changed", where=name, value=frame.shape, accepted=f"{shape} as the first frame"
+                    "frame size changed", where=name, value=frame.shape, accepted=f"{self._shape} as the first frame"
                 )
             if last is not None and t_ns <= last:
                 raise EventDataError(
                     "time stamps must increase", where=name, value=f"{t_ns} ns", accepted=f"more than {last} ns"
                 )
             last = t_ns
-            report.frames += 1
-            yield (frame if table and frame.dtype == np.uint8 else decode(frame, name)), t_ns
-        if report.frames < 2:
+            self._report.frames += 1
+            brightness.append(float(frame[::_SPARSE, ::_SPARSE].mean()))
+            if self.by_codes and frame.dtype == np.uint8:
+                yield frame, t_ns
+                continue
+            luminance = self.decode(frame, name)
+            luminance = luminance if self._fitting is None else self._fitting(luminance)
+            yield (luminance if self._steadied is None else self._steadied(luminance)), t_ns
+        if self._report.frames < 2:
             raise EventDataError("events need at least two frames", where=name, value="1 frame")
+        self._report.caveats.extend(caveats(self._first, brightness))
 
-    stream = luminances()
-    if interpolate == "motion":
-        report.displacement = between.Displacement()
-        stream = between.motion(stream, max_px, displacement=report.displacement)
-    else:
-        stream = between.watched(stream, report.moved_px)
-    seen: list[np.ndarray] = [first[0]]
 
-    def shown() -> Iterator[EventFrame]:
-        for luminance, t_ns in stream:
-            seen[0] = luminance
-            yield EventFrame(t_ns, luminance)
-
-    for t_ns, events in emulate(shown(), camera):
-        report.add(t_ns, events, camera)
-        yield Step(t_ns, events, seen[0])
+def noise_of(frames: Sequence[np.ndarray], decode: Decoder, fitting: Fitting | None = None) -> FrameNoise | None:
+    """The noise of the first frames as stored, after ``decode`` and ``fitting``; None for floats, which are exact, and
+    for frames that are not alike (which are refused when their turn comes)."""
+    first = frames[0]
+    if first.dtype not in (np.uint8, np.uint16):
+        return None
+    if any(frame.dtype != first.dtype or frame.shape != first.shape for frame in frames):
+        return None
+    lights = [decode(frame, "") for frame in frames]
+    lights = lights if fitting is None else [fitting(light) for light in lights]
+    table = decode.table(first.dtype)
+    middle = int(np.clip(np.searchsorted(table, np.median(lights[0])), 1, len(table) - 1))
+    return frame_noise(lights, float(table[middle] - table[middle - 1]))
 
 
 def file_to_events(
@@ -249,44 +325,44 @@ def file_to_events(
     size: tuple[int, int] | None = None,
     preview: str | os.PathLike | None = None,
     overwrite: bool = True,
+    use: FrameUse = FrameUse(),
+    emulator: str | EmulatorConfig = EmulatorConfig.members.default,
+    seed: int = 0,
+    readout: ReadoutConfig | None = None,
     progress: Callable[[SimulationReport, float | None], None] | None = None,
-    **options: Any,
 ) -> SimulationReport:
     """Frames of ``source`` (see :func:`~blinkgl.io.frames.open_frames`) to an event file whose ending names the format
-    (.h5 .raw .txt .csv .npz .npy); options as :func:`frames_to_events`. The files appear whole or not at all.
+    (.h5 .raw .txt .csv .npz .npy); emulator, seed, readout and what ``use`` holds as :func:`frames_to_events`. The
+    files appear whole or not at all.
 
     size : (height, width) of the sensor; frames of another size are cropped and scaled; None: as the frames are.
     preview : video of frames and events. progress : called with (report so far, fraction done or None) per given frame.
     """
     from blinkgl.io.formats import event_writer
 
-    _check_target(target, options.get("emulator", EmulatorConfig.members.default))
+    _check_target(target, emulator)
     if preview is not None and Path(preview).resolve() == Path(target).resolve():
         raise OutputError("preview and events in the same file", where=str(preview))
     frames = open_frames(source, fps=fps, timestamps=timestamps)
     height, width = (frames.height, frames.width) if size is None else size
     report = SimulationReport()
-    if options.get("gamma") is None and frames.linear:
-        options = {**options, "gamma": "linear"}
-    said = options.get("gamma") is not None
-    decode = Decoder(_checked_gamma(options["gamma"]) if said else "srgb")
+    if use.gamma is None and frames.linear:
+        use = replace(use, gamma="linear")
     if (height, width) != (frames.height, frames.width):
         report.fitting = Fitting((frames.height, frames.width), (height, width))
-        options = {**options, "gamma": "linear"}  # scaled in linear light
     iterator = iter(frames)
     first = next(iterator)
     second = next(iterator, None)
-    # A video is made to be looked at; images and arrays may be a camera's raw codes.
-    is_video = frames.path.suffix.lower() in VIDEO
-    report.assumed_srgb = not said and first[0].dtype.kind == "u" and not is_video
     start_us = first[1] // 1000
     gap_ns = (second[1] - first[1]) if second else 10**9
 
     def given() -> Iterator:
         for i, (frame, t_ns, name) in enumerate(itertools.chain([first], [second] if second else [], iterator)):
-            where = f"{source}: frame {i} ({name})"
-            yield (frame if report.fitting is None else report.fitting(decode(frame, where))), t_ns, where
+            yield frame, t_ns, f"{source}: frame {i} ({name})"
 
+    steps = simulated_steps(
+        given(), use, emulator=emulator, seed=seed, readout=readout, report=report, fitting=report.fitting
+    )
     with contextlib.ExitStack() as stack:
         out = stack.enter_context(event_writer(target, height, width, t_offset_us=start_us, overwrite=overwrite))
         video = None
@@ -294,18 +370,18 @@ def file_to_events(
             shown = _preview(preview, height, width, start_us, gap_ns, overwrite)
             video = stack.enter_context(shown)
         done = 0
-        for step in simulated_steps(given(), report=report, **options):
+        for step in steps:
             if video is not None:
                 video.add_events(step.events)
                 if video.due(step.t_ns // 1000):
-                    video.frame(
-                        step.t_ns // 1000, decode(step.frame, "") if step.frame.dtype == np.uint8 else step.frame
-                    )
+                    video.frame(step.t_ns // 1000, step.luminance())
             out.append(step.events)
             if progress is not None and report.frames > done:
                 done = report.frames
                 progress(report, min(done / frames.count, 1.0) if frames.count else None)
         out.t_end_us = report.last_ns // 1000
+    if frames.path.suffix.lower() in VIDEO:  # made to be looked at: sRGB is no guess there
+        report.assumed_gamma = None
     return report
 
 

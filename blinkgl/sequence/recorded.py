@@ -14,7 +14,7 @@ import numpy as np
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.events.camera import EventCamera
 from blinkgl.labels import Flow, LabelFrame, asked_for
-from blinkgl.recordings.simulation import Decoder, stepped, timed
+from blinkgl.recordings.simulation import FrameUse, Step, stepped, timed
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.folders import flow_files, folder_of, read_flow_of, read_frame, read_mask_of, used_images
@@ -65,7 +65,7 @@ class RecordedSequence(Simulation):
             if request.events
             else None
         )
-        self._luminance: np.ndarray | None = None
+        self._step: Step
         pictures_hz = None if request.pictures_hz is None else min(request.pictures_hz, frames.fps * 8)
         super().__init__(
             replace(request, config=resolved, pictures_hz=pictures_hz),
@@ -95,16 +95,14 @@ class RecordedSequence(Simulation):
         steps = stepped(
             timed(self._given()),
             self.camera,
-            gamma=frames.gamma,
-            interpolate=frames.interpolate,
-            max_px=frames.max_px,
+            FrameUse(frames.gamma, frames.interpolate, frames.max_px, frames.keep_noise),
         )
         while True:
             with self.clock("events"):  # reading and interpolating, too
                 step = next(steps, None)
             if step is None:
                 return
-            self._luminance = step.frame
+            self._step = step
             yield step.t_ns, step.events
 
     def _label_times(self) -> Iterator[tuple[int, int]]:
@@ -126,8 +124,7 @@ class RecordedSequence(Simulation):
         raise ConfigError("recorded frames have ground truth at their own times alone", where="frames")
 
     def _picture(self, t_ns: int) -> Picture:
-        frame = self._luminance
-        return Picture(t_ns, Decoder(self._recorded.gamma)(frame, "") if frame.dtype == np.uint8 else frame)
+        return Picture(t_ns, self._step.luminance())
 
     def poses(self) -> dict[str, np.ndarray]:
         return {}

@@ -26,9 +26,9 @@ FAR_PX = 2.0
 def emulator_options(
     name: str, config: str | None, overrides: Sequence[str], sensor: str | None = None
 ) -> dict[str, Any]:
-    """``emulator``, ``readout`` and ``size`` of :func:`blinkgl.simulate_file` from an emulator's name, an optional YAML
-    mapping (it may name the emulator itself), ``key=value`` overrides, and an optional sensor whose values hold where
-    nothing else is said."""
+    """``emulator``, ``readout``, ``size`` and what is known of a sensor's ``own`` frames: from an emulator's name, an
+    optional YAML mapping (it may name the emulator itself), ``key=value`` overrides, and an optional sensor whose
+    values hold where nothing else is said."""
     data: dict[str, Any] = {}
     if config is not None:
         data = read_table(config, "emulator parameters, key: value")
@@ -41,13 +41,14 @@ def emulator_options(
     if "recipe" in data:  # a video is one camera: the middle of what the recipe draws
         data = middle(expanded({"events": data}, Path.cwd())["events"])
     if sensor is None:
-        return {"emulator": data, "readout": None, "size": None}
+        return {"emulator": data, "readout": None, "size": None, "own": None}
     from blinkgl.config.sensor import load_sensor
-    from blinkgl.recordings.simulation import emulator_config
+    from blinkgl.recordings.simulation import emulator_config, own_frames
 
     camera = load_sensor(sensor)
     known = emulator_config({**camera.values(data["emulator"]), **data})
-    return {"emulator": known, "readout": camera.readout, "size": (camera.height, camera.width)}
+    size = (camera.height, camera.width)
+    return {"emulator": known, "readout": camera.readout, "size": size, "own": own_frames(camera)}
 
 
 def run(
@@ -60,13 +61,18 @@ def run(
     overrides: Sequence[str] = (),
     size: str | None = None,
     quiet: bool = False,
+    gamma: str | None = None,
+    interpolate: str = "linear",
+    max_px: float = 1.0,
+    keep_noise: bool = False,
     **options: Any,
 ) -> int:
     """``size``: "WIDTHxHEIGHT" in place of the sensor's.   ``options``: of
     :func:`~blinkgl.recordings.simulation.file_to_events`."""
-    from blinkgl.recordings.simulation import file_to_events
+    from blinkgl.recordings.simulation import FrameUse, file_to_events
 
     options |= emulator_options(emulator, config, overrides, sensor)
+    options["use"] = FrameUse(gamma, interpolate, max_px, keep_noise, options.pop("own"))
     if size is not None:
         options["size"] = size_of(size)
     console = plain_console(quiet=quiet)
@@ -109,11 +115,14 @@ def _told(console: Console, target: str, report: SimulationReport) -> None:
     )
     if report.fitting is not None:
         say(console, f"{report.fitting} (--size WIDTHxHEIGHT for another)")
-    if report.assumed_srgb:
-        say(
-            console,
-            "integer codes taken as sRGB (--gamma linear for raw frames, as calibrate and compare take them)",
-        )
+    if report.assumed_gamma == "srgb":
+        say(console, "integer codes taken as sRGB (--gamma linear for a camera's raw frames)")
+    elif report.assumed_gamma is not None:
+        say(console, f"images of the sensor's size taken for its own: --gamma {report.assumed_gamma}")
+    if report.noise is not None:
+        say(console, f"{report.noise}; changes that it explains make no events (--keep-noise: they do)")
+    for caveat in report.caveats:
+        say(console, f"warning: {caveat}")
     if report.guessed_over_px > FAR_PX:
         say(
             console,

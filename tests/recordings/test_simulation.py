@@ -16,7 +16,7 @@ from blinkgl.events import Events, make_emulator
 from blinkgl.io.formats import open_events
 from blinkgl.io.video import VideoReader, VideoWriter
 from blinkgl.recordings.fitting import Fitting
-from blinkgl.recordings.simulation import Decoder, SimulationReport, file_to_events, frames_to_events
+from blinkgl.recordings.simulation import Decoder, FrameUse, SimulationReport, file_to_events, frames_to_events
 from blinkgl.srgb import DECODE_8BIT
 from tests.shared_data import shared
 
@@ -106,15 +106,40 @@ def test_slow_video_is_said(tmp_path, capsys, step_px, said):
 def test_what_integer_codes_were_taken_for_is_said(tmp_path, gamma):
     """A recording's own frames are linear; codes of images are taken as sRGB, and the report says where nobody did."""
     np.save(tmp_path / "v.npy", frames8())
-    report = file_to_events(tmp_path / "v.npy", tmp_path / "e.h5", fps=100, gamma=gamma)
-    assert report.assumed_srgb == (gamma is None)
-    sized = file_to_events(tmp_path / "v.npy", tmp_path / "e.h5", fps=100, gamma=gamma, size=(15, 20))
-    assert sized.assumed_srgb == (gamma is None)
+    report = file_to_events(tmp_path / "v.npy", tmp_path / "e.h5", fps=100, use=FrameUse(gamma))
+    assert report.assumed_gamma == ("srgb" if gamma is None else None)
+    sized = file_to_events(tmp_path / "v.npy", tmp_path / "e.h5", fps=100, use=FrameUse(gamma), size=(15, 20))
+    assert sized.assumed_gamma == ("srgb" if gamma is None else None)
     own = shared("data/events/aedat4/davis346_events_frames_imu.aedat4")
-    file_to_events(own, tmp_path / "own.h5", gamma=gamma)
-    file_to_events(own, tmp_path / "linear.h5", gamma="linear")
+    file_to_events(own, tmp_path / "own.h5", use=FrameUse(gamma))
+    file_to_events(own, tmp_path / "linear.h5", use=FrameUse("linear"))
     alike = same(open_events(tmp_path / "own.h5").read(), open_events(tmp_path / "linear.h5").read())
     assert alike == (gamma != "srgb")
+
+
+@pytest.mark.parametrize(
+    ("size", "channels", "option", "taken"),
+    [
+        ((H, W), (), [], "linear"),
+        ((H, W + 8), (), [], "srgb"),
+        ((H, W), (3,), [], "srgb"),
+        ((H, W), (), ["--gamma", "srgb"], None),
+    ],
+)
+def test_grey_images_of_the_sensors_size_are_its_own(tmp_path, capsys, size, channels, option, taken):
+    """What `calibrate` took the frames for stands in the sensor file, and `simulate` takes such frames for the same."""
+    sensor = tmp_path / "mine.yaml"
+    sensor.write_text(f"name: mine\nwidth: {W}\nheight: {H}\nframe_gamma: linear\n")
+    np.save(tmp_path / "v.npy", frames8(8, *size, channels))
+    command = ["simulate", str(tmp_path / "v.npy"), "--fps", "100", "--sensor", str(sensor), "--out"]
+    assert run([*command, str(tmp_path / "e.h5"), *option]) == 0
+    said = capsys.readouterr().out
+    assert ("taken as sRGB" in said) == (taken == "srgb")
+    assert ("taken for its own: --gamma linear" in said) == (taken == "linear")
+    if not option and channels == ():
+        events = Events.concatenate(list(blinkgl.simulate(frames8(8, *size), fps=100, sensor=str(sensor))))
+        by_hand = all_of(frames8(8, *size), fps=100, gamma=taken)
+        assert same(events, by_hand)
 
 
 @pytest.mark.parametrize(
@@ -258,8 +283,7 @@ def test_real_frames_against_the_real_recording():
         file_to_events(
             root,
             f"{folder}/e.h5",
-            gamma="linear",
-            interpolate="motion",
+            use=FrameUse("linear", "motion"),
             emulator=EsimConfig(contrast_threshold=0.5, log_eps=10 / 255),
         )
         result = compare(root / "events_chunk.txt", f"{folder}/e.h5", frames=root)

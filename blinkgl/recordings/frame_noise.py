@@ -1,0 +1,148 @@
+"""The noise of given frames: found from the frames, and kept from becoming events.
+
+A camera that stands still gives frames that differ by noise, and an emulator takes every difference for light. What a
+pixel of the event camera would have seen is steadier: its own noise is the emulator's matter
+(:mod:`blinkgl.events.noise`), that of the frames is not.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+LOOKED_AT = 5
+"""Frames at the beginning from which the noise is found."""
+BAND = 3.0
+"""Standard deviations of the noise within which a change is taken for noise."""
+_BLOCK_PX = 8
+_QUANTILE, _OF_CHI_SQUARED = 0.2, 0.85
+"""Part of the blocks of one brightness that are taken to hold noise alone, and the 20 % quantile of the mean square of
+64 normal numbers: blocks in which something moves lie above."""
+_BINS, _LEAST_BLOCKS = 12, 12
+_CLEAN = 0.35
+"""Codes: what rounding alone makes is 0.29."""
+_BRIGHT = 0.85
+"""Of full scale: above, codes are near their end, and noise is cut."""
+_FEW_CODES, _CLIPPED, _FLICKER = 32, 0.1, 0.02
+"""From which on frames are warned of: different codes, part of the pixels at an end, and how much the whole picture's
+brightness jumps to and fro from one frame to the next (median)."""
+
+
+@dataclass(frozen=True)
+class FrameNoise:
+    """Variance of a pixel's noise, ``constant + slope * luminance``: what read-out and photons make of it in linear
+    light (Foi et al., IEEE TIP 2008).   typical : (luminance, standard deviation), at the frames' middle brightness."""
+
+    constant: float
+    slope: float
+    typical: tuple[float, float]
+
+    def sigma(self, luminance: np.ndarray) -> np.ndarray:
+        """Standard deviation at a luminance, of full scale."""
+        return np.sqrt(self.constant + self.slope * luminance)
+
+    def __str__(self) -> str:
+        light, sigma = self.typical
+        return f"the frames' own noise is {100 * sigma / light:.2g} % at middle brightness"
+
+
+def frame_noise(frames: Sequence[np.ndarray], code: float) -> FrameNoise | None:
+    """The noise of the first frames of a clip, or None for frames without: nothing but rounding, or too small to say.
+
+    frames : (H, W) float32 luminance of full scale 1, of one size.   code : distance of two codes at middle
+    brightness, in luminance."""
+    found = [_blocks(a, b) for a, b in itertools.pairwise(frames)]
+    light, square = (np.concatenate(values) for values in zip(*found)) if found else (np.empty(0), np.empty(0))
+    if len(light) < 2 * _LEAST_BLOCKS:
+        return None
+    edges = np.quantile(light, np.linspace(0, 1, max(min(_BINS, len(light) // _LEAST_BLOCKS), 2) + 1))
+    kind = np.clip(np.searchsorted(edges, light, side="right") - 1, 0, len(edges) - 2)
+    kinds = np.unique(kind)
+    level = np.array([light[kind == k].mean() for k in kinds])
+    variance = np.array([np.quantile(square[kind == k], _QUANTILE) for k in kinds]) / _OF_CHI_SQUARED
+    constant, slope = _lower_line(level, variance)
+    middle = float(np.median(light))
+    sigma = float(np.sqrt(constant + slope * middle))
+    return None if sigma < _CLEAN * code else FrameNoise(constant, slope, (middle, sigma))
+
+
+def _blocks(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) mean luminance and variance of a pixel's noise, of the blocks in which no code is at an end."""
+    height, width = (side // _BLOCK_PX * _BLOCK_PX for side in a.shape)
+    if not height or not width:
+        return np.empty(0), np.empty(0)
+    mean = lambda image: cv2.resize(
+        image[:height, :width], (width // _BLOCK_PX, height // _BLOCK_PX), interpolation=cv2.INTER_AREA
+    ).ravel()
+    change = b - a
+    # What changes smoothly over the picture is light. Taking the mean of 3x3 away leaves 8/9 of the noise's variance,
+    # of which a difference of two frames has twice as much as one.
+    fine = change - cv2.blur(change, (3, 3))
+    light = mean((a + b) / 2)
+    ends = (np.minimum(a, b) <= 0) | (np.maximum(a, b) >= 1)
+    inside = (mean(ends.astype(np.float32)) == 0) & (light < _BRIGHT)
+    return light[inside], mean(fine * fine)[inside] / (2 * 8 / 9)
+
+
+def _lower_line(level: np.ndarray, variance: np.ndarray) -> tuple[float, float]:
+    """(constant, slope), neither negative, of a line below most of the points: at some levels everything moves, and
+    their variance is not noise's."""
+    from scipy.optimize import nnls
+
+    scale = max(float(variance.max()), 1e-30)
+    # Squares of relative errors, about: noise of dark pixels is as well known as that of bright ones.
+    weight = 1 / np.sqrt(np.maximum(variance / scale, 1e-6))
+    columns = np.stack([np.ones_like(level), level], axis=1)
+    trust = np.ones_like(level)
+    for _ in range(20):
+        w = trust * weight
+        line, _ = nnls(columns * w[:, None], variance / scale * w)
+        trust = np.where(variance / scale > columns @ line, 0.2, 1.0)
+    return float(line[0] * scale), float(line[1] * scale)
+
+
+class Steadied:
+    """A pixel follows the frames' light only as far as noise does not explain the distance: by a band round what it
+    stands at, of ``BAND`` standard deviations to either side, which the light pushes along. What stays inside makes no
+    change at all, and so no event; a ramp is followed at a distance."""
+
+    def __init__(self, noise: FrameNoise):
+        self._noise = noise
+        self._at: np.ndarray | None = None
+        self._frames = 0
+
+    def __call__(self, luminance: np.ndarray) -> np.ndarray:
+        """(H, W) float32 of the next frame to what the pixels take it for; the argument stays as it is."""
+        if self._at is None:
+            self._at = luminance
+        else:
+            # Where a pixel stands is the frames' mean at first, whose own noise is in the distance, too.
+            width = BAND * np.sqrt(1 + 1 / self._frames) * self._noise.sigma(np.maximum(self._at, 0))
+            self._at = np.clip(self._at, luminance - width, luminance + width).astype(np.float32)
+        self._frames += 1
+        return self._at
+
+
+def caveats(first: Sequence[np.ndarray], brightness: Sequence[float]) -> Iterator[str]:
+    """What a user has to know of frames as stored before believing their events, a line each.
+
+    first : the first frames.   brightness : mean code of each frame."""
+    codes = [frame for frame in first if frame.dtype.kind == "u"]
+    if codes:
+        most = np.iinfo(codes[0].dtype).max
+        clipped = float(np.mean([(frame == 0) | (frame == most) for frame in codes]))
+        different = len(np.unique(np.concatenate([np.unique(frame) for frame in codes])))
+        if clipped > _CLIPPED:
+            yield f"{100 * clipped:.0f} % of the codes are at an end: what moves there makes no events"
+        if different <= _FEW_CODES:
+            yield f"frames of {different} different codes: each step from one to the next makes events at once"
+    jumps = np.diff(np.log(np.maximum(brightness, 1e-6)), 2)
+    if len(jumps) >= 3 and np.median(np.abs(jumps)) > _FLICKER:
+        yield (
+            f"the whole picture flickers, by {100 * np.median(np.abs(jumps)) / 2:.0f} % from frame to frame, and that "
+            "makes events as motion does"
+        )

@@ -1,0 +1,126 @@
+"""The noise of given frames: found, kept from becoming events, and never found where there is none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from blinkgl.cli import run
+from blinkgl.config.events import EsimConfig
+from blinkgl.events import Events
+from blinkgl.recordings.clip import FrameReading, clip_of_frames, read_recording, timed_frames
+from blinkgl.recordings.frame_noise import Steadied, frame_noise
+from blinkgl.recordings.simulation import SimulationReport, frames_to_events
+from tests.shared_data import shared
+
+H, W, CODE = 96, 128, 1 / 255
+ESIM = EsimConfig(contrast_threshold=0.15, threshold_sigma=0.0, log_eps=5 / 255)
+
+
+def scene(count: int, step_px: float = 0.0) -> np.ndarray:
+    """(count, H, W) luminance: a ramp over a fine pattern that stands still, before it a bar that moves."""
+    y, x = np.mgrid[:H, :W]
+    still = 0.06 + 0.6 * x / W + 0.03 * ((x // 3 + y // 3) % 2)
+    frames = np.repeat(still[None], count, axis=0)
+    for k in range(count):
+        left = 20 + step_px * k
+        frames[k][:, (x[0] >= left) & (x[0] < left + 10)] = 0.8
+    return frames
+
+
+def noisy(frames: np.ndarray, constant: float, slope: float, seed: int = 0) -> np.ndarray:
+    """As 8-bit codes of light, with noise of this variance."""
+    spread = np.sqrt(constant + slope * frames)
+    light = frames + spread * np.random.default_rng(seed).standard_normal(frames.shape)
+    return np.clip(np.round(light * 255), 0, 255).astype(np.uint8)
+
+
+def events_of(frames, **options) -> tuple[Events, SimulationReport]:
+    report = SimulationReport()
+    options = {"fps": 100, "emulator": ESIM, "gamma": "linear", **options}
+    return Events.concatenate(list(frames_to_events(frames, report=report, **options))), report
+
+
+@pytest.mark.parametrize("step_px", [0.0, 2.0])
+@pytest.mark.parametrize(("constant", "slope"), [((2 * CODE) ** 2, 0.0), (CODE**2, 2e-4), (1e-7, 5e-4)])
+def test_noise_is_found_at_every_brightness(constant, slope, step_px):
+    frames = noisy(scene(5, step_px), constant, slope).astype(np.float32) / 255
+    found = frame_noise(list(frames), CODE)
+    assert found is not None
+    light = np.array([0.1, 0.3, 0.6])
+    rounding = CODE**2 / 12
+    np.testing.assert_allclose(found.sigma(light), np.sqrt(constant + slope * light + rounding), rtol=0.15)
+
+
+def test_a_still_camera_makes_no_events_of_noise_and_a_moving_bar_its_own():
+    exact, _ = events_of(scene(12, 2.0).astype(np.float32))
+    noise, _ = events_of(noisy(scene(12), 4 * CODE**2, 2e-4), keep_noise=True)
+    still, report = events_of(noisy(scene(12), 4 * CODE**2, 2e-4))
+    assert report.noise is not None and "noise is" in str(report.noise)
+    assert len(noise) > 2000 and len(still) < len(noise) / 200
+    moving, _ = events_of(noisy(scene(12, 2.0), 4 * CODE**2, 2e-4))
+    where = lambda events: np.bincount(events.x, minlength=W)
+    assert len(moving) == pytest.approx(len(exact), rel=0.1)
+    assert np.corrcoef(where(moving), where(exact))[0, 1] > 0.97
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        np.round(scene(8, 2.0) * 255).astype(np.uint8),
+        np.repeat(np.round(scene(8, 1.3) * 255).astype(np.uint8)[..., None], 3, axis=3),
+        noisy(scene(8), 4 * CODE**2, 0.0).astype(np.float32) / 255,
+    ],
+    ids=["rendered", "rendered in colour", "floats"],
+)
+def test_exact_frames_are_taken_as_they_are(frames):
+    kept, _ = events_of(frames, keep_noise=True)
+    ours, report = events_of(frames)
+    assert report.noise is None
+    assert all(np.array_equal(getattr(ours, k), getattr(kept, k)) for k in "xytp")
+
+
+def test_a_pixel_moves_no_further_than_noise_leaves_it():
+    """A band round where a pixel stands: inside nothing changes, a ramp is followed at the band's distance."""
+    found = frame_noise(list(noisy(scene(5), 4 * CODE**2, 0.0).astype(np.float32) / 255), CODE)
+    steady, band = Steadied(found), 3 * found.sigma(np.float32(0.0))
+    value = lambda light: float(steady(np.full((2, 2), light, np.float32))[0, 0])
+    assert value(0.5) == 0.5 and value(0.5 + band) == 0.5
+    for k in range(2, 200):
+        last = value(0.5 + k * band)
+    assert 0.5 + 199 * band - last == pytest.approx(3 * np.sqrt(1 + 1 / 199) * found.sigma(last), rel=0.01)
+
+
+def flickering(count: int) -> np.ndarray:
+    return np.round(scene(count) * (0.8 + 0.1 * (np.arange(count) % 2))[:, None, None] * 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("frames", "said"),
+    [
+        (flickering(9), "warning: the whole picture flickers, by 12 %"),
+        (np.clip(np.round(scene(6, 2.0) * 500), 0, 255).astype(np.uint8), "% of the codes are at an end"),
+        (np.round(scene(6, 2.0) * 15).astype(np.uint8) * 17, "warning: frames of 11 different codes"),
+        (noisy(scene(2), 4 * CODE**2, 0.0), "own noise is"),
+        (np.round(scene(6) * 255).astype(np.uint8), "0 events"),
+    ],
+    ids=["flicker", "clipped", "four bits", "two frames", "nothing moves"],
+)
+def test_frames_with_a_caveat(tmp_path, capsys, frames, said):
+    np.save(tmp_path / "v.npy", frames)
+    assert run(["simulate", str(tmp_path / "v.npy"), "--fps", "100", "--out", str(tmp_path / "e.h5")]) == 0
+    out = capsys.readouterr().out
+    assert said in out
+    assert ("warning:" in out) == ("warning:" in said or "at an end" in said)
+
+
+def test_still_pixels_of_a_recording():
+    """cuke_davis346, a still camera: of the pixels where nothing changes fewer events than the camera's own are left,
+    where there were many times as many."""
+    path = shared("data/events/cuke_davis346/demo-01.aedat4")
+    events, size = read_recording(path)
+    frames, exposures = timed_frames(path)
+    clip = clip_of_frames(events, frames, size, FrameReading(exposures=exposures, delay_ms=5.0))
+    rate = lambda stream: np.count_nonzero(clip.still[stream.y, stream.x])
+    recorded, made = rate(clip.events), rate(clip.simulate(EsimConfig(contrast_threshold=0.25, log_eps=5 / 255)))
+    assert 0 < made < recorded

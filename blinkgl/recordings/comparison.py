@@ -28,6 +28,8 @@ IEI_EDGES_US = np.logspace(0, 7, 71)
 """Bins of the inter-event interval of a pixel: 1 µs to 10 s, ten per decade."""
 LOG_OFFSET = 10.0
 """Added to the 8-bit code before the logarithm: keeps the dark noise of real frames from dominating."""
+TOLD = 0.6
+"""AUC of the judge from which on it is worth saying by what it tells."""
 BLUR_PX = 1.0
 """Sigma of the Gaussian on both maps before a correlation: single-event quantisation and
 sub-pixel shifts are not what it asks about."""
@@ -138,7 +140,13 @@ class Comparison:
             cells = [f"{j.auc:.3f} ± {j.spread:.3f}" for j in self.halves]
             rows += [("judge: a recording's own halves, AUC", cells[0], cells[1] if self.b else "")]
         if self.told_apart:
-            rows += [("judge: A from B, AUC", "", f"{self.told_apart.auc:.3f} ± {self.told_apart.spread:.3f}")]
+            told = self.told_apart
+            rows += [("judge: A from B, AUC", "", f"{told.auc:.3f} ± {told.spread:.3f}")]
+            if told.paired is not None:
+                rows += [("judge: A from B, the same patch in both, AUC", "", f"{told.paired:.3f}")]
+            if told.auc > TOLD:
+                by = "; ".join(f"{name} {100 * share:.0f} %" for name, share in told.telling)
+                rows += [("judge: by what", "", by)]
         return rows
 
     def to_dict(self) -> dict[str, Any]:

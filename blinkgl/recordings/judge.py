@@ -1,42 +1,44 @@
 """Can two recordings be told apart? A two-sample test by a classifier (Lopez-Paz and Oquab, ICLR 2017) on local patches
-of events: what it learns in some stretches of time is tried on the others. An area under the curve of 0.5 is guessing,
-1 certainty.
+of events (:mod:`~blinkgl.recordings.patches`): what it learns in some stretches of time is tried on the others. An area
+under the curve of 0.5 is guessing, 1 certainty.
+
+Asked twice. Of a patch by itself: which recording is it from? That is how unlike the two look, whatever they saw. Of
+the same patch in both: which is which? There the scene cancels, and a tenth of the events missing is seen at once.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
-import numba
 import numpy as np
 
 from blinkgl.errors import EventDataError
+from blinkgl.recordings.patches import NAMES, WINDOWS, patches
 from blinkgl.types.events import Events
 
-SIDE_PX = 16
-WINDOWS = 16
-"""Of time; the classifier's patches are SIDE_PX x SIDE_PX pixels by one of them."""
 FOLDS = 4
 LEAST_IN_PATCH = 8
 """Events, on either side: of what is all but empty nothing can be said."""
 LEAST_PATCHES = 100
 """Of either side; fewer say nothing."""
 MOST_PATCHES = 20_000
-NEAR_US = 2000
-"""An event has company where a pixel beside it fired not longer ago."""
 _BINS, _ROUNDS, _RATE = 24, 80, 0.15
-_SUMS = 10
+_TELLING = 3
 
 
 @dataclass(frozen=True)
 class Judgement:
     """auc : mean over the folds; below 0.5 is chance, too.   spread : their standard deviation.   patches : of both
-    sides together.   window_us : of a patch."""
+    sides together.   window_us : of a patch.   paired : AUC of telling which of two patches of one place and time is
+    whose; None where there are no pairs.   telling : what told most, (name, share of what was gained)."""
 
     auc: float
     spread: float
     patches: int
     window_us: float
+    paired: float | None = None
+    telling: tuple[tuple[str, float], ...] = ()
 
 
 def judge(a: Events, b: Events, size: tuple[int, int], span_us: tuple[int, int]) -> Judgement:
@@ -44,10 +46,18 @@ def judge(a: Events, b: Events, size: tuple[int, int], span_us: tuple[int, int])
     but empty on both sides are left out. EventDataError: too few patches with events."""
     features = [patches(events, size, span_us) for events in (a, b)]
     full = np.maximum(features[0][0], features[1][0]) >= LEAST_IN_PATCH
-    x = np.concatenate([values[full] for _, values in features])
+    own, other = (values[full] for _, values in features)
     label = np.repeat([0.0, 1.0], int(full.sum()))
-    window = np.tile(np.nonzero(full)[0], 2)
-    return _judged(x, label, window, (span_us[1] - span_us[0]) / WINDOWS)
+    window = np.nonzero(full)[0]
+    window_us = (span_us[1] - span_us[0]) / WINDOWS
+    alone = _judged(np.concatenate([own, other]), label, np.tile(window, 2), window_us)
+    # Which of the two comes first is drawn, and the question is which.
+    swapped = np.random.default_rng(0).integers(0, 2, len(own)).astype(float)
+    try:
+        paired = _judged((own - other) * (2 * swapped - 1)[:, None], swapped, window, window_us).auc
+    except EventDataError:  # half as many as there are patches
+        paired = None
+    return replace(alone, paired=paired)
 
 
 def judge_unlike(
@@ -72,65 +82,6 @@ def judge_halves(a: Events, size: tuple[int, int], span_us: tuple[int, int]) -> 
     return _judged(values[full], ((t + y + x) % 2).astype(float), t, (span_us[1] - span_us[0]) / WINDOWS)
 
 
-def patches(events: Events, size: tuple[int, int], span_us: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """(T, Y, X) int number of events of each patch, and (T, Y, X, F) float32 what is told of it."""
-    height, width = size
-    ny, nx = -(-height // SIDE_PX), -(-width // SIDE_PX)
-    sums = np.zeros((WINDOWS, ny, nx, _SUMS))
-    part = events.window(*span_us)
-    _gather(part.x, part.y, part.t, part.p, span_us[0], (span_us[1] - span_us[0]) / WINDOWS, height, width, sums)
-    on, off, turns, pairs, log_gap, short, company, active, most, square = np.moveaxis(sums, -1, 0)
-    count = on + off
-    some, two = np.maximum(count, 1), np.maximum(pairs, 1)
-    told = (
-        np.log1p(on),
-        np.log1p(off),
-        np.abs(on - off) / some,
-        turns / two,
-        np.where(pairs > 0, log_gap / two, 20.0),
-        short / two,
-        company / some,
-        np.log1p(active),
-        most,
-        square / some,
-        count / np.maximum(active, 1),
-    )
-    return count.astype(np.int64), np.stack(told, -1).astype(np.float32)
-
-
-@numba.njit(cache=True, nogil=True)
-def _gather(x, y, t, p, begin, window, height, width, sums):
-    last = np.full((height, width), -1, np.int64)
-    before = np.zeros((height, width), np.uint8)
-    seen = np.full((height, width), -1, np.int64)
-    count = np.zeros((height, width), np.int64)
-    for i in range(len(t)):
-        k = min(int((t[i] - begin) / window), sums.shape[0] - 1)
-        r, c = y[i], x[i]
-        s = sums[k, r // SIDE_PX, c // SIDE_PX]
-        s[0 if p[i] else 1] += 1
-        if seen[r, c] != k:
-            seen[r, c], count[r, c] = k, 0
-            s[7] += 1
-        else:
-            gap = t[i] - last[r, c]
-            s[3] += 1
-            s[2] += p[i] != before[r, c]
-            s[4] += np.log(max(gap, 1))
-            s[5] += gap < NEAR_US
-        count[r, c] += 1
-        s[8] = max(s[8], count[r, c])
-        s[9] += count[r, c]
-        found = False
-        for dr in (-1, 0, 1):
-            for dc in (-1, 0, 1):
-                rr, cc = r + dr, c + dc
-                if (dr or dc) and 0 <= rr < height and 0 <= cc < width:
-                    found = found or (last[rr, cc] >= 0 and t[i] - last[rr, cc] < NEAR_US)
-        s[6] += found
-        last[r, c], before[r, c] = t[i], p[i]
-
-
 def _judged(x: np.ndarray, label: np.ndarray, window: np.ndarray, window_us: float) -> Judgement:
     counts = np.bincount(label.astype(int), minlength=2)
     if counts.min() < LEAST_PATCHES:
@@ -144,25 +95,34 @@ def _judged(x: np.ndarray, label: np.ndarray, window: np.ndarray, window_us: flo
         keep = np.random.default_rng(0).permutation(len(x))[:MOST_PATCHES]
         x, label, window = x[keep], label[keep], window[keep]
     fold = window * FOLDS // WINDOWS
-    found = []
+    found, gains = [], np.zeros(x.shape[1])
     for k in range(FOLDS):
         train, test = fold != k, fold == k
         if min(label[test].sum(), (1 - label[test]).sum()) >= 5 and 0 < label[train].mean() < 1:
-            found.append(area(boosted(x[train], label[train], x[test]), label[test]))
+            score, gained = boosted(x[train], label[train], x[test])
+            found.append(area(score, label[test]))
+            gains += gained
     if not found:
         raise EventDataError("events at one time alone cannot be judged by another", where="compare --judge")
-    return Judgement(float(np.mean(found)), float(np.std(found)), len(x), float(window_us))
+    return Judgement(
+        float(np.mean(found)), float(np.std(found)), len(x), float(window_us), telling=tuple(_telling(gains))
+    )
 
 
-def boosted(x: np.ndarray, label: np.ndarray, other: np.ndarray) -> np.ndarray:
+def _telling(gains: np.ndarray) -> Iterator[tuple[str, float]]:
+    for k in np.argsort(-gains)[:_TELLING]:
+        yield NAMES[k], float(gains[k] / max(gains.sum(), 1e-30))
+
+
+def boosted(x: np.ndarray, label: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Scores of ``other`` (M, F) by gradient boosting of stumps (Friedman 2001) under the logistic loss, learnt of
-    ``x`` (N, F) and ``label`` (N,) of 0 and 1; features are cut at quantiles."""
+    ``x`` (N, F) and ``label`` (N,) of 0 and 1; features are cut at quantiles. And (F,) what each feature gained."""
     count = x.shape[1]
     cuts = [np.unique(np.quantile(x[:, f], np.arange(1, _BINS) / _BINS)) for f in range(count)]
     code = lambda data: np.stack([np.searchsorted(cuts[f], data[:, f], side="right") for f in range(count)], 1)
     own, there = code(x), code(other)
     flat = (own + np.arange(count) * _BINS).ravel()
-    score, result = np.zeros(len(x)), np.zeros(len(other))
+    score, result, gained = np.zeros(len(x)), np.zeros(len(other)), np.zeros(count)
     for _ in range(_ROUNDS):
         chance = 1 / (1 + np.exp(-score))
         pull, weight = label - chance, chance * (1 - chance)
@@ -172,10 +132,11 @@ def boosted(x: np.ndarray, label: np.ndarray, other: np.ndarray) -> np.ndarray:
         gain = g**2 / (h + 1) + rest_g**2 / (rest_h + 1)
         gain[:, -1] = 0
         f, b = np.unravel_index(int(np.argmax(gain)), gain.shape)
+        gained[f] += max(float(gain[f, b] - g[f, -1] ** 2 / (h[f, -1] + 1)), 0.0)
         low, high = g[f, b] / (h[f, b] + 1), rest_g[f, b] / (rest_h[f, b] + 1)
         score += _RATE * np.where(own[:, f] <= b, low, high)
         result += _RATE * np.where(there[:, f] <= b, low, high)
-    return result
+    return result, gained
 
 
 def area(score: np.ndarray, label: np.ndarray) -> float:

@@ -1,0 +1,197 @@
+"""What is told of a patch of events, a few pixels by a stretch of time: the numbers by which the judge
+(:mod:`~blinkgl.recordings.judge`) tells recordings apart.
+
+Some are of single pixels (rates, intervals), some of neighbours (which way things move, what goes on over the patch's
+border), some of the whole sensor (bursts), some of the patches beside it in space and time.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from blinkgl.types.events import Events
+
+SIDE_PX = 16
+WINDOWS = 16
+"""Of time; a patch is SIDE_PX x SIDE_PX pixels by one of them."""
+NEAR_US = 2000
+"""An event has company where a pixel beside it fired not longer ago."""
+_BURST = 64
+"""Parts of a window in which the sensor's events are counted, and ``_BURST // 2`` of them are what is usual."""
+_PIXEL, _BESIDE = 14, 8
+
+NAMES = (
+    "ON events",
+    "OFF events",
+    "balance of polarity",
+    "turns of polarity",
+    "intervals",
+    "short intervals",
+    "company beside",
+    "pixels that fired",
+    "events of the busiest pixel",
+    "crowding in pixels",
+    "events of a pixel",
+    "intervals before ON against before OFF",
+    "turns to ON",
+    "intervals that grow",
+    "motion along x",
+    "motion along y",
+    "links over the patch's border",
+    "events at one time",
+    "bursts over the sensor",
+    "events unlike beside",
+    "motion unlike beside, x",
+    "motion unlike beside, y",
+    "polarity unlike beside",
+    "more than before",
+    "more than after",
+)
+"""Of the features, in their order."""
+
+
+def patches(events: Events, size: tuple[int, int], span_us: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """(T, Y, X) int number of events of each patch, and (T, Y, X, F) float32 what is told of it, ``NAMES``.
+
+    size : (height, width) px.   span_us : what is cut into ``WINDOWS``."""
+    height, width = size
+    shape = WINDOWS, -(-height // SIDE_PX), -(-width // SIDE_PX)
+    window = (span_us[1] - span_us[0]) / WINDOWS
+    e = events.window(*span_us)
+    t = e.t - span_us[0]
+    pixel, beside, times = np.zeros((*shape, _PIXEL)), np.zeros((*shape, _BESIDE)), np.zeros((*shape, 2))
+    _of_pixels(e.x, e.y, t, e.p, window, size, pixel)
+    _of_neighbours(e.x, e.y, t, e.p, window, size, beside)
+    _of_times(e.x, e.y, t, window, _bursts(t, window), times)
+    on, off, turns, pairs, log_gap, short, active, most, square, to_on, on_gap, off_gap, runs, growing = np.moveaxis(
+        pixel, -1, 0
+    )
+    company, inside, inside_near, border, border_near, near, right, down = np.moveaxis(beside, -1, 0)
+    count = on + off
+    some, two, linked = np.maximum(count, 1), np.maximum(pairs, 1), np.maximum(near, 1)
+    to_off = turns - to_on
+    both = (to_on > 0) & (to_off > 0)
+    x, y = right / linked, down / linked
+    log, on_share = np.log1p(count), (on + 1) / (count + 2)
+    told = (
+        np.log1p(on),
+        np.log1p(off),
+        np.abs(on - off) / some,
+        turns / two,
+        np.where(pairs > 0, log_gap / two, 20.0),
+        short / two,
+        company / some,
+        np.log1p(active),
+        most,
+        square / some,
+        count / np.maximum(active, 1),
+        np.where(both, on_gap / np.maximum(to_on, 1) - off_gap / np.maximum(to_off, 1), 0.0),
+        (to_on + 1) / (turns + 2),
+        growing / np.maximum(runs, 1),
+        x,
+        y,
+        border_near / np.maximum(border, 1) - inside_near / np.maximum(inside, 1),
+        times[..., 0] / some,
+        times[..., 1] / some,
+        np.abs(log - _beside(log)),
+        np.abs(x - _beside(x)),
+        np.abs(y - _beside(y)),
+        np.abs(on_share - _beside(on_share)),
+        np.diff(log, axis=0, prepend=log[:1]),
+        -np.diff(log, axis=0, append=log[-1:]),
+    )
+    return count.astype(np.int64), np.stack(told, -1).astype(np.float32)
+
+
+def _beside(values: np.ndarray) -> np.ndarray:
+    """Mean over the patches left, right, above and below, where there are such."""
+    padded = np.pad(values, ((0, 0), (1, 1), (1, 1)), constant_values=np.nan)
+    four = np.stack([padded[:, :-2, 1:-1], padded[:, 2:, 1:-1], padded[:, 1:-1, :-2], padded[:, 1:-1, 2:]])
+    there = np.isfinite(four)
+    mean = np.where(there, four, 0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
+    return np.where(there.any(axis=0), mean, values)
+
+
+def _bursts(t: np.ndarray, window: float) -> np.ndarray:
+    """Logarithm of the sensor's events in short parts of the time against what is usual round them."""
+    parts = WINDOWS * _BURST
+    count = np.bincount(np.minimum((t / window * _BURST).astype(np.int64), parts - 1), minlength=parts).astype(float)
+    usual = np.convolve(count, np.full(_BURST // 2 + 1, 1 / (_BURST // 2 + 1)), "same")
+    return np.log((count + 1) / (usual + 1))
+
+
+@numba.njit(cache=True, nogil=True)
+def _of_pixels(x, y, t, p, window, size, sums):
+    """Sums over each pixel's own events in a patch."""
+    last = np.full(size, -1, np.int64)
+    before = np.zeros(size, np.uint8)
+    gap_before = np.full(size, -1, np.int64)  # of one polarity; -1: the event before was of the other, or the first
+    seen = np.full(size, -1, np.int64)
+    count = np.zeros(size, np.int64)
+    for i in range(len(t)):
+        k = min(int(t[i] / window), sums.shape[0] - 1)
+        at = y[i], x[i]
+        s = sums[k, y[i] // SIDE_PX, x[i] // SIDE_PX]
+        s[0 if p[i] else 1] += 1
+        gap = t[i] - last[at] if last[at] >= 0 else -1
+        turn = p[i] != before[at]
+        if seen[at] != k:
+            seen[at], count[at] = k, 0
+            s[6] += 1
+        else:
+            log_gap = np.log(max(gap, 1))
+            s[2] += turn
+            s[3] += 1
+            s[4] += log_gap
+            s[5] += gap < NEAR_US
+            if turn:
+                s[9] += p[i]
+                s[10 if p[i] else 11] += log_gap
+            elif gap_before[at] >= 0:
+                s[12] += 1
+                s[13] += np.sign(gap - gap_before[at])
+        gap_before[at] = -1 if turn else gap
+        count[at] += 1
+        s[7] = max(s[7], count[at])
+        s[8] += count[at]
+        last[at], before[at] = t[i], p[i]
+
+
+@numba.njit(cache=True, nogil=True)
+def _of_neighbours(x, y, t, p, window, size, sums):
+    """Sums over the events of the eight pixels round each event, before it."""
+    height, width = size
+    last = np.full(size, -1, np.int64)
+    before = np.zeros(size, np.uint8)
+    for i in range(len(t)):
+        k = min(int(t[i] / window), sums.shape[0] - 1)
+        r, c = y[i], x[i]
+        s = sums[k, r // SIDE_PX, c // SIDE_PX]
+        company = False
+        for dr in (-1, 0, 1):
+            for dc in (-1, 0, 1):
+                rr, cc = r + dr, c + dc
+                if (dr == 0 and dc == 0) or not (0 <= rr < height and 0 <= cc < width):
+                    continue
+                company = company or (last[rr, cc] >= 0 and t[i] - last[rr, cc] < NEAR_US)
+                linked = last[rr, cc] >= 0 and t[i] - last[rr, cc] < window / 2 and before[rr, cc] == p[i]
+                inside = rr // SIDE_PX == r // SIDE_PX and cc // SIDE_PX == c // SIDE_PX
+                s[1 if inside else 3] += 1
+                s[2 if inside else 4] += linked
+                if linked:  # what fired there before came from there
+                    s[5] += 1
+                    s[6] -= dc
+                    s[7] -= dr
+        s[0] += company
+        last[r, c], before[r, c] = t[i], p[i]
+
+
+@numba.njit(cache=True, nogil=True)
+def _of_times(x, y, t, window, bursts, sums):
+    """Events that have the same time as the one before, wherever that is, and how busy the sensor was."""
+    for i in range(len(t)):
+        k = min(int(t[i] / window), sums.shape[0] - 1)
+        s = sums[k, y[i] // SIDE_PX, x[i] // SIDE_PX]
+        s[0] += i > 0 and t[i] == t[i - 1]
+        s[1] += bursts[min(int(t[i] / window * _BURST), len(bursts) - 1)]

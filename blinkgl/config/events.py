@@ -47,42 +47,54 @@ _THRESHOLD = dict(ge=0.001, le=10.0)
 
 class Fitted(NamedTuple):
     """Ends of what a calibration tries for a key, more than 0; it goes in steps of a ratio. The lower end of a noise is
-    as good as none."""
+    as good as none.
+
+    usual, factor : what cameras have, and one standard deviation of it as a ratio (thresholds of DAVIS settings from
+    0.11 to 0.56 have been published; a dark offset of 20 codes, Lin et al. 2022); None: nothing is known."""
 
     low: float
     high: float
+    usual: float | None = None
+    factor: float = 1.0
 
+    @property
+    def ends(self) -> tuple[float, float]:
+        return self.low, self.high
+
+
+_THRESHOLD_FITTED = Fitted(0.05, 1.5, 0.3, 1.6)
+_REFRACTORY_FITTED = Fitted(10.0, 10_000.0, 500.0, 5.0)
 
 _ESIM_FITTED = {
-    "contrast_threshold": Fitted(0.05, 2.0),
-    "contrast_threshold_off": Fitted(0.05, 2.0),
-    "threshold_sigma": Fitted(0.003, 0.5),
-    "log_eps": Fitted(1e-4, 1.0),
-    "refractory_us": Fitted(10.0, 20_000.0),
+    "contrast_threshold": _THRESHOLD_FITTED,
+    "contrast_threshold_off": _THRESHOLD_FITTED,
+    "threshold_sigma": Fitted(0.003, 0.3, 0.03, 2.5),
+    "log_eps": Fitted(1e-3, 0.16, 0.03, 2.0),
+    "refractory_us": _REFRACTORY_FITTED,
 }
 
 _V2E_FITTED = {
-    "contrast_threshold": Fitted(0.05, 2.0),
-    "contrast_threshold_off": Fitted(0.05, 2.0),
-    "threshold_sigma": Fitted(0.003, 0.5),
-    "full_scale": Fitted(20.0, 3000.0),
-    "cutoff_hz": Fitted(3.0, 3000.0),
-    "leak_rate_hz": Fitted(1e-3, 30.0),
+    "contrast_threshold": _THRESHOLD_FITTED,
+    "contrast_threshold_off": _THRESHOLD_FITTED,
+    "threshold_sigma": Fitted(0.003, 0.3, 0.03, 2.5),
+    "full_scale": Fitted(40.0, 1500.0, 200.0, 2.0),
+    "cutoff_hz": Fitted(20.0, 3000.0, 300.0, 3.0),
+    "leak_rate_hz": Fitted(1e-3, 10.0),
     "leak_cov_decades": Fitted(0.02, 1.5),
-    "shot_noise_rate_hz": Fitted(1e-3, 100.0),
-    "refractory_us": Fitted(10.0, 20_000.0),
+    "shot_noise_rate_hz": Fitted(1e-3, 30.0),
+    "refractory_us": _REFRACTORY_FITTED,
     "hot_pixel_fraction": Fitted(1e-5, 0.05),
     "hot_pixel_rate_hz": Fitted(1.0, 10_000.0),
 }
 
 _VOLTMETER_FITTED = {
-    "k1": Fitted(0.5, 20.0),
-    "k2": Fitted(1.0, 300.0),
+    "k1": Fitted(0.7, 20.0, 3.3, 1.6),
+    "k2": Fitted(1.0, 100.0, 10.0, 2.0),
     "k3": Fitted(1e-6, 0.1),
     "k4": Fitted(1e-9, 1e-5),
     "k5": Fitted(1e-10, 1e-6),
     "k6": Fitted(1e-6, 1e-2),
-    "refractory_us": Fitted(10.0, 20_000.0),
+    "refractory_us": _REFRACTORY_FITTED,
 }
 
 

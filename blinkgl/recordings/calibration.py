@@ -28,9 +28,10 @@ from blinkgl.recordings.clip import (
     read_recording,
     timed_frames,
 )
+from blinkgl.recordings.judge import judge
 from blinkgl.recordings.search import Search
 from blinkgl.recordings.simulation import INTERPOLATIONS, emulator_config
-from blinkgl.recordings.statistics import Sums, interval_distance, sums
+from blinkgl.recordings.statistics import Sums, correlation, interval_distance, sums
 from blinkgl.types.events import Events
 
 LEAST_EVENTS = 2000
@@ -49,9 +50,13 @@ class Judged:
     """Kolmogorov and Smirnov's, of the intervals between the events of a pixel"""
     polarity_correlation: float
     """of polarity sums per interval, blurred by a pixel; NaN for a still scene"""
+    count_correlation: float
+    """of the events of single pixels"""
     still_hz: float
     """of the pixels that saw no change, events per second and pixel; NaN where there are too few of them"""
     recorded_still_hz: float
+    told: float = float("nan")
+    """AUC of the judge (:mod:`~blinkgl.recordings.judge`); NaN where there are too few patches"""
 
     @property
     def rate_ratio(self) -> float:
@@ -220,7 +225,12 @@ def _judged(clip: Clip, stream: Events, halves: tuple[tuple[int, int], tuple[int
 
     def of(part: tuple[int, int]) -> Judged:
         own = sums(clip.events, clip, *part)
-        return judge_half(own, sums(stream, clip, *part, own.polarity))
+        span = int(clip.edges_us[part[0]]), int(clip.edges_us[part[1]])
+        try:
+            told = judge(clip.events, stream, clip.size, span).auc
+        except EventDataError:  # too few events
+            told = float("nan")
+        return judge_half(own, sums(stream, clip, *part, own), told)
 
     return of(halves[0]), of(halves[1])
 
@@ -264,12 +274,12 @@ def _without_lag(
     return again
 
 
-def judge_half(recorded: Sums, simulated: Sums) -> Judged:
+def judge_half(recorded: Sums, simulated: Sums, told: float = float("nan")) -> Judged:
     """``simulated`` with its products taken against ``recorded``."""
     own, other = recorded.without(None), simulated.without(None)
     total = lambda parts: parts[0].sum(axis=0) + parts[4]  # OFF, ON of those that moved and of those that did not
     a, b = total(own), total(other)
-    products, pixels = other[6], other[7]
+    products, pixels, alike = other[6:9]
     norm = np.sqrt(products[1] * products[2])
     hz = lambda parts: float(parts[4].sum() / (pixels[1] * recorded.seconds.sum())) if pixels[1] >= 400 else np.nan
     return Judged(
@@ -279,8 +289,10 @@ def judge_half(recorded: Sums, simulated: Sums) -> Judged:
         float(a[1] / max(a[0], 1)),
         interval_distance(recorded, simulated),
         float(products[0] / norm) if norm > 0 else float("nan"),
+        correlation(alike),
         hz(other),
         hz(own),
+        told,
     )
 
 
@@ -350,13 +362,18 @@ def _of_frames(clip: Clip, reading: FrameReading) -> tuple[list[str], list[str]]
     if "bursts" in facts:
         notes.append(
             f"{100 * facts['in_bursts']:.0f} % of the events come in {facts['bursts']:.0f} bursts of one polarity, all "
-            "over the sensor, at the frames' interval: the camera's frames set them off, not light. Intervals that "
-            "begin or end there are not compared."
+            "over the sensor, at the frames' interval: the camera's frames set them off, not light. What lies "
+            "there is not compared."
         )
-    if "other_exposure" in facts:
+    if "left_out" in facts:
         notes.append(
-            f"{facts['other_exposure']} intervals between frames were left out: there, or beyond, the picture as a "
-            "whole becomes brighter or darker without events, so the exposure or gain of the frames was changed."
+            f"{facts['left_out']} frames at the ends were left out: the picture as a whole leaps there, and no event "
+            "says so, so the exposure of the frames was changed."
+        )
+    if "gain" in facts:
+        notes.append(
+            f"The frames as a whole become brighter or darker by a factor of {facts['gain']:.3g} where no event says "
+            "so: that is their exposure or gain, and was taken out."
         )
     if facts["saturated"] > 0:
         notes.append(f"{100 * facts['saturated']:.1f} % of the pixels were saturated in a frame and are left out.")

@@ -6,12 +6,14 @@ A clip may hold some tiles of the sensor only, stacked on one another: emulators
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
+from scipy.ndimage import median_filter
 
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.sensor import ReadoutConfig
@@ -33,10 +35,17 @@ MOST_PIXEL_STEPS = 3_000_000
 """Pixels times frames that a clip holds at most, float32: what a fit of a minute or two has time for."""
 STILL = 0.04
 """Largest change of ln(I + 10) between two frames, blurred by a pixel, of a pixel that saw nothing."""
+STUCK_TIMES, STUCK_LEAST = 4, 30
+"""A stuck pixel has so many times the median of the 5x5 pixels round it, and so many events more."""
 MOST_SATURATED = 0.3
+LEAST_BRIGHT, LEAST_QUIET, ALIKE = 0.08, 0.05, 0.05
+"""Luminance of pixels, and part of them, that can tell the gain of a frame, and how much their changes of ln I may
+differ (median)."""
+SAME_GAIN = 0.02
+"""Of ln: less is not worth a note."""
 LEAP, LARGEST_THRESHOLD = 0.1, 2.0
-"""Median change of ln(I + 10) from one frame to the next from which on events have to say so, too, and the contrast
-that they stand for at most."""
+"""Median change of ln I from one frame to the next from which on events have to say so, too, and the contrast that
+they stand for at most."""
 MOST_SHIFT_US = 100_000
 LEAST_CORRELATION = 0.25
 """Of polarity sums with the frames' change: below, events and frames are not of one scene or not on one clock."""
@@ -128,21 +137,28 @@ def clip_of_frames(
     Raises EventDataError: frames of another size, no common time, saturated frames, clocks that do not match."""
     grey, steady, clock, full = _greys(frames, size, reading)
     facts: dict[str, float] = {"saturated": float(full.mean())}
+    full |= stuck_pixels(events, size)
     bursts = frame_bursts(events, float(np.median(np.diff(clock)))) if len(clock) > 1 else np.empty((0, 2), np.int64)
     if len(bursts):
         facts |= {"bursts": len(bursts), "in_bursts": float(inside_any(events.t, bursts).mean())}
-    logs = [cv2.GaussianBlur(np.log(g.astype(np.float64) * 255 + LOG_OFFSET), (0, 0), BLUR_PX) for g in grey]
-    change = np.diff(np.stack(logs), axis=0).astype(np.float32)
+    logs, change = _changes(grey)
     found, correlation = clock_offset(events, change, clock, size)
     delay_us = _delay(found, correlation, reading)
     facts |= {"delay_us": delay_us, "found_delay_us": found, "delay_correlation": correlation}
     clock = clock + delay_us
     inside = _spanned(events, clock, reading.name)
-    first, last = _one_exposure(inside, change, clock, ~full, events, reading.name)
-    if last - first < len(inside):
-        facts["other_exposure"] = len(inside) - (last - first)
-    grey = steady(grey[first : last + 1])
-    logs, clock, change = logs[first : last + 1], clock[first : last + 1], change[first:last]
+    first, last = inside[0], inside[-1] + 1
+    grey, clock = grey[first : last + 1], clock[first : last + 1]
+    gains = _one_gain(grey, clock, ~full, events)
+    kept = _without_leaps_at_the_ends(gains)
+    if len(gains[kept]) < len(gains):
+        facts["left_out"] = len(gains) - len(gains[kept])
+    grey, clock, gains = grey[kept], clock[kept], gains[kept]
+    if np.ptp(np.log(gains)) > SAME_GAIN:
+        facts["gain"] = float(gains.max() / gains.min())
+    grey = [(frame / np.float32(gain)) for frame, gain in zip(grey, gains)]
+    logs, change = _changes(grey)
+    grey = steady(grey)
     edges = clock.copy()
     edges[0], edges[-1] = max(clock[0], events.t[0]), min(clock[-1], events.t[-1] + 1)
     path = _path(grey, clock, reading, facts)
@@ -164,6 +180,12 @@ def clip_of_frames(
         bursts,
         facts,
     )
+
+
+def _changes(grey: list[np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
+    """ln(I + 10) of the frames, blurred by a pixel, and (K, H, W) float32 from one to the next."""
+    logs = [cv2.GaussianBlur(np.log(g.astype(np.float64) * 255 + LOG_OFFSET), (0, 0), BLUR_PX) for g in grey]
+    return logs, np.diff(np.stack(logs), axis=0).astype(np.float32)
 
 
 def _greys(
@@ -269,30 +291,34 @@ def clip_of_still(events: Events, size: tuple[int, int], *, luminance: float = D
     )
 
 
-def _one_exposure(
-    inside: np.ndarray, change: np.ndarray, clock_us: np.ndarray, used: np.ndarray, events: Events, where: str
-) -> tuple[int, int]:
-    """The longest stretch of the intervals ``inside``, first and behind the last, in which the picture as a whole does
-    not become brighter or darker without events: there the frames' exposure or gain was changed, which an emulator
-    would take for light."""
-    pixels = max(int(used.sum()), 1)
-    stretch, best = [], []
-    for k in inside.tolist():
-        middle = float(np.median(change[k][used])) if used.any() else 0.0
-        part = events.window(int(clock_us[k]), int(clock_us[k + 1]))
-        polarity = float(2 * np.count_nonzero(part.p) - len(part)) / pixels
-        leaps = abs(middle) > LEAP and np.sign(middle) * polarity * LARGEST_THRESHOLD < abs(middle) / 2
-        stretch = [] if leaps else [*stretch, k]
-        best = stretch if len(stretch) > len(best) else best
-    if len(best) < 2:
-        raise EventDataError(
-            "the frames' exposure changes from one to the next, and the events do not: what the light did is not "
-            "in them",
-            where=where,
-            value=f"{len(inside) - len(best)} of {len(inside)} intervals",
-            accepted="three or more frames in a row of one exposure and gain",
-        )
-    return best[0], best[-1] + 1
+def _one_gain(grey: list[np.ndarray], clock_us: np.ndarray, used: np.ndarray, events: Events) -> np.ndarray:
+    """(K + 1,) what to divide the frames by, so that the exposure or gain of their camera, which it changes by itself,
+    is no light: the brightness of pixels that fired in no interval stays as it is.
+
+    Where hardly any pixel was quiet all the time, those that were from one frame to the next say it, of changes that
+    the events contradict."""
+    bright = used & (np.minimum.reduce(grey) > LEAST_BRIGHT)
+    fired = [polarity_counts(events.window(int(a), int(b)), used.shape) for a, b in itertools.pairwise(clock_us)]
+    quiet = bright & ~np.any([on + off > 0 for on, off in fired], axis=0)
+    always = quiet.mean() >= LEAST_QUIET
+    gains = [0.0]
+    for k, (on, off) in enumerate(fired):
+        here = quiet if always else bright & (on + off == 0)
+        ratio = np.log(grey[k + 1][here] / grey[k][here]) if here.mean() >= LEAST_QUIET else np.zeros(1)
+        middle = float(np.median(ratio))
+        if float(np.median(np.abs(ratio - middle))) > max(ALIKE, 0.7 * abs(middle)):  # no common factor
+            middle = 0.0
+        said = np.sign(middle) * float((on - off)[used].mean()) * LARGEST_THRESHOLD
+        changed = always or (abs(middle) > LEAP and said < abs(middle) / 2)
+        gains.append(gains[-1] + (middle if changed else 0.0))
+    return np.exp(gains)
+
+
+def _without_leaps_at_the_ends(gains: np.ndarray) -> slice:
+    """The frames between the first and the last interval without a leap: what a camera's first exposures, before it
+    has found its own, leave of dark and of bright parts is not one factor."""
+    steady = np.flatnonzero(np.abs(np.diff(np.log(gains))) <= LEAP)
+    return slice(int(steady[0]), int(steady[-1]) + 2) if len(steady) >= 2 else slice(None)
 
 
 class Tiles:
@@ -374,10 +400,25 @@ def _match(events: Events, changes: np.ndarray, clock_us: np.ndarray, pairs: lis
     return float(np.mean(found)) if found else float("nan")
 
 
+def stuck_pixels(events: Events, size: tuple[int, int]) -> np.ndarray:
+    """(H, W) bool: pixels that fire many times as often as those round them. What they do is no answer to light
+    (``readout.pixels`` has them), and two of them can outweigh all others in a correlation of counts."""
+    where = events.y.astype(np.int64) * size[1] + events.x
+    count = np.bincount(where, minlength=size[0] * size[1]).reshape(size)
+    return count > STUCK_TIMES * median_filter(count, 5, mode="nearest") + STUCK_LEAST
+
+
 def polarity_sums(events: Events, size: tuple[int, int]) -> np.ndarray:
     """(H, W) float64, ON minus OFF."""
+    on, off = polarity_counts(events, size)
+    return on - off
+
+
+def polarity_counts(events: Events, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W) float64 each, ON and OFF events of the pixels."""
     where = events.y.astype(np.int64) * size[1] + events.x
-    return np.bincount(where, 2.0 * events.p - 1.0, minlength=size[0] * size[1]).reshape(size)
+    count = lambda kind: np.bincount(where[events.p == kind], minlength=size[0] * size[1]).reshape(size).astype(float)
+    return count(1), count(0)
 
 
 def read_recording(path: str | os.PathLike, *, least: int = 0) -> tuple[Events, tuple[int, int]]:

@@ -32,6 +32,8 @@ LEAST_CHANCE = 0.05
 """Of a number's error, where chance is known at all."""
 TOLERANCE = 0.5
 """How much worse the fit may become by putting a parameter that is not told back to its default."""
+PRIOR = 2.0
+"""How much a standard deviation from what cameras have counts for: as the smaller of the blocks of numbers."""
 _MOST_STEPS = 20
 _FEW_STEPS, _PLACES = 3, 6
 _WORTH = 0.2
@@ -66,11 +68,11 @@ class Search:
         """Those that make any difference to the scene; the others are named and left alone. What is tried is the middle
         of all rooms with one key at either end."""
         middle = self._ends(keys).mean(axis=1)
-        here, found = self._difference(keys, middle), []
+        here, found = self._off(keys, middle), []
         for i, ends in enumerate(self._ends(keys)):
             places = np.repeat(middle[None], 2, axis=0)
             places[:, i] = ends
-            if any(np.abs(self._difference(keys, at) - here).max() > 0 for at in places):
+            if any(np.abs(self._off(keys, at) - here).max() > 0 for at in places):
                 found.append(keys[i])
             else:
                 self.untold[keys[i]] = "makes no difference to this scene, left as it was"
@@ -126,7 +128,7 @@ class Search:
                 return
             key = keys[worst]
             keys = [k for k in keys if k != key]
-            default = float(np.clip(np.exp(self._defaults([key])[0]), *self._base.fitted[key]))
+            default = float(np.clip(np.exp(self._defaults([key])[0]), *self._base.fitted[key].ends))
             there = float(np.exp(best[1][worst]))
             others = np.delete(best[1], worst)
             within = f"the data tell it within a factor of {min(np.exp(spread[worst]), 1e6):.2g} at best"
@@ -165,31 +167,47 @@ class Search:
             return {}
         t = self.target
         weights = self._robust()
-        j = self._jacobian * weights[:, None]
-        pull = np.linalg.solve(j.T @ j + self._prior(), j.T * weights)
+        count = len(t.values)
+        j = (self._jacobian * weights[:, None])[:count]
+        pull = np.linalg.solve(j.T @ j + self._prior(), j.T * weights[:count])
         moved = (t.jackknife - t.jackknife.mean(axis=0)) * (t.weight / t.error) @ pull.T
-        count = len(t.jackknife)
-        spread = np.sqrt((count - 1) / count * (moved**2).sum(axis=0))
+        groups = len(t.jackknife)
+        spread = np.sqrt((groups - 1) / groups * (moved**2).sum(axis=0))
         # Where the model is off by more than chance, by that much; a number that hardly any group of pixels moves says
         # nothing of chance.
         known = t.chance > LEAST_CHANCE * t.error
-        off = self._residual[known] / t.weight[known] * t.error[known] / t.chance[known]
+        off = self._residual[:count][known] / t.weight[known] * t.error[known] / t.chance[known]
         misfit = max(1.0, float(np.sqrt(np.mean(off**2)))) if known.any() else 1.0
         return {key: float(np.exp(v) * s * misfit) for key, v, s in zip(self._keys, self._at, spread)}
 
     def _spread(self) -> np.ndarray:
-        weights = self._robust()
-        j = self._jacobian * weights[:, None]
-        return np.sqrt(np.diag(np.linalg.inv(j.T @ j + self._prior())))
+        told = (self._jacobian * self._robust()[:, None])[: len(self.target.values)]
+        return np.sqrt(np.diag(np.linalg.inv(told.T @ told + self._prior())))
 
     def _robust(self) -> np.ndarray:
         """Square roots of the weights that the loss gives to the residuals."""
         return (1 + self._residual**2) ** -0.25
 
     def _prior(self) -> np.ndarray:
-        """Nothing is known but the ends: a normal law as wide."""
+        """Of the logarithms, as information: what cameras have; where nothing is known of them but the ends, a normal
+        law as wide."""
         ends = self._ends(self._keys)
-        return np.diag(12 / np.diff(ends, axis=1)[:, 0] ** 2)
+        wide = 12 / np.diff(ends, axis=1)[:, 0] ** 2
+        _, scale = self._usual(self._keys)
+        return np.diag(np.where(scale > 0, scale**2, wide))
+
+    def _usual(self, keys: list[str]) -> tuple[np.ndarray, np.ndarray]:
+        """Logarithms of what cameras have, and what a distance from it counts for; 0 where nothing is known. Whoever
+        begins with a sensor says with it what is usual."""
+        usual, scale = np.zeros(len(keys)), np.zeros(len(keys))
+        for i, key in enumerate(keys):
+            known, given = self._base.fitted[key], self._default(key)
+            if known.usual is None:
+                continue
+            said = key in self._base.model_fields_set and given
+            usual[i] = np.log(given if said else known.usual)
+            scale[i] = PRIOR / np.log(known.factor)
+        return usual, scale
 
     def _default(self, key: str) -> float | None:
         return getattr(self._base, key)
@@ -200,15 +218,20 @@ class Search:
         return np.log([max(v, self._base.fitted[key].low) for key, v in zip(keys, values)])
 
     def _ends(self, keys: list[str]) -> np.ndarray:
-        return np.log([self._base.fitted[key] for key in keys]).reshape(-1, 2)
+        return np.log([self._base.fitted[key].ends for key in keys]).reshape(-1, 2)
 
     def _sums(self, keys: list[str], at: np.ndarray) -> Sums:
         self.evaluations += 1
         self._progress(min(self.evaluations / self._planned, 0.99))
         events = self._clip.simulate(self.config(keys, at), self._seed, stop=self._stop)
-        return sums(events, self._clip, 0, self._stop, self.target.sums.polarity)
+        return sums(events, self._clip, 0, self._stop, self.target.sums)
 
     def _difference(self, keys: list[str], at: np.ndarray) -> np.ndarray:
+        """What the simulation is off by, and behind it how far the parameters are from what is usual."""
+        usual, scale = self._usual(keys)
+        return np.concatenate([self._off(keys, at), scale * (at - usual)])
+
+    def _off(self, keys: list[str], at: np.ndarray) -> np.ndarray:
         return self.target.residual(self._sums(keys, at))
 
     def _costs(self, keys: list[str], places: np.ndarray) -> np.ndarray:
@@ -236,14 +259,15 @@ class Search:
         self._keys, self._at, self._residual = keys, best[1], self._difference(keys, best[1])
         self._jacobian = self._derivatives(keys, best[1], self._residual)
         vague = [i for i, spread in enumerate(self._spread()) if spread > VAGUE]
-        start, slopes = best, self._jacobian
+        start, numbers = best, len(self.target.values)
         for i in vague:
             others, held = [key for key in keys if key != keys[i]], self._set
             (low, high), tried = self._ends([keys[i]])[0], []
+            slopes = np.delete(np.delete(self._jacobian, i, axis=1), numbers + i, axis=0)
             for place in np.linspace(low, high, _PLACES + 2)[1:-1]:
                 self._set = {**held, keys[i]: float(np.exp(place))}
                 # By the derivatives of where the scan began: near enough to see which places are worth a descent.
-                cost, at = self._descend(others, np.delete(start[1], i), np.delete(slopes, i, axis=1), _FEW_STEPS)
+                cost, at = self._descend(others, np.delete(start[1], i), slopes, _FEW_STEPS)
                 tried.append((cost, np.insert(at, i, place)))
             self._set = held
             tried.sort(key=lambda one: one[0])

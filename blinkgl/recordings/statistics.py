@@ -16,6 +16,8 @@ import numpy as np
 from blinkgl.recordings.bursts import inside_any
 from blinkgl.recordings.clip import TILE_PX, Clip
 from blinkgl.recordings.comparison import BLUR_PX
+from blinkgl.recordings.judge import LEAST_IN_PATCH, LEAST_PATCHES
+from blinkgl.recordings.patches import NAMES, SIDE_PX, patches
 from blinkgl.types.events import Events
 
 GROUPS = 16
@@ -34,7 +36,8 @@ LEAST_STILL = 400
 
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """Of the intervals [first, stop) of a clip; the first axis is the group.
+    """Of the intervals [first, stop) of a clip; the first axis is the group. What lies in a burst that the camera's
+    frames set off is left out on both sides.
 
     rates : (G, K, 2) events by interval and polarity (OFF, ON), of pixels that saw a change.   lights : (G, 8, 2), by
     brightness.   isi : (G, 2, bins), by whether the second event is of the other polarity, where
@@ -42,7 +45,9 @@ class Sums:
     intervals by number of events.   still, still_counts : (G, 2), (G, C) of pixels that saw none, over all intervals.
     products : (G, 3) sums of a*b, a*a, b*b of polarity sums with the recording's.   pixels : (G, 2) that moved, and
     did not.   polarity : (K, H*W) float32, polarity sums,
-    blurred by a pixel."""
+    blurred by a pixel.   both : (H*W,) a pixel's events.   alike : (G, 6) pixels and sums of a, b, a*b, a*a, b*b of
+    these with the recording's.   looks : (G, 2 F + 1) of the recording's patches that are not all but empty: their
+    number, sums and sums of squares of what is told of them."""
 
     rates: np.ndarray
     lights: np.ndarray
@@ -53,29 +58,34 @@ class Sums:
     products: np.ndarray
     pixels: np.ndarray
     polarity: np.ndarray
+    both: np.ndarray
+    alike: np.ndarray
+    looks: np.ndarray
+    full: np.ndarray
     seconds: np.ndarray
 
     def without(self, group: int | None) -> list[np.ndarray]:
         """The totals over the groups, but for one."""
         keep = np.arange(GROUPS) != (-1 if group is None else group)
         parts = (self.rates, self.lights, self.isi, self.counts, self.still, self.still_counts, self.products,
-                 self.pixels)  # fmt: skip
+                 self.pixels, self.alike, self.looks)  # fmt: skip
         return [part[keep].sum(axis=0) for part in parts]
 
 
-def sums(events: Events, clip: Clip, first: int, stop: int, against: np.ndarray | None = None) -> Sums:
+def sums(events: Events, clip: Clip, first: int, stop: int, against: Sums | None = None) -> Sums:
     """Of a stream of events of the clip's scene in its intervals [first, stop).
 
-    against : polarity sums to correlate with; None: the stream's own."""
+    against : the recording's; None: it is that itself."""
     height, width = clip.size
     count = stop - first
     group = groups(clip.size)
     total = np.zeros((count, height * width, 2), np.int16)
     isi = np.zeros((GROUPS, 2, ISI_BINS), np.int64)
-    part = events.window(int(clip.edges_us[first]), int(clip.edges_us[stop]))
+    span_us = int(clip.edges_us[first]), int(clip.edges_us[stop])
+    part = events.window(*span_us)
+    part = part.part(~inside_any(part.t, clip.bursts))
     where = part.y.astype(np.int64) * width + part.x
-    by_light = ~inside_any(part.t, clip.bursts)
-    _collect(where, part.t, part.p, by_light, clip.edges_us[first : stop + 1], group, total, isi)
+    _collect(where, part.t, part.p, clip.edges_us[first : stop + 1], clip.bursts, group, total, isi)
     used, still = clip.used.ravel(), clip.still.ravel()
     moving = used & ~still
     on_group = np.where(moving, group, GROUPS)
@@ -92,7 +102,7 @@ def sums(events: Events, clip: Clip, first: int, stop: int, against: np.ndarray 
     raw = (total[..., 1] - total[..., 0]).reshape(count, height, width).astype(np.float32)
     # Quantisation and shifts of less than a pixel are not what is asked about, as in `compare`.
     polarity = np.stack([cv2.GaussianBlur(one, (0, 0), BLUR_PX).ravel() for one in raw])
-    other = polarity if against is None else against
+    other = polarity if against is None else against.polarity
     products = np.stack(
         [
             _by(on_group, np.einsum("kn,kn->n", x, y))
@@ -102,7 +112,33 @@ def sums(events: Events, clip: Clip, first: int, stop: int, against: np.ndarray 
     )
     pixels = np.stack([_by(on_group, np.ones(len(group))), _by(np.where(still, group, GROUPS), np.ones(len(group)))], 1)
     seconds = np.diff(clip.edges_us[first : stop + 1]) * 1e-6
-    return Sums(rates, lights, isi, counts, quiet, still_counts, products, pixels, polarity, seconds)
+    mine = both.sum(axis=1)
+    theirs = mine if against is None else against.both
+    alike = np.stack(
+        [
+            _by(np.where(used, group, GROUPS), one.astype(np.float64))
+            for one in (used, mine, theirs, mine * theirs, mine * mine, theirs * theirs)
+        ],
+        1,
+    )
+    looks, full = _looks(part, clip.size, span_us, None if against is None else against.full)
+    return Sums(
+        rates, lights, isi, counts, quiet, still_counts, products, pixels, polarity, mine, alike, looks, full, seconds
+    )
+
+
+def _looks(
+    events: Events, size: tuple[int, int], span_us: tuple[int, int], full: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """``Sums.looks`` and (T, Y, X) bool, the patches that count (full: where that is known)."""
+    count, told = patches(events, size, span_us)
+    full = count >= LEAST_IN_PATCH if full is None else full
+    side = TILE_PX // 2
+    rows, columns = (np.arange(n) * SIDE_PX // side for n in full.shape[1:])
+    group = np.broadcast_to((rows[:, None] * 7 + columns * 3) % GROUPS, full.shape)[full]
+    values = told[full].astype(np.float64)
+    parts = np.concatenate([np.ones((len(values), 1)), values, values * values], axis=1)
+    return np.stack([_by(group, column) for column in parts.T], 1), full
 
 
 def groups(size: tuple[int, int]) -> np.ndarray:
@@ -123,23 +159,23 @@ def _histogram(counts: np.ndarray, group: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True, nogil=True)
-def _collect(where, t, p, by_light, edges, group, total, isi):
+def _collect(where, t, p, edges, bursts, group, total, isi):
     """Counts by interval, pixel and polarity, and the histogram of the intervals between a pixel's events, of those
-    both of whose times are ``by_light``."""
+    without a burst between them, in which there may have been another."""
     pixels = total.shape[1]
     last = np.full(pixels, -1, np.int64)
     before = np.zeros(pixels, np.uint8)
-    k = 0
+    k, burst, quiet_since = 0, 0, edges[0]
     for i in range(len(t)):
         while t[i] >= edges[k + 1]:
             k += 1
         j = where[i]
         total[k, j, p[i]] += 1
-        if not by_light[i]:
-            last[j] = -1
-            continue
+        while burst < len(bursts) and t[i] >= bursts[burst, 1]:
+            quiet_since = bursts[burst, 1]
+            burst += 1
         now = t[i] - edges[0]
-        if last[j] >= 0:
+        if last[j] >= 0 and last[j] + edges[0] >= quiet_since:
             b = min(int(ISI_PER_DECADE * np.log10(max(now - last[j], 1)) + 1e-9), ISI_BINS - 1)
             isi[group[j], int(before[j] != p[i]), b] += 1
         last[j], before[j] = now, p[i]
@@ -152,6 +188,7 @@ class Target:
     values : (N,).   chance : (N,), what each may be off by, of the recording and of a simulation.
     floor : (N,), by which a model is off besides.   weight : (N,), of the block a number belongs to.
     jackknife : (G, N), differences without each group.   block : (N,) of names.
+    spread : (F,), of what is told of the recording's patches.
     together : rates of ON and OFF events of pixels that moved in one number."""
 
     sums: Sums
@@ -162,6 +199,7 @@ class Target:
     weight: np.ndarray
     jackknife: np.ndarray
     block: np.ndarray
+    spread: np.ndarray
     together: bool = False
 
     @property
@@ -173,7 +211,7 @@ class Target:
         return self.weight * (self._numbers(simulated) - self.values) / self.error
 
     def _numbers(self, of: Sums, without: int | None = None) -> np.ndarray:
-        return numbers(of, self.probes, without, self.together)[0]
+        return numbers(of, self.probes, self.spread, without, self.together)[0]
 
     def beside(self, simulated: Sums, *, floor: str) -> Target:
         """With the errors that a simulation near the recording shows. Chance: the jackknife of the differences, in
@@ -195,10 +233,10 @@ class Target:
 
 
 WEIGHTS = {"rate": 3.0, "light": 3.0, "interval": 5.0, "turn": 1.0, "count": 2.0, "still": 2.0, "still count": 2.0,
-           "polarity": 2.0}  # fmt: skip
+           "polarity": 2.0, "alike": 2.0, "look": 2.0, "total": 3.0}  # fmt: skip
 """How much the blocks count, each as a whole: what rates and intervals are is what a simulation is used for."""
 FLOOR = {"rate": 0.02, "light": 0.05, "interval": 0.01, "turn": 0.02, "count": 0.01, "still": 0.05, "still count": 0.01,
-         "polarity": 0.02}  # fmt: skip
+         "polarity": 0.02, "alike": 0.02, "look": 0.1, "total": 0.02}  # fmt: skip
 """No model is expected to be nearer to a camera than this: logarithms of rates, shares of events or of pixels."""
 LOWEST = 0.1
 """Of a floor, where the model turns out to be nearer."""
@@ -207,12 +245,27 @@ LOWEST = 0.1
 def target(recorded: Sums, together: bool = False) -> Target:
     """Of the recording's sums; with floors for errors until a simulation is beside it. together: see Target."""
     probes = _probes(recorded.isi.sum(axis=(0, 1)))
-    values, block = numbers(recorded, probes, together=together)
+    spread = _spread(recorded.looks.sum(axis=0))
+    values, block = numbers(recorded, probes, spread, together=together)
     floor = np.array([FLOOR[b] for b in block])
-    sizes = {b: np.count_nonzero(block == b) for b in FLOOR}
+    sizes = {b: max(np.count_nonzero(block == b), 1) for b in FLOOR}
     weight = np.array([WEIGHTS[b] / np.sqrt(sizes[b]) for b in block])
     chance, jackknife = np.zeros(len(values)), np.zeros((GROUPS, len(values)))
-    return Target(recorded, probes, values, chance, floor, weight, jackknife, block, together)
+    return Target(recorded, probes, values, chance, floor, weight, jackknife, block, spread, together)
+
+
+def _spread(looks: np.ndarray) -> np.ndarray:
+    """Standard deviations of what is told of patches, from ``Sums.looks``."""
+    count, features = max(looks[0], 1), len(NAMES)
+    mean, square = looks[1 : 1 + features] / count, looks[1 + features :] / count
+    return np.sqrt(np.maximum(square - mean**2, 1e-6))
+
+
+def correlation(alike: np.ndarray) -> float:
+    """Pearson's, of the events of single pixels, from ``Sums.alike``; 0 where one of them is constant."""
+    n, a, b, product, square_a, square_b = alike
+    norm = np.sqrt(max(n * square_a - a * a, 0.0) * max(n * square_b - b * b, 0.0))
+    return float((n * product - a * b) / norm) if norm > 0 else 0.0
 
 
 def _probes(isi: np.ndarray) -> np.ndarray:
@@ -225,10 +278,10 @@ def _probes(isi: np.ndarray) -> np.ndarray:
 
 
 def numbers(
-    s: Sums, probes: np.ndarray, without: int | None = None, together: bool = False
+    s: Sums, probes: np.ndarray, spread: np.ndarray, without: int | None = None, together: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) numbers of a stream, and the name of the block of each. together: see Target."""
-    rates, lights, isi, counts, still, still_counts, products, pixels = s.without(without)
+    """(N,) numbers of a stream, and the name of the block of each. spread, together: see Target."""
+    rates, lights, isi, counts, still, still_counts, products, pixels, alike, looks = s.without(without)
     values, block = [], []
 
     def add(name: str, more: np.ndarray | float) -> None:
@@ -241,10 +294,14 @@ def numbers(
         seconds = s.seconds[:, None] * pixels[0]
         add("rate", np.log((rates + 1) / seconds))
         add("rate", np.log((rates.sum(axis=0) + 1) / seconds.sum()))
+        add("total", np.log((rates.sum() + 1) / seconds.sum()))
         add("light", np.log((lights + 4) / (s.seconds.sum() * pixels[0])))
         add("count", (np.cumsum(counts) / max(counts.sum(), 1))[:-1])
         norm = np.sqrt(products[1] * products[2])
         add("polarity", products[0] / norm if norm > 0 else 0.0)
+        add("alike", correlation(alike))
+        if looks[0] >= LEAST_PATCHES:
+            add("look", looks[1 : 1 + len(NAMES)] / looks[0] / spread)
     if len(probes):
         total = isi.sum()
         add("interval", (np.cumsum(isi.sum(axis=0)) / max(total, 1))[probes])

@@ -70,7 +70,7 @@ def test_the_clock_is_found():
         assert found - lag == pytest.approx(shift, abs=700)
 
 
-def test_a_frame_of_another_exposure_is_no_light():
+def test_another_exposure_of_a_frame_is_no_light():
     """The camera's first frame was exposed longer (evbench_davis240): a picture that becomes darker without events. A
     lamp that is dimmed makes events, and stays."""
     frames = moving(most=0.6)
@@ -78,13 +78,26 @@ def test_a_frame_of_another_exposure_is_no_light():
     longer = [(np.round(frames[0][0] * 1.4).astype(np.uint8), *frames[0][1:]), *frames[1:]]
     cut = clip_of_frames(events, longer, (H, W), FrameReading(delay_ms=0))
     whole = clip_of_frames(events, frames, (H, W), FrameReading(delay_ms=0))
-    assert cut.facts["other_exposure"] == 1 and np.array_equal(cut.clock_us, whole.clock_us[1:])
-    assert "other_exposure" not in whole.facts
+    assert cut.facts["left_out"] == 1 and np.array_equal(cut.clock_us, whole.clock_us[1:])
+    assert not {"left_out", "gain"} & set(whole.facts)
     dimmed = scene(longer).simulate(emulator_config({"emulator": "esim", **TRUE}), 1)
-    assert "other_exposure" not in clip_of_frames(dimmed, longer, (H, W), FrameReading(delay_ms=0)).facts
-    by_turns = [(np.round(f * (1.4 if k % 2 else 1)).astype(np.uint8), *rest) for k, (f, *rest) in enumerate(frames)]
-    with pytest.raises(EventDataError, match="exposure changes from one to the next"):
-        clip_of_frames(events, by_turns, (H, W), FrameReading(delay_ms=0))
+    assert not {"left_out", "gain"} & set(clip_of_frames(dimmed, longer, (H, W), FrameReading(delay_ms=0)).facts)
+
+
+def test_a_gain_that_drifts_is_no_light():
+    """Frames that become brighter by 3 % each, where the pixels of a still background say nothing."""
+    bar = lambda k: np.s_[:, 5 + 8 * k : 11 + 8 * k]
+    still = moving(1, most=0.6)[0][0]
+    frames = []
+    for k in range(7):
+        codes = still.copy()
+        codes[bar(k)] = 200
+        frames.append((codes, (k + 1) * GAP_US * 1000, f"#{k}"))
+    events = scene(frames).simulate(emulator_config({"emulator": "esim", **TRUE}), 1)
+    drifting = [(np.round(f * 1.03**k).astype(np.uint8), *rest) for k, (f, *rest) in enumerate(frames)]
+    told, whole = (clip_of_frames(events, given, (H, W), FrameReading(delay_ms=0)) for given in (drifting, frames))
+    assert told.facts["gain"] == pytest.approx(1.03**6, rel=0.01) and "gain" not in whole.facts
+    assert abs(np.median(told.change)) < 1e-3 and np.median(np.abs(told.change - whole.change)) < 0.01
 
 
 def test_a_model_of_one_threshold_is_asked_for_on_and_off_together():

@@ -69,7 +69,7 @@ _ESIM_FITTED = {
     "contrast_threshold": _THRESHOLD_FITTED,
     "contrast_threshold_off": _THRESHOLD_FITTED,
     "threshold_sigma": Fitted(0.003, 0.3, 0.03, 2.5),
-    "log_eps": Fitted(1e-3, 0.16, 0.03, 2.0),
+    "log_eps": Fitted(1e-3, 0.16, 0.04, 1.8),
     "refractory_us": _REFRACTORY_FITTED,
 }
 

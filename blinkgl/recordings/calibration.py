@@ -188,7 +188,7 @@ def calibrate_events(
         notes, warnings = _of_frames(clip, reading)
     half = (clip.intervals + 1) // 2
     halves = ((0, half), (half, clip.intervals))
-    found = Search(clip, base, half, seed, lambda done: say("fitting", done))
+    found = Search([(clip, half)], base, seed, lambda done: say("fitting", done))
     if before is not None:
         found.untold.update(before.untold)
         keys, start = before.keys, before.place
@@ -250,7 +250,7 @@ def _of_scene(
     clip = clip_of_frames(events, frames, size, reading, seed=seed)
     if reading.delay_ms is not None:
         return clip, None
-    search = Search(clip, base, (clip.intervals + 1) // 2, seed, lambda done: say("clock", done))
+    search = Search([(clip, (clip.intervals + 1) // 2)], base, seed, lambda done: say("clock", done))
     search.roughly(search.responding(keys), starts)
     return _without_lag(clip, search, events, frames, size, reading, seed), search
 

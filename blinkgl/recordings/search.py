@@ -7,7 +7,7 @@ Econometrica 57, 1989). What the data say nothing about is left at its default, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from blinkgl.config.events import EmulatorConfig
 from blinkgl.errors import EventDataError
 from blinkgl.recordings.clip import Clip
 from blinkgl.recordings.simulation import emulator_config
-from blinkgl.recordings.statistics import Sums, Target, sums, target
+from blinkgl.recordings.statistics import Sums, Targets, sums, target
 
 TRIED = 64
 """Settings drawn over the whole room of the parameters, of which the best are started from."""
@@ -47,13 +47,21 @@ _LITTLE = 0.01
 class Search:
     """Looks for the parameters; their logarithms are what it works with."""
 
-    def __init__(self, clip: Clip, base: EmulatorConfig, stop: int, seed: int, progress: Callable[[float], None]):
-        self._clip, self._base, self._stop, self._seed, self._progress = clip, base, stop, seed, progress
-        recorded = sums(clip.events, clip, 0, stop)
+    def __init__(
+        self,
+        parts: Sequence[tuple[Clip, int]],
+        base: EmulatorConfig,
+        seed: int,
+        progress: Callable[[float], None] = lambda _: None,
+    ):
+        """parts : clips of one camera, and how many intervals of each are looked at: one set of parameters for all."""
+        self._parts, self._base, self._seed, self._progress = parts, base, seed, progress
         # What a model has no parameter for it would buy with those that are for something else.
-        self.target: Target = target(recorded, together=base.one_threshold)
+        one = lambda clip, stop: target(sums(clip.events, clip, 0, stop), together=base.one_threshold)
+        self.target = Targets([one(*part) for part in parts])
         if not len(self.target.values):
-            raise EventDataError("too few pixels to tell an emulator's parameters", value=int(clip.used.sum()))
+            pixels = sum(int(clip.used.sum()) for clip, _ in parts)
+            raise EventDataError("too few pixels to tell an emulator's parameters", value=pixels)
         self.evaluations = 0
         self.untold: dict[str, str] = {}
         self.cost = float("nan")
@@ -87,7 +95,7 @@ class Search:
         tried = np.vstack([np.clip(self._defaults(keys), ends[:, 0], ends[:, 1]), tried])
         self._planned = len(tried) + starts * 20 * (len(keys) + 2)
         ordered = tried[np.argsort(self._costs(keys, tried))]
-        self.target = self.target.beside(self._sums(keys, ordered[0]), floor="expected")
+        self.target.beside(self._sums(keys, ordered[0]), floor="expected")
         first = [self._descend(keys, one, steps=_FEW_STEPS) for one in _apart(ordered, _EACH * starts)]
         first.sort(key=lambda found: found[0])
         self._keys = keys
@@ -109,12 +117,12 @@ class Search:
         if not keys:
             self.cost = _loss(self._difference([], np.empty(0)))
             return
-        self.target = self.target.beside(self._sums(keys, start), floor="expected")
+        self.target.beside(self._sums(keys, start), floor="expected")
         best = self._descend(keys, start)
         # As if the model were the camera, with nothing but chance between them; then with what it turns out to be off
         # by.
         for floor in ("lowest", "seen"):
-            self.target = self.target.beside(self._sums(keys, best[1]), floor=floor)
+            self.target.beside(self._sums(keys, best[1]), floor=floor)
             best = self._descend(keys, best[1])
             if floor == "lowest":
                 best = self._scanned(keys, best)
@@ -220,11 +228,14 @@ class Search:
     def _ends(self, keys: list[str]) -> np.ndarray:
         return np.log([self._base.fitted[key].ends for key in keys]).reshape(-1, 2)
 
-    def _sums(self, keys: list[str], at: np.ndarray) -> Sums:
+    def _sums(self, keys: list[str], at: np.ndarray) -> list[Sums]:
         self.evaluations += 1
         self._progress(min(self.evaluations / self._planned, 0.99))
-        events = self._clip.simulate(self.config(keys, at), self._seed, stop=self._stop)
-        return sums(events, self._clip, 0, self._stop, self.target.sums)
+        config = self.config(keys, at)
+        return [
+            sums(clip.simulate(config, self._seed, stop=stop), clip, 0, stop, recorded)
+            for (clip, stop), recorded in zip(self._parts, self.target.sums)
+        ]
 
     def _difference(self, keys: list[str], at: np.ndarray) -> np.ndarray:
         """What the simulation is off by, and behind it how far the parameters are from what is usual."""

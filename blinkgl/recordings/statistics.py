@@ -232,6 +232,33 @@ class Target:
         return replace(self, chance=chance, floor=floors, jackknife=jackknife)
 
 
+class Targets:
+    """Of several recordings by one camera: their numbers behind one another."""
+
+    def __init__(self, each: list[Target]):
+        self._each = each
+
+    def beside(self, simulated: list[Sums], *, floor: str) -> None:
+        """As :meth:`Target.beside`, from now on."""
+        self._each = [one.beside(of, floor=floor) for one, of in zip(self._each, simulated)]
+
+    def residual(self, simulated: list[Sums]) -> np.ndarray:
+        return np.concatenate([one.residual(of) for one, of in zip(self._each, simulated)])
+
+    @property
+    def sums(self) -> list[Sums]:
+        return [one.sums for one in self._each]
+
+    def _joined(self, name: str) -> np.ndarray:
+        return np.concatenate([getattr(one, name) for one in self._each], axis=-1)
+
+    values = property(lambda self: self._joined("values"))
+    chance = property(lambda self: self._joined("chance"))
+    weight = property(lambda self: self._joined("weight"))
+    error = property(lambda self: self._joined("error"))
+    jackknife = property(lambda self: self._joined("jackknife"))
+
+
 WEIGHTS = {"rate": 3.0, "light": 3.0, "interval": 5.0, "turn": 1.0, "count": 2.0, "still": 2.0, "still count": 2.0,
            "polarity": 2.0, "alike": 2.0, "look": 2.0, "total": 3.0}  # fmt: skip
 """How much the blocks count, each as a whole: what rates and intervals are is what a simulation is used for."""
@@ -300,8 +327,8 @@ def numbers(
         norm = np.sqrt(products[1] * products[2])
         add("polarity", products[0] / norm if norm > 0 else 0.0)
         add("alike", correlation(alike))
-        if looks[0] >= LEAST_PATCHES:
-            add("look", looks[1 : 1 + len(NAMES)] / looks[0] / spread)
+        if s.looks[:, 0].sum() >= LEAST_PATCHES:
+            add("look", looks[1 : 1 + len(NAMES)] / max(looks[0], 1) / spread)
     if len(probes):
         total = isi.sum()
         add("interval", (np.cumsum(isi.sum(axis=0)) / max(total, 1))[probes])

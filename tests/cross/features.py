@@ -115,9 +115,8 @@ _SENSOR = {
     "width": 20,
     "height": 16,
     "emulators": {"esim": {"contrast_threshold": 0.25}, "v2e": {"cutoff_hz": 100}, "voltmeter": {"k1": 4}},
-    "readout": {
-        "clock_us": 5,
-    },
+    "frame_gamma": "linear",
+    "readout": {"clock_us": 5},
 }
 FEATURES: dict[str, dict[str, dict[str, Any]]] = {
     "source": {
@@ -129,7 +128,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "explicit, alive": {"scene": _ALIVE},
         "frames, motion": _frames(interpolate="motion", max_px=0.5),
         "frames, linear": _frames(interpolate="linear", flow="flow_flo", gamma="linear"),
-        "frames, part": _frames(interpolate="linear", flow=None, first=1, count=4),
+        "frames, part": _frames(interpolate="linear", flow=None, first=1, count=4, keep_noise=True),
     },
     "emulator": {
         "esim": {"events": {"emulator": "esim"}},
@@ -164,6 +163,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "unsaid": NOTHING,
         **{name: {"sensor": name} for name in ("davis346", "dvxplorer")},
         "a table": {"sensor": _SENSOR},
+        "its frames are sRGB": {"sensor": {**_SENSOR, "frame_gamma": "srgb"}},
     },
     "readout": {
         "unsaid": NOTHING,

@@ -14,9 +14,8 @@ from blinkgl.errors import BlinkGLError, ConfigError, EventDataError
 from blinkgl.io.formats import write_events
 from blinkgl.recordings.calibration import calibrate, calibrate_events
 from blinkgl.recordings.clip import TILE_PX, Clip, FrameReading, clip_of_frames, clip_of_still, clock_offset
-from blinkgl.recordings.search import Search
 from blinkgl.recordings.simulation import emulator_config
-from blinkgl.recordings.statistics import sums
+from blinkgl.recordings.statistics import sums, target
 from blinkgl.report.calibration import mosaic
 from blinkgl.types.events import Events
 from tests.shared_data import shared
@@ -108,8 +107,9 @@ def test_a_model_of_one_threshold_is_asked_for_on_and_off_together():
     fewer = np.ones(len(events), bool)
     fewer[off[::2]] = False
     recorded = sums(events.part(fewer), clip, 0, 3)
-    apart, together = (Search(clip.with_events(events.part(fewer)), emulator_config(kind), 3, 0, None).target
-                       for kind in ("esim", "voltmeter"))  # fmt: skip
+    spoilt = clip.with_events(events.part(fewer))
+    asked = lambda kind: target(sums(spoilt.events, spoilt, 0, 3), together=emulator_config(kind).one_threshold)
+    apart, together = asked("esim"), asked("voltmeter")
     assert together.together and not apart.together
     assert np.count_nonzero(together.block == "rate") == np.count_nonzero(apart.block == "rate") / 2
     on = np.exp(together.values[together.block == "rate"][-1]) * recorded.pixels[:, 0].sum() * recorded.seconds.sum()

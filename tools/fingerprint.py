@@ -5,7 +5,8 @@
     python -m blinkgl.tools.fingerprint --only wave,v2e       # some cases
 
 ``tests/fingerprint/cases.yaml`` has the cases: small pictures of every feature that a user was promised. The sums lie
-beside it, one file for each platform (:func:`platform_name`): rasterisers and NumPy versions round differently.
+beside it, one file for each platform (:func:`platform_name`): rasterisers, NumPy versions and processors with AVX-512
+round differently.
 A sum covers the names and bytes of the files in one folder. ``manifest.json`` and ``config.yaml`` are left
 out: they name versions and every key of the configuration, so that a removed key would change every case.
 """
@@ -44,10 +45,13 @@ NOT_DATA = re.compile(r"(^|/)(manifest\.json|config\.yaml|rig\.yaml|README\.md|\
 
 
 def platform_name() -> str:
-    """Return the name of what decides the last bits: rasteriser, its version, NumPy's version."""
+    """Return the name of what decides the last bits: rasteriser, NumPy, and the instructions that NumPy's sums use."""
     with create_context() as gl:
         drawn_by = f"{gl.renderer} {gl.version}"
-    words = re.sub(r"[^A-Za-z0-9.]+", "-", f"{drawn_by} numpy-{np.__version__}")
+    found = np.show_config(mode="dicts")["SIMD Extensions"]["found"]
+    # With AVX-512 (level 4 of x86-64) products and sines round the last bit of a pose differently than with AVX2.
+    level = max((name for name in found if name.startswith("X86_V")), default="baseline")
+    words = re.sub(r"[^A-Za-z0-9.]+", "-", f"{drawn_by} numpy-{np.__version__} {level}")
     return words.strip("-")
 
 

@@ -4,9 +4,9 @@
     python -m blinkgl.tools.sensors --recordings ../shared/data/events --left-out          # the judge
 
 One set of parameters for all recordings of a camera, by the same search as `blinkgl calibrate`; what of it goes into
-the file (``emulators.…``) is printed as YAML. Noise of single pixels is the file's ``readout.pixels``, so the emulators'
-own is off. ``--left-out`` fits without one recording at a time and judges by that one, whole: two cameras of one name
-differ, and so does one with other bias settings, so this is what a user of the file may expect.
+the file (``emulators.…``) is printed as YAML. Noise of single pixels is the file's ``readout.pixels``, so that of the
+emulators is off. ``--left-out`` fits without one recording at a time and judges by that one, whole: two cameras of one
+name differ, and so does one with other bias settings, so this is what a user of the file may expect.
 
 evbench (fbarranco/eventVision-evbench, ``DATA/sequences``) has a sequence that is not among the small recordings; its
 rows are turned over, its polarity inverted, and its frames' times are known by correlation alone.

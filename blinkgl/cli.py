@@ -272,20 +272,17 @@ def report(
     folder: Annotated[str, typer.Argument(metavar="DIR", help="Data set.")],
     out: Annotated[str | None, typer.Option("--out", "-o", help="The page (default: DIR/report.html).")] = None,
     examples: Annotated[int, typer.Option(min=0, max=100, help="Sequences shown in pictures.")] = 6,
-    card: Annotated[bool, typer.Option("--card", help="Also DIR/README.md, for data hubs.")] = False,
-    licence: Annotated[str | None, typer.Option("--license", help="On the card, e.g. cc-by-4.0.")] = None,
-    url: Annotated[str | None, typer.Option("--url", help="On the card: where the data set is found.")] = None,
 ) -> int:
     """Write one self-contained HTML page about a data set, and its index.jsonl."""
     from blinkgl.show import report as command
 
-    return command.run(folder, out, examples=examples, card=card, licence=licence, url=url)
+    return command.run(folder, out, examples=examples)
 
 
 @app.command()
 def export(
     folder: Annotated[str, typer.Argument(metavar="DIR", help="Data set, or one sequence of it.")],
-    out: Annotated[str | None, typer.Option("--out", "-o", help="Folder to write, as a whole or not at all.")] = None,
+    out: Annotated[str, typer.Option("--out", "-o", help="Folder to write, as a whole or not at all.")],
     layout: Annotated[
         str | None,
         typer.Option(
@@ -298,15 +295,11 @@ def export(
         int | None,
         typer.Option(min=0, help="Order of the samples in shards; a reader then only has to shuffle shards."),
     ] = None,
-    scene: Annotated[
-        str | None,
-        typer.Option("--scene", metavar="OUT.glb", help="Instead: one sequence as an animated glTF, for viewers."),
-    ] = None,
 ) -> int:
     """Write a data set as WebDataset shards, one sample per flow label, or as another data set's loaders read it."""
     from blinkgl.show import export as command
 
-    return command.run(folder, out, layout=layout, shard_mb=shard_mb, seed=seed, scene=scene)
+    return command.run(folder, out, layout=layout, shard_mb=shard_mb, seed=seed)
 
 
 @app.command()
@@ -492,7 +485,7 @@ def convert(
         str,
         typer.Argument(
             metavar="IN",
-            help="Event file: DSEC/BlinkFlow/MVSEC/Prophesee .h5, EVT2/EVT2.1/EVT3 .raw, .aedat4, .aedat, .es, "
+            help="Event file: DSEC/BlinkFlow/MVSEC .h5, EVT2/EVT2.1/EVT3 .raw, .aedat4, .aedat, .es, "
             ".mat, .txt, .csv, .npz, .npy.",
         ),
     ],
@@ -577,6 +570,8 @@ GONE = {
     "convert --format": "an ending that names the format: .raw is EVT3, .h5 DSEC's layout",
     "import --texture-size": "colours baked in Blender",
     "import --bake-seconds": "colours baked in Blender",
+    "export --scene": "the sequence's config.yaml and poses.npz: scenes are no longer written as glTF",
+    "report --card": "report.html and index.jsonl: the page of a data hub is yours to write",
     "shader time": "your driver's profiler, or blinkgl trade: passes are no longer timed",
     "shader show --active": "all lines, as the compiler gets them",
 }

@@ -262,6 +262,10 @@ class DsecEventReader:
                 if not isinstance(self._file.get(k), h5py.Dataset)
             ]
             if missing:
+                if "CD/events" in self._file:
+                    raise AssetError(
+                        "Prophesee's HDF5 files are not read", where=str(path), accepted="the camera's .raw"
+                    )
                 raise AssetError(f"not a DSEC event file: no dataset '{missing[0]}'", where=str(path))
             self._columns = {
                 k: dataset(self._file, f"events/{k}", self.path, shape=(None,), kinds="iub") for k in "xytp"

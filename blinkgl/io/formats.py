@@ -60,7 +60,6 @@ FORMATS = {
     for one in (
         EventFormat("dsec", HDF5, "dsec", "DsecEventReader", "DsecEventWriter", takes=("t_offset_us",), causes=True),
         EventFormat("mvsec", HDF5, "mvsec", "MvsecReader", dataset="davis/left/events"),
-        EventFormat("prophesee", HDF5, "prophesee", "PropheseeReader", dataset="CD/events"),
         EventFormat("evt3", (".raw",), "evt", "EvtReader", "EvtWriter"),
         EventFormat("aedat4", (".aedat4",), "aedat4", "Aedat4Reader"),
         EventFormat("aedat2", (".aedat",), "aedat2", "Aedat2Reader"),

@@ -1,7 +1,7 @@
 """One self-contained HTML page about a data set: examples, distributions, coverage of the recipe, cost, failures.
 
 In:    the folder of a data set.
-Out:   report.html; README.md (card.py).
+Out:   report.html and index.jsonl.
 Start: page.py (``build_report``) and templates/data_set.html; collect.py gathers, charts.py
 counts. calibration.py is the page of a fitted emulator. markup.py fills in any room's templates.
 """

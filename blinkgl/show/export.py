@@ -10,31 +10,10 @@ from blinkgl.machine.terminal import plain_console, say
 SHARDS = "webdataset"
 
 
-def run(
-    root: str,
-    out: str | None,
-    *,
-    layout: str | None,
-    shard_mb: float | None = None,
-    seed: int | None = None,
-    scene: str | None = None,
-) -> int:
-    """layout : "webdataset", the default, or one of :data:`~blinkgl.layouts.LAYOUTS`; scene : a .glb to write instead,
-    see :func:`~blinkgl.layouts.animated.export_scene`; the others are of
-    :func:`~blinkgl.dataset.shards.export_shards`. Raises ConfigError and as the three do."""
+def run(root: str, out: str, *, layout: str | None, shard_mb: float | None = None, seed: int | None = None) -> int:
+    """layout : "webdataset", the default, or one of :data:`~blinkgl.layouts.LAYOUTS`; the others are of
+    :func:`~blinkgl.dataset.shards.export_shards`. Raises ConfigError and as the two do."""
     console = plain_console()
-    if scene is not None:
-        for name, value in (("--out", out), ("--layout", layout), ("--shard-mb", shard_mb), ("--seed", seed)):
-            if value is not None:
-                raise ConfigError("one or the other", where=name, value=value, accepted="it without --scene")
-        from blinkgl.layouts.animated import export_scene
-
-        if left := export_scene(root, scene):
-            say(console, f"not in the file: {'; '.join(left)}")
-        say(console, f"written to {scene}")
-        return 0
-    if out is None:
-        raise ConfigError("nowhere to write", where="--out", accepted="--out FOLDER, or --scene FILE.glb")
     layout = layout or SHARDS
     if layout == SHARDS:
         with console.status("writing shards"):

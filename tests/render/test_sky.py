@@ -13,7 +13,6 @@ from blinkgl.config.sequence import RenderConfig
 from blinkgl.labels.frames import LabelRequest
 from blinkgl.render import reference
 from blinkgl.render.renderer import Renderer
-from blinkgl.scene.exporting import glb
 from blinkgl.scene.geometry.primitives import cuboid, grid
 from blinkgl.scene.lights import lit_by
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
@@ -111,8 +110,3 @@ def test_every_camera_of_a_rig_has_it_around_itself(gl):
     ):
         left, right = (one.luminance(SECOND // 3).read() for one in (first, second))
     np.testing.assert_array_equal(left, right)
-
-
-def test_a_glb_file_says_that_its_sky_is_near():
-    _, said = glb(world(MOVE), [0, SECOND], [0])
-    assert any("the sky's distance" in line for line in said)

@@ -18,9 +18,15 @@ _HOMES = {
     "blinkgl.front.surfaces": ("Light", "Material"),
     "blinkgl.front.scenes": ("Animation", "Body", "Camera", "Deform", "Mesh", "Primitive", "Scene", "Way"),
     "blinkgl.front.rigs": ("Rig", "RigSensor"),
-    "blinkgl.front.rig_sequences": ("RigRecording", "record_rig", "simulate_rig"),
     "blinkgl.front.runs": ("Timeline", "generate", "load", "verify"),
-    "blinkgl.front.sequences": ("Recording", "record", "simulate_sequence"),
+    "blinkgl.front.sequences": (
+        "Recording",
+        "RigRecording",
+        "record",
+        "record_rig",
+        "simulate_rig",
+        "simulate_sequence",
+    ),
     "blinkgl.front.drawing": ("Renderer", "render_frame"),
     "blinkgl.front.online": ("OnlineSequences",),
     "blinkgl.front.sensors": ("DvsVoltmeter", "Esim", "V2e", "load_sensor"),
@@ -40,7 +46,7 @@ _HOMES = {
     ),
     "blinkgl.types.events": ("Events",),
     "blinkgl.tensors": ("TensorEsim", "TensorEvents", "TensorV2e"),
-    "blinkgl.sequence.items": ("CameraImage", "EventChunk", "GroundTruth", "Picture"),
+    "blinkgl.sequence.request": ("CameraImage", "EventChunk", "GroundTruth", "Picture"),
     "blinkgl.labels.frames": ("Flow", "LabelFrame"),
     "blinkgl.online.samples": ("StreamSample", "WindowSample"),
     "blinkgl.online.stream": ("StreamStats",),
@@ -67,17 +73,16 @@ if TYPE_CHECKING:  # what a type checker and an editor see; a test compares it w
     )
     from blinkgl.front.online import OnlineSequences
     from blinkgl.front.poses import Keyframes, Pose, Trajectory, look_at
-    from blinkgl.front.rig_sequences import RigRecording, record_rig, simulate_rig
     from blinkgl.front.rigs import Rig, RigSensor
     from blinkgl.front.runs import Timeline, generate, load, verify
     from blinkgl.front.scenes import Animation, Body, Camera, Deform, Mesh, Primitive, Scene, Way
     from blinkgl.front.sensors import DvsVoltmeter, Esim, V2e, load_sensor
-    from blinkgl.front.sequences import Recording, record, simulate_sequence
+    from blinkgl.front.sequences import Recording, RigRecording, record, record_rig, simulate_rig, simulate_sequence
     from blinkgl.front.surfaces import Light, Material
     from blinkgl.labels.frames import Flow, LabelFrame
     from blinkgl.online.samples import StreamSample, WindowSample
     from blinkgl.online.stream import StreamStats
-    from blinkgl.sequence.items import CameraImage, EventChunk, GroundTruth, Picture
+    from blinkgl.sequence.request import CameraImage, EventChunk, GroundTruth, Picture
     from blinkgl.tensors import TensorEsim, TensorEvents, TensorV2e
     from blinkgl.types.events import Events
 

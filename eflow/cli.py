@@ -264,8 +264,8 @@ def predict(
     FWL is how much sharper the new window's events are when the flow takes them back to its start: above 1 it helps."""
     from blinkgl.types.events import Events
     from eflow import infer
-    from eflow.doubts import doubts
     from eflow.flow_of_file import Outputs, WindowsAsked, milliseconds, show_flows
+    from eflow.infer import doubts
 
     _one_of("--empty", empty, ("error", "zero"))
     asked = WindowsAsked(milliseconds(window_ms), start_ms, end_ms, whole)

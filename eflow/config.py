@@ -10,8 +10,7 @@ from pydantic import Field
 
 from blinkgl.config.base import Config, Refused, one_of, rule
 from blinkgl.config.problems import validate
-from blinkgl.config.reader import read_table
-from blinkgl.config.trees import apply_overrides
+from blinkgl.config.reader import apply_overrides, read_table
 from eflow import shipped
 
 

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors, remove_stale, temporary_beside
-from blinkgl.io.flow_png import write_flow_png
+from blinkgl.io.flow import write_flow_png
 from blinkgl.io.formats import EventFile, open_events
 from blinkgl.io.images import encode_npy
 from blinkgl.sequence_files.sequence_dir import refuse_existing
@@ -243,12 +243,12 @@ def read_truth(path: str | os.PathLike, height: int, width: int) -> np.ndarray:
         flow = np.moveaxis(flow, 0, -1) if flow.ndim == 3 and flow.shape[0] == 2 else flow
         flow = flow.astype(np.float32) if flow.ndim == 3 and flow.dtype.kind == "f" else flow
     elif path.suffix == ".flo":
-        from blinkgl.io.flo import read_flo
+        from blinkgl.io.flow import read_flo
 
         flow, valid = read_flo(path)
         flow = np.where(valid[..., None], flow, np.nan)
     else:
-        from blinkgl.io.flow_png import read_flow_png
+        from blinkgl.io.flow import read_flow_png
 
         flow, valid = read_flow_png(path)
         flow = np.where(valid[..., None], flow, np.nan)
@@ -314,3 +314,39 @@ class FlowWriter:
                 raise
         finally:
             shutil.rmtree(self._tmp, ignore_errors=True)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What makes one doubt a recording before a network is asked: clock ticks in place of µs, pixels that drown the rest.
+#
+# Neither is an error: a network answers all the same, and the answer is worth nothing.
+
+SLOWEST, FASTEST = 1e-3, 1e4
+"""Events per second and pixel that cameras give: a dark still scene has 0.05; a dead time of 100 µs allows 10,000."""
+FLOOD, FEW = 0.5, 0.005
+"""Share of the events in that share of the pixels, from which on they are said to be hot."""
+_ENOUGH = 1000
+
+
+def doubts(events: Events, height: int, width: int) -> list[str]:
+    """Lines about the first events of a recording of (height, width) px; empty where all is as it should be."""
+    if len(events) < _ENOUGH:
+        return []
+    found = []
+    seconds = max(int(events.t[-1]) - int(events.t[0]), 1) * 1e-6
+    rate = len(events) / seconds / (height * width)
+    if not SLOWEST <= rate <= FASTEST:
+        other = "ns, or ticks of the camera's clock" if rate < SLOWEST else "ms, or ticks of a slower clock"
+        found.append(
+            f"{rate:.2g} events per second and pixel are not a camera's (0.05 to 1000): are its times {other}, "
+            "instead of µs?"
+        )
+    counts = np.bincount(events.y.astype(np.int64) * width + events.x, minlength=height * width)
+    few = max(round(FEW * counts.size), 1)
+    share = np.partition(counts, -few)[-few:].sum() / len(events)
+    if share > FLOOD:
+        found.append(
+            f"{few} pixels ({100 * FEW:g} %) have {100 * share:.0f} % of the events: hot pixels, or a light that "
+            "flickers; flow there is not motion"
+        )
+    return found

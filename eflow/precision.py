@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
+from torch import Tensor
 
 from blinkgl.machine.cpu import bf16_instructions
 
@@ -32,7 +35,27 @@ def precision_on(device: torch.device, wanted: str, quiet: bool = False) -> str:
 def use_tf32(device: torch.device, wanted: bool = True) -> bool:
     """Whether fp32 products on a card are made of TF32 ones from here on, which have ten bits instead of 23 and are
     several times faster: where it is wanted and the card has them (capability 8.0 and above). Fp32 islands
-    (:func:`eflow.ops.precision.fp32`) stay exact."""
+    (:func:`eflow.precision.fp32`) stay exact."""
     able = wanted and device.type == "cuda" and torch.cuda.get_device_capability(device) >= (8, 0)
     torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = able
     return able
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Where bf16 is not good enough: softmax and expectation, coordinates, flow accumulation, upsampling (errors of px
+# otherwise).
+
+
+@contextmanager
+def fp32(x: Tensor) -> Iterator[None]:
+    """Context in which autocast, and on a card TF32, are off: an fp32 island. Cast the inputs with ``.float()``."""
+    with torch.autocast(x.device.type if x.device.type in ("cpu", "cuda") else "cpu", enabled=False):
+        # TF32 keeps 10 bits of a float32's fraction.
+        tf32 = x.device.type == "cuda" and torch.backends.cuda.matmul.allow_tf32
+        if tf32:
+            torch.backends.cuda.matmul.allow_tf32 = False
+        try:
+            yield
+        finally:
+            if tf32:
+                torch.backends.cuda.matmul.allow_tf32 = True

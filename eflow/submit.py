@@ -13,7 +13,8 @@ import numpy as np
 
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.atomic import atomic_file
-from blinkgl.io.flow_png import encode_flow_png, encode_png
+from blinkgl.io.flow import encode_flow_png
+from blinkgl.io.images import encode_png
 from eflow.data.dataset import FlowDataset, collate
 from eflow.data.sources import FolderSource, open_source
 from eflow.infer import predict

@@ -32,17 +32,16 @@ from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.sequence_files.sequence_dir import refuse_existing
 from eflow import checkpoint as ckpt
 from eflow.allocator import keep_memory
+from eflow.checkpoint import resume_run, weights_of
 from eflow.config import OptimConfig, TrainConfig
 from eflow.data.dataset import FlowDataset, StepSampler, batches, is_endless
 from eflow.data.sources import Source
-from eflow.losses import sequence_loss
+from eflow.metrics import sequence_loss
 from eflow.models import FlowModel, build_model
 from eflow.pictures import comparison, events_of, write_picture
 from eflow.precision import precision_on, use_tf32
-from eflow.progress import TrainProgress, Waiting, told
-from eflow.resume import resume_run, weights_of
+from eflow.progress import Log, Readings, Signals, TrainProgress, Waiting, told
 from eflow.training_data import check_sizes, training_sets, validate, validation_sets
-from eflow.training_log import Log, Readings, Signals
 
 
 @dataclass

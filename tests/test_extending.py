@@ -60,7 +60,7 @@ def test_a_file_format(code, tmp_path):
 
 def test_a_network(code):
     torch = pytest.importorskip("torch")
-    from eflow.losses import sequence_loss
+    from eflow.metrics import sequence_loss
 
     made = code("A network")
     model = made.Tiny(made.TinyConfig(width=8))

@@ -27,7 +27,7 @@ from blinkgl.config.problems import validate
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.config.scene import TEXTURE_KINDS, RandomSceneConfig
 from blinkgl.events import Events, make_emulator
-from blinkgl.events.readout import Readout
+from blinkgl.events.camera import Readout
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.geometry import BUILDERS
 from blinkgl.scene.geometry.meshes import make_mesh

@@ -29,15 +29,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from blinkgl.config.reader import read_table, to_yaml
+from blinkgl.config.reader import merge, read_table, to_yaml
 from blinkgl.config.run import load_run
-from blinkgl.config.trees import merge
 from blinkgl.dataset.generate import generate_run
 from blinkgl.events.table import EMULATORS
 from blinkgl.gl import create_context
 from blinkgl.io.formats import convert
-from blinkgl.layouts.export import export_layout
-from blinkgl.layouts.table import LAYOUTS
+from blinkgl.layouts.export import LAYOUTS, export_layout
 from blinkgl.recordings.simulation import file_to_events
 
 HERE = Path(__file__).resolve().parents[1] / "tests" / "fingerprint"

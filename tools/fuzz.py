@@ -35,11 +35,10 @@ import trimesh
 
 from blinkgl.config.run import load_run
 from blinkgl.errors import BlinkGLError
-from blinkgl.io.flo import read_flo, write_flo
-from blinkgl.io.flow_png import read_flow_png, write_flow_png
+from blinkgl.io.flow import read_flo, read_flow_png, write_flo, write_flow_png
 from blinkgl.io.formats import open_events, write_events
 from blinkgl.io.frames import open_frames
-from blinkgl.io.pfm import write_pfm
+from blinkgl.io.images import write_pfm
 from blinkgl.scene.importing.mesh_files import load_asset
 from blinkgl.types.events import Events
 

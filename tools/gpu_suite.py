@@ -41,7 +41,7 @@ from blinkgl.gl import create_context
 from blinkgl.io.atomic import atomic_file
 from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
-from blinkgl.show import checks
+from blinkgl.show import doctor
 from blinkgl.tensors import TensorEsim, TensorV2e, voxel_grid
 from blinkgl.tools import bench_accuracy
 from blinkgl.tools.bench import probe_scene
@@ -75,7 +75,7 @@ VARIANTS = {
 
 def doctor_piece(options: Namespace) -> Iterator[Row]:
     """What the machine has."""
-    for check in checks.examine(options.backend, options.egl_device).checks:
+    for check in doctor.examine(options.backend, options.egl_device).checks:
         line = asdict(check)
         yield {"": f"{line.pop('section')}: {line.pop('name')}", **line}
 

@@ -19,11 +19,9 @@ from importlib import resources
 from pathlib import Path
 
 from blinkgl.config.quality import QUALITIES
-from blinkgl.config.reader import to_yaml
+from blinkgl.config.reader import apply_overrides, to_yaml
 from blinkgl.config.run import RunTemplate
-from blinkgl.config.trees import apply_overrides
-from blinkgl.trade.pareto import excess
-from blinkgl.trade.settings import suite_design
+from blinkgl.trade.settings import excess, suite_design
 
 KEPT = (
     "name",

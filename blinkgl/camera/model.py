@@ -135,7 +135,7 @@ class CameraModel(ABC):
         return f"{self.width}x{self.height}, fx {self.fx:.0f} px"
 
     def clip_from_cam(self) -> np.ndarray:
-        """(4, 4) float64 from camera axes to clip space (:mod:`blinkgl.render.matrices`).
+        """(4, 4) float64 from camera axes to clip space (:mod:`blinkgl.render.moment`).
 
         Raises ConfigError: only a pin-hole image is a matrix's work; for a lens one is drawn
         (:func:`blinkgl.camera.drawing.seen_through`)."""

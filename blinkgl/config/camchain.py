@@ -28,8 +28,8 @@ from typing import Any
 import numpy as np
 
 from blinkgl.camera import CAMERA_MODELS, CameraModel, PinHole
-from blinkgl.camera.rectified import rectified
-from blinkgl.config.places import rigid_matrix
+from blinkgl.camera.pinhole import rectified
+from blinkgl.config.poses import rigid_matrix
 from blinkgl.config.reader import read_table, to_yaml
 from blinkgl.errors import ConfigError
 
@@ -106,7 +106,7 @@ def cam_to_cam_yaml(
     disparity_to_depth: Mapping[str, Any] | None = None,
 ) -> str:
     """Text of DSEC's ``cam_to_cam.yaml``: the raw cameras cam0 … and the rectified ones, whose axes are theirs
-    (:func:`blinkgl.camera.rectified.rectified`).
+    (:func:`blinkgl.camera.pinhole.rectified`).
 
     numbers : of the cameras, where they are not 0, 1, …: DSEC's right event camera is cam3.   disparity_to_depth : the
     table of that name, ``cams_03`` -> 4 x 4."""

@@ -21,10 +21,17 @@ from pydantic import Field
 from blinkgl.config.base import Config
 from blinkgl.config.camera import calibrated
 from blinkgl.config.problems import validate
-from blinkgl.config.reader import read_table
+from blinkgl.config.reader import (
+    Table,
+    each_option,
+    merge,
+    read_table,
+    shipped,
+    shipped_names,
+    with_groups,
+    with_sections,
+)
 from blinkgl.config.sensor import sensor_file_or_name
-from blinkgl.config.shipped import shipped, shipped_names
-from blinkgl.config.trees import Table, each_option, merge, with_groups, with_sections
 from blinkgl.errors import ConfigError
 
 

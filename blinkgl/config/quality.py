@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from blinkgl.config.shipped import shipped
+from blinkgl.config.reader import shipped
 
 Quality = Literal["fast", "balanced", "accurate", "reference", "auto"]
 QUALITIES = ("fast", "balanced", "accurate", "reference")

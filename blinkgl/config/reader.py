@@ -10,6 +10,10 @@ is text in YAML 1.1: the models convert it.
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +23,7 @@ from yaml.constructor import ConstructorError, SafeConstructor
 from yaml.nodes import MappingNode, Node, ScalarNode
 from yaml.resolver import Resolver
 
+from blinkgl.config.draw import is_distribution
 from blinkgl.errors import ConfigError
 
 MAX_BYTES = 4 << 20
@@ -206,3 +211,136 @@ def to_short_yaml(tree: Any) -> str:
 class _Dumper(yaml.SafeDumper):
     def ignore_aliases(self, data: Any) -> bool:
         return True
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Plain trees of configurations, as YAML gives them: laid over one another, changed in several places at once.
+
+Table = dict[str, Any]
+_TAGS = ("kind", "emulator")
+_WHOLE = ("sensor",)
+"""Keys whose tables are not mixed: another camera is another camera."""
+
+
+def merge(common: Any, own: Any) -> Any:
+    """``own`` laid over ``common``: tables key by key; anything else, a distribution, or a table of another kind
+    (``kind: explicit`` over ``kind: random``) replaces what was there."""
+    both = (
+        isinstance(common, dict) and isinstance(own, dict) and not is_distribution(common) and not is_distribution(own)
+    )
+    if not both or any(tag in own and own[tag] != common.get(tag) for tag in _TAGS):
+        return copy.deepcopy(own)
+    laid = {key: copy.deepcopy(value) if key in _WHOLE else merge(common.get(key), value) for key, value in own.items()}
+    return {**copy.deepcopy(common), **laid}
+
+
+def each_option(node: Any, change: Callable[[Any], Any]) -> Any:
+    """``node`` changed, or each of the options that it is drawn from."""
+    if not is_distribution(node):
+        return change(node)
+    kind, spec = next(iter(node.items()))
+    if kind == "choice" and isinstance(spec, list):
+        return {kind: [each_option(option, change) for option in spec]}
+    if kind == "shares" and isinstance(spec, list) and all(isinstance(p, dict) and "value" in p for p in spec):
+        return {kind: [{**part, "value": each_option(part["value"], change)} for part in spec]}
+    return node
+
+
+def with_groups(tree: Table, change: Callable[[Table], Table]) -> Table:
+    """``tree`` changed, and each of the groups that it holds; what is no group is left to validation."""
+    changed, groups = change(tree), tree.get("groups")
+    if isinstance(groups, dict):
+        changed["groups"] = {
+            name: change(group) if isinstance(group, dict) and "groups" not in group else group
+            for name, group in groups.items()
+        }
+    return changed
+
+
+def with_sections(tree: Table, change: Callable[[Table], Table]) -> Table:
+    """``tree`` with the table of every sensor that ``sensors:`` lists changed."""
+    given = tree.get("sensors")
+    if not isinstance(given, list):
+        return tree
+    return {**tree, "sensors": [change(one) if isinstance(one, dict) else one for one in given]}
+
+
+def apply_overrides(tree: Table, overrides: Sequence[str]) -> Table:
+    """Copy of ``tree`` with ``--set`` options applied; tables on the way are made when absent."""
+    tree = copy.deepcopy(tree)
+    for option in overrides:
+        dotted, equals, text = option.partition("=")
+        keys = dotted.strip().split(".")
+        if not equals or not all(keys):
+            raise ConfigError("not an override", where="--set", value=option, accepted="path.to.key=value")
+        value = parse_yaml(text, f"--set {dotted}")
+        node: Any = tree
+        for depth, key in enumerate(keys):
+            last = depth == len(keys) - 1
+            if isinstance(node, list):
+                if not key.isdigit() or int(key) >= len(node):
+                    raise ConfigError(
+                        "no such list entry",
+                        where="--set " + ".".join(keys[: depth + 1]),
+                        value=key,
+                        accepted=f"0 … {len(node) - 1}",
+                    )
+                key = int(key)
+            elif not isinstance(node, dict):
+                raise ConfigError(
+                    "is a plain value and has no keys", where="--set " + ".".join(keys[:depth]), value=node
+                )
+            if last:
+                node[key] = value
+            elif isinstance(node, dict):
+                if node.get(key) is None:
+                    node[key] = {}
+                node = node[key]
+            else:
+                node = node[key]
+    return tree
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What ships with the program, by name: runs, and tables of sensors, rigs, quality presets, emulators' recipes.
+
+
+@lru_cache
+def shipped_names(kind: str) -> tuple[str, ...]:
+    """Names of all of a kind, a folder of ``blinkgl/configs``, sorted."""
+    files = (resources.files("blinkgl.configs") / kind).iterdir()
+    return tuple(sorted(file.name.removesuffix(".yaml") for file in files if file.name.endswith(".yaml")))
+
+
+def shipped(kind: str, name: str) -> dict[str, Any]:
+    """A copy of the table of this name, one of :func:`shipped_names`."""
+    return copy.deepcopy(_read(kind, name))
+
+
+@lru_cache
+def _read(kind: str, name: str) -> dict[str, Any]:
+    text = (resources.files("blinkgl.configs") / kind / f"{name}.yaml").read_text(encoding="utf-8")
+    return parse_yaml(text, f"{kind}/{name}.yaml")
+
+
+_RUNS = ("*.yaml", "scenes/*.yaml", "eflow/*_data.yaml")
+
+
+@lru_cache
+def shipped_runs() -> dict[str, Path]:
+    """The files of whole runs, by name: "demo", "flags" …"""
+    folder = Path(str(resources.files("blinkgl.configs")))
+    return {path.stem: path for pattern in _RUNS for path in sorted(folder.glob(pattern))}
+
+
+def run_file(given: str | Path) -> Path:
+    """The file ``given``, or, where there is none, the shipped run that it names: "demo", "demo.yaml" and
+    "configs/demo.yaml" are one. Raises ConfigError."""
+    path = Path(given)
+    if path.exists() or path.is_symlink():
+        return path
+    shipped_one = shipped_runs().get(path.stem)
+    named = shipped_one is not None and shipped_one.as_posix().endswith(f"/{path.with_suffix('.yaml').as_posix()}")
+    if shipped_one is not None and (named or path.parent == Path()):
+        return shipped_one
+    raise ConfigError("no such file", where=str(given), accepted="a YAML file, or a name that 'blinkgl configs' lists")

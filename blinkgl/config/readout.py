@@ -53,7 +53,7 @@ class PixelsConfig(Config):
 
 
 class ReadoutConfig(Config):
-    """The bus between pixels and time stamps; see :mod:`blinkgl.events.readout`. Before it the pixels' own noise:
+    """The bus between pixels and time stamps; see :mod:`blinkgl.events.camera`. Before it the pixels' own noise:
     :mod:`blinkgl.events.pixels`."""
 
     removed: ClassVar = {

@@ -27,9 +27,9 @@ from typing import Any
 
 from blinkgl.config.draw import is_distribution
 from blinkgl.config.problems import validate_field
+from blinkgl.config.reader import merge
 from blinkgl.config.run import RunTemplate
 from blinkgl.config.sequence import SequenceConfig
-from blinkgl.config.trees import merge
 from blinkgl.errors import ConfigError
 
 

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from blinkgl.config.base import remembering
-from blinkgl.config.corners import Fill, corners, sites
-from blinkgl.config.draw import draw, is_distribution
+from blinkgl.config.draw import Fill, corners, draw, is_distribution, sites
 from blinkgl.config.expansion import expanded, with_scenes
 from blinkgl.config.labels import fill_causes
 from blinkgl.config.problems import validate, validate_field
 from blinkgl.config.quality import fill_quality, with_default
-from blinkgl.config.reader import read_table
+from blinkgl.config.reader import apply_overrides, read_table, run_file
 from blinkgl.config.rig import (
     SECTIONS,
     check_pairs,
@@ -24,8 +23,6 @@ from blinkgl.config.rig import (
 )
 from blinkgl.config.sensor import fill_sensor
 from blinkgl.config.sequence import SequenceConfig
-from blinkgl.config.shipped import run_file
-from blinkgl.config.trees import apply_overrides
 from blinkgl.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -96,7 +93,7 @@ class RunTemplate:
         return self.corners()[0]
 
     def corners(self) -> list[SequenceConfig]:
-        """Configurations that stand for all that can be drawn (:mod:`blinkgl.config.corners`). Raises ConfigError."""
+        """Configurations that stand for all that can be drawn (:mod:`blinkgl.config.draw`). Raises ConfigError."""
         with remembering():
             return [_validated(tree) for tree in corners(with_default(self.tree))]
 
@@ -147,7 +144,7 @@ def load_run(path: str | Path, overrides: Sequence[str] = (), *, seed: int | Non
     """Reads a YAML file and the files that its scenes come from, applies ``a.b=c`` overrides (c is YAML) and an
     optional seed, checks all that can be drawn.
 
-    path : of a file, or the name of a run that ships, such as "demo" (:func:`~blinkgl.config.shipped.shipped_runs`).
+    path : of a file, or the name of a run that ships, such as "demo" (:func:`~blinkgl.config.reader.shipped_runs`).
     Raises ConfigError: missing or unreadable file, bad YAML (with line and column), unknown key, bad value."""
     path = run_file(path)
     base = path.parent

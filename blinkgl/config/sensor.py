@@ -28,13 +28,11 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Discriminator, Field, Tag
 
 from blinkgl.config.base import Config, Refused, rule
-from blinkgl.config.corners import corners
-from blinkgl.config.draw import draw, is_distribution, middle
+from blinkgl.config.draw import corners, draw, is_distribution, middle
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.problems import validate
-from blinkgl.config.reader import read_table
+from blinkgl.config.reader import read_table, shipped, shipped_names
 from blinkgl.config.readout import ReadoutConfig
-from blinkgl.config.shipped import shipped, shipped_names
 from blinkgl.errors import ConfigError
 
 

@@ -2,7 +2,7 @@
 
 ``load_run(path, overrides)`` reads a YAML file; ``RunTemplate.sequence(i)`` draws the i-th sequence's parameters
 and returns a frozen, validated :class:`SequenceConfig` of plain values. What can be drawn is checked when the file is
-read (:mod:`blinkgl.config.corners`).
+read (:mod:`blinkgl.config.draw`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from blinkgl.config.base import Config, Refused, Removed, rule
 from blinkgl.config.camera import CameraConfig, camera_radius
 from blinkgl.config.events import EmulatorConfig, EsimConfig
 from blinkgl.config.frames import MAX_SPAN_S, FramesConfig
-from blinkgl.config.gl import GLConfig
 from blinkgl.config.images import ImagesConfig, check_images, readout_us
 from blinkgl.config.imu import ImuConfig, check_imu
 from blinkgl.config.labels import LabelsConfig
@@ -33,6 +32,22 @@ from blinkgl.config.tracks import TracksConfig, check_tracks
 
 if TYPE_CHECKING:
     pass
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# ``gl:`` section: which OpenGL implementation renders.
+
+
+class GLConfig(Config):
+    """Where the OpenGL context comes from (see :func:`blinkgl.gl.create_context`)."""
+
+    backend: Literal["auto", "egl", "osmesa"] = Field(
+        "auto", description="auto: EGL, and OSMesa (software) when EGL is missing; egl or osmesa: that one or an error"
+    )
+    device: int = Field(
+        0, ge=0, description="number of the EGL device as `blinkgl doctor` lists them; without meaning for osmesa"
+    )
+
 
 NS_PER_S = 1_000_000_000
 MAX_LABELS = 1_000_000

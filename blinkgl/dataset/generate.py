@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -12,21 +12,75 @@ import numpy as np
 
 import blinkgl
 from blinkgl.config.run import RunTemplate
-from blinkgl.config.sequence import SequenceConfig
+from blinkgl.config.sequence import PreviewConfig, SequenceConfig
 from blinkgl.dataset.plan import Plan, check_output, sequence_name
-from blinkgl.dataset.preview import PreviewRecorder
 from blinkgl.dataset.report import Progress, SequenceReport, config_yaml, losses
 from blinkgl.gl import GLContext, create_context
-from blinkgl.imaging.metering import decibels
+from blinkgl.imaging.exposure import decibels
 from blinkgl.io.frame_camera import ExposureLine
 from blinkgl.io.tracks import TRACKS
 from blinkgl.labels import LABELS
 from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Item, Picture, SequenceRequest, Simulation
-from blinkgl.sequence.clock import StageClock
+from blinkgl.sequence.request import StageClock
 from blinkgl.sequence.rig import RigSequence, simulate_rig
-from blinkgl.sequence_files.lens_files import write_lens
-from blinkgl.sequence_files.rig_dir import RigWriter
+from blinkgl.sequence_files.preview import Panels, RigPreviewWriter
+from blinkgl.sequence_files.rig_dir import RigWriter, write_lens
 from blinkgl.sequence_files.sequence_dir import SequenceWriter, refuse_existing
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Feeds the preview while a sequence happens.
+
+
+class PreviewRecorder:
+    """Context manager; does nothing where no sequence gives pictures. The flow panel shows the instantaneous
+    velocity times the label interval, which is what the flow labels look like for small
+    motions; recorded frames have none.
+
+    sequences : of one camera, or of those of a rig, shown one below the other by their names."""
+
+    def __init__(self, config: PreviewConfig, sequences: Sequence[Simulation], writer: SequenceWriter):
+        self._shown = {id(one): k for k, one in enumerate(one for one in sequences if one.pictures_hz is not None)}
+        self._video: RigPreviewWriter | None = None
+        shown = [one for one in sequences if id(one) in self._shown]
+        if not shown:
+            return
+        self._clock = shown[0].clock
+        rate, time = config.rate if shown[0].pictures_hz is None else shown[0].pictures_hz, shown[0].config.time
+        self._interval_s = np.float32(time.interval_ns * 1e-9)
+        panels = [
+            Panels(
+                one.height,
+                one.width,
+                t0_us=one.t0_ns // 1000,
+                flow=one.config.frames is None,
+                rate_hz=rate,
+                fps=rate / config.slowdown,
+                label=one.name or "frame",
+            )
+            for one in shown
+        ]
+        self._video = RigPreviewWriter(writer.path("preview.mp4"), panels, rate / config.slowdown)
+
+    def take(self, sequence: Simulation, item: Item) -> None:
+        """All that happens in a sequence, in order."""
+        if self._video is None or (number := self._shown.get(id(sequence))) is None:
+            return
+        if isinstance(item, EventChunk):
+            with sequence.clock("preview"):
+                self._video.panels[number].add_events(item.events)
+        elif isinstance(item, Picture):
+            with sequence.clock("preview"):
+                if item.velocity is not None:
+                    self._video.panels[number].set_flow(item.velocity * self._interval_s)
+                self._video.frame(number, item.t_ns // 1000, item.image)
+
+    def __enter__(self) -> PreviewRecorder:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self._video is not None:
+            with self._clock("preview"):
+                self._video.close() if kind is None else self._video.abort()
 
 
 def generate_run(

@@ -28,7 +28,7 @@ from blinkgl.scene.motion.dynamics import engine_version
 from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash
 from blinkgl.scene.worlds.pool import files_below, resolve
 from blinkgl.scene.worlds.random_world import pools
-from blinkgl.sequence.folders import matching_folders, used_images
+from blinkgl.sequence.recorded import matching_folders, used_images
 
 
 @dataclass(frozen=True)

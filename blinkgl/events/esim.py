@@ -25,9 +25,8 @@ from numba.extending import register_jitable
 
 from blinkgl.config.events import EsimConfig
 from blinkgl.events.arith import Q_ONE, log_q25
-from blinkgl.events.blocks import compact_flags, copy_block, lookup_block
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
-from blinkgl.events.packing import JIT, T_SHIFT
+from blinkgl.events.packing import JIT, T_SHIFT, compact_flags, copy_block, lookup_block
 from blinkgl.events.philox import Stream, normal2, pixel_counters
 from blinkgl.events.response import Response, smallest_threshold
 from blinkgl.events.table import register

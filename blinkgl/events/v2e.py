@@ -27,24 +27,23 @@ import numpy as np
 
 from blinkgl.config.events import EsimConfig, V2eConfig
 from blinkgl.errors import EventDataError
-from blinkgl.events.blocks import compact_flags, copy_block, lookup_block, scale_block
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
 from blinkgl.events.esim import draw_thresholds
 from blinkgl.events.noise import noise_table
-from blinkgl.events.packing import JIT
+from blinkgl.events.packing import JIT, compact_flags, copy_block, lookup_block, scale_block
 from blinkgl.events.response import Response, smallest_threshold
 from blinkgl.events.table import register
 from blinkgl.events.threads import take_part
 from blinkgl.events.v2e_blocks import (
     DRAWS,
     add_scaled_block,
+    emit,
     flag_block,
     lin_log_block,
     noise_block,
     relax_block,
     shot_block,
 )
-from blinkgl.events.v2e_emit import emit
 from blinkgl.events.v2e_model import (
     DARKEST,
     REBASE,

@@ -35,9 +35,17 @@ import numpy as np
 from numba.extending import register_jitable
 
 from blinkgl.config.events import EsimConfig, VoltmeterConfig
-from blinkgl.events.blocks import compact_flags, copy_block, lookup_block, scale_block
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
-from blinkgl.events.packing import CAUSE_SHIFT, JIT, T_SHIFT, cause_of
+from blinkgl.events.packing import (
+    CAUSE_SHIFT,
+    JIT,
+    T_SHIFT,
+    cause_of,
+    compact_flags,
+    copy_block,
+    lookup_block,
+    scale_block,
+)
 from blinkgl.events.philox import Stream, normal2_and_uniform
 from blinkgl.events.response import Response
 from blinkgl.events.table import register

@@ -13,8 +13,7 @@ from blinkgl.front.runs import load
 from blinkgl.online.cuts import CUTS
 from blinkgl.online.job import StreamJob, stream_seed
 from blinkgl.online.samples import StreamSample, WindowSample
-from blinkgl.online.share import Share, share_of_process
-from blinkgl.online.stream import SampleStream, StreamStats
+from blinkgl.online.stream import SampleStream, Share, StreamStats, share_of_process
 
 if TYPE_CHECKING:
     from blinkgl.online.loader import Batches

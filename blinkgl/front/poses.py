@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from blinkgl.config.base import Config, Refused
-from blinkgl.config.places import check_rigid, rigid_matrix
-from blinkgl.config.poses import KeyedMotionConfig, PoseConfig
+from blinkgl.config.poses import KeyedMotionConfig, PoseConfig, check_rigid, rigid_matrix
 from blinkgl.config.problems import validate
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, TypedDict
 from blinkgl.config.draw import middle
 from blinkgl.config.expansion import expanded
 from blinkgl.config.problems import validate_field
+from blinkgl.config.reader import merge
 from blinkgl.config.run import RunTemplate, load_run
 from blinkgl.config.sequence import SequenceConfig
-from blinkgl.config.trees import merge
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.front.rigs import Rig, rig_of

@@ -2,7 +2,7 @@
 
 In:    a renderer, ``images:`` and the span of a sequence.
 Out:   :class:`CameraImage`, one after the other, each when its last row has been exposed.
-Start: frame_camera.py; exposure.py, lens.py, sensor.py, response.py and metering.py are what it is made of.
+Start: frame_camera.py; exposure.py (how long), lens.py and sensor.py (codes) are what it is made of.
 """
 
 from blinkgl.imaging.frame_camera import CameraImage, FrameCamera

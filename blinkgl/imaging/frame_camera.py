@@ -17,14 +17,12 @@ import numpy as np
 
 from blinkgl.config.images import NS_PER_US, ImagesConfig, exposure_starts
 from blinkgl.imaging import lens as thin_lens
-from blinkgl.imaging.exposure import Exposure, accumulate, instants
-from blinkgl.imaging.metering import Setting, factor, next_setting
-from blinkgl.imaging.response import encode
-from blinkgl.imaging.sensor import mosaic, readings
+from blinkgl.imaging.exposure import Exposure, Setting, accumulate, factor, instants, next_setting
+from blinkgl.imaging.sensor import encode, mosaic, readings
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.colour import LUMA
 from blinkgl.render.moment import View
-from blinkgl.timeline.speed import largest_speed
+from blinkgl.timeline.sampling import largest_speed
 
 if TYPE_CHECKING:
     from blinkgl.render.renderer import Renderer

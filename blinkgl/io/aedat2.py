@@ -21,7 +21,7 @@ import numba
 import numpy as np
 
 from blinkgl.errors import AssetError
-from blinkgl.io.davis import CameraFrame, G, ImuSamples
+from blinkgl.io.columns import CameraFrame, G, ImuSamples
 from blinkgl.types.events import Events
 
 MAGIC = b"#!AER-DAT"

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
-from blinkgl.io.columns import check_size, events_of
-from blinkgl.io.davis import CameraFrame, G, ImuSamples
+from blinkgl.io.columns import CameraFrame, G, ImuSamples, check_size, events_of
 from blinkgl.types.events import Events
 
 _ABSENT = {"events": "no events", "frame": "no frames", "imus": "no samples of an inertial unit"}

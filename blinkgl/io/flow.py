@@ -3,15 +3,114 @@
 from __future__ import annotations
 
 import os
+import struct
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from blinkgl.errors import AssetError, OutputError
-from blinkgl.io.atomic import atomic_file
-from blinkgl.io.flo import encode_flo, read_flo
-from blinkgl.io.flow_png import encode_flow_png, read_flow_png
-from blinkgl.io.images import encode_npy, read_npy
+from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.images import encode_npy, encode_png, read_npy, read_png
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Flow as 16-bit PNG: DSEC's (quantum 1/128 px, ±256 px) and KITTI's (1/64 px, ±512 px).
+#
+# On disk the channels are R = x, G = y, B = valid. OpenCV is the codec because imageio's default and Pillow silently
+# return 8 bits for 16-bit RGB; it speaks BGR, so the order is turned here and nowhere else.
+
+DSEC_SCALE = 128.0
+_ZERO = 1 << 15
+
+
+def encode_flow_png(flow: np.ndarray, valid: np.ndarray, *, scale: float = DSEC_SCALE) -> tuple[bytes, int]:
+    """PNG bytes of a flow field.
+
+    flow : (H, W, 2) float px, +x right, +y down. valid : (H, W) bool.
+    Returns (png, lost): ``lost`` counts valid pixels that the format cannot hold (beyond -256 … 255.99 px for DSEC, or
+    not finite). They are stored as invalid instead of being clipped to a wrong flow. Invalid pixels hold zero flow.
+    """
+    valid = np.asarray(valid, bool)
+    with np.errstate(invalid="ignore", over="ignore"):
+        code = np.asarray(flow, np.float32) * np.float32(scale)
+        np.rint(code, out=code)
+        code += np.float32(_ZERO)
+        if code.size and code.min() >= 0 and code.max() <= 65535:  # as nearly always; NaN is neither
+            holds = np.ones(valid.shape, bool)
+        else:
+            holds = ((code >= 0) & (code <= 65535)).all(axis=-1)
+    stored = valid & holds
+    code[~stored] = _ZERO
+    bgr = np.empty((*valid.shape, 3), np.uint16)
+    bgr[..., 0], bgr[..., 1:] = stored, code[..., ::-1]
+    # Level 1: half as large as level 0 and as fast; level 6 saves another half for three times the time.
+    return encode_png(bgr, cv2.IMWRITE_PNG_STRATEGY_DEFAULT), int(np.count_nonzero(valid & ~holds))
+
+
+def write_flow_png(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray, *, scale: float = DSEC_SCALE) -> int:
+    """Writes :func:`encode_flow_png`; returns the count of valid pixels the format could not hold."""
+    png, lost = encode_flow_png(flow, valid, scale=scale)
+    with output_errors(path):
+        Path(path).write_bytes(png)
+    return lost
+
+
+def read_flow_png(path: str | os.PathLike, *, scale: float = DSEC_SCALE) -> tuple[np.ndarray, np.ndarray]:
+    """flow (H, W, 2) float32 px (0 where invalid), valid (H, W) bool.
+
+    Raises AssetError when the file is not a 16-bit RGB PNG."""
+    raw = read_png(path)
+    if raw.dtype != np.uint16 or raw.ndim != 3 or raw.shape[2] != 3:
+        raise AssetError("not a flow PNG", where=str(path), value=f"{raw.dtype} {raw.shape}", accepted="16-bit RGB")
+    valid = raw[..., 0] > 0
+    flow = (raw[..., 2:0:-1].astype(np.float32) - np.float32(_ZERO)) / np.float32(scale)
+    return np.where(valid[..., None], flow, np.float32(0)), valid
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Middlebury .flo: float32 202021.25, int32 width, height, then u, v interleaved, rows top-down, little-endian.
+
+_TAG = 202021.25
+_UNKNOWN = 1e9
+_MAX_SIDE = 99999  # Middlebury's own reader refuses beyond
+
+
+def encode_flo(flow: np.ndarray, valid: np.ndarray | None = None) -> bytes:
+    """flow: (H, W, 2) px; where ``valid`` (H, W) is False, the format's "unknown" (1e10) is stored."""
+    data = np.array(flow, "<f4", order="C")
+    if valid is not None:
+        data[~np.asarray(valid, bool)] = 1e10
+    return struct.pack("<fii", _TAG, data.shape[1], data.shape[0]) + data.tobytes()
+
+
+def write_flo(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray | None = None) -> None:
+    """See :func:`encode_flo`. Raises OutputError."""
+    with output_errors(path):
+        Path(path).write_bytes(encode_flo(flow, valid))
+
+
+def read_flo(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
+    """flow (H, W, 2) float32 px (0 where unknown), valid (H, W) bool. AssetError: wrong tag, size or length."""
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
+    if len(data) < 12 or struct.unpack_from("<f", data)[0] != _TAG:
+        raise AssetError("not a .flo file: wrong tag", where=str(path), accepted=f"{_TAG}")
+    width, height = struct.unpack_from("<ii", data, 4)
+    if not (0 < width <= _MAX_SIDE and 0 < height <= _MAX_SIDE):
+        raise AssetError("impossible .flo size", where=str(path), value=(width, height))
+    if len(data) != 12 + 8 * width * height:
+        raise AssetError(
+            "truncated .flo file" if len(data) < 12 + 8 * width * height else "trailing bytes in .flo file",
+            where=str(path),
+            value=len(data),
+            accepted=f"{12 + 8 * width * height} bytes",
+        )
+    flow = np.frombuffer(data, "<f4", offset=12).reshape(height, width, 2).astype(np.float32)
+    valid = np.all(np.abs(flow) <= _UNKNOWN, axis=-1)  # NaN compares False
+    return np.where(valid[..., None], flow, np.float32(0)), valid
+
 
 ENDINGS = (".png", ".flo", ".npy")
 

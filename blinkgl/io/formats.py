@@ -17,8 +17,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.atomic import atomic_file
-from blinkgl.io.columns import check_events, check_size
-from blinkgl.io.davis import CameraFrame, ImuSamples
+from blinkgl.io.columns import CameraFrame, ImuSamples, check_events, check_size
 from blinkgl.types.events import Events
 
 

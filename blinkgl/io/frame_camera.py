@@ -20,8 +20,7 @@ import numpy as np
 
 from blinkgl.config.images import ImagesConfig
 from blinkgl.errors import AssetError
-from blinkgl.io.flow_png import encode_png
-from blinkgl.io.images import read_image
+from blinkgl.io.images import encode_png, read_image
 
 FOLDER = "frame_camera"
 STAMPS = f"{FOLDER}/images/timestamps.txt"

@@ -107,7 +107,7 @@ def open_frames(
 def read_any_image(path: Path) -> np.ndarray:
     """(H, W) or (H, W, 3) RGB; uint8, uint16 or float32 as the file holds. AssetError when undecodable."""
     if path.suffix.lower() == ".pfm":
-        from blinkgl.io.pfm import read_pfm
+        from blinkgl.io.images import read_pfm
 
         return read_pfm(path)
     if path.suffix.lower() == ".exr":

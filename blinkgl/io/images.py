@@ -7,15 +7,25 @@ import contextlib
 import io
 import math
 import os
+import re
+import struct
+import warnings
 import zipfile
+import zlib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import BinaryIO
 
+import cv2
 import numpy as np
+from PIL import Image
 
-from blinkgl.errors import AssetError
-from blinkgl.io.flow_png import encode_png, read_png
+from blinkgl.errors import AssetError, OutputError
+from blinkgl.io.atomic import output_errors
 from blinkgl.srgb import to_srgb8
+
+_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+_MAX_PIXELS = 1 << 28
 
 
 def encode_image(image: np.ndarray) -> bytes:
@@ -162,3 +172,122 @@ def numpy_errors(path: str | os.PathLike) -> Iterator[None]:
         raise AssetError(
             f"cannot read: {' '.join(str(error).split())[:160] or type(error).__name__}", where=str(path)
         ) from error
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Portable float map: "PF" (3 channels) or "Pf" (1), width height, scale (negative: little-endian), rows bottom-up.
+
+_HEADER = re.compile(
+    rb"^(PF|Pf)\s+(\d{1,9})\s+(\d{1,9})\s+([-+]?(?:\d{1,40}\.?\d{0,40}|\.\d{1,40})(?:[eE][-+]?\d{1,4})?)[ \t\r]?\n"
+)
+
+
+def encode_pfm(image: np.ndarray) -> bytes:
+    """(H, W) or (H, W, 3) float32, row 0 = top."""
+    image = np.asarray(image)
+    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
+        raise ValueError(f"PFM holds (H, W) or (H, W, 3), got {image.shape}")
+    kind = b"PF" if image.ndim == 3 else b"Pf"
+    return kind + f"\n{image.shape[1]} {image.shape[0]}\n-1.0\n".encode() + image[::-1].astype("<f4").tobytes()
+
+
+def write_pfm(path: str | os.PathLike, image: np.ndarray) -> None:
+    """See :func:`encode_pfm`. Raises OutputError."""
+    with output_errors(path):
+        Path(path).write_bytes(encode_pfm(image))
+
+
+def read_pfm(path: str | os.PathLike) -> np.ndarray:
+    """(H, W) or (H, W, 3) float32, row 0 = top. AssetError: wrong header or length."""
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
+    return decode_pfm(data, path)
+
+
+def decode_pfm(data: bytes, path: str | os.PathLike) -> np.ndarray:
+    """:func:`read_pfm` of bytes; ``path`` is for messages."""
+    header = _HEADER.match(data)
+    if not header:
+        raise AssetError("not a PFM file: wrong header", where=str(path))
+    kind, width, height, scale = header.group(1), int(header.group(2)), int(header.group(3)), float(header.group(4))
+    channels = 3 if kind == b"PF" else 1
+    expected = header.end() + 4 * width * height * channels
+    if len(data) != expected or width == 0 or height == 0 or not 0 < abs(scale) < float("inf"):
+        raise AssetError(
+            "truncated or malformed PFM file", where=str(path), value=f"{len(data)} bytes", accepted=f"{expected}"
+        )
+    pixels = np.frombuffer(data, "<f4" if scale < 0 else ">f4", offset=header.end()).astype(np.float32)
+    shape = (height, width, 3) if channels == 3 else (height, width)
+    return np.ascontiguousarray(pixels.reshape(shape)[::-1])
+
+
+def encode_png(image: np.ndarray, strategy: int = cv2.IMWRITE_PNG_STRATEGY_RLE) -> bytes:
+    """PNG at the fast end (level 1). (H, W) or (H, W, 3) in BGR order, uint8 or uint16."""
+    ok, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, strategy])
+    if not ok:
+        raise OutputError("PNG encoding failed", value=f"{image.dtype} {image.shape}")
+    return data.tobytes()
+
+
+def read_png(path: str | os.PathLike) -> np.ndarray:
+    """Pixels as stored, channels in OpenCV's BGR order, of a PNG or another image that OpenCV decodes; AssetError when
+    missing, truncated, undecodable, or of more than 2^28 px (what it would unpack to is known before that happens)."""
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise AssetError(f"cannot read image: {error.strerror}", where=str(path)) from error
+    if (problem := _image_problem(data)) is not None:
+        raise AssetError(problem, where=str(path))
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise AssetError("cannot decode image (corrupt or truncated)", where=str(path))
+    return image
+
+
+def _image_problem(data: bytes) -> str | None:
+    """What is wrong with an image file that OpenCV would pass over: it fills up what is missing with grey."""
+    if data[:8] == _PNG_MAGIC:
+        return _png_problem(data)
+    if data[:2] == b"\xff\xd8" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
+        return "cannot decode image (truncated)"
+    if data[:2] == b"#?":
+        found = re.search(rb"\n[-+][XY] (\d{1,9}) [-+][XY] (\d{1,9})\n", data[:8192])
+        size = found and (int(found[2]), int(found[1]))
+    else:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                with Image.open(io.BytesIO(data)) as opened:  # reads the header only
+                    size = opened.size
+        except Exception:  # noqa: BLE001 - unknown to Pillow, or damaged: its plug-ins raise anything; OpenCV decides
+            return "cannot decode image (corrupt or truncated)" if not len(data) else None
+    return _size_problem(*size) if size else "cannot decode image (no size in its header)"
+
+
+def _png_problem(data: bytes) -> str | None:
+    """Chunks (length, type, content, CRC) up to IEND, all there and undamaged? (PNG specification, section 5)"""
+    if data[12:16] != b"IHDR" or len(data) < 33:
+        return "cannot decode image (corrupt or truncated)"
+    at = 8
+    while at + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, at)
+        end = at + 12 + length
+        if end > len(data) or zlib.crc32(data[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
+            break
+        if kind == b"IEND":
+            return _size_problem(*struct.unpack_from(">II", data, 16))
+        at = end
+    return f"cannot decode image (corrupt or truncated at byte {at})"
+
+
+def _size_problem(width: int, height: int) -> str | None:
+    return (
+        None
+        if 0 < width * height <= _MAX_PIXELS
+        else f"image of {width}x{height} px is too large (at most {_MAX_PIXELS >> 20} Mpx)"
+    )

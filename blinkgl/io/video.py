@@ -14,7 +14,7 @@ import imageio_ffmpeg
 import numpy as np
 
 from blinkgl.errors import AssetError, OutputError
-from blinkgl.io.pfm import decode_pfm
+from blinkgl.io.images import decode_pfm
 
 
 class VideoWriter:

@@ -8,21 +8,16 @@ imported here: a YAML is read by it.
 """
 
 from blinkgl.labels.boxes import ObjectBoxes
-from blinkgl.labels.depth import Depth
+from blinkgl.labels.depth import Depth, Ids, Images, Normals, SceneFlow, Velocity
 from blinkgl.labels.disparity import Disparity
 from blinkgl.labels.files import Form
 from blinkgl.labels.flow import FlowTo
 from blinkgl.labels.frames import Flow, LabelFrame, LabelRequest
-from blinkgl.labels.ids import Ids
-from blinkgl.labels.images import Images
 from blinkgl.labels.intervals import FlowIntervals, Flows, OcclusionIntervals, Occlusions
 from blinkgl.labels.label import Label
-from blinkgl.labels.normals import Normals
 from blinkgl.labels.occlusion import OcclusionAt
-from blinkgl.labels.scene_flow import SceneFlow
 from blinkgl.labels.semantics import Semantics
 from blinkgl.labels.table import LABELS, asked_for, label_of, register, unregister
-from blinkgl.labels.velocity import Velocity
 
 for _row in (
     Images(),

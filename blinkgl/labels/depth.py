@@ -6,15 +6,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from blinkgl.labels import grading
-from blinkgl.labels.label import Drawn, Label
+from blinkgl.labels import files, grading
+from blinkgl.labels.files import Form
+from blinkgl.labels.label import Drawn, Label, View
 from blinkgl.scene.types import FARTHEST
 
 if TYPE_CHECKING:
+    from blinkgl.render.passes import Shot
     from blinkgl.render.reference import ReferenceFrame
     from blinkgl.scene.types import Scene
 
-_SHARE = 0.95
+
+_DEPTH_SHARE = 0.95
 """Of the pixels, that two renderers agree on: silhouettes may fall on either side."""
 
 
@@ -33,3 +36,144 @@ class Depth(Label):
 
     def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
         return np.where(frame.depth < FARTHEST, frame.depth, np.inf)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Which way the surface faces.
+
+
+class Normals(Label):
+    """(H, W, 3) float32 unit, camera axes (OpenCV), facing the camera; 0 where nothing is hit."""
+
+    name = "normals"
+    unit, kind = "camera axes", "unit"
+    shard = "normals.npy"
+    buffer, varyings, channels = "RGBA32F", ("normal",), 3
+    judged_in, tolerance = "of a unit vector", 1e-3
+
+    def uniforms(self, shot: Shot) -> dict[str, np.ndarray]:
+        return {"camera_from_local": shot.moment.T_cam_obj[:, :3, :3]}
+
+    def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
+        rotation = scene.camera_path.pose(frame.t_ns)[:3, :3]
+        return np.where(frame.hit[..., None], frame.normal @ rotation, 0.0)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Which object is seen.
+
+
+class Ids(Label):
+    """(H, W) uint32 instance ids; 0: nothing hit."""
+
+    name = "ids"
+    title, unit, kind = "instance ids", "0: nothing hit", "ids"
+    shard = "ids.png"
+    buffer, dtype = "R32UI", np.uint32
+
+    def uniforms(self, shot: Shot) -> dict[str, np.ndarray]:
+        return {"instance_id": np.array([thing.instance_id for thing in shot.scene.objects], np.uint32)}
+
+    @property
+    def forms(self) -> tuple[Form, ...]:
+        return (files.ids_png("ids"),)
+
+    def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
+        return frame.instance
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        return (
+            View(
+                "id",
+                "instance id",
+                self.unit,
+                self.kind,
+                lambda value: value,
+                self.reference,
+                "mismatch",
+                0.0,
+                grading.different,
+                same_triangle=False,
+            ),
+        )
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# How fast the surface moves in the image.
+
+
+class Velocity(Label):
+    """(H, W, 2) float32 px/s at the label's time; 0 where nothing is hit."""
+
+    name = "velocity"
+    title, unit, kind = "velocity label", "px/s", "motion"
+    shard = "velocity.npy"
+    buffer, varyings, channels = "RG32F", ("local", "rate"), 2
+    judged_in, tolerance, error = "px per label interval", 1e-2, staticmethod(grading.motion_per_interval)
+
+    def uniforms(self, shot: Shot) -> dict[str, np.ndarray]:
+        return {"rate": shot.moment.rates.mvp[:, [0, 1, 3]]}
+
+    def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
+        return np.where(frame.hit[..., None], frame.velocity, 0.0)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# How far the surface moves in space.
+
+_SCENE_FLOW_SHARE = 0.95
+"""Of the pixels, that two renderers agree on: silhouettes may fall on either side."""
+
+
+class SceneFlow(Label):
+    """(H, W, 3) float32 world units: how far the point that a pixel shows moves in the world until the next label's
+    time, in the camera's axes at its own time; 0 where nothing is hit. What stands still has 0, however the camera
+    moves: of a point at X in the camera's axes it leads to X + s, which at the other time is at
+    T_cam'_cam (X + s) in that camera's axes."""
+
+    name, title = "scene_flow", "scene flow"
+    unit, kind = "world units", "scalar"
+    towards = "forward"
+    stamps, shard = "scene_flow/timestamps.txt", "scene_flow.npy"
+    buffer, varyings, channels = "RGBA32F", ("local", "forward"), 3
+    of_shapes = ("space_from_clip",)
+    judged_in, tolerance, error = "world units", 1e-4, staticmethod(grading.absolute)
+
+    def uniforms(self, shot: Shot) -> dict[str, np.ndarray]:
+        now, then = shot.moment, shot.ends["forward"]
+        to_camera = now.T_world_cam[:3, :3].T
+        # Differences of poses, so that what stands still has exactly nothing.
+        change = to_camera @ (then.T_world_obj - now.T_world_obj)[:, :3]
+        # A sky at infinity stands still: its box is only drawn where the camera is.
+        change[[thing.at_infinity for thing in shot.scene.objects]] = 0.0
+        of_clip = to_camera @ then.T_world_cam[:3, :3] @ np.linalg.inv(then.view.projection[[0, 1, 3], :3])
+        return {"change_in_space": change, "space_from_clip": np.tile(of_clip, (len(change), 1, 1))}
+
+    def finish(self, drawn: Drawn) -> np.ndarray:
+        raw = drawn.raw(self.name)
+        return np.where(raw[..., 3:] > 0, raw[..., :3], np.float32(0))
+
+    def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
+        return frame.scene_flow(scene)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What the scene looks like.
+
+
+class Images(Label):
+    """(H, W, 3) float32 linear radiance, anti-aliased as ``render.image_antialiasing`` says."""
+
+    name, title, unit, kind = "images", "images", "linear radiance", "light"
+    anti_aliased, at_last = True, True
+    channels, dtype = None, None
+    stamps, shard = "images/timestamps.txt", "image.png"
+
+    @property
+    def forms(self) -> tuple[Form, ...]:
+        return (files.image_png("images"),)
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        return ()  # the debugger follows the colour pass step by step, beginning with what it looks up

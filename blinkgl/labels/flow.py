@@ -105,7 +105,7 @@ class FlowTo(Label):
 
 
 def _png(value: Flow) -> tuple[bytes, int]:
-    from blinkgl.io.flow_png import encode_flow_png
+    from blinkgl.io.flow import encode_flow_png
 
     return encode_flow_png(value.flow, value.valid)
 
@@ -117,7 +117,7 @@ def _npy(value: Flow) -> bytes:
 
 
 def _flo(value: Flow) -> bytes:
-    from blinkgl.io.flo import encode_flo
+    from blinkgl.io.flow import encode_flo
 
     return encode_flo(value.flow, value.valid)
 

@@ -18,6 +18,7 @@ from blinkgl.labels.label import BUFFERS, KINDS, VARYINGS, Label
 if TYPE_CHECKING:
     from blinkgl.labels.frames import LabelRequest
 
+
 LABELS: dict[str, Label] = {}
 """By ``name``, in the order in which they were registered, which is that of everything that lists labels."""
 _KEYS: set[str] = set()
@@ -113,3 +114,44 @@ def _check_drawing(label: Label, unless: Callable[[Any, str, str], None]) -> Non
     for part, known in (("varyings", VARYINGS), ("needs", LABELS), ("there", LABELS), ("each", LABELS)):
         unless({*getattr(label, part)} <= {*known}, part, f"names others than {', '.join(known)}")
     unless(label.towards or not label.there, "there", "is said, but not `towards` where the label leads")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What the label shader (``shaders/label.glsl``) includes that is no file: the table of labels in GLSL, and the
+# snippets that stand in rows.
+
+
+def define_of(name: str) -> str:
+    """The macro that says to which attachment a label goes."""
+    return f"OUT_{name.upper()}"
+
+
+def includes() -> dict[str, str]:
+    """Texts by the name that they are included by: labels_need.glsl, labels.glsl, and
+    labels/NAME.glsl of those labels whose source is their own."""
+    drawn = [label for label in LABELS.values() if label.buffer]
+    own = {f"labels/{label.name}.glsl": label.glsl.lstrip("\n") for label in drawn if label.glsl is not None}
+    return {"labels_need.glsl": _needs(drawn), "labels.glsl": _written(drawn), **own}
+
+
+def _needs(drawn: list) -> str:
+    lines = []
+    for varying in VARYINGS:
+        who = [f"defined({define_of(label.name)})" for label in drawn if varying in label.varyings]
+        if who:
+            lines += [f"#if {' || '.join(who)}", f"#define NEEDS_{varying.upper()}", "#endif"]
+    return "\n".join(lines) + "\n"
+
+
+def _written(drawn: list) -> str:
+    before, inside = [], []
+    for label in drawn:
+        define = define_of(label.name)
+        before += [
+            f"#ifdef {define}",
+            f'#include "labels/{label.name}.glsl"',
+            f"layout(location = {define}) out {BUFFERS[label.buffer].glsl} out_{label.name};",
+            "#endif",
+        ]
+        inside += [f"#ifdef {define}", f"    out_{label.name} = label_{label.name}();", "#endif"]
+    return "\n".join([*before, "void write_labels()", "{", *inside, "}"]) + "\n"

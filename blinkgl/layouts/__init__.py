@@ -5,9 +5,8 @@ Out:   folders that DSEC's, E-RAFT's, BlinkFlow's, MVSEC's, TAP-Vid's and MultiF
 Start: export.py, then layout.py: a row of the table is a layout
 """
 
-from blinkgl.layouts.export import export_layout
+from blinkgl.layouts.export import LAYOUTS, export_layout, layout_of
 from blinkgl.layouts.layout import Layout, Missing
 from blinkgl.layouts.source import Source
-from blinkgl.layouts.table import LAYOUTS, layout_of
 
 __all__ = ["LAYOUTS", "Layout", "Missing", "Source", "export_layout", "layout_of"]

@@ -20,8 +20,7 @@ from blinkgl.config.reader import to_yaml
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.flow import encode_flow_npy
 from blinkgl.io.images import encode_npy
-from blinkgl.layouts.files import append, growing, write_bytes
-from blinkgl.layouts.layout import Layout, Missing, forward_flow
+from blinkgl.layouts.layout import Layout, Missing, append, forward_flow, growing, write_bytes
 from blinkgl.layouts.source import Source
 
 

@@ -20,12 +20,11 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.camera import CameraModel, PinHole
-from blinkgl.camera.rectified import rectify_map
+from blinkgl.camera.pinhole import rectify_map
 from blinkgl.config.camchain import Calibrated, cam_to_cam_yaml
 from blinkgl.io.dsec import identity_rectify_map, write_rectify_map
-from blinkgl.io.flow_png import encode_png
-from blinkgl.layouts.files import copy, write_bytes, write_lines
-from blinkgl.layouts.layout import Layout, Missing, forward_flow
+from blinkgl.io.images import encode_png
+from blinkgl.layouts.layout import Layout, Missing, copy, forward_flow, write_bytes, write_lines
 from blinkgl.layouts.source import Source
 
 DISPARITY_SCALE = 256.0

@@ -5,11 +5,27 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from blinkgl.errors import AssetError, OutputError
+from blinkgl.errors import AssetError, ConfigError, OutputError
 from blinkgl.io.atomic import atomic_folder
+from blinkgl.layouts.blinkflow import BlinkFlow
+from blinkgl.layouts.dsec import Dsec, ERaft
 from blinkgl.layouts.layout import Layout
+from blinkgl.layouts.multiflow import MultiFlow
+from blinkgl.layouts.mvsec import Mvsec
 from blinkgl.layouts.source import Source, sources_of
-from blinkgl.layouts.table import layout_of
+from blinkgl.layouts.tapvid import TapVid
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The layouts there are.
+
+LAYOUTS: dict[str, Layout] = {row.name: row for row in (Dsec(), ERaft(), BlinkFlow(), Mvsec(), TapVid(), MultiFlow())}
+
+
+def layout_of(name: str) -> Layout:
+    """Raises ConfigError: there is none of that name."""
+    if name not in LAYOUTS:
+        raise ConfigError("no such layout", where="--layout", value=name, accepted=", ".join(["webdataset", *LAYOUTS]))
+    return LAYOUTS[name]
 
 
 @dataclass(frozen=True)

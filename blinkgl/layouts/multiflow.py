@@ -20,8 +20,7 @@ import numpy as np
 from blinkgl.camera import PinHole
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.intervals import intervals_in
-from blinkgl.layouts.files import append, copy, growing
-from blinkgl.layouts.layout import Layout, Missing, images
+from blinkgl.layouts.layout import Layout, Missing, append, copy, growing, images
 from blinkgl.layouts.source import Source
 
 LABEL_US, TARGET_US, END_US, STEP_US = 400_000, 900_000, 1_000_000, 10_000

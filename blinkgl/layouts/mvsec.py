@@ -19,8 +19,7 @@ import numpy as np
 
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.imu import read_imu
-from blinkgl.layouts.files import append, growing
-from blinkgl.layouts.layout import Layout, forward_flow, images
+from blinkgl.layouts.layout import Layout, append, forward_flow, growing, images
 from blinkgl.layouts.source import Source
 
 _ALMOST_NOTHING = np.float32(1e-6)

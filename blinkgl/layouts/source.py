@@ -22,8 +22,7 @@ from blinkgl.io.records import read_text
 from blinkgl.labels import LABELS, Form
 from blinkgl.labels.intervals import Flows
 from blinkgl.sequence_files.index import made_folders
-from blinkgl.sequence_files.lens_files import CAM_TO_CAM
-from blinkgl.sequence_files.rig_dir import read_rig
+from blinkgl.sequence_files.rig_dir import CAM_TO_CAM, read_rig
 from blinkgl.sequence_files.sequence_dir import is_rig_folder, read_manifest, verify_sequence
 from blinkgl.types.events import Events
 

@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.io.tracks import TRACKS, read_tracks
-from blinkgl.layouts.files import write_bytes
-from blinkgl.layouts.layout import Layout, Missing, images
+from blinkgl.layouts.layout import Layout, Missing, images, write_bytes
 from blinkgl.layouts.source import Source
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from blinkgl.camera import CameraModel
 from blinkgl.labels.semantics import Categories, category_of, class_of
 from blinkgl.render.casting import vertices_at
-from blinkgl.render.matrices import cam_from_obj
+from blinkgl.render.moment import cam_from_obj
 from blinkgl.scene.types import Scene, SceneObject
 from blinkgl.types.boxes import Boxes, no_boxes
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeVar
 import cv2
 import numpy as np
 
-from blinkgl.render.rectangles import Rectangle
+from blinkgl.render.canvas import Rectangle
 from blinkgl.render.renderer import Renderer
 
 if TYPE_CHECKING:

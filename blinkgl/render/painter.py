@@ -11,7 +11,7 @@ import numpy as np
 from blinkgl.gl.shader import Uniforms
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.lighting import Lighting
-from blinkgl.render.matrices import linear_xyw_bytes
+from blinkgl.render.moment import linear_xyw_bytes
 from blinkgl.render.strokes import Strokes
 
 if TYPE_CHECKING:

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from blinkgl.render.canvas import Canvas, Frame
-from blinkgl.render.rectangles import Rectangle, merged
+from blinkgl.render.canvas import Canvas, Frame, Rectangle, merged
 
 if TYPE_CHECKING:
     from blinkgl.camera import CameraModel

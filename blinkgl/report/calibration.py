@@ -11,7 +11,7 @@ import numpy as np
 from blinkgl.recordings.clip import TILE_PX, polarity_sums
 from blinkgl.recordings.comparison import BLUR_PX
 from blinkgl.recordings.statistics import COUNTS, ISI_BINS, ISI_PER_DECADE, sums
-from blinkgl.report.markup import data_uri, render
+from blinkgl.report.charts import data_uri, render
 
 if TYPE_CHECKING:
     from blinkgl.recordings.calibration import Calibration

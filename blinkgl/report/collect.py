@@ -16,7 +16,7 @@ from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.verify.cross_checks import plan_of
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 from blinkgl.io.dsec import DsecEventReader
-from blinkgl.io.flow_png import read_flow_png
+from blinkgl.io.flow import read_flow_png
 from blinkgl.io.frame_camera import EXPOSURES, picture_file, read_codes, read_exposures
 from blinkgl.io.images import read_image
 from blinkgl.io.records import shown

@@ -10,9 +10,8 @@ import cv2
 import numpy as np
 
 from blinkgl.io.atomic import atomic_file, output_errors
-from blinkgl.report.charts import histogram, number, size
+from blinkgl.report.charts import histogram, number, png, render, size
 from blinkgl.report.collect import Collected, Example, Parameter, collect, task_of
-from blinkgl.report.markup import png, render
 from blinkgl.sequence_files.index import write_index
 
 _MAX_PICTURE_PX = 360

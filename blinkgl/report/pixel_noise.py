@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from blinkgl.report.markup import render
+from blinkgl.report.charts import render
 
 if TYPE_CHECKING:
     from blinkgl.recordings.pixel_noise import PixelFit

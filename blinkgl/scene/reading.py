@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from blinkgl.errors import AssetError, BlinkGLError
@@ -47,3 +48,26 @@ def contents(path: Path, what: str, where: str | None = None, max_bytes: int = M
         return path.read_bytes()
     except (OSError, ValueError) as error:
         raise AssetError(f"cannot read the {what}: {getattr(error, 'strerror', None) or error}", where=where) from None
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What a file asks for and BlinkGL does not draw: a loader collects it, a run says it, in one line per file.
+
+
+@dataclass
+class Omissions:
+    """Of one file, in the order met.
+
+    name : the file's name without its folder: the line goes into manifests, which know no machine.
+    """
+
+    name: str
+    found: dict[str, None] = field(default_factory=dict)
+
+    def add(self, what: str) -> None:
+        """``what``: a few words from the file's own world, with what is done instead: "alpha BLEND (drawn opaque)"."""
+        self.found[what] = None
+
+    def lines(self) -> tuple[str, ...]:
+        """The one line, or nothing."""
+        return (f"{self.name} asks for what is not drawn: " + "; ".join(self.found),) if self.found else ()

@@ -1,9 +1,11 @@
 """A sequence of recorded frames: the E-Tartan way. Frames go through the emulator, the
-frames' own flow becomes the label. :mod:`blinkgl.sequence.folders` says what a folder has to look like."""
+frames' own flow becomes the label. :mod:`blinkgl.sequence.recorded` says what a folder has to look like."""
 
 from __future__ import annotations
 
+import glob
 import os
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,18 +13,167 @@ from typing import Any
 
 import numpy as np
 
+from blinkgl.config.base import Refused
+from blinkgl.config.frames import FramesConfig, check_span
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.events.camera import EventCamera
+from blinkgl.io.flow import read_flow
+from blinkgl.io.frames import IMAGE, read_any_image
+from blinkgl.io.images import read_npy
 from blinkgl.labels import Flow, LabelFrame, asked_for
 from blinkgl.recordings.simulation import FrameUse, Step, stepped, timed
 from blinkgl.rng import Role, kernel_seed
-from blinkgl.sequence.clock import StageClock
-from blinkgl.sequence.folders import flow_files, folder_of, read_flow_of, read_frame, read_mask_of, used_images
-from blinkgl.sequence.items import GroundTruth, Picture
-from blinkgl.sequence.request import SequenceRequest
+from blinkgl.scene.worlds.pool import resolve
+from blinkgl.sequence.request import GroundTruth, Picture, SequenceRequest, StageClock
 from blinkgl.sequence.simulate import Simulation
 from blinkgl.tensors.choice import make_on_device
 from blinkgl.types.events import Events
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Folders of recorded frames and what is in them: which there are, their images, their flow.
+#
+# A folder is expected to look like a TartanAir trajectory: images in one sub-folder, one flow file per pair of
+# frames in another, and, where there are any, masks of occluded pixels beside the flow (``*_mask.npy``, non-zero:
+# the point is hidden or outside the image in the next frame). All are taken in the order of their names. A third may
+# hold the flow back, one file per pair of frames, too.
+
+_FLOW = (".npy", ".flo", ".png")
+
+
+def matching_folders(config: FramesConfig, base: Path) -> list[Path]:
+    """The folders that ``frames.folders`` names, sorted. ConfigError: none named, none
+    found, or no image folder inside."""
+    found: list[Path] = []
+    for number, pattern in enumerate(config.folders):
+        matches = sorted(Path(p) for p in glob.glob(str(resolve(pattern, base))) if Path(p).is_dir())
+        if not matches:
+            raise ConfigError(
+                "no such folder",
+                where=f"frames.folders.{number}",
+                value=pattern,
+                accepted="a folder of frames, or a pattern",
+            )
+        found += matches
+    if not found:
+        raise ConfigError(
+            "no folders of frames", where="frames.folders", value=[], accepted="one folder per sequence, or patterns"
+        )
+    for folder in found:
+        if not (folder / config.images).is_dir():
+            raise ConfigError(
+                "no such folder",
+                where="frames.images",
+                value=str(folder / config.images),
+                accepted="a folder of images",
+            )
+    return found
+
+
+def folder_of(config: FramesConfig, index: int, base: Path) -> Path:
+    """The ``index``-th folder of frames; the only one for every index. Raises ConfigError as
+    :func:`matching_folders`, or for too few."""
+    folders = matching_folders(config, base)
+    if len(folders) > 1 and index >= len(folders):
+        raise ConfigError(f"{len(folders)} folders are too few for sequence {index}", where="frames.folders")
+    return folders[index] if len(folders) > 1 else folders[0]
+
+
+def used_images(config: FramesConfig, folder: Path) -> list[Path]:
+    """The images of ``folder`` that become a sequence, in order. AssetError: too few; ConfigError: they last longer
+    than an event file can hold."""
+    files = _listed(folder / config.images, IMAGE)[config.first :]
+    files = files[: config.count]
+    if len(files) < 3 or (config.count and len(files) < config.count):
+        raise AssetError(
+            "too few frames",
+            where=str(folder / config.images),
+            value=len(files),
+            accepted=f"at least {config.count or 3}",
+        )
+    try:
+        check_span(len(files), config.fps)
+    except Refused as error:
+        raise ConfigError(error.problem, where="frames.fps", value=error.value, accepted=error.accepted) from None
+    return files
+
+
+def _listed(folder: Path, suffixes) -> list[Path]:
+    if not folder.is_dir():
+        raise AssetError("no such folder", where=str(folder))
+    return sorted(
+        p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file() and not p.name.startswith(".")
+    )
+
+
+def flow_files(folder: Path, frames: FramesConfig, images: list[Path]) -> tuple[list[Path], list[Path]]:
+    """(flow, masks) of the frames ``images``, which :func:`used_images` found; the k-th goes from frame k to frame
+    k + 1. AssetError: no folder, too few, or, by the numbers in their names, one that is missing in between."""
+    if frames.flow is None:
+        return [], []
+    return _flow_and_masks(folder / frames.flow, frames.first, images)
+
+
+def _flow_and_masks(folder: Path, first: int, images: list[Path]) -> tuple[list[Path], list[Path]]:
+    everything, pairs = _listed(folder, _FLOW), len(images) - 1
+    masks = [p for p in everything if p.stem.endswith("_mask")]
+    flows = [p for p in everything if p not in set(masks)]
+    if len(flows) < first + pairs or (masks and len(masks) < first + pairs):
+        raise AssetError(
+            "not one flow file per pair of frames",
+            where=str(folder),
+            value=f"{max(len(flows) - first, 0)} flow files, {len(masks)} masks",
+            accepted=f"at least {pairs} for {len(images)} frames",
+        )
+    # Files are taken in the order of their names; one that is missing would give every later pair its neighbour's.
+    one_each = len(_listed(images[0].parent, IMAGE)) - 1
+    for files in (flows, masks):
+        _check_in_step(files[first : first + pairs], images, shifted=len(files) == one_each)
+    return flows[first : first + pairs], masks[first : first + pairs]
+
+
+def _check_in_step(files: list[Path], images: list[Path], shifted: bool) -> None:
+    """The first numbers in the names of ``files`` are those of ``images``, or, where they may be ``shifted`` (frames
+    from 0, flow from 1), go up with them. Names without numbers say nothing. Raises AssetError."""
+    numbers = [(_number(file), _number(image)) for file, image in zip(files, images)]
+    offsets = [of_file - of_image for of_file, of_image in numbers if of_file is not None and of_image is not None]
+    if len(offsets) < len(numbers):
+        return
+    for file, image, offset in zip(files, images, offsets):
+        if offset != (offsets[0] if shifted else 0):
+            raise AssetError(
+                "the files do not go with the frames: one is missing before it, or the numbers in their names differ",
+                where=str(file),
+                value=f"it would go with {image.name}",
+                accepted="the same numbers",
+            )
+
+
+def _number(path: Path) -> int | None:
+    found = re.search(r"\d+", path.stem)
+    return None if found is None else int(found[0])
+
+
+def read_flow_of(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """flow (H, W, 2) float32 px and valid (H, W) bool of frames of (H, W) px. AssetError: unreadable, another size."""
+    flow, valid = read_flow(path)
+    if flow.shape[:2] != size:
+        raise AssetError("flow and image differ in size", where=str(path), value=flow.shape[:2], accepted=str(size))
+    return flow, valid
+
+
+def read_mask_of(path: Path, size: tuple[int, int]) -> np.ndarray:
+    """(H, W) bool of frames of (H, W) px. AssetError: unreadable, another size."""
+    mask = read_npy(path)
+    if mask.shape != size:
+        raise AssetError("mask and image differ in size", where=str(path), value=mask.shape, accepted=str(size))
+    return mask != 0
+
+
+def read_frame(path: Path) -> np.ndarray:
+    """(H, W) or (H, W, 3) RGB of an image file, alpha dropped. Raises AssetError."""
+    image = read_any_image(path)
+    return image if image.ndim == 2 else np.ascontiguousarray(image[..., :3])
+
 
 RECORDED = ("images", "flow_forward", "occlusion_forward")
 """Labels that recorded frames may bring."""

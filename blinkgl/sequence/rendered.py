@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from blinkgl.camera import CameraModel, PinHole
-from blinkgl.camera.rectified import rectified
+from blinkgl.camera.pinhole import rectified
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.config.timeline import DisplacementTimeline
 from blinkgl.config.tracks import track_times
@@ -29,11 +29,9 @@ from blinkgl.rng import Role, generator, kernel_seed
 from blinkgl.scene.build import recording, sequence_scene
 from blinkgl.scene.rig import Sensor
 from blinkgl.scene.types import Dynamics, Scene, SceneObject
-from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.first_look import first_look
 from blinkgl.sequence.inertial import Inertial, measured
-from blinkgl.sequence.items import GroundTruth, Item, Picture
-from blinkgl.sequence.request import SequenceRequest
+from blinkgl.sequence.request import GroundTruth, Item, Picture, SequenceRequest, StageClock
 from blinkgl.sequence.simulate import Simulation
 from blinkgl.tensors.choice import make_on_device
 from blinkgl.timeline import Timeline, make_timeline

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
+from blinkgl.imaging import CameraImage
+from blinkgl.labels import LabelFrame
+from blinkgl.machine.compiling import compiled_s, working_clock
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Scene
+from blinkgl.types.events import Events
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,3 +60,87 @@ class SequenceRequest:
                 where="frames",
                 accepted="no scene, renderer or window_ns",
             )
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What happens in a sequence, in the order in which it does. All arrays are the receiver's to keep.
+
+
+@dataclass(frozen=True, eq=False)
+class EventChunk:
+    """The events that have left the sensor since the chunk before.
+
+    t_ns : with this chunk, every event before this time's microsecond, t_ns // 1000, has been
+    given.   events : t in µs; may be empty."""
+
+    t_ns: int
+    events: Events
+
+
+@dataclass(frozen=True, eq=False)
+class GroundTruth:
+    """What is true at a label's time. Every event before its microsecond, t_ns // 1000,
+    came before it, and no other did.
+
+    k : number of the label, from 0.   t_ns : its time, ns.
+    frame : what ``labels:`` asks for, as :class:`LabelFrame` says; images as they were drawn, float32 linear light, or
+    as they were recorded, sRGB codes. At the last time of a sequence, from where nothing leads on, images alone.
+    forward_ns, backward_ns : where it leads, ns; None: nowhere.
+    T_world_cam : (4, 4) float64, OpenCV axes.   T_world_obj : (n, 4, 4) float64, n objects.
+    Both are None where nobody knows (recorded frames)."""
+
+    k: int
+    t_ns: int
+    frame: LabelFrame
+    forward_ns: int | None = None
+    backward_ns: int | None = None
+    T_world_cam: np.ndarray | None = None
+    T_world_obj: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """How it looks at t_ns, for somebody who watches: comes after the events up to then.
+
+    image : (H, W, 3) or (H, W) float32 linear light.   velocity : (H, W, 2) float32 px/s, or None
+    where nobody knows (recorded frames)."""
+
+    t_ns: int
+    image: np.ndarray
+    velocity: np.ndarray | None = None
+
+
+Item = EventChunk | GroundTruth | CameraImage | Picture
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Where the wall time of a sequence goes.
+
+
+class StageClock:
+    """Wall seconds per named stage, without the compilation of kernels, which happens once per machine and is told
+    apart (``compile_s``). ``with clock("events"): …`` adds to a stage; stages do not nest."""
+
+    def __init__(self) -> None:
+        self.started = working_clock()
+        self._compiled = compiled_s()
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        begin = working_clock()
+        try:
+            yield
+        finally:
+            self.add(stage, working_clock() - begin)
+
+    def add(self, stage: str, seconds: float) -> None:
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
+
+    @property
+    def total(self) -> float:
+        return working_clock() - self.started
+
+    @property
+    def compile_s(self) -> float:
+        return compiled_s() - self._compiled

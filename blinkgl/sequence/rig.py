@@ -22,10 +22,8 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, generator
 from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.types import Scene
-from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.inertial import Inertial, measured
-from blinkgl.sequence.items import Item
-from blinkgl.sequence.request import SequenceRequest
+from blinkgl.sequence.request import Item, SequenceRequest, StageClock
 from blinkgl.sequence.simulate import Simulation, simulate_sequence
 from blinkgl.timeline import together
 

@@ -29,10 +29,8 @@ from blinkgl.events.camera import EventCamera
 from blinkgl.gl import GLContext
 from blinkgl.imaging import FrameCamera
 from blinkgl.render.tracks import Tracks
-from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.inertial import Inertial
-from blinkgl.sequence.items import CameraImage, EventChunk, GroundTruth, Item, Picture
-from blinkgl.sequence.request import SequenceRequest
+from blinkgl.sequence.request import CameraImage, EventChunk, GroundTruth, Item, Picture, SequenceRequest, StageClock
 from blinkgl.timeline import Ticks, Timeline
 from blinkgl.types.events import Events, count_causes, named_causes
 

@@ -13,14 +13,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from blinkgl.camera import CameraModel
+from blinkgl.camera.pinhole import rectify_map
+from blinkgl.config.camchain import Calibrated, cam_to_cam_yaml, camchain_yaml
 from blinkgl.config.reader import read_table, to_yaml
 from blinkgl.config.rig import RigSensorConfig, baseline_of
 from blinkgl.io.atomic import output_errors
+from blinkgl.io.dsec import write_rectify_map
 from blinkgl.sequence_files.sequence_dir import MANIFEST, RIG, SequenceWriter, digest_of, read_manifest
 
 
@@ -101,3 +106,20 @@ def read_rig(folder: str | os.PathLike) -> dict[str, dict[str, Any]]:
     Raises AssetError, ConfigError: no such file, or damaged."""
     tables = read_table(Path(folder) / RIG)["sensors"]
     return {name: {**one, "T_rig_sensor": np.array(one["T_rig_sensor"], np.float64)} for name, one in tables.items()}
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What a sequence says of a lens that distorts: ``rectify_map.h5`` and ``cam_to_cam.yaml`` as DSEC has them, and
+# ``camchain.yaml`` as Kalibr has it.
+
+RECTIFY_MAP, CAM_TO_CAM, CAMCHAIN = "rectify_map.h5", "cam_to_cam.yaml", "camchain.yaml"
+FILES = RECTIFY_MAP, CAM_TO_CAM, CAMCHAIN
+_TOLERANCE = 1e-3
+
+
+def write_lens(writer: SequenceWriter, camera: CameraModel) -> None:
+    """All of them, into a sequence that is being written."""
+    one = Calibrated(camera)
+    writer.external(RECTIFY_MAP, partial(write_rectify_map, rectify_map=rectify_map(camera), codec=writer.codec))
+    writer.text(CAM_TO_CAM, cam_to_cam_yaml([one]))
+    writer.text(CAMCHAIN, camchain_yaml({"cam0": one}))

@@ -30,6 +30,7 @@ from blinkgl.render import appearance, casting, reference
 from blinkgl.render.colour import LUMA
 from blinkgl.scene.lights import lamps_of, shadowing
 from blinkgl.scene.types import Material
+from blinkgl.shader_debugger.lamps import share_range
 from blinkgl.shader_debugger.mipmaps import mipmapped_albedo
 from blinkgl.shader_debugger.moments import (
     MAPS,
@@ -42,7 +43,6 @@ from blinkgl.shader_debugger.moments import (
     view_of,
 )
 from blinkgl.shader_debugger.quantities import QUANTITIES, Quantity
-from blinkgl.shader_debugger.soft_twin import share_range
 from blinkgl.shader_debugger.suspicions import suspicions
 from blinkgl.shader_debugger.twins import TWINNED
 

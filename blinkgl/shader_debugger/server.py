@@ -17,8 +17,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from blinkgl.errors import BlinkGLError, GLError
-from blinkgl.shader_debugger.inspector import Inspector, Worker
-from blinkgl.shader_debugger.questions import ROUTES, read_query
+from blinkgl.shader_debugger.inspector import ROUTES, Inspector, Worker, read_query
 from blinkgl.shader_debugger.session import Subject, When
 
 PAGE = {

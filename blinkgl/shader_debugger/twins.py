@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -19,10 +20,198 @@ from blinkgl.render.contours import Lines
 from blinkgl.render.passes import Colour, Edged, Gather, Luminance, Pass
 from blinkgl.render.passes.edged import SKY
 from blinkgl.scene.types import Scene
-from blinkgl.shader_debugger.edges_twin import filtered
 
 if TYPE_CHECKING:
     from blinkgl.shader_debugger.session import DebugRenderer
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Slow twin of shaders/edges.glsl, a pixel at a time in float64; see there for what is done and why.
+#
+# picture, depths = frames of the pass that `edges` filters, read back pixels, crossings = Lines().in_pixels(moment,
+# items, width, height) filtered(picture, depths, pixels, crossings, 1 / focal, what the program wrote)
+
+GAP, COVER, SAME, NEARER, DIAGONAL, ALONG, SNAP, FEW, MANY = 3.0, 6.0, 0.25, 0.001, 0.25, 12, 1 / 128, 1.4, 2.0
+_AROUND = [(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+
+
+UNDECIDED = 2.0**-22
+"""Relative: float32 may decide a comparison of depths that are nearer to each other in either way."""
+
+
+def filtered(
+    picture: np.ndarray,
+    depths: np.ndarray,
+    pixels: np.ndarray,
+    crossings: np.ndarray,
+    pixel: float,
+    drawn: np.ndarray,
+) -> np.ndarray:
+    """(H, W) or (H, W, C) float64: the picture with its silhouettes and creases by area.
+
+    picture : (H, W) or (H, W, C) float32.   depths : (H, W) float32, near / Z.   pixels, crossings : of
+    :meth:`~blinkgl.render.contours.Lines.in_pixels`.   pixel : 1 / focal length, px.
+    drawn : (H, W) or (H, W, C) what the program made of it. Where comparisons of depths are undecided the value is the
+    one that is nearest to it."""
+    if picture.ndim == 3:
+        each = (filtered(picture[..., k], depths, pixels, crossings, pixel, drawn[..., k]) for k in range(3))
+        return np.stack(list(each), axis=-1)
+    out = picture.astype(np.float64)
+    # What is compared is the picture's depths with the lines'.
+    exact, *others = (
+        _Pixel(out.copy(), depths.astype(np.float64) * (1 + scale), pixel) for scale in (0.0, UNDECIDED, -UNDECIDED)
+    )
+    for x, y, first, end in pixels.tolist():
+        # Only where the exact value is not what was written do the others have to be computed.
+        lines, written = crossings[first:end].astype(np.float64), float(drawn[y, x])
+        value = exact.mean(x, y, lines)
+        if abs(value - written) > 1e-5 * abs(written):
+            value = min([value, *(of.mean(x, y, lines) for of in others)], key=lambda one: abs(one - written))
+        out[y, x] = value
+    return out
+
+
+class _Pixel:
+    """What one pixel shows, among those around it."""
+
+    def __init__(self, picture: np.ndarray, depths: np.ndarray, pixel: float):
+        self.picture, self.depths, self.pixel = picture, depths, pixel
+
+    def _inside(self, x: int, y: int) -> tuple[int, int]:
+        height, width = self.picture.shape
+        return min(max(x, 0), width - 1), min(max(y, 0), height - 1)
+
+    def _light(self, x: int, y: int) -> float:
+        x, y = self._inside(x, y)
+        return float(self.picture[y, x])
+
+    def _depth(self, x: int, y: int) -> float:
+        x, y = self._inside(x, y)
+        return float(self.depths[y, x])
+
+    def mean(self, x: int, y: int, crossings: np.ndarray) -> float:
+        plain, own = self._light(x, y), self._depth(x, y)
+        change, shares, sizes = 0.0, 0.0, 0.0
+        creases, bent, towards = 0.0, 0.0, np.zeros(2)
+        for share, turn, room, depth, lx, ly, further, kind in crossings.tolist():
+            # A crease or a seam: both sides are on one surface, so only their shares are added up here.
+            if kind > 0.5:
+                seam = kind > 1.5
+                if depth * (1 - (GAP * self.pixel if seam else SAME)) <= own <= depth * (1 + COVER * self.pixel):
+                    creases += share
+                    towards += share * np.array([lx, ly])
+                    bent += 0.0 if seam else abs(share)
+                continue
+            # A silhouette: its share moves light from what is behind to what is in front.
+            found = self._sides(x, y, own, room, depth, np.array([lx, ly]), further, kind < -0.5)
+            if found is None:
+                continue
+            front, back, inside = found
+            on_left = room > 0
+            # A centre on the line itself is on the side of what was drawn there.
+            if abs(room) < SNAP and on_left != ((kind < -0.5) != inside):
+                share += (turn - _turn(turn, not on_left)) / 8
+            change += share * (front - back)
+            shares += share
+            sizes += abs(share)
+        # More than the whole is the whole; from below minus one on the sum starts from two.
+        if shares < -1:
+            change *= max(shares + 1, -1.0) / shares
+        elif shares > 1:
+            change /= shares
+        result = plain + change
+        # A tangle of lines: the nearer to MANY, the more of the mean of the pixels around.
+        part = min(max((sizes - FEW) / (MANY - FEW), 0.0), 1.0)
+        around = sum((2 - abs(dx)) * (2 - abs(dy)) / 16 * self._light(x + dx, y + dy) for dx, dy in _AROUND)
+        result += part * part * (3 - 2 * part) * (around - result)
+        # Creases: towards the pixels on their other side, as far as these are of the same surface.
+        if towards.any():
+            level = (SAME if bent > 0 else COVER * self.pixel) * own
+            towards /= np.hypot(*towards)
+            weights, others = 0.0, 0.0
+            for dx, dy in _AROUND:
+                weight = max((dx * towards[0] + dy * towards[1]) / max(dx * dx + dy * dy, 1) - 0.3, 0.0)
+                if weight > 0 and abs(self._depth(x + dx, y + dy) - own) < level:
+                    weights += weight
+                    others += weight * self._light(x + dx, y + dy)
+            if weights > 0:
+                result += min(abs(creases), 1.0) * (others / weights - plain)
+        return max(result, min(0.0, plain))
+
+    def _sides(
+        self, x: int, y: int, own: float, room: float, depth: float, left: np.ndarray, further: float, back_again: bool
+    ) -> tuple[float, float, bool] | None:
+        """Of a silhouette's line: what is in front and behind, and whether the pixel's centre shows the first. None:
+        the line is hidden, or nothing is known of one of them."""
+        inwards = -left if back_again else left
+        inside = back_again != (room > 0)
+        behind, before = depth * (1 - GAP * self.pixel), depth * (1 + SAME)
+        ax, ay = (int(np.rint(1.2 * c)) for c in inwards)
+        there = (x, y) if inside else (x + ax, y + ay)
+        front_depth = self._depth(*there)
+        kept = self._inside(*there)
+        within = self._depth(kept[0] + ax, kept[1] + ay)
+        reached = front_depth + (front_depth - within) * min(max(abs(room) if inside else 1 - abs(room), 0.0), 1.0)
+        horizon = front_depth > before and abs(reached - depth) < SAME * depth
+        if horizon:
+            before = 2 * front_depth
+        fronts, in_front, backs, at_back = 0.0, 0.0, 0.0, 0.0
+        for dx, dy in _AROUND:
+            weight = 0.0 if dx == dy == 0 else DIAGONAL if dx and dy else 1.0
+            seen, is_at = self._light(x + dx, y + dy), self._depth(x + dx, y + dy)
+            if is_at < behind:
+                backs += weight * seen
+                at_back += weight or 1e-9
+            elif is_at < before:
+                fronts += weight * seen
+                in_front += weight
+        front = back = self._light(x, y)
+        if at_back > 0:
+            if own > (before if inside else depth * (1 + COVER * self.pixel)):
+                return None
+            inside = own >= behind
+            known = inside or in_front > 0
+            if inside:
+                back = backs / at_back
+            elif known:
+                front = fronts / in_front
+        else:
+            other = (x - ax, y - ay)
+            back_depth = self._depth(*other)
+            if abs(room) < SNAP:
+                front_depth = self._depth(x + ax, y + ay)
+                inside = abs(own - front_depth) < abs(own - back_depth)
+                there = (x, y) if inside else (x + ax, y + ay)
+            if inside:
+                front_depth = own
+            else:
+                other, back_depth = (x, y), own
+            kept = self._inside(*other)
+            beyond = self._depth(kept[0] - ax, kept[1] - ay)
+            steps = min(max(1 - abs(room) if inside else abs(room), 0.0), 1.0)
+            continued = back_depth + (back_depth - beyond) * steps
+            if not min(continued, back_depth) < depth * (1 + NEARER):
+                return None
+            known = abs(front_depth - depth) < SAME * depth or horizon
+            front, back = self._light(*there), self._light(*other)
+        if not known:
+            # Narrower than a pixel: looked for along the line, one pixel at a time, to both ends.
+            onwards = np.array([left[1], -left[0]]) / max(abs(left))
+            for k in range(2 * ALONG):
+                steps = (k % 2 * 2 - 1) * (k // 2 + 2)
+                at = (math.floor(x + 0.5 + steps * onwards[0]), math.floor(y + 0.5 + steps * onwards[1]))
+                expected = depth + steps * further
+                if abs(self._depth(*at) - expected) < SAME * expected:
+                    return self._light(*at), back, inside
+            return None
+        return front, back, inside
+
+
+def _turn(turn: float, on_left: bool) -> float:
+    """A turn of the boundary, in eighths, as it is for a centre on one side of the line."""
+    least = turn - 8 * np.rint(turn / 8)
+    return least + (8 if on_left else -8) if on_left != (least > 0) and abs(least) > 2 else least
+
 
 EDGED = ("luminance_edges", "colour_edges")
 LENSED = ("luminance_lens", "colour_lens")

@@ -2,5 +2,5 @@
 
 In:    a command's options.
 Out:   one call into the library behind a display, words and tables for people, the command's exit status.
-Start: generate.py; one module per command, of its name, with ``run``. checks.py is what ``doctor`` examines.
+Start: generate.py; one module per command, of its name, with ``run``. doctor.py also examines the machine for others.
 """

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.table import Table
 
-from blinkgl.config.shipped import shipped_runs
+from blinkgl.config.reader import shipped_runs
 from blinkgl.machine.terminal import plain_console
 
 

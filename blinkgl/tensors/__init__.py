@@ -19,16 +19,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from blinkgl.tensors.batch import TensorEvents
+    from blinkgl.tensors.batch import TensorEvents, event_counts, latest_times, time_surface, voxel_grid
     from blinkgl.tensors.esim import TensorEsim
-    from blinkgl.tensors.grids import event_counts, latest_times, time_surface, voxel_grid
     from blinkgl.tensors.v2e import TensorV2e
 
 __all__ = ["TensorEsim", "TensorEvents", "TensorV2e", "event_counts", "latest_times", "time_surface", "voxel_grid"]
-_HOMES = {"TensorEsim": "esim", "TensorEvents": "batch", "TensorV2e": "v2e"}
+_HOMES = {"TensorEsim": "esim", "TensorV2e": "v2e"}
 
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES.get(name, 'grids')}"), name)
+    return getattr(import_module(f"{__name__}.{_HOMES.get(name, 'batch')}"), name)

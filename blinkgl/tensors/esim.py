@@ -20,9 +20,8 @@ from blinkgl.events.arith import Q_ONE
 from blinkgl.events.emulator import BLOCK, NEVER_NS
 from blinkgl.events.esim import MIN_THRESHOLD, draw_thresholds, to_q25
 from blinkgl.events.philox import Stream
-from blinkgl.tensors.arith import log_q25_
+from blinkgl.tensors.arith import log_q25_, normal2
 from blinkgl.tensors.batch import Batch, Found, Interval, TensorEvents, places
-from blinkgl.tensors.philox import normal2
 
 _ASLEEP = 2**30 + 2**28
 """A level that no signal reaches, and whose distance from any signal fits 32 bits: of pixels without a first frame."""

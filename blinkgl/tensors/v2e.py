@@ -27,9 +27,8 @@ from blinkgl.events.noise import TABLE_LOW, TABLE_SIZE, TABLE_STEP, noise_table
 from blinkgl.events.packing import MAX_CAUSE_ROWS
 from blinkgl.events.philox import Stream
 from blinkgl.events.v2e import V2e
-from blinkgl.tensors.arith import exp_f32, horner, log_f32, log_f64, sqrt
+from blinkgl.tensors.arith import exp_f32, horner, log_f32, log_f64, normal2, sqrt, uniform2
 from blinkgl.tensors.batch import Batch, Found, Interval, TensorEvents, places, stable_order
-from blinkgl.tensors.philox import normal2, uniform2
 from blinkgl.tensors.waves import Parts, Rows, Shots, Step, add_curves, wake, waves
 
 # Constants of the numba functions, so that there is one copy of each.

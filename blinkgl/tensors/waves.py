@@ -1,6 +1,6 @@
 """V2E's events of the pixels that fire, on tensors: their first events together, then their second ones, and so on.
 
-The sums and products of :mod:`blinkgl.events.v2e_emit`, in its order, on float64 rows: over an interval a pixel's
+The sums and products of :mod:`blinkgl.events.v2e_blocks`, in its order, on float64 rows: over an interval a pixel's
 signal is z(s) = c + rise s + fall e^(-k s) for s in [0, 1] (``v2e_model.curve_of``). A wave finds where each pixel's
 signal meets its level, lets shot noise come first where it does, and sets the levels round the new reference; pixels
 that have another event go on into the next wave. How many do is known only then, so the host looks once a wave.
@@ -17,8 +17,7 @@ from torch import Tensor
 
 from blinkgl.events.packing import CAUSE_SHIFT
 from blinkgl.events.philox import Stream
-from blinkgl.tensors.arith import fall_f64
-from blinkgl.tensors.philox import rough_normal
+from blinkgl.tensors.arith import fall_f64, rough_normal
 from blinkgl.types.events import Cause
 
 _TURNS = 60  # of the root finder, as in the kernel

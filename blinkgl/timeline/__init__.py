@@ -7,7 +7,6 @@ interpolate.py invents frames of a video.
 """
 
 from blinkgl.timeline.sampling import Ticks, bounded_times, displacement_times, uniform_times
-from blinkgl.timeline.strategy import Timeline, make_timeline
-from blinkgl.timeline.together import together
+from blinkgl.timeline.strategy import Timeline, make_timeline, together
 
 __all__ = ["Ticks", "Timeline", "bounded_times", "displacement_times", "make_timeline", "together", "uniform_times"]

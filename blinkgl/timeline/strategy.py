@@ -8,13 +8,81 @@ timeline.info()                                  # what was achieved, for the ma
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Iterator, Sequence
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
 
 from blinkgl.config.timeline import TimelineConfig
 from blinkgl.events.response import Response
-from blinkgl.timeline.reductions import Drawn, changes, speeds
 from blinkgl.timeline.sampling import bounded_times, uniform_times
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What a timeline needs of a small picture: a percentile and the largest of what moves in it, two numbers.
+
+SLOWEST = np.float32(2.0**-40)
+"""What moves (px/s) or changes (per second) by less than these 1e-12 stands still."""
+
+
+class Drawn(Protocol):
+    """What has been drawn, wherever it is."""
+
+    def read(self) -> np.ndarray: ...
+
+
+class Ranked(NamedTuple):
+    """Of the values that move. count : how many.   percentile, largest : 0.0 where there are none."""
+
+    count: int
+    percentile: float
+    largest: float
+
+
+STILL = Ranked(0, 0.0, 0.0)
+
+
+def speeds(drawn: Drawn, percent: float) -> Ranked:
+    """Of the lengths of (h, w, 2) float32 vectors."""
+    return ranked(np.linalg.norm(drawn.read(), axis=-1), percent)
+
+
+def changes(drawn: Drawn, response: Response, percent: float) -> Ranked:
+    """Of |d(signal)/dt|, per second, of (h, w, 2) float32 luminances and their rates."""
+    picture = drawn.read()
+    return ranked(np.abs(response.change(picture[..., 0], picture[..., 1])), percent)
+
+
+def ranked(values: np.ndarray, percent: float) -> Ranked:
+    """Of float32 values of any shape >= 0: those that neither stand still nor are beyond all bounds (a surface in the
+    camera plane); a still background has no say in a percentile."""
+    values = values.ravel()
+    values = values[(values >= SLOWEST) & np.isfinite(values)]
+    if not len(values):
+        # The k-th smallest and the one above it, without sorting all.
+        return STILL
+    k, share = place(len(values), percent)
+    above = min(k + 1, len(values) - 1)
+    values = np.partition(values, (k, above, len(values) - 1))
+    return Ranked(len(values), between(values[k], values[above], share), float(values[-1]))
+
+
+def place(count: int, percent: float) -> tuple[int, float]:
+    """Which of ``count`` values in order, and how far on to the next one [0, 1), in double precision."""
+    at = (count - 1) * (percent / 100)
+    # percent = 100 would give the place behind the last by rounding.
+    k = min(math.floor(at), count - 1)
+    return k, at - k
+
+
+def between(below: np.float32, above: np.float32, share: float) -> float:
+    # NumPy interpolates from the nearer neighbour, which rounds otherwise than from below.
+    """From one value towards the next in single precision, as NumPy's percentile rounds (from the nearer of them)."""
+    apart = above - below
+    if share < 0.5:
+        return float(below + apart * np.float32(share))
+    return float(above - apart * np.float32(1.0 - share))
 
 
 class SmallPictures(Protocol):
@@ -47,7 +115,7 @@ class Timeline:
         self.seen: dict[str, Any] = {}
         """What a first look at the sequence saw and made of it, for the manifest."""
         self.others: tuple[Timeline, ...] = ()
-        """Of other cameras, whose pace is kept, too (:mod:`blinkgl.timeline.together`)."""
+        """Of other cameras, whose pace is kept, too (:mod:`blinkgl.timeline.strategy`)."""
 
     def __iter__(self) -> Iterator[int]:
         c = self.config
@@ -108,3 +176,33 @@ def make_timeline(
     """Of any ``timeline:`` configuration.   stops_ns : increasing; times of impacts, that
     adaptive kinds do not step over."""
     return _KINDS[config.kind](config, t0_ns, t1_ns, pictures, response, stops_ns)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# One timeline of several cameras: frames are drawn when the strictest of them asks.
+
+
+class Shared(Timeline):
+    """One of several timelines, with the times of all; it says what was achieved for its own camera."""
+
+    def __init__(self, own: Timeline, times: Iterator[int]):
+        self.own, self._times = own, times
+        super().__init__(own.config, own.t0_ns, own.t1_ns, own.pictures, own.response, own.stops_ns)
+
+    def __iter__(self) -> Iterator[int]:
+        return self._times
+
+    def info(self) -> dict[str, Any]:
+        return self.own.info()
+
+
+def together(timelines: Sequence[Timeline]) -> list[Timeline]:
+    """As many timelines of the same times, at which no step is longer than any of ``timelines`` (of one configuration)
+    allows. A time is decided when the first of them is asked for it; those that lag behind get it later. A single one
+    stays as it is."""
+    if len(timelines) < 2:
+        return list(timelines)
+    lead = timelines[0]
+    # tee holds a time until every camera has taken it, so cameras may lag behind each other.
+    lead.others = tuple(timelines[1:])
+    return [Shared(own, times) for own, times in zip(timelines, itertools.tee(lead, len(timelines)), strict=True)]

@@ -15,9 +15,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from blinkgl.config.reader import apply_overrides
 from blinkgl.config.run import RunTemplate
 from blinkgl.config.sequence import SequenceConfig
-from blinkgl.config.trees import apply_overrides
 from blinkgl.errors import ConfigError
 from blinkgl.events import Events, emulator_of
 from blinkgl.events.grids import masked
@@ -28,8 +28,7 @@ from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.types import Scene
 from blinkgl.sequence import SequenceRequest, Simulation, simulate_sequence
-from blinkgl.trade.labels import flow_errors
-from blinkgl.trade.metrics import EventErrors, SpeedMaps, event_errors
+from blinkgl.trade.metrics import EventErrors, SpeedMaps, event_errors, flow_errors
 from blinkgl.trade.reference import FineTiles, reference_events
 from blinkgl.trade.settings import SIZES, Setting
 

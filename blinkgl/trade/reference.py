@@ -21,11 +21,10 @@ from blinkgl.config.sequence import RenderConfig
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.grids import masked
 from blinkgl.gl import GLContext
+from blinkgl.render.canvas import Rectangle
 from blinkgl.render.cutouts import Cutouts
-from blinkgl.render.rectangles import Rectangle
 from blinkgl.scene.types import Scene
-from blinkgl.timeline.sampling import displacement_times
-from blinkgl.timeline.speed import largest_speed
+from blinkgl.timeline.sampling import displacement_times, largest_speed
 from blinkgl.types.events import Events
 
 SAMPLES = RenderConfig(antialiasing="edges", mip_bias=-1.0)

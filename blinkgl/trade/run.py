@@ -17,8 +17,7 @@ from blinkgl.gl import create_context
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.machine.bench import machine_line
 from blinkgl.trade.measure import ENOUGH, QUICK, Bench, Level, Options
-from blinkgl.trade.pareto import pareto_front
-from blinkgl.trade.settings import SIZES, Setting, design
+from blinkgl.trade.settings import SIZES, Setting, design, pareto_front
 
 COLUMNS = (
     "name",
@@ -168,8 +167,7 @@ NAMES = {
 
 def write(result: dict, out: str | Path) -> list[Path]:
     """trade.json, trade.csv, pareto.png and trade.html in the folder ``out``. Raises OutputError."""
-    from blinkgl.trade.page import page
-    from blinkgl.trade.plot import pareto
+    from blinkgl.trade.plot import page, pareto
 
     out = Path(out)
     paths = [out / name for name in ("trade.json", "trade.csv", "pareto.png", "trade.html")]

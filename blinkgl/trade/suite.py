@@ -20,15 +20,14 @@ from pathlib import Path
 from typing import Any
 
 from blinkgl.config.quality import QUALITIES, load_quality
+from blinkgl.config.reader import apply_overrides
 from blinkgl.config.run import RunTemplate, load_run
 from blinkgl.config.sequence import SequenceConfig
-from blinkgl.config.trees import apply_overrides
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.trade.measure import Density, Options
-from blinkgl.trade.pareto import excess, pareto_front
 from blinkgl.trade.run import chosen, convergence_line, plain, trade
-from blinkgl.trade.settings import Setting, suite_design
+from blinkgl.trade.settings import Setting, excess, pareto_front, suite_design
 
 OPTIONS = Options(tiles=(3, 2, 14, 11), levels=Density(), reference_s=480.0, rounds=3, rounds_s=240.0, labels=False)
 FILE = "suite.json"

@@ -25,8 +25,7 @@ import numpy as np
 from blinkgl.config.reader import read_table
 from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.dsec import DsecEventReader
-from blinkgl.io.flow import read_flow_npy
-from blinkgl.io.flow_png import read_flow_png
+from blinkgl.io.flow import read_flow_npy, read_flow_png
 from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
 from blinkgl.labels import LABELS
 from blinkgl.sequence_files.index import INDEX, read_index

@@ -14,8 +14,8 @@ from eflow.config import EraftConfig
 from eflow.data.representation import VoxelGrid
 from eflow.models.contract import FlowModel, FlowPrediction, initialise
 from eflow.ops.correlation import DENSE_TOKENS, DenseCorrelation, OnDemandCorrelation, channels_of, pixel_grid
-from eflow.ops.precision import fp32
 from eflow.ops.upsample import convex_upsample, convex_upsample_slow
+from eflow.precision import fp32
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from eflow.ops.precision import fp32
+from eflow.precision import fp32
 
 # Up to so many tokens the whole volume is held: beyond, its memory grows with their square.
 DENSE_TOKENS = 8192

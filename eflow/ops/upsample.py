@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from eflow.ops.precision import fp32
+from eflow.precision import fp32
 
 SCALE = 8
 

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from eflow.ops.correlation import pixel_grid
-from eflow.ops.precision import fp32
+from eflow.precision import fp32
 
 
 def backward_warp(image: Tensor, flow: Tensor, border: str = "zero") -> Tensor:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from blinkgl.camera import Equidistant, PinHole, Radtan
-from blinkgl.camera.rectified import rectified, rectify_map
+from blinkgl.camera.pinhole import rectified, rectify_map
 
 SIZE = (160, 120, 130.0, 128.0, 82.0, 57.5)
 LENSES = [

@@ -5,7 +5,7 @@ import itertools
 import pytest
 
 from blinkgl.config.base import Config, rule
-from blinkgl.config.corners import corners, sites
+from blinkgl.config.draw import corners, sites
 from blinkgl.config.run import RunTemplate
 from blinkgl.errors import ConfigError
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from blinkgl.config.corners import sites
-from blinkgl.config.draw import draw
+from blinkgl.config.draw import draw, sites
 from blinkgl.errors import ConfigError
 
 TREE = {"a": {"uniform": [0.18, 0.25]}, "b": {"c": [{"integer": [1, 6]}, 5]}, "d": {"choice": ["x", "y"]}, "e": 3}

@@ -11,8 +11,8 @@ from blinkgl.config.draw import draw, middle, options
 from blinkgl.config.events import EsimConfig, V2eConfig
 from blinkgl.config.expansion import load_recipe
 from blinkgl.config.problems import validate
+from blinkgl.config.reader import shipped_names
 from blinkgl.config.run import load_run
-from blinkgl.config.shipped import shipped_names
 from blinkgl.errors import ConfigError
 from blinkgl.show.simulate import emulator_options
 

@@ -3,8 +3,8 @@
 import pytest
 
 from blinkgl.cli import run
+from blinkgl.config.reader import run_file, shipped_runs
 from blinkgl.config.run import load_run
-from blinkgl.config.shipped import run_file, shipped_runs
 from blinkgl.errors import ConfigError
 
 

@@ -19,8 +19,7 @@ from blinkgl.dataset.report import SequenceReport
 from blinkgl.dataset.shards import export_shards
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.io.dsec import DsecEventReader
-from blinkgl.io.flo import read_flo
-from blinkgl.io.flow_png import read_flow_png
+from blinkgl.io.flow import read_flo, read_flow_png
 from blinkgl.io.frame_camera import read_exposures
 from blinkgl.labels import LABELS, asked_for
 from blinkgl.report import write_report

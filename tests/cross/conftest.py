@@ -41,7 +41,7 @@ def scene_file(path: Path) -> None:
 
 def frame_folder(folder: Path, seed: int) -> None:
     """A texture that slides by SHIFT px a frame; flow as .npy with masks, and once more as .flo."""
-    from blinkgl.io.flo import encode_flo
+    from blinkgl.io.flow import encode_flo
 
     for name in ("image_left", "flow", "flow_flo"):
         (folder / name).mkdir(parents=True)

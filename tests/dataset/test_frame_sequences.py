@@ -16,7 +16,7 @@ from blinkgl.config.run import load_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import ConfigError
-from blinkgl.io.flow_png import read_flow_png
+from blinkgl.io.flow import read_flow_png
 from blinkgl.io.images import read_mask
 
 H, W, N, SHIFT = 48, 64, 6, (1.5, 0.5)

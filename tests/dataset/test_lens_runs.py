@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 import pytest
 
-from blinkgl.camera.rectified import rectified
+from blinkgl.camera.pinhole import rectified
 from blinkgl.cli import run
 from blinkgl.config.reader import to_yaml
 from blinkgl.config.run import load_run

@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 
 from blinkgl.io.dsec import DsecEventWriter, identity_rectify_map, write_rectify_map
-from blinkgl.io.flow_png import write_flow_png
+from blinkgl.io.flow import write_flow_png
 from blinkgl.labels import Flow
 from blinkgl.sequence_files.sequence_dir import SequenceWriter
 from blinkgl.types.events import Events

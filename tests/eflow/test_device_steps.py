@@ -11,11 +11,10 @@ from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 
 from eflow.config import TrainConfig  # noqa: E402
 from eflow.models import build_model, model_config  # noqa: E402
-from eflow.ops.precision import fp32  # noqa: E402
-from eflow.precision import use_tf32  # noqa: E402
+from eflow.precision import fp32, use_tf32  # noqa: E402
+from eflow.progress import Readings  # noqa: E402
 from eflow.train import _forward  # noqa: E402
 from eflow.training_data import _alike, validate  # noqa: E402
-from eflow.training_log import Readings  # noqa: E402
 
 WAITS = {
     "aten::_local_scalar_dense": "a number that Python reads: float(t), int(t), if t",

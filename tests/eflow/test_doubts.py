@@ -5,7 +5,7 @@ import pytest
 
 from blinkgl.types.events import Events
 from eflow.cli import run
-from eflow.doubts import doubts
+from eflow.infer import doubts
 
 
 def recorded(count=20_000, span_us=100_000, hot=0.0, seed=0) -> Events:

@@ -11,7 +11,7 @@ from torch.utils.flop_counter import FlopCounterMode  # noqa: E402
 from blinkgl.errors import BlinkGLError  # noqa: E402
 from eflow.config import LossConfig  # noqa: E402
 from eflow.infer import predict  # noqa: E402
-from eflow.losses import pixel_error, sequence_loss  # noqa: E402
+from eflow.metrics import pixel_error, sequence_loss  # noqa: E402
 from eflow.models import NETWORKS, SIZES, FlowPrediction, build_model, model_config, parameters_of  # noqa: E402
 from eflow.models.unets import Consensus  # noqa: E402
 

@@ -19,8 +19,8 @@ from blinkgl.errors import BlinkGLError, ConfigError, OutputError  # noqa: E402
 from eflow import checkpoint as ckpt  # noqa: E402
 from eflow.cli import run  # noqa: E402
 from eflow.config import load_train_config  # noqa: E402
+from eflow.progress import TrainingError  # noqa: E402
 from eflow.train import learning_rate, train  # noqa: E402
-from eflow.training_log import TrainingError  # noqa: E402
 from flow_data import blinkgl_set  # noqa: E402
 
 FAST = {"name": "ev_flownet", "input": "voxel", "bins": 5, "width": 8}

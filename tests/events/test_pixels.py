@@ -12,9 +12,8 @@ from blinkgl.config.events import EsimConfig
 from blinkgl.config.readout import PixelsConfig, ReadoutConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events import Events
-from blinkgl.events.camera import EventCamera, EventFrame
+from blinkgl.events.camera import EventCamera, EventFrame, Readout
 from blinkgl.events.pixels import PixelNoise
-from blinkgl.events.readout import Readout
 from blinkgl.types.events import Cause
 from tests.events.clips import assert_same
 

@@ -15,8 +15,7 @@ from blinkgl.config.readout import ReadoutConfig
 from blinkgl.config.sensor import SensorConfig, load_sensor, sensor_names, sensor_table
 from blinkgl.errors import ConfigError
 from blinkgl.events import Events, make_emulator
-from blinkgl.events.camera import EventCamera, EventFrame
-from blinkgl.events.readout import Readout
+from blinkgl.events.camera import EventCamera, EventFrame, Readout
 from blinkgl.recordings.clip import read_recording
 from tests.events.clips import assert_same
 

@@ -17,7 +17,7 @@ from blinkgl.labels import LabelRequest
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.motion.paths import KeyframePath
 from blinkgl.timeline import displacement_times, uniform_times
-from blinkgl.timeline.speed import largest_speed
+from blinkgl.timeline.sampling import largest_speed
 from tests.extremes.measures import FACING, MOTION, compare, length, moving_camera
 from tests.render.render_scenes import (
     LEVEL,

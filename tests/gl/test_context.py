@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import GLError
-from blinkgl.gl import context as context_module, create_context, egl_devices, osmesa
+from blinkgl.gl import context as context_module, create_context, egl_devices
 
 VERTEX = """#version 430 core
 in vec3 position;
@@ -27,8 +27,8 @@ def needs(*backends: str) -> None:
         pytest.skip("no EGL device here")
     if "osmesa" in backends:
         try:
-            osmesa._load_library()
-        except osmesa.OSMesaUnavailable as error:
+            context_module._load_library()
+        except context_module.OSMesaUnavailable as error:
             pytest.skip(str(error))
 
 
@@ -136,7 +136,7 @@ def test_auto_falls_back_to_osmesa_and_says_so(monkeypatch):
 
 def test_neither_is_one_line_with_the_remedy(monkeypatch):
     monkeypatch.setattr(context_module, "_EGL_LIBRARIES", ("libmissing.so",))
-    monkeypatch.setattr(osmesa, "LIBRARIES", ("libmissing.so",))
+    monkeypatch.setattr(context_module, "LIBRARIES", ("libmissing.so",))
     with pytest.raises(GLError) as caught:
         create_context()
     line = str(caught.value)

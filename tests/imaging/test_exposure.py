@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from blinkgl.config.images import AutoExposureConfig
-from blinkgl.imaging.exposure import Exposure, accumulate, instants
-from blinkgl.imaging.metering import Setting, decibels, factor, next_setting
+from blinkgl.imaging.exposure import Exposure, Setting, accumulate, decibels, factor, instants, next_setting
 
 MS = 1_000_000
 

@@ -11,7 +11,7 @@ from blinkgl.config.images import ImagesConfig, exposure_starts
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.imaging import FrameCamera
 from blinkgl.imaging.lens import blur_px, samples
-from blinkgl.imaging.response import decode
+from blinkgl.imaging.sensor import decode
 from blinkgl.render.appearance import sample_bilinear
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.rig import Rig

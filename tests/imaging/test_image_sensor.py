@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from blinkgl.imaging.response import decode, encode
-from blinkgl.imaging.sensor import PATTERNS, mosaic, readings
+from blinkgl.imaging.sensor import PATTERNS, decode, encode, mosaic, readings
 
 SEED = np.uint64(0xFEEDBEEF12345678)
 

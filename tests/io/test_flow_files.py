@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import AssetError, OutputError
-from blinkgl.io import flow_png, pfm
+from blinkgl.io import flow as flow_files, images
 from blinkgl.io.flow import read_flow, write_flow
 
 
@@ -37,7 +37,7 @@ def test_the_ends_of_sixteen_bits(scale, low, high):
     half = 0.5 / scale
     flow = np.zeros((1, 6, 2), np.float32)
     flow[0, :, 1] = (low, low - 0.9 * half, low - 1.1 * half, high, high + 0.9 * half, high + 1.1 * half)
-    data, lost = flow_png.encode_flow_png(flow, np.ones((1, 6), bool), scale=scale)
+    data, lost = flow_files.encode_flow_png(flow, np.ones((1, 6), bool), scale=scale)
     code = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)[0]
     assert lost == 2 and code[:, 0].tolist() == [1, 1, 0, 1, 1, 0]
     assert code[:, 1].tolist() == [0, 0, 32768, 65535, 65535, 32768] and (code[:, 2] == 32768).all()
@@ -77,7 +77,7 @@ def png(width: int, height: int, cut: int | None = None) -> bytes:
 def test_what_opencv_would_pass_over(data, said):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        problem = flow_png._image_problem(data)
+        problem = images._image_problem(data)
     assert problem is None if said is None else said in problem
 
 
@@ -101,11 +101,11 @@ def test_what_opencv_would_pass_over(data, said):
 def test_headers_of_pfm(head, count, said):
     data = head + np.arange(count, dtype="<f4" if b"-" in head else ">f4").tobytes()
     if said is None:
-        image = pfm.decode_pfm(data, "a")
+        image = images.decode_pfm(data, "a")
         assert image.ravel().tolist() == list(range(count)) and image.dtype == np.float32 and image.shape[:2] == (1, 2)
     else:
         with pytest.raises(AssetError, match=said):
-            pfm.decode_pfm(data, "a")
+            images.decode_pfm(data, "a")
     for shape in ((2,), (2, 2, 2), (2, 2, 4), (1, 2, 2, 3)):
         with pytest.raises(ValueError, match="PFM holds"):
-            pfm.encode_pfm(np.zeros(shape))
+            images.encode_pfm(np.zeros(shape))

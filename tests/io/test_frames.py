@@ -12,7 +12,7 @@ import pytest
 
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.frames import open_frames, read_any_image, read_timestamps
-from blinkgl.io.pfm import write_pfm
+from blinkgl.io.images import write_pfm
 from blinkgl.io.video import VideoWriter
 
 

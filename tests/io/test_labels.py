@@ -10,7 +10,7 @@ import pytest
 
 from blinkgl import srgb
 from blinkgl.errors import AssetError
-from blinkgl.io import flo, flow_png, images, pfm
+from blinkgl.io import flow as flow_files, images
 from tests.shared_data import shared
 
 
@@ -21,13 +21,13 @@ def flow_field(height=37, width=51, scale=20.0, seed=0):
 
 def test_dsec_flow_png_read_by_opencv(tmp_path):
     flow, valid = flow_field()
-    assert flow_png.write_flow_png(tmp_path / "f.png", flow, valid) == 0
+    assert flow_files.write_flow_png(tmp_path / "f.png", flow, valid) == 0
     rgb = cv2.imread(str(tmp_path / "f.png"), cv2.IMREAD_UNCHANGED)[..., ::-1]
     assert rgb.dtype == np.uint16
     assert np.array_equal(rgb[..., 2], valid)
     decoded = (rgb[..., :2].astype(np.float64) - 2**15) / 128
     assert np.abs(decoded - flow)[valid].max() <= 0.5 / 128
-    again, again_valid = flow_png.read_flow_png(tmp_path / "f.png")
+    again, again_valid = flow_files.read_flow_png(tmp_path / "f.png")
     assert (
         np.array_equal(again_valid, valid) and np.array_equal(again[valid], decoded[valid]) and not again[~valid].any()
     )
@@ -35,7 +35,7 @@ def test_dsec_flow_png_read_by_opencv(tmp_path):
 
 def test_kitti_ground_truth():
     path = shared("data/flow/kitti/flow_gt.png")
-    flow, valid = flow_png.read_flow_png(path, scale=64.0)
+    flow, valid = flow_files.read_flow_png(path, scale=64.0)
     assert flow.shape == (375, 1242, 2) and round(valid.mean(), 3) == 0.162
     raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     y, x = np.argwhere(valid)[1000]
@@ -44,37 +44,37 @@ def test_kitti_ground_truth():
 
 def test_flo_round_trip_and_unknown(tmp_path):
     flow, valid = flow_field()
-    flo.write_flo(tmp_path / "f.flo", flow, valid)
-    again, again_valid = flo.read_flo(tmp_path / "f.flo")
+    flow_files.write_flo(tmp_path / "f.flo", flow, valid)
+    again, again_valid = flow_files.read_flo(tmp_path / "f.flo")
     assert np.array_equal(again_valid, valid) and np.array_equal(again[valid], flow[valid])
     assert np.array_equal(cv2.readOpticalFlow(str(tmp_path / "f.flo"))[valid], flow[valid])
 
 
 def test_flo_real_files():
-    flow, valid = flo.read_flo(shared("data/flow/middlebury/flow_gt.flo"))
+    flow, valid = flow_files.read_flo(shared("data/flow/middlebury/flow_gt.flo"))
     assert flow.shape == (388, 584, 2) and round(1 - valid.mean(), 3) == 0.016 and np.abs(flow).max() < 100
     path = shared("data/flow/tiny_mmflow/00001_flow.flo")
-    assert np.array_equal(flo.read_flo(path)[0], cv2.readOpticalFlow(str(path)))
+    assert np.array_equal(flow_files.read_flo(path)[0], cv2.readOpticalFlow(str(path)))
 
 
 def test_pfm_real_file_and_orientation(tmp_path):
-    image = pfm.read_pfm(shared("data/flow/tiny_mmflow/0000000-occ_weights_01.pfm"))
+    image = images.read_pfm(shared("data/flow/tiny_mmflow/0000000-occ_weights_01.pfm"))
     assert image.shape == (50, 50) and np.isfinite(image).all()
     (tmp_path / "big.pfm").write_bytes(b"Pf\n1 2\n1.0\n" + np.array([1, 2], ">f4").tobytes())
-    assert pfm.read_pfm(tmp_path / "big.pfm").ravel().tolist() == [2, 1]  # bottom row is stored first
+    assert images.read_pfm(tmp_path / "big.pfm").ravel().tolist() == [2, 1]  # bottom row is stored first
 
 
 @pytest.mark.parametrize(
     "read, name, data, message",
     [
-        (flo.read_flo, "a.flo", b"PIEH", "wrong tag"),
-        (flo.read_flo, "a.flo", flo.encode_flo(np.zeros((4, 4, 2)))[:-1], "truncated"),
-        (flo.read_flo, "a.flo", b"PIEH" + b"\xff" * 8, "impossible"),
-        (pfm.read_pfm, "a.pfm", b"P6\n1 1\n255\n", "wrong header"),
-        (pfm.read_pfm, "a.pfm", pfm.encode_pfm(np.zeros((3, 3)))[:-1], "truncated"),
-        (flow_png.read_flow_png, "a.png", b"\x89PNG..", "corrupt"),
-        (flow_png.read_flow_png, "a.png", images.encode_mask(np.ones((3, 3))), "16-bit RGB"),
-        (flow_png.read_flow_png, "a.png", b"", "corrupt"),
+        (flow_files.read_flo, "a.flo", b"PIEH", "wrong tag"),
+        (flow_files.read_flo, "a.flo", flow_files.encode_flo(np.zeros((4, 4, 2)))[:-1], "truncated"),
+        (flow_files.read_flo, "a.flo", b"PIEH" + b"\xff" * 8, "impossible"),
+        (images.read_pfm, "a.pfm", b"P6\n1 1\n255\n", "wrong header"),
+        (images.read_pfm, "a.pfm", images.encode_pfm(np.zeros((3, 3)))[:-1], "truncated"),
+        (flow_files.read_flow_png, "a.png", b"\x89PNG..", "corrupt"),
+        (flow_files.read_flow_png, "a.png", images.encode_mask(np.ones((3, 3))), "16-bit RGB"),
+        (flow_files.read_flow_png, "a.png", b"", "corrupt"),
         (images.read_npy, "a.npy", images.encode_npy(np.zeros(10))[:-8], "truncated or malformed array"),
     ],
 )

@@ -3,7 +3,7 @@
 import numba
 
 from blinkgl.machine import compiling
-from blinkgl.sequence.clock import StageClock
+from blinkgl.sequence.request import StageClock
 
 
 def test_compilation_is_counted_once():

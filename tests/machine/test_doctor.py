@@ -9,8 +9,8 @@ import pytest
 
 from blinkgl import cli
 from blinkgl.errors import GLError
-from blinkgl.gl import context as context_module, osmesa
-from blinkgl.show import checks as doctor
+from blinkgl.gl import context as context_module
+from blinkgl.show import doctor as doctor
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def test_this_machine_passes_every_required_check(report):
 
 def test_no_opengl_is_reported_with_the_remedy_and_status_2(monkeypatch, capsys):
     monkeypatch.setattr(context_module, "_EGL_LIBRARIES", ("libmissing.so",))
-    monkeypatch.setattr(osmesa, "LIBRARIES", ("libmissing.so",))
+    monkeypatch.setattr(context_module, "LIBRARIES", ("libmissing.so",))
     monkeypatch.setattr(doctor, "_numba", lambda: iter(()))  # compiled in another test; slow
     assert cli.run(["doctor", "--json"]) == 2
     result = json.loads(capsys.readouterr().out)

@@ -16,7 +16,7 @@ from tiny_recipe import TINY
 from blinkgl import AssetError, ConfigError, EventDataError, GLError, OnlineSequences, StreamSample, WindowSample, load
 from blinkgl.online import stream
 from blinkgl.online.job import MIX
-from blinkgl.online.share import Share, share_of_process
+from blinkgl.online.stream import Share, share_of_process
 
 RECIPE = {**TINY, "output": {"sequences": 3}}
 

@@ -22,7 +22,7 @@ from blinkgl.camera import PinHole
 from blinkgl.config.images import ImagesConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.imaging import FrameCamera
-from blinkgl.imaging.response import decode
+from blinkgl.imaging.sensor import decode
 from blinkgl.render import reference
 from blinkgl.scene.geometry.primitives import cuboid, grid, sphere
 from blinkgl.scene.lights import lamp_pose

@@ -16,7 +16,7 @@ from blinkgl.render.passes import Luminance
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Light, Material, Texture
-from blinkgl.shader_debugger.edges_twin import filtered as filtered_slowly
+from blinkgl.shader_debugger.twins import filtered as filtered_slowly
 from render_scenes import (
     LEVEL,
     SECOND,

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 import blinkgl
 from blinkgl.camera import CAMERA_MODELS, PinHole
 from blinkgl.camera.drawing import seen_through
-from blinkgl.camera.rectified import rectified
+from blinkgl.camera.pinhole import rectified
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.gl import create_context
 from blinkgl.labels import LABELS, LabelRequest

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import PinHole
-from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate
+from blinkgl.render.moment import cam_from_obj, cam_from_obj_rate
 
 CAMERA = PinHole(64, 40, 50.0, 70.0, 20.0, 28.0)  # nothing about it is symmetric
 

@@ -17,8 +17,7 @@ from blinkgl.gl.shader import ShaderError
 from blinkgl.labels import LabelRequest
 from blinkgl.render import casting
 from blinkgl.render.canvas import DEPTH_BUFFER
-from blinkgl.render.matrices import mat4_bytes
-from blinkgl.render.moment import View
+from blinkgl.render.moment import View, mat4_bytes
 from blinkgl.render.passes import Geometry, Input, Output, ScenePass, ScreenPass
 from blinkgl.render.renderer import Renderer
 from render_scenes import SECOND, cube, drift, mixed_scene, quad, scene, still, thing

@@ -11,7 +11,7 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.scene.geometry import primitives
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Light, Material, Part, Scene, SceneObject, Texture
-from blinkgl.timeline.speed import largest_speed
+from blinkgl.timeline.sampling import largest_speed
 from render_scenes import LEVEL, SECOND, curve, drift, still
 
 PLAIN = RenderConfig(image_antialiasing="none")

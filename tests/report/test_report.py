@@ -14,7 +14,7 @@ import yaml
 from blinkgl.cli import run
 from blinkgl.config.run import load_run
 from blinkgl.dataset.run import run_dataset
-from blinkgl.report import markup
+from blinkgl.report import charts
 from blinkgl.report.charts import histogram
 from blinkgl.report.collect import collect
 
@@ -170,7 +170,7 @@ def draw():
     """A macro of charts.html, as a template uses it."""
 
     def drawn(call, **values):
-        template = markup._environment().from_string(
+        template = charts._environment().from_string(
             '{% import "report/charts.html" as charts %}{{ charts.' + call + " }}"
         )
         return template.render(values)

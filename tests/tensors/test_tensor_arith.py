@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from blinkgl.events import arith, philox
-from blinkgl.tensors import arith as ours, philox as draws
+from blinkgl.tensors import arith as ours
 
 RNG = np.random.default_rng(0)
 WIDE32 = np.exp(RNG.uniform(-20, 20, 100_003)).astype(np.float32)
@@ -34,9 +34,9 @@ def test_elementary_functions():
 @pytest.mark.parametrize("seed", [0, 1, 2**63 + 12_345, 2**64 - 1])
 def test_draws(seed):
     pixel, index = np.arange(10_001, dtype=np.uint64), np.uint64(2**40 + 7)
-    key, tensor, number = draws.words_of(seed), torch.arange(10_001), 2**40 + 7
+    key, tensor, number = ours.words_of(seed), torch.arange(10_001), 2**40 + 7
     for name in ("uniform2", "normal2", "rough_normal"):
         theirs = getattr(philox, name)(np.uint64(seed), pixel, np.uint64(3), index)
-        made = getattr(draws, name)(key, tensor, 3, number)
+        made = getattr(ours, name)(key, tensor, 3, number)
         for a, b in zip(*((x if isinstance(x, tuple) else (x,)) for x in (made, theirs))):
             assert same(a, b), name

@@ -6,7 +6,7 @@ import torch
 
 from blinkgl.events import grids
 from blinkgl.tensors import TensorEsim, event_counts, latest_times, time_surface, voxel_grid
-from blinkgl.tensors.grids import NEVER_US
+from blinkgl.tensors.batch import NEVER_US
 
 
 @pytest.fixture(scope="module")

@@ -15,13 +15,12 @@ from blinkgl.config.quality import QUALITIES
 from blinkgl.config.run import load_run
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import ConfigError
-from blinkgl.render.rectangles import Rectangle
+from blinkgl.render.canvas import Rectangle
 from blinkgl.scene.build import sequence_scene
 from blinkgl.show.suite import show
 from blinkgl.trade.measure import Density, Options
-from blinkgl.trade.pareto import excess
 from blinkgl.trade.reference import FineTiles
-from blinkgl.trade.settings import Setting, suite_design
+from blinkgl.trade.settings import Setting, excess, suite_design
 from blinkgl.trade.suite import Trial, clips, preset_names, run_suite, standing
 
 SAMPLES = {"none": 1, "taps4": 2, "edges2": 8, "edges": 2.5, "ssaa2": 4, "ssaa4": 16}

@@ -17,10 +17,9 @@ from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import ConfigError
 from blinkgl.render.renderer import Renderer
 from blinkgl.trade.measure import Bench, Level, Options
-from blinkgl.trade.pareto import pareto_front
 from blinkgl.trade.reference import FineTiles
 from blinkgl.trade.run import convergence_line
-from blinkgl.trade.settings import Setting
+from blinkgl.trade.settings import Setting, pareto_front
 
 CONFIG = {
     "seed": 3,

@@ -14,7 +14,7 @@ from blinkgl.io.imu import FILES as IMU_FILES
 from blinkgl.io.records import shown
 from blinkgl.io.tracks import TRACKS
 from blinkgl.labels import LABELS, asked_for
-from blinkgl.sequence_files.lens_files import FILES as LENS_FILES
+from blinkgl.sequence_files.rig_dir import FILES as LENS_FILES
 from blinkgl.sequence_files.sequence_dir import MANIFEST, RIG
 
 

@@ -6,14 +6,11 @@ Start: base.py, then luminance.py.
 """
 
 from blinkgl.render.passes.base import Input, Output, Pass, ScenePass, ScreenPass, Shot
-from blinkgl.render.passes.colour import Colour
 from blinkgl.render.passes.edged import Edged, filtered
 from blinkgl.render.passes.gather import Gather, one_value
-from blinkgl.render.passes.geometry import Geometry
-from blinkgl.render.passes.luminance import Brightness, Luminance
-from blinkgl.render.passes.mean import Mean
+from blinkgl.render.passes.geometry import Geometry, Velocity
+from blinkgl.render.passes.luminance import Brightness, Colour, Luminance, Mean
 from blinkgl.render.passes.shadow import Shaded, ShadowMap, shadow_maps
-from blinkgl.render.passes.velocity import Velocity
 
 PASSES: tuple[type[Pass], ...] = (
     Luminance,

@@ -10,11 +10,10 @@ from blinkgl.render.antialiasing import Samples
 
 if TYPE_CHECKING:
     from blinkgl.gl import Target
-    from blinkgl.render.canvas import Frame
+    from blinkgl.render.canvas import Frame, Rectangle
     from blinkgl.render.draw_items import DrawItem, Kind
     from blinkgl.render.moment import Moment
     from blinkgl.render.painter import Painter, Uniforms
-    from blinkgl.render.rectangles import Rectangle
     from blinkgl.scene.types import Scene
 
 

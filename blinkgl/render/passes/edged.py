@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from blinkgl.render.antialiasing import Samples
-from blinkgl.render.canvas import DEPTH_BUFFER
+from blinkgl.render.canvas import DEPTH_BUFFER, Rectangle, merged
 from blinkgl.render.passes.base import Input, Output, Pass, Shot
-from blinkgl.render.passes.mean import Mean
-from blinkgl.render.rectangles import Rectangle, merged
+from blinkgl.render.passes.luminance import Mean
 
 if TYPE_CHECKING:
     from blinkgl.render.draw_items import DrawItem, Kind
@@ -86,8 +85,7 @@ class Edged(Pass):
 
     @classmethod
     def every_kind(cls) -> Iterator[Pass]:
-        from blinkgl.render.passes.colour import Colour
-        from blinkgl.render.passes.luminance import Luminance
+        from blinkgl.render.passes.luminance import Colour, Luminance
 
         edges = Samples(taps=4, edges=True)
         return (cls(of) for of in (Luminance(edges), Colour(edges)))

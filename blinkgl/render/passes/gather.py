@@ -11,13 +11,12 @@ from moderngl import LINEAR
 from blinkgl.camera import CameraModel, Radtan
 from blinkgl.gl import FORMATS
 from blinkgl.labels import LABELS
+from blinkgl.render.canvas import Rectangle
 from blinkgl.render.lens import steps_of
 from blinkgl.render.passes.base import Input, Output, Pass, ScreenPass, Shot
-from blinkgl.render.passes.colour import Colour
 from blinkgl.render.passes.edged import Edged
-from blinkgl.render.passes.geometry import Geometry
-from blinkgl.render.passes.velocity import Velocity
-from blinkgl.render.rectangles import Rectangle
+from blinkgl.render.passes.geometry import Geometry, Velocity
+from blinkgl.render.passes.luminance import Colour
 
 if TYPE_CHECKING:
     from blinkgl.render.draw_items import DrawItem, Kind

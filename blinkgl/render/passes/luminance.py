@@ -10,8 +10,8 @@ import numpy as np
 
 from blinkgl.render.antialiasing import Samples
 from blinkgl.render.colour import LUMA
-from blinkgl.render.matrices import rows_xyw_bytes
-from blinkgl.render.passes.base import Output, Pass, Shot
+from blinkgl.render.moment import rows_xyw_bytes
+from blinkgl.render.passes.base import Input, Output, Pass, ScreenPass, Shot
 from blinkgl.render.passes.shadow import Shaded, ShadowMap
 
 if TYPE_CHECKING:
@@ -86,3 +86,64 @@ class Brightness(_Luminance):
     @classmethod
     def every_kind(cls) -> Iterator[Pass]:
         return (cls(every) for every in (1, 4))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Pictures in colour.
+
+
+@dataclass(frozen=True)
+class Colour(Shaded):
+    """Output "colour", (H, W, 3) float32 linear radiance, at ``samples``."""
+
+    samples: Samples = Samples()
+    shadows: tuple[ShadowMap, ...] = ()
+    program: ClassVar[str] = "colour.glsl"
+    outputs: ClassVar[tuple[Output, ...]] = (Output("colour", "RGBA32F", components=3),)
+
+    @property
+    def depth(self) -> bool | str:
+        return "texture" if self.samples.edges else True
+
+    def background(self, scene: Scene) -> tuple[float, ...]:
+        return (scene.backdrop,) * 3
+
+    def set(self, painter: Painter, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
+        super().set(painter, uniforms, item, shot)
+        uniforms["base_color"].value = tuple(item.material.base_color)
+        if item.textured:
+            painter.resources.colour_texture(item.material).use(0)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# One value per pixel of a picture that was drawn finer.
+
+
+@dataclass(frozen=True)
+class Mean(ScreenPass):
+    """The mean of each pixel's samples of another pass, of one output; outputs as its."""
+
+    of: Pass
+    program: ClassVar[str] = "downsample.glsl"
+    pointwise: ClassVar[bool] = True
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        return (Input("fine", self.of),)
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        return self.of.outputs
+
+    @property
+    def every(self) -> int:
+        return self.of.every
+
+    def defines(self, kind: Kind | None) -> dict[str, Any]:
+        # Samples per pixel in x and in y.
+        return {"FACTOR": self.of.samples.grid}
+
+    @classmethod
+    def every_kind(cls) -> Iterator[Pass]:
+
+        return (cls(Colour(Samples(grid=factor))) for factor in (2, 4))

@@ -12,7 +12,7 @@ import numpy as np
 from blinkgl.config.deform import AnimationConfig
 from blinkgl.errors import ConfigError
 from blinkgl.scene.importing import gltf
-from blinkgl.scene.importing.raw_mesh import RawMesh, transformed
+from blinkgl.scene.importing.parts import RawMesh, transformed
 from blinkgl.scene.shapes.clips import PATHS, Clip, Playing, Track
 from blinkgl.scene.shapes.deformer import Deformer
 from blinkgl.scene.shapes.skeleton import Skeleton, Still

@@ -7,7 +7,7 @@ Reference: Khronos glTF 2.0 specification, sections 3.5 (scenes), 3.6 (accessors
 :mod:`~blinkgl.scene.importing.gltf_materials`.
 
 Coordinates stay as in the file (y up) until whoever asked turns them z up
-(:data:`~blinkgl.scene.importing.raw_mesh.Z_UP`). What a file asks for and is not drawn is collected in
+(:data:`~blinkgl.scene.importing.parts.Z_UP`). What a file asks for and is not drawn is collected in
 :attr:`Document.omissions`.
 """
 
@@ -24,9 +24,8 @@ from blinkgl.scene.importing import gltf_schema
 from blinkgl.scene.importing.gltf_file import buffers_of, index_of, item, needs, parse
 from blinkgl.scene.importing.gltf_materials import DRAWN, INVISIBLE, INVISIBLE_EXTENSIONS, Materials
 from blinkgl.scene.importing.gltf_nodes import MAX_NODES, Node, nodes_of
-from blinkgl.scene.importing.raw_mesh import RawMesh
-from blinkgl.scene.omissions import Omissions
-from blinkgl.scene.reading import contents, reading
+from blinkgl.scene.importing.parts import RawMesh
+from blinkgl.scene.reading import Omissions, contents, reading
 from blinkgl.scene.shapes.clips import PATHS, Track
 from blinkgl.scene.shapes.skeleton import Locals, Motion, Skeleton
 from blinkgl.scene.types import Material

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from blinkgl.scene.importing.gltf_file import fetch, index_of, item
-from blinkgl.scene.omissions import Omissions
+from blinkgl.scene.reading import Omissions
 from blinkgl.scene.surfaces.images import content_hash, decode_alpha, decode_image, decode_numbers
 from blinkgl.scene.types import REPEAT, Gloss, Map, Mask, Material, Texture, Wrap
 

@@ -21,10 +21,8 @@ from blinkgl.scene.geometry.meshes import concatenate, normalise
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.animations import Animation, clip_names, meshes_at_rest, play as play_clip
 from blinkgl.scene.importing.gltf_file import buffer_contents
-from blinkgl.scene.importing.parts import DeformerOf, closed_parts, part_of
-from blinkgl.scene.importing.raw_mesh import Z_UP, RawMesh, transformed
-from blinkgl.scene.omissions import Omissions
-from blinkgl.scene.reading import MAX_BYTES, contents, reading
+from blinkgl.scene.importing.parts import Z_UP, DeformerOf, RawMesh, closed_parts, part_of, transformed
+from blinkgl.scene.reading import MAX_BYTES, Omissions, contents, reading
 from blinkgl.scene.shapes.skin import Skin, joined
 from blinkgl.scene.surfaces.images import content_hash
 from blinkgl.scene.types import Material, Mesh, Part
@@ -38,7 +36,7 @@ class Asset:
     """A loaded object: its parts in object coordinates, z up.
 
     has_materials : the parts carry the file's own materials.   log : repairs made.
-    omissions : what the file asks for and is not drawn, in one line (:mod:`blinkgl.scene.omissions`), or empty.
+    omissions : what the file asks for and is not drawn, in one line (:mod:`blinkgl.scene.reading`), or empty.
     clips : names of the animations that its file has.   replay : loads it again as it plays one; None: it has none.
     """
 

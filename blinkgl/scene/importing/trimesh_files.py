@@ -16,9 +16,8 @@ from PIL import Image
 
 from blinkgl.errors import AssetError
 from blinkgl.scene.importing.gltf_file import inside
-from blinkgl.scene.importing.raw_mesh import RawMesh
-from blinkgl.scene.omissions import Omissions
-from blinkgl.scene.reading import contents
+from blinkgl.scene.importing.parts import RawMesh
+from blinkgl.scene.reading import Omissions, contents
 from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash, decode_image
 from blinkgl.scene.types import Material, Texture
 from blinkgl.srgb import linear_from_srgb

@@ -39,10 +39,9 @@ from scipy.spatial.transform import Rotation
 from blinkgl.config.physics import IN_THE_WAY, BodyConfig, PhysicsConfig
 from blinkgl.errors import ConfigError
 from blinkgl.machine.extras import install
-from blinkgl.scene.motion.body_shapes import Barrier, Shape, plane_of, quaternions, shapes_of
+from blinkgl.scene.motion.body_shapes import Barrier, Shape, damping_ratio, plane_of, quaternions, shapes_of
 from blinkgl.scene.motion.paths import HermitePath, StaticPath
 from blinkgl.scene.motion.piecewise import thin
-from blinkgl.scene.motion.restitution import damping_ratio
 from blinkgl.scene.types import Dynamics, PosePath, SceneObject
 
 IMPACT_S = 1.6e-3

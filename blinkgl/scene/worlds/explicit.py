@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 from blinkgl.camera import CameraModel
 from blinkgl.config.deform import AnimationConfig, animation_of
 from blinkgl.config.materials import MaterialConfig
-from blinkgl.config.places import rigid_matrix
-from blinkgl.config.poses import KeyedMotionConfig, PoseConfig, TrajectoryConfig
+from blinkgl.config.poses import KeyedMotionConfig, PoseConfig, TrajectoryConfig, rigid_matrix
 from blinkgl.config.primitives import PRIMITIVES
 from blinkgl.config.scene import ExplicitSceneConfig, MeshConfig, ObjectConfig, object_names
 from blinkgl.errors import AssetError, ConfigError

@@ -22,8 +22,7 @@ from blinkgl.config.scene import FileSceneConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.animations import Animation, clip_names, meshes_at_rest, play
-from blinkgl.scene.importing.parts import DeformerOf, closed_parts, part_of
-from blinkgl.scene.importing.raw_mesh import Z_UP, RawMesh, transformed
+from blinkgl.scene.importing.parts import Z_UP, DeformerOf, RawMesh, closed_parts, part_of, transformed
 from blinkgl.scene.lights import MAX_LAMPS, lamp_of_gltf, make_light
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.reading import reading

@@ -13,10 +13,9 @@ from blinkgl.config.physics import BodyConfig, PhysicsConfig
 from blinkgl.errors import ConfigError
 from blinkgl.scene.geometry.meshes import transform_mesh
 from blinkgl.scene.geometry.primitives import cone, cuboid, cylinder, grid, icosphere, sphere
-from blinkgl.scene.motion.body_shapes import Barrier, shapes_of
+from blinkgl.scene.motion.body_shapes import Barrier, damping_ratio, shapes_of
 from blinkgl.scene.motion.dynamics import simulate
 from blinkgl.scene.motion.paths import HermitePath, KeyframePath, StaticPath
-from blinkgl.scene.motion.restitution import damping_ratio
 from blinkgl.scene.types import Material, Part, SceneObject
 
 G, S = 9.81, 1_000_000_000

@@ -17,7 +17,7 @@ from blinkgl.scene.build import build_scene
 from blinkgl.scene.geometry import BUILDERS
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.mesh_files import clip_of, load_asset
-from blinkgl.scene.importing.raw_mesh import Z_UP
+from blinkgl.scene.importing.parts import Z_UP
 from tests.scene.gltf_files import arm_file
 
 SECOND = 10**9

@@ -14,7 +14,7 @@ from blinkgl.config.scene import FileSceneConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.importing import gltf
-from blinkgl.scene.importing.raw_mesh import Z_UP, transformed
+from blinkgl.scene.importing.parts import Z_UP, transformed
 from blinkgl.scene.worlds.from_file import from_document, split_rigid
 from tests.scene.gltf_files import GltfBuilder, triangle
 from tests.shared_data import shared

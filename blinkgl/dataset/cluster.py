@@ -18,6 +18,7 @@ from typing import Any
 
 from blinkgl.dataset.work import Job, Maker, Message, Work, environment_differences, thread_environment
 from blinkgl.errors import BlinkGLError, ConfigError
+from blinkgl.gl.context import egl_devices
 from blinkgl.machine.extras import install
 
 _HELLO_S = 600.0
@@ -268,8 +269,6 @@ def _open(job: dict[str, Any]) -> tuple[Maker, Message]:
 def _egl_device(gpu_ids: list) -> int | None:
     """The EGL device of the card Ray gave to this task: cards are numbered alike, but EGL
     lists software devices, too."""
-    from blinkgl.gl.context import egl_devices
-
     if not gpu_ids or not str(gpu_ids[0]).isdigit():
         return None
     cards = [number for number, text in enumerate(egl_devices()) if "software" not in text.lower()]

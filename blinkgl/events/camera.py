@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -17,15 +17,12 @@ import numpy as np
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import EventDataError
+from blinkgl.events.emulator import Emulator
 from blinkgl.events.packing import JIT
 from blinkgl.events.pixels import PixelNoise
 from blinkgl.events.table import make_emulator
 from blinkgl.events.truth import Surfaces, SurfaceTruth
 from blinkgl.types.events import OPTIONAL, Events
-
-if TYPE_CHECKING:
-    from blinkgl.events.emulator import Emulator
-
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The read-out bus: what becomes of events when a sensor makes more than it can send.

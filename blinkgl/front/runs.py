@@ -28,13 +28,13 @@ from blinkgl.front.sections import (
     labels_tree,
     section_tree,
 )
+from blinkgl.scene.types import Scene as SceneData
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from blinkgl.dataset.run import Outcome
     from blinkgl.dataset.verify import Verification
-    from blinkgl.scene.types import Scene as SceneData
     from blinkgl.sequence.request import SequenceRequest
 
 MAX_INDEX = 10_000_000

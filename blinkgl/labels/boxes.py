@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import os
 from dataclasses import fields
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from blinkgl.config.labels import LabelsConfig
 from blinkgl.io.boxes import encode_boxes, kitti_text, read_boxes
 from blinkgl.io.overlays import with_boxes
 from blinkgl.labels.files import Form
 from blinkgl.labels.label import Drawn, Label
 from blinkgl.labels.semantics import Categories, categories_of
 from blinkgl.types.boxes import SHAPES, Boxes
-
-if TYPE_CHECKING:
-    from blinkgl.config.labels import LabelsConfig
 
 
 class ObjectBoxes(Label):

@@ -9,12 +9,11 @@ import numpy as np
 from blinkgl.labels import files, grading
 from blinkgl.labels.files import Form
 from blinkgl.labels.label import Drawn, Label, View
-from blinkgl.scene.types import FARTHEST
+from blinkgl.scene.types import FARTHEST, Scene
 
 if TYPE_CHECKING:
     from blinkgl.render.passes import Shot
     from blinkgl.render.reference import ReferenceFrame
-    from blinkgl.scene.types import Scene
 
 
 _DEPTH_SHARE = 0.95

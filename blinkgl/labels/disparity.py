@@ -8,10 +8,10 @@ import numpy as np
 
 from blinkgl.labels import grading
 from blinkgl.labels.label import Drawn, Label
+from blinkgl.scene.types import Scene
 
 if TYPE_CHECKING:
     from blinkgl.render.reference import ReferenceFrame
-    from blinkgl.scene.types import Scene
 
 _SHARE = 0.95
 """Of the pixels, that two renderers agree on: silhouettes may fall on either side."""

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from blinkgl.config.labels import LabelsConfig
 from blinkgl.labels import grading
 from blinkgl.labels.files import Form
 from blinkgl.labels.frames import Flow
 from blinkgl.labels.label import Drawn, Label, Towards, View
 
 if TYPE_CHECKING:
-    from blinkgl.config.labels import LabelsConfig
     from blinkgl.render.passes import Shot
 
 

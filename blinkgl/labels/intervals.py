@@ -5,17 +5,15 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from blinkgl.config.labels import LabelsConfig
 from blinkgl.labels.files import Form
 from blinkgl.labels.flow import seconds_of
 from blinkgl.labels.frames import Flow
 from blinkgl.labels.label import Drawn, Label
-
-if TYPE_CHECKING:
-    from blinkgl.config.labels import LabelsConfig
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,16 +13,16 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
+from blinkgl.config.labels import LabelsConfig
 from blinkgl.labels import files, grading
 from blinkgl.labels.files import Form
+from blinkgl.scene.types import Scene
+from blinkgl.types.boxes import Boxes
 
 if TYPE_CHECKING:
-    from blinkgl.config.labels import LabelsConfig
     from blinkgl.labels.frames import Flow, LabelFrame
     from blinkgl.render.passes import Shot
     from blinkgl.render.reference import ReferenceFrame
-    from blinkgl.scene.types import Scene
-    from blinkgl.types.boxes import Boxes
 
 Towards = Literal["forward", "backward"]
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from blinkgl.config.labels import LabelsConfig
 from blinkgl.labels import files, grading
 from blinkgl.labels.files import Form
 from blinkgl.labels.label import Drawn, Label, Towards, View
-
-if TYPE_CHECKING:
-    from blinkgl.config.labels import LabelsConfig
 
 
 class OcclusionAt(Label):

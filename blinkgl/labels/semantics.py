@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.primitives import PRIMITIVES
 from blinkgl.errors import ConfigError
 from blinkgl.labels import files, grading
 from blinkgl.labels.files import Form
 from blinkgl.labels.label import Drawn, Label, View
+from blinkgl.scene.types import Scene, SceneObject
 
 if TYPE_CHECKING:
-    from blinkgl.config.labels import LabelsConfig
     from blinkgl.render.reference import ReferenceFrame
-    from blinkgl.scene.types import Scene, SceneObject
 
 Categories = tuple[tuple[str, int], ...]
 """Pattern -> number, in order."""

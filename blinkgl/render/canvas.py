@@ -8,17 +8,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import moderngl
 import numpy as np
 
 from blinkgl.errors import GLError
+from blinkgl.gl import Target
 from blinkgl.gl.framebuffer import checked_array
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.tensors import TextureReader
 
 if TYPE_CHECKING:
-    import moderngl
-
-    from blinkgl.gl import Target
     from blinkgl.render.moment import Moment
     from blinkgl.render.painter import Painter
     from blinkgl.render.passes.base import Pass, Shot

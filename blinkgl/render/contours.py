@@ -15,14 +15,13 @@ surface itself, and its line runs back along others that are seen: it is one of 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numba as nb
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from blinkgl.render.draw_items import DrawItem
     from blinkgl.render.moment import Moment
     from blinkgl.scene.types import Mesh

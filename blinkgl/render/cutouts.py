@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, TypeVar
 import cv2
 import numpy as np
 
+from blinkgl.gl import GLContext
 from blinkgl.render.canvas import Rectangle
 from blinkgl.render.renderer import Renderer
+from blinkgl.scene.types import Scene
 
 if TYPE_CHECKING:
     from blinkgl.config.sequence import RenderConfig
-    from blinkgl.gl import GLContext
-    from blinkgl.scene.types import Scene
 
 
 Self = TypeVar("Self", bound="Cutouts")

@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from blinkgl.camera import PinHole
 from blinkgl.labels import LABELS, Flow, Label, LabelFrame, LabelRequest
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.boxes import boxes_of
+from blinkgl.render.canvas import Frame
 from blinkgl.render.moment import Moment, View
 from blinkgl.render.occlusion import flow_and_reach, occlusion_mask
 from blinkgl.render.passes import Geometry
+from blinkgl.scene.types import Scene
+from blinkgl.types.boxes import Boxes
 
 if TYPE_CHECKING:
-    from blinkgl.camera import PinHole
-    from blinkgl.render.canvas import Frame
     from blinkgl.render.renderer import Renderer
-    from blinkgl.scene.types import Scene
-    from blinkgl.types.boxes import Boxes
 
 KEPT = 3
 """Times whose buffers are kept for others: neighbouring labels look at the same moments."""

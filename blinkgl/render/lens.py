@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from blinkgl.camera import CameraModel, PinHole
 from blinkgl.camera.drawing import seen_through
 
 if TYPE_CHECKING:
     import moderngl
 
-    from blinkgl.camera import CameraModel, PinHole
     from blinkgl.gl import GLContext
     from blinkgl.render.painter import Uniforms
     from blinkgl.render.passes.base import Shot

@@ -13,13 +13,13 @@ import numpy as np
 
 from blinkgl.render.colour import LUMA
 from blinkgl.scene.lights import is_coloured, lamps_of, quadric_of, quartic_of
+from blinkgl.scene.types import Light
 
 if TYPE_CHECKING:
     from blinkgl.render.draw_items import DrawItem, Kind
     from blinkgl.render.moment import Moment
     from blinkgl.render.painter import Uniforms
     from blinkgl.render.passes.base import Pass
-    from blinkgl.scene.types import Light
 
 EXAMPLES: tuple[dict[str, Any], ...] = (
     {"LIGHTS": 1, "AMBIENT": 3},

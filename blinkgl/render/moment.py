@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from blinkgl.camera import CameraModel
 from blinkgl.camera.drawing import seen_through
 
 if TYPE_CHECKING:
-    from blinkgl.camera import CameraModel
     from blinkgl.render.draw_items import DrawItem
     from blinkgl.scene.types import PosePath, Scene
 

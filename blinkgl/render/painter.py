@@ -8,21 +8,20 @@ from typing import TYPE_CHECKING, Any
 import moderngl
 import numpy as np
 
+from blinkgl.gl import GLContext, Target
 from blinkgl.gl.shader import Uniforms
 from blinkgl.machine.compiling import working_clock
+from blinkgl.render.frames import RenderStats
+from blinkgl.render.lens import Lens
 from blinkgl.render.lighting import Lighting
-from blinkgl.render.moment import linear_xyw_bytes
+from blinkgl.render.moment import Moment, linear_xyw_bytes
 from blinkgl.render.strokes import Strokes
+from blinkgl.scene.types import Map, Scene
 
 if TYPE_CHECKING:
-    from blinkgl.gl import GLContext, Target
     from blinkgl.render.draw_items import DrawItem, Kind
-    from blinkgl.render.frames import RenderStats
-    from blinkgl.render.lens import Lens
-    from blinkgl.render.moment import Moment
     from blinkgl.render.passes.base import Pass, Shot
     from blinkgl.render.resources import SceneResources
-    from blinkgl.scene.types import Map, Scene
 
 FREE_UNIT = 8
 """Texture unit from which on a shape may put its own: a pass has a material's and those of its inputs."""

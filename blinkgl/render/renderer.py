@@ -18,6 +18,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from blinkgl.camera import CameraModel, PinHole
+from blinkgl.gl import GLContext
 from blinkgl.labels import LabelFrame, LabelRequest
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.antialiasing import samples_of
@@ -45,12 +47,10 @@ from blinkgl.render.passes import (
 from blinkgl.render.resources import SceneResources
 from blinkgl.render.still import StillCanvas
 from blinkgl.scene.geometry.meshes import without_collapsed_faces
+from blinkgl.scene.types import Scene
 
 if TYPE_CHECKING:
-    from blinkgl.camera import CameraModel, PinHole
     from blinkgl.config.sequence import RenderConfig
-    from blinkgl.gl import GLContext
-    from blinkgl.scene.types import Scene
 
 
 class Renderer:

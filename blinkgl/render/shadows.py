@@ -8,6 +8,7 @@ a picture of its cone.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
@@ -17,12 +18,10 @@ import numpy as np
 from blinkgl.camera import PinHole
 from blinkgl.render.moment import View
 from blinkgl.scene.lights import lamps_of, shadowing
+from blinkgl.scene.types import Lamp, Scene
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from blinkgl.render.draw_items import DrawItem
-    from blinkgl.scene.types import Lamp, Scene
 
 CV_FROM_LAMP = np.diag([1.0, -1.0, -1.0, 1.0])
 """A lamp shines along its -z axis, a camera looks along its z axis with y down."""

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from blinkgl.gl import Target
 from blinkgl.render.canvas import Canvas, Frame, Rectangle, merged
 
 if TYPE_CHECKING:
     from blinkgl.camera import CameraModel
-    from blinkgl.gl import Target
     from blinkgl.render.draw_items import DrawItem
     from blinkgl.render.passes.base import Shot
 

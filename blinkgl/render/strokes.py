@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import moderngl
 import numpy as np
 
+from blinkgl.gl import GLContext, Target
 from blinkgl.gl.shader import Uniforms, unused
 from blinkgl.render.contours import CROSSING, Lines
 
 if TYPE_CHECKING:
-    from blinkgl.gl import GLContext, Target
     from blinkgl.render.draw_items import DrawItem
     from blinkgl.render.moment import Moment
 

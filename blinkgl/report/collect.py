@@ -15,10 +15,13 @@ from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.verify.cross_checks import plan_of
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError
+from blinkgl.io.colour import count_events, event_colour, flow_colour
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flow import read_flow_png
 from blinkgl.io.frame_camera import EXPOSURES, picture_file, read_codes, read_exposures
 from blinkgl.io.images import read_image
+from blinkgl.io.overlays import TrackLines, with_tracks
+from blinkgl.io.pictures import picture
 from blinkgl.io.records import shown
 from blinkgl.io.tracks import TRACKS, read_tracks
 from blinkgl.labels import LABELS
@@ -195,8 +198,6 @@ def _spread(sequences: list[dict[str, Any]], order: list[int], count: int) -> li
 
 
 def _example(folder: Path, line: dict[str, Any], flows: list[Path], pairs, k: int) -> Example:
-    from blinkgl.io.colour import count_events, event_colour, flow_colour
-
     flow, valid = read_flow_png(flows[k])
     start, end = pairs[k]
     with DsecEventReader(folder / "events.h5") as reader:
@@ -251,8 +252,6 @@ def _of_the_camera(folder: Path, line: dict[str, Any], t_us: int) -> list[tuple[
 
 def _over_time(folder: Path, line: dict[str, Any], t_us: int, image: np.ndarray | None) -> list[tuple[str, np.ndarray]]:
     """Point tracks over the image of a time, with tails."""
-    from blinkgl.io.overlays import TrackLines, with_tracks
-
     pictures = []
     if (folder / TRACKS).is_file():
         tracks, size = read_tracks(folder), np.array([line["width"], line["height"]])
@@ -266,8 +265,6 @@ def _over_time(folder: Path, line: dict[str, Any], t_us: int, image: np.ndarray 
 def _others(folder: Path, index: int, image: np.ndarray | None) -> list[tuple[str, np.ndarray]]:
     """Pictures of the labels besides those that every example shows. image : of the same time, what is no picture is
     drawn over that."""
-    from blinkgl.io.pictures import picture
-
     pictures = []
     for name, label in LABELS.items():
         form = label.forms[0]

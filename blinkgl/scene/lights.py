@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,10 +27,7 @@ from blinkgl.config.lights import (
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.surfaces.environment import Environment, pixel_directions
 from blinkgl.scene.surfaces.gloss import blurred
-from blinkgl.scene.types import Lamp, Light, Panorama
-
-if TYPE_CHECKING:
-    from blinkgl.scene.types import PosePath
+from blinkgl.scene.types import Lamp, Light, Panorama, PosePath
 
 MAX_LAMPS = 32
 """Of a scene: each is looked at by every lit pixel."""

@@ -9,21 +9,19 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.sequence import RenderConfig
+from blinkgl.config.timeline import DisplacementTimeline
 from blinkgl.events import Events, emulator_of
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.grids import masked, voxel_grid
 from blinkgl.render.cutouts import Cutouts, lattice, mask_of
-
-if TYPE_CHECKING:
-    from blinkgl.config.events import EmulatorConfig
-    from blinkgl.config.timeline import DisplacementTimeline
-    from blinkgl.render.renderer import Renderer
-    from blinkgl.scene.types import Scene
+from blinkgl.render.renderer import Renderer
+from blinkgl.scene.types import Scene
 
 WORTH = 1.3
 """Frames that close together are worth their price where half as many make events so many times as wrong."""

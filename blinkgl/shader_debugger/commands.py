@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.errors import OutputError
+from blinkgl.io import pictures
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.images import encode_npy
 from blinkgl.shader_debugger.compare import BufferReport, Comparison, parse_tolerances
@@ -22,6 +23,7 @@ from blinkgl.shader_debugger.moments import (
     open_reference,
 )
 from blinkgl.shader_debugger.probe import as_text, probe
+from blinkgl.shader_debugger.quantities import QUANTITIES
 from blinkgl.shader_debugger.session import Subject, When, check_pixel, open_renderer
 from blinkgl.shader_debugger.twins import TWINNED, twinned_of
 from blinkgl.shader_debugger.verdict import as_text as verdict_text, verdict
@@ -34,7 +36,6 @@ def write_passes(
     folder ``out``. Returns the paths.
 
     Anti-aliased as the configuration says: these are the arrays that generation uses. Raises BlinkGLError."""
-    from blinkgl.io import pictures
     from blinkgl.shader_debugger import picture
 
     there = buffers_of(subject.scene)
@@ -107,8 +108,6 @@ def run_diff(
     """Compares the named buffers (default: all that can be); with ``out`` also writes
     diff.png and NAME_error.npy there.
     Returns what :func:`verdict.verdict` says, and the reports."""
-    from blinkgl.shader_debugger.quantities import QUANTITIES
-
     # Names are checked before anything is drawn.
     if names:
         there = buffers_of(subject.scene, twinned_of(subject.config, subject.scene))

@@ -11,12 +11,11 @@ import numpy as np
 from blinkgl.gl.shader import MADE, ShaderError
 from blinkgl.labels import LABELS
 from blinkgl.labels.table import define_of, includes
-from blinkgl.render.moment import rows_xyw_bytes
+from blinkgl.render.moment import Moment, rows_xyw_bytes
 from blinkgl.render.passes.base import Output, Pass, ScenePass, Shot
 
 if TYPE_CHECKING:
     from blinkgl.render.draw_items import DrawItem, Kind
-    from blinkgl.render.moment import Moment
     from blinkgl.render.painter import Painter, Uniforms
 
 

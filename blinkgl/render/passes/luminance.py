@@ -13,11 +13,11 @@ from blinkgl.render.colour import LUMA
 from blinkgl.render.moment import rows_xyw_bytes
 from blinkgl.render.passes.base import Input, Output, Pass, ScreenPass, Shot
 from blinkgl.render.passes.shadow import Shaded, ShadowMap
+from blinkgl.scene.types import Scene
 
 if TYPE_CHECKING:
     from blinkgl.render.draw_items import DrawItem, Kind
     from blinkgl.render.painter import Painter, Uniforms
-    from blinkgl.scene.types import Scene
 
 
 class _Luminance(Shaded):

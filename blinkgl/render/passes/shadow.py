@@ -11,17 +11,16 @@ import numpy as np
 from moderngl import LINEAR
 
 from blinkgl.render.canvas import DEPTH_BUFFER
+from blinkgl.render.moment import Moment
 from blinkgl.render.passes.base import Input, Output, Pass, ScenePass, Shot
 from blinkgl.render.shadows import Box, boxes, planes_of, scale_of, view_of
 from blinkgl.scene.lights import MAX_SHADOWS, lamps_of
 from blinkgl.scene.motion.paths import StaticPath
-from blinkgl.scene.types import Lamp
+from blinkgl.scene.types import Lamp, Scene
 
 if TYPE_CHECKING:
     from blinkgl.render.draw_items import DrawItem, Kind
-    from blinkgl.render.moment import Moment
     from blinkgl.render.painter import Painter, Uniforms
-    from blinkgl.scene.types import Scene
 
 
 FINEST = 1 / 32

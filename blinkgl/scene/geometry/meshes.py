@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -13,11 +12,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from blinkgl.errors import AssetError
-from blinkgl.scene.shapes.deformer import filled
+from blinkgl.scene.shapes.deformer import Deformer, filled
 from blinkgl.scene.types import Mesh, Scene
-
-if TYPE_CHECKING:
-    from blinkgl.scene.shapes.deformer import Deformer
 
 CREASE_DEGREES = 40.0
 WELD_RELATIVE = 1e-6  # vertices nearer than this times the extent are one point

@@ -51,7 +51,7 @@ FLOORS = (
     "layouts online report",
     "trade front eflow",
     "show shader_debugger",
-    "cli __main__ tools",
+    "cli cli_recordings __main__ tools",
 )
 """From the ground up. ``import blinkgl`` itself fetches its names when they are first used."""
 

@@ -1,0 +1,257 @@
+"""The commands of ``blinkgl`` on one recording, video, event file or scene; those on data sets are in ``cli.py``."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+
+def simulate(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="INPUT", help="Video, folder of images, .npy or .npz of frames, .aedat4 or .aedat with frames."
+        ),
+    ],
+    out: Annotated[
+        str, typer.Option("--out", "-o", help="Event file: .h5 (DSEC), .raw (EVT3), .txt, .csv, .npz, .npy.")
+    ],
+    emulator: Annotated[str, typer.Option("--emulator", "-e", help="esim, v2e or voltmeter.")] = "esim",
+    sensor: Annotated[
+        str | None,
+        typer.Option(
+            "--sensor",
+            help="davis240c, davis346, dvxplorer, gen31_vga or imx636, or a sensor file (.yaml): its size, thresholds, "
+            "noise and read-out limit.",
+        ),
+    ] = None,
+    size: Annotated[
+        str | None,
+        typer.Option(
+            help="WIDTHxHEIGHT that frames are cropped and scaled to (default: the sensor's, else their own)."
+        ),
+    ] = None,
+    config: Annotated[str | None, typer.Option("--config", help="YAML file of emulator parameters.")] = None,
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", metavar="key=value", help="Emulator parameter; may be repeated.")
+    ] = None,
+    fps: Annotated[
+        float | None, typer.Option(help="Frames per second (default: the video's, or the time stamps).")
+    ] = None,
+    timestamps: Annotated[
+        str | None, typer.Option(help="File of frame times: µs as integers, or seconds with a point.")
+    ] = None,
+    gamma: Annotated[
+        str | None,
+        typer.Option(
+            help="srgb, linear or an exponent (default: linear for floats and a recording's frames, for grey images "
+            "of the sensor's size what its own frames are, else srgb)."
+        ),
+    ] = None,
+    interpolate: Annotated[str, typer.Option(help="Between frames: linear, or motion (dense-flow warp).")] = "linear",
+    max_px: Annotated[float, typer.Option(min=0.01, help="motion: largest displacement per step, px.")] = 1.0,
+    keep_noise: Annotated[
+        bool, typer.Option("--keep-noise", help="Make events of the frames' own noise, too (default: none).")
+    ] = False,
+    seed: Annotated[int, typer.Option(help="Seed of the emulator.")] = 0,
+    preview: Annotated[str | None, typer.Option(help="Also write a video of frames and events, .mp4.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
+) -> int:
+    """Turn any video into events."""
+    from blinkgl.show import simulate as command
+
+    return command.run(
+        source,
+        out,
+        emulator=emulator,
+        sensor=sensor,
+        size=size,
+        config=config,
+        overrides=overrides or [],
+        quiet=quiet,
+        fps=fps,
+        timestamps=timestamps,
+        gamma=gamma,
+        interpolate=interpolate,
+        max_px=max_px,
+        keep_noise=keep_noise,
+        seed=seed,
+        preview=preview,
+        overwrite=overwrite,
+    )
+
+
+def compare(
+    a: Annotated[str, typer.Argument(metavar="A", help="Event file.")],
+    b: Annotated[
+        str | None, typer.Argument(metavar="B", help="Event file (of any size), or frames (video, folder, .npy).")
+    ] = None,
+    frames: Annotated[str | None, typer.Option(help="Frames of the scene, for the log-intensity change.")] = None,
+    out: Annotated[str | None, typer.Option("--out", "-o", help="Folder for compare.json and compare.png.")] = None,
+    fps: Annotated[float | None, typer.Option(help="Frame rate of the frames.")] = None,
+    timestamps: Annotated[str | None, typer.Option(help="Frame times.")] = None,
+    gamma: Annotated[
+        str, typer.Option(help="Of the frames: linear, as a camera's own are, srgb or an exponent.")
+    ] = "linear",
+    frame_delay_ms: Annotated[float, typer.Option(help="Added to the frame times, ms.")] = 0.0,
+    interval_ms: Annotated[float, typer.Option(min=0.001, help="Interval where there are no frames, ms.")] = 20.0,
+    zero_time: Annotated[bool, typer.Option("--zero-time", help="Count both from their first event.")] = False,
+    judge: Annotated[
+        bool, typer.Option("--judge", help="Also say how well a classifier tells A from B, and the halves of each.")
+    ] = False,
+) -> int:
+    """Describe a recording, or compare it with another or with frames: counts, rates,
+    intervals, polarity against brightness."""
+    from blinkgl.show import compare as command
+
+    return command.run(
+        a,
+        b,
+        out,
+        frames=frames,
+        fps=fps,
+        timestamps=timestamps,
+        gamma=gamma,
+        frame_delay_ms=frame_delay_ms,
+        interval_ms=interval_ms,
+        zero_time=zero_time,
+        judge=judge,
+    )
+
+
+def calibrate(
+    recording: Annotated[str, typer.Argument(metavar="RECORDING", help="Event file of a camera.")],
+    out: Annotated[
+        str, typer.Option("--out", "-o", help="The sensor file, .yaml; a page goes beside it, .html.")
+    ] = "sensor.yaml",
+    frames: Annotated[
+        str | None,
+        typer.Option(help="What the camera saw, of its size (default: the recording's own frames)."),
+    ] = None,
+    still: Annotated[
+        bool, typer.Option("--still", help="No frames: a scene that stands still in constant light. Noise alone.")
+    ] = False,
+    emulator: Annotated[
+        str,
+        typer.Option("--emulator", "-e", help="esim, v2e or voltmeter; with --still also pixels: noise beside any."),
+    ] = "esim",
+    sensor: Annotated[str | None, typer.Option("--sensor", help="A sensor whose values the fit begins with.")] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="key=value", help="Emulator parameter that is not fitted; may be repeated."),
+    ] = None,
+    fps: Annotated[float | None, typer.Option(help="Frame rate of the frames.")] = None,
+    timestamps: Annotated[str | None, typer.Option(help="Frame times.")] = None,
+    gamma: Annotated[
+        str, typer.Option(help="Of the frames: linear, as a camera's own are, srgb or an exponent.")
+    ] = "linear",
+    interpolate: Annotated[str, typer.Option(help="Between frames: motion (dense-flow warp) or linear.")] = "motion",
+    max_px: Annotated[float, typer.Option(min=0.01, help="motion: largest displacement per step, px.")] = 1.0,
+    frame_delay_ms: Annotated[
+        float | None, typer.Option(help="Added to the frame times, ms (default: found from both).")
+    ] = None,
+    starts: Annotated[int, typer.Option(min=1, max=20, help="Of the search.")] = 3,
+    seed: Annotated[int, typer.Option(min=0, help="Of the simulations and of the search.")] = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
+) -> int:
+    """Fit an emulator to a camera's own recording: a sensor file, and a page that says how near it comes."""
+    from blinkgl.show import calibrate as command
+
+    return command.run(
+        recording,
+        frames,
+        out,
+        still=still,
+        emulator=emulator,
+        sensor=sensor,
+        overrides=overrides or [],
+        fps=fps,
+        timestamps=timestamps,
+        gamma=gamma,
+        interpolate=interpolate,
+        max_px=max_px,
+        frame_delay_ms=frame_delay_ms,
+        starts=starts,
+        seed=seed,
+        overwrite=overwrite,
+        quiet=quiet,
+    )
+
+
+def convert(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="IN",
+            help="Event file: DSEC/BlinkFlow/MVSEC .h5, EVT2/EVT2.1/EVT3 .raw, .aedat4, .aedat, .es, "
+            ".mat, .txt, .csv, .npz, .npy.",
+        ),
+    ],
+    target: Annotated[str, typer.Argument(metavar="OUT", help="Event file; its ending names the format.")],
+    size: Annotated[
+        str | None, typer.Option(help="WIDTHxHEIGHT, where the file does not say (default: guessed).")
+    ] = None,
+    zero_time: Annotated[
+        bool, typer.Option("--zero-time", help="Shift times so that the first event is at 0.")
+    ] = False,
+    time_unit: Annotated[
+        str,
+        typer.Option("--time-unit", help="Of .txt and .csv: s (six decimals), or us (integers; a .csv as faery's)."),
+    ] = "s",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
+) -> int:
+    """Convert an event file from one format to another."""
+    from blinkgl.show import convert as command
+
+    return command.run(source, target, size=size, zero_time=zero_time, time_unit=time_unit, overwrite=overwrite)
+
+
+def import_(
+    source: Annotated[
+        str, typer.Argument(metavar="SCENE", help=".blend, .fbx, .usd/.usda/.usdc/.usdz, .dae, .abc or .obj.")
+    ],
+    out: Annotated[str, typer.Option("--out", "-o", help="The GLB to write.")],
+    scene: Annotated[
+        str | None, typer.Option("--scene", help="Name of the file's scene (default: the one it was saved in).")
+    ] = None,
+    frames: Annotated[
+        tuple[int, int] | None, typer.Option("--frames", metavar="FIRST LAST", help="Default: the scene's range.")
+    ] = None,
+    fps: Annotated[
+        float | None,
+        typer.Option("--fps", help="Frames per second (default: the file's; 24 for USD, Collada and Alembic)."),
+    ] = None,
+    keys_per_frame: Annotated[
+        int,
+        typer.Option("--keys-per-frame", min=1, max=64, help="Key frames per frame; between them motion is straight."),
+    ] = 1,
+    clips: Annotated[
+        bool, typer.Option("--clips", help="An animation per action, not one of the scene as it plays.")
+    ] = False,
+    time_limit: Annotated[
+        float, typer.Option("--time-limit", min=1, help="Seconds that Blender may take altogether.")
+    ] = 900.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no table.")] = False,
+) -> int:
+    """Make a GLB of a scene of Blender's or of a format that Blender reads (extra [cycles]), and say what came and what
+    could not."""
+    from blinkgl.show import import_ as command
+
+    return command.run(
+        source,
+        out,
+        as_json=as_json,
+        quiet=quiet,
+        scene=scene,
+        frames=frames,
+        fps=fps,
+        keys_per_frame=keys_per_frame,
+        clips=clips,
+        time_limit_s=time_limit,
+        overwrite=overwrite,
+    )

@@ -1,6 +1,6 @@
 #version 430 core
-// Colour pass: linear radiance, rgb, into one target. Material variants as in luminance.glsl: TEXTURED, LIT, TWO_SIDED, LIGHTS, HUED,
-// TINTED, EMISSIVE, GLOSSY, BUMPED, GLOSS_MAP, MASKED.
+// Colour pass: linear radiance, rgb, into one target. Material variants as in luminance.glsl: TEXTURED, LIT, TWO_SIDED,
+// LIGHTS, HUED, TINTED, EMISSIVE, GLOSSY, BUMPED, GLOSS_MAP, MASKED.
 // SHOW_LOOKUP, the shader debugger's: also writes what was looked up, see lookup.glsl.
 
 #include "needs.glsl"
@@ -100,8 +100,8 @@ void main()
 #else
 #define OF_LUMINANCE(light) (light)
 #endif
-    show_lookup(radiance, vec3(light), OF_LUMINANCE(light), mirrored_light, added - mirrored_light, OF_LUMINANCE(shown_direct),
-                OF_LUMINANCE(shown_arrives), OF_LUMINANCE(shown_around));
+    show_lookup(radiance, vec3(light), OF_LUMINANCE(light), mirrored_light, added - mirrored_light,
+                OF_LUMINANCE(shown_direct), OF_LUMINANCE(shown_arrives), OF_LUMINANCE(shown_around));
 #endif
 #ifdef LIT
     radiance *= light;

@@ -7,12 +7,12 @@
 // own boundary as seen from the centre, signed. So corners, ends of lines and surfaces that are narrower than a pixel
 // come out right, whatever the order of the lines.
 //
-// An outline of triangles smaller than a pixel is a zigzag: some of its lines run back, and their shares cancel those of
-// others. So all lines of a pixel have to mean the same two surfaces by "in front" and "behind", whichever way they run:
-// those that the depth buffer shows around the pixel, before and behind the line's depth.
+// An outline of triangles smaller than a pixel is a zigzag: some of its lines run back, and their shares cancel those
+// of others. So all lines of a pixel have to mean the same two surfaces by "in front" and "behind", whichever way they
+// run: those that the depth buffer shows around the pixel, before and behind the line's depth.
 //
-// Which lines cross which pixels, and with what share, is known before (contours.py). Here is one vertex, and one point,
-// for each pixel that has any: the pixels around it are looked at once, whatever the number of lines.
+// Which lines cross which pixels, and with what share, is known before (contours.py). Here is one vertex, and one
+// point, for each pixel that has any: the pixels around it are looked at once, whatever the number of lines.
 //
 // LIGHT: the type of what a pixel shows, OF: its components in the picture. The sum is held to 0, since what
 // lines of different surfaces do not know of each other may take more away than there is.
@@ -32,9 +32,9 @@ uniform sampler2D picture;
 uniform sampler2D depths;
 uniform sampler2D crossings;
 
-// By how much depths (near / Z) differ, in parts. The first two in widths of a pixel where the surface is, since a body of
-// some pixels is round by some: what is farther than GAP lies behind; what is nearer than COVER hides the line, unless the
-// pixel's centre is on its surface, which may come nearer by SAME. NEARER: where nothing is clearly behind.
+// By how much depths (near / Z) differ, in parts. The first two in widths of a pixel where the surface is, since a body
+// of some pixels is round by some: what is farther than GAP lies behind; what is nearer than COVER hides the line,
+// unless the pixel's centre is on its surface, which may come nearer by SAME. NEARER: where nothing is clearly behind.
 const float GAP = 3.0;
 const float COVER = 6.0;
 const float SAME = 0.25;
@@ -137,9 +137,8 @@ void main()
             else if (known)
                 front = fronts / in_front;
         } else {
-            // Two surfaces that meet or nearly so: those to the line's left and right. What lies behind it, continued as a
-            // plane to the line, is not nearer. (A floor that a body stands on is nearer beside it, and is not where they
-            // meet.)
+            // Two surfaces that meet or nearly so: those to the line's left and right. What lies behind it, continued
+            // as a plane to the line, is not nearer. (A floor that a body stands on is nearer beside it.)
             ivec2 to_back = here - aside;
             float back_depth = depth_at(to_back);
             if (abs(room) < SNAP) { // what was drawn there decides
@@ -198,8 +197,7 @@ void main()
     else if (shares > 1.0)
         whole = 1.0 / shares;
     LIGHT result = plain + change * whole;
-    // What is rough by less than a pixel has too many layers there to know how many hide the centre: a mean of what is seen
-    // around.
+    // What is rough by less than a pixel has too many layers there to know how many hide the centre: a mean of them.
     LIGHT around = LIGHT(0.0);
     for (int k = 0; k < 9; ++k)
         around += (k == 4 ? 0.25 : k % 2 == 1 ? 0.125 : 0.0625) * seen[k];

@@ -1,6 +1,6 @@
 #version 430 core
-// A lens's picture out of a flat one (blinkgl/render/lens.py): what of the flat picture is nearest to each pixel's ray, or
-// (SMOOTH) its mean over the pixel.
+// A lens's picture out of a flat one (blinkgl/render/lens.py): what of the flat picture is nearest to each pixel's ray,
+// or (SMOOTH) its mean over the pixel.
 //
 // SAMPLER_k, TEXEL_k   types of the k-th output, its sampler's and its own
 // COLUMNS, ROWS        SMOOTH: places in a pixel. Counts that a pixel finds for itself cost five times as much.

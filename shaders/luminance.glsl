@@ -109,8 +109,8 @@ void main()
 #ifdef TEXTURED
 #ifdef TAPS4
 #ifdef STRETCHED
-    // The longer way of the pixel over the surface, and the shorter: four taps in a square where they are alike, in a row
-    // along the longer one where the surface is seen at a grazing angle, and all between; each of the level that fits.
+    // The longer way of the pixel over the surface, and the shorter: four taps in a square where they are alike, in a
+    // row along the longer one where the surface is seen at a grazing angle; each of the level that fits.
     vec2 right = 0.25 * dFdx(uv), down = 0.25 * dFdy(uv), texels = vec2(textureSize(albedo, 0));
     float across = dot(right * texels, right * texels), along = dot(down * texels, down * texels);
     if (across > along) {
@@ -184,7 +184,8 @@ void main()
 #endif
 #ifdef CHANGES
     // L of the surface as a whole, a little before and after.
-    Spot spot_change = Spot(change / WEIGHTS, seen_rate(normal, motion), vec4(0.0), seen_rate(local, motion), vec2(0.0));
+    vec3 turn_rate = seen_rate(normal, motion), local_rate = seen_rate(local, motion);
+    Spot spot_change = Spot(change / WEIGHTS, turn_rate, vec4(0.0), local_rate, vec2(0.0));
 #ifdef BUMPED
     spot_change.along.xyz = seen_rate(tangent.xyz, motion);
 #endif

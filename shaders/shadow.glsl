@@ -1,6 +1,6 @@
 #version 430 core
-// Shadow map: depth alone, as a lamp sees the scene. Of closed meshes the sides that face it are drawn: the lower side of a
-// box that stands on the ground is as far from the lamp as the ground, which would be lit along the box's edge.
+// Shadow map: depth alone, as a lamp sees the scene. Of closed meshes the sides that face it are drawn: the lower side
+// of a box that stands on the ground is as far from the lamp as the ground, which would be lit along the box's edge.
 #include "vertex.glsl"
 
 #ifdef FRAGMENT_SHADER

@@ -1,11 +1,11 @@
 // Where on its surface a fragment is evaluated, for programs that write labels.
 //
-// Behind a lens (LENS_CLAIMS) that is where the ray of the one pixel of the lens's picture passes that will look at this
-// fragment: up to half a pixel beside its centre (lens_claims, blinkgl/render/lens.py). Whether it is on this facet is
-// asked of the ray, too, not of the centre. So a geometry stage (GEOMETRY_STAGE) makes every triangle as large as all
-// pixels that it touches, and hands on the corners of the one that it is; the fragment finds where the ray meets that, and
-// its depth there, and is none where it passes it by. Neighbours share a corner's bits and ask the same product with
-// opposite signs, so no ray passes between them.
+// Behind a lens (LENS_CLAIMS) that is where the ray of the one pixel of the lens's picture passes that will look at
+// this fragment: up to half a pixel beside its centre (lens_claims, blinkgl/render/lens.py). Whether it is on this
+// facet is asked of the ray, too, not of the centre. So a geometry stage (GEOMETRY_STAGE) makes every triangle as large
+// as all pixels that it touches, and hands on the corners of the one that it is; the fragment finds where the ray meets
+// that, and its depth there, and is none where it passes it by. Neighbours share a corner's bits and ask the same
+// product with opposite signs, so no ray passes between them.
 #ifdef LENS_CLAIMS
 
 // What vertex.glsl gives, as F(type, name).
@@ -140,7 +140,8 @@ void main()
         int before = (k + 2) % 3;
         vec2 a = outward[before], b = outward[k];
         // Where two moved sides meet: Cramer's rule on their two line equations.
-        vec2 by = vec2(away[before] * b.y - away[k] * a.y, away[k] * a.x - away[before] * b.x) / (a.x * b.y - a.y * b.x);
+        vec2 by = vec2(away[before] * b.y - away[k] * a.y, away[k] * a.x - away[before] * b.x);
+        by /= a.x * b.y - a.y * b.x;
         fits = fits && max(abs(by.x), abs(by.y)) < FARTHEST; // NaN does not
         moved[k] = p[k] + by;
     }

@@ -1,5 +1,5 @@
-// A shape that changes with time, q(p, t) in the place of p (blinkgl/scene/shapes): included by vertex.glsl in the variants of such
-// shapes alone. One of DEFORM_<NAME> is defined; its source, include/deform/<name>.glsl or the text of its class, defines
+// A shape that changes with time, q(p, t) in the place of p (blinkgl/scene/shapes): included by vertex.glsl in the
+// variants of such shapes alone. One of DEFORM_<NAME> is defined; include/deform/<name>.glsl or its class's text has
 //   vec3 deformed(vec3 p)                      q
 //   vec3 deformed_rate(vec3 p)                 dq/dt
 //   vec3 deformed_change(vec3 p, int other)    q at the other time less q, never as the difference of two positions
@@ -10,16 +10,18 @@ layout(std140) uniform Shape
 {
     vec4 shape[4 * SHAPE_ROWS];
 };
-const int SHAPE_RATE = SHAPE_ROWS, SHAPE_FORWARD = 2 * SHAPE_ROWS, SHAPE_BACKWARD = 3 * SHAPE_ROWS; // first rows; those of now begin at 0
+// First rows; those of now begin at 0.
+const int SHAPE_RATE = SHAPE_ROWS, SHAPE_FORWARD = 2 * SHAPE_ROWS, SHAPE_BACKWARD = 3 * SHAPE_ROWS;
 
-// sin and cos to float32's precision, near 0 relative to the result: drivers' own are only as good as 2^-21, which would be all of a
-// small motion. Angles beyond some hundred turns lose digits.
+// sin and cos to float32's precision, near 0 relative to the result: drivers' own are only as good as 2^-21, which
+// would be all of a small motion. Angles beyond some hundred turns lose digits.
 float sine(float x)
 {
     float k = round(x * 0.31830988618);
     float r = (x - k * 3.140625) - k * 9.67653589793e-4; // pi in two parts, the first with few digits
     float s = r * r;
-    float y = r + r * s * (-1.6666666667e-1 + s * (8.3333333333e-3 + s * (-1.9841269841e-4 + s * (2.7557319224e-6 - s * 2.5052108385e-8))));
+    float series = -1.9841269841e-4 + s * (2.7557319224e-6 - s * 2.5052108385e-8);
+    float y = r + r * s * (-1.6666666667e-1 + s * (8.3333333333e-3 + s * series));
     return mod(k, 2.0) < 0.5 ? y : -y;
 }
 

@@ -7,8 +7,8 @@
 // Of a shape that changes, q is in the place of p, and its own change comes on top: d = D * q + MVP' * (q' - q), the
 // second term from the vertex stage.
 //
-// d: rows x, y, w.  Returns (u, v in px, w' in world units).  w' <= 0: behind the camera, or so near to its plane that the
-// flow is beyond float32; u = v = 0 then.
+// d: rows x, y, w.  Returns (u, v in px, w' in world units).  w' <= 0: behind the camera, or so near to its plane that
+// the flow is beyond float32; u = v = 0 then.
 vec3 displacement(vec3 d, vec2 image_size)
 {
     float w_next = 1.0 / INVERSE_DEPTH + d.z;

@@ -28,15 +28,16 @@ mat2 lens_slope(vec2 u)
 #endif
 
 #ifdef EQUIDISTANT
-// atan(x) to the last place or two, relatively, also of x near 0: tan of the quarter, then its series. What cards have is
-// good to 1e-5, which is 1e-3 px of a flow of 100.
+// atan(x) to the last place or two, relatively, also of x near 0: tan of the quarter, then its series. What cards have
+// is good to 1e-5, which is 1e-3 px of a flow of 100.
 float lens_atan(float x)
 {
     // tan(a/2) = tan a / (1 + sqrt(1 + tan^2 a)), twice.
     float t = x / (1.0 + sqrt(1.0 + x * x));
     t /= 1.0 + sqrt(1.0 + t * t);
     float t2 = t * t;
-    return 4.0 * t * (1.0 + t2 * (-1.0 / 3.0 + t2 * (0.2 + t2 * (-1.0 / 7.0 + t2 * (1.0 / 9.0 + t2 * (-1.0 / 11.0 + t2 / 13.0))))));
+    float series = -1.0 / 7.0 + t2 * (1.0 / 9.0 + t2 * (-1.0 / 11.0 + t2 / 13.0));
+    return 4.0 * t * (1.0 + t2 * (-1.0 / 3.0 + t2 * (0.2 + t2 * series)));
 }
 
 // k1 to k4; g(theta) is the distance from the principal point

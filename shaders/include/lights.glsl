@@ -1,12 +1,12 @@
 // Light of a scene that asks for more than a white sun and sky; blinkgl/scene/lights.py says what each lamp sends.
 //
 //   SUNS     number of suns           LAMPS    number of point and spot lights, SPOTS: the last of them are spot lights
-//   AMBIENT  light from all around    HUED     of three channels; else of one, what the luminance of this material takes
+//   AMBIENT  light from all around    HUED     of three channels; else of one: what this material's luminance takes
 //   SHADOWS  see shadows.glsl
 //   SURFACED with RATE: all of this is as it is ``later`` by so many seconds, to first order, for surface.glsl
 //
-// Everything is in the object's own frame, made from float64 poses, so that neither normals nor positions need a matrix.
-// A lamp is a Beam at a point of the surface: whoever shades by more than Lambert's cosine asks for the same beams.
+// Everything is in the object's own frame, made from float64 poses, so that neither normals nor positions need a
+// matrix. A lamp is a Beam at a point of the surface: whoever shades by more than Lambert's cosine asks for the same.
 #ifdef HUED
 #define ILLUMINANT vec3
 #else
@@ -103,9 +103,9 @@ Beam lamp_beam(int i, vec3 at)
 #else
 #define BANDS 1
 #endif
-// Of a white surface with normal n: dot(even, (n, 1)), an even sky; and, of a panorama (AMBIENT 2), a quadratic form of n
-// besides: dot(squares, n n) + dot(mixed, n n.yzx); or, of one that is not smooth enough for that (AMBIENT 3), a quartic form,
-// which has the quadratic one in it: x^4 x²y² x³y xy³ x²yz, three of each.
+// Of a white surface with normal n: dot(even, (n, 1)), an even sky; and, of a panorama (AMBIENT 2), a quadratic form of
+// n besides: dot(squares, n n) + dot(mixed, n n.yzx); or, of one that is not smooth enough for that (AMBIENT 3), a
+// quartic form, which has the quadratic one in it: x^4 x²y² x³y xy³ x²yz, three of each.
 uniform vec4 around_even[BANDS];
 #if AMBIENT == 2
 uniform vec3 around_squares[BANDS], around_mixed[BANDS];
@@ -131,7 +131,8 @@ float around_band(int band, vec3 n)
 #elif AMBIENT > 2
     vec3 square = n * n, mixed = n * n.yzx;
     int k = 5 * band;
-    sum += dot(square, NOW(around_fourth, k) * square + NOW(around_fourth, k + 1) * square.yzx + NOW(around_fourth, k + 2) * mixed)
+    vec3 by_square = NOW(around_fourth, k) * square + NOW(around_fourth, k + 1) * square.yzx;
+    sum += dot(square, by_square + NOW(around_fourth, k + 2) * mixed)
          + dot(mixed, NOW(around_fourth, k + 3) * square.yzx + NOW(around_fourth, k + 4) * mixed.zxy);
 #endif
     return sum;
@@ -174,7 +175,8 @@ ILLUMINANT irradiance(vec3 normal)
 #ifdef MOVED
             if (later == 0.0)
 #endif
-            shadow_share[i] = facing > 0.0 ? shadow(i, n, facing, vec3(0.0)) : 1.0; // not looked up where it does not shine
+            // Not looked up where the lamp does not shine.
+            shadow_share[i] = facing > 0.0 ? shadow(i, n, facing, vec3(0.0)) : 1.0;
             facing *= shadow_share[i];
         }
 #endif
@@ -222,10 +224,14 @@ float around_band_rate(int band, vec3 n, vec3 turn)
     vec3 square = n * n, mixed = n * n.yzx, square_rate = 2.0 * n * turn, mixed_rate = turn * n.yzx + n * turn.yzx;
     int k = 5 * band;
     rate += dot(around_fourth[k], 2.0 * square * square_rate) + dot(around_fourth_rate[k], square * square)
-          + dot(around_fourth[k + 1], square_rate * square.yzx + square * square_rate.yzx) + dot(around_fourth_rate[k + 1], square * square.yzx)
-          + dot(around_fourth[k + 2], square_rate * mixed + square * mixed_rate) + dot(around_fourth_rate[k + 2], square * mixed)
-          + dot(around_fourth[k + 3], square_rate.yzx * mixed + square.yzx * mixed_rate) + dot(around_fourth_rate[k + 3], square.yzx * mixed)
-          + dot(around_fourth[k + 4], mixed_rate * mixed.zxy + mixed * mixed_rate.zxy) + dot(around_fourth_rate[k + 4], mixed * mixed.zxy);
+          + dot(around_fourth[k + 1], square_rate * square.yzx + square * square_rate.yzx)
+          + dot(around_fourth_rate[k + 1], square * square.yzx)
+          + dot(around_fourth[k + 2], square_rate * mixed + square * mixed_rate)
+          + dot(around_fourth_rate[k + 2], square * mixed)
+          + dot(around_fourth[k + 3], square_rate.yzx * mixed + square.yzx * mixed_rate)
+          + dot(around_fourth_rate[k + 3], square.yzx * mixed)
+          + dot(around_fourth[k + 4], mixed_rate * mixed.zxy + mixed * mixed_rate.zxy)
+          + dot(around_fourth_rate[k + 4], mixed * mixed.zxy);
 #endif
 #if AMBIENT > 1
     rate *= step(0.0, around_band(band, n)); // none where it is cut off
@@ -262,7 +268,7 @@ ILLUMINANT irradiance_rate(vec3 normal, vec3 normal_rate, vec3 at_rate)
 #ifdef LAMPS
     for (int i = 0; i < LAMPS; ++i)
     {
-        // E = s (n.d) f(|d|) a(c): the product rule, with d the way to the lamp and c the cosine at a spot light's axis.
+        // E = s (n.d) f(|d|) a(c): the product rule, with d the way to the lamp and c the cosine at a spot's axis.
         vec3 way = lamp_place[i] - local, way_rate = lamp_place_rate[i] - at_rate;
         float square = dot(way, way), facing = dot(n, way);
         // No rate where it does not shine, nor nearer than NEAREST, where the strength is held.

@@ -6,7 +6,7 @@ layout(location = 1) out vec4 shown_lookup; // u, v (times uv_scale), mip level 
 layout(location = 2) out vec4 shown_albedo; // what is multiplied by the light; number of look-ups
 layout(location = 3) out vec4 shown_mirrored; // added to their product: what a gloss mirrors
 layout(location = 4) out vec4 shown_emission; // and light of its own
-layout(location = 5) out vec4 shown_terms;    // of the light: of lamps without shadows, share of it that shadows leave, from all around
+layout(location = 5) out vec4 shown_terms; // of the light: of lamps without shadows, share that shadows leave, all around
 layout(location = 6) out vec4 shown_light;    // r, g, b of the light
 
 vec4 noted = vec4(0.0); // sum over the look-ups of (u, v, level, 1)
@@ -44,7 +44,8 @@ vec4 noted_texture_grad(sampler2D image, vec2 at, vec2 along_x, vec2 along_y)
 // To be called once, when the albedo is known and the light has not been multiplied yet.
 // direct, arrives : of the lamps, without shadows and with them.   around : of the sky or panorama.
 // seen : of the light, in the luminance of what it falls on.
-void show_lookup(vec3 unlit, vec3 light, float seen, vec3 mirrored, vec3 emission, float direct, float arrives, float around)
+void show_lookup(vec3 unlit, vec3 light, float seen, vec3 mirrored, vec3 emission,
+                 float direct, float arrives, float around)
 {
     shown_mirrored = vec4(mirrored, 0.0);
     shown_emission = vec4(emission, 0.0);

@@ -19,8 +19,8 @@ vec2 ndc_of_fragment(vec2 image_size)
     return FRAGMENT_XY / image_size * 2.0 - 1.0;
 }
 
-// In the limit: d(ndc)/dt = (d.xy - ndc.xy * d.w) / w with d = d(MVP)/dt * p (of a shape that changes: d(MVP)/dt * q + MVP *
-// dq/dt); half the image is one unit of ndc.
+// In the limit: d(ndc)/dt = (d.xy - ndc.xy * d.w) / w with d = d(MVP)/dt * p (of a shape that changes: d(MVP)/dt * q +
+// MVP * dq/dt); half the image is one unit of ndc.
 // rate: rows x, y, w of d(MVP)/dt.  Returns px/s, at most BEYOND, whose square is infinite.
 vec2 velocity(mat4x3 rate, vec3 local, vec2 image_size)
 {

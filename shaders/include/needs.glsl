@@ -3,10 +3,10 @@
 #if defined(LIT) && (defined(GLOSSY) || defined(BUMPED))
 #define SURFACED
 #endif
-// FACETED: of flat facets, whose corners have one normal. Where the light hangs on nothing else it is the same all over a facet, and the
-// vertex stage's: a panorama's form of up to 57 numbers is then not evaluated at every pixel.
-#if defined(FACETED) && defined(LIT) && defined(LIGHTS) && !defined(SURFACED) && !defined(SHADOWS) && !defined(LAMPS) && !defined(RATE) \
-    && !defined(DEFORM) && !defined(SHOW_LOOKUP)
+// FACETED: of flat facets, whose corners have one normal. Where the light hangs on nothing else it is the same all over
+// a facet, and the vertex stage's: a panorama's form of up to 57 numbers is then not evaluated at every pixel.
+#if defined(FACETED) && defined(LIT) && defined(LIGHTS) && !defined(SURFACED) && !defined(SHADOWS) \
+    && !defined(LAMPS) && !defined(RATE) && !defined(DEFORM) && !defined(SHOW_LOOKUP)
 #define LIT_AT_CORNERS
 #elif defined(LIT)
 #define NEEDS_NORMAL

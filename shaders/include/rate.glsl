@@ -21,8 +21,8 @@ vec2 seen_rate(vec2 value, vec2 v)
 // pixel, and far above the 1/256 texel in which GPUs place a sample.
 const float REACH = 0.25;
 
-// Of the texture's channels that the pass looks at (CHANNELS), per second, by a central difference along the motion. every: px of the image per px
-// of the target.
+// Of the texture's channels that the pass looks at (CHANNELS), per second, by a central difference along the motion.
+// every: px of the image per px of the target.
 ALBEDO texture_rate(sampler2D image, vec2 uv, vec2 v, float every)
 {
     float speed = length(v);

@@ -3,9 +3,9 @@
 //   SHADOW_SUNS, SHADOW_SPOTS   the first of the suns and of the spot lights have a map each, in this order
 //   SHADOWS   their number, 1 to 4          SOFT   by the size of the lamp; else each edge is one texel wide
 //
-// Depth is reversed: what is nearer to the lamp is larger. What is compared with the map is moved towards the lamp by as
-// much as the surface's own plane changes over the texels that are looked at, so that no surface is in its own shadow;
-// it is not moved aside, so that edges stay where they are.
+// Depth is reversed: what is nearer to the lamp is larger. What is compared with the map is moved towards the lamp by
+// as much as the surface's own plane changes over the texels that are looked at, so that no surface is in its own
+// shadow; it is not moved aside, so that edges stay where they are.
 #ifdef SOFT
 uniform mat3 shadow_plane[SHADOWS];      // by rows: what makes of a normal the slope of its plane's depth in the map
 #endif
@@ -52,7 +52,7 @@ float nearer(SHADOW_MAP map, vec2 at, float depth)
     return mix(mix(lit.w, lit.z, f.x), mix(lit.x, lit.y, f.x), f.y);
 }
 
-// at: where the point is in the map; slope: of its plane's depth there; unit, texel: depth of a world unit, width of one.
+// at: where the point is in the map; slope: of its plane's depth there; unit, texel: depth and width of one.
 float seen_share(SHADOW_MAP map, vec3 at, vec2 slope, float unit, float texel, vec4 scale)
 {
     // Least and most distance towards the lamp that spares a surface its own shadow, as depth.
@@ -72,7 +72,7 @@ float seen_share(SHADOW_MAP map, vec3 at, vec2 slope, float unit, float texel, v
             count += 1.0;
         }
     }
-    // llvmpipe computes both sides of an if, and a loop whose length is known; this one it leaves with the last pixel that stays.
+    // llvmpipe computes both sides of an if, and a loop whose length is known; this one ends with the last pixel.
     int taps = count > 0.0 ? TAPS : 0;
     float blocker = sum / max(count, 1.0);
     // The penumbra's width: the sun's angle times the way from the blocker, or by similar triangles from the lamp's
@@ -91,8 +91,8 @@ float seen_share(SHADOW_MAP map, vec3 at, vec2 slope, float unit, float texel, v
 }
 #endif
 
-// Of map k for a surface with unit normal n; its place in the map is the vertex stage's (``shadow_place``). facing: n.l > 0. aside: from
-// the lamp to the surface, of a spot light. Beside a map nothing is in the way: its edge is empty, and holds for what lies outside.
+// Of map k for a surface with unit normal n; its place in the map is the vertex stage's (``shadow_place``). facing: n.l
+// > 0. aside: from the lamp to the surface, of a spot light. Beside a map nothing is in the way: its edge is empty.
 float shadow(int k, vec3 n, float facing, vec3 aside)
 {
     vec4 scale = shadow_scale[k];

@@ -2,11 +2,11 @@
 // blinkgl/render/reference.py, radiated()). Included after light.glsl.
 //
 //   BUMPED      a normal map
-//   GLOSSY      metal and roughness: GGX, height-correlated Smith, Schlick; what several reflections inside the surface keep is given back
-//               (energy), and what is reflected is missing below, so that white under even light is white
+//   GLOSSY      metal and roughness: GGX, height-correlated Smith, Schlick; what several reflections inside the
+//               surface keep is given back (energy) and missing below, so that white under even light is white
 //   GLOSS_MAP   both from a map
 //
-// With RATE a surface is looked at twice more, a little before and after: everything in it is smooth, and there is one formula.
+// With RATE a surface is looked at twice more, a little before and after: all of it is smooth, and there is one formula.
 #ifdef RATE
 #define MAP(map, at) map_at(map, map##_place * vec3(at, 1.0), mat2(map##_place) * map_x, mat2(map##_place) * map_y)
 vec2 map_x, map_y; // d(uv) of a pixel to the right and downwards
@@ -44,8 +44,8 @@ uniform vec2 gloss;    // metallic, roughness
 uniform sampler2D gloss_map;
 uniform mat3x2 gloss_map_place;
 #endif
-uniform sampler2D energy;       // what is reflected of even light, over (cosine, roughness): F0 r + g; b: the mean of r + g
-uniform sampler2D looks;        // where it comes from, over the same: of two looks how far from the normal to the mirror's
+uniform sampler2D energy; // what is reflected of even light, over (cosine, roughness): F0 r + g; b: the mean of r + g
+uniform sampler2D looks; // where it comes from, over the same: of two looks how far from the normal to the mirror's
                                 // direction, and roughness; energy's a: how much is the first one's (gloss.py, both())
 // Radiance seen in a mirror, by longitude, latitude and roughness.
 #ifdef HUED
@@ -110,7 +110,8 @@ ILLUMINANT shone(ILLUMINANT base, vec3 normal, vec3 at, vec2 coordinates)
     ILLUMINANT sum = base * shown_matt;
     // Mirrored surroundings: two looks between the normal and the mirror direction, weighted by energy's a.
     vec3 up = TO_WORLD * n, away = TO_WORLD * reflect(-v, n);
-    ILLUMINANT first = mirrored(normalize(mix(up, away, look.r)), look.g), second = mirrored(normalize(mix(up, away, look.b)), look.a);
+    ILLUMINANT first = mirrored(normalize(mix(up, away, look.r)), look.g);
+    ILLUMINANT second = mirrored(normalize(mix(up, away, look.b)), look.a);
     sum += mix(second, first, part.a) * mix(ILLUMINANT(even_clear), even_metal, metallic);
 #if defined(SUNS) || defined(LAMPS)
     // Lamps: D V F of GGX with Smith's height-correlated visibility and Schlick's Fresnel term; pi is in the
@@ -124,7 +125,8 @@ ILLUMINANT shone(ILLUMINANT base, vec3 normal, vec3 at, vec2 coordinates)
         vec3 aside = cross(n, h); /* 1 - (n.h)^2 without cancellation */ \
         float edge = 1.0 - clamp(dot(v, h), 0.0, 1.0), narrow = dot(aside, aside) * (1.0 - square) + square; \
         edge = edge * edge * edge * edge * edge; \
-        float lobe = square / (narrow * narrow) * 0.5 / (facing * seen + facing_eye * sqrt(facing * facing * (1.0 - square) + square)); \
+        float lobe = square / (narrow * narrow) * 0.5 \
+            / (facing * seen + facing_eye * sqrt(facing * facing * (1.0 - square) + square)); \
         ILLUMINANT of_metal = metal * (base + (1.0 - base) * edge); \
         float of_clear = clear * (DIELECTRIC + (1.0 - DIELECTRIC) * edge); \
         sum += lobe * facing * share * mix(ILLUMINANT(of_clear), of_metal, metallic) * beam.strength; \
@@ -186,7 +188,7 @@ ILLUMINANT radiated(Spot spot, float side)
 }
 
 #ifdef MOVED
-// Over how much time the surface is looked at to either side: a quarter of a pixel, and a fraction of the width of a highlight.
+// Over how much time the surface is looked at to either side: a quarter of a pixel, a fraction of a highlight's width.
 float pause(Spot spot, Spot change, float speed)
 {
     // How fast directions turn, rad/s: of normals, suns, lamps and the eye. width: of a highlight.
@@ -216,8 +218,9 @@ ILLUMINANT radiated_rate(Spot spot, Spot change, float side, float speed)
     for (int i = 0; i < 2; ++i)
     {
         later = i == 0 ? -step : step;
-        ends[i] = radiated(Spot(spot.base + later * change.base, spot.normal + later * change.normal, spot.along + later * change.along,
-                                spot.at + later * change.at, spot.coordinates + later * change.coordinates), side);
+        ends[i] = radiated(Spot(spot.base + later * change.base, spot.normal + later * change.normal,
+                                spot.along + later * change.along, spot.at + later * change.at,
+                                spot.coordinates + later * change.coordinates), side);
     }
     later = 0.0;
     return (ends[1] - ends[0]) * (0.5 / step);

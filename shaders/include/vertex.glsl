@@ -7,12 +7,12 @@
 //   NEEDS_NORMAL  in vec3 normal  object frame, not normalised
 //   NEEDS_LOCAL   in vec3 local   position, object frame
 //   NEEDS_TINT    in vec3 tint    the vertices' colours
-//   NEEDS_TANGENT in vec4 tangent the way a texture's u runs, object frame, of any length; 1 or -1 (scene/geometry/tangents.py)
+//   NEEDS_TANGENT in vec4 tangent the way a texture's u runs, object frame, of any length; 1 or -1 (tangents.py)
 //
 // MASKED, a surface with holes: is_hole(), which drop_artefact() of guard.glsl asks.
 //
-// Of a shape that changes with time (DEFORM, deform.glsl) all of these are as they are now, and there is besides, in clip
-// space, rows x, y, w:
+// Of a shape that changes with time (DEFORM, deform.glsl) all of these are as they are now, and there is besides, in
+// clip space, rows x, y, w:
 //   NEEDS_RATE         in vec3 shape_rate      MVP dq/dt, per second
 //   NEEDS_FORWARD      in vec3 shape_forward   MVP' (q' - q) of the time that forward flow leads to
 //   NEEDS_BACKWARD     in vec3 shape_backward  the same of backward flow
@@ -24,8 +24,8 @@
 #define NEEDS_UV
 #endif
 
-// SHADOWS, of a surface that is LIT: in SHADOW_PLACE shadow_place[SHADOWS], where it is in each lamp's map, times w. Affine in the
-// position, so that the rasteriser's interpolation is exact, and two dot products a pixel less each.
+// SHADOWS, of a surface that is LIT: in SHADOW_PLACE shadow_place[SHADOWS], where it is in each lamp's map, times w.
+// Affine in the position, so that the rasteriser's interpolation is exact, and two dot products a pixel less each.
 #if defined(SHADOWS) && defined(LIT)
 #ifdef SHADOW_SPOTS
 #define SHADOW_PLACE vec4
@@ -34,7 +34,7 @@
 #endif
 #endif
 
-// LIT_AT_CORNERS (needs.glsl): flat in light_here, of the facet; TWO_SIDED: light_behind, of its back. LIGHT_SEEN: of the side that is seen.
+// LIT_AT_CORNERS (needs.glsl): flat in light_here, of the facet; TWO_SIDED: light_behind. LIGHT_SEEN: of the seen side.
 #ifdef LIT_AT_CORNERS
 #ifdef HUED
 #define LIGHT_HERE vec3
@@ -230,7 +230,7 @@ in vec3 tangent_rate;
 uniform sampler2D coverage; // opacity over the coordinates of the base colour
 uniform float cutoff;
 
-// Of the finest level whatever the distance: a hole is a shape, which every pass, the shadow maps and the float64 ray caster see alike.
+// Of the finest level whatever the distance: a hole is a shape, which passes, shadow maps and the ray caster see alike.
 bool is_hole()
 {
     return textureLod(coverage, uv, 0.0).r < cutoff;

@@ -14,7 +14,8 @@ mat3x4 skin_blend(int first)
     for (int i = 0; i < SKIN_WEIGHTS; ++i)
     {
 #if SKIN_WEIGHTS > 4
-        float joint = i < 4 ? in_joints_0[i] : in_joints_1[i - 4], weight = i < 4 ? in_weights_0[i] : in_weights_1[i - 4];
+        float joint = i < 4 ? in_joints_0[i] : in_joints_1[i - 4];
+        float weight = i < 4 ? in_weights_0[i] : in_weights_1[i - 4];
 #else
         float joint = in_joints_0[i], weight = in_weights_0[i];
 #endif
@@ -37,7 +38,8 @@ vec3 skin_morphed(int set, int what)
     for (int k = 0; k < SKIN_MORPHS; ++k)
     {
         int texel = 2 * (k * SKIN_VERTICES + gl_VertexID) + what;
-        sum += shape[set + SKIN_MORPH_ROW + k / 4][k % 4] * texelFetch(skin_morphs, ivec2(texel % size.x, texel / size.x), 0).xyz;
+        sum += shape[set + SKIN_MORPH_ROW + k / 4][k % 4]
+             * texelFetch(skin_morphs, ivec2(texel % size.x, texel / size.x), 0).xyz;
     }
     return sum;
 }

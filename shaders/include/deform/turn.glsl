@@ -32,7 +32,7 @@ vec3 deformed_change(vec3 p, int other)
     return cross(shape[0].xyz, turned(p - shape[1].xyz, shape[3].x * u + half_turn)) * (2.0 * sine(half_turn));
 }
 
-// The gradient of q is (1 + w g^T) R with w = b x R (p - c) and g = a R s; its cofactors take n to (1 + w.g) R n - g (w.R n).
+// The gradient of q is (1 + w g^T) R with w = b x R (p - c) and g = a R s; cofactors: n to (1 + w.g) R n - g (w.R n).
 vec3 deformed_normal(vec3 p, vec3 n)
 {
     float angle = shape[3].x * turn_share(p);

@@ -1,5 +1,5 @@
 // Two plane waves: q = p + d e(p) (A1 sin(k1 . p + phi1) + A2 sin(k2 . p + phi2)).
-// rows: d | e, e0 | k1, phi1 | k2, phi2 | A1, A2;  rate: the last row is d(phi) A;  change: half the changes of phi, 2 A sin of those.
+// rows: d | e, e0 | k1, phi1 | k2, phi2 | A1, A2;  rate: last row d(phi) A;  change: half of phi's, 2 A sin of it.
 
 vec2 wave_angles(vec3 p)
 {

@@ -77,7 +77,6 @@ setup: .venv/.installed-dev opengl
 	@echo "installing the test tools into .venv"
 	@$(INSTALL) -e '.[dev]'
 	@$(INSTALL) -e '.[learn]' || echo "torch could not be installed: the tests of eflow will be skipped"
-	@$(INSTALL) -e '.[onnx]' || echo "ONNX could not be installed: the tests of eflow export will be skipped"
 	@$(INSTALL) -e '.[cluster]' || echo "Ray could not be installed: the tests of the Ray executor will be skipped"
 	@$(INSTALL) -e '.[physics]' || echo "MuJoCo could not be installed: the tests of falling bodies will be skipped"
 	@touch $@

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import signal
 import sys
 from pathlib import Path
@@ -11,9 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from blinkgl import __version__
-from blinkgl.errors import BlinkGLError, ConfigError
+from blinkgl.errors import ConfigError
 from blinkgl.machine.command_line import run_app
-from blinkgl.machine.extras import EXTRAS, install
 from blinkgl.machine.interrupts import interruptible
 from eflow.methods.table import METHODS, make_method
 
@@ -368,27 +366,6 @@ def pack(
         typer.echo(line)
 
 
-@app.command()
-def export(
-    checkpoint: Network,
-    out: Annotated[str, typer.Option("--out", "-o", help="New .onnx file.")],
-    size: Annotated[
-        str | None, typer.Option(metavar="WxH", help="The only size it takes; default: any multiple of its stride.")
-    ] = None,
-    iterations: Annotated[int | None, typer.Option(min=1, help="GRU iterations, where the network has them.")] = None,
-    raw: Annotated[bool, typer.Option("--raw", help="The last weights instead of the averaged ones.")] = False,
-) -> None:
-    """A network as an ONNX file, for programs without torch; onnxruntime's flow is compared before it appears."""
-    missing = [name for name in EXTRAS["onnx"][0] if importlib.util.find_spec(name) is None]
-    if missing:
-        raise BlinkGLError(f"{missing[0]} is not installed", accepted=f"run {install(*EXTRAS['onnx'][0])}")
-    from eflow.export import OPSET, export_onnx
-
-    wanted = _size(size)
-    told = export_onnx(_model(checkpoint, "cpu", raw, "fp32", iterations), out, size=wanted)
-    typer.echo(f"written: {out}, opset {OPSET}, sizes: {told['sizes']}; onnxruntime agrees with torch")
-
-
 def _method(name: str, focal: float | None, **network: object):
     """The method of that name, unless a file has it; None: a network's. network : options that only those have."""
     if name not in METHODS or Path(name).exists():
@@ -474,6 +451,7 @@ def _size(text: str | None) -> tuple[int, int] | None:
 
 
 GONE = {
+    "export": "torch.onnx.export of eflow.load_model(NAME)'s network: ONNX files are no longer written here",
     "bench": "python -m blinkgl.tools.bench networks",
     "evaluate --by-density": "sets of several densities, evaluated one by one",
     "evaluate --confidence": "nothing: no network here says how sure it is",

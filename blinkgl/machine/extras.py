@@ -14,7 +14,6 @@ EXTRAS = {  # extra of setup.cfg -> (distributions, what they are for)
     ),
     "learn": (("torch", "safetensors", "tensorboard"), "training"),
     "tensors": (("torch",), "events as tensors: TensorEsim, TensorV2e, events.device: cuda"),
-    "onnx": (("onnx", "onnxscript", "onnxruntime"), "networks for programs without torch: eflow export"),
     "cluster": (("ray",), "many machines"),
     "physics": (("mujoco",), "scenes in which things fall"),
     "formats": (("faery",), "checks of EVT2 and EVT3, which need nothing"),

@@ -107,7 +107,7 @@ def generate(
     """Generate event + optical-flow sequences from one YAML file. Exit status 3: done, but
     some sequences were set aside."""
     from blinkgl.show import generate as command
-    from blinkgl.show.executors import choose_executor
+    from blinkgl.show.generate import choose_executor
 
     chosen = choose_executor(executor, workers, address=address, gpus=gpus, devices=devices)
     return command.run(

@@ -33,7 +33,7 @@ class _Lender:
     WHERE = (
         "blinkgl.dataset.generate",
         "blinkgl.dataset.work",
-        "blinkgl.dataset.verify.reproduce",
+        "blinkgl.dataset.verify",
         "blinkgl.sequence.rendered",
         "blinkgl.sequence.rig",
         "blinkgl.trade.run",

@@ -26,13 +26,12 @@ from blinkgl.config.base import Config, Refused, rule
 from blinkgl.config.camera import CameraConfig
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.images import ImagesConfig
-from blinkgl.config.imu import ImuConfig
 from blinkgl.config.labels import LabelsConfig
+from blinkgl.config.over_time import ImuConfig, TracksConfig
 from blinkgl.config.poses import Matrix, check_rigid, rigid_matrix
 from blinkgl.config.reader import merge, shipped, shipped_names
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.config.sensor import Sensor
-from blinkgl.config.tracks import TracksConfig
 from blinkgl.config.values import Position, Vector3
 from blinkgl.errors import ConfigError
 

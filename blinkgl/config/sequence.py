@@ -17,8 +17,8 @@ from blinkgl.config.camera import CameraConfig, camera_radius
 from blinkgl.config.events import EmulatorConfig, EsimConfig
 from blinkgl.config.frames import MAX_SPAN_S, FramesConfig
 from blinkgl.config.images import ImagesConfig, check_images, readout_us
-from blinkgl.config.imu import ImuConfig, check_imu
 from blinkgl.config.labels import LabelsConfig
+from blinkgl.config.over_time import ImuConfig, TracksConfig, check_imu, check_tracks
 from blinkgl.config.quality import DEFAULT, Quality
 from blinkgl.config.readout import ReadoutConfig, drain_us
 from blinkgl.config.rig import (
@@ -28,7 +28,6 @@ from blinkgl.config.rig import (
 from blinkgl.config.scene import RandomSceneConfig, SceneConfig
 from blinkgl.config.sensor import Sensor
 from blinkgl.config.timeline import DisplacementTimeline, TimelineConfig
-from blinkgl.config.tracks import TracksConfig, check_tracks
 
 if TYPE_CHECKING:
     pass

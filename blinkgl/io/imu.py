@@ -18,7 +18,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from blinkgl.config.imu import ImuConfig
+from blinkgl.config.over_time import ImuConfig
 from blinkgl.config.reader import to_yaml
 from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
 

@@ -6,7 +6,7 @@
         edges = renderer.draw(MyPass(), t_ns)                  # a Frame: on the card until it is read
 
 A pass (``passes/``) says what is drawn; a :class:`~blinkgl.render.moment.Moment` where everything is; a
-:class:`~blinkgl.render.canvas.Canvas` holds what one pass has drawn, :class:`~blinkgl.render.still.StillCanvas` draws
+:class:`~blinkgl.render.canvas.Canvas` holds what one pass has drawn, :class:`~blinkgl.render.canvas.StillCanvas` draws
 again only what moves. Poses are composed in float64 relative to the camera (``matrices.py``); vertices stay
 object-local. Programs and targets are made the first time something asks for them, and only in
 the variants the scene's materials need.
@@ -23,7 +23,7 @@ from blinkgl.gl import GLContext
 from blinkgl.labels import LabelFrame, LabelRequest
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.antialiasing import samples_of
-from blinkgl.render.canvas import Canvas, Frame
+from blinkgl.render.canvas import Canvas, Frame, StillCanvas
 from blinkgl.render.draw_items import DrawItem
 from blinkgl.render.frames import RenderStats
 from blinkgl.render.labels import Labels
@@ -45,7 +45,6 @@ from blinkgl.render.passes import (
     shadow_maps,
 )
 from blinkgl.render.resources import SceneResources
-from blinkgl.render.still import StillCanvas
 from blinkgl.scene.geometry.meshes import without_collapsed_faces
 from blinkgl.scene.types import Scene
 

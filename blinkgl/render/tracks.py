@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from blinkgl.config.tracks import TracksConfig
+from blinkgl.config.over_time import TracksConfig
 from blinkgl.render import casting
 from blinkgl.render.casting import Hits
 from blinkgl.scene.types import Scene

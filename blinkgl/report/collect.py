@@ -11,9 +11,9 @@ import numpy as np
 
 from blinkgl.config.draw import is_distribution
 from blinkgl.config.reader import read_table
+from blinkgl.dataset.cross_checks import plan_of
 from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.run_folder import RunFolder
-from blinkgl.dataset.verify.cross_checks import plan_of
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 from blinkgl.io.colour import count_events, event_colour, flow_colour
 from blinkgl.io.dsec import DsecEventReader

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from blinkgl.config.imu import ImuConfig, imu_times
+from blinkgl.config.over_time import ImuConfig, imu_times
 from blinkgl.errors import ConfigError
 from blinkgl.scene.motion.paths import OffsetPath
 from blinkgl.scene.types import PosePath

@@ -12,9 +12,9 @@ import numpy as np
 
 from blinkgl.camera import CameraModel, PinHole
 from blinkgl.camera.pinhole import rectified
+from blinkgl.config.over_time import track_times
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.config.timeline import DisplacementTimeline
-from blinkgl.config.tracks import track_times
 from blinkgl.errors import EventDataError
 from blinkgl.events import emulator_of
 from blinkgl.events.camera import EventCamera, EventFrame, emulate

@@ -35,8 +35,8 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
-from blinkgl.config.imu import ImuConfig
 from blinkgl.config.labels import LabelsConfig
+from blinkgl.config.over_time import ImuConfig
 from blinkgl.errors import AssetError, BlinkGLError, OutputError
 from blinkgl.io import imu as imu_files
 from blinkgl.io.atomic import fsync, output_errors, refuse_existing, remove_stale, temporary_beside

@@ -11,7 +11,7 @@ from blinkgl.errors import OutputError
 from blinkgl.io import pictures
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.images import encode_npy
-from blinkgl.shader_debugger.compare import BufferReport, Comparison, parse_tolerances
+from blinkgl.shader_debugger.compare import BufferReport, Comparison, as_text as verdict_text, parse_tolerances, verdict
 from blinkgl.shader_debugger.moments import (
     MAPS,
     PASSES,
@@ -26,7 +26,6 @@ from blinkgl.shader_debugger.probe import as_text, probe
 from blinkgl.shader_debugger.quantities import QUANTITIES
 from blinkgl.shader_debugger.session import Subject, When, check_pixel, open_renderer
 from blinkgl.shader_debugger.twins import TWINNED, twinned_of
-from blinkgl.shader_debugger.verdict import as_text as verdict_text, verdict
 
 
 def write_passes(

@@ -23,7 +23,7 @@ from blinkgl.io import pictures
 from blinkgl.io.pictures import MAPS
 from blinkgl.shader_debugger import picture
 from blinkgl.shader_debugger.commands import _finite, _meaningful
-from blinkgl.shader_debugger.compare import Comparison
+from blinkgl.shader_debugger.compare import Comparison, verdict
 from blinkgl.shader_debugger.diagnostics import Diagnostic, diagnose
 from blinkgl.shader_debugger.moments import (
     PASSES,
@@ -43,7 +43,6 @@ from blinkgl.shader_debugger.session import (
     open_renderer,
 )
 from blinkgl.shader_debugger.twins import TWINNED, twinned_of
-from blinkgl.shader_debugger.verdict import verdict
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What the page may ask, and how each parameter is read: the one place that looks at a query's text.

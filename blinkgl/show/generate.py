@@ -12,11 +12,12 @@ from rich.progress import BarColumn, Progress, TaskID, TimeElapsedColumn
 from rich.table import Table
 
 from blinkgl.config.run import load_run
-from blinkgl.dataset.executor import Executor
+from blinkgl.dataset.executor import Executor, Inline, Local
 from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.report import STAGES, SequenceReport, Totals
 from blinkgl.dataset.run import Outcome, run_dataset
 from blinkgl.dataset.work import Message, report_of
+from blinkgl.errors import ConfigError
 from blinkgl.machine.compiling import compiling_line
 from blinkgl.machine.terminal import causes_line, plain_column, plain_console, say
 
@@ -243,3 +244,41 @@ def show_table(console: Console, made: Totals, elapsed_s: float | None = None) -
     console.print(table)
     folder = first.path
     say(console, f"look at {folder / 'preview.mp4'}" if (folder / "preview.mp4").exists() else f"written to {folder}")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# From the options of ``blinkgl generate`` to an executor.
+
+
+def choose_executor(
+    name: str, workers: int | None, *, address: str | None = None, gpus: float = 0.0, devices: str | None = None
+) -> Executor:
+    """``local`` without ``workers`` is this process itself. Raises ConfigError: unknown name,
+    options of another executor, no Ray."""
+    if name not in ("local", "ray"):
+        raise ConfigError("unknown executor", where="--executor", value=name, accepted="local or ray")
+    if name == "local":
+        for option, value in (("--address", address), ("--gpus", gpus)):
+            if value:
+                raise ConfigError("belongs to --executor ray", where=option, value=value)
+        numbers = _devices(devices)
+        return Inline() if workers is None and numbers is None else Local(workers or 1, numbers)
+    if devices is not None:
+        raise ConfigError("belongs to --executor local; Ray deals out GPUs itself", where="--devices", value=devices)
+    from blinkgl.dataset.cluster import RayCluster
+
+    return RayCluster(workers, address=address, gpus=gpus)
+
+
+def _devices(text: str | None) -> list[int] | None:
+    if text is None:
+        return None
+    parts = [part.strip() for part in text.split(",")]
+    if not all(part.isdigit() for part in parts):
+        raise ConfigError(
+            "not a list of device numbers",
+            where="--devices",
+            value=text,
+            accepted="numbers as `blinkgl doctor` lists them, e.g. 0,1",
+        )
+    return [int(part) for part in parts]

@@ -16,7 +16,9 @@ from __future__ import annotations
 import csv
 import os
 from collections import OrderedDict
+from collections.abc import Iterator
 from dataclasses import dataclass
+from fnmatch import filter as matching
 from pathlib import Path
 from typing import Protocol
 
@@ -29,9 +31,29 @@ from blinkgl.io.flow import read_flow_npy, read_flow_png
 from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
 from blinkgl.labels import LABELS
 from blinkgl.sequence_files.index import INDEX, read_index
-from eflow.data.folders import below
 from eflow.data.pool import ABOUT, PoolSource
 from eflow.data.window import RawSample, Window
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Where the parts of a data set lie below a folder.
+
+
+def below(root: Path, pattern: str) -> Iterator[Path]:
+    """Files and folders below ``root`` whose name matches ``pattern`` (`*` and `?`), those of a folder in order.
+
+    Links to folders are followed, for subsets are often made of links; each folder is visited once, so that links in
+    a circle end."""
+    visited = set()
+    for folder, folders, files in os.walk(root, followlinks=True):
+        real = os.path.realpath(folder)
+        if real in visited:
+            folders.clear()
+            continue
+        visited.add(real)
+        folders.sort()
+        for name in sorted(matching([*folders, *files], pattern)):
+            yield Path(folder, name)
+
 
 FORMATS = ("blinkgl", "dsec", "mvsec", "blinkflow", "windows")
 _OPEN_FILES = 16

@@ -14,8 +14,7 @@ import yaml
 from blinkgl.config.run import load_run
 from blinkgl.dataset.executor import Inline, Local
 from blinkgl.dataset.run import run_dataset
-from blinkgl.dataset.verify import verify_dataset
-from blinkgl.dataset.verify.reproduce import differences
+from blinkgl.dataset.verify import differences, verify_dataset
 from blinkgl.errors import ConfigError, OutputError
 from blinkgl.io.records import SEAL
 from blinkgl.render.reference import render as by_reference

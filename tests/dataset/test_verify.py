@@ -16,10 +16,10 @@ import pytest
 
 from blinkgl.cli import run
 from blinkgl.config.run import load_run
+from blinkgl.dataset.cross_checks import guarded
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.verify import verify_dataset
-from blinkgl.dataset.verify.problems import guarded
 from blinkgl.errors import AssetError
 from blinkgl.io.records import sealed
 from blinkgl.sequence_files.sequence_dir import digest_of, manifest_problems, verify_sequence

@@ -10,9 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import PinHole
-from blinkgl.render.canvas import Rectangle, merged
+from blinkgl.render.canvas import Rectangle, merged, screen_rectangle
 from blinkgl.render.draw_items import box_corners
-from blinkgl.render.still import screen_rectangle
 
 CAMERA = PinHole(64, 40, 50.0, 70.0, 20.0, 28.0, near=0.1)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from blinkgl import Camera, ConfigError, Deform, Keyframes, Material, Pose, Primitive, Scene, look_at, record
-from blinkgl.config.tracks import TracksConfig
+from blinkgl.config.over_time import TracksConfig
 from blinkgl.front.runs import configured
 from blinkgl.render import casting
 from blinkgl.render.tracks import track_points

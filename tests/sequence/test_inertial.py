@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from blinkgl import ConfigError
-from blinkgl.config.imu import ImuConfig
+from blinkgl.config.over_time import ImuConfig
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.sequence.inertial import measured, place_of
 

@@ -11,8 +11,8 @@ import pytest
 
 from blinkgl.gl import ShaderLoader
 from blinkgl.shader_debugger import compare, moments
+from blinkgl.shader_debugger.compare import as_text, verdict
 from blinkgl.shader_debugger.session import moment, open_renderer, open_subject
-from blinkgl.shader_debugger.verdict import as_text, verdict
 from debugger_scene import edit
 from tests.scene.gltf_files import arm_file
 

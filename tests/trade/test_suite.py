@@ -18,8 +18,7 @@ from blinkgl.errors import ConfigError
 from blinkgl.render.canvas import Rectangle
 from blinkgl.scene.build import sequence_scene
 from blinkgl.show.suite import show
-from blinkgl.trade.measure import Density, Options
-from blinkgl.trade.reference import FineTiles
+from blinkgl.trade.measure import Density, FineTiles, Options
 from blinkgl.trade.settings import Setting, excess, suite_design
 from blinkgl.trade.suite import Trial, clips, preset_names, run_suite, standing
 

@@ -16,8 +16,7 @@ from blinkgl.config.run import load_run
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import ConfigError
 from blinkgl.render.renderer import Renderer
-from blinkgl.trade.measure import Bench, Level, Options
-from blinkgl.trade.reference import FineTiles
+from blinkgl.trade.measure import Bench, FineTiles, Level, Options
 from blinkgl.trade.run import convergence_line
 from blinkgl.trade.settings import Setting, pareto_front
 

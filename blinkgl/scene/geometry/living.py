@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from blinkgl.config.deform import FlagConfig
+from blinkgl.config.deform import DeformConfig, FlagConfig
 from blinkgl.errors import AssetError
 from blinkgl.scene.geometry.figure import body_of
-from blinkgl.scene.geometry.meshes import weld
+from blinkgl.scene.geometry.meshes import bounds, finer, weld
 from blinkgl.scene.geometry.primitives import Surface, join, lattice, primitive, square
 from blinkgl.scene.shapes.closed_forms import Beat, Flag, Waves
 from blinkgl.scene.shapes.deformer import Deformer
 from blinkgl.scene.shapes.gait import PARENTS, Proportions, clip_of
 from blinkgl.scene.shapes.skeleton import Skeleton
 from blinkgl.scene.shapes.skin import Skin
+from blinkgl.scene.shapes.table import deformer_of
+from blinkgl.scene.types import Part
 
 
 @primitive
@@ -136,3 +140,18 @@ def _smooth_normals(positions: np.ndarray, faces: np.ndarray, area: np.ndarray) 
     out[faces] = total[welded]
     length = np.linalg.norm(out, axis=1, keepdims=True)
     return np.where(length > 0, out / np.maximum(length, 1e-300), [0.0, 0.0, 1.0])
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# ``deform:`` on the parts of one object.
+
+EDGE = 1 / 12
+"""Of the object's longest side: longer edges are split, so that a box can bend."""
+
+
+def deforming(parts: Sequence[Part], config: DeformConfig) -> tuple[Part, ...]:
+    """The parts of one object, whose shape changes together as ``deform:`` says; their triangles as fine as that
+    takes."""
+    low, high = bounds([part.mesh for part in parts])
+    deformer, edge = deformer_of(config, low, high), EDGE * float(np.max(high - low))
+    return tuple(replace(part, mesh=replace(finer(part.mesh, edge), deformer=deformer)) for part in parts)

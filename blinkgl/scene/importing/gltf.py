@@ -21,9 +21,8 @@ import numpy as np
 
 from blinkgl.errors import AssetError
 from blinkgl.scene.importing import gltf_schema
-from blinkgl.scene.importing.gltf_file import buffers_of, index_of, item, needs, parse
+from blinkgl.scene.importing.gltf_file import MAX_NODES, Node, buffers_of, index_of, item, needs, nodes_of, parse
 from blinkgl.scene.importing.gltf_materials import DRAWN, INVISIBLE, INVISIBLE_EXTENSIONS, Materials
-from blinkgl.scene.importing.gltf_nodes import MAX_NODES, Node, nodes_of
 from blinkgl.scene.importing.parts import RawMesh
 from blinkgl.scene.reading import Omissions, contents, reading
 from blinkgl.scene.shapes.clips import PATHS, Track

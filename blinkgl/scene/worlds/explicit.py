@@ -20,7 +20,7 @@ from blinkgl.config.primitives import PRIMITIVES
 from blinkgl.config.scene import ExplicitSceneConfig, MeshConfig, ObjectConfig, object_names
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.geometry import BUILDERS
-from blinkgl.scene.geometry.deforming import deforming
+from blinkgl.scene.geometry.living import deforming
 from blinkgl.scene.geometry.meshes import transform_mesh
 from blinkgl.scene.geometry.tangents import split_mirrored
 from blinkgl.scene.importing.mesh_files import Asset, clip_of, load_asset

@@ -24,7 +24,7 @@ from blinkgl.config.physics import BodyConfig, RandomPhysicsConfig
 from blinkgl.config.scene import RandomSceneConfig, SkyConfig
 from blinkgl.errors import ConfigError
 from blinkgl.rng import Role, generator
-from blinkgl.scene.geometry.deforming import deforming
+from blinkgl.scene.geometry.living import deforming
 from blinkgl.scene.geometry.meshes import scale_mesh
 from blinkgl.scene.geometry.primitives import grid
 from blinkgl.scene.importing.mesh_files import Asset

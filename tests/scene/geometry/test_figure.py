@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import AssetError
-from blinkgl.scene.geometry.figure import ATLAS, CHARTS
-from blinkgl.scene.geometry.isosurface import isosurface
+from blinkgl.scene.geometry.figure import ATLAS, CHARTS, isosurface
 from blinkgl.scene.geometry.living import figure, fish, flag
 from blinkgl.scene.geometry.meshes import closedness, uvs_degenerate, weld
 from blinkgl.scene.shapes.gait import CLIPS

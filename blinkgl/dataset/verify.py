@@ -1,0 +1,360 @@
+"""Is a data set whole and right? Files against manifests, names and manifests against configurations, and a sample
+against itself made anew, bit by bit.
+
+A sequence's problems are lines of text; none means none found. What could not be looked at is counted and said: nothing
+is passed over in silence. Whatever stands in a record, looking at it ends, and ends with a line.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from blinkgl.config.images import exposure_starts
+from blinkgl.config.run import load_run
+from blinkgl.config.sequence import SequenceConfig
+from blinkgl.dataset.cross_checks import (
+    Known,
+    Verification,
+    against_run,
+    guarded,
+    index,
+    made_with,
+    strangers,
+    twins,
+)
+from blinkgl.dataset.generate import generate_sequence
+from blinkgl.dataset.plan import sequence_name
+from blinkgl.dataset.run_folder import RunFolder
+from blinkgl.dataset.work import RUN_FOLDER
+from blinkgl.errors import AssetError, BlinkGLError
+from blinkgl.gl import GLContext, create_context
+from blinkgl.io.event_labels import EVENT_LABELS
+from blinkgl.io.frame_camera import files_of
+from blinkgl.io.imu import FILES as IMU_FILES
+from blinkgl.io.records import shown
+from blinkgl.io.tracks import TRACKS
+from blinkgl.labels import LABELS, asked_for
+from blinkgl.sequence_files.index import made_folders, sequence_folders
+from blinkgl.sequence_files.rig_dir import FILES as LENS_FILES
+from blinkgl.sequence_files.sequence_dir import MANIFEST, RIG, manifest_problems, read_manifest, verify_sequence
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What a configuration asks of a sequence's folder: its name, its manifest, its files.
+
+
+def said_of(config: SequenceConfig) -> list[tuple[str, Any]]:
+    """(key, value) that the manifest of any folder has."""
+    return [("split", config.output.split), ("seed", config.seed), ("sequence", config.output.first_index)]
+
+
+def times_of(config: SequenceConfig) -> list[tuple[str, Any]]:
+    """(key, value) of its time."""
+    t0, t1 = config.time.t0_ns // 1000, config.time.t1_ns // 1000
+    return [("t_offset_us", t0), ("duration_us", t1 - t0)]
+
+
+def bound(name: str, manifest: dict[str, Any], config: SequenceConfig, events: bool = True) -> list[str]:
+    """Do the folder's name, the manifest and the sequence's own configuration speak of the same
+    sequence, and is there what it asks for?   events : whether there are some."""
+    said = [*said_of(config), ("emulator", config.events.emulator if events else None)]
+    if config.frames is None:
+        said += [
+            ("height", config.camera.height),
+            ("width", config.camera.width),
+            *times_of(config),
+            ("labels", config.time.label_count),
+        ]
+    told = events and bool(getattr(config.events, "causes", False))
+    if ("events_by_cause" in manifest) != told:
+        said.append(("events_by_cause", "that there are some" if told else None))
+    problems = [*unlike(manifest, said), *misnamed(name, manifest, config)]
+    if config.frames is None and not problems:
+        problems += not_asked_for(set(_files_of(config, events)), manifest)
+    return problems
+
+
+def unlike(manifest: dict[str, Any], said: list[tuple[str, Any]]) -> list[str]:
+    """Where the manifest says another value than ``said``."""
+    return [
+        f"{MANIFEST}: {key} is {shown(manifest.get(key))}, config.yaml says {value}"
+        for key, value in said
+        if manifest.get(key) != value
+    ]
+
+
+def misnamed(name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
+    """Whether a folder is called otherwise than what it holds, with its split or without. "." may have any name."""
+    path = sequence_name(config.output, manifest["sequence"])
+    wrong = name != "." and name != (path if "/" in name else path.split("/")[1])
+    return [f"the folder is called {shown(name)}, but holds {path}"] if wrong else []
+
+
+def not_asked_for(wanted: set[str], manifest: dict[str, Any]) -> list[str]:
+    """Files that are missing or too many, five each."""
+    there = set(manifest["files"])
+    missing = [f"{file}: missing, config.yaml asks for it" for file in sorted(wanted - there)[:5]]
+    return missing + [f"{shown(file)}: config.yaml does not ask for it" for file in sorted(there - wanted)[:5]]
+
+
+def files_of_rig(config: SequenceConfig) -> Iterator[str]:
+    """Names of the files of a rig's sequence, its manifest left out."""
+    yield from ("config.yaml", RIG)
+    for _, name, own, gives_events in config.cameras():
+        yield f"{name}/{MANIFEST}"
+        yield from (f"{name}/{file}" for file in _files_of(own, gives_events))
+    for one in config.sensors or ():
+        if one.imu is not None and not one.sees:
+            yield from (f"{one.name}/{file}" for file in IMU_FILES)
+    if config.preview.enabled and any(one.events is not None for one in config.sensors or ()):
+        yield "preview.mp4"
+
+
+def _files_of(config: SequenceConfig, events: bool = True) -> Iterator[str]:
+    """Names of the files of a generated sequence, the manifest left out.   events : whether there are some."""
+    yield from ("poses.npz", "config.yaml")
+    if events:
+        yield "events.h5"
+        if config.labels.events:
+            yield EVENT_LABELS
+    for name in asked_for(config.labels):
+        label = LABELS[name]
+        if label.stamps is not None:
+            yield label.stamps
+        for form in label.written(config.labels):
+            yield from form.files(config.time.label_count + label.at_last)
+    if config.imu is not None:
+        yield from IMU_FILES
+    if config.tracks is not None:
+        yield TRACKS
+    if distorts(config):
+        yield from LENS_FILES
+    if config.images is not None:
+        yield from files_of(config.images, len(exposures_of(config)))
+    if config.preview.enabled:
+        yield "preview.mp4"
+
+
+def distorts(config: SequenceConfig) -> bool:
+    """Whether a lens bends straight lines, so that its files are there."""
+    return config.frames is None and config.camera.lens != "pinhole"
+
+
+def exposures_of(config: SequenceConfig) -> list[int]:
+    """When the frame camera's exposures begin, ns; of a configuration with ``images``."""
+    assert config.images is not None
+    return exposure_starts(config.images, config.time.t0_ns, config.time.t1_ns, config.camera.height)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# One sequence's folder, or one rig's, by itself.
+
+_REQUIRED = {"duration_us": int, "seed": int, "sequence": int, "split": str, "labels": int}
+
+
+def look(folder: Path, name: str) -> tuple[list[str], Known | None]:
+    """``name``: path below the data set, "." where the sequence is looked at alone and may be called anything."""
+    found: list[Known] = []
+
+    def check() -> list[str]:
+        if name != "." and folder.is_symlink():
+            return ["a symbolic link, not a folder"]
+        if problems := verify_sequence(folder):
+            return problems
+        manifest = read_manifest(folder)
+        if missing := [
+            f"{MANIFEST}: '{key}' is missing or no {kind.__name__}"
+            for key, kind in _REQUIRED.items()
+            if manifest.get(key) is None
+        ]:
+            return missing
+        if "config.yaml" not in manifest["files"]:
+            return ["config.yaml: missing"]
+        config = load_run(folder / "config.yaml").sequence(manifest["sequence"])
+        if manifest["format"] == "blinkgl-rig":
+            problems = look_at_rig(folder, name, manifest, config)
+        elif config.sensors is not None:
+            problems = look_at_sensor(manifest, config)
+        else:
+            problems = bound(name, manifest, config)
+        # Last: what else is found says more than that something was edited.
+        problems = problems or manifest_problems(folder)
+        if not problems:
+            found.append(Known(folder, manifest, config))
+        return problems
+
+    return guarded(check), found[0] if found else None
+
+
+def look_at_rig(folder: Path, name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
+    """Problems of a rig's folder whose files are whole: of itself, and of each camera's in it."""
+    if config.sensors is None:
+        return ["config.yaml: a single camera's, but the manifest is a rig's"]
+    said = [("sensors", [one.name for one in config.sensors]), *said_of(config), *times_of(config)]
+    if problems := [*unlike(manifest, said), *misnamed(name, manifest, config)]:
+        return problems
+    if problems := not_asked_for(set(files_of_rig(config)), manifest):
+        return problems
+    names = [name for _, name, _, _ in config.cameras()]
+    for name in names:
+        inside = guarded(lambda name=name: look_at_sensor(read_manifest(folder / name), config))
+        problems += [f"{name}/{line}" for line in inside]
+    total = sum(read_manifest(folder / name)["events"] for name in names)
+    return problems or unlike(manifest, [("events", total)])
+
+
+def look_at_sensor(manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
+    """Problems of the folder of one camera of a rig, whose configuration is the rig's."""
+    for _, name, own, gives_events in config.cameras():
+        if name == manifest.get("sensor"):
+            return bound(".", manifest, own, gives_events)
+    return [f"{MANIFEST}: sensor is {shown(manifest.get('sensor'))}, of which config.yaml says nothing"]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A sequence against itself made anew.
+
+_SAME_ANYWHERE = (
+    "split",
+    "seed",
+    "sequence",
+    "emulator",
+    "labels",
+    "duration_us",
+    "t_offset_us",
+    "height",
+    "width",
+    "objects",
+    "source",
+)
+"""Of a manifest: what no renderer and no library has a say in."""
+
+
+def made_again(
+    root: Path,
+    chosen: dict[str, Known],
+    result: Verification,
+    base: str | Path | None,
+    progress: Callable[[int, str], None] | None,
+) -> None:
+    """``chosen`` generated again, in one OpenGL context. What differs goes to ``result``.   base : folder that relative
+    paths start from; None: the run's.   progress : called with a count and a name, or None."""
+    gl: GLContext | None = None
+    if base is None:
+        base = "."
+        with suppress(BlinkGLError):  # a damaged record has been reported
+            base = (RunFolder(root).read("run.json") or {}).get("base", ".")
+    with tempfile.TemporaryDirectory(prefix="blinkgl-verify-") as scratch:
+        try:
+            for name, one in chosen.items():
+                if progress:
+                    progress(result.sequences, "again: " + shown(name))
+
+                def again(name: str = name, one: Known = one) -> list[str]:
+                    nonlocal gl
+                    if one.config.frames is None and gl is None:
+                        gl = create_context(one.config.gl.backend, one.config.gl.device)
+                    made = generate_sequence(one.config, one.manifest["sequence"], scratch, gl, base=Path(base)).path
+                    try:
+                        result.deep.append(name)
+                        return _compared(name, one, made, result)
+                    finally:
+                        shutil.rmtree(made)
+
+                lines = guarded(again)
+                result.add(name, lines if name in result.deep else [f"cannot be made again: {line}" for line in lines])
+        finally:
+            if gl is not None:
+                gl.release()
+
+
+def _compared(name: str, one: Known, made: Path, result: Verification) -> list[str]:
+    """The sequence against itself made again: bit by bit, or as far as two machines can agree."""
+    lines = differences(one.folder, made)
+    if one.manifest["format_version"] == 1:  # theirs have no hash of themselves, which ours have
+        lines = [line for line in lines if not line.endswith(f"{MANIFEST}: differs")]
+    if not lines:
+        return []
+    manifest = read_manifest(made)
+    if not (apart := _apart(one.manifest, manifest)):
+        return [f"made again, {line}" for line in lines]
+    result.in_part.append(name)
+    problems = [
+        f"made again, {MANIFEST}: {key} differs" for key in _SAME_ANYWHERE if one.manifest.get(key) != manifest.get(key)
+    ]
+    problems += [f"made again, {line}" for line in lines if line.endswith("only in one of them")]
+    result.notes.append(f"{shown(name)}: {apart}; the bytes of its files were not compared")
+    return problems
+
+
+def _apart(one: dict[str, Any], other: dict[str, Any]) -> str:
+    """What may make the bytes of two machines differ; "" where nothing does."""
+    mine, here = ({"BlinkGL": manifest.get("blinkgl"), **made_with(manifest)} for manifest in (one, other))
+    different = [k for k in mine.keys() | here.keys() if mine.get(k) != here.get(k)]
+    return "; ".join(
+        f"made with {k} {shown(mine.get(k))}, this machine has {shown(here.get(k))}" for k in sorted(different)
+    )
+
+
+def differences(a: Path, b: Path) -> list[str]:
+    """Files in which two folders differ, one line each."""
+    names = [{p.relative_to(f).as_posix() for p in f.rglob("*") if p.is_file()} for f in (a, b)]
+    lines = [f"{shown(name)}: only in one of them" for name in sorted(names[0] ^ names[1])]
+    return lines + [
+        f"{shown(name)}: differs"
+        for name in sorted(names[0] & names[1])
+        if (a / name).read_bytes() != (b / name).read_bytes()
+    ]
+
+
+__all__ = ["Verification", "verify_dataset"]
+
+
+def verify_dataset(
+    root: str | Path,
+    *,
+    deep: int = 0,
+    seed: int = 0,
+    base: str | Path | None = None,
+    progress: Callable[[int, str], None] | None = None,
+) -> Verification:
+    """Every sequence below ``root``, and what lies between them.
+
+    deep : so many sequences, drawn with ``seed``, are generated again and compared bit by bit.
+    base : folder that the recipe's relative paths start from; default: as the run's record says.
+    Raises AssetError when ``root`` holds no sequence at all."""
+    root = Path(root)
+    if not root.is_dir():
+        raise AssetError("no such data set", where=str(root), accepted="a folder of sequences")
+    result = Verification()
+    folders = list(made_folders(root))
+    if not folders and not (root / RUN_FOLDER).is_dir():
+        raise AssetError("no sequence found", where=str(root), accepted="a folder that 'blinkgl generate' wrote")
+    known: dict[str, Known] = {}
+    for number, folder in enumerate(folders):
+        name = folder.relative_to(root).as_posix()
+        if progress:
+            progress(number, shown(name))
+        problems, found = look(folder, name)
+        result.add(name, problems)
+        if found is not None:
+            known[name] = found
+    result.sequences = len(folders)
+    if not (root / MANIFEST).is_file():
+        result.add(".", guarded(lambda: strangers(root, folders)))
+        result.add(".", guarded(lambda: index(root, list(sequence_folders(root)))))
+        for name, lines in twins(known, result).items():
+            result.add(name, lines)
+        result.add(".", guarded(lambda: against_run(root, folders, known, result)))
+        result.add(".", guarded(RunFolder(root).altered))
+    sound = [name for name in known if name not in result.problems]
+    if deep and sound:
+        chosen = sorted(np.random.default_rng(seed).permutation(len(sound))[:deep])
+        made_again(root, {sound[i]: known[sound[i]] for i in chosen}, result, base, progress)
+    return result

@@ -1,5 +1,7 @@
 """The house, as docs/architecture.md draws it: every room says what it is for."""
 
+from __future__ import annotations
+
 import ast
 import graphlib
 import importlib
@@ -8,6 +10,8 @@ import re
 from pathlib import Path
 
 import pytest
+
+from blinkgl.tools import draws
 
 ROOT = Path(__file__).parents[1]
 ROOMS = sorted(
@@ -136,3 +140,14 @@ def test_doors_to_one_thing_have_the_same_defaults(what):
                 said.setdefault(parameter.name, {})[name] = parameter.default
     assert any(len(doors) > 1 for doors in said.values())
     assert {name: doors for name, doors in said.items() if len(set(doors.values())) > 1} == {}
+
+
+# --- The same configuration and seed draw the same textures, bodies, worlds and noise in every version: against
+# ``tests/golden/draws.json``.
+
+
+@pytest.mark.parametrize("part", draws.PARTS, ids=lambda part: part.__name__)
+def test_what_seeds_draw(part):
+    """After a change that is meant: ``python -m blinkgl.tools.draws``, and a look at what has become of the file."""
+    golden = {key: value for key, value in draws.known().items() if key.startswith(part.__name__ + "/")}
+    assert golden and draws.differences(golden, draws.drawn((part,))) == []

@@ -1,13 +1,25 @@
 """What every camera model of the table promises, and the pin-hole camera by hand."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
+import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from blinkgl.camera import CAMERA_MODELS, Equidistant, PinHole, Radtan
+from blinkgl.camera import CAMERA_MODELS, Equidistant, PinHole, Radtan, register, unregister
+from blinkgl.camera.distorted import DistortedModel
+from blinkgl.camera.pinhole import rectified, rectify_map
+from blinkgl.config.scene import RandomSceneConfig
 from blinkgl.errors import ConfigError
+from blinkgl.render import casting, reference
+from blinkgl.scene.geometry.primitives import grid
+from blinkgl.scene.motion.paths import KeyframePath, StaticPath
+from blinkgl.scene.rig import Rig
+from blinkgl.scene.types import Material, Part, Scene, SceneObject
+from blinkgl.scene.worlds.random_world import random_world
 
 SIZE = {
     "width": 120,
@@ -212,3 +224,182 @@ def test_planes_touch_the_picture(camera):
 
 def points_at(camera, xy, z=2.0):
     return z * camera.rays(np.asarray(xy, np.float64))
+
+
+# --- A camera model that nothing but this file knows, and each part of it taken away in turn.
+
+
+@dataclass(frozen=True)
+class Stereographic(DistortedModel):
+    """A direction at the angle theta to the axis is seen at 2 f tan(theta / 2), stretched by ``pull``."""
+
+    kind: ClassVar[str] = "stereographic"
+    coefficients: ClassVar[tuple[str, ...]] = ("pull",)
+    reach: ClassVar[float] = np.inf
+
+    pull: float = 1.0
+
+    def project(self, points):
+        points = np.asarray(points, np.float64)
+        ahead = points[..., 2] + np.linalg.norm(points, axis=-1)
+        return 2 * self.pull * points[..., :2] / ahead[..., None] * [self.fx, self.fy] + [self.cx, self.cy]
+
+    def jacobian(self, points):
+        points = np.asarray(points, np.float64)
+        length = np.linalg.norm(points, axis=-1, keepdims=True)
+        ahead = points[..., 2:] + length
+        eye = np.broadcast_to(np.eye(3)[:2], (*points.shape[:-1], 2, 3))
+        slope = points / length + [0, 0, 1]
+        out = (
+            2
+            * self.pull
+            * (eye / ahead[..., None] - points[..., :2, None] * slope[..., None, :] / ahead[..., None] ** 2)
+        )
+        return np.array([[self.fx], [self.fy]]) * out
+
+    def rays(self, xy):
+        u = (np.asarray(xy, np.float64) - [self.cx, self.cy]) / [self.fx, self.fy] / (2 * self.pull)
+        return np.concatenate([2 * u, 1 - (u**2).sum(axis=-1, keepdims=True)], axis=-1)
+
+    def ray_jacobian(self, xy):
+        u = (np.asarray(xy, np.float64) - [self.cx, self.cy]) / [self.fx, self.fy] / (2 * self.pull)
+        out = np.concatenate([np.broadcast_to(2 * np.eye(2), (*u.shape, 2)), -2 * u[..., None, :]], axis=-2)
+        return out / [self.fx, self.fy] / (2 * self.pull)
+
+
+@pytest.fixture
+def stereographic():
+    yield register(Stereographic)
+    unregister("stereographic")
+
+
+def test_a_model_from_outside_is_in_the_table(stereographic):
+    assert CAMERA_MODELS["stereographic"] is Stereographic and register(Stereographic) is Stereographic
+    camera = Stereographic(64, 48, 40.0, 40.0, 31.5, 23.5)
+    assert camera.part(0, 0, 32, 24, 2).pull == 1.0
+
+
+def without(part, value=None):
+    """The class with one part taken away, or another in its place."""
+    parts = (
+        "__annotations__",
+        "kind",
+        "coefficients",
+        "reach",
+        "pull",
+        "project",
+        "jacobian",
+        "rays",
+        "ray_jacobian",
+    )
+    body = {name: vars(Stereographic)[name] for name in parts if name != part} | (
+        {} if value is None else {part: value}
+    )
+    return dataclass(frozen=True)(type("Spoiled", (DistortedModel,), body))
+
+
+@pytest.mark.parametrize(
+    "part, value, problem",
+    [
+        ("project", None, "camera model 'stereographic': `project` is missing"),
+        ("jacobian", None, "camera model 'stereographic': `jacobian` is missing"),
+        ("rays", None, "`rays` is missing"),
+        ("ray_jacobian", None, "`ray_jacobian` is missing"),
+        ("kind", 3, "camera model Spoiled: `kind` is not a name"),
+    ],
+)
+def test_a_part_that_is_missing_or_wrong_is_named(part, value, problem):
+    before = dict(CAMERA_MODELS)
+    with pytest.raises(TypeError, match=problem):
+        register(without(part, value))
+    assert before == CAMERA_MODELS
+
+
+def test_what_is_no_model_and_what_is_there_already(stereographic):
+    with pytest.raises(TypeError, match="'pinhole' is not a subclass of CameraModel"):
+        register("pinhole")
+
+    @dataclass(frozen=True)
+    class Other(PinHole):
+        kind: ClassVar[str] = "stereographic"
+
+    with pytest.raises(TypeError, match="camera model 'stereographic': there is one already, Stereographic"):
+        register(Other)
+
+
+# --- Rectified pixels, DSEC's convention, with OpenCV as the judge.
+
+SIZE_RECTIFIED = (160, 120, 130.0, 128.0, 82.0, 57.5)
+LENSES = [
+    Radtan(*SIZE_RECTIFIED, k1=-0.35, k2=0.15, p1=1e-3, p2=-2e-3),
+    Radtan(*SIZE_RECTIFIED, k1=0.2, k2=-0.03, k3=0.01),
+    Equidistant(*SIZE_RECTIFIED, k1=-0.03, k2=0.01, k3=-0.004, k4=0.001),
+]
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=lambda c: f"{c.kind} {c.k1}")
+def test_the_map_there_and_back(lens):
+    map_ = rectify_map(lens)
+    assert map_.shape == (120, 160, 2) and map_.dtype == np.float32
+    y, x = np.mgrid[:120, :160]
+    grid = np.stack([x, y], axis=-1)
+    back = lens.project(rectified(lens).rays(map_))
+    assert np.abs(back - grid).max() < 1e-4  # asked: 1e-3 px
+    # OpenCV goes back by its own formulas
+    rays = rectified(lens).rays(map_).reshape(1, -1, 3)
+    if lens.kind == "radtan":
+        theirs, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), lens.K, np.array(lens.distortion))
+    else:
+        theirs, _ = cv2.fisheye.projectPoints(rays, np.zeros(3), np.zeros(3), lens.K, np.array(lens.distortion))
+    assert np.abs(theirs.reshape(grid.shape) - grid).max() < 1e-4
+    undistort = cv2.undistortPoints if lens.kind == "radtan" else cv2.fisheye.undistortPoints
+    theirs = undistort(grid.reshape(1, -1, 2).astype(float), lens.K, np.array(lens.distortion), P=lens.K)
+    middle = np.linalg.norm(grid - [82.0, 57.5], axis=-1) < 55  # further out its few steps do not converge
+    assert np.abs(theirs.reshape(grid.shape) - map_)[middle].max() < 1e-3
+
+
+def test_a_pin_hole_camera_s_is_the_identity():
+    map_ = rectify_map(PinHole(*SIZE_RECTIFIED))
+    y, x = np.mgrid[:120, :160]
+    np.testing.assert_allclose(map_, np.stack([x, y], axis=-1), atol=1e-4)
+
+
+# --- The float64 reference and random worlds ask the camera model, whichever it is.
+
+SECOND = 1_000_000_000
+CAMERAS_SEEN_THROUGH = [
+    model(48, 36, 30.0, 32.0, 22.0, 18.5, **getattr(model, "sample", {})) for model in CAMERA_MODELS.values()
+]
+every_of_seen_through = pytest.mark.parametrize("camera", CAMERAS_SEEN_THROUGH, ids=lambda c: c.kind)
+
+
+def wall(camera):
+    """A wall 4 m ahead that drifts by 0.3 m in x and -0.5 m in z each second, seen by a camera at rest in the
+    origin."""
+    path = KeyframePath(
+        [0, SECOND], [(0, 0, 4.0), (0.3, 0, 3.5)], Rotation.concatenate([Rotation.identity()] * 2), "linear"
+    )
+    sheet = SceneObject("wall", 1, (Part(grid(width=40, depth=40), Material(double_sided=True)),), path)
+    return Scene((sheet,), Rig.alone(camera, StaticPath(np.eye(4))), 0, SECOND)
+
+
+@every_of_seen_through
+def test_the_reference_sees_through_it(camera):
+    scene = wall(camera)
+    frame = reference.render(scene, 0, forward_ns=SECOND)
+    xy = casting.pixel_grid(camera).reshape(36, 48, 2)
+    rays = camera.rays(xy)
+    points = 4.0 * rays / rays[..., 2:]
+    assert frame.hit.all()
+    np.testing.assert_allclose(frame.depth, 4.0, rtol=1e-13)
+    there = camera.project(points + np.array([0.3, 0, -0.5]))
+    np.testing.assert_allclose(frame.forward.flow, there - xy, atol=1e-10)
+    np.testing.assert_allclose(frame.velocity, camera.jacobian(points) @ [0.3, 0, -0.5], atol=1e-10)
+    np.testing.assert_array_equal(frame.forward.occluded, ((there < -0.5) | (there >= [47.5, 35.5])).any(axis=-1))
+
+
+@every_of_seen_through
+def test_a_random_world_places_in_its_view(camera, tmp_path):
+    config = RandomSceneConfig(objects={"count": 3, "in_view": 1.0}, textures={"photographs": False})
+    scene = random_world(config, camera, 0, SECOND // 10, "train", 1, 0, tmp_path)
+    assert scene.camera is camera and len(scene.objects) > 3

@@ -5,11 +5,14 @@ from __future__ import annotations
 import pytest
 import yaml
 
+from blinkgl.cli import run
 from blinkgl.config.quality import QUALITIES, fill_quality, load_quality
+from blinkgl.config.reader import run_file, shipped_runs
 from blinkgl.config.run import RunTemplate, load_run
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.config.timeline import DisplacementTimeline
 from blinkgl.dataset.report import config_yaml
+from blinkgl.errors import ConfigError
 
 
 def load_run_of(tmp_path, tree: dict, *overrides: str) -> RunTemplate:
@@ -55,3 +58,37 @@ def test_null_leaves_every_key_its_own_default(tmp_path):
     assert (config.timeline, config.render) == (DisplacementTimeline(), RenderConfig())
     (tmp_path / "again.yaml").write_text(config_yaml(config, 0))
     assert load_run(tmp_path / "again.yaml").sequence(0) == config, "and stays so in what is written"
+
+
+# --- What ships, by name: from anywhere, as long as no file of that name is there.
+
+
+@pytest.mark.parametrize("name", ["demo", "demo.yaml", "configs/demo.yaml", "flags", "scenes/flags.yaml"])
+def test_a_run_is_found_by_its_name(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    stem = name.split("/")[-1].removesuffix(".yaml")
+    assert run_file(name) == shipped_runs()[stem]
+    assert load_run(name).tree == load_run(shipped_runs()[stem]).tree
+
+
+@pytest.mark.parametrize("name", ["demo", "demo.yaml"])
+def test_a_file_of_ones_own_comes_first(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).write_text("seed: 91\n")
+    assert load_run(name).seed == 91
+
+
+@pytest.mark.parametrize("name", ["nothing", "elsewhere/demo.yaml", "../demo", "flags/demo"])
+def test_what_is_neither_says_where_names_are_listed(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(
+        ConfigError, match=f"^{name}: no such file; expected a YAML file, or a name that 'blinkgl configs' lists$"
+    ):
+        load_run(name)
+
+
+def test_every_run_that_ships_is_listed_with_what_it_is(capsys, monkeypatch):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    assert run(["configs"]) == 0
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert {words[0] for words in lines} >= set(shipped_runs()) and all(len(words) > 3 for words in lines)

@@ -1,12 +1,18 @@
 """The YAML as a user writes it, and what a user reads when it is wrong."""
 
+from __future__ import annotations
+
 import math
 from importlib import resources
+from pathlib import Path
 
 import pytest
+import yaml
 
 from blinkgl.camera import PinHole
+from blinkgl.cli import run
 from blinkgl.config.camera import CameraConfig
+from blinkgl.config.reader import to_yaml
 from blinkgl.config.recipe import all_groups
 from blinkgl.config.run import load_run
 from blinkgl.config.sequence import TimeConfig
@@ -200,3 +206,77 @@ def test_bad_overrides(tmp_path, option, message):
     with pytest.raises(ConfigError) as caught:
         load_run(write(tmp_path, "camera: {width: 3}\nlabels: {flow: [forward]}"), [option])
     assert str(caught.value).startswith(message)
+
+
+# --- Keys that earlier versions had: read where they say what happens anyway, refused in one line where they do not.
+
+OLD = Path(__file__).parents[1] / "golden" / "config_0.1.0.yaml"
+"""A sequence's own config.yaml as 0.1.0 wrote it (commit 348eebef), with every key that there was."""
+
+
+def test_a_recorded_configuration_of_an_earlier_version_is_read(tmp_path):
+    config = load_run(OLD).sequence(0)
+    assert config.events.emulator == "v2e" and config.camera.width == 96
+    again = tmp_path / "again.yaml"
+    again.write_text(to_yaml(config.model_dump(mode="json")))
+    assert load_run(again).sequence(0) == config
+
+
+@pytest.mark.parametrize(
+    "path, value, said",
+    [
+        ("render.lod.enabled", "true", "render.lod: this key was removed"),
+        ("events.compat", "authors", "events.compat: this key was removed (got 'authors'); expected the key left out"),
+    ],
+)
+def test_a_value_that_would_matter_is_refused(path, value, said):
+    with pytest.raises(ConfigError) as error:
+        load_run(OLD, [f"{path}={value}"])
+    assert str(error.value).startswith(said) and "\n" not in str(error.value)
+
+
+# --- What a scene's light and its surfaces cannot be: one line each, with key, value and what is accepted, before
+# any work starts.
+
+BASE = {
+    "camera": {"width": 16, "height": 12},
+    "time": {"duration": 0.2, "label_rate": 10},
+    "scene": {
+        "kind": "explicit",
+        "meshes": {"box": {"primitive": "cuboid"}},
+        "materials": {"m": {}},
+        "objects": [{"mesh": "box", "material": "m", "position": [0, 4, 0]}],
+        "camera": {"look_at": [0, 4, 0]},
+    },
+}
+LAMP = {"kind": "point", "position": [0, 0, 1]}
+INF, NAN = float("inf"), float("nan")
+ROWS = [
+    ("scene.light.sun", -1, "scene.light.sun: too small (got -1); expected a number from 0 to 1e+09"),
+    ("scene.light.sky", INF, "scene.light.sky: not a finite number (got inf)"),
+    ("scene.light.sun_color", [1, -1, 1], "scene.light.sun_color.1: too small (got -1)"),
+    ("scene.light.lights", [LAMP | {"strength": -2}], "scene.light.lights.0.strength: too small (got -2)"),
+    ("scene.light.lights", [LAMP | {"strength": INF}], "scene.light.lights.0.strength: not a finite number (got inf)"),
+    ("scene.light.lights", [LAMP | {"strength": NAN}], "scene.light.lights.0.strength: not a finite number (got nan)"),
+    ("scene.light.lights", [LAMP] * 33, "scene.light.lights: too many lights (got 33); expected at most 31"),
+    ("scene.light.shadow_size", 30000, "scene.light.shadow_size: too large (got 30000)"),
+    ("scene.light.environment", {"map": "no.hdr"}, "scene.light.environment.map: no such file (got 'no.hdr')"),
+    ("scene.light.environment", {"map": "a", "strength": INF}, "environment.strength: not a finite number (got inf)"),
+    ("scene.light", {"unlit": True, "shadows": "hard"}, "scene.light.shadows: nothing is lit by them"),
+    ("scene.materials.m.normal_map", "no.png", "scene.materials.m.normal_map: no such file (got 'no.png')"),
+    ("scene.materials.m.emission_map", "a.png", "scene.materials.m.emission: a map of light that is none"),
+    ("scene.materials.m.normal_scale", NAN, "scene.materials.m.normal_scale: not a finite number (got nan)"),
+    ("scene.materials.m.metallic", 2, "scene.materials.m.metallic: too large (got 2); expected a number from 0 to 1"),
+    ("scene.fog", {"density": -1}, "scene.fog.density: too small (got -1)"),
+]
+
+
+@pytest.mark.parametrize("key, value, words", ROWS, ids=[f"{k.rpartition('.')[2]}-{v}"[:40] for k, v, _ in ROWS])
+def test_one_line_with_the_key(tmp_path, monkeypatch, capsys, key, value, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bad.yaml").write_text(yaml.safe_dump(BASE))
+    option = f"{key}={yaml.safe_dump([value], default_flow_style=True, width=9999).strip()[1:-1]}"
+    assert run(["generate", "bad.yaml", "--out", "out", "--set", option]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ") and said.count("\n") == 1 and words in said, said
+    assert not (tmp_path / "out").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -17,9 +18,12 @@ from blinkgl.dataset.explain import explain
 from blinkgl.dataset.shards import sample
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import AssetError, ConfigError
+from blinkgl.io.boxes import read_boxes
 from blinkgl.io.flow import read_flow
+from blinkgl.io.images import read_ids
 from blinkgl.io.intervals import read_intervals
 from blinkgl.labels import LABELS, Flows, LabelRequest
+from blinkgl.report.collect import collect
 
 MS = 1_000_000
 RUN = {
@@ -131,3 +135,69 @@ def test_intervals_that_cannot_be_are_refused(flow, said, tmp_path):
     with pytest.raises(ConfigError) as error:
         load_run(tmp_path / "a.yaml")
     assert said in str(error.value)
+
+
+# --- Boxes, categories, tracks and an inertial unit in whole data sets: written, verified, shown by the report.
+
+RUN_SHOWN_LABELS = {
+    "seed": 5,
+    "camera": {"width": 64, "height": 48, "fov": 60},
+    "time": {"duration": 0.05, "label_rate": 40},
+    "timeline": {"kind": "uniform", "fps": 80},
+    "scene": {
+        "objects": {"count": 3, "distance": [2, 4]},
+        "pool": {"primitives": ["cuboid", "flag"], "variants": 4},
+        "textures": {"procedural": ["checks"], "variants": 4, "photographs": False, "max_size": 32},
+    },
+    "labels": {"boxes": True, "semantics": {"ground": 2, "*": 1}, "scene_flow": True, "ids": True},
+    "tracks": {"points": 20, "choose": "surface", "rate": 200},
+    "imu": {"rate": 200},
+    "preview": {"rate": 40},
+}
+
+
+@pytest.fixture(scope="module")
+def made_of_shown_labels(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("shown")
+    (folder / "run.yaml").write_text(to_yaml(RUN_SHOWN_LABELS), encoding="utf-8")
+    assert run(["generate", str(folder / "run.yaml"), "--out", str(folder / "out")]) == 0
+    return folder
+
+
+def test_written_and_verified(made_of_shown_labels):
+    assert verify_dataset(made_of_shown_labels / "out", deep=1).problems == {}
+    folder = folder_of(made_of_shown_labels)
+    boxes, ids = read_boxes(folder / "boxes/000001.npz"), read_ids(folder / "ids/000001.png")
+    assert boxes.visible_pixels.sum() == np.count_nonzero(ids) and set(boxes.category.tolist()) == {1, 2}
+    semantics = read_ids(folder / "semantics/000001.png")
+    ground = int(boxes.instance[boxes.kind == "ground"][0])
+    assert (semantics[ids == ground] == 2).all() and (semantics[(ids > 0) & (ids != ground)] == 1).all()
+    poses = np.load(folder / "poses.npz")  # of the start and every label
+    row = int(np.flatnonzero(poses["object_ids"] == boxes.instance[-1])[0])
+    np.testing.assert_allclose(boxes.T_world_box[-1, :3, :3], poses["T_world_obj"][row, 2, :3, :3], atol=1e-12)
+    told = json.loads((folder / "manifest.json").read_text())["categories"]
+    assert told["patterns"] == {"ground": 2, "*": 1} and told["objects"]["ground"] == 2
+    stamps = [line.split(",") for line in (folder / "scene_flow/timestamps.txt").read_text().splitlines()[1:]]
+    assert [[int(a), int(b)] for a, b in stamps] == [[25_000, 50_000], [50_000, 75_000]]
+    endings = {name.partition(".")[2] for name, _ in sample(folder, 0)}
+    assert {"boxes.npz", "boxes.txt", "semantics.png", "scene_flow.npy"} <= endings
+
+
+def test_report_shows_them(made_of_shown_labels):
+    others = dict(collect(made_of_shown_labels / "out").examples[0].others)
+    frame = collect(made_of_shown_labels / "out").examples[0].image
+    assert {"boxes", "semantics", "scene flow", "point tracks, 20"} <= set(others)
+    assert (others["boxes"] != frame).any() and (others["point tracks, 20"] != frame).any()
+
+
+def test_a_table_that_fits_nothing_is_refused(made_of_shown_labels, tmp_path, capsys):
+    tree = {**RUN_SHOWN_LABELS, "labels": {"semantics": {"car*": 1, "bus": 2}}}
+    (tmp_path / "a.yaml").write_text(to_yaml(tree), encoding="utf-8")
+    assert run(["generate", str(tmp_path / "a.yaml"), "--out", str(tmp_path / "out")]) != 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert (
+        "labels.semantics: no object has a name that one of the patterns fits (got ['car*', 'bus']); expected" in said
+    )
+    assert "cuboid" in said and "Traceback" not in said and not list((tmp_path / "out").rglob("manifest.json"))
+    with Renderer(load(tmp_path / "a.yaml")) as renderer:
+        assert renderer.frame(0.05, labels=["semantics"]).semantics.max() > 1  # by kinds of shape

@@ -1,6 +1,8 @@
 """One YAML in, a DSEC-layout sequence out: read back by independent readers, reproducible, whole or not at all."""
 
 import hashlib
+import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -11,10 +13,16 @@ import numpy as np
 import pytest
 import yaml
 
+from blinkgl.camera.pinhole import rectified
 from blinkgl.cli import run
-from blinkgl.config.run import load_run
+from blinkgl.config.reader import to_yaml
+from blinkgl.config.run import RunTemplate, load_run
 from blinkgl.dataset import generate as generate_module
 from blinkgl.dataset.generate import generate_run
+from blinkgl.dataset.verify import verify_dataset
+from blinkgl.errors import AssetError, ConfigError
+from blinkgl.io.flow import read_flow
+from blinkgl.io.frame_camera import read_codes, read_exposures
 from blinkgl.render.passes import Luminance
 
 SMALL = {
@@ -178,3 +186,162 @@ def test_existing_output_is_refused_before_any_work(tmp_path, capsys, monkeypatc
 
 
 # ---- the command line --------------------------------------------------------------------------------------------
+
+
+# --- A camera with a lens in whole sequences: files, verification, rectified labels, tracks, the frame camera,
+# layouts.
+
+LENS = {"width": 64, "height": 48, "fov": 75, "lens": "radtan", "distortion": [-0.3, 0.1, 1e-3, -2e-3]}
+RUN = {
+    "seed": 4,
+    "camera": LENS,
+    "time": {"duration": 0.1, "label_rate": 20},
+    "timeline": {"kind": "displacement", "max_px": 1.0},
+    "scene": {
+        "objects": {"count": 4, "distance": [2, 5]},
+        "camera_motion": {"speed": 1.5, "rotation_rate": [60, 90]},
+        "pool": {"primitives": ["cuboid", "cone"], "variants": 6},
+        "textures": {"procedural": ["checks"], "variants": 4, "photographs": False, "max_size": 32},
+    },
+    "labels": {"flow": ["forward"], "depth": True, "ids": True, "events": True},
+    "tracks": {"points": 64, "choose": "grid"},
+    "images": {
+        "rate": 20,
+        "exposure_us": 4000,
+        "row_us": 40,
+        "lens": {"aperture": 0.02, "focus": 3},
+        "also": ["sharp"],
+    },
+    "preview": {"enabled": False},
+    "groups": {
+        "bent": {"seed": 4, "output": {"sequences": 1, "name": "bent"}},
+        "flat": {"seed": 4, "output": {"sequences": 1, "name": "flat"}, "labels": {"pixels": "rectified"}},
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("lenses")
+    (folder / "run.yaml").write_text(to_yaml(RUN), encoding="utf-8")
+    assert run(["generate", str(folder / "run.yaml"), "--out", str(folder / "out")]) == 0
+    return folder / "out"
+
+
+def test_verify_knows_the_lens(made, tmp_path):
+    assert verify_dataset(made, deep=2).problems == {}
+    for name, change in (
+        ("rectify_map.h5", lambda path: h5py.File(path, "r+")["rectify_map"].write_direct(np.zeros((48, 64, 2), "f4"))),
+        ("camchain.yaml", lambda path: path.write_text(path.read_text().replace("-0.3\n", "-0.29\n"))),
+    ):
+        copy = tmp_path / name
+        shutil.copytree(made, copy)
+        path = copy / "train/bent_000000" / name
+        before = path.read_bytes()
+        change(path)
+        assert path.read_bytes() != before
+        found = str(verify_dataset(copy).problems)
+        assert name in found
+
+
+def test_rectified_labels_are_where_the_map_leads(made):
+    bent, flat = (made / f"train/{name}_000000" for name in ("bent", "flat"))
+    for name in ("events.h5", "frame_camera/images/000000.png", "rectify_map.h5"):
+        assert (bent / name).read_bytes() == (flat / name).read_bytes()  # nothing of the sensor's own has changed
+    camera = load_run(bent / "config.yaml").sequence(0).camera.model
+    one, other = (np.load(folder / "depth/000000.npy") for folder in (bent, flat))
+    assert (one != other).mean() > 0.5
+    with h5py.File(bent / "rectify_map.h5") as file:
+        to = np.rint(file["rectify_map"][()]).astype(int)
+    inside = (to >= 0).all(axis=-1) & (to < [64, 48]).all(axis=-1)
+    there = other[np.clip(to[..., 1], 0, 47), np.clip(to[..., 0], 0, 63)]
+    assert np.quantile(np.abs(one / there - 1)[inside], 0.8) < 0.03
+    assert rectified(camera).width == 64
+
+
+@pytest.mark.parametrize("name", ["bent", "flat"])
+def test_tracks_are_in_the_labels_pixels(made, name):
+    folder = made / f"train/{name}_000000"
+    tracks = np.load(folder / "tracks.npz")
+    flow, valid = read_flow(folder / "flow/forward/000000.png")
+    x, y = tracks["query_points"][:, 2].astype(int), tracks["query_points"][:, 1].astype(int)
+    moved = tracks["target_points"][:, 1] - tracks["target_points"][:, 0]
+    seen = valid[y, x] & ~tracks["occluded"][:, 0]
+    assert seen.sum() > 20
+    off = np.abs(flow[y, x] - moved)[seen].max(axis=-1)
+    assert np.quantile(off, 0.9) < 1 / 128 and np.abs(moved[seen]).max() > 1  # the PNG's quantum
+
+
+def test_a_file_s_own_camera_has_no_lens(tmp_path):
+    scene = {"kind": "file", "path": "a.glb", "intrinsics": "file"}
+    Path(tmp_path / "run.yaml").write_text(to_yaml({"camera": LENS, "scene": scene}), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"scene.intrinsics: the file's camera is a pin-hole camera \(got 'file'\)"):
+        load_run(tmp_path / "run.yaml")
+
+
+# --- A frame camera from the configuration to the files and those who read them.
+
+RUN_FRAME_CAMERA_RUNS = {
+    "seed": 5,
+    "camera": {"width": 40, "height": 30},
+    "time": {"duration": 0.1, "label_rate": 20, "start": 0.5},
+    "scene": {
+        "objects": {"count": 2, "distance": [2, 4]},
+        "pool": {"primitives": ["sphere", "cuboid"], "variants": 2},
+        "textures": {"procedural": ["checks", "fbm"], "variants": 2, "photographs": False, "max_size": 32},
+        "camera_motion": {"speed": [2, 5], "rotation_rate": [60, 200]},
+    },
+    "images": {
+        "rate": 70,
+        "exposure_us": 6000,
+        "row_us": 50,
+        "bits": 12,
+        "photon_noise": True,
+        "gain_db": 12,
+        "read_noise": 3,
+        "max_instants": 3,
+        "also": ["clean", "sharp"],
+        "auto_exposure": {"lag": 0.05, "longest_us": 9000},
+    },
+    "preview": {"enabled": False},
+}
+
+
+def template(**images):
+    return RunTemplate({**RUN_FRAME_CAMERA_RUNS, "images": {**RUN_FRAME_CAMERA_RUNS["images"], **images}}, Path("."))
+
+
+@pytest.fixture(scope="module")
+def made_of_frame_camera_runs(tmp_path_factory):
+    out = tmp_path_factory.mktemp("camera") / "out"
+    (report,) = generate_run(template(), out)
+    return report, out
+
+
+def test_images_are_written_beside_everything_else_and_verified(made_of_frame_camera_runs):
+    report, out = made_of_frame_camera_runs
+    lines = read_exposures(report.path)
+    assert len(lines) == 10 and [round(e.start_us) for e in lines[:3]] == [500_000, 514_286, 528_571]
+    assert not (report.path / "images").exists(), "in the place of the instantaneous ones"
+    for name in ("images", "clean", "sharp"):
+        assert len(list((report.path / "frame_camera" / name).glob("*.png"))) == 10
+        codes = read_codes(report.path / f"frame_camera/{name}/000009.png")
+        assert codes.shape == (30, 40, 3) and codes.dtype == np.uint16 and 300 < codes.max() < 4096
+    manifest = json.loads((report.path / "manifest.json").read_text())
+    assert manifest["frame_camera"]["images"] == 10 and manifest["frame_camera"]["bits"] == 12
+    assert report.seconds["images"] > 0
+    assert verify_dataset(out, deep=1).clean
+
+
+@pytest.mark.parametrize("old, new", [("start_us", "begin_us"), ("500000.000", "nan")])
+def test_a_damaged_list_of_exposures_is_one_line(made_of_frame_camera_runs, tmp_path, old, new):
+    path = tmp_path / "frame_camera/exposures.csv"
+    path.parent.mkdir()
+    path.write_text((made_of_frame_camera_runs[0].path / "frame_camera/exposures.csv").read_text().replace(old, new))
+    with pytest.raises(AssetError, match="damaged list of exposures"):
+        read_exposures(tmp_path)
+
+
+def test_no_list_of_exposures_is_said(tmp_path):
+    with pytest.raises(AssetError, match="no frame camera here"):
+        read_exposures(tmp_path)

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
+import os
+import threading
+from queue import SimpleQueue
+
+import numba
 import numpy as np
 import pytest
 
-from blinkgl.config.events import EsimConfig, V2eConfig
+from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.errors import EventDataError
-from blinkgl.events import Esim, V2e
+from blinkgl.events import Esim, V2e, make_emulator, threads
 from blinkgl.events.noise import noise_size
 from blinkgl.events.packing import PackedBuffer
 
@@ -169,3 +175,178 @@ def test_a_saved_state_is_refused_by_another_emulator():
     assert fresh.state_dict()["clock"].tolist() == [0, 0, 0, 0]
     one.load_state_dict(fresh.state_dict())
     assert one.t_ns is None and one.frames == 0
+
+
+# --- Rows that the caller knows to be unchanged may be skipped: same events, same state.
+
+H, W = 53, 70
+
+
+def clip():
+    """A bright bar wandering up and down over a still background, and the rows that differ from frame to frame."""
+    rng = np.random.default_rng(3)
+    background = rng.uniform(0.1, 1.0, (H, W)).astype(np.float32)
+    frames, places = [background], [(0, 0)]
+    for k in range(12):
+        y0 = 5 * k % 40
+        frame = background.copy()
+        frame[y0 : y0 + 6, 10:40] *= np.float32(2.5)
+        frames.append(frame)
+        places.append((y0, y0 + 6))
+    rows = [None] + [(min(a[0], b[0]), max(a[1], b[1])) for a, b in itertools.pairwise(places)]
+    rows[1] = places[1]
+    frames += [frames[-1], frames[-1]]
+    rows += [(0, 0), (0, 0)]  # nothing changed at all
+    return frames, rows
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        EsimConfig(),
+        EsimConfig(threshold_sigma=0.0),
+        EsimConfig(threshold_jitter=0.05, refractory_us=300.0),
+        V2eConfig(preset="noisy"),
+        VoltmeterConfig(),
+    ],
+)
+def test_same_events_and_state(config):
+    frames, rows = clip()
+    told, untold = (make_emulator(config, H, W, seed=9) for _ in range(2))
+    count = 0
+    for k, (frame, changed) in enumerate(zip(frames, rows)):
+        a, b = told.step(frame, k * 1_000_000, changed), untold.step(frame, k * 1_000_000)
+        for name in "xytp":
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+        count += len(a)
+    assert count > 500
+    for name, value in untold.state_dict().items():
+        np.testing.assert_array_equal(told.state_dict()[name], value)
+
+
+def test_bad_values_in_the_changed_rows_are_still_found():
+    emulator = make_emulator(EsimConfig(), H, W, seed=1)
+    frame = np.ones((H, W), np.float32)
+    emulator.step(frame, 0)
+    frame[20, 7] = np.nan
+    with pytest.raises(EventDataError, match="x=7, y=20"):
+        emulator.step(frame, 1000, rows=(18, 24))
+
+
+# --- Events that ``max_events_per_step`` cuts are counted, and no others: nothing is lost, nothing is reported as
+# lost.
+
+KINDS = {
+    "esim": EsimConfig(threshold_sigma=0.0),
+    "v2e": V2eConfig(preset="clean"),
+    "voltmeter": VoltmeterConfig(),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_cut_is_counted(kind):
+    """One step of 30 events a pixel into room for four: as many are given as fit, and with those that are counted as
+    cut there are as many as without a limit, to an event of each pixel."""
+    frames = [np.full((24, 30), v, np.float32) for v in (0.01, 1.0)]
+    counts = []
+    for limit in (3000, 10**6):
+        emulator = make_emulator(KINDS[kind].model_copy(update={"max_events_per_step": limit}), 24, 30, 3)
+        emulator.step(frames[0], 0)
+        made = len(emulator.step(frames[1], 10**8))
+        assert made <= limit and (emulator.saturated > 0) == (limit == 3000)
+        counts.append(made + emulator.saturated)
+        if limit == 3000:
+            assert made > 2000
+    assert abs(counts[0] - counts[1]) <= (0.1 if kind == "voltmeter" else 0.05) * counts[1]
+
+
+# --- The kernels' threads: every part is done once, by whoever is free; nobody waits for a thread that has not
+# begun.
+
+
+@numba.njit(nogil=True)
+def _count(taken, start, counts):
+    part = threads.take_part(taken, start)
+    while part >= 0:
+        counts[part] += 1
+        part = threads.take_part(taken, start)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_every_part_is_done_once(count):
+    for parts in (1, 3, 10_000):
+        counts = np.zeros(parts, np.int64)
+        for _ in range(20):
+            threads.run(_count, parts, (counts,), count)
+        assert (counts == 20).all()
+
+
+def test_the_caller_does_not_wait_for_who_has_not_begun(monkeypatch):
+    """No helper ever gets a core here: the work is done all the same."""
+    monkeypatch.setattr(threads, "_helpers", [None])
+    monkeypatch.setattr(threads, "_jobs", SimpleQueue())
+    counts = np.zeros(100, np.int64)
+    threads.run(_count, 100, (counts,), 2)
+    assert (counts == 1).all()
+    late = threads._jobs.get_nowait()
+    late.help()
+    assert (counts == 1).all() and late._arguments == (), "one who comes too late does nothing and keeps nothing alive"
+
+
+def test_an_error_in_a_helper_is_raised_in_the_caller():
+    both = threading.Barrier(2)
+
+    def kernel(taken, start):
+        both.wait(10)
+        if start:
+            raise MemoryError("no room")
+
+    with pytest.raises(MemoryError, match="no room"):
+        threads.run(kernel, 2, (), 2)
+    counts = np.zeros(10, np.int64)
+    threads.run(_count, 10, (counts,), 2)
+    assert (counts == 1).all(), "the helper is alive"
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_forked_child_has_threads_of_its_own():
+    counts = np.zeros(1000, np.int64)
+    threads.run(_count, 1000, (counts,), 2)
+    if not (child := os.fork()):
+        ok = False
+        try:
+            threads.run(_count, 1000, (counts,), 2)
+            ok = (counts == 2).all() and threads._helpers[0].is_alive()
+        finally:
+            os._exit(0 if ok else 1)
+    assert os.waitpid(child, 0)[1] == 0
+
+
+@pytest.mark.parametrize(
+    "config",
+    [EsimConfig(threshold_sigma=0.05), V2eConfig(preset="noisy"), VoltmeterConfig()],
+    ids=["esim", "v2e", "voltmeter"],
+)
+def test_events_do_not_depend_on_the_number_of_threads(config, monkeypatch):
+    """Large enough for several threads in the kernel and in the sort; more threads than cores,
+    so that they get in each other's way."""
+    from blinkgl.events import emulator as emulators
+
+    frames = np.random.default_rng(3).random((5, 400, 500), np.float32)
+    used = []
+
+    def run(kernel, parts, arguments, count):
+        used.append((kernel.__name__, count))
+        threads.run(kernel, parts, arguments, count)
+
+    results = []
+    for count in (1, 2, 3):
+        monkeypatch.setattr(emulators, "thread_count", lambda count=count: count)
+        monkeypatch.setattr(emulators, "run", run)
+        model = make_emulator(config, 400, 500, 7)
+        results.append([model.step(f, 10**6 * k) for k, f in enumerate(frames)])
+    assert {count for name, count in used} == {1, 2, 3}
+    assert sum(len(e) for e in results[0]) > 100_000
+    for other in results[1:]:
+        for a, b in zip(results[0], other):
+            assert all(np.array_equal(getattr(a, k), getattr(b, k)) for k in "xytp")

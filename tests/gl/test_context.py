@@ -5,13 +5,20 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
-from blinkgl.errors import GLError
-from blinkgl.gl import context as context_module, create_context, egl_devices
+from blinkgl.config.run import load_run
+from blinkgl.dataset.executor import Inline
+from blinkgl.dataset.run import run_dataset
+from blinkgl.errors import GLError, may_pass
+from blinkgl.gl import GLContext, context as context_module, create_context, egl_devices
+from tests.dataset.runs import tree
+from tests.tiny_recipe import TINY
 
 VERTEX = """#version 430 core
 in vec3 position;
@@ -267,3 +274,133 @@ def test_a_process_forked_after_a_context_is_told_so_and_does_not_hang():
 
 def test_a_process_forked_before_any_context_draws():
     assert forked(False, "new") == ["new drawn"]
+
+
+# --- A context that a driver throws away in the middle of the work: noticed, and the work done again in another one.
+
+
+class Gone:
+    """A framebuffer that takes every call, and gives back what was there before."""
+
+    use = clear = staticmethod(lambda *_: None)
+    read = staticmethod(lambda components: b"\0" * components)
+
+
+def test_a_context_that_draws_no_more_is_noticed(gl):
+    for _ in range(300):  # each time another colour
+        gl.check()
+    assert not gl.lost
+
+    with create_context() as other:
+        other.idle = Gone
+        said = r"^llvmpipe.*: the card has lost its context.*; expected another try, in a new context"
+        with pytest.raises(GLError, match=said) as caught:
+            other.check()
+        assert other.lost and may_pass(caught.value)
+    gl.make_current()
+    gl.check()
+
+
+def test_the_sequence_is_made_again_in_another_context(tmp_path, monkeypatch):
+    """The first is lost when all of the first sequence has been drawn: nothing of it stays, and the files are those of
+    a run without trouble."""
+    recipe = tmp_path / "run.yaml"
+    recipe.write_text(yaml.safe_dump({**TINY, "output": {"sequences": 2}}))
+    run_dataset(load_run(recipe), tmp_path / "wanted", Inline())
+    seen, check = [], GLContext.check
+
+    def lose(self):
+        seen.append(self)
+        if len(seen) == 1:
+            self.idle = Gone
+        check(self)
+
+    monkeypatch.setattr(GLContext, "check", lose)
+    outcome = run_dataset(load_run(recipe), tmp_path / "out", Inline())
+    assert len(outcome.made) == 2 and not outcome.set_aside
+    assert seen[0].lost and seen[0].released and seen[1] is not seen[0] and not seen[-1].lost
+    logs = "".join(path.read_text() for path in (tmp_path / "out/.run/logs").rglob("*.log"))
+    assert "attempt 1 failed: llvmpipe" in logs and logs.count("\n") > 4
+    assert tree(tmp_path / "out") == tree(tmp_path / "wanted")
+
+
+# --- Releasing one context must not free what belongs to another that happens to be current.
+
+
+def test_names_of_another_context_survive(gl):
+    """Programs and buffers of two contexts have the same numbers; the second is released while the first is current."""
+    try:
+        other = create_context("egl")
+    except GLError:
+        pytest.skip("no EGL for a second context")
+    theirs = [other.program("downsample.glsl", {"FACTOR": n}) for n in range(2, 40)]
+    gl.make_current()
+    ours = [gl.program("downsample.glsl", {"FACTOR": n}) for n in range(40, 80)]
+    if not {p.glo for p in theirs} & {p.glo for p in ours}:
+        pytest.skip("the numbers of the two contexts' programs do not meet")
+    other.release()
+    assert other.released
+    gl.make_current()
+    for _, program in zip(range(40, 80), ours):
+        target = gl.framebuffer(4, 4, ("R32F",), depth=False)
+        target.use()
+        gl.ctx.vertex_array(program, []).render(vertices=3)
+        assert np.isfinite(target.read(0)).all()
+        target.release()
+    assert gl.ctx.error == "GL_NO_ERROR"
+
+
+def test_an_abandoned_generator_leaves_the_current_context_current(gl):
+    """The garbage collector may close it, and release its context, in the middle of somebody else's drawing."""
+
+    def suspended():
+        with create_context("egl") as other:
+            other.program("downsample.glsl", {"FACTOR": 3})
+            yield
+
+    try:
+        generator = suspended()
+        next(generator)
+    except GLError:
+        pytest.skip("no EGL for a second context")
+    gl.make_current()
+    with gl.framebuffer(4, 4, ("R32UI",), depth=False) as target:
+        target.clear(7)
+        generator.close()
+        target.clear(9)
+        assert (target.read(0) == 9).all()
+    assert gl.ctx.error == "GL_NO_ERROR"
+
+
+def test_a_context_of_another_thread_is_refused_and_nothing_of_ours_is_freed(gl):
+    """eglMakeCurrent fails for it; what was current here would then be drawn into, and its objects deleted."""
+    made, done, box = threading.Event(), threading.Event(), {}
+
+    def work():
+        try:
+            box["other"] = create_context("egl")
+        except GLError as error:
+            box["error"] = error
+        made.set()
+        done.wait()
+        if "other" in box:
+            box["other"].release()
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    try:
+        assert made.wait(30)
+        if "error" in box:
+            pytest.skip("no EGL for a second context")
+        gl.make_current()
+        with gl.framebuffer(4, 4, ("R32F",), depth=False) as target:
+            target.clear(1.0)
+            with pytest.raises(GLError, match="in use by another thread"):
+                box["other"].release()
+            target.clear(2.0)
+            assert (target.read(0) == 2.0).all()
+        assert not box["other"].released
+    finally:
+        done.set()
+        thread.join()
+    assert box["other"].released and gl.ctx.error == "GL_NO_ERROR"

@@ -4,14 +4,16 @@ import math
 
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import PinHole
-from blinkgl.config.images import ImagesConfig, exposure_starts
+from blinkgl.config.images import AutoExposureConfig, ImagesConfig, exposure_starts
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.imaging import FrameCamera
+from blinkgl.imaging.exposure import Exposure, Setting, accumulate, decibels, factor, instants, next_setting
 from blinkgl.imaging.lens import blur_px, samples
-from blinkgl.imaging.sensor import decode
+from blinkgl.imaging.sensor import PATTERNS, decode, encode, mosaic, readings
 from blinkgl.render.appearance import sample_bilinear
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.rig import Rig
@@ -258,3 +260,177 @@ def test_images_are_taken_while_their_exposure_fits(gl):
             image = camera.take()
             assert image.t_ns == due[-1] and image.k == len(due) - 1
     assert due == [260 * MS, 510 * MS] and camera.facts()["images"] == 2
+
+
+# --- When rows are exposed, what an image is the mean of, and how automatic exposure follows the light.
+
+
+def test_a_global_shutter_takes_the_middles_of_equal_cells():
+    exposure = Exposure(5 * MS, 10 * MS, 0.0, 7)
+    times, weights = exposure.cells(4)
+    assert times == [6_250_000, 8_750_000, 11_250_000, 13_750_000]
+    assert (weights == 0.25).all() and weights.shape == (4, 7)
+    assert exposure.end_ns == 15 * MS and exposure.middle_ns == 10 * MS
+
+
+@pytest.mark.parametrize(
+    ("exposure_ns", "row_ns", "count"),
+    [(10 * MS, 300_000.0, 5), (200_000, 50_000.0, 9), (1 * MS, 1 * MS, 24), (MS, 1.5, 3)],
+)
+def test_each_row_weighs_the_cells_by_what_of_them_it_sees(exposure_ns, row_ns, count):
+    exposure = Exposure(3 * MS, exposure_ns, row_ns, 24)
+    times, weights = exposure.cells(count)
+    np.testing.assert_allclose(weights.sum(axis=0), 1.0, rtol=1e-12)
+    # by brute force: in which cell are a million instants of the row's own exposure
+    span = exposure.end_ns - exposure.start_ns
+    for row in (0, 11, 23):
+        seen = row * row_ns + exposure_ns * (np.arange(200_000) + 0.5) / 200_000
+        share = np.bincount(np.minimum((seen / span * count).astype(int), count - 1), minlength=count) / 200_000
+        np.testing.assert_allclose(weights[:, row], share, atol=2e-5)
+        # so the mean time that a row sees is its own middle, as far as its cells reach
+        middle = exposure.start_ns + row * row_ns + exposure_ns / 2
+        assert abs(weights[:, row] @ np.array(times) - middle) <= span / count / 2 + 2
+
+
+def test_as_many_instants_as_displacement_asks_for():
+    exposure = Exposure(0, 20 * MS, 0.0, 10)
+    assert instants(exposure, 0.0, 0.5, 1, 256) == 1, "nothing moves: once"
+    assert instants(exposure, 200.0, 0.5, 1, 256) == 8, "4 px, half a pixel each"
+    assert instants(exposure, 201.0, 0.5, 1, 256) == 9
+    assert instants(exposure, 1e9, 0.5, 1, 256) == 256 and instants(exposure, 1e9, 0.5, 1, 7) == 7
+    assert instants(exposure, 0.0, 0.5, 30, 256) == 30, "points of the lens"
+    rolling = Exposure(0, 20 * MS, 2.0 * MS, 11)
+    assert instants(rolling, 0.0, 0.5, 30, 256) == 60, "so many in every row's own exposure"
+
+
+def test_light_is_added_up_row_by_row_and_rows_without_weight_stay():
+    rng = np.random.default_rng(0)
+    images, weights = rng.random((3, 4, 5, 4)).astype(np.float32), rng.random((3, 4))
+    weights[1, 2] = 0.0
+    images[1, 2] = np.nan
+    total = np.zeros((4, 5, 3))
+    for image, weight in zip(images, weights):
+        accumulate(total, image, weight)
+    expected = sum(w[:, None, None] * np.where(w[:, None, None] > 0, i[..., :3], 0) for i, w in zip(images, weights))
+    np.testing.assert_allclose(total, expected, rtol=1e-12)
+
+
+# --- automatic exposure -----------------------------------------------------------------------------------------------
+
+AUTO = AutoExposureConfig(target=0.2, lag=0.3, shortest_us=1, longest_us=1e9, max_gain_db=60)
+
+
+def settings(config, scene_means, setting, dt_s):
+    """Products of exposure and gain, under light of which an exposure of 1 ns would give ``mean``."""
+    out = [setting.product]
+    for mean in scene_means:
+        setting = next_setting(config, setting, mean * setting.product, dt_s)
+        out.append(setting.product)
+    return np.array(out)
+
+
+@pytest.mark.parametrize("dt_s", [0.01, 0.05, 0.4])
+def test_the_lag_is_first_order_in_the_logarithm_whatever_the_rate(dt_s):
+    mean_per_ns = 1e-9
+    products = settings(AUTO, [mean_per_ns] * 40, Setting(5_000_000, 1.0), dt_s)
+    end = AUTO.target / mean_per_ns
+    t = dt_s * np.arange(41)
+    expected = math.log(end) + (math.log(5e6) - math.log(end)) * np.exp(-t / AUTO.lag)
+    np.testing.assert_allclose(np.log(products), expected, atol=2e-6)
+
+
+def test_time_changes_first_gain_beyond_it_and_both_keep_to_their_limits():
+    config = AutoExposureConfig(target=0.2, lag=0.0, shortest_us=100, longest_us=10_000, max_gain_db=20)
+    now = Setting(1_000_000, 1.0)
+    assert next_setting(config, now, 0.1, 0.1) == Setting(2_000_000, 1.0)
+    assert next_setting(config, now, 0.01, 0.1) == Setting(10_000_000, pytest.approx(2.0))
+    assert next_setting(config, now, 0.0, 0.1) == Setting(10_000_000, pytest.approx(10.0))
+    assert next_setting(config, now, 1.0, 0.1) == Setting(200_000, 1.0)
+    assert next_setting(config, Setting(200_000, 1.0), 1.0, 0.1) == Setting(100_000, 1.0)
+    assert decibels(factor(13.7)) == pytest.approx(13.7) and factor(20.0) == pytest.approx(10.0)
+
+
+# --- Photons, full well, read noise, gain, filters and response of the frame camera, each against its law.
+
+SEED = np.uint64(0xFEEDBEEF12345678)
+
+
+def read(light, count, electrons=1000.0, gain=1e-3, well=1e9, photons=True, noise=0.0, seed=SEED, image=0):
+    out = np.empty(count)
+    light = np.broadcast_to(np.float64(light), count).copy()
+    readings(light, electrons, gain, well, photons, noise, np.uint64(seed), np.uint64(image), out)
+    return out
+
+
+def drawn(mean, count, seed=SEED, image=0):
+    """Electrons of ``count`` pixels: one for each of the light's units, and nothing else happens to them."""
+    return read(mean, count, electrons=1.0, gain=1.0, well=1e18, seed=seed, image=image)
+
+
+@pytest.mark.parametrize("mean", [0.05, 0.7, 4.0, 9.99, 10.0, 10.7, 33.3, 400.0, 20000.0])
+def test_photons_are_poisson_distributed(mean):
+    """Both methods, on either side of where they meet: the whole distribution by chi-square."""
+    count = 200_000
+    k = drawn(mean, count, SEED, np.uint64(3))
+    assert (k >= 0).all() and (k == np.floor(k)).all()
+    law = stats.poisson(mean)
+    edges = np.unique(law.ppf(np.linspace(0.002, 0.998, 60)))
+    expected = count * np.diff(np.concatenate([[0.0], law.cdf(edges), [1.0]]))
+    found = np.bincount(np.searchsorted(edges, k), minlength=len(edges) + 1)
+    keep = expected > 5
+    chi2 = ((found - expected)[keep] ** 2 / expected[keep]).sum()
+    assert stats.chi2.sf(chi2, keep.sum() - 1) > 1e-4, f"chi2 {chi2:.1f} of {keep.sum()} bins"
+    assert abs(k.mean() - mean) < 5 * np.sqrt(mean / count)
+    assert abs(k.var() / mean - 1) < 5 * np.sqrt((2 + 1 / mean) / count)
+
+
+def test_read_noise_is_normal_and_adds_to_the_photons():
+    alone = read(0.0, 200_000, photons=False, noise=6.0) / 1e-3
+    assert stats.kstest(alone / 6.0, "norm").pvalue > 1e-3
+    both = read(0.4, 200_000, noise=6.0) / 1e-3
+    assert both.var() == pytest.approx(400 + 36, rel=0.02) and both.mean() == pytest.approx(400, abs=0.3)
+
+
+def test_the_full_well_cuts_electrons_before_the_read_noise():
+    x = read(5.0, 50_000, electrons=1000.0, well=1500.0, noise=3.0) / 1e-3
+    assert x.mean() == pytest.approx(1500, abs=0.1) and x.std() == pytest.approx(3.0, rel=0.03), (
+        "no photon noise is left"
+    )
+    assert (read(5.0, 1000, electrons=1000.0, well=1500.0) == 1.5).all()
+    near = read(1.0, 50_000, electrons=1000.0, well=1000.0) / 1e-3
+    assert near.max() == 1000.0 and 0.4 < (near == 1000.0).mean() < 0.6
+    assert (read(1e12, 10, well=1e4) == 1e4 * 1e-3).all(), "any light"
+
+
+def test_noise_is_a_function_of_seed_image_and_pixel():
+    a = read(0.5, 4096, noise=2.0)
+    np.testing.assert_array_equal(a, read(0.5, 4096, noise=2.0))
+    np.testing.assert_array_equal(a[:100], read(0.5, 100, noise=2.0))
+    others = [read(0.5, 4096, noise=2.0, image=1), read(0.5, 4096, noise=2.0, seed=SEED + np.uint64(1))]
+    for b in others:
+        assert abs(np.corrcoef(a, b)[0, 1]) < 5 / 64
+    assert abs(np.corrcoef(a[:-1], a[1:])[0, 1]) < 5 / 64, "neighbours"
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_a_mosaic_has_of_each_pixel_the_colour_that_its_name_says(pattern):
+    image = np.arange(5 * 7 * 3).reshape(5, 7, 3)
+    out = mosaic(image, pattern)
+    for y in range(5):
+        for x in range(7):
+            assert out[y, x] == image[y, x, "rgb".index(pattern[2 * (y % 2) + x % 2])]
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 16])
+@pytest.mark.parametrize(("response", "gamma"), [("srgb", 2.2), ("linear", 2.2), ("gamma", 2.2), ("gamma", 0.5)])
+def test_responses_invert(response, gamma, bits):
+    codes = np.arange(1 << bits)
+    light = decode(codes, response, gamma, bits)
+    assert light[0] == 0 and light[-1] == pytest.approx(1.0) and (np.diff(light) > 0).all()
+    again = encode(light, response, gamma, bits)
+    assert again.dtype == (np.uint8 if bits == 8 else np.uint16)
+    np.testing.assert_array_equal(again, codes)
+    # and any light comes back within half a code's step
+    x = np.random.default_rng(1).random(20_000)
+    step = np.gradient(light)
+    assert (np.abs(decode(encode(x, response, gamma, bits), response, gamma, bits) - x) <= 1.01 * step.max()).all()

@@ -1,22 +1,31 @@
 """Sensors on a rig: what a configuration makes of one, and two eyes in a test, which no configuration asks for yet."""
 
+import math
+
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import PinHole
+from blinkgl.config.camera import CameraConfig
+from blinkgl.config.lights import LightConfig, RandomLightsConfig
 from blinkgl.config.problems import validate
+from blinkgl.config.scene import ExplicitSceneConfig, RandomSceneConfig
 from blinkgl.config.sequence import RenderConfig, SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.labels import LabelRequest
 from blinkgl.render import casting
 from blinkgl.render.renderer import Renderer
-from blinkgl.scene.build import sequence_scene
+from blinkgl.rng import Role, generator
+from blinkgl.scene.build import build_scene, sequence_scene
 from blinkgl.scene.geometry.primitives import cuboid, grid
+from blinkgl.scene.lights import beam, is_coloured, lamp_pose, lamps_of, make_light, random_lamps
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.rig import Rig, Sensor
+from blinkgl.scene.surfaces.environment import pixel_directions
 from blinkgl.scene.surfaces.textures import procedural_texture
-from blinkgl.scene.types import Material, Part, Scene, SceneObject
+from blinkgl.scene.types import Light, Material, Part, Scene, SceneObject
 
 SECOND = 1_000_000_000
 BASELINE = 0.12
@@ -105,3 +114,168 @@ def test_disparity_is_focal_length_times_baseline_over_depth(gl):
 def test_what_no_rig_is(make, message):
     with pytest.raises(ConfigError, match=message):
         make()
+
+
+# --- Lights of a configuration, drawn ones, and what is refused.
+
+SPOT = {"kind": "spot", "position": [1, 2, 3], "look_at": [1, 2, 0], "strength": 4, "angle": 40, "edge": 0.5}
+
+
+def light(**tree) -> Light:
+    return make_light(validate(LightConfig, tree, where="scene.light"))
+
+
+def test_nothing_white_is_clipped_in_the_default_light():
+    """However it faces the sun and the sky."""
+    normals = np.random.default_rng(0).normal(size=(1000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    made = Light()
+    around = made.sky * (0.5 + 0.5 * normals[:, 2])
+    received = made.sun * np.maximum(0, normals @ made.sun_direction) + around
+    assert 0.9 < received.max() <= 1.0
+
+
+def test_lamps_of_a_configuration():
+    made = light(
+        lights=[
+            SPOT,
+            {"kind": "point", "position": [0, 0, 2], "color": [1, 0.5, 0], "strength": 2, "reach": 9},
+            {"kind": "sun", "elevation": 0, "azimuth": 90, "strength": 0.5, "size": 2},
+        ],
+        sun_color=[1, 0.5, 0.25],
+    )
+    sun, other, point, spot = lamps_of(made)  # as the shader has them
+    assert sun.strength == pytest.approx((0.6, 0.3, 0.15)) and sun.size == pytest.approx(math.radians(0.53))
+    np.testing.assert_allclose(sun.path.pose(0)[:3, 2], made.sun_direction, atol=1e-12)
+    np.testing.assert_allclose(other.path.pose(0)[:3, 2], [0, 1, 0], atol=1e-12)
+    assert point.strength == (2, 1, 0) and point.reach == 9 and point.path.pose(5)[:3, 3].tolist() == [0, 0, 2]
+    np.testing.assert_allclose(spot.path.pose(0)[:3, 2], [0, 0, 1], atol=1e-12)  # it shines down
+    assert (spot.inner, spot.outer) == pytest.approx((math.radians(10), math.radians(20)))
+
+
+@pytest.mark.parametrize("shines", [(0, 0, -1), (0, 1, 0), (1, 2, 3), (0, -1e-3, 0)])
+def test_a_lamps_pose_is_rigid_and_shines_where_it_should(shines):
+    R = lamp_pose((1, 2, 3), shines)[:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(-R[:, 2], np.array(shines) / np.linalg.norm(shines), atol=1e-12)
+    assert np.linalg.det(R) > 0
+
+
+def test_a_spot_light_fades_by_the_square_of_the_cosines_ramp():
+    made = light(sun=0, lights=[SPOT])
+    (lamp,) = lamps_of(made)
+    angles = np.radians([0.0, 9.0, 15.0, 21.0])
+    points = np.array([1, 2, 3]) + 2.0 * np.stack([np.sin(angles), 0 * angles, -np.cos(angles)], axis=1)
+    towards, strength = beam(lamp, lamp.path.pose(0), points)
+    ramp = (math.cos(angles[2]) - math.cos(math.radians(20))) / (
+        math.cos(math.radians(10)) - math.cos(math.radians(20))
+    )
+    np.testing.assert_allclose(strength[:, 0], np.array([1, 1, ramp**2, 0]) * 4 / 2**2, atol=1e-12)
+    np.testing.assert_allclose(towards * 2.0, np.array([1, 2, 3]) - points, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "tree, expected",
+    [
+        ({"sun": -1}, "scene.light.sun: .*got -1"),
+        ({"sun": math.inf}, "scene.light.sun"),
+        ({"sky_color": [1, 1]}, "scene.light.sky_color"),
+        ({"lights": [{"kind": "lamp"}]}, "scene.light.lights.0.*sun.*point.*spot"),
+        ({"lights": [{"kind": "point"}]}, "scene.light.lights.0.*position"),
+        ({"lights": [{"kind": "point", "position": [0, 0, 1], "strength": -2}]}, "lights.0.*strength.*got -2"),
+        ({"lights": [{"kind": "point", "position": [0, 0, 1], "strength": math.inf}]}, "lights.0.*strength"),
+        ({"lights": [{"kind": "sun", "position": [0, 0, 1]}]}, "lights.0.*position"),
+        ({"lights": [{"kind": "point", "position": [0, 0, 1], "angle": 4}]}, "lights.0.*angle"),
+        ({"lights": [{**SPOT, "look_at": [1, 2, 3]}]}, "look_at: must differ from the position"),
+        ({"lights": [SPOT] * 32}, "scene.light.lights: too many lights .got 32.; expected at most 31"),
+        ({"environment": {"map": "a.hdr"}, "unlit": True}, "scene.light.environment: nothing is lit by them"),
+        ({"environment": {}}, "scene.light.environment.map"),
+        ({"environment": {"map": "a.hdr", "strength": -1}}, "environment.strength.*got -1"),
+        ({"lights": [SPOT], "unlit": True}, "scene.light.lights: nothing is lit by them"),
+    ],
+)
+def test_what_is_refused(tree, expected):
+    with pytest.raises(ConfigError, match=expected) as error:
+        light(**tree)
+    assert "\n" not in str(error.value)
+
+
+def test_random_lights():
+    """As many as asked for, in their ranges, of a stream of their own."""
+    config = RandomLightsConfig(count=[2, 5], kinds=["sun", "point", "spot"], height=[2, 3])
+    drawn = [random_lamps(config, generator(7, k, Role.LIGHT), 10.0, 1.0) for k in range(40)]
+    assert {len(lamps) for lamps in drawn} == {2, 3, 4, 5}
+    assert {lamp.kind for lamps in drawn for lamp in lamps} == {"sun", "point", "spot"}
+    for lamp in (lamp for lamps in drawn for lamp in lamps):
+        low, high = config.sun_strength if lamp.kind == "sun" else config.strength
+        assert low * 0.999 <= max(lamp.strength) <= high * 1.001 and min(lamp.strength) >= 0.49 * max(lamp.strength)
+        pose = lamp.path.pose(0)
+        if lamp.kind != "sun":
+            assert 3.0 <= pose[2, 3] <= 4.0 and np.abs(pose[:2, 3]).max() <= 10.0
+        if lamp.kind != "point":
+            assert pose[2, 2] > 0, "it shines downwards"
+    again = random_lamps(config, generator(7, 3, Role.LIGHT), 10.0, 1.0)
+    assert [a.strength for a in again] == [b.strength for b in drawn[3]]
+
+
+def test_bad_random_lights():
+    for tree, expected in (
+        ({"lights": {"count": [3, 1]}}, "lights.count: the range must be .fewest, most."),
+        ({"lights": {"count": [0, 99]}}, "lights.count.1"),
+        ({"lights": {"angle": [10, 179]}}, "lights.angle: out of range"),
+        ({"lights": {"kinds": []}}, "lights.kinds"),
+        ({"lights": {}, "light": {"unlit": True}}, "lights: nothing is lit by them"),
+        ({"sky": {"lights": True}}, "sky.lights: only panoramas light"),
+        ({"sky": {"lights": True, "panoramas": "a.hdr"}, "light": {"unlit": True}}, "sky.lights: nothing is lit"),
+        ({"light": {"environment": {"map": "a.hdr"}}}, "light.environment: a random world is lit by its own sky"),
+    ):
+        with pytest.raises(ConfigError, match=expected):
+            validate(RandomSceneConfig, tree, where="scene")
+
+
+def panorama(folder):
+    """A dark hall with one window, towards +y."""
+    directions, _ = pixel_directions(64, 128)
+    image = np.full((64, 128, 3), 0.05, np.float32)
+    image[directions @ np.array([0, 0.8, 0.6]) > math.cos(0.15)] = (200.0, 150.0, 100.0)
+    assert cv2.imwrite(str(folder / "hall.hdr"), image[..., ::-1].copy())
+    return "hall.hdr"
+
+
+def test_a_panorama_is_sky_and_light_at_once(tmp_path):
+    """Of a random world and of an explicit one: the sun stands where the sky is brightest."""
+    camera = CameraConfig(width=32, height=24)
+    tree = {
+        "objects": {"count": 1},
+        "sky": {"panoramas": panorama(tmp_path), "lights": True, "brightness": 0.5},
+        "textures": {"procedural": ["checks"], "photographs": False, "variants": 2, "test_fraction": 0},
+        "pool": {"primitives": ["cuboid"], "variants": 2},
+    }
+    fixed = {
+        "kind": "explicit",
+        "meshes": {"box": {"primitive": "cuboid"}},
+        "objects": [{"mesh": "box"}],
+        "camera": {"position": [-3, 0, 1]},
+        "light": {"environment": {"map": "hall.hdr", "strength": 0.5, "heading": 30}},
+    }
+    for config in (validate(RandomSceneConfig, tree), validate(ExplicitSceneConfig, fixed)):
+        scene = build_scene(config, camera, 0, 10**9, base=tmp_path)
+        (sun,) = lamps_of(scene.light)
+        assert scene.light.sun == scene.light.sky == 0 and is_coloured(scene.light)
+        (sky,) = (thing for thing in scene.objects if thing.category == "sky")
+        best, where = 0.0, None
+        for part in sky.parts:  # the middle of the brightest texels, on the box
+            image = part.material.texture.image.sum(axis=2)
+            y, x = (c.mean() for c in np.nonzero(image > 0.9 * image.max()))
+            if image.max() > best and (image > 0.9 * image.max()).mean() < 0.3:
+                uv = np.array([(x + 0.5) / image.shape[1], (y + 0.5) / image.shape[0]])
+                corner = np.linalg.lstsq(
+                    np.c_[part.mesh.uvs, np.ones(len(part.mesh.uvs))], part.mesh.vertices, rcond=None
+                )[0]
+                best, where = image.max(), np.array([*uv, 1.0]) @ corner
+        assert sun.path.pose(0)[:3, 2] @ where > 0.99 * np.linalg.norm(where)
+    towards = sun.path.pose(0)[:3, 2]
+    assert math.degrees(math.atan2(towards[1], towards[0])) == pytest.approx(120, abs=1)  # +y, turned by 30
+    with pytest.raises(ConfigError, match="scene.light.environment.map: no such file .got 'none.hdr'"):
+        tree = {**fixed, "light": {"environment": {"map": "none.hdr"}}}
+        build_scene(validate(ExplicitSceneConfig, tree), camera, 0, 10**9, base=tmp_path)

@@ -1,5 +1,9 @@
 """The pages of keys say what the models say, the page of commands what the commands say."""
 
+from __future__ import annotations
+
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -19,3 +23,16 @@ def test_the_page_is_up_to_date(name):
     made, command = PAGES[name]
     written = (Path(__file__).parents[2] / name).read_text()
     assert written == made(), f"run: {command} > {name}"
+
+
+# --- The fuzz of file formats: a short seeded run, and that it tells defects from refusals.
+
+SHORT = ("e.txt", "e.h5", "e.npz", "e.raw", "flow.png", "flow.flo", "0.pfm", "frames.npy", "mesh.ply", "run.yaml")
+
+
+def test_no_format_has_a_defect():
+    """In a process of its own: this one has threads, which cannot be forked."""
+    command = [sys.executable, "-m", "blinkgl.tools.fuzz", *SHORT, "--mutants", "12", "--seed", "3"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count(" 0 defects") == len(SHORT)

@@ -45,7 +45,8 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
                 accepted="a .safetensors file",
             )
         with safe_open(path, framework="pt") as file:
-            return {k: file.get_tensor(k) for k in file.keys()}, dict(file.metadata() or {})  # noqa: SIM118 - it has keys and is no mapping
+            tensors = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118 - it has keys and is no mapping
+            return tensors, dict(file.metadata() or {})
     except FileNotFoundError:
         raise AssetError("no such file", where=str(path)) from None
     except OSError as error:

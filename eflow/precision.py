@@ -1,4 +1,4 @@
-"""Whether a device computes in the precision that is asked for."""
+"""The precision that a device computes in, and islands of float32 where bfloat16 is not good enough."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Progress of training on the terminal: a live line on a TTY, one line now and then otherwise."""
+"""Progress of training on the terminal, a live line on a TTY, one now and then otherwise; and its log in files."""
 
 from __future__ import annotations
 

@@ -213,7 +213,9 @@ class RandomSceneConfig(Config):
 class MeshConfig(Config):
     """A primitive with its parameters, or a file."""
 
-    primitive: Literal[ALL_PRIMITIVES] | None = Field(None, description="kind of primitive")  # type: ignore[invalid-literal]
+    primitive: Literal[ALL_PRIMITIVES] | None = Field(  # type: ignore[invalid-literal]
+        None, description="kind of primitive"
+    )
     parameters: dict[str, Annotated[int | float | Vector3 | str, BeforeValidator(parameter_value)]] = Field(
         {},
         description="the primitive's sizes, numbers of faces, and what it does: see [primitives](#primitives)",

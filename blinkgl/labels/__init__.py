@@ -8,7 +8,6 @@ imported here: a YAML is read by it.
 """
 
 from blinkgl.labels.boxes import ObjectBoxes
-from blinkgl.labels.depth import Depth, Ids, Images, Normals, SceneFlow, Velocity
 from blinkgl.labels.disparity import Disparity
 from blinkgl.labels.files import Form
 from blinkgl.labels.flow import FlowTo
@@ -17,6 +16,7 @@ from blinkgl.labels.intervals import FlowIntervals, Flows, OcclusionIntervals, O
 from blinkgl.labels.label import Label
 from blinkgl.labels.occlusion import OcclusionAt
 from blinkgl.labels.semantics import Semantics
+from blinkgl.labels.surface import Depth, Ids, Images, Normals, SceneFlow, Velocity
 from blinkgl.labels.table import LABELS, asked_for, label_of, register, unregister
 
 for _row in (

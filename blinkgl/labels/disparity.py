@@ -13,9 +13,6 @@ from blinkgl.scene.types import Scene
 if TYPE_CHECKING:
     from blinkgl.render.reference import ReferenceFrame
 
-_SHARE = 0.95
-"""Of the pixels, that two renderers agree on: silhouettes may fall on either side."""
-
 
 class Disparity(Label):
     """(H, W) float32 px, f b / Z >= 0: x in the left eye less x in the right, whichever eye's picture it is of; 0 where

@@ -1,4 +1,4 @@
-"""A whole data set in another layout: it is there in full or not at all."""
+"""Which layouts there are, and a whole data set in one of them: it is there in full or not at all."""
 
 from __future__ import annotations
 

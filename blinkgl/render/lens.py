@@ -72,7 +72,8 @@ _MOST = 16
 def steps_of(camera: CameraModel, finer: int) -> tuple[int, int]:
     """Places in a pixel, along x and y, between which a flat picture that is so many times finer has one pixel or a
     little more, wherever in the picture."""
-    slopes = places_of(camera, seen_through(camera), camera.width, camera.height).slopes  # type: ignore[bad-argument-type]
+    seen, size = seen_through(camera), (camera.width, camera.height)
+    slopes = places_of(camera, seen, *size).slopes  # type: ignore[bad-argument-type]
     lengths = np.hypot(slopes[..., ::2], slopes[..., 1::2]).max(axis=(0, 1)) * finer
     columns, rows = np.clip(np.ceil(lengths - _SPARED), 1, _MOST).astype(int)
     return int(columns), int(rows)

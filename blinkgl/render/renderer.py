@@ -7,7 +7,7 @@
 
 A pass (``passes/``) says what is drawn; a :class:`~blinkgl.render.moment.Moment` where everything is; a
 :class:`~blinkgl.render.canvas.Canvas` holds what one pass has drawn, :class:`~blinkgl.render.canvas.StillCanvas` draws
-again only what moves. Poses are composed in float64 relative to the camera (``matrices.py``); vertices stay
+again only what moves. Poses are composed in float64 relative to the camera (``moment.py``); vertices stay
 object-local. Programs and targets are made the first time something asks for them, and only in
 the variants the scene's materials need.
 """

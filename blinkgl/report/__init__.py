@@ -3,7 +3,7 @@
 In:    the folder of a data set.
 Out:   report.html and index.jsonl.
 Start: page.py (``build_report``) and templates/data_set.html; collect.py gathers, charts.py
-counts. calibration.py is the page of a fitted emulator. markup.py fills in any room's templates.
+counts and fills in any room's templates. calibration.py is the page of a fitted emulator.
 """
 
 from blinkgl.report.page import build_report, write_report

@@ -1,4 +1,4 @@
-"""What goes wrong while a file is read, as one line that names the file."""
+"""What goes wrong while a file is read, and what it asks for that is not drawn, as lines that name the file."""
 
 from __future__ import annotations
 

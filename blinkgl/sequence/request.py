@@ -1,4 +1,4 @@
-"""What to make of a run, as one value: everybody who simulates a sequence hands it on whole."""
+"""What to make of a run, as one value, and what comes of it in time: events, ground truth, pictures."""
 
 from __future__ import annotations
 

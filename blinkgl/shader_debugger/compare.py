@@ -12,7 +12,7 @@ what the pass looks up there (coordinates, level, albedo), the light, and their 
 shown by a variant of its own source (``include/lookup.glsl``), and what follows from an earlier step is graded with
 that step as the GPU made it: the albedo against a CPU twin of mip-mapped sampling at the GPU's own coordinates and
 level, the result against the GPU's own albedo times its own light. So the first buffer that fails is where the fault
-is; ``verdict.py`` says so, object by object.
+is; the verdict says so, object by object.
 
 The reference has no mip maps, hence the twin, and a loose tolerance: drivers may make mip maps as they like. With
 anisotropic filtering (``render.anisotropy`` > 1) level and albedo are left out.

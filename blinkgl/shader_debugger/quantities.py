@@ -117,12 +117,12 @@ LOG2 = 1.0 - (1.0 + math.log(math.log(2.0))) / math.log(2.0) + 1e-3
 takes it: the largest of log2(1 + f) - f; and a thousandth for float32."""
 _LEVEL = "outside of what OpenGL 4.6, section 8.14.1, allows"
 _EDGES = (
-    "soft ones against a float64 twin on the GPU's own map (soft_twin.py); hard ones against rays, not near an edge "
+    "soft ones against a float64 twin on the GPU's own map (lamps.py); hard ones against rays, not near an edge "
     "nor where light grazes: there a map is off by its texels"
 )
 _MAP = "off its silhouettes"
 _GATHERED = "at all pixels, against the float64 mean of the GPU's own flat picture over each pixel of the lens"
-_FILTERED = "at all pixels, against a float64 twin on the GPU's own unfiltered picture and depths (edges_twin.py)"
+_FILTERED = "at all pixels, against a float64 twin on the GPU's own unfiltered picture and depths (twins.py)"
 
 
 def _shading(name: str, unit: str) -> tuple[Quantity, ...]:

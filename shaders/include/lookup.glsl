@@ -6,7 +6,7 @@ layout(location = 1) out vec4 shown_lookup; // u, v (times uv_scale), mip level 
 layout(location = 2) out vec4 shown_albedo; // what is multiplied by the light; number of look-ups
 layout(location = 3) out vec4 shown_mirrored; // added to their product: what a gloss mirrors
 layout(location = 4) out vec4 shown_emission; // and light of its own
-layout(location = 5) out vec4 shown_terms; // of the light: of lamps without shadows, share that shadows leave, all around
+layout(location = 5) out vec4 shown_terms; // of the light: lamps without shadows, share that shadows leave, all around
 layout(location = 6) out vec4 shown_light;    // r, g, b of the light
 
 vec4 noted = vec4(0.0); // sum over the look-ups of (u, v, level, 1)

@@ -6,7 +6,7 @@
 //               surface keep is given back (energy) and missing below, so that white under even light is white
 //   GLOSS_MAP   both from a map
 //
-// With RATE a surface is looked at twice more, a little before and after: all of it is smooth, and there is one formula.
+// With RATE a surface is looked at twice more, a little before and after: all of it is smooth, in one formula.
 #ifdef RATE
 #define MAP(map, at) map_at(map, map##_place * vec3(at, 1.0), mat2(map##_place) * map_x, mat2(map##_place) * map_y)
 vec2 map_x, map_y; // d(uv) of a pixel to the right and downwards

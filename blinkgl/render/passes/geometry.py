@@ -1,4 +1,4 @@
-"""The label pass: any subset of the labels that the shader draws, in one go."""
+"""The label pass, any subset of the labels that the shader draws in one go; and the small picture of velocity."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Event frames: linear luminance; and small pictures of it with its rate of change."""
+"""Pictures of light: luminance of event frames, its rate of change in small pictures, colour, and means of several."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ the time between them. Both go into the path.
 **Restitution.** MuJoCo's contacts are soft: a spring with a damper, ``solref = (-stiffness, -damping)``, per mass. A
 body that meets one leaves it after about half a period of the spring, ``IMPACT_S``, with a share e of its speed that
 hangs on the damping ratio alone. Which ratio gives which e is found with the very recurrence that the engine computes,
-over all the phases in which a step can meet the surface (restitution.py). What is left is the phase: at the default
+over all the phases in which a step can meet the surface (body_shapes.py). What is left is the phase: at the default
 rate e varies by +-0.015 where it is 0.3, by +-0.006 where it is 0.8, and by less the more steps there are.
 
 **Paths.** Of the steps those are kept that a cubic needs to pass all others to 2e-6 of the body's radius

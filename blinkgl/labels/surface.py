@@ -1,4 +1,4 @@
-"""Z along the optical axis."""
+"""Labels that are read off the surface at a pixel's centre: depth, normals, ids, velocity, motion in space, images."""
 
 from __future__ import annotations
 
@@ -14,10 +14,6 @@ from blinkgl.scene.types import FARTHEST, Scene
 if TYPE_CHECKING:
     from blinkgl.render.passes import Shot
     from blinkgl.render.reference import ReferenceFrame
-
-
-_DEPTH_SHARE = 0.95
-"""Of the pixels, that two renderers agree on: silhouettes may fall on either side."""
 
 
 class Depth(Label):
@@ -120,9 +116,6 @@ class Velocity(Label):
 
 # ---------------------------------------------------------------------------------------------------------------------
 # How far the surface moves in space.
-
-_SCENE_FLOW_SHARE = 0.95
-"""Of the pixels, that two renderers agree on: silhouettes may fall on either side."""
 
 
 class SceneFlow(Label):

@@ -3,7 +3,7 @@ what lies on disk, how it is judged.
 
 In:    rows (:func:`register`).
 Out:   :data:`LABELS`, which configuration, renderer, writer, verification, reports and the shader debugger read.
-Start: label.py, which says what a row holds, and depth.py, the plainest of them. Neither OpenGL nor a compiler is
+Start: label.py, which says what a row holds, and surface.py, the plainest of them. Neither OpenGL nor a compiler is
 imported here: a YAML is read by it.
 """
 

@@ -230,5 +230,5 @@ def test_what_is_no_address(address):
 
 @pytest.mark.parametrize("ids, device", [([], None), (["0"], 1), ([1], 3), ([2], None), (["MIG-7"], None)])
 def test_cards_of_egl_without_software(monkeypatch, ids, device):
-    monkeypatch.setattr("blinkgl.gl.context.egl_devices", lambda: ["Software", "a", "software b", "c"])
+    monkeypatch.setattr(module, "egl_devices", lambda: ["Software", "a", "software b", "c"])
     assert module._egl_device(ids) == device

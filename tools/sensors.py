@@ -24,9 +24,11 @@ import numpy as np
 
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.reader import to_short_yaml
+from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import BlinkGLError
 from blinkgl.io.frames import read_any_image
 from blinkgl.machine.terminal import plain_console, say
+from blinkgl.recordings.bursts import inside_any
 from blinkgl.recordings.calibration import judge_half
 from blinkgl.recordings.clip import Clip, FrameReading, clip_of_frames, read_recording, timed_frames
 from blinkgl.recordings.judge import judge
@@ -42,6 +44,7 @@ NOISE_ELSEWHERE: dict[str, dict[str, Any]] = {
     "voltmeter": {"k4": 0.0, "k5": 0.0},
 }
 HOT = ("hot_pixel_fraction", "hot_pixel_rate_hz")
+KICKS = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32)
 MakeClip = Callable[[int], Clip]
 
 
@@ -82,25 +85,54 @@ def cameras(root: Path, more: Path | None) -> dict[str, dict[str, MakeClip]]:
     return {"davis240c": davis240, "davis346": davis346}
 
 
-def fitted(clips: list[Clip], emulator: str) -> EmulatorConfig:
-    """One set of parameters for all of the clips, whole."""
+def resets(clip: Clip, kick: float) -> ReadoutConfig | None:
+    """The jumps of a recording's camera, where and how often its own were; None: it had none."""
+    if not len(clip.bursts):
+        return None
+    # Bursts of ON events begin with the jump; where it is over, OFF events may make one of their own.
+    on = [
+        clip.events.window(int(a), int(b) + 1).p.mean() if len(clip.events.window(int(a), int(b) + 1)) else 0.0
+        for a, b in clip.bursts
+    ]
+    begins = clip.bursts[np.array(on) > 0.5, 0]
+    gaps = np.diff(begins)
+    every = float(np.median(gaps))
+    number = np.round((begins - begins[0]) / every)
+    every, first = np.polyfit(number, begins, 1)
+    since_ms = (first / 1000 - clip.frames[0][0] / 1e6) % (every / 1000)
+    return ReadoutConfig(frame_resets={"interval_ms": every / 1000, "kick": kick, "first_ms": since_ms})
+
+
+def kick_of(clip: Clip, config: EmulatorConfig) -> float:
+    """Height of the jump with which as many events more are in the recording's bursts as the camera has there."""
+    inside = lambda events: float(inside_any(events.t, clip.bursts).sum())
+    wanted, without = inside(clip.events), inside(clip.simulate(config, 1))
+    found = [inside(clip.simulate(config, 1, readout=resets(clip, kick))) for kick in KICKS]
+    return float(np.exp(np.interp(wanted, [without, *found], np.log([KICKS[0] / 4, *KICKS]))))
+
+
+def fitted(clips: list[Clip], emulator: str, usual: EmulatorConfig | None = None) -> EmulatorConfig:
+    """One set of parameters for all of the clips, whole. usual : of cameras of this kind, as far as the clips do not
+    say otherwise."""
     off = NOISE_ELSEWHERE.get(emulator, {})
-    base = emulator_config({"emulator": emulator, **off})
+    base = usual if usual is not None else emulator_config({"emulator": emulator, **off})
     search = Search([(clip, clip.intervals) for clip in clips], base, 0)
     keys = search.responding([key for key in base.fitted if key not in off and key not in HOT])
     search.run(keys, search.roughly(keys, 1))
     return search.config()
 
 
-def row(clip: Clip, config: EmulatorConfig) -> list[str]:
+def row(clip: Clip, config: EmulatorConfig, kick: float = 0.0) -> list[str]:
     """Rate against the recording, intervals, counts of pixels, and what the judge says."""
-    stream, recorded = clip.simulate(config, 1), sums(clip.events, clip, 0, clip.intervals)
+    readout = resets(clip, kick) if kick else None
+    stream, recorded = clip.simulate(config, 1, readout=readout), sums(clip.events, clip, 0, clip.intervals)
     half = judge_half(recorded, sums(stream, clip, 0, clip.intervals, recorded))
     try:
         told = judge(clip.events, stream, clip.size, (int(clip.edges_us[0]), int(clip.edges_us[-1]))).auc
     except BlinkGLError:
         told = float("nan")
-    values = (half.rate_ratio, half.interval_distance, half.polarity_correlation, half.count_correlation, told)
+    rate = len(stream) / max(len(clip.events), 1)
+    values = (rate, half.interval_distance, half.polarity_correlation, half.count_correlation, told)
     return [f"{value:.2f}" for value in values]
 
 

@@ -69,7 +69,7 @@ _ESIM_FITTED = {
     "contrast_threshold": _THRESHOLD_FITTED,
     "contrast_threshold_off": _THRESHOLD_FITTED,
     "threshold_sigma": Fitted(0.003, 0.3, 0.03, 2.5),
-    "log_eps": Fitted(1e-3, 0.16, 0.04, 1.8),
+    "log_eps": Fitted(1e-3, 0.16, 0.01, 1.5),
     "refractory_us": _REFRACTORY_FITTED,
 }
 
@@ -77,7 +77,7 @@ _V2E_FITTED = {
     "contrast_threshold": _THRESHOLD_FITTED,
     "contrast_threshold_off": _THRESHOLD_FITTED,
     "threshold_sigma": Fitted(0.003, 0.3, 0.03, 2.5),
-    "full_scale": Fitted(40.0, 1500.0, 200.0, 2.0),
+    "full_scale": Fitted(40.0, 1500.0, 255.0, 1.5),
     "cutoff_hz": Fitted(20.0, 3000.0, 300.0, 3.0),
     "leak_rate_hz": Fitted(1e-3, 10.0),
     "leak_cov_decades": Fitted(0.02, 1.5),
@@ -89,7 +89,7 @@ _V2E_FITTED = {
 
 _VOLTMETER_FITTED = {
     "k1": Fitted(0.7, 20.0, 3.3, 1.6),
-    "k2": Fitted(1.0, 100.0, 10.0, 2.0),
+    "k2": Fitted(1.0, 100.0, 10.0, 1.5),
     "k3": Fitted(1e-6, 0.1),
     "k4": Fitted(1e-9, 1e-5),
     "k5": Fitted(1e-10, 1e-6),

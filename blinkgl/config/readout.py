@@ -52,6 +52,22 @@ class PixelsConfig(Config):
     )
 
 
+class FrameResetsConfig(Config):
+    """A camera of events and frames: where the frame's pixels are reset, the signal of all event pixels jumps and comes
+    back, and those that stand near their threshold fire; see :mod:`blinkgl.events.resets`."""
+
+    interval_ms: float = Field(gt=2, le=10_000, description="Time from one reset to the next, ms: that of the frames.")
+    kick: float = Field(gt=0, le=1, description="Height of the jump, ln units of intensity.")
+    length_ms: float = Field(1.0, gt=0, le=1000, description="Time that the signal takes to come back, ms.")
+    first_ms: float = Field(0.0, ge=0, le=10_000, description="First reset after the first frame, ms.")
+
+    @rule("interval_ms", "length_ms")
+    def _over_before_the_next(interval: float, length: float):
+        if length + 1 > interval:
+            raise Refused("the jump lasts into the next one", where="length_ms", value=length,
+                          accepted=f"at most {interval - 1:g}, a millisecond less than interval_ms")  # fmt: skip
+
+
 class ReadoutConfig(Config):
     """The bus between pixels and time stamps; see :mod:`blinkgl.events.camera`. Before it the pixels' own noise:
     :mod:`blinkgl.events.pixels`."""
@@ -83,6 +99,9 @@ class ReadoutConfig(Config):
         description="Time stamps are multiples of this, microseconds: the last one that has passed.",
     )
     pixels: PixelsConfig | None = Field(None, description="Dead, hot and noisy pixels; null: none.")
+    frame_resets: FrameResetsConfig | None = Field(
+        None, description="Bursts of events that the camera's frames set off; null: none."
+    )
 
     @rule("events_per_second", "row_ns", "queue_events")
     def _queue_empties(rate: float | None, row_ns: float, queue: int):

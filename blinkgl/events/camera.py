@@ -20,6 +20,7 @@ from blinkgl.errors import EventDataError
 from blinkgl.events.emulator import Emulator
 from blinkgl.events.packing import JIT
 from blinkgl.events.pixels import PixelNoise
+from blinkgl.events.resets import FrameResets
 from blinkgl.events.table import make_emulator
 from blinkgl.events.truth import Surfaces, SurfaceTruth
 from blinkgl.types.events import OPTIONAL, Events
@@ -171,8 +172,9 @@ class EventFrame(NamedTuple):
 class EventCamera:
     """``events:`` and ``readout:`` of a configuration: frames in, the events that leave the sensor out.
 
-    Events go from the emulator through the pixels' defects, the bus with its clock, as far as the
-    configuration has them. readout : None: none of it.   seed : of the draws.
+    Light goes through the jumps that a frame camera's resets make into the emulator, its events through the pixels'
+    defects and the bus with its clock, as far as the configuration has them.
+    readout : None: none of it.   seed : of the draws.
     emulator : the :class:`Emulator` itself.
     truth : says what made each event, of frames that come with their ``surfaces``; None: nobody asks.
     make : of the emulator: that on the processor, or on the device that is asked for (``tensors/choice.py``).
@@ -190,8 +192,12 @@ class EventCamera:
     ):
         self._truth = truth
         self.emulator = make(config, height, width, seed)
-        self._pixels, self._readout = None, None
+        self.frames = 0
+        """Taken so far."""
+        self._pixels, self._readout, self._resets = None, None, None
         if readout is not None:
+            if readout.frame_resets is not None:
+                self._resets = FrameResets(readout.frame_resets)
             if readout.pixels is not None:
                 self._pixels = PixelNoise(readout.pixels, height, width, seed, self.emulator.causes)
             self._readout = Readout(readout)
@@ -205,12 +211,7 @@ class EventCamera:
     def tensor_device(self) -> Any:
         """The torch device of which it takes frames as tensors; None: arrays alone, because the emulator does or
         because something else of the camera looks at them."""
-        return self.emulator.tensor_device if self._truth is None else None
-
-    @property
-    def frames(self) -> int:
-        """Taken so far."""
-        return self.emulator.frames
+        return self.emulator.tensor_device if self._truth is None and self._resets is None else None
 
     @property
     def saturated(self) -> int:
@@ -230,8 +231,9 @@ class EventCamera:
     def step(self, frame: EventFrame) -> Events:
         """The events that are out by the frame's time and were not before. Raises EventDataError as ``Emulator.step``;
         ``t_ns`` is then the frame's."""
+        self.frames += 1
         try:
-            events = self.emulator.step(frame.luminance, frame.t_ns, frame.rows)
+            events = self._emulated(frame)
         except EventDataError as error:
             error.t_ns = frame.t_ns if error.t_ns is None else error.t_ns
             raise
@@ -244,6 +246,14 @@ class EventCamera:
         if self._truth is not None:  # what is behind the pixels carries it along, whenever it lets an event go
             events = replace(events, truth=self._truth.of(events, frame.t_ns))
         return events if self._readout is None else self._readout.step(events, until_us)
+
+    def _emulated(self, frame: EventFrame) -> Events:
+        """The emulator's events, of what else its pixels are shown before the frame, too."""
+        if self._resets is None:
+            return self.emulator.step(frame.luminance, frame.t_ns, frame.rows)
+        shown = self._resets.shown(frame.t_ns, self.emulator.decoded(frame.luminance))
+        chunks = [self.emulator.step(light, t_ns, None if jump else frame.rows) for t_ns, light, jump in shown]
+        return chunks[0] if len(chunks) == 1 else Events.concatenate(chunks)
 
 
 def emulate(

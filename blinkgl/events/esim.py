@@ -27,7 +27,7 @@ from blinkgl.config.events import EsimConfig
 from blinkgl.events.arith import Q_ONE, log_q25
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
 from blinkgl.events.packing import JIT, T_SHIFT, compact_flags, copy_block, lookup_block
-from blinkgl.events.philox import Stream, normal2, pixel_counters
+from blinkgl.events.philox import Stream, in_blocks, normal2, pixel_counters
 from blinkgl.events.response import Response, smallest_threshold
 from blinkgl.events.table import register
 from blinkgl.events.threads import take_part
@@ -241,7 +241,8 @@ def draw_thresholds(
     """
     # Draw 0 of the stream, one pair of normals per pixel: thresholds are fixed for the life of the
     # sensor.
-    a, b = normal2(seed, pixel_counters(height, width), np.uint64(Stream.THRESHOLD), np.uint64(0))
+    spread = lambda pixels: normal2(seed, pixels, np.uint64(Stream.THRESHOLD), np.uint64(0))
+    a, b = in_blocks(spread, pixel_counters(height, width))
     clip = lambda c, n: np.clip(c + sigma * n, min(MIN_THRESHOLD, c / 2), 10.0)
     return clip(on, a), clip(off, b)
 
@@ -310,7 +311,8 @@ class Esim(Emulator):
             jitter = self.config.threshold_jitter * Q_ONE
             # Draw 0 is the pair of thresholds in force at the first frame. _emit_block counts on from
             # 1.
-            a, b = normal2(self.seed, pixel_counters(self.height, self.width), _JITTER, np.uint64(0))
+            spread = lambda pixels: normal2(self.seed, pixels, _JITTER, np.uint64(0))
+            a, b = in_blocks(spread, pixel_counters(self.height, self.width))
             up = np.maximum(self._floor_on, up + np.floor(jitter * a + 0.5).astype(np.int64))
             down = np.maximum(self._floor_off, down + np.floor(jitter * b + 0.5).astype(np.int64))
         self._upper[...] = log + up

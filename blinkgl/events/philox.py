@@ -11,6 +11,7 @@ scalars (see :mod:`blinkgl.events.arith`).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import IntEnum
 
 import numpy as np
@@ -108,3 +109,18 @@ def normal2_and_uniform(seed: int, pixel: int, stream: int, index: int) -> tuple
 def pixel_counters(height: int, width: int) -> np.ndarray:
     """(H*W,) uint64 pixel numbers in raster order, the ``pixel`` argument of the draws."""
     return np.arange(height * width, dtype=np.uint64)
+
+
+_BLOCK = 2**16
+"""Pixels whose draws fit the cache: the dozens of arrays on the way of a 1080p sensor do not."""
+
+
+def in_blocks(draw: Callable[..., tuple[np.ndarray, ...]], *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return what ``draw`` returns for ``arrays`` of one length (or [], which stay so), called for a block of pixels at
+    a time: the same numbers sooner."""
+    count = len(arrays[0])
+    parts = [
+        draw(*(array[first : first + _BLOCK] if len(array) else array for array in arrays))
+        for first in range(0, max(count, 1), _BLOCK)
+    ]
+    return parts[0] if len(parts) == 1 else tuple(np.concatenate(one) for one in zip(*parts))

@@ -15,7 +15,7 @@ from blinkgl.config.events import V2eConfig
 from blinkgl.events.arith import exp_f32, exp_f64, fall_f64, log_f32, log_f64, select
 from blinkgl.events.emulator import BLOCK
 from blinkgl.events.noise import TABLE_LOW, TABLE_SIZE, TABLE_STEP, start_places, start_sizes
-from blinkgl.events.philox import Stream, normal2, pixel_counters, rough_normal, uniform2
+from blinkgl.events.philox import Stream, in_blocks, normal2, pixel_counters, rough_normal, uniform2
 
 _F = np.float32
 # _SLOPE is that of the chord from (0, 0) to (20, ln 20).
@@ -218,7 +218,8 @@ def draw_start_noise(intensity: np.ndarray, config: V2eConfig, seed: np.uint64) 
     # The low-pass's corner f_c (I + 20)/275 Hz.
     """Photoreceptor noise at the first frame, already stationary, (H*W,) float32 ln units."""
     corner = config.cutoff_hz * (intensity.astype(np.float64) + 20.0) / 275.0
-    _, normal = normal2(seed, np.arange(len(intensity), dtype=np.uint64), np.uint64(Stream.START), np.uint64(1))
+    pixels = np.arange(len(intensity), dtype=np.uint64)
+    _, normal = in_blocks(lambda part: normal2(seed, part, np.uint64(Stream.START), np.uint64(1)), pixels)
     return (start_sizes(config.shot_noise_rate_hz, corner, noise_threshold(config)) * normal).astype(np.float32)
 
 
@@ -253,6 +254,20 @@ def draw_start(
     rate R begins it anew: the T under way has the weight (1 - e^-RT)/R (of a long one more is seen), its age a the
     density e^-Ra up to T."""
     pixels = np.arange(len(on), dtype=np.uint64)
+    return Start(*in_blocks(lambda *part: _start_of(config, seed, *part), pixels, intensity, on, off, leak, noise))
+
+
+def _start_of(
+    config: V2eConfig,
+    seed: np.uint64,
+    pixels: np.ndarray,
+    intensity: np.ndarray,
+    on: np.ndarray,
+    off: np.ndarray,
+    leak: np.ndarray,
+    noise: np.ndarray,
+) -> Start:
+    """:func:`draw_start` of the pixels of these numbers."""
     offset, dead_ns = np.zeros(len(on), np.float32), np.zeros(len(on) if config.refractory_us else 0, np.int64)
     age_ns, by_noise = np.zeros(len(on), np.int64), np.zeros(len(on), np.float32)
     # One pair of uniforms per pixel: the first is the age of the interval or the place on the ladder.
@@ -353,8 +368,8 @@ MAX_LEAK_HZ = 1e6
 
 def draw_hot(height: int, width: int, config: V2eConfig, seed: np.uint64) -> np.ndarray:
     """Which pixels are hot, (H*W,) uint8."""
-    u, _ = uniform2(seed, pixel_counters(height, width), np.uint64(Stream.HOT), np.uint64(0))
-    return (u < config.hot_pixel_fraction).astype(np.uint8)
+    which = lambda pixels: uniform2(seed, pixels, np.uint64(Stream.HOT), np.uint64(0))
+    return (in_blocks(which, pixel_counters(height, width))[0] < config.hot_pixel_fraction).astype(np.uint8)
 
 
 def draw_leaks(height: int, width: int, config: V2eConfig, on: np.ndarray, seed: np.uint64) -> np.ndarray:
@@ -364,7 +379,12 @@ def draw_leaks(height: int, width: int, config: V2eConfig, on: np.ndarray, seed:
     """
     if config.leak_rate_hz == 0 and config.hot_pixel_fraction == 0:
         return np.empty(0, np.float32)
-    pixels = pixel_counters(height, width)
+    (leak,) = in_blocks(lambda pixels, on: (_leaks_of(config, pixels, on, seed),), pixel_counters(height, width), on)
+    return leak
+
+
+def _leaks_of(config: V2eConfig, pixels: np.ndarray, on: np.ndarray, seed: np.uint64) -> np.ndarray:
+    """:func:`draw_leaks` of the pixels of these numbers."""
     spread, _ = normal2(seed, pixels, np.uint64(Stream.LEAK), np.uint64(0))
     # Log-normal tails of several decades ask for more events than there are microseconds: that is noise without end.
     # 10^(cov N) as a power of e.

@@ -10,7 +10,7 @@ from numba.extending import register_jitable
 
 from blinkgl.config.events import VoltmeterConfig
 from blinkgl.events.arith import exp_f64, select
-from blinkgl.events.philox import Stream, uniform2
+from blinkgl.events.philox import Stream, in_blocks, uniform2
 
 _F = np.float32
 # Typed constants: a float literal is float64 to numba and would widen the float32 loops.
@@ -136,6 +136,15 @@ def start_voltage(intensity: np.ndarray, config: VoltmeterConfig, seed: np.uint6
     Between events V has the density 1 - e^{-r(1-v)} above 0 and e^{rv} - e^{-r} below, r = 2 mu/sigma^2 >= 0 (the
     Fokker-Planck equation with a source at 0; for r < 0 its mirror image); drawn by rejection, half are kept at any r.
     """
+    pixels = np.arange(len(intensity), dtype=np.uint64)
+    v, left_us = in_blocks(lambda *part: _voltage_of(config, seed, *part), pixels, intensity)
+    return v, left_us
+
+
+def _voltage_of(
+    config: VoltmeterConfig, seed: np.uint64, pixels: np.ndarray, intensity: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """:func:`start_voltage` of the pixels of these numbers."""
     c = config
     level = intensity.astype(np.float64)
     # Drift and noise of a scene that does not change.
@@ -151,7 +160,7 @@ def start_voltage(intensity: np.ndarray, config: VoltmeterConfig, seed: np.uint6
     for turn in range(200):
         if not wanted.size:
             break
-        a, b = uniform2(seed, wanted.astype(np.uint64), _START, np.uint64(turn))
+        a, b = uniform2(seed, pixels[wanted], _START, np.uint64(turn))
         place, rate = 2.0 * a - 1.0, r[wanted]
         # 1 - e^-r(1-v) and e^rv - e^-r, both over 1 - e^-r, their value at 0; a triangle for small r.
         flat = rate < 1e-9
@@ -166,7 +175,7 @@ def start_voltage(intensity: np.ndarray, config: VoltmeterConfig, seed: np.uint6
     v = np.where(mu < 0, -v, v)
     left = np.zeros(level.size)
     if c.refractory_us:
-        a, b = uniform2(seed, np.arange(level.size, dtype=np.uint64), _START, np.uint64(1000))
+        a, b = uniform2(seed, pixels, _START, np.uint64(1000))
         # The chance to be in the dead time is its share of the whole cycle.
         dead = np.isfinite(r) & (a * (c.refractory_us + between) < c.refractory_us)
         left[dead] = b[dead] * c.refractory_us

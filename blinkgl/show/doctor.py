@@ -1,4 +1,4 @@
-"""``blinkgl doctor``: what of the machine is examined; sections, then what is missing with the commands that mend it."""
+"""``blinkgl doctor``: what is examined; sections, then what is missing with the commands that mend it."""
 
 from __future__ import annotations
 

@@ -1,0 +1,78 @@
+"""Jumps that the resets of a frame camera make: against the times and numbers that ESIM's levels give for them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from blinkgl.config.events import EsimConfig
+from blinkgl.config.problems import validate
+from blinkgl.config.readout import FrameResetsConfig, ReadoutConfig
+from blinkgl.errors import ConfigError
+from blinkgl.events import Events
+from blinkgl.events.camera import EventCamera, EventFrame, emulate
+from blinkgl.events.resets import RISE_NS
+
+H, W, MS = 20, 30, 1_000_000
+EXACT = EsimConfig(contrast_threshold=0.2, contrast_threshold_off=0.17, threshold_sigma=0.0, log_eps=1e-6)
+
+
+def events_of(frames, resets=None, config=EXACT):
+    readout = None if resets is None else ReadoutConfig(frame_resets=resets)
+    camera = EventCamera(config, readout, H, W, 0)
+    out = Events.concatenate([events for _, events in emulate((EventFrame(t, f) for t, f in frames), camera)])
+    assert camera.frames == len(frames)  # what is shown in between is nobody's frame
+    return out
+
+
+def still(times_ms):
+    return [(round(t * MS), np.full((H, W), 0.3, np.float32)) for t in times_ms]
+
+
+@pytest.mark.parametrize("times_ms", [[0, 40], np.arange(0, 40.01, 0.25), [0, 1.13, 7.2, 7.9, 30, 40]])
+def test_a_still_pixel_fires_as_the_jump_passes_its_levels_whenever_frames_come(times_ms):
+    """Up by 2.5 thresholds and down again: two events each way, at the crossings of straight lines."""
+    resets = FrameResetsConfig(interval_ms=20, kick=0.5, length_ms=2, first_ms=5)
+    events = events_of(still(times_ms), resets)
+    assert len(events) == 2 * 4 * H * W
+    for reset, ups, downs in ((5000, (0.2, 0.4), (0.23, 0.06)), (25_000, (0.26, 0.46), (0.29, 0.12))):
+        part = events.window(reset - 1000, reset + 4000)
+        rises = [RISE_NS / 1000 * level / 0.5 for level in ups]
+        falls = [RISE_NS / 1000 + 2000 * (1 - level / 0.5) for level in downs]
+        assert (part.p == np.repeat([1, 1, 0, 0], H * W)).all()
+        assert np.abs(part.t - np.repeat(np.array(rises + falls) + reset, H * W)).max() <= 2
+
+
+def test_of_moving_pixels_the_share_fires_that_stands_within_the_jump_of_its_threshold():
+    """Light that rises slowly, each pixel at another phase: a jump of a tenth of a threshold takes a tenth of them."""
+    rng = np.random.default_rng(0)
+    start, slope = rng.uniform(-0.2, 0, (H, W)), 0.2 / 0.2  # a threshold in 0.2 s
+    frames = [(t * MS, np.exp(start + slope * t / 1000).astype(np.float32)) for t in range(0, 401, 5)]
+    first = [(0, np.ones((H, W), np.float32)), *[(t + MS, f) for t, f in frames]]  # phases: levels hang on the first
+    resets = FrameResetsConfig(interval_ms=50, kick=0.02, first_ms=21)
+    quiet, jumping = events_of(first), events_of(first, resets)
+    times = np.arange(21, 400, 50)
+    burst = sum(len(jumping.window(t * 1000, t * 1000 + 300)) for t in times if t > 200)
+    expected = 0.1 * H * W * np.count_nonzero(times > 200)
+    assert abs(burst - expected) < 4 * np.sqrt(expected)
+    # They fire before their time, and not instead of other events.
+    assert abs(len(jumping.window(250_000, 400_000)) - len(quiet.window(250_000, 400_000))) < 0.15 * H * W
+    after = [(e.window(t * 1000 + 300, t * 1000 + 1300)).p.sum() for e in (quiet, jumping) for t in times if t > 200]
+    assert sum(after[4:]) < 0.2 * sum(after[:4])  # those that would have come next have come
+
+
+def test_codes_and_rows_are_as_light_and_whole_frames():
+    light = np.linspace(0.1, 0.9, H * W).reshape(H, W).astype(np.float32)
+    resets = FrameResetsConfig(interval_ms=10, kick=0.3, first_ms=2.9)
+    whole = events_of([(t * MS, light) for t in range(12)], resets)
+    camera = EventCamera(EXACT, ReadoutConfig(frame_resets=resets), H, W, 0)
+    parts = [camera.step(EventFrame(t * MS, light, (3, 5) if t else None)) for t in range(12)]
+    assert len(whole) and Events.concatenate(parts).t.tolist() == whole.t.tolist()
+    codes = EventCamera(EXACT, ReadoutConfig(frame_resets=resets), H, W, 0)
+    coded = [codes.step(EventFrame(t * MS, np.full((H, W), 80, np.uint8))) for t in range(12)]
+    assert len(Events.concatenate(coded)) == 2 * H * W and codes.tensor_device is None
+
+
+def test_a_jump_that_lasts_into_the_next_is_refused():
+    with pytest.raises(ConfigError, match="length_ms: the jump lasts into the next one .*at most 9,"):
+        validate(ReadoutConfig, {"frame_resets": {"interval_ms": 10, "kick": 0.1, "length_ms": 10}})

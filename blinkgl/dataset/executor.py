@@ -116,9 +116,11 @@ class Local:
         if self._devices is None:
             self._devices = several_cards(job)
         cores = self._cores or len(os.sched_getaffinity(0))
+        # numba and OpenGL read these once, when they are loaded, so they are in a worker's environment from its start.
         self._environment = {**os.environ, **thread_environment(self._wanted, cores)}
         for slot in range(self._wanted):
             self._start(slot)
+        # A run begins when every worker has said hello: what their machines and assets are is compared before any work.
         hellos, deadline = [], time.monotonic() + _START_S
         while len(hellos) < self._wanted:
             hellos += [m for m in self.poll(1.0) if m["kind"] == "hello"]
@@ -132,6 +134,7 @@ class Local:
         return sum(p.ready and p.task is None for p in self._processes)
 
     def submit(self, task: int, attempt: int) -> None:
+        # There is one: the driver submits only after ``free`` has said so.
         process = next(p for p in self._processes if p.ready and p.task is None)
         process.task = task
         process.send({"task": task, "attempt": attempt})
@@ -142,9 +145,11 @@ class Local:
             process: _Process = key.data
             lines, ended = process.read()
             for message in lines:
+                # The job itself cannot be done (assets, OpenGL): another worker would be refused likewise.
                 if message["kind"] == "refused":
                     raise BlinkGLError(message["error"])
                 if message["kind"] == "hello":
+                    # Only starts that fail one after the other say that no worker can start.
                     process.ready, self._bad_starts = True, 0
                 if message["kind"] in ("done", "failed"):
                     process.task = None
@@ -157,11 +162,13 @@ class Local:
         for process in self._processes:
             if process.task == task:
                 process.reason = reason
+                # SIGKILL: a worker that hangs in a driver does not hear SIGTERM. ``poll`` reports its task.
                 process.popen.kill()
 
     def close(self) -> None:
         for process in self._processes:
             process.stop()
+        # One deadline for all of them: they stop at the same time, not one after the other.
         deadline = time.monotonic() + _STOP_S
         for process in self._processes:
             try:
@@ -182,6 +189,7 @@ class Local:
 
     def _bury(self, process: _Process) -> list[Message]:
         """The process ended by itself: its task failed, and another takes its place."""
+        # A closed pipe is always readable: the selector would spin on it.
         self._selector.unregister(process.channel)
         self._processes.remove(process)
         status = process.popen.wait()
@@ -212,7 +220,9 @@ class _Process:
     def __init__(self, slot: int, log: Path, environment: dict[str, str]):
         self.slot, self.log = slot, log
         self.ready, self.task, self.reason = False, None, ""
+        # Bytes after the last newline: a message may come in two reads.
         self._rest = b""
+        # Messages have a pipe of their own: libraries and drivers print to standard output, which is the log.
         self.channel, write_end = os.pipe()
         try:
             log.parent.mkdir(parents=True, exist_ok=True)
@@ -229,6 +239,7 @@ class _Process:
                 env=environment,
                 start_new_session=True,
             )
+        # The child has its copy. With ours open the channel would never end.
         os.close(write_end)
 
     def send(self, order: dict) -> None:
@@ -246,6 +257,7 @@ class _Process:
 
     def stop(self) -> None:
         if self.popen.poll() is None:
+            # The signal interrupts a sequence that is being made; the closed input ends a worker that waits.
             self.popen.terminate()
         try:
             self.popen.stdin.close()

@@ -111,6 +111,7 @@ class Maker:
         rendered = [group.template.check() for group in self.plan.used]
         rendered = [config.gl for config in rendered if config.frames is None]
         if rendered:
+            # A process has one context, which sequences of all groups share.
             if any(gl != rendered[0] for gl in rendered):
                 raise ConfigError(
                     "the groups ask for different OpenGL", where="gl", accepted="one gl section at the top level"
@@ -141,6 +142,7 @@ class Maker:
 
         def progress(report: SequenceReport, fraction: float) -> None:
             nonlocal last
+            # Frames come by the hundred a second, and each message is a line of JSON through a pipe.
             if (now := time.monotonic()) - last > _NEWS_EVERY_S:
                 last = now
                 tell(
@@ -156,6 +158,7 @@ class Maker:
                 )
 
         try:
+            # A lost context fails the sequence that it was lost in; the next attempt begins with a new one.
             self.renew()
             config = self.plan.config(task)
             report = generate_sequence(
@@ -246,6 +249,7 @@ def _source_hash() -> str:
     tests while the code is being worked on)."""
     if build := os.environ.get("BLINKGL_BUILD"):
         return build
+    # Rooms that no byte of a sequence depends on are left out, so that editing them does not end a run.
     found, apart = hashlib.sha256(), {"configs", "tools", "report", "shader_debugger"}  # what makes no sequence
     for package in ("blinkgl", "blinkgl.shaders"):
         root = resources.files(package)

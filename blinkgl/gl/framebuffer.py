@@ -95,6 +95,7 @@ class Target:
         self.colour: tuple[moderngl.Texture, ...] = tuple(self._texture(f) for f in self.formats)
         self.depth = self._depth(depth)
         self.fbo = gl.ctx.framebuffer(list(self.colour), self.depth)
+        # What moderngl does not offer: blits between targets, and clearing each attachment by its own type.
         self._bind = gl.function("glBindFramebuffer", None, ctypes.c_uint, ctypes.c_uint)
         self._blit = gl.function("glBlitFramebuffer", None, *[ctypes.c_int] * 8, ctypes.c_uint, ctypes.c_uint)
         self._read_buffer = gl.function("glReadBuffer", None, ctypes.c_uint)
@@ -118,6 +119,7 @@ class Target:
             return None
         uint, integer = ctypes.c_uint, ctypes.c_int
         if kind in _TEXTURES:
+            # Given 32F (or 16-bit) storage in place of moderngl's 24 bits, which reversed depth would waste.
             depth = gl.ctx.depth_texture(size)
             gl.function("glActiveTexture", None, uint)(_TEXTURE0 + gl.ctx.default_texture_unit)
             gl.function("glBindTexture", None, uint, uint)(_TEXTURE_2D, depth.glo)
@@ -159,6 +161,7 @@ class Target:
         self, colour: Sequence[float | int | Sequence[float]], depth: float
     ) -> Iterator[Callable[[], object]]:
         for i, pixel in enumerate(self.formats):
+            # glClearBuffer reads four values of the format's type, however many components it has.
             value = np.zeros(4, {"u": np.uint32, "i": np.int32}.get(pixel.gl[0], np.float32))
             if i < len(colour):
                 value[: np.size(colour[i])] = colour[i]

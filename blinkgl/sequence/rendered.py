@@ -47,6 +47,7 @@ def drawn(renderer: Renderer, times: Iterable[int], surfaces: bool = False, devi
     frame = None
     for t_ns in times:
         before, frame = frame, renderer.luminance(t_ns)
+        # Rows that are as before are not looked at by the emulator: a still camera costs what moves.
         rows = frame.rows_changed_since(before)
         luminance = frame.view() if device is None else frame.tensor(device)
         yield EventFrame(t_ns, luminance, rows, surfaces_at(renderer, t_ns) if surfaces else None)
@@ -68,6 +69,7 @@ def timeline_of(
     """What decides the times of a sensor's frames, after a first look where one is asked for.   scene : of one sensor,
     as it was built.   renderer : of it.   span_ns : first and last time, ns."""
     emulator, dynamics = recording(scene, config).sensors[0].emulator, scene.dynamics
+    # A frame stands at every impact: a velocity jumps there, and no speed measured before it bounds the step.
     stops = dynamics.impacts_ns if dynamics is not None else ()
     response = emulator_of(emulator).response(emulator)
     made = partial(make_timeline, pictures=renderer, response=response, stops_ns=stops)
@@ -115,6 +117,7 @@ class RenderedSequence(Simulation):
             if request.labels and self.sensor.labels is not None:
                 for name in asked_for(self.sensor.labels):
                     LABELS[name].check(scene, self.sensor.labels)
+            # A renderer that was handed in has drawn before: its seconds until now are not this sequence's.
             self.triangles, self._before = renderer.triangles, (renderer.stats.render_s, renderer.stats.readback_s)
             camera = None
             if request.events:
@@ -173,6 +176,7 @@ class RenderedSequence(Simulation):
         request, interval = asked_for(self.sensor.labels), self.config.time.interval_ns
         last = k == self.config.time.label_count
         if last:
+            # Nothing leads on from the last label time: flow and what goes with it have no other end.
             request = request.only(name for name in request if LABELS[name].at_last)
         return self._truth_over(k, t_ns, interval, request, last)
 
@@ -185,6 +189,7 @@ class RenderedSequence(Simulation):
         request = request.within(self.scene.t0_ns - t_ns, self.scene.t1_ns - t_ns)
         frame = self.renderer.labels(t_ns, request, t_ns + span_ns, t_ns - span_ns, self._rectified)
         camera, objects = poses_at(self.scene, [t_ns])
+        # Times of forward and backward flow.
         leads_to = (None, None) if last else (t_ns + span_ns, t_ns - span_ns)
         return GroundTruth(k, t_ns, frame, *leads_to, camera[0], objects[:, 0])
 

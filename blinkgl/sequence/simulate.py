@@ -140,6 +140,7 @@ class Simulation(ABC):
     def gather(self) -> Events:
         """All events at once, for whoever cuts windows out of a short sequence. OpenGL stays until :meth:`close`, so
         that :meth:`truth` can be asked at any time in it: use it in ``with``."""
+        # The end of the iteration closes ``_stack``: an empty one stands in for it meanwhile.
         held, self._stack = self._stack, ExitStack()
         try:
             return Events.concatenate([chunk.events for chunk in self.chunks()])
@@ -153,6 +154,7 @@ class Simulation(ABC):
 
     def _items(self) -> Iterator[Item]:
         with self:
+            # The receiver may use OpenGL between two items, as another sensor of the rig does.
             self._resume()
             for item in self._in_order():
                 yield item
@@ -165,6 +167,7 @@ class Simulation(ABC):
             self.events += len(events)
             if events.cause is not None:
                 self._by_cause += count_causes(events)
+            # Labels and images come between the events before and after their microsecond, so a chunk is cut at each.
             while (due_ns := due.ns) is not None and due_ns <= t_ns:
                 before, events = events.split(due_ns // 1000)
                 yield EventChunk(due_ns, before)
@@ -172,6 +175,7 @@ class Simulation(ABC):
             yield EventChunk(t_ns, events)
             if ticks is not None and ticks.passed(t_ns // 1000):
                 yield self._picture(t_ns)
+        # Those at or behind the last frame, and all of them where no events were asked for.
         while due.ns is not None:
             yield self._next(due)
 

@@ -76,9 +76,11 @@ class Cache:
             self._kept.move_to_end(key)
             return self._kept[key][0]
         loaded = load()
+        # Measured when it is loaded: textures and meshes are never written to afterwards.
         size = _bytes_of(loaded)
         self._kept[key] = loaded, size
         self.held += size
+        # The last one stays however large it is, since its caller is about to use it.
         while self.held > self.limit and len(self._kept) > 1:
             self.held -= self._kept.popitem(last=False)[1][1]
         return loaded
@@ -136,6 +138,7 @@ class Pool:
         sides = self.split(split)
         sources = list(sides)
         for _ in range(_MAX_REDRAWS):
+            # First a source, then one of its entries: a folder of thousands does not crowd out a few primitives.
             entries = sides[sources[int(rng.integers(len(sources)))]]
             entry = entries[int(rng.integers(len(entries)))]
             try:
@@ -178,6 +181,7 @@ def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_t
 
     def load(entry: Entry) -> Asset:
         if entry.file is None:
+            # People, flags and fish have colours of their own; other primitives take a texture of the pool.
             wears = config.keep_materials and entry.kind in COATS
             material = Material(coat(entry.kind, entry.index)) if wears else Material()
             part = Part(random_primitive(entry.kind, entry.index), material)
@@ -191,6 +195,7 @@ def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_t
             source_hash=entry.source_hash,
             up=config.up,
         )
+        # The hash decides split and order. A file that changed since it was listed would be another scene, silently.
         _same_content(entry, content_hash(contents(entry.file, "mesh", max_bytes=limit), *dependencies(entry.file)))
         return asset.normalised()
 

@@ -111,6 +111,7 @@ class Config(BaseModel):
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
         found = {
             name: value
+            # From the base down, so that a subclass may replace a rule of the same name.
             for base in reversed(cls.__mro__)
             for name, value in vars(base).items()
             if isinstance(value, Rule)
@@ -118,6 +119,7 @@ class Config(BaseModel):
         cls.rules = tuple(found.values())
         for name, one in found.items():
             for key in one.keys:
+                # A rule of a key that was renamed would otherwise never run again, silently.
                 if not _fits(cls, _steps(key)):
                     raise TypeError(f"{cls.__name__}.{name}: there is no key {key}")
 
@@ -128,6 +130,7 @@ class Config(BaseModel):
             data = {key: value for key, value in data.items() if not cls._is_removed(key, value)}
         if cls.presets and isinstance(data, dict):
             name = data.get("preset", cls.model_fields["preset"].default)
+            # Later tables win: the preset, then null for what another key replaces, then what is given.
             data = {**(cls.presets.get(name, {}) if isinstance(name, str) else {}), **cls._left_out(data), **data}
         return cls.completed(data) if isinstance(data, dict) else data
 
@@ -136,6 +139,7 @@ class Config(BaseModel):
         """Return whether a key of an earlier version may be ignored. Raises Refused where its value would matter."""
         if key in cls.fixed:
             now = getattr(cls, key)
+            # YAML has lists where constants are tuples.
             if value not in (now, list(now) if isinstance(now, tuple) else now):
                 raise Refused("this key was removed", where=key, value=value, accepted=f"{now}, which holds always")
             return True
@@ -164,6 +168,7 @@ class Config(BaseModel):
     @model_validator(mode="wrap")  # the last, so that it is round the others
     @classmethod
     def _remembered(cls, data: Any, handler: Callable[[Any], Any]) -> Any:
+        # Corners of one template share most of their tables: each of those is validated once.
         known = _known.get()
         if known is None or not isinstance(data, dict):
             return handler(data)
@@ -206,6 +211,7 @@ class Members(Generic[M]):
             raise TypeError(f"{model.__name__} has no key `{self.tag}: Literal[...]` of one name")
         if self.models.get(tag[1], model) is not model:
             raise TypeError(f"there is another {self.tag} '{tag[1]}'")
+        # The union is made anew when it is asked for next.
         self.models[tag[1]], self._adapter = model, None
 
     def remove(self, value: str) -> None:
@@ -235,6 +241,7 @@ class Family(Config):
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> core_schema.CoreSchema:
+        # A function in place of a schema: pydantic would keep the members of now for good.
         if not stands_for_many(cls):
             return handler(source)
         return core_schema.no_info_plain_validator_function(lambda data: cls.members.adapter().validate_python(data))
@@ -263,6 +270,7 @@ class Growing(Config):
         if name in cls.model_fields or not name.isidentifier() or name.startswith("_") or hasattr(BaseModel, name):
             raise TypeError(f"'{name}' " + ("is a key already" if name in cls.model_fields else "cannot be a key"))
         fields = {**cls.model_fields, name: FieldInfo.from_annotated_attribute(annotation, info)}
+        # Keys are listed in the order of the fields: on pages, in manifests, in error messages.
         later = list(cls.model_fields)[list(cls.model_fields).index(before) :] if before in cls.model_fields else []
         cls._regrown({key: fields[key] for key in (*(key for key in fields if key not in later), *later)})
 
@@ -283,6 +291,7 @@ class Growing(Config):
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> core_schema.CoreSchema:
+        # While the class is being made its own schema is wanted; afterwards a call that looks it up.
         if not vars(cls).get("_made", False):
             return handler(source)
         return core_schema.no_info_plain_validator_function(lambda data: cls.model_validate(data))  # noqa: PLW0108
@@ -332,6 +341,7 @@ def below(annotation: Any, step: str | int) -> list[Any]:
     if origin is dict:
         return members(arguments[1])
     if origin in (tuple, list) and (isinstance(step, int) or step == "*" or str(step).isdigit()):
+        # A tuple of fixed length has an annotation for each place, others one for all.
         if origin is tuple and arguments and arguments[-1] is not Ellipsis:
             at = 0 if step == "*" else int(step)
             return members(arguments[at]) if at < len(arguments) else []

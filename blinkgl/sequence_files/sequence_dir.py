@@ -142,9 +142,12 @@ class SequenceWriter:
         with output_errors(self.final):
             self.final.parent.mkdir(parents=True, exist_ok=True)
             remove_stale(self.final.parent)
+            # Beside the final name, on the same file system, so that the last step is one rename.
             self._tmp = temporary_beside(self.final)
             self._tmp.mkdir()
+        # One thread: files are written in the order in which they were given, while the next frame is drawn.
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="sequence-writer")
+        # Memory is bounded: whoever draws waits when the disk is this many files behind.
         self._slots = threading.BoundedSemaphore(_IN_FLIGHT)
         self._truth: EventLabelsWriter | None = None
         try:
@@ -182,6 +185,7 @@ class SequenceWriter:
         self._check()
         self._events.append(events)
         if self._truth is not None and len(events):
+            # A copy: the thread gets to them when the caller has gone on.
             self._submit(partial(self._truth.append, events.copy()))
 
     def label(self, name: str, index: int, value: Any, t_us: int, to_us: int | None = None) -> None:
@@ -196,6 +200,7 @@ class SequenceWriter:
             self._stamp(label.stamps, str(int(t_us)))
         elif label.stamps is not None:
             self._stamp(label.stamps, f"{int(t_us)}, {int(to_us)}", "# from_timestamp_us, to_timestamp_us")
+        # Without a configuration (a test, a converter) a label has its first form alone.
         for form in label.forms[:1] if self.labels is None else label.written(self.labels):
             self._write(form.file(index), partial(self._encoded, label, form, value))
 
@@ -275,7 +280,9 @@ class SequenceWriter:
             with output_errors(path), open(path, "wb") as file:
                 file.write(data)
                 file.flush()
+                # The rename at the end must not reach the disk before the contents do.
                 os.fsync(file.fileno())
+            # Hashed from memory: reading it back would say what the disk has, not what was meant.
             self._files[name] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
 
         self._submit(task)
@@ -287,6 +294,7 @@ class SequenceWriter:
 
     def _done(self, future: Future) -> None:
         self._slots.release()
+        # Raised by the next call: an exception of another thread has nobody to catch it there.
         if not future.cancelled() and (error := future.exception()) is not None:
             self._failure.append(error)
 
@@ -306,10 +314,12 @@ class SequenceWriter:
             self._events.close(self.t_end_us)
         if self._truth is not None:
             self._submit(self._truth.close)
+        # Every file is there from here on, or the check raises what stopped it.
         self._pool.shutdown(wait=True)
         self._check()
         with output_errors(self.final):
             self._check_untouched()
+            # Files of other writers: events.h5, the preview, arrays.
             for path in sorted(self._tmp.rglob("*")):
                 name = path.relative_to(self._tmp).as_posix()
                 if path.is_file() and name not in self._files:
@@ -325,8 +335,10 @@ class SequenceWriter:
             path = self._tmp / MANIFEST
             path.write_text(sealed(manifest, default=_plain), encoding="utf-8")
             fsync(path)
+            # Deepest first: an entry is durable when its folder is.
             for folder in sorted({p.parent for p in self._tmp.rglob("*")}, reverse=True):
                 fsync(folder)
+            # Again: somebody may have put something there while the sequence was made.
             refuse_existing(self.final)
             os.rename(self._tmp, self.final)
             fsync(self.final.parent)

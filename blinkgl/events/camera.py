@@ -17,7 +17,7 @@ from blinkgl.errors import EventDataError
 from blinkgl.events.pixels import PixelNoise
 from blinkgl.events.readout import Readout
 from blinkgl.events.resets import FrameResets
-from blinkgl.events.table import make_emulator
+from blinkgl.events.table import EMULATORS, make_emulator
 from blinkgl.events.truth import Surfaces, SurfaceTruth
 from blinkgl.types.events import Events
 
@@ -70,7 +70,8 @@ class EventCamera:
         self._pixels, self._readout, self._resets = None, None, None
         if readout is not None:
             if readout.frame_resets is not None:
-                self._resets = FrameResets(readout.frame_resets)
+                response = EMULATORS[config.emulator].response(config)
+                self._resets = FrameResets(readout.frame_resets, response.threshold / response.gain)
             if readout.pixels is not None:
                 self._pixels = PixelNoise(readout.pixels, height, width, seed, self.emulator.causes)
             self._readout = Readout(readout)

@@ -57,7 +57,9 @@ class FrameResetsConfig(Config):
     back, and those that stand near their threshold fire; see :mod:`blinkgl.events.resets`."""
 
     interval_ms: float = Field(gt=2, le=10_000, description="Time from one reset to the next, ms: that of the frames.")
-    kick: float = Field(gt=0, le=1, description="Height of the jump, ln units of intensity.")
+    kick: float = Field(
+        gt=0, le=5, description="Height of the jump, in thresholds (the smaller of the emulator's ON and OFF ones)."
+    )
     length_ms: float = Field(1.0, gt=0, le=1000, description="Time that the signal takes to come back, ms.")
     first_ms: float = Field(0.0, ge=0, le=10_000, description="First reset after the first frame, ms.")
 

@@ -21,7 +21,7 @@ from blinkgl.events.emulator import Emulator
 from blinkgl.events.packing import JIT
 from blinkgl.events.pixels import PixelNoise
 from blinkgl.events.resets import FrameResets
-from blinkgl.events.table import make_emulator
+from blinkgl.events.table import EMULATORS, make_emulator
 from blinkgl.events.truth import Surfaces, SurfaceTruth
 from blinkgl.types.events import OPTIONAL, Events
 
@@ -197,7 +197,8 @@ class EventCamera:
         self._pixels, self._readout, self._resets = None, None, None
         if readout is not None:
             if readout.frame_resets is not None:
-                self._resets = FrameResets(readout.frame_resets)
+                response = EMULATORS[config.emulator].response(config)
+                self._resets = FrameResets(readout.frame_resets, response.threshold / response.gain)
             if readout.pixels is not None:
                 self._pixels = PixelNoise(readout.pixels, height, width, seed, self.emulator.causes)
             self._readout = Readout(readout)

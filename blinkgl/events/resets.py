@@ -29,11 +29,14 @@ class _Seen(NamedTuple):
 class FrameResets:
     """The light that pixels see between and at the frames that an emulator is given, with the jumps in it.
 
-    ln I is higher by ``kick`` ``RISE_NS`` after a reset, and by nothing ``length_ms`` after that, in straight lines.
-    Resets follow one another at ``interval_ms``; the first comes ``first_ms`` after the first frame."""
+    ln I is higher by ``kick`` thresholds ``RISE_NS`` after a reset, and by nothing ``length_ms`` after that, in
+    straight lines. Resets follow one another at ``interval_ms``; the first comes ``first_ms`` after the first frame.
 
-    def __init__(self, config: FrameResetsConfig):
-        self._kick = config.kick
+    threshold : the emulator's, ln units: in three recordings whose thresholds differ by a factor of four the jump is
+    0.31 to 0.39 of it."""
+
+    def __init__(self, config: FrameResetsConfig, threshold: float):
+        self._kick = config.kick * threshold
         self._every, self._first = (round(1e6 * ms) for ms in (config.interval_ms, config.first_ms))
         self._corners = (0, RISE_NS, RISE_NS + round(1e6 * config.length_ms))
         self._began: int | None = None

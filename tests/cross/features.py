@@ -170,7 +170,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "ample": {"readout": {"events_per_second": 1e9}},
         "slow": {"readout": {"events_per_second": 1e3, "row_ns": 50, "queue_events": 4}},
         "clock": {"readout": {"clock_us": 10}},
-        "resets": {"readout": {"frame_resets": {"interval_ms": 8, "kick": 0.3, "first_ms": 3}}},
+        "resets": {"readout": {"frame_resets": {"interval_ms": 8, "kick": 1.2, "first_ms": 3}}},
         "pixels": {
             "readout": {
                 "pixels": {"dead_fraction": 0.1, "hot_fraction": 0.02, "hot_rate_hz": 500, "rate_hz": 5},

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blinkgl.config.events import EsimConfig
+from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.config.problems import validate
 from blinkgl.config.readout import FrameResetsConfig, ReadoutConfig
 from blinkgl.errors import ConfigError
@@ -32,7 +32,7 @@ def still(times_ms):
 @pytest.mark.parametrize("times_ms", [[0, 40], np.arange(0, 40.01, 0.25), [0, 1.13, 7.2, 7.9, 30, 40]])
 def test_a_still_pixel_fires_as_the_jump_passes_its_levels_whenever_frames_come(times_ms):
     """Up by 2.5 thresholds and down again: two events each way, at the crossings of straight lines."""
-    resets = FrameResetsConfig(interval_ms=20, kick=0.5, length_ms=2, first_ms=5)
+    resets = FrameResetsConfig(interval_ms=20, kick=0.5 / 0.17, length_ms=2, first_ms=5)
     events = events_of(still(times_ms), resets)
     assert len(events) == 2 * 4 * H * W
     for reset, ups, downs in ((5000, (0.2, 0.4), (0.23, 0.06)), (25_000, (0.26, 0.46), (0.29, 0.12))):
@@ -49,7 +49,7 @@ def test_of_moving_pixels_the_share_fires_that_stands_within_the_jump_of_its_thr
     start, slope = rng.uniform(-0.2, 0, (H, W)), 0.2 / 0.2  # a threshold in 0.2 s
     frames = [(t * MS, np.exp(start + slope * t / 1000).astype(np.float32)) for t in range(0, 401, 5)]
     first = [(0, np.ones((H, W), np.float32)), *[(t + MS, f) for t, f in frames]]  # phases: levels hang on the first
-    resets = FrameResetsConfig(interval_ms=50, kick=0.02, first_ms=21)
+    resets = FrameResetsConfig(interval_ms=50, kick=0.02 / 0.17, first_ms=21)
     quiet, jumping = events_of(first), events_of(first, resets)
     times = np.arange(21, 400, 50)
     burst = sum(len(jumping.window(t * 1000, t * 1000 + 300)) for t in times if t > 200)
@@ -63,7 +63,7 @@ def test_of_moving_pixels_the_share_fires_that_stands_within_the_jump_of_its_thr
 
 def test_codes_and_rows_are_as_light_and_whole_frames():
     light = np.linspace(0.1, 0.9, H * W).reshape(H, W).astype(np.float32)
-    resets = FrameResetsConfig(interval_ms=10, kick=0.3, first_ms=2.9)
+    resets = FrameResetsConfig(interval_ms=10, kick=0.3 / 0.17, first_ms=2.9)
     whole = events_of([(t * MS, light) for t in range(12)], resets)
     camera = EventCamera(EXACT, ReadoutConfig(frame_resets=resets), H, W, 0)
     parts = [camera.step(EventFrame(t * MS, light, (3, 5) if t else None)) for t in range(12)]
@@ -71,6 +71,21 @@ def test_codes_and_rows_are_as_light_and_whole_frames():
     codes = EventCamera(EXACT, ReadoutConfig(frame_resets=resets), H, W, 0)
     coded = [codes.step(EventFrame(t * MS, np.full((H, W), 80, np.uint8))) for t in range(12)]
     assert len(Events.concatenate(coded)) == 2 * H * W and codes.tensor_device is None
+
+
+@pytest.mark.parametrize(
+    ("config", "expected"),
+    [
+        (V2eConfig(preset="clean"), 1.0),  # from the middle, as far as one level
+        (VoltmeterConfig(k1=5.0), 5 * np.log((153 * np.exp(0.3) + 20) / 173)),  # from anywhere between two levels
+    ],
+)
+def test_a_jump_of_one_and_a_half_thresholds_by_any_emulator(config, expected):
+    light = [(t * MS, np.full((H, W), 0.6, np.float32)) for t in range(40)]
+    events = events_of(light, FrameResetsConfig(interval_ms=100, kick=1.5, length_ms=2, first_ms=10), config)
+    quiet = events_of(light, None, config)
+    on = events.window(10_000, 12_500).p.sum() - quiet.window(10_000, 12_500).p.sum()
+    assert abs(on / (H * W) - expected) < 0.1
 
 
 def test_a_jump_that_lasts_into_the_next_is_refused():

@@ -120,12 +120,8 @@ class SequenceWriter:
         codec: str = "zstd",
     ):
         self.final = Path(final)
-        self.height, self.width, self.config_yaml, self.t_offset_us = (
-            int(height),
-            int(width),
-            config_yaml,
-            int(t_offset_us),
-        )
+        self.height, self.width = int(height), int(width)
+        self.config_yaml, self.t_offset_us = config_yaml, int(t_offset_us)
         self.labels = labels
         self.info: dict[str, Any] = {}
         self.t_end_us: int | None = None
@@ -325,13 +321,8 @@ class SequenceWriter:
                 if path.is_file() and name not in self._files:
                     fsync(path)
                     self._files[name] = digest_of(path)
-            manifest = {
-                "format": self.kind,
-                "format_version": 2,
-                **self._about(),
-                **self.info,
-                "files": self._files,
-            }
+            about = {"format": self.kind, "format_version": 2, **self._about(), **self.info}
+            manifest = {**about, "files": self._files}
             path = self._tmp / MANIFEST
             path.write_text(sealed(manifest, default=_plain), encoding="utf-8")
             fsync(path)

@@ -49,7 +49,7 @@ FLOORS = (
     "sequence",
     "dataset",
     "layouts online report",
-    "trade front eflow",
+    "trade front eflow viewer",
     "show shader_debugger",
     "cli __main__ tools",
 )

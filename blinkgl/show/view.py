@@ -27,9 +27,9 @@ def run(sequences: Sequence[str], *, port: int | None = None, save: str | None =
     """Serves the sequences until interrupted, or writes one of them as a file. Raises ConfigError: no viser, more than
     one sequence for a file; AssetError: no sequence; OutputError: a port in use, a file that exists."""
     check_extra("view")
-    from blinkgl.viewer.recording import recordings_in
+    from blinkgl.viewer.views import sequences_in
 
-    folders = [folder for path in sequences for folder in recordings_in(path)]
+    folders = [folder for path in sequences for folder in sequences_in(path)]
     console = plain_console()
     if save is not None:
         return _save(console, folders, Path(save), port, overwrite)
@@ -42,7 +42,7 @@ def run(sequences: Sequence[str], *, port: int | None = None, save: str | None =
         for folder in folders:
             page.add(folder)
         page.draw()
-        if page.recording is None and page.problem is not None:
+        if page.sequence is None and page.problem is not None:
             raise page.problem
         say(console, f"{server.url}  (open it in a browser; Ctrl-C ends it)")
         page.run()

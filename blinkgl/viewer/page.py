@@ -11,9 +11,9 @@ import numpy as np
 
 from blinkgl.errors import BlinkGLError
 from blinkgl.io.atomic import atomic_file, output_errors
-from blinkgl.viewer.recording import Picture, Recording
 from blinkgl.viewer.server import LocalServer
 from blinkgl.viewer.stage import FOV, LAYERS, Stage
+from blinkgl.viewer.views import Picture, SequenceView
 
 SPEEDS = ("1x", "1/2x", "1/5x", "1/10x", "1/20x", "1/50x", "1/100x")
 _TICK_S = 0.05
@@ -33,7 +33,7 @@ class Page:
     def __init__(self, server: LocalServer):
         self.server = server
         self.folders: dict[str, Path] = {}
-        self.recording: Recording | None = None
+        self.sequence: SequenceView | None = None
         self.problem: BlinkGLError | None = None
         self._chosen = ""
         self._changed, self._ended = threading.Event(), False
@@ -58,11 +58,11 @@ class Page:
         last = time.monotonic()
         while not self._ended:
             now = time.monotonic()
-            if self.recording is not None and self._playing:
+            if self.sequence is not None and self._playing:
                 self._advance(now - last)
             last = now
             self.draw()
-            self._changed.wait(_TICK_S if self.recording is not None and self._playing else 0.5)
+            self._changed.wait(_TICK_S if self.sequence is not None and self._playing else 0.5)
 
     def end(self) -> None:
         self._ended = True
@@ -77,7 +77,7 @@ class Page:
             if self._stale and self._chosen:
                 self._stale = False
                 self._open(self._chosen)
-            if self.recording is not None:
+            if self.sequence is not None:
                 with self.server.atomic():
                     self._show()
         except BlinkGLError as error:
@@ -92,24 +92,24 @@ class Page:
 
     def _open(self, name: str) -> None:
         """Builds the page of a sequence, unless it is there already and only the list has grown."""
-        if self.recording is not None and self.recording.folder == self.folders[name]:
+        if self.sequence is not None and self.sequence.folder == self.folders[name]:
             if len(self.folders) > 1 and self._choice is None:
                 self._add_choice()
             elif self._choice is not None:
                 self._choice.options = tuple(self.folders)
             return
-        recording = Recording(self.folders[name])
-        if self.recording is not None:
-            self.recording.close()
-        self.recording = recording
+        sequence = SequenceView(self.folders[name])
+        if self.sequence is not None:
+            self.sequence.close()
+        self.sequence = sequence
         self.server.scene.reset()
         self.server.gui.reset()
-        self.stage = Stage(self.server.scene, recording)
-        self._controls(recording)
-        self._panels(recording)
-        self._look_at("world" if recording.has_space else "events")
+        self.stage = Stage(self.server.scene, sequence)
+        self._controls(sequence)
+        self._panels(sequence)
+        self._look_at("world" if sequence.has_space else "events")
 
-    def _controls(self, recording: Recording) -> None:
+    def _controls(self, sequence: SequenceView) -> None:
         gui = self.server.gui
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_CONTROLS_PX)
@@ -117,8 +117,8 @@ class Page:
         self._choice: Any = None
         if len(self.folders) > 1:
             self._add_choice()
-        gui.add_markdown(_about(recording))
-        start, end = recording.start_us / 1000, recording.end_us / 1000
+        gui.add_markdown(_about(sequence))
+        start, end = sequence.start_us / 1000, sequence.end_us / 1000
         step = 10.0 ** np.floor(np.log10((end - start) / 500))
         self._time = gui.add_slider("time, ms", start, end, float(step), start + (end - start) / 2)
         self._playing = False
@@ -126,15 +126,16 @@ class Page:
         self._play.on_click(lambda _: self._toggle())
         self._speed: Any = gui.add_dropdown("speed", SPEEDS, initial_value=SPEEDS[3])
         self._windows, self._layers = [], {}
-        if with_events := [s for s in recording.sensors if s.event_count]:
+        if with_events := [s for s in sequence.sensors if s.event_count]:
             usual = with_events[0].usual_window_us() / 1000
             for said, long in (("events of, ms", usual), ("in space of, ms", SPACE_WINDOWS * usual)):
                 self._windows.append(gui.add_slider(said, 0.1, max(100.0, long), 0.1, float(long)))
         with gui.add_folder("in space"):
-            looks = [name for name, there in (("world", recording.has_space), ("events", with_events)) if there]
-            look = gui.add_button_group("look at", looks)
-            look.on_click(lambda event: self._look_at(event.target.value))
-            if recording.has_space:
+            looks = [name for name, there in (("world", sequence.has_space), ("events", with_events)) if there]
+            if looks:
+                look = gui.add_button_group("look at", looks)
+                look.on_click(lambda event: self._look_at(event.target.value))
+            if sequence.has_space:
                 there = [name for name in LAYERS if self.stage.has(name)]
                 self._layers = {name: gui.add_checkbox(LAYERS[name], True) for name in there}
         for one in (self._time, *self._windows, *self._layers.values()):
@@ -156,15 +157,15 @@ class Page:
 
         self._choice.on_update(chosen)
 
-    def _panels(self, recording: Recording) -> None:
+    def _panels(self, sequence: SequenceView) -> None:
         """The pictures, a tab for each camera and one for each inertial unit."""
         panel = self.server.gui.add_panel()
         panel.dock_left()
         panel.set_width(_PICTURES_PX)
         self._images: dict[str, dict[str, Any]] = {}
-        self._tabs = {sensor.name: panel.add_tab(sensor.name) for sensor in recording.sensors}
+        self._tabs = {sensor.name: panel.add_tab(sensor.name) for sensor in sequence.sensors}
         self._curves = []
-        for name, unit in recording.units.items():
+        for name, unit in sequence.units.items():
             with panel.add_tab(name):
                 self._curves += [self._curve(unit, *what) for what in (("rate", "rad/s"), ("acceleration", "m/s²"))]
 
@@ -189,11 +190,11 @@ class Page:
     # ---- a moment ------------------------------------------------------------------------------------------------
 
     def _show(self) -> None:
-        recording = self.recording
-        assert recording is not None
+        sequence = self.sequence
+        assert sequence is not None
         t_us = round(1000 * self._time.value)
         window_us, long_us = [max(1, round(1000 * one.value)) for one in self._windows] or (1, 1)
-        pictures = {sensor.name: sensor.pictures(t_us, window_us) for sensor in recording.sensors}
+        pictures = {sensor.name: sensor.pictures(t_us, window_us) for sensor in sequence.sensors}
         for name, found in pictures.items():
             for one in found:
                 self._picture(name, one)
@@ -218,8 +219,6 @@ class Page:
 
     def _look_at(self, what: str) -> None:
         """Shows the world, or the events beside it, and turns every browser's view there."""
-        recording = self.recording
-        assert recording is not None
         self.stage.world.visible, self.stage.space.visible = what == "world", what == "events"
         eye, at = self.stage.views()[what]
         cameras = [client.camera for client in self.server.get_clients().values()]
@@ -236,9 +235,9 @@ def _speed(said: str) -> float:
     return float(whole) / float(part or 1)
 
 
-def _about(recording: Recording) -> str:
-    lines = [f"**{recording.name}**, {(recording.end_us - recording.start_us) / 1e6:g} s"]
-    for sensor in recording.sensors:
+def _about(sequence: SequenceView) -> str:
+    lines = [f"**{sequence.name}**, {(sequence.end_us - sequence.start_us) / 1e6:g} s"]
+    for sensor in sequence.sensors:
         source = sensor.source
         events = f", {sensor.event_count:,} events" if sensor.event_count else ""
         emulator = f", {source.manifest['emulator']}" if source.manifest.get("emulator") else ""
@@ -248,23 +247,23 @@ def _about(recording: Recording) -> str:
 
 def save(folder: Path, out: Path) -> None:
     """Writes a sequence as one HTML file that plays without a server: the world, the events, and all pictures on a
-    wall. Raises AssetError as :class:`Recording`, OutputError."""
-    recording, server = Recording(folder), LocalServer(0)
+    wall. Raises AssetError as :class:`SequenceView`, OutputError."""
+    sequence, server = SequenceView(folder), LocalServer(0)
     try:
-        stage = Stage(server.scene, recording, pictures=True)
+        stage = Stage(server.scene, sequence, pictures=True)
         begins = server.initial_camera
         begins.position, begins.look_at = stage.views()["all"]
         begins.fov = FOV
-        windows = [s.usual_window_us() for s in recording.sensors if s.event_count]
+        windows = [s.usual_window_us() for s in sequence.sensors if s.event_count]
         window_us = windows[0] if windows else 1
-        times = np.linspace(recording.start_us, recording.end_us, SAVED_STEPS + 1)[1:].astype(np.int64)
+        times = np.linspace(sequence.start_us, sequence.end_us, SAVED_STEPS + 1)[1:].astype(np.int64)
         film = server.get_scene_serializer()
         for t_us in times.tolist():
-            pictures = {s.name: s.pictures(t_us, window_us) for s in recording.sensors}
+            pictures = {s.name: s.pictures(t_us, window_us) for s in sequence.sensors}
             stage.show(t_us, SPACE_WINDOWS * window_us, pictures)
             film.insert_sleep(SAVED_S / SAVED_STEPS)
         with atomic_file(out) as path, output_errors(out):
             path.write_text(film.as_html(), encoding="utf-8")
     finally:
         server.stop()
-        recording.close()
+        sequence.close()

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from blinkgl.viewer.recording import Body, Cloud, Picture, Recording, Sensor
+from blinkgl.viewer.views import Body, CameraView, Cloud, Picture, SequenceView
 
 if TYPE_CHECKING:
     import viser
@@ -31,24 +31,24 @@ FOV = math.radians(45)
 
 
 class Stage:
-    """The nodes of a recording: ``/world`` in its own axes (z up) and units, ``/events`` beside it, on request
+    """The nodes of a sequence: ``/world`` in its own axes (z up) and units, ``/events`` beside it, on request
     ``/pictures`` on the other side."""
 
-    def __init__(self, scene: viser.SceneApi, recording: Recording, *, pictures: bool = False):
-        self._scene, self._recording = scene, recording
-        self._middle, self._radius = recording.extent()
-        self._turn = _facing(recording)
+    def __init__(self, scene: viser.SceneApi, sequence: SequenceView, *, pictures: bool = False):
+        self._scene, self._sequence = scene, sequence
+        self._middle, self._radius = sequence.extent()
+        self._turn = _facing(sequence)
         self._with_pictures = pictures
         self._shown: dict[str, Any] = {}
         self.world = scene.add_frame("/world", show_axes=False)
         self.space = scene.add_frame(
             "/events", show_axes=False, wxyz=_wxyz(self._turn), position=self._aside(_EVENTS_AT * self._radius)
         )
-        self._cameras = [self._camera(s) for s in recording.sensors if s.source.camera and s.source.poses]
-        self._volumes = [s for s in recording.sensors if s.event_count]
+        self._cameras = [self._camera(s) for s in sequence.sensors if s.source.camera and s.source.poses]
+        self._volumes = [s for s in sequence.sensors if s.event_count]
         for k, sensor in enumerate(self._volumes):
             self._volume(sensor, k)
-        if recording.has_space:
+        if sequence.has_space:
             size = 4 * self._radius
             scene.add_grid("/world/grid", size, size, cell_size=size / 40, section_size=size / 8, cell_color=(225,) * 3,
                            section_color=(200,) * 3, position=(*self._middle[:2], 0.0))  # fmt: skip
@@ -75,7 +75,7 @@ class Stage:
 
     def has(self, layer: str) -> bool:
         """Whether there is anything of a layer of the world."""
-        sensors, start = self._recording.sensors, self._recording.start_us
+        sensors, start = self._sequence.sensors, self._sequence.start_us
         found = {
             "points": lambda s: s.depth_cloud(start),
             "boxes": lambda s: s.bodies(start) or None,
@@ -85,7 +85,7 @@ class Stage:
 
     # ---- what stays ----------------------------------------------------------------------------------------------
 
-    def _camera(self, sensor: Sensor) -> tuple[Sensor, Any]:
+    def _camera(self, sensor: CameraView) -> tuple[CameraView, Any]:
         camera = sensor.source.camera
         assert camera is not None
         fx, fy, _, _ = camera.intrinsics
@@ -105,7 +105,7 @@ class Stage:
             self._lines(f"/world/paths/{sensor.name}", segments, _PALE)
         return sensor, frustum
 
-    def _volume(self, sensor: Sensor, k: int) -> None:
+    def _volume(self, sensor: CameraView, k: int) -> None:
         """The frame in which a window of events stands, and its words; its points come with the time."""
         tall, size = sensor.source.height / sensor.source.width, self._radius
         corners = (_EDGES - [0.5, 1.0, 0.5]) * [1, _DEPTH, tall] * size
@@ -142,21 +142,22 @@ class Stage:
             if image is not None:
                 frustum.image = image
         self._bodies(t_us, "boxes" in layers)
-        with_depth = [c for s in self._recording.sensors if (c := self._depth(s, t_us)) is not None][:1]
-        self._cloud("/world/points", with_depth, 0.006 * self._radius, "points" in layers)
-        followed = [c for s in self._recording.sensors if (c := s.track_cloud(t_us)) is not None]
+        # Of one camera: those of a rig see much the same.
+        seen = next((c for s in self._sequence.sensors if (c := self._depth(s, t_us)) is not None), None)
+        self._cloud("/world/points", [] if seen is None else [seen], 0.006 * self._radius, "points" in layers)
+        followed = [c for s in self._sequence.sensors if (c := s.track_cloud(t_us)) is not None]
         self._cloud("/world/tracks", followed, 0.012 * self._radius, "tracks" in layers)
         for sensor in self._volumes:
             self._events(sensor, t_us, window_us, pictures[sensor.name])
         if self._with_pictures:
             self._wall(pictures)
 
-    def _depth(self, sensor: Sensor, t_us: int) -> Cloud | None:
+    def _depth(self, sensor: CameraView, t_us: int) -> Cloud | None:
         """The cloud of the label's time, made once."""
-        key = ("depth", sensor.name, sensor.label(t_us))
-        if self._shown.get("depth key") != key:
-            self._shown["depth key"], self._shown["depth"] = key, sensor.depth_cloud(t_us)
-        return self._shown["depth"]
+        key, k = f"depth {sensor.name}", sensor.label(t_us)
+        if self._shown.get(key, (None,))[0] != k:
+            self._shown[key] = (k, sensor.depth_cloud(t_us))
+        return self._shown[key][1]
 
     def _cloud(self, name: str, clouds: list[Cloud], size: float, visible: bool) -> None:
         if not clouds:
@@ -173,7 +174,7 @@ class Stage:
         self._shown[name] = (node, points)
 
     def _bodies(self, t_us: int, visible: bool) -> None:
-        bodies: dict[str, Body] = {b.name: b for s in reversed(self._recording.sensors) for b in s.bodies(t_us)}
+        bodies: dict[str, Body] = {b.name: b for s in reversed(self._sequence.sensors) for b in s.bodies(t_us)}
         for body in bodies.values():
             segments = ((_EDGES - 0.5) * body.size).astype(np.float32)
             known = self._shown.get(f"box {body.name}")
@@ -183,7 +184,7 @@ class Stage:
             known[0].position, known[0].wxyz = body.pose[:3, 3], _wxyz(body.pose)
             known[0].visible = visible
 
-    def _events(self, sensor: Sensor, t_us: int, window_us: int, pictures: list[Picture]) -> None:
+    def _events(self, sensor: CameraView, t_us: int, window_us: int, pictures: list[Picture]) -> None:
         (points, on), size, root = sensor.event_points(t_us, window_us), self._radius, f"/events/{sensor.name}"
         points = points[:, [0, 2, 1]] * [1, -_DEPTH, -1]
         for name, which, colour in (("ON", on, _ON), ("OFF", ~on, _OFF)):
@@ -232,10 +233,10 @@ class Stage:
         )
 
 
-def _facing(recording: Recording) -> np.ndarray:
+def _facing(sequence: SequenceView) -> np.ndarray:
     """(3, 3) columns right, forward, up: level, and as the first camera looks when it begins."""
-    for sensor in recording.sensors:
-        pose = sensor.camera_pose(recording.start_us)
+    for sensor in sequence.sensors:
+        pose = sensor.camera_pose(sequence.start_us)
         if pose is not None and np.linalg.norm(pose[:2, 2]) > 1e-6:
             forward = np.array([*pose[:2, 2], 0.0]) / np.linalg.norm(pose[:2, 2])
             return np.stack([np.cross(forward, [0, 0, 1]), forward, [0, 0, 1]], axis=1)

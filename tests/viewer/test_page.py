@@ -54,8 +54,8 @@ def page_of(*folders):
         page.draw()
         yield page
     finally:
-        if page.recording is not None:
-            page.recording.close()
+        if page.sequence is not None:
+            page.sequence.close()
         server.stop()
 
 
@@ -67,18 +67,18 @@ def test_a_camera_its_world_and_its_events_are_in_the_scene(made):
     with page_of(made.single) as page:
         there = ("/world/cameras/camera", "/world/points", "/world/tracks", "/events/camera/ON", "/events/camera/OFF")
         assert nodes(page, *there) == list(there)
-        names = [str(n) for n in page.recording.sensors[0].source.poses["object_names"]]
+        names = [str(n) for n in page.sequence.sensors[0].source.poses["object_names"]]
         assert nodes(page, *(f"/world/boxes/{name}" for name in names)) == [
             f"/world/boxes/{name}" for name in names if name not in ("sky", "ground")
         ]
-        assert {*page._images["camera"]} == {p.heading for p in page.recording.sensors[0].pictures(7_100_000, 1000)}
+        assert {*page._images["camera"]} == {p.heading for p in page.sequence.sensors[0].pictures(7_100_000, 1000)}
         assert len(page._curves) == 2
         assert [*page._layers] == ["points", "boxes", "tracks"]
 
 
 def test_the_slider_moves_everything(made):
     with page_of(made.single) as page:
-        sensor = page.recording.sensors[0]
+        sensor = page.sequence.sensors[0]
         frustum = page.server.scene.get_handle_by_name("/world/cameras/camera")
         for t_ms, label in ((7100, 0), (7200, 1)):
             page._time.value = float(t_ms)
@@ -119,21 +119,21 @@ def test_sequences_are_chosen_and_come_while_others_are_shown(made):
         page.add(made.rig)
         page.draw()
         assert page._choice.options == ("single_000000", "rig_000000")
-        assert page.recording.folder == made.single
+        assert page.sequence.folder == made.single
         page._choice.value = "rig_000000"
         page._chosen, page._stale = page._choice.value, True
         page._changed.set()
         page.draw()
-        assert page.recording.folder == made.rig
+        assert page.sequence.folder == made.rig
         assert nodes(page, "/world/cameras/camera", "/world/cameras/left") == ["/world/cameras/left"]
 
 
 def test_a_damaged_sequence_is_said_on_the_page_and_the_others_stay(made, tmp_path):
     damaged = shutil.copytree(made.single, tmp_path / "damaged")
     with page_of(damaged, made.rig) as page:
-        assert page.recording is not None
+        assert page.sequence is not None
         (damaged / "depth/000000.npy").write_bytes(b"")
-        page.recording.sensors[0]._known.clear()
+        page.sequence.sensors[0]._known.clear()
         page._time.value = 7100.0
         page._changed.set()
         page.draw()

@@ -14,7 +14,7 @@ from blinkgl.io.boxes import read_boxes
 from blinkgl.io.tracks import read_tracks
 from blinkgl.sequence_files.sequence_dir import SequenceWriter
 from blinkgl.types.events import Events
-from blinkgl.viewer.recording import MAX_EVENTS, Recording, recordings_in
+from blinkgl.viewer.views import MAX_EVENTS, SequenceView, sequences_in
 from recipes import RIG, SINGLE
 
 
@@ -37,13 +37,13 @@ def rig(tmp_path_factory):
 
 @pytest.fixture
 def sensor(single):
-    recording = Recording(single)
-    yield recording.sensors[0]
-    recording.close()
+    sequence = SequenceView(single)
+    yield sequence.sensors[0]
+    sequence.close()
 
 
 def test_every_label_has_its_picture_and_what_lacks_has_none(single, rig):
-    with_all = Recording(single).sensors[0].pictures(7_150_000, 5000)
+    with_all = SequenceView(single).sensors[0].pictures(7_150_000, 5000)
     assert [one.heading for one in with_all] == [
         "frame", "frame camera", "events", "forward flow", "backward flow", "depth", "instance id", "normals",
         "occluded, forward", "occluded, backward", "semantics",
@@ -52,7 +52,7 @@ def test_every_label_has_its_picture_and_what_lacks_has_none(single, rig):
         assert one.image.dtype == np.uint8
         assert one.image.shape[2] == 3
         assert one.image.std() > 0, one.heading
-    left, right, rgb = Recording(rig).sensors
+    left, right, rgb = SequenceView(rig).sensors
     assert [one.heading for one in left.pictures(100_000, 5000)] == ["frame", "events", "forward flow", "depth"]
     assert [one.heading for one in right.pictures(100_000, 5000)] == ["frame", "events", "forward flow", "depth"]
     assert [one.heading for one in rgb.pictures(100_000, 5000)] == ["frame camera"]
@@ -147,11 +147,11 @@ def test_tracked_points_are_seen_where_the_tracks_say(single, sensor):
 
 
 def test_a_rig_has_all_its_cameras_and_units_on_one_clock(rig):
-    recording = Recording(rig)
-    assert [one.name for one in recording.sensors] == ["left", "right", "rgb"]
-    assert list(recording.units) == ["imu"]
-    assert (recording.start_us, recording.end_us) == (0, 200_000)
-    middle, radius = recording.extent()
+    sequence = SequenceView(rig)
+    assert [one.name for one in sequence.sensors] == ["left", "right", "rgb"]
+    assert list(sequence.units) == ["imu"]
+    assert (sequence.start_us, sequence.end_us) == (0, 200_000)
+    middle, radius = sequence.extent()
     assert radius > 0
     assert np.isfinite(middle).all()
 
@@ -163,10 +163,10 @@ def test_events_alone_are_a_recording_without_space(tmp_path):
         x, y, p = (np.uint16(t % 16), np.uint16(t % 12), np.uint8(t // 100 % 2))
         writer.append_events(Events(x, y, t, p))
         writer.info = {"duration_us": 10_000}
-    recording = Recording(folder)
-    assert not recording.has_space
-    assert recording.extent()[1] == 1.0
-    (sensor,) = recording.sensors
+    sequence = SequenceView(folder)
+    assert not sequence.has_space
+    assert sequence.extent()[1] == 1.0
+    (sensor,) = sequence.sensors
     assert [one.heading for one in sensor.pictures(5_010_000, 1000)] == ["events"]
     assert len(sensor.events(5_010_000, 1000)) == 10
     assert sensor.depth_cloud(5_010_000) is None
@@ -177,16 +177,16 @@ def test_an_empty_sequence_is_refused(tmp_path):
     with SequenceWriter(tmp_path / "nothing", 12, 16, config_yaml="{}", events=False) as writer:
         writer.info = {"duration_us": 1000}
     with pytest.raises(AssetError, match="nothing: an empty sequence: it has nothing to show"):
-        Recording(tmp_path / "nothing")
+        SequenceView(tmp_path / "nothing")
 
 
 def test_what_is_no_sequence_is_refused(tmp_path, single):
     with pytest.raises(AssetError, match="no such folder"):
-        recordings_in(tmp_path / "gone")
+        sequences_in(tmp_path / "gone")
     with pytest.raises(AssetError, match="no sequence in it"):
-        recordings_in(tmp_path)
-    assert recordings_in(single.parents[1]) == [single]
+        sequences_in(tmp_path)
+    assert sequences_in(single.parents[1]) == [single]
     damaged = shutil.copytree(single, tmp_path / "damaged")
     (damaged / "poses.npz").unlink()
     with pytest.raises(AssetError, match=r"damaged sequence: poses\.npz: missing"):
-        Recording(damaged)
+        SequenceView(damaged)

@@ -26,7 +26,7 @@ from blinkgl.labels import LABELS
 from blinkgl.layouts.source import Source
 from blinkgl.sequence_files.index import made_folders
 from blinkgl.sequence_files.rig_dir import read_rig
-from blinkgl.sequence_files.sequence_dir import is_rig_folder
+from blinkgl.sequence_files.sequence_dir import MANIFEST, is_rig_folder
 from blinkgl.types.boxes import Boxes
 from blinkgl.types.events import Events
 
@@ -64,7 +64,7 @@ class Body:
     pose: np.ndarray
 
 
-class Sensor:
+class CameraView:
     """What one camera of a sequence has to show."""
 
     def __init__(self, source: Source, name: str):
@@ -279,25 +279,22 @@ def _inside(points: np.ndarray, body: Body) -> np.ndarray:
     return np.all(abs(local) <= 0.51 * body.size + 1e-3, axis=1)
 
 
-class Recording:
+class SequenceView:
     """A sequence, or a rig's: its cameras and inertial units, on one clock."""
 
     def __init__(self, folder: Path):
         """Raises AssetError: damaged, or there is nothing in it to show."""
         self.folder, self.name = folder, folder.name
-        units = [folder]
-        if is_rig_folder(folder):
-            names = [name for name in read_rig(folder) if (folder / name).is_dir()]
-            units = [folder / name for name in names]
-            cameras = [folder / name for name in names if (folder / name / "manifest.json").is_file()]
-        else:
-            cameras = units
-        self.sensors = [Sensor(Source.open(one), one.name if len(units) > 1 else "camera") for one in cameras]
-        self.units = {one.name if len(units) > 1 else "imu": read_imu(one) for one in units if (one / IMU).is_file()}
+        rig = is_rig_folder(folder)
+        places = {name: folder / name for name in read_rig(folder)} if rig else {"camera": folder}
+        cameras = {name: place for name, place in places.items() if (place / MANIFEST).is_file()}
+        self.sensors = [CameraView(Source.open(place), name) for name, place in cameras.items()]
+        units = {name if rig else "imu": place for name, place in places.items() if (place / IMU).is_file()}
+        self.units = {name: unit for name, place in units.items() if len((unit := read_imu(place))["t_ns"]) > 1}
         self.start_us = min((s.source.start_us for s in self.sensors), default=0)
         self.end_us = max((s.source.end_us for s in self.sensors), default=0)
         for unit in self.units.values():
-            self.end_us = max(self.end_us, int(unit["t_ns"][-1] // 1000) if len(unit["t_ns"]) else 0)
+            self.end_us = max(self.end_us, int(unit["t_ns"][-1] // 1000))
         if self.end_us <= self.start_us or not (self.units or any(s.pictures(self.end_us, 1) for s in self.sensors)):
             raise AssetError("an empty sequence: it has nothing to show", where=str(folder))
 
@@ -319,7 +316,7 @@ class Recording:
             sensor.close()
 
 
-def recordings_in(path: str | Path) -> list[Path]:
+def sequences_in(path: str | Path) -> list[Path]:
     """Folders of the sequences at or below a path, in order; of a rig its own. Raises AssetError: there are none."""
     path = Path(path)
     if not path.is_dir():

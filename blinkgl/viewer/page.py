@@ -86,7 +86,7 @@ class Page:
 
     def _advance(self, seconds: float) -> None:
         later = self._time.value + 1000 * seconds * _speed(self._speed.value)
-        self._time.value = self._time.min + (later - self._time.min) % (self._time.max - self._time.min)
+        self._time.value = round(self._time.min + (later - self._time.min) % (self._time.max - self._time.min), 2)
 
     # ---- one sequence --------------------------------------------------------------------------------------------
 

@@ -211,13 +211,14 @@ class Stage:
             )
         for number, (name, image) in enumerate(found):
             row, column = divmod(number, columns)
-            if self._shown.get(name) is not None and np.array_equal(self._shown[name], image):
-                continue
-            self._shown[name] = image
             at = size * np.array([column - (columns - 1) / 2, 0, 0.95 * ((columns - 1) / 2 - row)])
-            key = f"/pictures/{name.replace('/', ' ')}"
-            self._image(key, _small(image), at, 0.96 * size)
-            self._label(f"{key}/name", name, (0, -0.53 * size * image.shape[0] / image.shape[1], 0))
+            known, plain = self._shown.get(name), name.replace("/", " ")
+            if known is None:  # beside the picture: what is below a node goes when that is made anew
+                above = (0, 0, 0.53 * size * image.shape[0] / image.shape[1])
+                self._label(f"/pictures/names/{plain}", name, at + above)
+            if known is None or not np.array_equal(known, image):
+                self._image(f"/pictures/{plain}", _small(image), at, 0.96 * size)
+            self._shown[name] = image
 
     def _image(self, name: str, image: np.ndarray, at: Sequence[float] | np.ndarray, width: float) -> None:
         """A picture that stands upright: viser's lie in x and y, with y down."""

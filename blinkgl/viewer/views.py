@@ -22,7 +22,7 @@ from blinkgl.io.imu import H5 as IMU, read_imu
 from blinkgl.io.overlays import TrackLines, with_boxes, with_tracks
 from blinkgl.io.pictures import id_colours, picture
 from blinkgl.io.tracks import TRACKS, read_tracks
-from blinkgl.labels import LABELS
+from blinkgl.labels import LABELS, Label
 from blinkgl.layouts.source import Source
 from blinkgl.sequence_files.index import made_folders
 from blinkgl.sequence_files.rig_dir import read_rig
@@ -139,7 +139,7 @@ class CameraView:
 
     def _of_label(self, k: int) -> list[Picture]:
         found = []
-        for label in sorted(LABELS.values(), key=lambda label: label.kind != "motion"):
+        for label in sorted(LABELS.values(), key=_rank):
             form = label.forms[0]
             if form.read is None or not self.source.has(form.file(k)):
                 continue
@@ -271,6 +271,11 @@ class CameraView:
     def close(self) -> None:
         if self._events is not None:
             self._events.close()
+
+
+def _rank(label: Label) -> int:
+    """Flow first, then what else is motion; the rest as the table has it."""
+    return 2 if label.kind != "motion" else int(label.towards is None)
 
 
 def _inside(points: np.ndarray, body: Body) -> np.ndarray:

@@ -14,7 +14,9 @@ SINGLE = {
     "scene": _SCENE,
     "labels": {
         "flow": ["forward", "backward"],
-        **dict.fromkeys(("images", "occlusion", "depth", "ids", "boxes", "normals", "semantics"), True),
+        **dict.fromkeys(
+            ("images", "occlusion", "depth", "ids", "boxes", "normals", "semantics", "velocity", "scene_flow"), True
+        ),
     },
     "tracks": {"points": 20, "choose": "surface", "rate": 20},
     "imu": {"preset": "ideal", "rate": 100},
@@ -28,7 +30,7 @@ RIG = {
     "time": {"duration": 0.1, "label_rate": 10},
     "timeline": {"kind": "uniform", "fps": 60},
     "scene": _SCENE,
-    "labels": {"flow": ["forward"], "depth": True, "occlusion": False},
+    "labels": {"flow": ["forward"], "depth": True, "disparity": True, "occlusion": False},
     "sensors": [
         {"name": "rgb", "camera": {"width": 48, "height": 32}, "images": {"rate": 20}},
         {"name": "imu", "imu": {"preset": "ideal", "rate": 100}},

@@ -45,16 +45,17 @@ def sensor(single):
 def test_every_label_has_its_picture_and_what_lacks_has_none(single, rig):
     with_all = SequenceView(single).sensors[0].pictures(7_150_000, 5000)
     assert [one.heading for one in with_all] == [
-        "frame", "frame camera", "events", "forward flow", "backward flow", "depth", "instance id", "normals",
-        "occluded, forward", "occluded, backward", "semantics",
+        "frame", "frame camera", "events", "forward flow", "backward flow", "velocity label", "depth", "instance id",
+        "normals", "occluded, forward", "occluded, backward", "scene flow", "semantics",
     ]  # fmt: skip
     for one in with_all:
         assert one.image.dtype == np.uint8
         assert one.image.shape[2] == 3
         assert one.image.std() > 0, one.heading
     left, right, rgb = SequenceView(rig).sensors
-    assert [one.heading for one in left.pictures(100_000, 5000)] == ["frame", "events", "forward flow", "depth"]
-    assert [one.heading for one in right.pictures(100_000, 5000)] == ["frame", "events", "forward flow", "depth"]
+    for eye in (left, right):
+        headings = [one.heading for one in eye.pictures(100_000, 5000)]
+        assert headings == ["frame", "events", "forward flow", "depth", "disparity"]
     assert [one.heading for one in rgb.pictures(100_000, 5000)] == ["frame camera"]
 
 

@@ -103,6 +103,9 @@ def generate(
         float,
         typer.Option(min=0, help="Seconds that one attempt at a sequence may take; 0: no limit. Needs --workers."),
     ] = 3600.0,
+    view: Annotated[
+        bool, typer.Option("--view", help="Show each sequence in the browser when it is whole (extra [view]).")
+    ] = False,
 ) -> int:
     """Generate event + optical-flow sequences from one YAML file. Exit status 3: done, but
     some sequences were set aside."""
@@ -121,7 +124,26 @@ def generate(
         resume=resume,
         mixed=mixed,
         time_limit_s=time_limit,
+        view=view,
     )
+
+
+@app.command()
+def view(
+    sequences: Annotated[
+        list[str], typer.Argument(metavar="SEQUENCE", help="Folders of sequences, or of data sets of them.")
+    ],
+    port: Annotated[int | None, typer.Option(help="Of 127.0.0.1 (default: the first free one from 8080 on).")] = None,
+    save: Annotated[
+        str | None, typer.Option("--save", metavar="FILE.html", help="Instead: one sequence as a file for any browser.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
+) -> int:
+    """Look at sequences in the browser: frames, events, labels and the scene in space (extra [view]). Ctrl-C ends
+    it."""
+    from blinkgl.show import view as command
+
+    return command.run(sequences, port=port, save=save, overwrite=overwrite)
 
 
 @app.command()

@@ -355,6 +355,7 @@ WHAT_TO_DO = [
     (lambda: M(np.full((4, 4, 3), 255.0)), "values beyond 1 (got 255.0); expected 0 to 1, or uint8 sRGB"),
     (lambda: M(colour=(1, 0, 0)), "expected 'color' (nearest)"),
     (lambda: P("cuboid", (0, 0, 1)), "too many positional arguments; expected Primitive(kind, material, pose, "),
+    (lambda: blinkgl.Material(texture="a.png"), "Material.texture: has another name; expected image=…"),
     (lambda: P("cuboid", size=1), "expected one of extents"),
     (lambda: b.Pose(positions=(1, 2, 3)), "expected 'position' (nearest)"),
     (lambda: b.look_at((0, 0, 0)), "expected look_at(position, target)"),

@@ -53,7 +53,7 @@ FLOORS = (
     "sequence",
     "dataset",
     "layouts online report",
-    "trade front eflow",
+    "trade front eflow viewer",
     "show shader_debugger",
     "cli cli_recordings __main__ tools",
 )

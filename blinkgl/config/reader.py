@@ -335,11 +335,12 @@ def shipped_runs() -> dict[str, Path]:
 
 def run_file(given: str | Path) -> Path:
     """The file ``given``, or, where there is none, the shipped run that it names: "demo", "demo.yaml" and
-    "configs/demo.yaml" are one. Raises ConfigError."""
+    "configs/demo.yaml" are one. (A folder is none: after ``generate demo --out demo`` there is one.) Raises
+    ConfigError."""
     path = Path(given)
-    if path.exists() or path.is_symlink():
-        return path
     shipped_one = shipped_runs().get(path.stem)
+    if (path.exists() or path.is_symlink()) and not (path.is_dir() and str(path) == path.stem and shipped_one):
+        return path
     named = shipped_one is not None and shipped_one.as_posix().endswith(f"/{path.with_suffix('.yaml').as_posix()}")
     if shipped_one is not None and (named or path.parent == Path()):
         return shipped_one

@@ -203,7 +203,9 @@ def _complete(
     camera = events or own.get("images") is not None
     keys = [key for key in INHERITED if key in tree and (events or key in ("camera", "sensor"))]
     sections = {key: own[key] for key in SECTIONS if key in own and (events or key not in ("events", "readout"))}
-    sections = merge({key: copy.deepcopy(tree[key]) for key in keys if camera}, sections)
+    above = {key: copy.deepcopy(tree[key]) for key in keys if camera}
+    _drop_other_focal(above.get("camera"), sections.get("camera"))
+    sections = merge(above, sections)
     if not events and "labels" not in own:
         sections["labels"] = {"images": False, "flow": []}
     if events:
@@ -214,6 +216,20 @@ def _complete(
         sections |= {"events": None, "readout": None}
     rest = {key: value for key, value in own.items() if key not in SECTIONS}
     return {**rest, **{key: sections[key] for key in SECTIONS if key in sections}}
+
+
+_FOCAL = (("fov",), ("focal",), ("fx", "fy"))
+"""Ways to say how long a lens is, of which a camera has one."""
+
+
+def _drop_other_focal(above: Any, own: Any) -> None:
+    """A sensor that says how long its lens is in one way does not have what the top says in another."""
+    if isinstance(above, dict) and isinstance(own, dict):
+        said = [keys for keys in _FOCAL if any(own.get(key) is not None for key in keys)]
+        for keys in _FOCAL:
+            for key in keys:
+                if said and keys not in said:
+                    above.pop(key, None)
 
 
 def check_pairs(sensors: Sequence[RigSensorConfig]) -> None:

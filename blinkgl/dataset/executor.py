@@ -35,7 +35,13 @@ _BAD_STARTS = 3
 
 
 class StartError(BlinkGLError):
-    """Workers ended before they could say why. What they wrote, which the message names, stays."""
+    """Workers ended before they could say why. What they wrote, which the message names, stays.
+
+    log : where that is."""
+
+    def __init__(self, problem: str, log: Path):
+        super().__init__(problem, where="--workers", accepted=f"see {log}")
+        self.log = log
 
 
 class Executor(Protocol):
@@ -125,9 +131,7 @@ class Local:
         while len(hellos) < self._wanted:
             hellos += [m for m in self.poll(1.0) if m["kind"] == "hello"]
             if time.monotonic() > deadline:
-                raise StartError(
-                    f"workers did not start within {_START_S:.0f} s", where="--workers", accepted=f"see {self._log(0)}"
-                )
+                raise StartError(f"workers did not start within {_START_S:.0f} s", self._log(0))
         return hellos
 
     def free(self) -> int:
@@ -202,7 +206,7 @@ class Local:
         if not process.ready:
             self._bad_starts += 1
             if self._bad_starts >= _BAD_STARTS:
-                raise StartError(f"workers cannot start: {how}", where="--workers", accepted=f"see {process.log}")
+                raise StartError(f"workers cannot start: {how}", process.log)
         self._start(process.slot)
         return (
             []

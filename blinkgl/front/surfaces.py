@@ -74,6 +74,8 @@ class Material(Piece):
     Raises ConfigError."""
 
     def __init__(self, image: str | os.PathLike | np.ndarray | None = None, **keys: Any):
+        if "texture" in keys:  # the YAML's name, which would be lost below the one of here
+            raise ConfigError("has another name", where="Material.texture", accepted="image=…, as in Material(image)")
         maps = {key: keys[key] for key in MAPS if keys.get(key) is not None}
         self.maps = {key: _map(map_, key) for key, map_ in maps.items() if not _is_file(map_)}
         self.image: data.Texture | None = None

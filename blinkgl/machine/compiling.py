@@ -8,6 +8,7 @@ the figure is 0. It is no part of what anything costs, so it must not be in anyb
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 from numba.core import event
 
@@ -18,11 +19,15 @@ class _Watch(event.Listener):
 
     def __init__(self) -> None:
         self.seconds, self._depth, self._began = 0.0, 0, 0.0
+        self.say: Callable[[str], None] | None = None
 
     def on_start(self, event: event.Event) -> None:
         self._depth += 1
         if self._depth == 1:
             self._began = time.perf_counter()
+            if self.say is not None:
+                say, self.say = self.say, None
+                say("compiling kernels, once per machine: this may take a minute or two")
 
     def on_end(self, event: event.Event) -> None:
         self._depth -= 1
@@ -37,6 +42,12 @@ event.register("numba:compile", _watch)
 def compiled_s() -> float:
     """Wall seconds spent compiling kernels in this process so far; loading them from disk does not count."""
     return _watch.seconds
+
+
+def announce_compiling(say: Callable[[str], None]) -> None:
+    """Calls ``say`` with a sentence when the next kernel is compiled, and never again: a program that prints nothing
+    for a minute looks as if it hung."""
+    _watch.say = say
 
 
 def working_clock() -> float:

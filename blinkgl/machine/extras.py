@@ -17,11 +17,11 @@ EXTRAS = {  # extra of setup.cfg -> (distributions, what they are for)
     "cluster": (("ray",), "many machines"),
     "physics": (("mujoco",), "scenes in which things fall"),
     "formats": (("faery",), "checks of EVT2 and EVT3, which need nothing"),
-    "viz": (("rerun-sdk",), "3D viewer"),
+    "view": (("viser",), "sequences in the browser: blinkgl view, generate --view"),
     "docs": (("zensical", "mkdocstrings", "towncrier"), "the documentation as a site"),
     "dev": (("pytest", "pytest-xdist", "hypothesis", "build"), "tests and packaging"),
 }
-_PINNED = {"torch": "torch>=2.6", "bpy": "bpy>=4.5,<4.6", "mujoco": "mujoco>=3.17,<4"}
+_PINNED = {"torch": "torch>=2.6", "bpy": "bpy>=4.5,<4.6", "mujoco": "mujoco>=3.17,<4", "viser": "viser>=1.1,<2"}
 
 
 def python() -> str:

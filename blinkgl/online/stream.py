@@ -29,7 +29,7 @@ import numpy as np
 
 from blinkgl.config.reader import to_yaml
 from blinkgl.config.run import RunTemplate
-from blinkgl.dataset.executor import Executor, Inline, Local, several_cards
+from blinkgl.dataset.executor import Executor, Inline, Local, StartError, several_cards
 from blinkgl.dataset.work import Message
 from blinkgl.errors import BlinkGLError, ConfigError, EventDataError
 from blinkgl.online.cuts import Sample
@@ -96,6 +96,10 @@ class SampleStream:
             one = [cards[card % len(cards)]] if cards and card is not None else None
             self._executor = Inline() if workers == 0 else Local(workers, one, cores=workers)
             self._executor.open(self.job)
+        except StartError as error:
+            said = _why(error)
+            self.close()
+            raise ConfigError(said, where="workers") from error
         except BaseException:
             self.close()
             raise
@@ -171,7 +175,8 @@ class SampleStream:
             return False
         if path.is_file():  # what was there before is good
             return False
-        raise ConfigError(said, where="recipe")
+        where, _, said = said.partition("\n")
+        raise ConfigError(said, where=where)
 
     def _told_base(self) -> int:
         with suppress(OSError, ValueError):
@@ -237,6 +242,8 @@ class SampleStream:
                 for slot, (_, since) in running.items():
                     if time.monotonic() - since > _SLOT_S:
                         executor.kill(slot, f"a slot took longer than {_SLOT_S:.0f} s")
+        except StartError as error:
+            self._give_up(_why(error), where="workers")
         except BlinkGLError as error:
             self._give_up(str(error))
         except Exception as error:  # noqa: BLE001 - whoever waits for samples has to hear of it
@@ -271,12 +278,23 @@ class SampleStream:
         self._give_up(message["error"] + (f" ({attempt} times)" if died else ""))
         return False
 
-    def _give_up(self, said: str) -> None:
+    def _give_up(self, said: str, where: str = "recipe") -> None:
+        """Leaves the reason for all takers: what is at fault, in a line by itself, and why."""
         self._stop = True
         temporary = self.spool / (_ERROR + ".tmp")
         with suppress(OSError):
-            temporary.write_text(said, encoding="utf-8")
+            temporary.write_text(f"{where}\n{said}", encoding="utf-8")
             os.replace(temporary, self.spool / _ERROR)
+
+
+def _why(error: StartError) -> str:
+    """The problem, and the last line that the workers wrote: their log goes with the stream."""
+    try:
+        lines = error.log.read_text(encoding="utf-8", errors="replace").split("\n")
+    except OSError:
+        lines = []
+    last = next((line.strip() for line in reversed(lines) if line.strip()), "")
+    return error.problem + (f"; the last that it wrote: {last}" if last else "")
 
 
 @lru_cache(maxsize=4)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from rich.console import Console
@@ -15,10 +16,10 @@ from blinkgl.config.run import load_run
 from blinkgl.dataset.executor import Executor, Inline, Local
 from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.report import STAGES, SequenceReport, Totals
-from blinkgl.dataset.run import Outcome, run_dataset
+from blinkgl.dataset.run import Listener, Outcome, run_dataset
 from blinkgl.dataset.work import Message, report_of
 from blinkgl.errors import ConfigError
-from blinkgl.machine.compiling import compiling_line
+from blinkgl.machine.compiling import announce_compiling, compiling_line
 from blinkgl.machine.terminal import causes_line, plain_column, plain_console, say
 
 MAX_NOTES = 20
@@ -39,26 +40,40 @@ def run(
     resume: bool = False,
     mixed: bool = False,
     time_limit_s: float = 0.0,
+    view: bool = False,
 ) -> int:
     """:func:`~blinkgl.dataset.run.run_dataset` behind a display; status :data:`SET_ASIDE` when sequences are missing,
-    whose names and reasons are said even when ``quiet``. Raises what it raises."""
+    whose names and reasons are said even when ``quiet``. view : show each sequence in a browser when it is whole, and
+    all until Ctrl-C. Raises what it raises, and ConfigError without the extra [view]."""
     template = load_run(config, overrides, seed=seed)
     console = plain_console(quiet=quiet)
-    outcome = run_dataset(
-        template,
-        out,
-        executor,
-        num=num,
-        resume=resume,
-        mixed=mixed,
-        time_limit_s=time_limit_s,
-        listener=None if quiet else Display(console, Path(out)),
-    )
-    show_outcome(console, outcome, Path(out))
-    if quiet:
-        for name, reason in sorted(outcome.set_aside.items()):
-            say(plain_console(stderr=True), f"set aside: {name}: {reason}")
+    display = None if quiet else Display(console, Path(out))
+    announce_compiling(lambda text: say(console, text))
+    with _shown(view, Path(out), display) as listener:
+        outcome = run_dataset(
+            template,
+            out,
+            executor,
+            num=num,
+            resume=resume,
+            mixed=mixed,
+            time_limit_s=time_limit_s,
+            listener=listener,
+        )
+        show_outcome(console, outcome, Path(out))
+        if quiet:
+            for name, reason in sorted(outcome.set_aside.items()):
+                say(plain_console(stderr=True), f"set aside: {name}: {reason}")
     return SET_ASIDE if outcome.set_aside else 0
+
+
+def _shown(view: bool, out: Path, display: Listener | None) -> AbstractContextManager[Listener | None]:
+    """Whom the run tells, inside of a page in the browser where that is asked for."""
+    if not view:
+        return nullcontext(display)
+    from blinkgl.show.view import watching
+
+    return watching(plain_console(), out, display)
 
 
 class Display:

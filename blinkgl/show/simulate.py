@@ -69,6 +69,7 @@ def run(
 ) -> int:
     """``size``: "WIDTHxHEIGHT" in place of the sensor's.   ``options``: of
     :func:`~blinkgl.recordings.simulation.file_to_events`."""
+    from blinkgl.machine.compiling import announce_compiling
     from blinkgl.recordings.simulation import FrameUse, file_to_events
 
     options |= emulator_options(emulator, config, overrides, sensor)
@@ -76,6 +77,7 @@ def run(
     if size is not None:
         options["size"] = size_of(size)
     console = plain_console(quiet=quiet)
+    announce_compiling(lambda text: say(console, text))
     bar = Progress(
         plain_column("{task.description}"),
         BarColumn(),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import yaml
 
@@ -92,3 +94,15 @@ def test_every_run_that_ships_is_listed_with_what_it_is(capsys, monkeypatch):
     assert run(["configs"]) == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert {words[0] for words in lines} >= set(shipped_runs()) and all(len(words) > 3 for words in lines)
+
+
+def test_a_folder_of_that_name_hides_no_run(tmp_path, monkeypatch):
+    """`blinkgl generate demo --out demo` twice."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "demo").mkdir()
+    assert run_file("demo") == shipped_runs()["demo"]
+    (tmp_path / "other").mkdir()
+    with pytest.raises(ConfigError, match="is a folder"):
+        load_run("other")
+    (tmp_path / "stereo").write_text("seed: 7\n")
+    assert run_file("stereo") == Path("stereo")

@@ -117,3 +117,23 @@ def test_one_clear_line(text, said):
 def test_places_that_are_none(place, said):
     line = refusal(f"sensors: [{{name: a, place: {place}}}]")
     assert "sensors.0.place" in line and said in line
+
+
+@pytest.mark.parametrize(
+    ("top", "own", "fx_fy"),
+    [
+        ("focal: 60", "fx: 50, fy: 51", (50, 51)),
+        ("fx: 50, fy: 51", "focal: 60", (60, 60)),
+        ("fx: 50, fy: 51", "fy: 52", (50, 52)),
+        ("fov: 50", "focal: 60", (60, 60)),
+        ("focal: 60", "cx: 3", (60, 60)),
+    ],
+)
+def test_a_sensor_that_says_how_long_its_lens_is_does_not_have_it_of_the_top(top, own, fx_fy):
+    config = read(f"{{camera: {{width: 40, height: 30, {top}}}, sensors: [{{name: a, camera: {{{own}}}}}]}}")
+    assert config.sensors[0].camera.model.intrinsics[:2] == fx_fy
+
+
+def test_two_ways_of_its_own_are_still_refused():
+    said = refusal("{camera: {width: 40, focal: 60}, sensors: [{name: a, camera: {fov: 50, focal: 9}}]}")
+    assert said == "sensors.0.camera: give fov or focal, not both"

@@ -37,3 +37,15 @@ def test_stages_and_total_are_without_compilation(monkeypatch):
         watch.on_end(None)
         now[0] += 0.5
     assert clock.seconds == {"events": 1.5} and clock.total == 1.5 and clock.compile_s == 14.0
+
+
+def test_the_next_compilation_is_announced_once():
+    import numba
+
+    said = []
+    compiling.announce_compiling(said.append)
+    first, second = numba.njit(lambda x: x + 1), numba.njit(lambda x: x + 2)
+    first(1)
+    first(1)
+    second(1)
+    assert said == ["compiling kernels, once per machine: this may take a minute or two"]

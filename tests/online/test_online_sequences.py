@@ -212,3 +212,23 @@ def test_sequences_that_fail_are_counted_and_bounded(recipe, monkeypatch):
     assert 4 + stats.sequences / 2 < stats.failures < stats.sequences < 60 and stats.samples > 0
     assert str(caught.value).startswith(f"recipe: {stats.failures} of {stats.sequences} sequences failed, the last: ")
     assert str(caught.value).endswith("pool/a.glb: no such mesh")
+
+
+def test_workers_that_cannot_start_are_named_as_python_names_them(recipe, tmp_path, monkeypatch):
+    """At once, and where they die later; with what they wrote last, since their log goes with the stream."""
+    dies = "import os\nos.write(2, b'first\\nno room for the driver\\n')\nos._exit(3)\n"
+    why = (
+        "workers: workers cannot start: the worker ended with status 3; the last that it wrote: no room for the driver"
+    )
+    (tmp_path / "sitecustomize.py").write_text(dies)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with pytest.raises(ConfigError) as caught:
+        OnlineSequences(recipe, workers=1)
+    assert str(caught.value) == why
+    (tmp_path / "sitecustomize.py").write_text("")
+    with OnlineSequences(recipe, workers=1, per_sequence=2) as sequences:
+        (tmp_path / "sitecustomize.py").write_text(dies)
+        os.kill(sequences.stream._executor._processes[0].popen.pid, signal.SIGKILL)
+        with pytest.raises(ConfigError) as caught:
+            list(islice(sequences, 1000))
+    assert str(caught.value) == why

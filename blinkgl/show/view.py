@@ -1,0 +1,127 @@
+"""``blinkgl view``: where the page is, or the file that was written; and ``generate --view``."""
+
+from __future__ import annotations
+
+import importlib.util
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from blinkgl.dataset.run import Listener, Outcome
+from blinkgl.errors import ConfigError, OutputError
+from blinkgl.machine.extras import EXTRAS, install
+from blinkgl.machine.terminal import plain_console, say
+from blinkgl.sequence_files.index import made_folders
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from blinkgl.dataset.plan import Plan
+    from blinkgl.dataset.work import Message
+    from blinkgl.viewer.page import Page
+
+
+def run(sequences: Sequence[str], *, port: int | None = None, save: str | None = None, overwrite: bool = False) -> int:
+    """Serves the sequences until interrupted, or writes one of them as a file. Raises ConfigError: no viser, more than
+    one sequence for a file; AssetError: no sequence; OutputError: a port in use, a file that exists."""
+    check_extra("view")
+    from blinkgl.viewer.views import sequences_in
+
+    folders = [folder for path in sequences for folder in sequences_in(path)]
+    console = plain_console()
+    if save is not None:
+        return _save(console, folders, Path(save), port, overwrite)
+    from blinkgl.viewer.page import Page
+    from blinkgl.viewer.server import LocalServer
+
+    server = LocalServer(port)
+    try:
+        page = Page(server)
+        for folder in folders:
+            page.add(folder)
+        page.draw()
+        if page.sequence is None and page.problem is not None:
+            raise page.problem
+        say(console, f"{server.url}  (open it in a browser; Ctrl-C ends it)")
+        page.run()
+    except KeyboardInterrupt:
+        say(console, "")
+    finally:
+        server.stop()
+    return 0
+
+
+def _save(console: Console, folders: list[Path], out: Path, port: int | None, overwrite: bool) -> int:
+    if port is not None:
+        raise ConfigError("is of a server", where="--port", value=port, accepted="it without --save")
+    if out.suffix.lower() not in (".html", ".htm"):
+        raise OutputError("not the name of a page", where="--save", value=str(out), accepted="NAME.html")
+    if len(folders) != 1:
+        one = f"one, such as {folders[0]}"
+        raise ConfigError("a file is of one sequence", where="--save", value=len(folders), accepted=one)
+    if out.exists() and not overwrite:  # before the work, not after it
+        raise OutputError("output file exists", where=str(out), accepted="a new name, or --overwrite")
+    from blinkgl.viewer.page import save
+
+    with console.status("drawing"):
+        save(folders[0], out)
+    say(console, f"written to {out}: it opens in a browser, without a server and without the data")
+    return 0
+
+
+def check_extra(option: str) -> None:
+    """Raises ConfigError where the extra [view] is missing."""
+    if importlib.util.find_spec("viser") is None:
+        remedy = f"run {install(*EXTRAS['view'][0])}"
+        raise ConfigError("viser is not installed, which shows sequences", where=option, accepted=remedy)
+
+
+class Watched:
+    """A run's listener that hands everything on and puts each finished sequence on a page."""
+
+    def __init__(self, page: Page, out: Path, display: Listener | None):
+        self._page, self._out, self._display = page, out, display
+
+    def begin(self, plan: Plan, outcome: Outcome) -> None:
+        if self._display is not None:
+            self._display.begin(plan, outcome)
+        if self._out.is_dir():
+            for folder in made_folders(self._out):  # of the run that is resumed
+                self._page.add(folder)
+
+    def message(self, name: str, message: Message) -> None:
+        if self._display is not None:
+            self._display.message(name, message)
+        if message["kind"] == "done":
+            self._page.add(self._out / name)
+
+    def end(self, outcome: Outcome) -> None:
+        if self._display is not None:
+            self._display.end(outcome)
+
+
+@contextmanager
+def watching(console: Console, out: Path, display: Listener | None) -> Iterator[Watched]:
+    """A page beside a run; when that is over, until Ctrl-C. Raises ConfigError without viser."""
+    check_extra("--view")
+    from blinkgl.viewer.page import Page
+    from blinkgl.viewer.server import LocalServer
+
+    server = LocalServer()
+    page = Page(server)
+    drawing = threading.Thread(target=page.run, daemon=True)
+    try:
+        say(console, f"{server.url}  (each sequence appears there when it is whole)")
+        drawing.start()
+        yield Watched(page, out, display)
+        if page.folders:
+            say(console, f"{server.url}  (Ctrl-C ends it)")
+            try:
+                drawing.join()
+            except KeyboardInterrupt:
+                say(console, "")
+    finally:
+        page.end()
+        server.stop()

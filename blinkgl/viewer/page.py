@@ -1,0 +1,269 @@
+"""The page: one time slider over pictures and space, in panels on either side."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from blinkgl.errors import BlinkGLError
+from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.viewer.server import LocalServer
+from blinkgl.viewer.stage import FOV, LAYERS, Stage
+from blinkgl.viewer.views import Picture, SequenceView
+
+SPEEDS = ("1x", "1/2x", "1/5x", "1/10x", "1/20x", "1/50x", "1/100x")
+_TICK_S = 0.05
+_PICTURES_PX, _CONTROLS_PX = 380, 330
+SPACE_WINDOWS = 5
+"""A window of events in space is so many times as long as in a picture: its shape is seen only then."""
+SAVED_STEPS, SAVED_S = 40, 12.0
+"""Moments in a saved file, and how long it plays."""
+
+
+class Page:
+    """What a server shows: sequences to choose from, and the chosen one at a time.
+
+    Callbacks of the browser only ask for the page to be drawn anew; one thread draws it, so that a slider that is
+    dragged shows its last place and not each on the way."""
+
+    def __init__(self, server: LocalServer):
+        self.server = server
+        self.folders: dict[str, Path] = {}
+        self.sequence: SequenceView | None = None
+        self.problem: BlinkGLError | None = None
+        self._chosen = ""
+        self._changed, self._ended = threading.Event(), False
+        self._stale = True
+        server.gui.main_panel.dock_right()
+        server.gui.main_panel.set_width(_CONTROLS_PX)
+        server.gui.set_panel_label("BlinkGL")
+        server.gui.add_markdown("Waiting for the first sequence …")
+
+    def add(self, folder: Path) -> None:
+        """Another sequence to choose; the first is shown."""
+        name = folder.name if folder.name not in self.folders else str(folder)
+        self.folders[name] = folder
+        self._chosen = self._chosen or name
+        self._stale = True
+        self._changed.set()
+
+    # ---- the thread that draws -----------------------------------------------------------------------------------
+
+    def run(self) -> None:
+        """Draws until :meth:`end`."""
+        last = time.monotonic()
+        while not self._ended:
+            now = time.monotonic()
+            if self.sequence is not None and self._playing:
+                self._advance(now - last)
+            last = now
+            self.draw()
+            self._changed.wait(_TICK_S if self.sequence is not None and self._playing else 0.5)
+
+    def end(self) -> None:
+        self._ended = True
+        self._changed.set()
+
+    def draw(self) -> None:
+        """What has changed since it was last drawn. A sequence that cannot be read is said on the page."""
+        if not self._changed.is_set():
+            return
+        self._changed.clear()
+        try:
+            if self._stale and self._chosen:
+                self._stale = False
+                self._open(self._chosen)
+            if self.sequence is not None:
+                with self.server.atomic():
+                    self._show()
+        except BlinkGLError as error:
+            self.problem, self._playing = error, False
+            self.server.gui.add_markdown(f"**cannot be shown**: {error}")
+
+    def _advance(self, seconds: float) -> None:
+        later = self._time.value + 1000 * seconds * _speed(self._speed.value)
+        self._time.value = round(self._time.min + (later - self._time.min) % (self._time.max - self._time.min), 2)
+
+    # ---- one sequence --------------------------------------------------------------------------------------------
+
+    def _open(self, name: str) -> None:
+        """Builds the page of a sequence, unless it is there already and only the list has grown."""
+        if self.sequence is not None and self.sequence.folder == self.folders[name]:
+            if len(self.folders) > 1 and self._choice is None:
+                self._add_choice()
+            elif self._choice is not None:
+                self._choice.options = tuple(self.folders)
+            return
+        sequence = SequenceView(self.folders[name])
+        if self.sequence is not None:
+            self.sequence.close()
+        self.sequence = sequence
+        self.server.scene.reset()
+        self.server.gui.reset()
+        self.stage = Stage(self.server.scene, sequence)
+        self._controls(sequence)
+        self._panels(sequence)
+        self._look_at("world" if sequence.has_space else "events")
+
+    def _controls(self, sequence: SequenceView) -> None:
+        gui = self.server.gui
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(_CONTROLS_PX)
+        gui.set_panel_label("BlinkGL")
+        self._choice: Any = None
+        if len(self.folders) > 1:
+            self._add_choice()
+        gui.add_markdown(_about(sequence))
+        start, end = sequence.start_us / 1000, sequence.end_us / 1000
+        step = 10.0 ** np.floor(np.log10((end - start) / 500))
+        self._time = gui.add_slider("time, ms", start, end, float(step), start + (end - start) / 2)
+        self._playing = False
+        self._play = gui.add_button("play")
+        self._play.on_click(lambda _: self._toggle())
+        self._speed: Any = gui.add_dropdown("speed", SPEEDS, initial_value=SPEEDS[3])
+        self._windows, self._layers = [], {}
+        if with_events := [s for s in sequence.sensors if s.event_count]:
+            usual = with_events[0].usual_window_us() / 1000
+            for said, long in (("events of, ms", usual), ("in space of, ms", SPACE_WINDOWS * usual)):
+                self._windows.append(gui.add_slider(said, 0.1, max(100.0, long), 0.1, float(long)))
+        with gui.add_folder("in space"):
+            looks = [name for name, there in (("world", sequence.has_space), ("events", with_events)) if there]
+            if looks:
+                look = gui.add_button_group("look at", looks)
+                look.on_click(lambda event: self._look_at(event.target.value))
+            if sequence.has_space:
+                there = [name for name in LAYERS if self.stage.has(name)]
+                self._layers = {name: gui.add_checkbox(LAYERS[name], True) for name in there}
+        for one in (self._time, *self._windows, *self._layers.values()):
+            one.on_update(lambda _: self._changed.set())
+
+    def _toggle(self) -> None:
+        self._playing = not self._playing
+        self._play.label = "pause" if self._playing else "play"
+        self._changed.set()
+
+    def _add_choice(self) -> None:
+        self._choice = self.server.gui.add_dropdown(
+            "sequence", tuple(self.folders), initial_value=self._chosen, order=-1
+        )
+
+        def chosen(_: Any) -> None:
+            self._chosen, self._stale = self._choice.value, True
+            self._changed.set()
+
+        self._choice.on_update(chosen)
+
+    def _panels(self, sequence: SequenceView) -> None:
+        """The pictures, a tab for each camera and one for each inertial unit."""
+        panel = self.server.gui.add_panel()
+        panel.dock_left()
+        panel.set_width(_PICTURES_PX)
+        self._images: dict[str, dict[str, Any]] = {}
+        self._tabs = {sensor.name: panel.add_tab(sensor.name) for sensor in sequence.sensors}
+        self._curves = []
+        for name, unit in sequence.units.items():
+            with panel.add_tab(name):
+                self._curves += [self._curve(unit, *what) for what in (("rate", "rad/s"), ("acceleration", "m/s²"))]
+
+    def _curve(self, unit: dict[str, np.ndarray], name: str, measure: str) -> tuple[Any, tuple[np.ndarray, ...]]:
+        """A plot that is filled up to the time that is shown, and all that it will hold."""
+        t_ms = unit["t_ns"] / 1e6
+        data = (t_ms, *unit[name].T)
+        low, high = float(unit[name].min(initial=0)), float(unit[name].max(initial=0))
+        series = ({"label": "ms"}, *({"label": a, "stroke": c, "width": 1.5} for a, c in zip("xyz", _XYZ)))
+        plot = self.server.gui.add_uplot(
+            data,
+            series,
+            title=f"{name}, {measure}",
+            scales={
+                "x": {"time": False, "range": (float(t_ms[0]), float(t_ms[-1]))},
+                "y": {"range": (low - 0.05 * (high - low + 1e-9), high + 0.05 * (high - low + 1e-9))},
+            },
+            height=220,
+        )
+        return plot, data
+
+    # ---- a moment ------------------------------------------------------------------------------------------------
+
+    def _show(self) -> None:
+        sequence = self.sequence
+        assert sequence is not None
+        t_us = round(1000 * self._time.value)
+        window_us, long_us = [max(1, round(1000 * one.value)) for one in self._windows] or (1, 1)
+        pictures = {sensor.name: sensor.pictures(t_us, window_us) for sensor in sequence.sensors}
+        for name, found in pictures.items():
+            for one in found:
+                self._picture(name, one)
+        layers = [name for name, box in self._layers.items() if box.value]
+        self.stage.show(t_us, long_us, pictures, layers)
+        for plot, data in self._curves:
+            count = max(2, int(np.searchsorted(data[0], t_us / 1000, side="right")))
+            plot.data = tuple(column[:count] for column in data)
+
+    def _picture(self, sensor: str, one: Picture) -> None:
+        images = self._images.setdefault(sensor, {})
+        said = f"{one.heading} · {one.note}" if one.note else one.heading
+        times = max(1, _PICTURES_PX // one.image.shape[1])  # else small ones are shown as small as they are
+        image = one.image.repeat(times, axis=0).repeat(times, axis=1)
+        if one.heading not in images:
+            with self._tabs[sensor]:
+                images[one.heading] = self.server.gui.add_image(image, label=said, jpeg_quality=85)
+            return
+        images[one.heading].label = said
+        if not np.array_equal(images[one.heading].image, image):
+            images[one.heading].image = image
+
+    def _look_at(self, what: str) -> None:
+        """Shows the world, or the events beside it, and turns every browser's view there."""
+        self.stage.world.visible, self.stage.space.visible = what == "world", what == "events"
+        eye, at = self.stage.views()[what]
+        cameras = [client.camera for client in self.server.get_clients().values()]
+        for camera in (self.server.initial_camera, *cameras):
+            camera.position, camera.look_at, camera.fov = eye, at, FOV
+
+
+_XYZ = ("#d62728", "#2ca02c", "#1f77b4")
+
+
+def _speed(said: str) -> float:
+    """ "1/10x" → 0.1."""
+    whole, _, part = said.rstrip("x").partition("/")
+    return float(whole) / float(part or 1)
+
+
+def _about(sequence: SequenceView) -> str:
+    lines = [f"**{sequence.name}**, {(sequence.end_us - sequence.start_us) / 1e6:g} s"]
+    for sensor in sequence.sensors:
+        source = sensor.source
+        events = f", {sensor.event_count:,} events" if sensor.event_count else ""
+        emulator = f", {source.manifest['emulator']}" if source.manifest.get("emulator") else ""
+        lines.append(f"{sensor.name}: {source.width}x{source.height} px{events}{emulator}")
+    return "  \n".join(lines)
+
+
+def save(folder: Path, out: Path) -> None:
+    """Writes a sequence as one HTML file that plays without a server: the world, the events, and all pictures on a
+    wall. Raises AssetError as :class:`SequenceView`, OutputError."""
+    sequence, server = SequenceView(folder), LocalServer(0)
+    try:
+        stage = Stage(server.scene, sequence, pictures=True)
+        begins = server.initial_camera
+        begins.position, begins.look_at = stage.views()["all"]
+        begins.fov = FOV
+        windows = [s.usual_window_us() for s in sequence.sensors if s.event_count]
+        window_us = windows[0] if windows else 1
+        times = np.linspace(sequence.start_us, sequence.end_us, SAVED_STEPS + 1)[1:].astype(np.int64)
+        film = server.get_scene_serializer()
+        for t_us in times.tolist():
+            pictures = {s.name: s.pictures(t_us, window_us) for s in sequence.sensors}
+            stage.show(t_us, SPACE_WINDOWS * window_us, pictures)
+            film.insert_sleep(SAVED_S / SAVED_STEPS)
+        with atomic_file(out) as path, output_errors(out):
+            path.write_text(film.as_html(), encoding="utf-8")
+    finally:
+        server.stop()
+        sequence.close()

@@ -1,0 +1,75 @@
+"""viser's server, for this machine alone: it listens on 127.0.0.1, talks to its own pages, and shares nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import io
+import re
+import socket
+from collections.abc import Iterator
+from typing import Any
+
+import viser
+import websockets.asyncio.server
+
+from blinkgl.errors import ConfigError, OutputError
+
+HOST = "127.0.0.1"
+PORT = 8080
+_OWN_PAGES = re.compile(r"http://(127\.0\.0\.1|localhost):\d{1,5}")
+
+
+class LocalServer(viser.ViserServer):
+    """A :class:`viser.ViserServer` without its tunnel, its prints and visitors from other web sites.
+
+    port : None takes the first that is free from :data:`PORT` on; 0 any. Raises OutputError: the port is in use;
+    ConfigError: it is none."""
+
+    def __init__(self, port: int | None = None):
+        if port is not None and not 0 <= port <= 65535:
+            raise ConfigError("no port", where="--port", value=port, accepted="0 to 65535")
+        if port:
+            _check_free(port)
+        with _quiet(), _only_own_pages():
+            super().__init__(host=HOST, port=PORT if port is None else port, verbose=False)
+        self.gui.configure_theme(show_logo=False, show_share_button=False)
+
+    @property
+    def url(self) -> str:
+        return f"http://{HOST}:{self.get_port()}"
+
+    def request_share_url(self, verbose: bool = True) -> None:
+        """Do nothing: what pages ask for by viser's protocol, button or not, opens no tunnel to its makers' host."""
+
+    def stop(self) -> None:
+        with _quiet():
+            super().stop()
+
+
+def _check_free(port: int) -> None:
+    """Raises OutputError; viser itself would take the next port."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, port))
+        except OSError as error:
+            problem = f"cannot be listened on: {(error.strerror or str(error)).lower()}"
+            raise OutputError(problem, where="--port", value=port, accepted="another, or none for a free one") from None
+
+
+def _quiet() -> contextlib.AbstractContextManager:
+    return contextlib.redirect_stdout(io.StringIO())
+
+
+@contextlib.contextmanager
+def _only_own_pages() -> Iterator[None]:
+    """While a server starts: websockets are of pages from this machine. viser has no option for it, so any web site
+    that is open in the same browser could connect and read what is shown."""
+    serve = websockets.asyncio.server.serve
+    own: Any = functools.partial(serve, origins=[_OWN_PAGES, None])
+    websockets.asyncio.server.serve = own
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = serve

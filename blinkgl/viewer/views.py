@@ -1,0 +1,331 @@
+"""What a sequence has to show at a time, as plain arrays: pictures, events, points and boxes in space.
+
+Times are µs on the sequence's clock. Labels and poses are known at label times: until the next one, the last is shown.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from blinkgl.camera import CameraModel, PinHole
+from blinkgl.camera.pinhole import rectified
+from blinkgl.errors import AssetError
+from blinkgl.io.boxes import read_boxes
+from blinkgl.io.colour import count_events, event_colour
+from blinkgl.io.dsec import DsecEventReader
+from blinkgl.io.frame_camera import EXPOSURES, picture_file, read_codes, read_exposures
+from blinkgl.io.imu import H5 as IMU, read_imu
+from blinkgl.io.overlays import TrackLines, with_boxes, with_tracks
+from blinkgl.io.pictures import id_colours, picture
+from blinkgl.io.tracks import TRACKS, read_tracks
+from blinkgl.labels import LABELS, Label
+from blinkgl.layouts.source import Source
+from blinkgl.sequence_files.index import made_folders
+from blinkgl.sequence_files.rig_dir import read_rig
+from blinkgl.sequence_files.sequence_dir import MANIFEST, is_rig_folder
+from blinkgl.types.boxes import Boxes
+from blinkgl.types.events import Events
+
+EVERYWHERE = ("sky", "ground")
+"""Objects that surround all others: they have no box, and their points would hide everything else."""
+MAX_POINTS, MAX_EVENTS = 30_000, 15_000
+"""In space at a time: what a browser without a graphics card still turns smoothly; more events would be a cloud."""
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """heading : what it is, one for each.   note : its time and scale, in words.   image : (H, W, 3) uint8."""
+
+    heading: str
+    note: str
+    image: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """points (N, 3) float32; colours (N, 3) uint8."""
+
+    points: np.ndarray
+    colours: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """An object's box. colour (3,) uint8, of its id. size (3,) and pose (4, 4), from the box's axes and middle to the
+    world's; world units."""
+
+    name: str
+    colour: np.ndarray
+    size: np.ndarray
+    pose: np.ndarray
+
+
+class CameraView:
+    """What one camera of a sequence has to show."""
+
+    def __init__(self, source: Source, name: str):
+        self.source, self.name = source, name
+        poses_us = source.poses["t_ns"] // 1000 if source.poses else np.zeros(0, np.int64)
+        self._poses_us = poses_us
+        flows = [[a for a, _ in source.flow_times(way)] for way in ("forward", "backward")]
+        self._label_us = np.array(poses_us[1:] if len(poses_us) else source.image_times or flows[0] or flows[1])
+        self._events = DsecEventReader(source.folder / "events.h5") if source.has("events.h5") else None
+        self._exposures = read_exposures(source.folder) if source.has(EXPOSURES) else []
+        self.tracks = read_tracks(source.folder) if source.has(TRACKS) else None
+        self._known: dict[int, list[Picture]] = {}
+
+    @property
+    def event_count(self) -> int:
+        return 0 if self._events is None else self._events.count
+
+    def label(self, t_us: int) -> int:
+        """Number of the last label at or before a time; the first one before that."""
+        return max(int(np.searchsorted(self._label_us, t_us, side="right")) - 1, 0)
+
+    # ---- pictures ------------------------------------------------------------------------------------------------
+
+    def pictures(self, t_us: int, window_us: int) -> list[Picture]:
+        """All that there is of a time: frame, images of a frame camera, events of [t - window, t), then labels, those
+        of motion first. What the sequence lacks is absent."""
+        found = [*self._frame(t_us), *self._of_frame_camera(t_us)]
+        if self._events is not None:
+            events = self.events(t_us, window_us)
+            counts = np.zeros((2, self.source.height, self.source.width), np.uint16)
+            count_events(events.x, events.y, events.p, counts)
+            span = f"{(t_us - window_us) / 1000:.1f}–{t_us / 1000:.1f} ms"
+            found.append(Picture("events", f"{span}, {len(events):,}, ON blue, OFF red", event_colour(counts)))
+        k = self.label(t_us)
+        if k not in self._known:
+            self._known = {k: self._of_label(k)}  # playing reads each file once
+        return found + self._known[k]
+
+    def _frame(self, t_us: int) -> list[Picture]:
+        """The image of the last label's time, with the objects' boxes and the tracks of points over it."""
+        k = self.label(t_us)
+        has_image, boxes = self.source.has(LABELS["images"].forms[0].file(k)), self._boxes(k)
+        if not has_image and boxes is None and self.tracks is None:
+            return []
+        image = self.source.image(k) if has_image else np.full((self.source.height, self.source.width, 3), 24, np.uint8)
+        when = f"{self._label_us[k] / 1000:.1f} ms" if len(self._label_us) else ""
+        if boxes is not None:
+            image, when = with_boxes(image, boxes), f"{when}, boxes"
+        if self.tracks is not None:
+            size = np.array([self.source.width, self.source.height])
+            times, px, occluded, of = (self.tracks[n] for n in ("t_us", "target_points", "occluded", "instance"))
+            image = with_tracks(image, TrackLines(times, px, occluded, of, size), t_us)
+            when += f", tracks at {t_us / 1000:.1f} ms"
+        return [Picture("frame", when, image)]
+
+    def _of_frame_camera(self, t_us: int) -> list[Picture]:
+        """The images whose exposure was over last; before that the first."""
+        if not self._exposures:
+            return []
+        about = self.source.manifest["frame_camera"]
+        ends = [one.end_us for one in self._exposures]
+        k = max(int(np.searchsorted(ends, t_us, side="right")) - 1, 0)
+        found = []
+        for name in about["pictures"]:
+            codes = read_codes(self.source.folder / picture_file(name, k))
+            shown = (codes.astype(np.uint32) >> (about["bits"] - 8)).astype(np.uint8)
+            shown = np.repeat(shown[..., None], 3, axis=2) if shown.ndim == 2 else shown
+            heading = "frame camera" if name == "images" else f"frame camera, {name}"
+            note = f"{self._exposures[k].middle_us / 1000:.1f} ms, exposed {self._exposures[k].exposure_us / 1000:g} ms"
+            found.append(Picture(heading, note, shown))
+        return found
+
+    def _of_label(self, k: int) -> list[Picture]:
+        found = []
+        for label in sorted(LABELS.values(), key=_rank):
+            form = label.forms[0]
+            if form.read is None or not self.source.has(form.file(k)):
+                continue
+            value = form.read(self.source.folder / form.file(k))
+            views = [view for view in label.views if not (view.kind == "mask" and len(label.views) > 1)]
+            for view in views:
+                image, legend = picture(view.kind, view.of(value))
+                found.append(Picture(view.title, self._note(k, legend, view.unit), image))
+        return found
+
+    def _note(self, k: int, legend: dict[str, Any], unit: str) -> str:
+        when = f"{self._label_us[k] / 1000:.1f} ms"
+        if legend["kind"] == "wheel":
+            return f"{when}, full colour {legend['high']:.3g} {unit}"
+        return f"{when}, {legend['low']:.3g}–{legend['high']:.3g} {unit}" if legend["kind"] == "bar" else when
+
+    def _boxes(self, k: int) -> Boxes | None:
+        file = LABELS["boxes"].forms[0].file(k)
+        return read_boxes(self.source.folder / file) if self.source.has(file) else None
+
+    # ---- events --------------------------------------------------------------------------------------------------
+
+    def events(self, t_us: int, window_us: int) -> Events:
+        """Those of [t - window, t)."""
+        assert self._events is not None, self.name
+        return self._events.slice(t_us - window_us, t_us)
+
+    def event_points(self, t_us: int, window_us: int) -> tuple[np.ndarray, np.ndarray]:
+        """(N, 3) float32 and (N,) bool: events of [t - window, t) as points, and which are ON. x and y go from -0.5 to
+        0.5 of the picture's width, right and down, z from 0, a window ago, to 1, now. Every n-th where there are more
+        than :data:`MAX_EVENTS`."""
+        events = self.events(t_us, window_us)
+        some = slice(None, None, 1 + len(events) // MAX_EVENTS)
+        width, height = self.source.width, self.source.height
+        x = (events.x[some] - (width - 1) / 2) / width  # the middle of the picture is between its middle pixels
+        y = (events.y[some] - (height - 1) / 2) / width
+        z = (events.t[some] - (t_us - window_us)) / window_us
+        return np.stack([x, y, z], axis=-1).astype(np.float32), events.p[some] > 0
+
+    def usual_window_us(self) -> int:
+        """A window whose picture is neither empty nor a blot: an event in about three pixels."""
+        span = max(self.source.end_us - self.source.start_us, 1)
+        wanted = self.source.height * self.source.width / 3
+        steps = 1000 * np.array([1, 2, 5, 10, 20, 50, 100])
+        return int(steps[np.argmin(abs(np.log(steps) - np.log(wanted * span / max(self.event_count, 1))))])
+
+    # ---- space ---------------------------------------------------------------------------------------------------
+
+    def _pose(self, t_us: int) -> int:
+        return max(int(np.searchsorted(self._poses_us, t_us, side="right")) - 1, 0)
+
+    def camera_pose(self, t_us: int) -> np.ndarray | None:
+        """T_world_cam (4, 4), OpenCV's axes; None where a recording has none."""
+        return self.source.poses["T_world_cam"][self._pose(t_us)] if self.source.poses else None
+
+    @property
+    def camera_path(self) -> np.ndarray:
+        """(M, 3) places of the camera."""
+        return self.source.poses["T_world_cam"][:, :3, 3] if self.source.poses else np.zeros((0, 3))
+
+    def label_camera(self) -> CameraModel | None:
+        """The camera whose pixels labels are of."""
+        camera = self.source.camera
+        return rectified(camera) if camera is not None and self._is_rectified(camera) else camera
+
+    def _is_rectified(self, camera: CameraModel) -> bool:
+        return not isinstance(camera, PinHole) and self.source.rectified
+
+    def bodies(self, t_us: int) -> list[Body]:
+        """Boxes of the objects but :data:`EVERYWHERE`, as they are at the last label: those of ``boxes`` for what is in
+        the picture, else those of the shapes at rest."""
+        poses, m = self.source.poses, self._pose(t_us)
+        seen: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        if len(self._label_us) and self._label_us[0] <= t_us and (boxes := self._boxes(self.label(t_us))) is not None:
+            seen = {int(i): (s, T) for i, s, T in zip(boxes.instance, boxes.size, boxes.T_world_box)}
+        at_rest = {one["id"]: one["box"] for one in self.source.manifest.get("objects", ()) if one.get("box")}
+        found = []
+        for row, number in enumerate(map(int, poses.get("object_ids", ()))):
+            if number in self._everywhere() or number not in {*at_rest, *seen}:
+                continue
+            low, high = np.array(at_rest.get(number, np.zeros((2, 3))), float)
+            middle = np.eye(4)
+            middle[:3, 3] = (low + high) / 2
+            size, pose = seen.get(number, (high - low, poses["T_world_obj"][row, m] @ middle))
+            colour = id_colours(np.array([number]))[0]
+            found.append(Body(str(poses["object_names"][row]), colour, size, pose))
+        return found
+
+    def _everywhere(self) -> set[int]:
+        poses = self.source.poses
+        kinds = poses.get("object_categories", poses.get("object_names", ()))
+        return {int(i) for i, kind in zip(poses.get("object_ids", ()), kinds) if kind in EVERYWHERE}
+
+    def depth_cloud(self, t_us: int) -> Cloud | None:
+        """What the last label's depth shows, in the world, in the image's colours (else the ids', else grey), without
+        sky and ground: by ids, or else what lies in some object's box. None: no depth, or no poses."""
+        k, camera = self.label(t_us), self.label_camera()
+        form, pose = LABELS["depth"].forms[0], self.camera_pose(int(self._label_us[k]) if len(self._label_us) else 0)
+        if not self.source.has(form.file(k)) or camera is None or pose is None:
+            return None
+        depth = self.source.value("depth", k)
+        ids = self.source.value("ids", k) if self.source.has(LABELS["ids"].forms[0].file(k)) else None
+        shown = np.isfinite(depth)
+        if ids is not None:
+            shown &= ~np.isin(ids, [0, *self._everywhere()])
+        y, x = np.nonzero(shown)
+        some = slice(None, None, 1 + len(x) // MAX_POINTS)
+        y, x = y[some], x[some]
+        rays = camera.rays(np.stack([x, y], axis=-1).astype(float))  # pixels' centres are at whole numbers
+        points = rays / rays[:, 2:] * depth[y, x, None] @ pose[:3, :3].T + pose[:3, 3]
+        if self.source.has(LABELS["images"].forms[0].file(k)):
+            colours = self.source.image(k)[y, x]
+        else:
+            colours = np.full((len(x), 3), 160, np.uint8) if ids is None else id_colours(ids[y, x])
+        if ids is None and (bodies := self.bodies(int(self._label_us[k]))):
+            inside = np.any([_inside(points, body) for body in bodies], axis=0)
+            points, colours = points[inside], colours[inside]
+        return Cloud(points.astype(np.float32), colours)
+
+    def track_cloud(self, t_us: int) -> Cloud | None:
+        """Tracked points in the world at the last of their times, in their objects' colours, hidden ones grey."""
+        if self.tracks is None:
+            return None
+        m = max(int(np.searchsorted(self.tracks["t_us"], t_us, side="right")) - 1, 0)
+        colours = id_colours(self.tracks["instance"])
+        colours[self.tracks["occluded"][:, m]] = 130
+        return Cloud(self.tracks["points_world"][:, m].astype(np.float32), colours)
+
+    def close(self) -> None:
+        if self._events is not None:
+            self._events.close()
+
+
+def _rank(label: Label) -> int:
+    """Flow first, then what else is motion; the rest as the table has it."""
+    return 2 if label.kind != "motion" else int(label.towards is None)
+
+
+def _inside(points: np.ndarray, body: Body) -> np.ndarray:
+    """(N,) bool: which of (N, 3) points lie in a body's box, or within a hundredth of its size of it."""
+    local = (points - body.pose[:3, 3]) @ body.pose[:3, :3]
+    return np.all(abs(local) <= 0.51 * body.size + 1e-3, axis=1)
+
+
+class SequenceView:
+    """A sequence, or a rig's: its cameras and inertial units, on one clock."""
+
+    def __init__(self, folder: Path):
+        """Raises AssetError: damaged, or there is nothing in it to show."""
+        self.folder, self.name = folder, folder.name
+        rig = is_rig_folder(folder)
+        places = {name: folder / name for name in read_rig(folder)} if rig else {"camera": folder}
+        cameras = {name: place for name, place in places.items() if (place / MANIFEST).is_file()}
+        self.sensors = [CameraView(Source.open(place), name) for name, place in cameras.items()]
+        units = {name if rig else "imu": place for name, place in places.items() if (place / IMU).is_file()}
+        self.units = {name: unit for name, place in units.items() if len((unit := read_imu(place))["t_ns"]) > 1}
+        self.start_us = min((s.source.start_us for s in self.sensors), default=0)
+        self.end_us = max((s.source.end_us for s in self.sensors), default=0)
+        for unit in self.units.values():
+            self.end_us = max(self.end_us, int(unit["t_ns"][-1] // 1000))
+        if self.end_us <= self.start_us or not (self.units or any(s.pictures(self.end_us, 1) for s in self.sensors)):
+            raise AssetError("an empty sequence: it has nothing to show", where=str(folder))
+
+    @property
+    def has_space(self) -> bool:
+        return any(s.source.poses for s in self.sensors)
+
+    def extent(self) -> tuple[np.ndarray, float]:
+        """Middle (3,) and radius of where things are: cameras' paths, and objects when it begins."""
+        bodies = [b.pose[:3, 3] for s in self.sensors for b in s.bodies(self.start_us)]
+        places = np.concatenate([s.camera_path for s in self.sensors] + [np.reshape(bodies, (-1, 3))])
+        if not len(places):
+            return np.zeros(3), 1.0
+        middle = np.median(places, axis=0)
+        return middle, max(float(np.quantile(np.linalg.norm(places - middle, axis=1), 0.9)), 1e-3)
+
+    def close(self) -> None:
+        for sensor in self.sensors:
+            sensor.close()
+
+
+def sequences_in(path: str | Path) -> list[Path]:
+    """Folders of the sequences at or below a path, in order; of a rig its own. Raises AssetError: there are none."""
+    path = Path(path)
+    if not path.is_dir():
+        raise AssetError("no such folder", where=str(path), accepted="a sequence, or a folder of sequences")
+    if not (found := list(made_folders(path))):
+        raise AssetError("no sequence in it", where=str(path), accepted="a folder that 'blinkgl generate' wrote")
+    return found

@@ -179,7 +179,7 @@ def test_arrays_as_mesh_and_image():
 
 
 def test_emulators_take_a_sensor():
-    assert blinkgl.V2e(4, 4, sensor="davis346").config.refractory_us == blinkgl.load_sensor("davis346").refractory_us
+    assert blinkgl.V2e(4, 4, sensor="davis346").config == blinkgl.load_sensor("davis346").emulator("v2e")
     assert blinkgl.Esim(4, 4, sensor="davis346", contrast_threshold=0.5).config.contrast_threshold == 0.5
     assert blinkgl.DvsVoltmeter(4, 4, preset="DVS240").config.k1 == pytest.approx(4.424)
 

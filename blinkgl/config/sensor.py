@@ -107,6 +107,12 @@ class SensorConfig(Config):
                 if not known or (key == "emulators" and rest and rest[0] not in emulators):
                     raise Refused("there is no such value in the file", where=table, value=name)
 
+    @property
+    def pixels_known(self) -> bool:
+        """Whether anything is said of what its pixels do: else the emulators' defaults stand for it."""
+        told = (self.contrast_threshold, self.threshold_sigma, self.cutoff_hz, self.refractory_us, self.leak_rate_hz)
+        return bool(self.emulators) or any(value is not None for value in told)
+
     def values(self, emulator: Any) -> dict[str, Any]:
         """What this sensor says about the keys of the emulator of this name; of one that is not known nothing."""
         models = EmulatorConfig.members.models

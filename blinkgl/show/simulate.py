@@ -69,6 +69,7 @@ def run(
 ) -> int:
     """``size``: "WIDTHxHEIGHT" in place of the sensor's.   ``options``: of
     :func:`~blinkgl.recordings.simulation.file_to_events`."""
+    from blinkgl.config.sensor import load_sensor
     from blinkgl.machine.compiling import announce_compiling
     from blinkgl.recordings.simulation import FrameUse, file_to_events
 
@@ -78,6 +79,8 @@ def run(
         options["size"] = size_of(size)
     console = plain_console(quiet=quiet)
     announce_compiling(lambda text: say(console, text))
+    if sensor is not None and not load_sensor(sensor).pixels_known:
+        say(console, f"of {sensor} only the size is known: thresholds and noise are the emulator's defaults")
     bar = Progress(
         plain_column("{task.description}"),
         BarColumn(),

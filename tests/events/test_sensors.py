@@ -94,8 +94,20 @@ def test_five_sensors_serve_every_emulator():
     assert (load_sensor("Davis-346").width, load_sensor("DAVIS346").height) == (346, 260)
     assert load_sensor("dvxplorer").emulator("voltmeter").k1 == pytest.approx(1 / 0.24)
     assert load_sensor("gen31_vga").emulator("v2e") == V2eConfig(), "what has no source is the emulator's own"
-    assert load_sensor("davis240c").emulator("voltmeter").k1 == 4.424
+    assert not load_sensor("gen31_vga").pixels_known and load_sensor("dvxplorer").pixels_known
     assert load_sensor("davis346").emulator("v2e", cutoff_hz=50).cutoff_hz == 50
+
+
+@pytest.mark.parametrize("name", ["davis240c", "davis346"])
+def test_a_davis_is_its_recordings_middle_and_its_units_lie_around(name):
+    """Of a file with distributions: the middle stands for the camera, a unit is drawn by its number."""
+    for emulator, key in (("esim", "contrast_threshold"), ("v2e", "contrast_threshold"), ("voltmeter", "k1")):
+        low, high = sensor_table(name)["emulators"][emulator][key]["log_uniform"]
+        units = [getattr(load_sensor(name, unit).emulator(emulator), key) for unit in range(40)]
+        assert low <= min(units) < np.sqrt(low * high) < max(units) <= high
+        assert getattr(load_sensor(name).emulator(emulator), key) == pytest.approx(np.sqrt(low * high))
+    with_resets = load_sensor(name).readout.frame_resets
+    assert (with_resets is not None) == (name == "davis240c"), "recordings of the DAVIS346 show none"
 
 
 def test_every_value_of_every_shipped_sensor_has_a_source():

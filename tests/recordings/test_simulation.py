@@ -298,7 +298,7 @@ def test_a_sensor_brings_its_parameters_and_its_read_out(tmp_path, capsys):
     from blinkgl.show.simulate import emulator_options
 
     options = emulator_options("v2e", None, ["contrast_threshold=0.3"], "davis346")
-    assert options["emulator"].refractory_us == 500 and options["emulator"].contrast_threshold == 0.3
+    assert options["emulator"] == load_sensor("davis346").emulator("v2e", contrast_threshold=0.3)
     assert options["readout"] == load_sensor("davis346").readout
     strobe = [np.full((120, 160), 0.1 if k % 2 else 1.0, np.float32) for k in range(20)]
     report = SimulationReport()

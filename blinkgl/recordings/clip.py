@@ -23,8 +23,8 @@ from blinkgl.io.formats import open_events
 from blinkgl.io.frames import RECORDING, open_frames
 from blinkgl.recordings.bursts import frame_bursts, inside_any
 from blinkgl.recordings.comparison import BLUR_PX, LOG_OFFSET
+from blinkgl.recordings.decoding import Decoder, noise_of
 from blinkgl.recordings.frame_noise import LOOKED_AT, Steadied
-from blinkgl.recordings.simulation import Decoder, noise_of
 from blinkgl.timeline.interpolate import Displacement, motion
 from blinkgl.types.events import Events
 

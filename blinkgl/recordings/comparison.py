@@ -358,7 +358,7 @@ def _span(file: EventFile) -> tuple[int, int]:
 def _frame_intervals(path, fps, timestamps, gamma, delay_us: int, start: int, stop: int, files: list[EventFile]):
     """Edges (µs) of the frame intervals inside [start, stop) and, lazily, the change of ln(I + 10) over each."""
     from blinkgl.io.frames import open_frames
-    from blinkgl.recordings.simulation import Decoder
+    from blinkgl.recordings.decoding import Decoder
 
     source = open_frames(path, fps=fps, timestamps=timestamps)
     if any((f.height, f.width) != (source.height, source.width) for f in files):

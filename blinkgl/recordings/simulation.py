@@ -13,14 +13,12 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-import numba
 import numpy as np
-from numpy.typing import DTypeLike
 
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.problems import validate
@@ -28,9 +26,9 @@ from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import ConfigError, EventDataError, OutputError
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.io.frames import VIDEO, open_frames
+from blinkgl.recordings.decoding import Decoder, checked_gamma, noise_of
 from blinkgl.recordings.fitting import Fitting
-from blinkgl.recordings.frame_noise import LOOKED_AT, FrameNoise, Steadied, caveats, frame_noise
-from blinkgl.srgb import linear_from_srgb
+from blinkgl.recordings.frame_noise import LOOKED_AT, FrameNoise, Steadied, caveats
 from blinkgl.tensors.choice import make_on_device
 from blinkgl.timeline import interpolate as between
 from blinkgl.types.events import Events, count_causes, named_causes
@@ -42,8 +40,6 @@ if TYPE_CHECKING:
 _SPARSE = 8
 """Rows and columns for one of which a frame's brightness is taken."""
 INTERPOLATIONS = ("linear", "motion")
-_LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
-"""ITU-R BT.709, on linear light."""
 
 
 class OwnFrames(NamedTuple):
@@ -203,7 +199,7 @@ def simulated_steps(
         raise ConfigError(
             "unknown interpolation", where="interpolate", value=use.interpolate, accepted=", ".join(INTERPOLATIONS)
         )
-    use = replace(use, gamma=_checked_gamma(use.gamma))
+    use = replace(use, gamma=checked_gamma(use.gamma))
     return _run(timed(frames, fps), use, config, seed, readout, report, fitting)
 
 
@@ -299,21 +295,6 @@ class _Given:
         if self._report.frames < 2:
             raise EventDataError("events need at least two frames", where=name, value="1 frame")
         self._report.caveats.extend(caveats(self._first, brightness))
-
-
-def noise_of(frames: Sequence[np.ndarray], decode: Decoder, fitting: Fitting | None = None) -> FrameNoise | None:
-    """The noise of the first frames as stored, after ``decode`` and ``fitting``; None for floats, which are exact, and
-    for frames that are not alike (which are refused when their turn comes)."""
-    first = frames[0]
-    if first.dtype not in (np.uint8, np.uint16):
-        return None
-    if any(frame.dtype != first.dtype or frame.shape != first.shape for frame in frames):
-        return None
-    lights = [decode(frame, "") for frame in frames]
-    lights = lights if fitting is None else [fitting(light) for light in lights]
-    table = decode.table(first.dtype)
-    middle = int(np.clip(np.searchsorted(table, np.median(lights[0])), 1, len(table) - 1))
-    return frame_noise(lights, float(table[middle] - table[middle - 1]))
 
 
 def file_to_events(
@@ -416,65 +397,6 @@ def _preview(
         yield writer
 
 
-class Decoder:
-    """Frames as stored to linear luminance (H, W) float32. gamma as :func:`frames_to_events`."""
-
-    def __init__(self, gamma: str | float | None):
-        self._gamma = gamma
-        self._tables: dict[np.dtype, np.ndarray] = {}
-
-    def table(self, dtype: DTypeLike) -> np.ndarray:
-        """Luminance of each code of an unsigned integer type, float32."""
-        dtype = np.dtype(dtype)
-        if dtype not in self._tables:
-            most = np.iinfo(dtype).max
-            self._tables[dtype] = self._curve(np.arange(most + 1, dtype=np.float64) / most, "srgb").astype(np.float32)
-        return self._tables[dtype]
-
-    def __call__(self, frame: np.ndarray, name: str) -> np.ndarray:
-        """Raises EventDataError with ``name``, pixel and value for NaN, infinite or negative intensities."""
-        if frame.dtype in (np.uint8, np.uint16):
-            table = self.table(frame.dtype)
-            if frame.ndim == 2:
-                return table[frame]
-            out = np.empty(frame.shape[:2], np.float32)
-            _luma_by_table(np.ascontiguousarray(frame), table, _LUMA, out)
-            return out
-        if frame.dtype.kind != "f":
-            raise EventDataError(
-                "unsupported pixel type", where=name, value=str(frame.dtype), accepted="uint8, uint16 or float"
-            )
-        frame = np.asarray(frame, np.float32)
-        low, high = frame.min(), frame.max()
-        if not (low >= 0 and high < np.inf):  # NaN fails both
-            where = np.argwhere(~((frame >= 0) & (frame < np.inf)))[0]
-            raise EventDataError(
-                f"intensity at pixel x={where[1]}, y={where[0]} cannot be used",
-                where=name,
-                value=float(frame[tuple(where)]),
-                accepted="a finite value >= 0",
-            )
-        linear = self._curve(frame, "linear")
-        return np.ascontiguousarray(linear if linear.ndim == 2 else linear @ _LUMA, np.float32)
-
-    def _curve(self, code: np.ndarray, default: str) -> np.ndarray:
-        gamma = default if self._gamma is None else self._gamma
-        if gamma == "linear":
-            return code
-        return linear_from_srgb(code) if gamma == "srgb" else code ** code.dtype.type(gamma)
-
-
-@numba.njit(cache=True, nogil=True)
-def _luma_by_table(frame, table, weights, out):
-    for y in range(out.shape[0]):
-        for x in range(out.shape[1]):
-            out[y, x] = (
-                weights[0] * table[frame[y, x, 0]]
-                + weights[1] * table[frame[y, x, 1]]
-                + weights[2] * table[frame[y, x, 2]]
-            )
-
-
 def emulator_config(emulator: str | EmulatorConfig | dict) -> EmulatorConfig:
     """A validated emulator config from a name, a plain mapping with ``emulator``, or a config."""
     if isinstance(emulator, EmulatorConfig):
@@ -485,20 +407,6 @@ def emulator_config(emulator: str | EmulatorConfig | dict) -> EmulatorConfig:
     if not isinstance(kind, str) or kind not in members.models:
         raise ConfigError("unknown emulator", where="emulator", value=kind, accepted=", ".join(members.models))
     return validate(members.models[kind], data, where=kind)
-
-
-def _checked_gamma(gamma: str | float | None) -> str | float | None:
-    if gamma in (None, "srgb", "linear"):
-        return gamma
-    try:
-        value = float(gamma)
-        if 0 < value <= 10:
-            return value
-    except (TypeError, ValueError):
-        pass
-    raise ConfigError(
-        "unknown transfer curve", where="gamma", value=gamma, accepted="srgb, linear or an exponent up to 10"
-    )
 
 
 def timed(frames: Iterable, fps: float | None = None) -> Iterator[tuple[np.ndarray, int, str]]:

@@ -15,8 +15,9 @@ from blinkgl.errors import ConfigError, EventDataError
 from blinkgl.events import Events, make_emulator
 from blinkgl.io.formats import open_events
 from blinkgl.io.video import VideoReader, VideoWriter
+from blinkgl.recordings.decoding import Decoder
 from blinkgl.recordings.fitting import Fitting
-from blinkgl.recordings.simulation import Decoder, FrameUse, SimulationReport, file_to_events, frames_to_events
+from blinkgl.recordings.simulation import FrameUse, SimulationReport, file_to_events, frames_to_events
 from blinkgl.srgb import DECODE_8BIT
 from tests.shared_data import shared
 

@@ -18,7 +18,9 @@ _LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 class Decoder:
-    """Frames as stored to linear luminance (H, W) float32. gamma as :func:`~blinkgl.recordings.simulation.frames_to_events`."""
+    """Frames as stored to linear luminance (H, W) float32.
+
+    gamma : as of :func:`~blinkgl.recordings.simulation.frames_to_events`."""
 
     def __init__(self, gamma: str | float | None):
         self._gamma = gamma

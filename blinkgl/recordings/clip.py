@@ -246,7 +246,7 @@ def _spanned(events: Events, clock: np.ndarray, where: str) -> np.ndarray:
         raise EventDataError(
             "the recording spans fewer than two intervals between frames",
             where=where,
-            value=[tuple(round(t / 1e6, 6) for t in (a[0], a[-1])) for a in (events.t, clock)],
+            value=[tuple(round(int(t) / 1e6, 6) for t in (a[0], a[-1])) for a in (events.t, clock)],
             accepted="two or more, on one clock (seconds of events and of frames shown)",
         )
     return inside
@@ -395,7 +395,7 @@ def _match(events: Events, changes: np.ndarray, clock_us: np.ndarray, pairs: lis
             continue
         part = events.window(int(clock_us[k]), int(clock_us[k + 1]))
         sums = polarity_sums(part, size)
-        if sums.any():
+        if sums.any() and np.ptp(changes[k]) > 0:  # frames without motion match nothing
             found.append(np.corrcoef(cv2.GaussianBlur(sums, (0, 0), BLUR_PX).ravel(), changes[k].ravel())[0, 1])
     return float(np.mean(found)) if found else float("nan")
 

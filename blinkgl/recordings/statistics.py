@@ -260,7 +260,7 @@ class Targets:
 
 
 WEIGHTS = {"rate": 3.0, "light": 3.0, "interval": 5.0, "turn": 1.0, "count": 2.0, "still": 2.0, "still count": 2.0,
-           "polarity": 2.0, "alike": 2.0, "look": 2.0, "total": 3.0}  # fmt: skip
+           "polarity": 2.0, "alike": 4.0, "look": 2.0, "total": 3.0}  # fmt: skip
 """How much the blocks count, each as a whole: what rates and intervals are is what a simulation is used for."""
 FLOOR = {"rate": 0.02, "light": 0.05, "interval": 0.01, "turn": 0.02, "count": 0.01, "still": 0.05, "still count": 0.01,
          "polarity": 0.02, "alike": 0.02, "look": 0.1, "total": 0.02}  # fmt: skip

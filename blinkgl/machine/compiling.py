@@ -7,8 +7,9 @@ the figure is 0. It is no part of what anything costs, so it must not be in anyb
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from numba.core import event
 
@@ -44,10 +45,15 @@ def compiled_s() -> float:
     return _watch.seconds
 
 
-def announce_compiling(say: Callable[[str], None]) -> None:
-    """Calls ``say`` with a sentence when the next kernel is compiled, and never again: a program that prints nothing
-    for a minute looks as if it hung."""
+@contextlib.contextmanager
+def announced_compiling(say: Callable[[str], None]) -> Iterator[None]:
+    """Calls ``say`` with a sentence when a kernel is compiled inside, once: a program that prints nothing for a minute
+    looks as if it hung."""
     _watch.say = say
+    try:
+        yield
+    finally:
+        _watch.say = None
 
 
 def working_clock() -> float:

@@ -70,7 +70,7 @@ def run(
     """``size``: "WIDTHxHEIGHT" in place of the sensor's.   ``options``: of
     :func:`~blinkgl.recordings.simulation.file_to_events`."""
     from blinkgl.config.sensor import load_sensor
-    from blinkgl.machine.compiling import announce_compiling
+    from blinkgl.machine.compiling import announced_compiling
     from blinkgl.recordings.simulation import FrameUse, file_to_events
 
     options |= emulator_options(emulator, config, overrides, sensor)
@@ -78,7 +78,6 @@ def run(
     if size is not None:
         options["size"] = size_of(size)
     console = plain_console(quiet=quiet)
-    announce_compiling(lambda text: say(console, text))
     if sensor is not None and not load_sensor(sensor).pixels_known:
         say(console, f"of {sensor} only the size is known: thresholds and noise are the emulator's defaults")
     bar = Progress(
@@ -91,7 +90,7 @@ def run(
         transient=True,
         disable=quiet or not console.is_terminal,
     )
-    with bar:
+    with announced_compiling(lambda text: say(console, text)), bar:
         task = bar.add_task(Path(target).name, total=None, detail="")
 
         def progress(report, fraction) -> None:

@@ -43,9 +43,10 @@ def test_the_next_compilation_is_announced_once():
     import numba
 
     said = []
-    compiling.announce_compiling(said.append)
-    first, second = numba.njit(lambda x: x + 1), numba.njit(lambda x: x + 2)
-    first(1)
-    first(1)
-    second(1)
+    first, second, third = (numba.njit(lambda x, k=k: x + k) for k in (1, 2, 3))
+    with compiling.announced_compiling(said.append):
+        first(1)
+        first(1)
+        second(1)
+    third(1)  # nobody listens any more
     assert said == ["compiling kernels, once per machine: this may take a minute or two"]

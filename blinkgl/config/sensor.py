@@ -110,8 +110,9 @@ class SensorConfig(Config):
     @property
     def pixels_known(self) -> bool:
         """Whether anything is said of what its pixels do: else the emulators' defaults stand for it."""
-        told = (self.contrast_threshold, self.threshold_sigma, self.cutoff_hz, self.refractory_us, self.leak_rate_hz)
-        return bool(self.emulators) or any(value is not None for value in told)
+        keys = ("contrast_threshold", "contrast_threshold_off", "threshold_sigma", "cutoff_hz", "refractory_us",
+                "leak_rate_hz", "shot_noise_rate_hz", "emulators")  # fmt: skip
+        return any(getattr(self, key) not in (None, {}) for key in keys)
 
     def values(self, emulator: Any) -> dict[str, Any]:
         """What this sensor says about the keys of the emulator of this name; of one that is not known nothing."""

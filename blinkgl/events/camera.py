@@ -198,7 +198,7 @@ class EventCamera:
         if readout is not None:
             if readout.frame_resets is not None:
                 response = EMULATORS[config.emulator].response(config)
-                self._resets = FrameResets(readout.frame_resets, response.threshold / response.gain)
+                self._resets = FrameResets(readout.frame_resets, self.emulator, response.threshold / response.gain)
             if readout.pixels is not None:
                 self._pixels = PixelNoise(readout.pixels, height, width, seed, self.emulator.causes)
             self._readout = Readout(readout)

@@ -123,6 +123,12 @@ class Emulator(ABC):
         (H, W); None: not at all. Whoever says what made an event asks."""
         return None
 
+    def push(self, luminance: np.ndarray, jump: float, rise_s: float) -> np.ndarray | None:
+        """(H, W) float32 by what ln I has to be higher for ``rise_s`` so that the signal ends higher by ``jump``, of
+        linear luminance (H, W); None: the signal follows at once. Whoever makes a jump behind the photoreceptor asks
+        (:mod:`~blinkgl.events.resets`)."""
+        return None
+
     @property
     def causes(self) -> bool:
         """Whether events say what caused them, ``config.causes``."""

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from blinkgl.config.readout import FrameResetsConfig
+from blinkgl.events.emulator import Emulator
 
 RISE_NS = 300_000
 """Time of the jump: the ON events of a reset lie within half a millisecond."""
@@ -29,16 +30,21 @@ class _Seen(NamedTuple):
 class FrameResets:
     """The light that pixels see between and at the frames that an emulator is given, with the jumps in it.
 
-    ln I is higher by ``kick`` thresholds ``RISE_NS`` after a reset, and by nothing ``length_ms`` after that, in
-    straight lines. Resets follow one another at ``interval_ms``; the first comes ``first_ms`` after the first frame.
+    The signal is higher by ``kick`` thresholds ``RISE_NS`` after a reset. Of an emulator that follows light at once it
+    goes there and, in ``length_ms``, back in straight lines; one with a low-pass is pushed there by brighter light
+    and comes back as slowly as its pixels do. Resets follow one another at ``interval_ms``; the first comes
+    ``first_ms`` after the first frame.
 
-    threshold : the emulator's, ln units: in three recordings whose thresholds differ by a factor of four the jump is
-    0.31 to 0.39 of it."""
+    emulator : of which the pixels are.   threshold : its smallest nominal one, ln units: in three recordings whose
+    thresholds differ by a factor of four the jump is 0.31 to 0.39 of it."""
 
-    def __init__(self, config: FrameResetsConfig, threshold: float):
-        self._kick = config.kick * threshold
+    def __init__(self, config: FrameResetsConfig, emulator: Emulator, threshold: float):
+        self._jump, self._emulator = config.kick * threshold, emulator
         self._every, self._first = (round(1e6 * ms) for ms in (config.interval_ms, config.first_ms))
-        self._corners = (0, RISE_NS, RISE_NS + round(1e6 * config.length_ms))
+        if emulator.push(np.ones((1, 1), np.float32), self._jump, 1e-9 * RISE_NS) is None:
+            self._corners, self._share = (0, RISE_NS, RISE_NS + round(1e6 * config.length_ms)), (0.0, 1.0, 0.0)
+        else:
+            self._corners, self._share = (0, 1000, RISE_NS, RISE_NS + 1000), (0.0, 1.0, 1.0, 0.0)
         self._began: int | None = None
         self._last: _Seen | None = None
 
@@ -54,18 +60,24 @@ class FrameResets:
             kicked = self._at(last.t_ns) > 0
             for knot in self._knots(last.t_ns, t_ns):
                 part = np.float32((knot - last.t_ns) / (t_ns - last.t_ns))
-                between = last.luminance + (luminance - last.luminance) * part
-                yield knot, between * np.float32(np.exp(self._at(knot))), True
+                yield knot, self._lit(last.luminance + (luminance - last.luminance) * part, self._at(knot)), True
                 kicked = True
         here = self._at(t_ns)
-        yield t_ns, luminance * np.float32(np.exp(here)) if here else luminance, kicked or here > 0
+        yield t_ns, self._lit(luminance, here), kicked or here > 0
         self._last = _Seen(t_ns, np.array(luminance, np.float32))
 
+    def _lit(self, luminance: np.ndarray, share: float) -> np.ndarray:
+        """The light with a share of the jump in it."""
+        if share == 0:
+            return luminance
+        push = self._emulator.push(luminance, self._jump, 1e-9 * RISE_NS)
+        return luminance * np.exp(np.float32(share) * (np.float32(self._jump) if push is None else push))
+
     def _at(self, t_ns: int) -> float:
-        """The jump, of ln I."""
+        """The share of the jump at a time."""
         assert self._began is not None
         since = (t_ns - self._began - self._first) % self._every if t_ns >= self._began + self._first else -1
-        return float(np.interp(since, self._corners, (0.0, self._kick, 0.0), left=0.0, right=0.0))
+        return float(np.interp(since, self._corners, self._share, left=0.0, right=0.0))
 
     def _knots(self, after_ns: int, before_ns: int) -> Iterator[int]:
         """Times strictly between two frames at which the jump begins, is highest and is over."""

@@ -198,6 +198,8 @@ def _bands(taken, start, edges, progress, share, packed, frame, codes, table, x_
 
 _TAIL = 4.0
 """Time constants of the low-pass after which a step, e^4 times the threshold at most, is over."""
+_PUSHES, _MOST_PUSH = 8, 3.0
+"""Steps to the light that makes a jump, and its largest ln: what is darker follows more slowly than that."""
 
 
 @register
@@ -297,6 +299,20 @@ class V2e(Emulator):
         # The corner frequency of the first low-pass, f_c (I + 20)/275, as in v2e_model.relax.
         corner = self.config.cutoff_hz * (luminance.astype(np.float64) * self.config.full_scale + 20.0) / 275.0
         return _TAIL / (2 * np.pi * corner)
+
+    def push(self, luminance: np.ndarray, jump: float, rise_s: float) -> np.ndarray | None:
+        memory = self.memory_s(luminance)
+        if memory is None:
+            return None
+        # m (1 - e^{-k g}) = jump: what a low-pass takes up of m in k of its time constants, which brighter light
+        # shortens, by g. The geometric mean of two steps converges where the steps by themselves run away.
+        k = rise_s * _TAIL / memory
+        intensity, most = luminance.astype(np.float64) * self.config.full_scale, _MOST_PUSH
+        m = np.minimum(jump / -np.expm1(-k), most)
+        for _ in range(_PUSHES):
+            g = (intensity * np.exp(m) + 20.0) / (intensity + 20.0)
+            m = np.minimum(np.sqrt(m * jump / -np.expm1(-k * g)), most)
+        return m.astype(np.float32)
 
     def _start(self, frame: np.ndarray, t_ns: int) -> Events:
         intensity = self._table[frame] if frame.dtype == np.uint8 else frame * self._scale

@@ -73,19 +73,26 @@ def test_codes_and_rows_are_as_light_and_whole_frames():
     assert len(Events.concatenate(coded)) == 2 * H * W and codes.tensor_device is None
 
 
+@pytest.mark.parametrize("luminance", [0.1, 0.6])
 @pytest.mark.parametrize(
-    ("config", "expected"),
+    ("config", "kick", "expected"),
     [
-        (V2eConfig(preset="clean"), 1.0),  # from the middle, as far as one level
-        (VoltmeterConfig(k1=5.0), 5 * np.log((153 * np.exp(0.3) + 20) / 173)),  # from anywhere between two levels
+        (V2eConfig(preset="clean", threshold_sigma=0.0, cutoff_hz=0.0), 1.2, 1.0),  # from the middle
+        (V2eConfig(preset="clean", threshold_sigma=0.0, cutoff_hz=150.0), 1.2, 1.0),  # behind a low-pass
+        (V2eConfig(preset="clean", threshold_sigma=0.0, cutoff_hz=150.0), 0.9, 0.0),
+        (V2eConfig(preset="clean", threshold_sigma=0.0, cutoff_hz=150.0), 1.8, 1.0),
+        (V2eConfig(preset="clean", threshold_sigma=0.0, cutoff_hz=150.0), 2.2, 2.0),
+        (VoltmeterConfig(k1=5.0, k2=1.0), 1.5, 1.5),  # from anywhere between two levels
     ],
 )
-def test_a_jump_of_one_and_a_half_thresholds_by_any_emulator(config, expected):
-    light = [(t * MS, np.full((H, W), 0.6, np.float32)) for t in range(40)]
-    events = events_of(light, FrameResetsConfig(interval_ms=100, kick=1.5, length_ms=2, first_ms=10), config)
+def test_the_signal_of_any_emulator_jumps_by_so_many_thresholds(config, kick, expected, luminance):
+    """A low-pass that light has to go through takes nothing of it."""
+    light = [(t * MS, np.full((H, W), luminance, np.float32)) for t in range(40)]
+    events = events_of(light, FrameResetsConfig(interval_ms=100, kick=kick, length_ms=2, first_ms=10), config)
     quiet = events_of(light, None, config)
-    on = events.window(10_000, 12_500).p.sum() - quiet.window(10_000, 12_500).p.sum()
-    assert abs(on / (H * W) - expected) < 0.1
+    on = lambda one: int(one.window(10_000, 10_400).p.sum())
+    assert abs((on(events) - on(quiet)) / (H * W) - expected) < 0.1
+    assert not expected or np.ptp(events.window(10_000, 10_400).t) < 305
 
 
 def test_a_jump_that_lasts_into_the_next_is_refused():

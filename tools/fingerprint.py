@@ -5,8 +5,11 @@
     python -m blinkgl.tools.fingerprint --only wave,v2e       # some cases
 
 ``tests/fingerprint/cases.yaml`` has the cases: small pictures of every feature that a user was promised. The sums lie
-beside it, one file for each platform (:func:`platform_name`): rasterisers, NumPy versions and processors with AVX-512
-round differently.
+beside it, one file for each rasteriser and NumPy version (:func:`platform_name`). So that they hold on every x86
+processor, the program runs in a process whose NumPy and OpenBLAS use no AVX-512 (``PINNED``), which rounds the last
+bit of a pose differently. Colour pictures have a sum for each processor vendor: llvmpipe makes the mip levels of sRGB
+textures with the processor's approximate reciprocal square root, whose last bits are Intel's or AMD's own.
+
 A sum covers the names and bytes of the files in one folder. ``manifest.json`` and ``config.yaml`` are left
 out: they name versions and every key of the configuration, so that a removed key would change every case.
 """
@@ -17,8 +20,10 @@ import argparse
 import functools
 import hashlib
 import json
+import os
 import re
 import shutil
+import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
@@ -36,21 +41,22 @@ from blinkgl.events.table import EMULATORS
 from blinkgl.gl import create_context
 from blinkgl.io.formats import convert
 from blinkgl.layouts.export import LAYOUTS, export_layout
+from blinkgl.machine.cpu import cpu_field
 from blinkgl.recordings.simulation import file_to_events
 
 HERE = Path(__file__).resolve().parents[1] / "tests" / "fingerprint"
+PINNED = {"OPENBLAS_CORETYPE": "Haswell", "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR"}
+COLOUR = re.compile(r"(^|/)(images|clean|sharp|ev_inf|frame_camera|mvsec/train)$")
+"""Folders of colour pictures, whose sums are kept for each processor vendor."""
+Sums = dict[str, str | dict[str, str]]
 NOT_DATA = re.compile(r"(^|/)(manifest\.json|config\.yaml|rig\.yaml|README\.md|\.run/.*)$")
 
 
 def platform_name() -> str:
-    """Return the name of what decides the last bits: rasteriser, NumPy, and the instructions that NumPy's sums use."""
+    """Return the name of what decides the bytes beside this program: the rasteriser and NumPy's version."""
     with create_context() as gl:
         drawn_by = f"{gl.renderer} {gl.version}"
-    found = np.show_config(mode="dicts")["SIMD Extensions"]["found"]
-    # With AVX-512 (level 4 of x86-64) products and sines round the last bit of a pose differently than with AVX2.
-    level = max((name for name in found if name.startswith("X86_V")), default="baseline")
-    words = re.sub(r"[^A-Za-z0-9.]+", "-", f"{drawn_by} numpy-{np.__version__} {level}")
-    return words.strip("-")
+    return re.sub(r"[^A-Za-z0-9.]+", "-", f"{drawn_by} numpy-{np.__version__}").strip("-")
 
 
 def sums(folder: Path) -> dict[str, str]:
@@ -145,17 +151,33 @@ def fingerprint(name: str) -> dict[str, str]:
         return sums(OTHERS[name](scratch) if name in OTHERS else generated(name, scratch))
 
 
-def kept(platform: str) -> dict[str, dict[str, str]] | None:
-    """Return the sums that the repository keeps of a platform, or None."""
+def kept(platform: str) -> dict[str, Sums]:
+    """Return the sums that the repository keeps of a platform, by case; empty where it keeps none."""
     try:
         return json.loads((HERE / "sums" / f"{platform}.json").read_text(encoding="utf-8"))
     except FileNotFoundError:
-        return None
+        return {}
 
 
-def differences(name: str, before: dict[str, str], after: dict[str, str]) -> list[str]:
-    """Return one line for each folder whose sum differs."""
-    return [f"{name}/{path}" for path in sorted(before.keys() | after) if before.get(path) != after.get(path)]
+def differences(before: Sums, after: dict[str, str], vendor: str) -> list[str]:
+    """Return the folders of one case whose sums differ; colour pictures count where this vendor's sum is kept."""
+
+    def known(path: str) -> str | None:
+        entry = before.get(path)
+        return entry.get(vendor, after.get(path)) if isinstance(entry, dict) else entry
+
+    return [path for path in sorted(before.keys() | after) if known(path) != after.get(path)]
+
+
+def renewed(before: Sums, after: dict[str, str], vendor: str) -> Sums:
+    """Return the sums of one case as they are kept: another vendor's stay only beside an unchanged one of this."""
+
+    def entry(path: str, made: str) -> str | dict[str, str]:
+        known = before.get(path)
+        others = known if isinstance(known, dict) and known.get(vendor, made) == made else {}
+        return {**others, vendor: made} if COLOUR.search(path) else made
+
+    return {path: entry(path, made) for path, made in after.items()}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -163,24 +185,32 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--keep", action="store_true", help="write the sums of this platform instead of comparing")
     parser.add_argument("--only", default="", help="names of cases, with commas between")
     options = parser.parse_args(arguments)
+    if any(os.environ.get(name) != value for name, value in PINNED.items()):  # they count when NumPy is loaded
+        command = [
+            sys.executable,
+            "-m",
+            "blinkgl.tools.fingerprint",
+            *(sys.argv[1:] if arguments is None else arguments),
+        ]
+        return subprocess.run(command, env={**os.environ, **PINNED}, check=False).returncode
     wanted = options.only.split(",") if options.only else names()
-    platform = platform_name()
+    platform, vendor = platform_name(), cpu_field("vendor_id")
     before = kept(platform)
-    made = {}
+    made, changed = {}, {}
     for name in wanted:
         made[name] = fingerprint(name)
-        changed = differences(name, before.get(name, {}), made[name]) if before else []
-        print(f"{name}: {len(made[name])} folders", *changed, sep="\n  differs: ", flush=True)
+        changed[name] = differences(before[name], made[name], vendor) if name in before else []
+        print(f"{name}: {len(made[name])} folders", *changed[name], sep=f"\n  differs: {name}/", flush=True)
     if options.keep:
         file = HERE / "sums" / f"{platform}.json"
         file.parent.mkdir(exist_ok=True)
-        known = before if before and options.only else {}
-        file.write_text(json.dumps({**known, **made}, indent=1) + "\n", encoding="utf-8")
+        new = {name: renewed(before.get(name, {}), sums, vendor) for name, sums in made.items()}
+        known = before if options.only else {}
+        file.write_text(json.dumps({**known, **new}, indent=1) + "\n", encoding="utf-8")
         return 0
-    if before is None:
-        print(f"no sums are kept for {platform}; --keep writes them")
-        return 1
-    return int(any(differences(name, before.get(name, {}), made[name]) for name in wanted))
+    if unknown := [name for name in wanted if name not in before]:
+        print(f"no sums are kept for {platform} of {', '.join(unknown)}; --keep writes them")
+    return int(bool(unknown) or any(changed.values()))
 
 
 if __name__ == "__main__":

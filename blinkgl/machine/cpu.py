@@ -8,17 +8,23 @@ _BF16 = {"avx512_bf16": "AVX-512 BF16", "amx_bf16": "AMX", "bf16": "Arm BF16"}
 """Names of the kernel's flags, x86 and Arm."""
 
 
-def cpu_flags(path: str = "/proc/cpuinfo") -> frozenset[str]:
-    """The kernel's names of the first core's features; empty where there is no such file. What a virtual machine hides
-    is not there, which is what the mathematics libraries see, too."""
+def cpu_field(*names: str, path: str = "/proc/cpuinfo") -> str:
+    """Return what the kernel says of the first core under the first of ``names`` that it has, e.g. ``vendor_id``; an
+    empty string where there is no such file."""
     try:
         for line in Path(path).read_text(encoding="utf-8", errors="replace").splitlines():
-            name, _, values = line.partition(":")
-            if name.strip() in ("flags", "Features"):
-                return frozenset(values.split())
+            name, _, value = line.partition(":")
+            if name.strip() in names:
+                return value.strip()
     except OSError:
         pass
-    return frozenset()
+    return ""
+
+
+def cpu_flags(path: str = "/proc/cpuinfo") -> frozenset[str]:
+    """Return the kernel's names of the first core's features (x86: flags; Arm: Features), without those that a virtual
+    machine hides, which the mathematics libraries do not see either."""
+    return frozenset(cpu_field("flags", "Features", path=path).split())
 
 
 def bf16_instructions() -> str:

@@ -15,7 +15,7 @@ surface itself, and its line runs back along others that are seen: it is one of 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numba as nb
@@ -35,48 +35,75 @@ of a turn along the pixel's boundary; of the centre, px to the left of the line;
 way to the left, a unit vector; what depth gains along the line in a px of the longer axis; the line's kind."""
 CREASE = np.cos(np.radians(20.0))
 """Of the angle between the normals of two faces where they meet, above which light is expected to jump."""
+WELD = 2e-3
+"""Of an object's size: up to this far apart borders of two of its parts are one. Files that were compressed part by part
+(Draco) have such cracks."""
 SILHOUETTE, BACK_AGAIN, BENT, TORN = 0, -1, 1, 2
 """Kinds of lines: silhouettes and borders; silhouettes where a closed surface is hollow; creases; seams."""
 
 
 class Contour:
-    """The edges of one mesh. Vertices at the same place are one.
+    """The edges of one object. Vertices at the same place are one, those of two parts, too: where parts meet is no
+    border.
 
-    corners : (V,) int64 where in ``mesh.vertices`` each place is.   faces : (F, 3) int32 places.
+    corners : (V,) int64 where in the parts' vertices, one part behind the other, each place is.
+    rest : (V, 3) float64 of the shape that does not deform.   faces : (F, 3) int32 places.
     edges : (E, 4) int32: two places in the order of the first face, the first face, the second or -1.
-    sharp : (E,) int8: :data:`BENT` where its faces meet at an angle, else :data:`TORN` where they meet in space and not
-    in the texture, else 0.   planes : (F, 4) float64 of a mesh that does not deform:
-    normal, any length, and its product with a point of the face."""
+    sharp : (E,) int8: :data:`BENT` where its faces meet at an angle or are of two parts, else :data:`TORN` where they
+    meet in space and not in the texture, else 0.   culled : (F,) bool: faces that are drawn from one side alone.
+    planes : (F, 4) float64 of the rest shape: normal, any length, and its product with a point of the face."""
 
-    def __init__(self, mesh: Mesh):
+    def __init__(self, parts: Sequence[tuple[Mesh, bool]]):
+        """parts : meshes, and whether both sides of their faces are drawn."""
+        self.meshes = [mesh for mesh, _ in parts]
+        self.deforms = any(mesh.deformer is not None for mesh in self.meshes)
+        vertices = np.concatenate([np.asarray(mesh.vertices, np.float64) for mesh in self.meshes])
         # + 0.0 makes -0.0 and 0.0 one place.
-        _, self.corners, place = np.unique(
-            np.ascontiguousarray(mesh.vertices, np.float64) + 0.0, axis=0, return_index=True, return_inverse=True
-        )
-        self.faces = np.ascontiguousarray(place.reshape(-1)[mesh.faces], np.int32).reshape(-1, 3)
-        self.rest = np.ascontiguousarray(mesh.vertices[self.corners], np.float64)
+        _, self.corners, place = np.unique(vertices + 0.0, axis=0, return_index=True, return_inverse=True)
+        firsts = np.cumsum([0, *(len(mesh.vertices) for mesh in self.meshes)])
+        corner_of = [mesh.faces + first for mesh, first in zip(self.meshes, firsts[:-1], strict=True)]
+        places = [place.reshape(-1)[c].reshape(-1, 3).astype(np.int32) for c in corner_of]
+        self.faces = np.ascontiguousarray(np.concatenate(places))
+        self.culled = np.concatenate([np.full(len(mesh.faces), not both, np.bool_) for mesh, both in parts])
+        self.rest = np.ascontiguousarray(vertices[self.corners])
         self.planes = np.empty((len(self.faces), 4))
         _planes(self.rest, self.faces, self.planes)
-        self.edges = _edges(self.faces, len(self.corners))
-        self.sharp = self._sharp(mesh)
+        counts = np.cumsum([0, *(len(faces) for faces in places)])
+        each = [_edges(faces, len(self.corners)) for faces in places]
+        if len(each) > 1:
+            welded = _welded(self.rest, [np.unique(e[e[:, 3] < 0, :2]) for e in each])
+            self.faces = welded[self.faces]
+            each = [np.column_stack([welded[e[:, :2]], e[:, 2:]]) for e in each]
+        edges = np.concatenate([np.where(e >= 0, e + (0, 0, n, n), -1) for e, n in zip(each, counts[:-1], strict=True)])
+        self.edges = _joined(edges.astype(np.int32), len(self.corners))
+        self.sharp = self._sharp(np.concatenate(corner_of), np.repeat(np.arange(len(places)), np.diff(counts)))
 
-    def _sharp(self, mesh: Mesh) -> np.ndarray:
+    def positions(self, t_ns: int) -> np.ndarray:
+        """(V, 3) float64 places at a time."""
+        moved = [
+            mesh.vertices if mesh.deformer is None else mesh.deformer.positions(mesh, t_ns) for mesh in self.meshes
+        ]
+        return np.concatenate(moved)[self.corners]
+
+    def _sharp(self, corner_of: np.ndarray, part: np.ndarray) -> np.ndarray:
         """(E,) int8. Bent: its two faces have other normals at both of its ends; a surface that is bent there and lit
         as if it were round shows no step. Torn: other texture coordinates, and not only by whole turns of the
-        texture."""
+        texture. corner_of : (F, 3) vertices of the faces; part : (F,) their parts."""
+        normals, uvs = (np.concatenate([getattr(m, name) for m in self.meshes]) for name in ("normals", "uvs"))
         first, second = self.edges[:, 2], self.edges[:, 3]
         bent, torn = second >= 0, second >= 0
         # Only edges with two faces can be either; both ends have to agree.
         for end in (0, 1):
             # The vertex of each face that is at this end of the edge.
             one, other = (
-                mesh.faces[face, (self.faces[face] == self.edges[:, end, None]).argmax(axis=1)]
+                corner_of[face, (self.faces[face] == self.edges[:, end, None]).argmax(axis=1)]
                 for face in (first, second)
             )
-            bent &= (mesh.normals[one] * mesh.normals[other]).sum(axis=1) < CREASE
+            bent &= (normals[one] * normals[other]).sum(axis=1) < CREASE
             # Whole turns of the texture are no seam.
-            apart = mesh.uvs[one] - mesh.uvs[other]
+            apart = uvs[one] - uvs[other]
             torn &= np.abs(apart - np.round(apart)).max(axis=1) > 1e-5
+        bent |= (second >= 0) & (part[first] != part[second])  # parts have materials of their own
         return np.where(bent, BENT, np.where(torn, TORN, 0)).astype(np.int8)
 
 
@@ -105,6 +132,42 @@ def _edges(faces: np.ndarray, places: int) -> np.ndarray:
     return np.ascontiguousarray(np.column_stack([ends[lead], face[lead], second]), np.int32)
 
 
+def _welded(places: np.ndarray, borders: Sequence[np.ndarray]) -> np.ndarray:
+    """Return (V,) int32: for each place the one that stands for it. Places on the borders of two parts are one where
+    each is the other's nearest, up to :data:`WELD`. borders : places on each part's borders."""
+    from scipy.spatial import cKDTree  # scenes without such parts need no SciPy here
+
+    result = np.arange(len(places), dtype=np.int32)
+    reach = WELD * float(np.ptp(places, axis=0).max())
+    for i in range(1, len(borders)):
+        for j in range(i):
+            if not len(borders[i]) or not len(borders[j]):
+                continue
+            mine, theirs = cKDTree(places[borders[i]]), cKDTree(places[borders[j]])
+            off, nearest = theirs.query(places[borders[i]], distance_upper_bound=reach)
+            back = mine.query(places[borders[j]])[1]
+            found = np.flatnonzero(np.isfinite(off))
+            found = found[back[nearest[found]] == found]
+            result[borders[i][found]] = result[borders[j][nearest[found]]]
+    return result
+
+
+def _joined(edges: np.ndarray, places: int) -> np.ndarray:
+    """Return (E, 4) int32 in which two borders that run in opposite directions between the same places are one edge."""
+    border = np.flatnonzero(edges[:, 3] < 0)
+    ends = edges[border, :2].astype(np.int64)
+    key = ends.min(axis=1) * places + ends.max(axis=1)
+    order = np.argsort(key, kind="stable")
+    border, ends, key = border[order], ends[order], key[order]
+    # Of exactly two; more are surfaces that lie on each other.
+    begins = np.r_[True, key[1:] != key[:-1]] if len(key) else np.zeros(0, np.bool_)
+    alone = np.diff(np.r_[np.flatnonzero(begins), len(key)]) == 2
+    first = np.flatnonzero(begins)[alone]
+    first = first[ends[first, 0] == ends[first + 1, 1]]
+    edges[border[first], 3] = edges[border[first + 1], 2]
+    return np.ascontiguousarray(np.delete(edges, border[first + 1], axis=0))
+
+
 class _Arrays(NamedTuple):
     """Of a pool, for kernels."""
 
@@ -114,10 +177,11 @@ class _Arrays(NamedTuple):
     planes: np.ndarray
     edges: np.ndarray
     sharp: np.ndarray
+    culled: np.ndarray
 
 
 class _Pool:
-    """Contours one behind the other: places, faces, planes, edges, sharp as theirs, with numbers that count on.
+    """Contours one behind the other: places, faces, planes, edges, sharp, culled as theirs, with numbers that count on.
 
     starts : (N + 1, 3) int64: where each one's places, faces and edges begin, and the last one's end."""
 
@@ -140,14 +204,17 @@ class _Pool:
         self.places, self.planes = places, planes
         self.faces, self.edges = faces.astype(np.int32), edges.astype(np.int32)
         self.sharp = np.concatenate([np.empty(0, np.int8), *(c.sharp for c in contours)])
+        self.culled = np.concatenate([np.empty(0, np.bool_), *(c.culled for c in contours)])
 
 
 class Lines:
-    """The contours of a scene's meshes; each is made when it is first drawn, and kept, all one behind the other."""
+    """The contours of a scene's objects; each is made when it is first drawn, and kept, all one behind the other.
+    Objects of the same meshes share one."""
 
     def __init__(self) -> None:
         self._contours: list[Contour] = []
-        self._numbers: dict[int, int] = {}  # of a mesh's contour, by the mesh's id
+        self._numbers: dict[tuple[tuple[int, bool], ...], int] = {}  # of a contour, by its meshes' ids and sides
+        self._of_object: dict[int, int] = {}
         self._pool = _Pool([])
         self._lines = np.empty((1024, LINE))
         self._crossings = np.empty((4096, CROSSING), np.float32)
@@ -157,36 +224,39 @@ class Lines:
         self._counts = np.zeros(0, np.int32)
 
     def of(self, moment: Moment, items: Iterable[DrawItem], width: int, height: int) -> np.ndarray:
-        """(lines, LINE) float64: the lines of these items that are in a picture of ``width`` x ``height`` px, those
-        that something hides included; valid until the next call."""
-        items = list(items)
-        for item in items:
-            if id(item.mesh) not in self._numbers:
-                self._numbers[id(item.mesh)] = len(self._contours)
-                self._contours.append(Contour(item.mesh))
+        """(lines, LINE) float64: the lines of the objects that these items are of, in a picture of ``width`` x
+        ``height`` px, those that something hides included; valid until the next call."""
+        bodies = np.array(list(dict.fromkeys(item.object_index for item in items)), np.int64)
+        numbers = np.array([self._number(moment, body) for body in bodies.tolist()], np.int64)
         if len(self._pool.starts) <= len(self._contours):
             self._pool = _Pool(self._contours)
         pool = self._pool
-        numbers = np.array([self._numbers[id(item.mesh)] for item in items], np.int64)
-        bodies = np.array([item.object_index for item in items], np.int64)
-        culled = np.array([not item.two_sided for item in items], np.bool_)
-        for number, item in zip(numbers, items, strict=True):
+        for number in dict.fromkeys(numbers.tolist()):
+            contour, (place, face, _) = self._contours[number], pool.starts[number]
             # The shape of this moment: its planes, too, are those of now.
-            if item.mesh.deformer is not None:
-                contour, (place, face, _) = self._contours[number], pool.starts[number]
+            if contour.deforms:
                 there = slice(face, face + len(contour.faces))
-                pool.places[place : place + len(contour.corners)] = item.mesh.deformer.positions(
-                    item.mesh, moment.t_ns
-                )[contour.corners]
+                pool.places[place : place + len(contour.corners)] = contour.positions(moment.t_ns)
                 _planes(pool.places, pool.faces[there], pool.planes[there])
-        # Every edge of every item may be a line.
+        # Every edge of every object may be a line.
         room = int((pool.starts[numbers + 1, 2] - pool.starts[numbers, 2]).sum())
         if room > len(self._lines):
             self._lines = np.empty((2 * room, LINE))
-        arrays = _Arrays(pool.starts, pool.places, pool.faces, pool.planes, pool.edges, pool.sharp)
+        arrays = _Arrays(pool.starts, pool.places, pool.faces, pool.planes, pool.edges, pool.sharp, pool.culled)
         poses = moment.T_cam_obj, moment.mvp
-        count = _emit(numbers, bodies, culled, *poses, arrays, float(width), float(height), self._lines)
+        count = _emit(numbers, bodies, *poses, arrays, float(width), float(height), self._lines)
         return self._lines[:count]
+
+    def _number(self, moment: Moment, body: int) -> int:
+        """Return the number of an object's contour, which is made where there is none."""
+        if body not in self._of_object:
+            parts = [(item.mesh, item.two_sided) for item in moment.parts_of(body)]
+            key = tuple((id(mesh), both) for mesh, both in parts)
+            if key not in self._numbers:
+                self._numbers[key] = len(self._contours)
+                self._contours.append(Contour(parts))
+            self._of_object[body] = self._numbers[key]
+        return self._of_object[body]
 
     def in_pixels(
         self, moment: Moment, items: Iterable[DrawItem], width: int, height: int
@@ -221,9 +291,9 @@ def _planes(places, faces, out):
 
 
 @nb.njit(cache=True, nogil=True)
-def _emit(numbers, bodies, culled, T_cam_obj, mvps, pool, width, height, out):
-    """Write the lines of all items and return their number. numbers, bodies, culled : of each item, its contour's
-    place in the pool, its object's, and whether the backs of its faces are not drawn."""
+def _emit(numbers, bodies, T_cam_obj, mvps, pool, width, height, out):
+    """Write the lines of all objects and return their number. numbers, bodies : of each object, its contour's place in
+    the pool and its own in the scene."""
     starts, planes = pool.starts, pool.planes
     front = np.empty(len(planes), np.bool_)
     # np.int64(0), because a literal 0 would compile _emit_one for a second type.
@@ -238,13 +308,13 @@ def _emit(numbers, bodies, culled, T_cam_obj, mvps, pool, width, height, out):
             # The camera lies on the outer side of the face's plane.
             front[f] = planes[f, 0] * x + planes[f, 1] * y + planes[f, 2] * z > planes[f, 3]
         mine = starts[number, 2], starts[number + 1, 2]
-        count = _emit_one(mvps[bodies[n]], pool, mine, front, culled[n], width, height, out, count)
+        count = _emit_one(mvps[bodies[n]], pool, mine, front, width, height, out, count)
     return count
 
 
 @nb.njit(cache=True, nogil=True)
-def _emit_one(mvp, pool, mine, front, culled, width, height, out, count):
-    """Append the lines of one item, whose edges are ``mine`` of the pool's, to the first ``count``, and return the new
+def _emit_one(mvp, pool, mine, front, width, height, out, count):
+    """Append the lines of one object, whose edges are ``mine`` of the pool's, to the first ``count``, and return the new
     number."""
     places, faces, planes = pool.places, pool.faces, pool.planes
     edges, sharp = pool.edges[mine[0] : mine[1]], pool.sharp[mine[0] : mine[1]]
@@ -252,6 +322,7 @@ def _emit_one(mvp, pool, mine, front, culled, width, height, out, count):
     for e in range(len(edges)):
         # Kinds and directions from which faces are seen.
         v0, v1, towards, kind = edges[e, 0], edges[e, 1], front[edges[e, 2]], SILHOUETTE
+        culled = pool.culled[edges[e, 2]] and (edges[e, 3] < 0 or pool.culled[edges[e, 3]])
         if edges[e, 3] >= 0:
             other = front[edges[e, 3]]
             if towards == other:

@@ -213,6 +213,10 @@ class Moment:
         order = np.lexsort((nearest, stage.item_layer))
         return [stage.items[i] for i in order if inside[i]]
 
+    def parts_of(self, object_index: int) -> list[DrawItem]:
+        """Return all items of one object, in view or not."""
+        return self._stage.parts[object_index]
+
 
 _OF_THE_PLACE = ("T_cam_obj", "dT_world_cam", "centres")
 
@@ -227,6 +231,9 @@ class Stage:
         self.item_centre = np.array([i.centre for i in items]).reshape(-1, 3)
         self.item_radius = np.array([i.radius for i in items])
         self.item_layer = np.array([i.layer for i in items])
+        self.parts: dict[int, list[DrawItem]] = {}
+        for item in items:
+            self.parts.setdefault(item.object_index, []).append(item)
 
 
 class Bodies:

@@ -15,7 +15,7 @@ from blinkgl.render.contours import CROSSING, LINE, Contour, Lines
 from blinkgl.render.passes import Luminance
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.rig import Rig
-from blinkgl.scene.types import Light, Material, Texture
+from blinkgl.scene.types import Light, Material, Part, SceneObject, Texture
 from blinkgl.shader_debugger.twins import filtered as filtered_slowly
 from render_scenes import (
     LEVEL,
@@ -123,8 +123,26 @@ def test_the_horizon(gl):
     assert error["edges"] < 0.5 * error["ssaa2"]
 
 
+@pytest.mark.parametrize("crack", [0.0, 1e-3], ids=["exact", "of a file compressed part by part"])
+def test_where_parts_of_one_object_meet_is_no_border(gl, crack):
+    """A window in a door, and the strip beside it: every line between two parts once, not once for each of them."""
+    ring = [(-15.2, -11.3), (14.1, -12.6), (16.3, 10.2), (-13.4, 12.7)]
+    pane = [(-6.3, -5.1), (5.2, -6.7), (7.4, 4.9), (-5.5, 6.2)]
+    frame = mesh(
+        np.column_stack([np.array(ring + pane) * 3 / 48, np.full(8, 3.0)]),
+        [f for k in range(4) for f in ([k, (k + 1) % 4, 4 + (k + 1) % 4], [k, 4 + (k + 1) % 4, 4 + k])],
+    )
+    glass = mesh(np.column_stack([np.array(pane) * 3 / 48 + crack, np.full(4, 3.0 + crack)]), [[0, 1, 2], [0, 2, 3]])
+    door = SceneObject("door", 1, (Part(frame, WHITE), Part(glass, GREY)), still())
+    world = looked_at(door)
+    error = np.abs(luminance(gl, world, "edges") - finest(gl, world))
+    assert (error > 0.02).sum() <= 4 and error.mean() < 4e-4  # the pane's corners
+    contour = Contour([(frame, True), (glass, True)])
+    assert (contour.edges[:, 3] < 0).sum() == 4  # the outline alone
+
+
 def test_a_bent_surface_that_is_lit_as_if_it_were_round_has_no_creases():
-    assert not Contour(sphere(1.0, 1)).sharp.any()  # 80 faces, 30 degrees and more between them
+    assert not Contour([(sphere(1.0, 1), False)]).sharp.any()  # 80 faces, 30 degrees and more between them
 
 
 def test_creases(gl):
@@ -179,7 +197,7 @@ def test_lines_of_a_cube(gl, turn, silhouette, creases):
 def test_three_faces_at_an_edge_and_faces_without_area():
     """The third has a border there; a triangle whose corners are one place has no edges."""
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, 0]], float)
-    contour = Contour(mesh(points, [[0, 1, 2], [1, 0, 3], [0, 1, 4], [0, 5, 0]]))
+    contour = Contour([(mesh(points, [[0, 1, 2], [1, 0, 3], [0, 1, 4], [0, 5, 0]]), False)])
     at = contour.edges[(np.sort(contour.edges[:, :2], axis=1) == np.sort(contour.faces[0, :2])).all(axis=1)]
     assert sorted(at[:, 3] >= 0) == [False, True]
     assert (contour.edges[:, 0] != contour.edges[:, 1]).all()
@@ -444,7 +462,7 @@ def test_seams_of_textures(gl):
     image[:32], image[32:] = 0.1, 0.9
     paint = Material(Texture(image), unlit=True, double_sided=True)
     world = looked_at(thing("card", 1, replace(card, uvs=uvs), still(), paint))
-    assert set(Contour(world.objects[0].parts[0].mesh).sharp.tolist()) == {0, 2}
+    assert set(Contour([(world.objects[0].parts[0].mesh, False)]).sharp.tolist()) == {0, 2}
     true = finest(gl, world)
     inside = np.s_[16:32, 20:28]
     error = {name: rmse(luminance(gl, world, name)[inside], true[inside]) for name in ("taps4", "edges")}

@@ -19,7 +19,7 @@ SAMPLINGS = {
     **{f"uniform {fps}/s": (f"timeline={{kind: uniform, fps: {fps}}}",) for fps in (50, 100, 200, 400, 800, 1600)},
     **{
         f"displacement {px:g} px": (f"timeline={{kind: displacement, max_px: {px}, min_step_us: 20}}",)
-        for px in (4, 2, 1.5, 1, 0.5, 0.25, 0.125)
+        for px in (4, 3, 2, 1.5, 1, 0.5, 0.25, 0.125)
     },
     **{
         f"brightness {c:g} C": (f"timeline={{kind: brightness, max_fraction_of_threshold: {c}, min_step_us: 20}}",)
@@ -104,7 +104,7 @@ def suite_design() -> tuple[Setting, ...]:
     points = [Setting(s, a) for s in _displacement(2, 1, 0.5, 0.25) for a in ("none", "edges")]
     points += [Setting(s, a, sharp) for s in _displacement(2, 1) for a in ("none", "taps4")]
     points += [Setting(s, "edges", o) for s in _displacement(2, 1) for o in _SHARPER]
-    points += [Setting(s, "edges", sharp) for s in _displacement(4, 1.5, 0.5)]
+    points += [Setting(s, "edges", sharp) for s in _displacement(4, 3, 1.5, 0.5)]
     points += [Setting(s, a, sharp) for s in _displacement(2, 1, 0.5) for a in ("ssaa2", "edges2")]
     points += [Setting(_displacement(0.5)[0], "ssaa4", sharp)]
     points += [Setting(f"brightness {c} C", "edges", sharp) for c in (4, 2, 1)]

@@ -47,10 +47,10 @@ def _palette(rng: np.random.Generator) -> np.ndarray:
 def _grade(field: np.ndarray, palette: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Field (h, w) in [0, 1], or (h, w) integer labels, to (h, w, 3) uint8."""
     if field.dtype.kind in "iu":
-        return np.round(palette[field % len(palette)]).astype(np.uint8)
+        return np.round(palette).astype(np.uint8).take(field % len(palette), axis=0)
     stops = np.linspace(0, 1, len(palette))
     table = np.stack([np.interp(np.linspace(0, 1, 1024), stops, palette[:, c]) for c in range(3)], axis=1)
-    return np.round(table[np.clip(field * 1023, 0, 1023).astype(np.int32)]).astype(np.uint8)
+    return np.round(table).astype(np.uint8).take(np.clip(field * 1023, 0, 1023).astype(np.intp), axis=0)
 
 
 def _stretch(field: np.ndarray) -> np.ndarray:

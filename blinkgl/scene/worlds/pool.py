@@ -105,9 +105,12 @@ class Pool:
     bad_assets: str = "error"
     cache: Cache = field(default=_OF_ALL_POOLS, repr=False)
     _own: object = field(default_factory=object, repr=False)  # two pools may load the same file in two ways
+    _sides: dict[str, dict[str, tuple[Entry, ...]]] = field(default_factory=dict, repr=False)
 
     def split(self, split: str) -> dict[str, tuple[Entry, ...]]:
         """source -> its entries on this side; sources without any are left out. ConfigError when nothing is left."""
+        if split in self._sides:
+            return self._sides[split]
         if split not in SPLITS:
             raise ConfigError("unknown split", value=split, accepted="train or test")
         sides: dict[str, list[Entry]] = {}
@@ -127,7 +130,8 @@ class Pool:
                 value=self.test_fraction,
                 accepted="another fraction, or a larger pool",
             )
-        return {source: tuple(entries) for source, entries in sides.items()}
+        self._sides[split] = {source: tuple(entries) for source, entries in sides.items()}
+        return self._sides[split]
 
     def load(self, entry: Entry) -> Any:
         """The entry's content, which may be the cache's."""

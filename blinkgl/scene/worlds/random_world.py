@@ -270,7 +270,9 @@ def _place(
     placed: list[_Placed] = []
     if settings.count == 0:
         return placed
-    centres, radii = [T_cam[:3, 3]], [clearance]
+    # Of the bodies placed so far, the camera's first.
+    centres, radii = np.empty((settings.count + 1, 3)), np.empty(settings.count + 1)
+    centres[0], radii[0] = T_cam[:3, 3], clearance
     for k in range(settings.count):
         asset, said = _playing(objects.draw(rng, split, log), config, rng_shape)
         radius = 0.5 * _log_uniform(rng, (settings.size[0], min(settings.size[1], region.height)))
@@ -284,19 +286,17 @@ def _place(
         changed, word = _changing(asset, settings.deform, rng_shape)
         parts = _dress(config, changed, radius, textures, rng_texture, split, log)
         lowest = min(_lowest(p.mesh, rotation[2]) for p in parts)
-        in_view = rng.random() < settings.in_view
+        in_view, taken = rng.random() < settings.in_view, len(placed) + 1
         for _ in range(_PLACEMENTS):
             position = _candidate(config, camera, rng, T_cam, floor, in_view, resting)
             if resting:
                 position[2] = floor - lowest
             elif not floor + (radius if config.ground else 0) + _GAP <= position[2] <= floor + region.height:
                 continue
-            gap = np.linalg.norm(np.array(centres) - position, axis=1) - radii - radius
-            if (
-                (np.abs(position[:2]) <= region.width / 2).all()
-                and gap.min() > _GAP
-                and gap[0] > max(radius, _STAND_OFF)
-            ):
+            if max(abs(position[0]), abs(position[1])) > region.width / 2:
+                continue
+            gap = np.sqrt(((centres[:taken] - position) ** 2).sum(axis=1)) - radii[:taken] - radius
+            if gap.min() > _GAP and gap[0] > max(radius, _STAND_OFF):
                 break
         else:
             log.append(
@@ -305,8 +305,7 @@ def _place(
             continue
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = rotation, position
-        centres.append(position)
-        radii.append(radius)
+        centres[taken], radii[taken] = position, radius
         placed.append(_Placed(f"{asset.name}#{k}", parts, T, radius, resting))
         log.extend(f"{asset.name}#{k} {text}" for text in (said, word) if text)
         log.extend(line for line in asset.log if line not in log)
@@ -354,11 +353,11 @@ def _candidate(config, camera, rng, T_cam, floor, in_view, resting) -> np.ndarra
     if not in_view:
         half = region.width / 2
         return rng.uniform([-half, -half, floor], [half, half, floor + region.height])
-    pixel = rng.uniform([-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5])
+    pixel = rng.random(2) * (camera.width, camera.height) - 0.5
     ray = T_cam[:3, :3] @ camera.rays(pixel)
     if resting:
         ray[2] = 0.0
-    return T_cam[:3, 3] + ray / np.linalg.norm(ray) * _log_uniform(rng, config.objects.distance)
+    return T_cam[:3, 3] + ray / math.sqrt(ray @ ray) * _log_uniform(rng, config.objects.distance)
 
 
 def _gait(parts: Iterable[Part]) -> tuple[str, float]:

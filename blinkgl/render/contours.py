@@ -36,8 +36,8 @@ way to the left, a unit vector; what depth gains along the line in a px of the l
 CREASE = np.cos(np.radians(20.0))
 """Of the angle between the normals of two faces where they meet, above which light is expected to jump."""
 WELD = 2e-3
-"""Of an object's size: up to this far apart borders of two of its parts are one. Files that were compressed part by part
-(Draco) have such cracks."""
+"""Of an object's size: up to this far apart borders of two of its parts are one. Files that were compressed part by
+part (Draco) have such cracks."""
 SILHOUETTE, BACK_AGAIN, BENT, TORN = 0, -1, 1, 2
 """Kinds of lines: silhouettes and borders; silhouettes where a closed surface is hollow; creases; seams."""
 
@@ -314,8 +314,8 @@ def _emit(numbers, bodies, T_cam_obj, mvps, pool, width, height, out):
 
 @nb.njit(cache=True, nogil=True)
 def _emit_one(mvp, pool, mine, front, width, height, out, count):
-    """Append the lines of one object, whose edges are ``mine`` of the pool's, to the first ``count``, and return the new
-    number."""
+    """Append the lines of one object, whose edges are ``mine`` of the pool's, to the first ``count``, and return the
+    new number."""
     places, faces, planes = pool.places, pool.faces, pool.planes
     edges, sharp = pool.edges[mine[0] : mine[1]], pool.sharp[mine[0] : mine[1]]
     ends = np.empty((2, 4))

@@ -20,7 +20,7 @@ INPUTS = setup.cfg setup.py pyproject.toml constraints.txt tools/setup.sh Makefi
 .PHONY: demo test lint format coverage docs slow bench fuzz doctor setup opengl clean
 .DELETE_ON_ERROR:
 
-demo: .venv/.kernels opengl
+demo: .venv/.installed-core opengl
 	@rm -rf out/demo
 	.venv/bin/blinkgl generate configs/demo.yaml --out out/demo
 	@echo "beside it: events.h5, flow/, images/ in DSEC's layout; README.md says what to do next"

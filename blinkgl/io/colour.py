@@ -71,9 +71,12 @@ def _look_up(flow, valid, maximum, wheel, invalid, rgb):
             speed = np.sqrt(u * u + v * v)
             if valid[y, x] and np.isfinite(speed):
                 scale = radius / max(speed, maximum)
-                rgb[y, x] = wheel[int(np.rint(v * scale)) + radius, int(np.rint(u * scale)) + radius]
+                row, column = int(np.rint(v * scale)) + radius, int(np.rint(u * scale)) + radius
+                for c in range(3):
+                    rgb[y, x, c] = wheel[row, column, c]
             else:
-                rgb[y, x] = invalid
+                for c in range(3):
+                    rgb[y, x, c] = invalid[c]
 
 
 @numba.njit(cache=True, nogil=True)

@@ -450,7 +450,7 @@ def _cross(lines, width, height, out, places):
                 room = -(lx * fx + ly * fy)
                 # The short way round, unless the centre lies on the other side of the line.
                 turn = _around(qx, qy) - _around(px, py)
-                turn -= 8.0 * np.round(turn / 8.0)
+                turn -= 8.0 * np.rint(turn / 8.0)
                 if (room > 0.0) != (turn > 0.0) and abs(turn) > 2.0:
                     turn += 8.0 if room > 0.0 else -8.0
                 # Triangle with the centre, less the sector: 8 half sides are an area of 1.

@@ -86,21 +86,43 @@ class Holes(NamedTuple):
     wrap: tuple[str, str]
 
 
+# Slices that are assigned and argsort would take longer to compile than all the rest here: numba brings a string
+# library along for the message that shapes differ.
+@nb.njit(cache=True, nogil=True)
+def _sort_stably(order, a, b, centre, axis, spare):
+    """Sort order[a:b] by the centroids along an axis; equal ones keep their order. spare : room for b - a."""
+    width = 1
+    while width < b - a:
+        for low in range(a, b, 2 * width):
+            middle, high = min(low + width, b), min(low + 2 * width, b)
+            i, j = low, middle
+            for k in range(low, high):
+                if i < middle and (j >= high or centre[order[i], axis] <= centre[order[j], axis]):
+                    spare[k - a] = order[i]
+                    i += 1
+                else:
+                    spare[k - a] = order[j]
+                    j += 1
+        for k in range(a, b):
+            order[k] = spare[k - a]
+        width *= 2
+
+
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _build(triangles, lower, upper, child, count):
     """Build the tree by median splits along the longest side of the centroids' box. Return (order, number of nodes)."""
     n = triangles.shape[0]
-    order = np.arange(n)
-    centre = np.empty((n, 3))
+    order, spare, centre = np.empty(n, np.int64), np.empty(n, np.int64), np.empty((n, 3))
     for i in range(n):
+        order[i] = i
         for k in range(3):
             centre[i, k] = (triangles[i, 0, k] + triangles[i, 1, k] + triangles[i, 2, k]) / 3.0
     stack = np.empty((_STACK, 3), np.int64)
-    stack[0] = (0, 0, n)
+    stack[0, 0], stack[0, 1], stack[0, 2] = 0, 0, n
     depth, nodes = 1, 1
     while depth > 0:
         depth -= 1
-        node, a, b = stack[depth]
+        node, a, b = stack[depth, 0], stack[depth, 1], stack[depth, 2]
         # The box of the range's triangles, and the axis along which their centroids spread most.
         axis, widest = 0, -1.0
         for k in range(3):
@@ -116,15 +138,13 @@ def _build(triangles, lower, upper, child, count):
         if b - a <= LEAF_TRIANGLES:
             child[node], count[node] = a, b - a
             continue
-        # A stable sort: equal centroids keep their order, so the tree does not depend on the sort's
-        # implementation.
-        part = order[a:b].copy()
-        order[a:b] = part[np.argsort(centre[part, axis], kind="mergesort")]
+        # Stable, so that the tree does not depend on the sort's implementation.
+        _sort_stably(order, a, b, centre, axis, spare)
         # Children are neighbours in memory: one number finds both.
         middle = (a + b) // 2
         child[node], count[node] = nodes, 0
-        stack[depth] = (nodes, a, middle)
-        stack[depth + 1] = (nodes + 1, middle, b)
+        stack[depth, 0], stack[depth, 1], stack[depth, 2] = nodes, a, middle
+        stack[depth + 1, 0], stack[depth + 1, 1], stack[depth + 1, 2] = nodes + 1, middle, b
         depth += 2
         nodes += 2
     return order, nodes

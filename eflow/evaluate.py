@@ -22,6 +22,7 @@ from eflow.data.dataset import FlowDataset, collate
 from eflow.data.sources import Source
 from eflow.infer import PICTURED, predict
 from eflow.methods import Method
+from eflow.methods.contrast import sharpest_length
 from eflow.metrics import NAMES, Tally, frame_metrics
 from eflow.models import FlowModel, parameters_of
 from eflow.pictures import comparison, events_of, write_picture
@@ -42,12 +43,14 @@ def evaluate(
     empty: str = "error",
     precision: str = "fp32",
     limit: int | None = None,
+    sharpen: bool = False,
     progress: Callable[[int, int, float], None] | None = None,
 ) -> dict[str, Any]:
     """Scores ``model``, or a method that needs no training, on every labelled sample of ``source``.
 
     out : new folder for ``results.json`` and ``pictures/`` (evenly spaced samples: events, truth, prediction, error
-    map); None: nothing is written. limit : score only so many samples, evenly spaced.
+    map); None: nothing is written. limit : score only so many samples, evenly spaced.   sharpen : a network's flow as
+    long as makes the events of its two windows sharpest, as `eflow predict` has it.
     progress : called with (done, of, AEE so far).
     Returns {"methods": {name: {"total": …, "scenes": …}}, "ms", "samples", "skipped", "model", "parameters"}; metrics
     as in :mod:`eflow.metrics`.
@@ -59,7 +62,7 @@ def evaluate(
     out = Path(out) if out is not None else None
     method = None if isinstance(model, FlowModel) else model
     representation = model.representation if method is None else PICTURED
-    reads = model.reads if method is None else ("old", "new")
+    reads = model.reads if method is None and not sharpen else ("old", "new")
     dataset = FlowDataset([source], representation, empty=empty, raw=True, reads=reads)
     indices = _evenly(len(dataset), limit or len(dataset))
     shown = {indices[k] for k in _evenly(len(indices), pictures)}
@@ -72,6 +75,8 @@ def evaluate(
         began = time.perf_counter()
         if method is None:
             flow = predict(model, batch, precision=precision).flow[0].permute(1, 2, 0).cpu().numpy()
+            if sharpen:
+                flow = flow * np.float32(sharpest_length([raw.old, raw.new], flow))
         else:
             flow = method(raw.old, raw.new, raw.height, raw.width)
         spent += time.perf_counter() - began

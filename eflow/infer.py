@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +22,7 @@ from blinkgl.types.events import Events
 from eflow.data.representation import VoxelGrid
 from eflow.data.window import Window
 from eflow.methods import Method
+from eflow.methods.contrast import sharpest_length
 from eflow.models import FlowModel, FlowPrediction
 from eflow.ops.warp import forward_warp
 from eflow.pictures import comparison, events_of, write_picture
@@ -84,19 +85,24 @@ class StreamWindow:
 
 
 def windows(
-    file: EventFile, span_us: int, *, start_us: int | None = None, end_us: int | None = None
+    file: EventFile,
+    span_us: int,
+    *,
+    start_us: int | None = None,
+    end_us: int | None = None,
+    reads: Sequence[str] = ("old", "new"),
 ) -> Iterator[StreamWindow]:
     """Successive windows of an event file: reference times start + Δ, start + 2Δ, … while
-    both windows lie inside [start, end).
+    both windows lie inside [start, end); from start on where only the new one is read.
 
     start_us, end_us : default the first event's time and the last's + 1. Streams; holds two windows and a chunk."""
-    pending, t = Events.empty(), None
+    pending, t, skipped = Events.empty(), None, span_us if "old" in reads else 0
     last = None
     for chunk in file.chunks():
         pending = Events.concatenate([pending, chunk])
         if t is None:
             start_us = int(pending.t[0]) if start_us is None else start_us
-            t = start_us + span_us
+            t = start_us + skipped
         last = int(chunk.t[-1])
         while last >= t + span_us and (end_us is None or t + span_us <= end_us):
             yield _pair(pending, t, span_us)
@@ -112,31 +118,37 @@ LIKELY_PX = 5.0
 """Displacement in a window that :func:`likely_span` looks for: networks are trained on 2 to 8 px."""
 
 
-def likely_span(file: EventFile, predictor: Callable[[StreamWindow], tuple[np.ndarray, np.ndarray]]) -> int:
-    """Δ, µs, at which things in the recording move by about :data:`LIKELY_PX`: ``predictor``'s own flow where there are
-    events, at three places of the recording, tells how fast they are; tried with shorter and longer windows until it
-    stands. From 1 ms to a third of the recording. Raises EventDataError: no events."""
+def likely_span(
+    file: EventFile,
+    predictor: Callable[[StreamWindow], tuple[np.ndarray, np.ndarray]],
+    reads: Sequence[str] = ("old", "new"),
+) -> tuple[int, int]:
+    """(Δ, the longest that there is), µs: how long things in the recording take to move by about :data:`LIKELY_PX`.
+    ``predictor``'s own flow where there are events, at three places of the recording, tells how fast they are; tried
+    with shorter and longer windows until it stands. From 1 ms to half of the recording, or all of it for a predictor
+    that ``reads`` the new window alone. Raises EventDataError: no events."""
     ends = [(int(c.t[0]), int(c.t[-1])) for c in file.chunks() if len(c)]
     if not ends:
         raise EventDataError("holds no events", where=str(file.path))
     first, last = ends[0][0], ends[-1][1]
-    longest = max((last - first) // 3, 1000)
+    pair = 2 if "old" in reads else 1
+    longest = max((last + 1 - first) // pair, 1000)
     span = min(30_000, longest)
     for _ in range(4):
         speeds = []
         for place in (0.25, 0.5, 0.75):
-            start = max(first, min(round(first + place * (last - first)) - span, last + 1 - 2 * span))
-            pair = next(windows(file, span, start_us=start), None)
-            if pair is None or not (len(pair.old) and len(pair.new)):
+            start = max(first, min(round(first + place * (last - first)) - span, last + 1 - pair * span))
+            window = next(windows(file, span, start_us=start, reads=reads), None)
+            if window is None or not all(len(getattr(window, name)) for name in reads):
                 continue
-            flow, _ = predictor(pair)
-            speeds.append(float(np.median(np.hypot(*flow[pair.new.y, pair.new.x].T))))
+            flow, _ = predictor(window)
+            speeds.append(float(np.median(np.hypot(*flow[window.new.y, window.new.x].T))))
         speed = float(np.median(speeds)) if speeds else 0.0
         factor = min(max(LIKELY_PX / max(speed, 1e-3), 0.4), 2.5)
         span = int(min(max(span * factor, 1000), longest))
         if 0.8 < factor < 1.25:
             break
-    return span
+    return span, longest
 
 
 def whole_file(file: EventFile, reads: tuple[str, ...] = ("old", "new")) -> tuple[StreamWindow, float]:
@@ -185,7 +197,8 @@ class MethodPredictor:
 class Predictor:
     """A model over a stream of windows. ``warm_start`` carries each flow along itself to the next reference time
     (networks with an iterated low-resolution flow only). empty : "error", or "zero" flow for
-    a window without events."""
+    a window without events.   sharpen : multiply each flow by the factor that makes the events of its windows sharpest
+    (:func:`eflow.methods.contrast.sharpest_length`), kept in ``length``."""
 
     def __init__(
         self,
@@ -196,9 +209,11 @@ class Predictor:
         warm_start: bool = False,
         precision: str = "fp32",
         empty: str = "error",
+        sharpen: bool = False,
     ):
         self.model, self.height, self.width = model, height, width
-        self.warm_start, self.precision, self.empty = warm_start, precision, empty
+        self.warm_start, self.precision, self.empty, self.sharpen = warm_start, precision, empty, sharpen
+        self.length = 1.0
         self._low: torch.Tensor | None = None
 
     def __call__(self, window: StreamWindow) -> tuple[np.ndarray, np.ndarray]:
@@ -220,7 +235,12 @@ class Predictor:
             batch["flow_init"] = forward_warp(self._low)
         prediction = predict(self.model, batch, precision=self.precision)
         self._low = prediction.low
-        return prediction.flow[0].permute(1, 2, 0).cpu().numpy(), new
+        flow = prediction.flow[0].permute(1, 2, 0).cpu().numpy()
+        if self.sharpen:
+            follows = len(window.old) and window.old.t1 == window.new.t0
+            self.length = sharpest_length([window.old, window.new] if follows else [window.new], flow)
+            flow = flow * np.float32(self.length)
+        return flow, new
 
 
 def open_sized(path: str | os.PathLike, size: tuple[int, int] | None = None) -> EventFile:

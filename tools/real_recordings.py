@@ -17,8 +17,9 @@ for all that are judged; of large sensors their middle). Beside each other, medi
 image's x axis: ``x`` is the share of its flow along it.
 
 The second line is for judging, and to be used seldom: the bursts' flow is known. AEE and cosine of the whole burst as
-one window, beside zero flow's and the best constant and affine flow (which know the truth); at pixels with events, and
-over all.
+one window and (``halves``) of its second half, behind its first, beside zero flow's and the best constant and affine
+flow (which know the truth); at pixels with events, and over all. ``NAME+sharp`` is a network whose flow is as long as
+makes the events sharpest, which is what `eflow predict` gives.
 """
 
 from __future__ import annotations
@@ -44,6 +45,8 @@ from eflow.methods.table import METHODS, make_method
 
 TEST = "ecd_rotation"
 """Folder of the bursts whose flow is known: the networks are judged by them and not tuned on them."""
+SHARPENED = "+sharp"
+"""Behind a network's name: its flow as long as makes the events sharpest, as `eflow predict` has it."""
 MOVES = 1.1
 """FWL of the affine field from which on a window is said to move."""
 LONGEST_MS = 120.0
@@ -97,10 +100,11 @@ def answer_of(name: str, height: int, width: int, focal: float | None = None) ->
     """A network's or method's flow (H, W, 2) of a pair of windows, zero where there is nothing to go by."""
     if name == "zero":
         return lambda window: np.zeros((height, width, 2), np.float32)
+    plain = name.removesuffix(SHARPENED)
     if name in METHODS:
         predictor = MethodPredictor(make_method(name, focal), height, width, empty="zero")
     else:
-        predictor = Predictor(load_model(name), height, width, empty="zero")
+        predictor = Predictor(load_model(plain), height, width, empty="zero", sharpen=plain != name)
     return lambda window: predictor(window)[0]
 
 
@@ -182,20 +186,22 @@ def burst(folder: Path, names: list[str]) -> dict[str, dict[str, float]]:
         "best constant": np.broadcast_to(np.median(truth[valid], 0), truth.shape),
         "best affine": basis @ fit,
     }
+    nothing = events.x[:0], events.y[:0], events.t[:0], events.p[:0]
     for name in names:
         if name in METHODS:
             # A method's flow is over its new window, which must lie behind an old one.
-            empty = Window(events.x[:0], events.y[:0], events.t[:0], events.p[:0], t0 - (t1 - t0), t0)
+            empty = Window(*nothing, t0 - (t1 - t0), t0)
             try:
                 flows[name] = make_method(name, focal)(empty, whole, height, width)
             except BlinkGLError as error:
                 print(f"{name}: {error}")
             continue
-        model = load_model(name)
-        predictor = Predictor(model, height, width, empty="zero")
-        one = "old" not in model.reads
-        pair = StreamWindow(t0, whole, whole) if one else halves
-        flows[name] = predictor(pair)[0] * (1.0 if one else (t1 - t0) / (t1 - middle))
+        plain = name.removesuffix(SHARPENED)
+        model = load_model(plain)
+        predictor = Predictor(model, height, width, empty="zero", sharpen=plain != name)
+        if "old" not in model.reads:
+            flows[name] = predictor(StreamWindow(t0, Window(*nothing, t0 - (t1 - t0), t0), whole))[0]
+        flows[f"{name}, halves"] = predictor(halves)[0] * ((t1 - t0) / (t1 - middle))
     rows = {}
     for name, flow in flows.items():
         row = {}

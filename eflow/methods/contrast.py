@@ -140,6 +140,39 @@ def sharpness(cloud: _Cloud, flow: tuple[np.ndarray, np.ndarray], blur: float) -
     return total, slope
 
 
+LENGTHS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1)
+"""Factors that :func:`sharpest_length` tries. Networks make flow too long where it is short, hardly ever too short; and
+where things move their own ways a longer flow is always a little sharper (event collapse)."""
+LENGTH_PRIOR = 0.03
+"""Weight of (ln factor)^2 beside the logarithm of the sharpness: where events hardly tell, the network is believed."""
+
+
+def sharpest_length(windows: list[Window], flow: np.ndarray) -> float:
+    """Return the factor by which a flow has to be multiplied so that its events are sharpest: a network knows the
+    direction of motion from few events, and its length less well.
+
+    windows : one, or two that follow each other.   flow : (H, W, 2) px over the last of them.
+    1.0 where there are too few events to tell (:data:`LEAST_EVENTS`) or nothing moves."""
+    height, width = flow.shape[:2]
+    try:
+        cloud = _Cloud.of(windows, height, width)
+    except EventDataError:
+        return 1.0
+    spans = (windows[-1].t1 - windows[0].t0) / (windows[-1].t1 - windows[-1].t0)
+    at = flow[np.rint(cloud.y).astype(np.intp), np.rint(cloud.x).astype(np.intp)].astype(np.float64) * spans
+    values = np.array([sharpness(cloud, (f * at[:, 0], f * at[:, 1]), BLURS_PX[-1])[0] for f in LENGTHS])
+    if not np.isfinite(values).all() or not values.min() > 0:
+        return 1.0
+    scores = np.log(values) - LENGTH_PRIOR * np.log(LENGTHS) ** 2
+    best = int(scores.argmax())
+    if best in (0, len(LENGTHS) - 1):
+        return LENGTHS[best]
+    # The top of the parabola through three equally spaced factors.
+    low, middle, high = scores[best - 1 : best + 2]
+    step = LENGTHS[best + 1] - LENGTHS[best]
+    return LENGTHS[best] + 0.5 * step * (low - high) / (low - 2 * middle + high)
+
+
 def _climb(
     cloud: _Cloud,
     field: _Field,

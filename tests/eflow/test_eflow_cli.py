@@ -16,7 +16,7 @@ from shared_data import shared  # noqa: E402
 
 import eflow  # noqa: E402
 from blinkgl.io.formats import write_events  # noqa: E402
-from eflow import checkpoint as ckpt, submit  # noqa: E402
+from eflow import checkpoint as ckpt, infer, submit  # noqa: E402
 from eflow.cli import run  # noqa: E402
 from eflow.models import build_model, model_config  # noqa: E402
 from eflow.pictures import BAR, FlowVideo  # noqa: E402
@@ -79,7 +79,7 @@ def test_a_video_of_the_flow(network, tmp_path, capsys):
     assert f"written: {video}" in capsys.readouterr().out
     shown = cv2.VideoCapture(str(video))
     frames = [frame for ok, frame in iter(shown.read, (False, None)) if ok]
-    assert len(frames) == 4 and frames[0].shape[:2] == (2 * (130 + BAR), 2 * (2 * 145 + 4))
+    assert len(frames) == 5 and frames[0].shape[:2] == (2 * (130 + BAR), 2 * (2 * 145 + 4))
     assert run(["predict", network, str(tmp_path / "e.h5"), "--video", str(video)]) == 2
     assert "output file exists" in capsys.readouterr().err
     with pytest.raises(ZeroDivisionError), FlowVideo(tmp_path / "half.mp4", 130, 145, 10) as half:
@@ -100,6 +100,34 @@ def test_a_window_as_long_as_things_need_to_move_by_five_pixels(tmp_path, capsys
     assert 0.7 * span < 1000 * found < 1.4 * span
     assert run([*command[:-1], "soon"]) == 2
     assert "--window-ms: not a length (got 'soon'); expected milliseconds, or auto" in capsys.readouterr().err
+
+
+def test_windows_of_a_recording_that_hardly_moves_are_as_long_as_it_allows(network, tmp_path, capsys):
+    """All of it for a network that reads one window, half of it for a pair; and a line says so."""
+    events = moving_events(130, 145, 0, 90_000, (0, 0), n=4000)
+    write_events(tmp_path / "e.h5", events, 130, 145)
+    file = infer.open_sized(tmp_path / "e.h5")
+    still = lambda window: (np.zeros((130, 145, 2)), None)
+    length = int(events.t[-1]) + 1 - int(events.t[0])
+    assert infer.likely_span(file, still, ("new",)) == (length, length)
+    assert infer.likely_span(file, still) == (length // 2, length // 2)
+    one, two = (list(infer.windows(file, 30_000, reads=reads)) for reads in (("new",), ("old", "new")))
+    assert one[0].t_us == int(events.t[0]) and [w.t_us for w in one[1:]] == [w.t_us for w in two]
+    command = ["predict", "contrast-translation", str(tmp_path / "e.h5"), "--window-ms", "auto"]
+    assert run(command) == 0
+    assert "as long as the recording allows: things move by less than 5 px in it" in capsys.readouterr().out
+    assert run(["predict", network, str(tmp_path / "e.h5"), "--whole", "--no-sharpen"]) == 0
+
+
+def test_another_motion_by_contrast_maximisation_is_said(monkeypatch, tmp_path, capsys):
+    speed = 800.0
+    write_events(tmp_path / "e.h5", moving_events(64, 72, 0, 25_000, (speed, 0), n=4000), 64, 72)
+    wrong = lambda self, window: (np.full((64, 72, 2), (-5.0, 3.0), np.float32), np.zeros((2, 64, 72), np.float32))
+    monkeypatch.setattr(infer.MethodPredictor, "__call__", wrong)
+    assert run(["predict", "contrast-translation", str(tmp_path / "e.h5"), "--window-ms", "auto"]) == 0
+    out = capsys.readouterr().out
+    assert "makes the events in the middle no sharper" in out
+    assert re.search(r"contrast maximisation moves the middle by \(\d.*, this flow by \(-5.0, 3.0\)", out)
 
 
 def test_from_eflow_import_load_model(network):

@@ -8,7 +8,15 @@ import pytest
 from blinkgl.errors import EventDataError
 from eflow.data.window import Window
 from eflow.methods import make_method
-from eflow.methods.contrast import MOST_EVENTS, _Cloud, affine_field, rotation_field, sharpness
+from eflow.methods.contrast import (
+    LENGTHS,
+    MOST_EVENTS,
+    _Cloud,
+    affine_field,
+    rotation_field,
+    sharpest_length,
+    sharpness,
+)
 from eflow.methods.iwe import flow_warp_loss, slope_at, vote, warped
 
 H, W = 96, 128
@@ -86,6 +94,23 @@ def test_a_rotating_camera():
 
     flow = make_method("contrast-rotation", focal)(*pictured(motion), H, W)
     assert length(flow - truth(motion)).mean() < 0.15 < 0.04 * length(truth(motion)).mean()
+
+
+@pytest.mark.parametrize("motion", ["translation", "fast", "zoom", "affine"])
+@pytest.mark.parametrize("windows", [1, 2])
+def test_the_length_of_a_right_direction_is_found(motion, windows):
+    seen = pictured(MOTIONS[motion])[-windows:]
+    for wrong in (0.95, 1.25, 2.2):
+        factor = sharpest_length(list(seen), wrong * truth(MOTIONS[motion]))
+        assert factor * wrong == pytest.approx(1, abs=0.06)
+
+
+def test_a_length_that_events_do_not_tell_stays():
+    old, new = pictured(MOTIONS["translation"])
+    assert sharpest_length([old, new], np.zeros((H, W, 2))) == pytest.approx(1.0, abs=0.01)
+    few = Window(new.x[:20], new.y[:20], new.t[:20], new.p[:20], new.t0, new.t1)
+    assert sharpest_length([few], truth(MOTIONS["translation"])) == 1.0
+    assert sharpest_length([new], 9 * truth(MOTIONS["translation"])) == LENGTHS[0]  # no shorter than it looks
 
 
 def test_the_derivative_of_the_sharpness():

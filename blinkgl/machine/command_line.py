@@ -113,6 +113,17 @@ def user_line(error: Exception) -> str | None:
             code = errno.ENOSPC
         if code in _MACHINE_ERRNOS:
             return f"{error.filename}: {os.strerror(code).lower()}" if error.filename else os.strerror(code).lower()
+    if (folder := _damaged_kernels(error)) is not None:
+        return f"{folder}: the kernels that numba keeps there are damaged; remove the folder, they are compiled anew"
+    return None
+
+
+def _damaged_kernels(error: Exception) -> str | None:
+    """The folder of numba's kernels that could not be read, where reading one is what failed."""
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    for frame in reversed(frames):
+        if frame.f_code.co_filename.replace(os.sep, "/").endswith("numba/core/caching.py"):
+            return getattr(frame.f_locals.get("self"), "_cache_path", None)
     return None
 
 

@@ -1,8 +1,14 @@
 """Compiling kernels is told by itself and is in nobody's seconds."""
 
+import importlib
+import pickle
+import sys
+
 import numba
+import pytest
 
 from blinkgl.machine import compiling
+from blinkgl.machine.command_line import user_line
 from blinkgl.sequence.request import StageClock
 
 
@@ -50,3 +56,18 @@ def test_the_next_compilation_is_announced_once():
         second(1)
     third(1)  # nobody listens any more
     assert said == ["compiling kernels, once per machine: this may take a minute or two"]
+
+
+def test_damaged_kernels_are_a_line_that_names_their_folder(tmp_path, monkeypatch):
+    module = tmp_path / "kernels_of_a_test.py"
+    module.write_text("import numba\n\n\n@numba.njit(cache=True)\ndef twice(x):\n    return 2 * x\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    twice = importlib.import_module("kernels_of_a_test").twice
+    assert twice(3) == 6
+    (index,) = tmp_path.rglob("*.nbi")
+    index.write_bytes(b"\x09nonsense" * 9)
+    del sys.modules["kernels_of_a_test"]
+    with pytest.raises(pickle.UnpicklingError) as damaged:
+        importlib.import_module("kernels_of_a_test").twice(3)
+    assert user_line(damaged.value).startswith(f"{index.parent}: the kernels that numba keeps there are damaged")
+    assert user_line(pickle.UnpicklingError("elsewhere")) is None

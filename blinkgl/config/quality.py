@@ -6,9 +6,8 @@ from typing import Any, Literal
 
 from blinkgl.config.reader import shipped
 
-Quality = Literal["fast", "balanced", "accurate", "reference", "auto"]
+Quality = Literal["fast", "balanced", "accurate", "reference"]
 QUALITIES = ("fast", "balanced", "accurate", "reference")
-"""Those that are settings of the suite. ``auto`` is :data:`DEFAULT` with a first look at each sequence."""
 DEFAULT: Quality = "balanced"
 """Of a configuration that says nothing; ``quality: null`` leaves every key at its own default."""
 
@@ -20,16 +19,13 @@ def with_default(tree: Any) -> Any:
 
 def load_quality(name: str) -> dict[str, Any]:
     """``timeline:`` and ``render:`` of a preset, plain data; the figures it was chosen by are comments in its file."""
-    preset = shipped("quality", DEFAULT if name == "auto" else name)
-    if name == "auto":
-        preset["timeline"]["first_look"] = True
-    return preset
+    return shipped("quality", name)
 
 
 def fill_quality(quality: Any, kind: Any) -> dict[str, Any]:
     """The preset's values for a configuration with this timeline.kind (None: not said); none where ``quality`` names
     no known one. To a timeline of another kind than the preset's its values mean nothing."""
-    if quality not in (*QUALITIES, "auto"):
+    if quality not in QUALITIES:
         return {}
     preset = load_quality(quality)
     same = kind in (None, preset["timeline"]["kind"])

@@ -221,8 +221,8 @@ class SequenceConfig(Config):
     quality: Quality | None = Field(
         DEFAULT,
         description="fast, balanced, accurate or reference: gives timeline and render the values of a measured "
-        "point of speed against accuracy (docs/trade.md); what is said beside it wins. auto: fast or balanced, as a "
-        "first look at each sequence asks for. null: every key has the default that stands in its own table",
+        "point of speed against accuracy (docs/trade.md); what is said beside it wins. null: every key has the "
+        "default that stands in its own table",
     )
     timeline: TimelineConfig = Field(DisplacementTimeline(), description="when event frames are drawn")
     scene: SceneConfig = Field(RandomSceneConfig(), description="what is in front of the camera and how it moves")

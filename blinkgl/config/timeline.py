@@ -8,14 +8,16 @@ from pydantic import Field
 
 from blinkgl.config.base import Config, Refused, Removed, one_of, rule
 
+_NO_RECONSTRUCTION = {
+    "reconstruction": Removed(
+        "the key left out (events are timed on straight lines between frames; a smaller max_px makes better times)",
+        lambda value: value == "linear",
+    )
+}
+
 
 class _Timeline(Config):
-    removed: ClassVar = {
-        "reconstruction": Removed(
-            "the key left out (events are timed on straight lines between frames; a smaller max_px makes better times)",
-            lambda value: value == "linear",
-        )
-    }
+    removed: ClassVar = _NO_RECONSTRUCTION
 
 
 class UniformTimeline(_Timeline):
@@ -52,6 +54,11 @@ class DisplacementTimeline(_AdaptiveTimeline):
     """Event frames so far apart that pixels move no more than ``max_px`` from one to the next, by
     the speeds at both ends of the step."""
 
+    removed: ClassVar = {
+        **_NO_RECONSTRUCTION,
+        "first_look": Removed("the key left out, or quality: fast for fewer frames", lambda value: value is False),
+    }
+
     kind: Literal["displacement"] = "displacement"
     max_px: float = Field(
         0.5, gt=0, le=1e4, description="displacement between two frames, px, that the percentile keeps to"
@@ -64,12 +71,6 @@ class DisplacementTimeline(_AdaptiveTimeline):
         gt=0,
         le=1e4,
         description="what the fastest sampled pixel keeps to besides, px; for a percentile below 100",
-    )
-    first_look: bool = Field(
-        False,
-        description="each sequence is looked at before it begins: where frames twice as far apart would make its "
-        "events less than 1.3 times as wrong, they are (docs/trade.md, `auto`). Takes half a second; the manifest "
-        "has what was seen",
     )
 
 

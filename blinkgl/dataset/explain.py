@@ -65,11 +65,10 @@ def quality_in_words(config: SequenceConfig) -> str:
     else:
         apart = _apart("timeline", mine["timeline"], usual["timeline"])
     apart += _apart("render", mine["render"], usual["render"])
-    looks = " with a first look (docs/trade.md, auto)" if mine["timeline"].get("first_look", False) else ""
     if not apart:
-        return f"{DEFAULT}{looks or ', the default'}"
+        return f"{DEFAULT}, the default"
     named = "" if config.quality in (None, DEFAULT) else f"{config.quality}; "
-    return f"{named}not {DEFAULT}: {', '.join(apart)}{looks}"
+    return f"{named}not {DEFAULT}: {', '.join(apart)}"
 
 
 def _apart(table: str, mine: dict[str, Any], usual: dict[str, Any]) -> list[str]:

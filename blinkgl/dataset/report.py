@@ -39,8 +39,6 @@ class SequenceReport:
     """compiling kernels; 0 but for a machine's first sequence of a kind"""
     causes: dict[str, int] = field(default_factory=dict)
     """events by what caused them; empty unless ``events.causes`` asks for it"""
-    timeline: dict = field(default_factory=dict)
-    """what an adaptive timeline says it achieved"""
     omissions: tuple[str, ...] = ()
     """what files of the scene ask for and is not drawn, a line per file"""
 
@@ -58,7 +56,7 @@ class SequenceReport:
         """All there is, now that its files are. flushed_s : what closing them took."""
         self.count(sequence)
         self.seconds["write"] += flushed_s
-        self.simulated_s, self.timeline = (sequence.t1_ns - sequence.t0_ns) * 1e-9, sequence.achieved
+        self.simulated_s = (sequence.t1_ns - sequence.t0_ns) * 1e-9
         self.triangles, self.omissions = sequence.triangles, sequence.omissions
         self.total_s, self.compile_s = sequence.clock.total, sequence.clock.compile_s
 

@@ -42,26 +42,13 @@ def mask_of(tiles: tuple[Rectangle, ...], height: int, width: int) -> np.ndarray
 
 class Cutouts:
     """Luminance of rectangles of a scene's picture, each pixel the mean of ``scale`` x ``scale`` samples on a regular
-    grid. A context manager; called with times it draws.
+    grid. A context manager; called with times it draws.   samples : how each sample is drawn."""
 
-    samples : how each sample is drawn.   beside : of the same scene; its textures and meshes are used where ``samples``
-    look textures up in the same way. It has to be released last."""
-
-    def __init__(
-        self,
-        gl: GLContext,
-        scene: Scene,
-        tiles: tuple[Rectangle, ...],
-        scale: int,
-        samples: RenderConfig,
-        beside: Renderer | None = None,
-    ):
+    def __init__(self, gl: GLContext, scene: Scene, tiles: tuple[Rectangle, ...], scale: int, samples: RenderConfig):
         self._tiles, self._scale = tiles, scale
         self._shape = (scene.camera.height, scene.camera.width)
         self._cameras = [scene.camera.part(r.x0, r.y0, r.x1, r.y1, scale) for r in tiles]
-        if beside is not None and _look_ups(beside.config) != _look_ups(samples):
-            beside = None
-        self._renderer = Renderer(gl, scene.with_camera(self._cameras[0]), samples, beside=beside)
+        self._renderer = Renderer(gl, scene.with_camera(self._cameras[0]), samples)
         self._fine = np.empty((self._cameras[0].height, self._cameras[0].width), np.float32)
 
     def __enter__(self: Self) -> Self:
@@ -82,7 +69,3 @@ class Cutouts:
                     self._fine, (r.x1 - r.x0, r.y1 - r.y0), interpolation=cv2.INTER_AREA
                 )
             yield frame
-
-
-def _look_ups(config: RenderConfig) -> tuple[float, float]:
-    return config.anisotropy, config.mip_bias

@@ -14,7 +14,6 @@ from blinkgl.camera import CameraModel, PinHole
 from blinkgl.camera.pinhole import rectified
 from blinkgl.config.over_time import track_times
 from blinkgl.config.sequence import SequenceConfig
-from blinkgl.config.timeline import DisplacementTimeline
 from blinkgl.errors import EventDataError
 from blinkgl.events import emulator_of
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
@@ -29,7 +28,6 @@ from blinkgl.rng import Role, generator, kernel_seed
 from blinkgl.scene.build import recording, sequence_scene
 from blinkgl.scene.rig import Sensor
 from blinkgl.scene.types import Dynamics, Scene, SceneObject
-from blinkgl.sequence.first_look import first_look
 from blinkgl.sequence.inertial import Inertial, measured
 from blinkgl.sequence.request import GroundTruth, Item, Picture, SequenceRequest, StageClock
 from blinkgl.sequence.simulate import Simulation
@@ -66,22 +64,13 @@ def timeline_of(
     renderer: Renderer,
     span_ns: tuple[int, int],
 ) -> Timeline:
-    """What decides the times of a sensor's frames, after a first look where one is asked for.   scene : of one sensor,
-    as it was built.   renderer : of it.   span_ns : first and last time, ns."""
+    """What decides the times of a sensor's frames.   scene : of one sensor, as it was built.   renderer : of it.
+    span_ns : first and last time, ns."""
     emulator, dynamics = recording(scene, config).sensors[0].emulator, scene.dynamics
     # A frame stands at every impact: a velocity jumps there, and no speed measured before it bounds the step.
     stops = dynamics.impacts_ns if dynamics is not None else ()
     response = emulator_of(emulator).response(emulator)
-    made = partial(make_timeline, pictures=renderer, response=response, stops_ns=stops)
-    asked, (t0_ns, t1_ns) = config.timeline, span_ns
-    timeline = made(asked, t0_ns, t1_ns)
-    if not isinstance(asked, DisplacementTimeline) or not asked.first_look:
-        return timeline
-    look = first_look(renderer, scene, asked, emulator, span_ns, timeline.pace)
-    max_px = asked.max_px * (2 if look.twice else 1)
-    timeline = made(asked.model_copy(update={"max_px": max_px}), t0_ns, t1_ns)
-    timeline.seen = {"max_px": max_px, "first_look": look.facts()}
-    return timeline
+    return make_timeline(config.timeline, *span_ns, renderer, response, stops)
 
 
 def surfaces_at(renderer: Renderer, t_ns: int) -> Surfaces:
@@ -269,10 +258,10 @@ class RenderedSequence(Simulation):
         return facts
 
     def facts(self) -> dict[str, Any]:
-        gl, scene, timeline = self.renderer.gl, self.renderer.scene, self.config.timeline
+        gl, scene = self.renderer.gl, self.renderer.scene
         return {
             "opengl": {"renderer": gl.renderer, "version": gl.version, "vendor": gl.vendor, "backend": gl.backend},
-            "timeline": {"kind": timeline.kind, **self.achieved},
+            "timeline": {"kind": self.config.timeline.kind},
             "triangles": self.triangles,
             "objects": [_described(o) for o in scene.objects],
             **self._facts_of_labels(),

@@ -145,11 +145,6 @@ class RigSequence:
         return _summed([self.clock.seconds, *(member.seconds for member in self.members)])
 
     @property
-    def achieved(self) -> dict[str, Any]:
-        """Of the first camera's timeline: all have the same times."""
-        return self.members[0].achieved if self.members else {}
-
-    @property
     def libraries(self) -> Mapping[str, str]:
         return self.members[0].libraries if self.members else {}
 

@@ -218,11 +218,6 @@ class Simulation(ABC):
         """Wall seconds per stage so far."""
         return dict(self.clock.seconds)
 
-    @property
-    def achieved(self) -> dict[str, Any]:
-        """What an adaptive timeline says it has achieved so far; empty for the others."""
-        return {} if self.timeline is None else self.timeline.info()
-
     @abstractmethod
     def facts(self) -> dict[str, Any]:
         """Plain values for the manifest about where it came from; complete when the iteration is."""

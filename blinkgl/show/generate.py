@@ -242,13 +242,6 @@ def show_table(console: Console, made: Totals, elapsed_s: float | None = None) -
     table.add_row("wall time of all sequences" if len(made) > 1 else "wall time", f"{s['total_s']:.1f} s")
     table.add_row("per simulated second", f"{s['seconds_per_simulated_second']:.2f} s")
     table.add_row("rate", f"{s['events_per_second'] / 1e6:.2f} M events/s")
-    if (error := first.timeline.get("time_error")) is not None:
-        name = f"p{error['percentile']:g}"
-        table.add_row(
-            "time error, estimated",
-            f"median {error['median_us']} µs, {name} {error[name + '_us']} µs"
-            + (" (first sequence)" if len(made) > 1 else ""),
-        )
     table.add_section()
     for name in (*STAGES, "other"):
         seconds = s[f"{name}_s"]

@@ -3,7 +3,6 @@
 timeline = make_timeline(config.timeline, t0_ns, t1_ns, renderer,
 emulator_of(config.events).response(config.events)) for t_ns in timeline:
     luminance = ...                              # the frame at t_ns
-timeline.info()                                  # what was achieved, for the manifest
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -112,8 +111,6 @@ class Timeline:
         self.stops_ns = stops_ns
         self.looks = 0
         """Small pictures asked for so far."""
-        self.seen: dict[str, Any] = {}
-        """What a first look at the sequence saw and made of it, for the manifest."""
         self.others: tuple[Timeline, ...] = ()
         """Of other cameras, whose pace is kept, too (:mod:`blinkgl.timeline.strategy`)."""
 
@@ -130,10 +127,6 @@ class Timeline:
     def _counted(self, t_ns: int) -> float:
         self.looks += 1
         return max([self.pace(t_ns), *(other.pace(t_ns) for other in self.others)])
-
-    def info(self) -> dict[str, Any]:
-        """What was achieved: plain values for the manifest."""
-        return dict(self.seen)
 
 
 class Uniform(Timeline):
@@ -183,17 +176,14 @@ def make_timeline(
 
 
 class Shared(Timeline):
-    """One of several timelines, with the times of all; it says what was achieved for its own camera."""
+    """One of several timelines, with the times of all."""
 
     def __init__(self, own: Timeline, times: Iterator[int]):
-        self.own, self._times = own, times
+        self._times = times
         super().__init__(own.config, own.t0_ns, own.t1_ns, own.pictures, own.response, own.stops_ns)
 
     def __iter__(self) -> Iterator[int]:
         return self._times
-
-    def info(self) -> dict[str, Any]:
-        return self.own.info()
 
 
 def together(timelines: Sequence[Timeline]) -> list[Timeline]:

@@ -46,14 +46,6 @@ def test_what_is_said_wins(tmp_path):
     assert config.render.antialiasing == preset["render"]["antialiasing"]
 
 
-def test_auto_is_the_default_with_a_first_look(tmp_path):
-    config, usual = sequence(tmp_path, {"quality": "auto"}), sequence(tmp_path, {})
-    assert config.timeline.first_look and not usual.timeline.first_look
-    assert config.timeline.model_copy(update={"first_look": False}) == usual.timeline and config.render == usual.render
-    assert not sequence(tmp_path, {"quality": "auto", "timeline": {"first_look": False}}).timeline.first_look
-    assert sequence(tmp_path, {"quality": "auto"}, "timeline={kind: uniform, fps: 77}").timeline.fps == 77
-
-
 def test_null_leaves_every_key_its_own_default(tmp_path):
     assert fill_quality(None, "uniform") == {} == fill_quality("best", None)
     config = sequence(tmp_path, {"quality": None})

@@ -226,6 +226,7 @@ def test_a_recorded_configuration_of_an_earlier_version_is_read(tmp_path):
     "path, value, said",
     [
         ("render.lod.enabled", "true", "render.lod: this key was removed"),
+        ("timeline.first_look", "true", "timeline.first_look: this key was removed (got True); expected the key left"),
         ("events.compat", "authors", "events.compat: this key was removed (got 'authors'); expected the key left out"),
     ],
 )

@@ -154,11 +154,10 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
     "timeline": {
         "uniform": {"timeline": {"kind": "uniform", "fps": 400}},
         "displacement": {"timeline": {"kind": "displacement", "max_px": 1}},
-        "displacement, after a look": {"timeline": {"kind": "displacement", "max_px": 1, "first_look": True}},
         "brightness": {"timeline": {"kind": "brightness"}},
         "unsaid": NOTHING,
     },
-    "quality": {"unsaid": NOTHING, **{name: {"quality": name} for name in (*QUALITIES, "auto")}},
+    "quality": {"unsaid": NOTHING, **{name: {"quality": name} for name in QUALITIES}},
     "sensor": {
         "unsaid": NOTHING,
         **{name: {"sensor": name} for name in ("davis346", "dvxplorer")},

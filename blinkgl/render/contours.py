@@ -15,16 +15,17 @@ surface itself, and its line runs back along others that are seen: it is one of 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numba as nb
 import numpy as np
 
+from blinkgl.render.mesh_edges import Contour, write_planes
+
 if TYPE_CHECKING:
     from blinkgl.render.draw_items import DrawItem
     from blinkgl.render.moment import Moment
-    from blinkgl.scene.types import Mesh
 
 LINE = 7
 """Numbers of a line (:meth:`Lines.of`): both of its ends, px and depth (near / Z); its kind. The surface lies to the
@@ -33,139 +34,9 @@ CROSSING = 8
 """Numbers of what a line is in one pixel (:meth:`Lines.in_pixels`): its share, and the turn that is in it, in eighths
 of a turn along the pixel's boundary; of the centre, px to the left of the line; depth in the middle of the part; the
 way to the left, a unit vector; what depth gains along the line in a px of the longer axis; the line's kind."""
-CREASE = np.cos(np.radians(20.0))
-"""Of the angle between the normals of two faces where they meet, above which light is expected to jump."""
-WELD = 2e-3
-"""Of an object's size: up to this far apart borders of two of its parts are one. Files that were compressed part by
-part (Draco) have such cracks."""
-SILHOUETTE, BACK_AGAIN, BENT, TORN = 0, -1, 1, 2
-"""Kinds of lines: silhouettes and borders; silhouettes where a closed surface is hollow; creases; seams."""
-
-
-class Contour:
-    """The edges of one object. Vertices at the same place are one, those of two parts, too: where parts meet is no
-    border.
-
-    corners : (V,) int64 where in the parts' vertices, one part behind the other, each place is.
-    rest : (V, 3) float64 of the shape that does not deform.   faces : (F, 3) int32 places.
-    edges : (E, 4) int32: two places in the order of the first face, the first face, the second or -1.
-    sharp : (E,) int8: :data:`BENT` where its faces meet at an angle or are of two parts, else :data:`TORN` where they
-    meet in space and not in the texture, else 0.   culled : (F,) bool: faces that are drawn from one side alone.
-    planes : (F, 4) float64 of the rest shape: normal, any length, and its product with a point of the face."""
-
-    def __init__(self, parts: Sequence[tuple[Mesh, bool]]):
-        """parts : meshes, and whether both sides of their faces are drawn."""
-        self.meshes = [mesh for mesh, _ in parts]
-        self.deforms = any(mesh.deformer is not None for mesh in self.meshes)
-        vertices = np.concatenate([np.asarray(mesh.vertices, np.float64) for mesh in self.meshes])
-        # + 0.0 makes -0.0 and 0.0 one place.
-        _, self.corners, place = np.unique(vertices + 0.0, axis=0, return_index=True, return_inverse=True)
-        firsts = np.cumsum([0, *(len(mesh.vertices) for mesh in self.meshes)])
-        corner_of = [mesh.faces + first for mesh, first in zip(self.meshes, firsts[:-1], strict=True)]
-        places = [place.reshape(-1)[c].reshape(-1, 3).astype(np.int32) for c in corner_of]
-        self.faces = np.ascontiguousarray(np.concatenate(places))
-        self.culled = np.concatenate([np.full(len(mesh.faces), not both, np.bool_) for mesh, both in parts])
-        self.rest = np.ascontiguousarray(vertices[self.corners])
-        self.planes = np.empty((len(self.faces), 4))
-        _planes(self.rest, self.faces, self.planes)
-        counts = np.cumsum([0, *(len(faces) for faces in places)])
-        each = [_edges(faces, len(self.corners)) for faces in places]
-        if len(each) > 1:
-            welded = _welded(self.rest, [np.unique(e[e[:, 3] < 0, :2]) for e in each])
-            self.faces = welded[self.faces]
-            each = [np.column_stack([welded[e[:, :2]], e[:, 2:]]) for e in each]
-        edges = np.concatenate([np.where(e >= 0, e + (0, 0, n, n), -1) for e, n in zip(each, counts[:-1], strict=True)])
-        self.edges = _joined(edges.astype(np.int32), len(self.corners))
-        self.sharp = self._sharp(np.concatenate(corner_of), np.repeat(np.arange(len(places)), np.diff(counts)))
-
-    def positions(self, t_ns: int) -> np.ndarray:
-        """(V, 3) float64 places at a time."""
-        moved = [
-            mesh.vertices if mesh.deformer is None else mesh.deformer.positions(mesh, t_ns) for mesh in self.meshes
-        ]
-        return np.concatenate(moved)[self.corners]
-
-    def _sharp(self, corner_of: np.ndarray, part: np.ndarray) -> np.ndarray:
-        """(E,) int8. Bent: its two faces have other normals at both of its ends; a surface that is bent there and lit
-        as if it were round shows no step. Torn: other texture coordinates, and not only by whole turns of the
-        texture. corner_of : (F, 3) vertices of the faces; part : (F,) their parts."""
-        normals, uvs = (np.concatenate([getattr(m, name) for m in self.meshes]) for name in ("normals", "uvs"))
-        first, second = self.edges[:, 2], self.edges[:, 3]
-        bent, torn = second >= 0, second >= 0
-        # Only edges with two faces can be either; both ends have to agree.
-        for end in (0, 1):
-            # The vertex of each face that is at this end of the edge.
-            one, other = (
-                corner_of[face, (self.faces[face] == self.edges[:, end, None]).argmax(axis=1)]
-                for face in (first, second)
-            )
-            bent &= (normals[one] * normals[other]).sum(axis=1) < CREASE
-            # Whole turns of the texture are no seam.
-            apart = uvs[one] - uvs[other]
-            torn &= np.abs(apart - np.round(apart)).max(axis=1) > 1e-5
-        bent |= (second >= 0) & (part[first] != part[second])  # parts have materials of their own
-        return np.where(bent, BENT, np.where(torn, TORN, 0)).astype(np.int8)
-
-
-def _edges(faces: np.ndarray, places: int) -> np.ndarray:
-    """Return (E, 4) int32, see :class:`Contour`. Where more than two faces meet, the sides of those after the
-    second are borders."""
-    # Every face's three sides, as (from, to) in the face's order.
-    count = len(faces)
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
-    face = np.tile(np.arange(count), 3)
-    # Sides of no length belong to degenerate triangles.
-    there = ends[:, 0] != ends[:, 1]
-    ends, face = ends[there], face[there]
-    # One number per unordered pair of places: equal ones are the same edge.
-    key = ends.min(axis=1) * places + ends.max(axis=1)
-    order = np.argsort(key, kind="stable")
-    key, ends, face = key[order], ends[order], face[order]
-    first = np.flatnonzero(np.r_[True, key[1:] != key[:-1]]) if len(key) else np.zeros(0, np.int64)
-    # Which one it is of its edge's sides: 0 the first, 1 the second.
-    rank = np.arange(len(key)) - np.repeat(first, np.diff(np.r_[first, len(key)]))
-    lead = np.flatnonzero(rank != 1)
-    second = np.full(len(lead), -1)
-    paired = (rank[lead] == 0) & (lead + 1 < len(key))
-    paired[paired] = key[lead[paired] + 1] == key[lead[paired]]
-    second[paired] = face[lead[paired] + 1]
-    return np.ascontiguousarray(np.column_stack([ends[lead], face[lead], second]), np.int32)
-
-
-def _welded(places: np.ndarray, borders: Sequence[np.ndarray]) -> np.ndarray:
-    """Return (V,) int32: for each place the one that stands for it. Places on the borders of two parts are one where
-    each is the other's nearest, up to :data:`WELD`. borders : places on each part's borders."""
-    from scipy.spatial import cKDTree  # scenes without such parts need no SciPy here
-
-    result = np.arange(len(places), dtype=np.int32)
-    reach = WELD * float(np.ptp(places, axis=0).max())
-    for i in range(1, len(borders)):
-        for j in range(i):
-            if not len(borders[i]) or not len(borders[j]):
-                continue
-            mine, theirs = cKDTree(places[borders[i]]), cKDTree(places[borders[j]])
-            off, nearest = theirs.query(places[borders[i]], distance_upper_bound=reach)
-            back = mine.query(places[borders[j]])[1]
-            found = np.flatnonzero(np.isfinite(off))
-            found = found[back[nearest[found]] == found]
-            result[borders[i][found]] = result[borders[j][nearest[found]]]
-    return result
-
-
-def _joined(edges: np.ndarray, places: int) -> np.ndarray:
-    """Return (E, 4) int32 in which two borders that run in opposite directions between the same places are one edge."""
-    border = np.flatnonzero(edges[:, 3] < 0)
-    ends = edges[border, :2].astype(np.int64)
-    key = ends.min(axis=1) * places + ends.max(axis=1)
-    order = np.argsort(key, kind="stable")
-    border, ends, key = border[order], ends[order], key[order]
-    # Of exactly two; more are surfaces that lie on each other.
-    begins = np.r_[True, key[1:] != key[:-1]] if len(key) else np.zeros(0, np.bool_)
-    alone = np.diff(np.r_[np.flatnonzero(begins), len(key)]) == 2
-    first = np.flatnonzero(begins)[alone]
-    first = first[ends[first, 0] == ends[first + 1, 1]]
-    edges[border[first], 3] = edges[border[first + 1], 2]
-    return np.ascontiguousarray(np.delete(edges, border[first + 1], axis=0))
+SILHOUETTE, BACK_AGAIN = 0, -1
+"""Kinds of lines, beside creases and seams (mesh_edges.py): silhouettes and borders; silhouettes where a closed
+surface is hollow."""
 
 
 class _Arrays(NamedTuple):
@@ -237,7 +108,7 @@ class Lines:
             if contour.deforms:
                 there = slice(face, face + len(contour.faces))
                 pool.places[place : place + len(contour.corners)] = contour.positions(moment.t_ns)
-                _planes(pool.places, pool.faces[there], pool.planes[there])
+                write_planes(pool.places, pool.faces[there], pool.planes[there])
         # Every edge of every object may be a line.
         room = int((pool.starts[numbers + 1, 2] - pool.starts[numbers, 2]).sum())
         if room > len(self._lines):
@@ -275,19 +146,6 @@ class Lines:
         count = _cross(lines, width, height, self._crossings, self._places)
         pixels = _by_pixel(self._crossings[:count], self._places, width, self._counts, self._pixels, self._sorted)
         return self._pixels[:pixels], self._sorted[:count]
-
-
-@nb.njit(cache=True, nogil=True)
-def _planes(places, faces, out):
-    """Write (F, 4) float64, see :class:`Contour`."""
-    # Normal by the cross product of two sides, of twice the triangle's area; its product with a corner.
-    for f in range(len(faces)):
-        a, b, c = places[faces[f, 0]], places[faces[f, 1]], places[faces[f, 2]]
-        ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-        vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
-        x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-        out[f, 0], out[f, 1], out[f, 2] = x, y, z
-        out[f, 3] = x * a[0] + y * a[1] + z * a[2]
 
 
 @nb.njit(cache=True, nogil=True)

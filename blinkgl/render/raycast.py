@@ -124,7 +124,7 @@ def _build(triangles, lower, upper, child, count):
         depth -= 1
         node, a, b = stack[depth, 0], stack[depth, 1], stack[depth, 2]
         # The box of the range's triangles, and the axis along which their centroids spread most.
-        axis, widest = 0, -1.0
+        axis, widest = np.int64(0), -1.0  # a literal 0 would compile the sort for a second type
         for k in range(3):
             lo, hi, clo, chi = np.inf, -np.inf, np.inf, -np.inf
             for j in range(a, b):

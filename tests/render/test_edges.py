@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from blinkgl.camera import PinHole, Radtan
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.render.antialiasing import samples_of
-from blinkgl.render.contours import CROSSING, LINE, Contour, Lines
+from blinkgl.render.contours import CROSSING, LINE, Lines
+from blinkgl.render.mesh_edges import Contour
 from blinkgl.render.passes import Luminance
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.rig import Rig

@@ -147,7 +147,7 @@ def _joined(edges: np.ndarray, places: int) -> np.ndarray:
 
 
 @nb.njit(cache=True, nogil=True)
-def write_planes(places, faces, out):
+def write_planes(places: np.ndarray, faces: np.ndarray, out: np.ndarray) -> None:
     """Write (F, 4) float64, see :class:`Contour`."""
     # Normal by the cross product of two sides, of twice the triangle's area; its product with a corner.
     for f in range(len(faces)):

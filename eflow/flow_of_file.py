@@ -116,29 +116,25 @@ def _windows(file, predictor, reads, asked, say):
         say(f"windows of {span / 1000:g} ms")
         if span == longest:
             say(f"  as long as the recording allows: things move by less than {infer.LIKELY_PX:g} px in it")
-        _second_opinion(file, predictor, span, reads, say)
+        _second_opinion(file, predictor, span, first + (longest - span) * len(reads) // 2, reads, say)
     else:
         span = round(asked.milliseconds * 1000)
     start, end = (None if ms is None else first + round(ms * 1000) for ms in (asked.start_ms, asked.end_ms))
     return infer.windows(file, span, start_us=start, end_us=end, reads=reads), span, 1.0
 
 
-def _second_opinion(file, predictor, span: int, reads: Sequence[str], say: Callable[[str], None]) -> None:
-    """Say where contrast maximisation, a translation, finds another motion in a window from the middle, and where the
-    flow makes the events no sharper."""
-    first, last = (int(t) for t in _ends(file))
-    middle = max(first, min((first + last - span) // 2, last + 1 - span * len(reads)))
-    window = next(infer.windows(file, span, start_us=middle, reads=reads), None)
+def _second_opinion(file, predictor, span: int, start: int, reads: Sequence[str], say: Callable[[str], None]) -> None:
+    """Say where contrast maximisation, a translation, finds another motion in the window (or pair) of ``span`` µs that
+    begins at ``start``, the middle of the recording, and where the flow makes its events no sharper."""
+    window = next(infer.windows(file, span, start_us=start, reads=reads), None)
     if window is None or len(window.new) < LEAST_EVENTS:
         return
     flow, _ = predictor(window)
     if flow_warp_loss(window.new, flow) < 1:
         say("  the flow makes the events in the middle no sharper: nothing moves there, or too much does at once")
     mine = np.median(flow[window.new.y, window.new.x], axis=0)
-    before = window.new.t0 - span
-    old = (
-        window.old if len(window.old) else Window(*(getattr(window.new, k)[:0] for k in "xytp"), before, before + span)
-    )
+    nothing = (getattr(window.new, k)[:0] for k in "xytp")
+    old = window.old if len(window.old) else Window(*nothing, window.new.t0 - span, window.new.t0)
     try:
         other = ContrastMaximisation("translation")(old, window.new, file.height, file.width)[0, 0]
     except BlinkGLError:
@@ -148,11 +144,6 @@ def _second_opinion(file, predictor, span: int, reads: Sequence[str], say: Calla
             f"  contrast maximisation moves the middle by ({other[0]:.1f}, {other[1]:.1f}) px a window, this flow by "
             f"({mine[0]:.1f}, {mine[1]:.1f}): where things move their own ways that may be right; look at the pictures"
         )
-
-
-def _ends(file: EventFile) -> tuple[int, int]:
-    chunks = [(int(c.t[0]), int(c.t[-1])) for c in file.chunks() if len(c)]
-    return chunks[0][0], chunks[-1][1]
 
 
 def _beside_truth(flow: np.ndarray, truth: np.ndarray, window: StreamWindow) -> str:

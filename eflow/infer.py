@@ -198,7 +198,7 @@ class Predictor:
     """A model over a stream of windows. ``warm_start`` carries each flow along itself to the next reference time
     (networks with an iterated low-resolution flow only). empty : "error", or "zero" flow for
     a window without events.   sharpen : multiply each flow by the factor that makes the events of its windows sharpest
-    (:func:`eflow.methods.contrast.sharpest_length`), kept in ``length``."""
+    (:func:`eflow.methods.contrast.sharpest_length`)."""
 
     def __init__(
         self,
@@ -213,7 +213,6 @@ class Predictor:
     ):
         self.model, self.height, self.width = model, height, width
         self.warm_start, self.precision, self.empty, self.sharpen = warm_start, precision, empty, sharpen
-        self.length = 1.0
         self._low: torch.Tensor | None = None
 
     def __call__(self, window: StreamWindow) -> tuple[np.ndarray, np.ndarray]:
@@ -238,8 +237,8 @@ class Predictor:
         flow = prediction.flow[0].permute(1, 2, 0).cpu().numpy()
         if self.sharpen:
             follows = len(window.old) and window.old.t1 == window.new.t0
-            self.length = sharpest_length([window.old, window.new] if follows else [window.new], flow)
-            flow = flow * np.float32(self.length)
+            seen = [window.old, window.new] if follows else [window.new]
+            flow = flow * np.float32(sharpest_length(seen, flow))
         return flow, new
 
 

@@ -16,6 +16,8 @@ CREASE = np.cos(np.radians(20.0))
 WELD = 2e-3
 """Of an object's size: up to this far apart borders of two of its parts are one. Files that were compressed part by
 part (Draco) have such cracks."""
+NEIGHBOURS = 8
+"""Border places that are looked at round one: more parts do not meet in a corner."""
 BENT, TORN = 1, 2
 """Kinds of edges between two faces that are both seen: creases; seams."""
 
@@ -113,20 +115,27 @@ def _edges(faces: np.ndarray, places: int) -> np.ndarray:
 def _welded(places: np.ndarray, borders: Sequence[np.ndarray]) -> np.ndarray:
     """Return (V,) int32: for each place the one that stands for it. Places on the borders of two parts are one where
     each is the other's nearest, up to :data:`WELD`. borders : places on each part's borders."""
-    from scipy.spatial import KDTree  # scenes without such parts need no SciPy here
+    from scipy.spatial import KDTree  # objects of one part need no SciPy here
 
     result = np.arange(len(places), dtype=np.int32)
+    at, part = np.concatenate(borders), np.repeat(np.arange(len(borders)), [len(border) for border in borders])
+    if not len(at):
+        return result
     reach = WELD * float(np.ptp(places, axis=0).max())
-    for i in range(1, len(borders)):
-        for j in range(i):
-            if not len(borders[i]) or not len(borders[j]):
-                continue
-            mine, theirs = KDTree(places[borders[i]]), KDTree(places[borders[j]])
-            off, nearest = theirs.query(places[borders[i]], distance_upper_bound=reach)
-            back = mine.query(places[borders[j]])[1]
-            found = np.flatnonzero(np.isfinite(off))
-            found = found[back[nearest[found]] == found]
-            result[borders[i][found]] = result[borders[j][nearest[found]]]
+    # One search for all parts; of the few that are so near, the nearest of each other part.
+    off, near = KDTree(places[at]).query(places[at], k=min(NEIGHBOURS, len(at)), distance_upper_bound=reach)
+    off, near = off.reshape(len(at), -1), near.reshape(len(at), -1)
+    mine, column = np.nonzero(np.isfinite(off))
+    other, off = near[mine, column], off[mine, column]
+    apart = part[mine] != part[other]
+    mine, other, off = mine[apart], other[apart], off[apart]
+    order = np.lexsort((off, part[other], mine))
+    mine, other = mine[order], other[order]
+    nearest = np.r_[True, (np.diff(mine) != 0) | (np.diff(part[other]) != 0)][: len(mine)]
+    mine, other = mine[nearest], other[nearest]
+    back = np.isin(other.astype(np.int64) * len(at) + mine, mine.astype(np.int64) * len(at) + other)
+    for one, for_it in zip(at[mine[back]].tolist(), at[other[back]].tolist(), strict=True):
+        result[one] = min(result[one], result[for_it])
     return result
 
 

@@ -142,6 +142,14 @@ def test_where_parts_of_one_object_meet_is_no_border(gl, crack):
     assert (contour.edges[:, 3] < 0).sum() == 4  # the outline alone
 
 
+def test_many_parts_that_meet_in_corners_have_one_outline():
+    tile = quad(0.5, 0.5, 3)
+    jitter = np.random.default_rng(0).uniform(-1e-3, 1e-3, (64, 3))  # of 8: cracks between the tiles
+    place = lambda k: tile.vertices + (k % 8, k // 8, 0) + jitter[k]
+    parts = [(mesh(place(k), tile.faces, tile.normals, tile.uvs), False) for k in range(64)]
+    assert (Contour(parts).edges[:, 3] < 0).sum() == 4 * 8 * 3
+
+
 def test_a_bent_surface_that_is_lit_as_if_it_were_round_has_no_creases():
     assert not Contour([(sphere(1.0, 1), False)]).sharp.any()  # 80 faces, 30 degrees and more between them
 

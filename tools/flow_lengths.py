@@ -1,0 +1,126 @@
+"""How long is a network's flow beside the true one, where flow is short and where it is long?
+
+    eflow render configs/eflow/real_data.yaml --out out/lengths -n 500 --split test --seed 99 --per-sequence 4 \\
+        --window-ms 1.5-100 --max-flow 24 --min-density 0.008
+    python -m blinkgl.tools.flow_lengths real_small out/lengths
+
+Two tables of medians, each of the network's flow as it is and as long as makes the events sharpest (`eflow predict`):
+over the windows of a rendered pool, by their true length; and over pans across photographs (one velocity everywhere,
+three speeds, three emulators), by the length of a window. At pixels with events.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+from collections.abc import Iterable, Iterator
+
+import cv2
+import numpy as np
+
+from blinkgl.io.frames import read_any_image
+from blinkgl.machine.terminal import plain_console, say
+from blinkgl.recordings.simulation import emulator_config, frames_to_events
+from blinkgl.scene.surfaces.images import photographs
+from blinkgl.tools.real_recordings import cut, table
+from blinkgl.types.events import Events
+from eflow.checkpoint import load_model
+from eflow.data.sources import open_source
+from eflow.infer import Predictor, StreamWindow
+from eflow.models import FlowModel
+
+BINS = (0.2, 0.5, 1.0, 2.0, 4.0, 8.0, 24.0)
+"""Edges of the bins of true length, px."""
+PANS = ("astronaut", "gravel", "brick", "grass"), (40.0, 150.0, 600.0), (0.5, 1.0, 2.0, 4.0, 6.0)
+"""Photographs; speeds, px/s; lengths of windows, px."""
+EMULATORS = (
+    {"emulator": "esim", "contrast_threshold": 0.2},
+    {"emulator": "esim", "contrast_threshold": 0.5},
+    {"emulator": "v2e"},
+)
+HEIGHT, WIDTH = 180, 240
+DIRECTION = np.array([-0.825, -0.565])
+LEAST_EVENTS = 50
+Judged = tuple[float, float, float, float, float]
+"""True length; predicted over true length and error over true length, of the flow as it is and sharpened."""
+
+
+def of_pool(path: str) -> Iterator[tuple[StreamWindow, np.ndarray]]:
+    """Pairs of windows and their true flow, (H, W, 2) px, NaN where there is none."""
+    source = open_source(path)
+    for i in range(len(source)):
+        sample = source[i]
+        yield (
+            StreamWindow(sample.new.t0, sample.old, sample.new),
+            np.where(sample.valid[..., None], sample.flow, np.nan),
+        )
+
+
+def of_pans() -> Iterator[tuple[StreamWindow, np.ndarray]]:
+    """The same of photographs that move as one, at most half a pixel a frame."""
+    files = photographs()
+    for name, speed, emulator in itertools.product(*PANS[:2], EMULATORS):
+        image = read_any_image(files[name])
+        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        soft = cv2.GaussianBlur(cv2.resize(grey, (512, 512)).astype(np.float32) / 255, (0, 0), 0.6)
+        fps = max(100.0, 2 * speed)
+        frames = []
+        for k in range(int(13 / speed * fps) + 1):
+            x, y = DIRECTION * speed * k / fps - 40
+            moved = cv2.warpAffine(
+                soft, np.float32([[1, 0, x], [0, 1, y]]), (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT
+            )
+            frames.append(0.9 * moved**2.2 + 0.02)
+        events = Events.concatenate([*frames_to_events(frames, fps=fps, emulator=emulator_config(emulator))])
+        for length in PANS[2]:
+            span = round(1e6 * length / speed)
+            flow = np.broadcast_to(DIRECTION * speed * span * 1e-6, (HEIGHT, WIDTH, 2))
+            yield cut(events, int(events.t[-1]) - 1000 - span, span), flow
+
+
+def judged(model: FlowModel, pairs: Iterable[tuple[StreamWindow, np.ndarray]]) -> Iterator[Judged]:
+    """Of every pair whose new window has events enough."""
+    for pair, truth in pairs:
+        height, width = truth.shape[:2]
+        hit = np.zeros((height, width), bool)
+        hit[pair.new.y, pair.new.x] = True
+        hit &= np.isfinite(truth).all(-1)
+        if len(pair.new) < LEAST_EVENTS or not hit.any():
+            continue
+        true, row = truth[hit], []
+        size = np.hypot(*true.T)
+        if not size.any():  # nothing moves: no length to compare
+            continue
+        for sharpen in (False, True):
+            flow = Predictor(model, height, width, empty="zero", sharpen=sharpen)(pair)[0][hit]
+            row += [np.hypot(*flow.T).sum() / size.sum(), np.hypot(*(flow - true).T).sum() / size.sum()]
+        yield float(np.median(size)), *map(float, row)
+
+
+def rows_of(found: list[Judged], edges: Iterable[tuple[float, float]]) -> list[list[object]]:
+    """A row of medians for each pair of edges."""
+    table_of, values = [], np.array(found)
+    for low, high in edges:
+        inside = values[(values[:, 0] >= low) & (values[:, 0] < high)]
+        if len(inside):
+            table_of.append(
+                [f"{low:g} to {high:g} px", len(inside), *np.median(inside[:, 1:], axis=0)[[0, 2, 1, 3]].tolist()]
+            )
+    return table_of
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("network", help="checkpoint, or a packaged network")
+    parser.add_argument("pool", help="folder of `eflow render`")
+    options = parser.parse_args()
+    model, heads = load_model(options.network), ["windows", "length", "length, sharp", "error", "error, sharp"]
+    pool = list(judged(model, of_pool(options.pool)))
+    say(plain_console(), table("true length", heads, rows_of(pool, itertools.pairwise(BINS))))
+    pans = list(judged(model, of_pans()))
+    near = [(0.9 * length, 1.1 * length) for length in PANS[2]]
+    say(plain_console(), "\n" + table("pans", heads, rows_of(pans, near)))
+
+
+if __name__ == "__main__":
+    main()

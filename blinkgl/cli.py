@@ -106,6 +106,9 @@ def generate(
     view: Annotated[
         bool, typer.Option("--view", help="Show each sequence in the browser when it is whole (extra [view]).")
     ] = False,
+    layout: Annotated[
+        str | None, typer.Option(help="When all are whole, write them as OUT-LAYOUT, too (blinkgl export --layout).")
+    ] = None,
 ) -> int:
     """Generate event + optical-flow sequences from one YAML file. Exit status 3: done, but
     some sequences were set aside."""
@@ -125,6 +128,7 @@ def generate(
         mixed=mixed,
         time_limit_s=time_limit,
         view=view,
+        layout=layout,
     )
 
 
@@ -309,8 +313,8 @@ def export(
     layout: Annotated[
         str | None,
         typer.Option(
-            help="webdataset (shards SPLIT-000000.tar …, the default), dsec, eraft, blinkflow, mvsec, tapvid or "
-            "multiflow."
+            help="webdataset (shards SPLIT-000000.tar …, the default), dsec, eraft, blinkflow, mvsec, tapvid, "
+            "multiflow or eventkubric."
         ),
     ] = None,
     shard_mb: Annotated[float | None, typer.Option("--shard-mb", min=1, help="Size of a shard (default: 512).")] = None,

@@ -3,6 +3,7 @@
     python -m blinkgl.tools.bench                                    # what can be timed
     python -m blinkgl.tools.bench WHAT [--config FILE] [--set a.b=c …] [--rounds 9] [--load N] [--json FILE]
     python -m blinkgl.tools.bench WHAT --against CHECKOUT …          # ratios of the two versions
+    python -m blinkgl.tools.bench --page [--rounds 5]                # docs/benchmarks.md: all of them
 
 Every row is run once per round after ``--warm-up`` rounds that do not count, the rows and the checkouts in turns, each
 checkout in a process of its own. Printed are medians of wall and of processor milliseconds, children's included, and
@@ -416,6 +417,28 @@ def show(found: dict[str, dict]) -> None:
             print(line)
 
 
+def page(machine: str, rounds: int) -> str:
+    """docs/benchmarks.md: every row of every part, on this machine."""
+    about = (
+        "# Benchmarks\n\nMade by `python -m blinkgl.tools.bench --page` on an otherwise idle machine; do not edit. "
+        f"{machine}. Medians of {rounds} rounds (networks: one), milliseconds. Processor time is that of all threads. "
+        "Accuracy is in [what was measured](results.md), speed beside other programs in [peers](peers.md).\n"
+    )
+    parts = [about]
+    for what, rows in WHATS.items():
+        once = what == "networks"  # minutes each
+        options = argparse.Namespace(rounds=1 if once else rounds, warm_up=int(not once), load=0)
+        found = measure({"this": Path(__file__).resolve().parents[1]}, options, [what])
+        lines = [f"|{row}|{r['this']['cpu_ms']:.3g}|{r['this']['wall_ms']:.3g}|\n" for row, r in found.items()]
+        about = " ".join((rows.__doc__ or "").split())
+        parts.append(
+            f"\n## {what}\n\n{about} `python -m blinkgl.tools.bench {what}`\n\n|row|processor|wall|\n|---|---|---|\n"
+            + "".join(lines)
+        )
+        print(parts[-1], flush=True)
+    return "".join(parts)
+
+
 def main(arguments: list[str] | None = None) -> None:
     from blinkgl.machine.bench import machine_line
 
@@ -431,9 +454,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--load", type=int, default=0, metavar="N", help="processes that spin meanwhile")
     parser.add_argument("--against", type=Path, metavar="CHECKOUT")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
+    parser.add_argument("--page", action="store_true", help="write docs/benchmarks.md")
     parser.add_argument("--answer", action="store_true", help=argparse.SUPPRESS)
     given = sys.argv[1:] if arguments is None else arguments
     options = parser.parse_args(given)
+    if options.page:
+        Path("docs/benchmarks.md").write_text(page(machine_line(), options.rounds), encoding="utf-8")
+        return
     if options.what is None:
         parser.print_help()
         return

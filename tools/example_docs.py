@@ -112,7 +112,8 @@ def section(name: str, output: str, root: Path = ROOT) -> str:
     title = re.match(r'"""(.*?)"""', source, re.S)[1].strip()
     picture = f"\n![{PICTURES[name][2]}](images/{PICTURES[name][1]})\n" if name in PICTURES else ""
     return (
-        f'## {name}\n\n{title}\n\n???+ example "examples/{name}.py"\n\n    ``` {{.python}}\n    --8<-- "examples/{name}.py"\n'
+        f'## {name}\n\n{title}\n\n???+ example "examples/{name}.py"\n\n    ``` {{.python}}\n'
+        f'    --8<-- "examples/{name}.py"\n'
         f"    ```\n\nIt prints:\n\n```\n{output.rstrip()}\n```\n{picture}"
     )
 

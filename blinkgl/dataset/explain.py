@@ -114,7 +114,12 @@ class Explanation:
 
 
 def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
-    """Explains one sequence (default: the first). Raises what generating it would raise."""
+    """Explains one sequence (default: the first), of a recipe its first group's. Raises what generating it would
+    raise."""
+    if "groups" in template.tree:
+        result = explain(template.groups[0].template, sequence)
+        result.scene = {"group": f"{template.groups[0].name}, the first of {len(template.groups)}", **result.scene}
+        return result
     config = template.sequence(template.sequence(0).output.first_index if sequence is None else sequence)
     index = config.output.first_index if sequence is None else sequence
     if config.frames is not None:

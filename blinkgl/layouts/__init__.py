@@ -1,7 +1,7 @@
 """A data set as the loaders of other people's data sets expect it: their files, names, shapes, scales and clocks.
 
 In:    sequence directories
-Out:   folders that DSEC's, E-RAFT's, BlinkFlow's, MVSEC's, TAP-Vid's and MultiFlow's loaders open
+Out:   folders that DSEC's, E-RAFT's, BlinkFlow's, MVSEC's, TAP-Vid's, MultiFlow's and EventKubric's loaders open
 Start: export.py, then layout.py: a row of the table is a layout
 """
 

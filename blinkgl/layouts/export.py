@@ -9,6 +9,7 @@ from blinkgl.errors import AssetError, ConfigError, OutputError
 from blinkgl.io.atomic import atomic_folder
 from blinkgl.layouts.blinkflow import BlinkFlow
 from blinkgl.layouts.dsec import Dsec, ERaft
+from blinkgl.layouts.event_kubric import EventKubric
 from blinkgl.layouts.layout import Layout
 from blinkgl.layouts.multiflow import MultiFlow
 from blinkgl.layouts.mvsec import Mvsec
@@ -18,7 +19,8 @@ from blinkgl.layouts.tapvid import TapVid
 # ---------------------------------------------------------------------------------------------------------------------
 # The layouts there are.
 
-LAYOUTS: dict[str, Layout] = {row.name: row for row in (Dsec(), ERaft(), BlinkFlow(), Mvsec(), TapVid(), MultiFlow())}
+_ROWS = (Dsec(), ERaft(), BlinkFlow(), Mvsec(), TapVid(), MultiFlow(), EventKubric())
+LAYOUTS: dict[str, Layout] = {row.name: row for row in _ROWS}
 
 
 def layout_of(name: str) -> Layout:

@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from blinkgl.dataset.shards import export_shards
-from blinkgl.errors import ConfigError
+from blinkgl.errors import ConfigError, OutputError
 from blinkgl.layouts import export_layout, layout_of
 from blinkgl.machine.terminal import plain_console, say
 
 SHARDS = "webdataset"
+
+
+def refuse_early(out: str, layout: str) -> None:
+    """Raises ConfigError: no such layout; OutputError: ``out`` exists. For what exports after hours of other work."""
+    if layout != SHARDS:
+        layout_of(layout)
+    if Path(out).exists():
+        raise OutputError("exists already", where=out, accepted="another folder, or remove it")
 
 
 def run(root: str, out: str, *, layout: str | None, shard_mb: float | None = None, seed: int | None = None) -> int:

@@ -21,6 +21,7 @@ from blinkgl.dataset.work import Message, report_of
 from blinkgl.errors import ConfigError
 from blinkgl.machine.compiling import compiling_line
 from blinkgl.machine.terminal import causes_line, plain_column, plain_console, say
+from blinkgl.show import export
 
 MAX_NOTES = 20
 """Files of which it is said what is not drawn; beyond, that there are more."""
@@ -41,10 +42,15 @@ def run(
     mixed: bool = False,
     time_limit_s: float = 0.0,
     view: bool = False,
+    layout: str | None = None,
 ) -> int:
     """:func:`~blinkgl.dataset.run.run_dataset` behind a display; status :data:`SET_ASIDE` when sequences are missing,
     whose names and reasons are said even when ``quiet``. view : show each sequence in a browser when it is whole, and
-    all until Ctrl-C. Raises what it raises, and ConfigError without the extra [view]."""
+    all until Ctrl-C. layout : when no sequence is missing, write them as ``OUT-LAYOUT``, too (`blinkgl export`).
+    Raises what these raise, and ConfigError without the extra [view]."""
+    exported = f"{out.rstrip('/')}-{layout}"
+    if layout is not None:
+        export.refuse_early(exported, layout)
     template = load_run(config, overrides, seed=seed)
     console = plain_console(quiet=quiet)
     display = None if quiet else Display(console, Path(out))
@@ -63,6 +69,8 @@ def run(
         if quiet:
             for name, reason in sorted(outcome.set_aside.items()):
                 say(plain_console(stderr=True), f"set aside: {name}: {reason}")
+    if layout is not None and not outcome.set_aside:
+        export.run(out, exported, layout=layout)
     return SET_ASIDE if outcome.set_aside else 0
 
 

@@ -148,3 +148,17 @@ def multiflow_sample(folder, height, width):
         assert flows[int(path.stem)].shape == (height, width, 2) and flows[int(path.stem)].dtype == np.float32
     assert max(flows) == 900_000 and min(flows) > 400_000
     return (x, y, t, p), images, flows
+
+
+def eventkubric_sample(folder, times, seconds):
+    """EventKubric's sample as ETAP reads it: (x, y, t in ns, p), images, target points and what is occluded."""
+    table = np.load(folder / "annotations.npy", allow_pickle=True).item()
+    assert table["target_points"].shape == (*table["occluded"].shape, 2) and table["occluded"].dtype == bool
+    assert table["occluded"].shape[1] == times and table["target_points"].dtype == np.float32
+    with h5py.File(folder / "data.hdf5") as file:
+        rgba = file["rgba"][:]
+    assert rgba.shape[0] == times and rgba.shape[3] == 4 and rgba.dtype == np.uint8 and (rgba[..., 3] == 255).all()
+    parts = [np.load(path) for path in sorted((folder / "events").iterdir())]
+    x, y, t, p = (np.concatenate([part[name] for part in parts]) for name in "xytp")
+    assert (np.diff(t) >= 0).all() and t[0] >= 0 and t[-1] < seconds * 1e9 and set(np.unique(p)) == {-1, 1}
+    return (x, y, t, p), rgba[..., :3], table["target_points"], table["occluded"]

@@ -17,13 +17,14 @@ from blinkgl.io.flow import read_flow_npy
 from blinkgl.io.formats import open_events
 from blinkgl.io.imu import read_imu
 from blinkgl.io.tracks import read_tracks
-from blinkgl.layouts import LAYOUTS, export as exporting, export_layout
+from blinkgl.layouts import LAYOUTS, event_kubric, export as exporting, export_layout
 from loaders import (
     blinkflow_sequence,
     dsec_disparity,
     dsec_flow,
     dsec_sequence,
     eraft_sequence,
+    eventkubric_sample,
     multiflow_sample,
     rectify_map,
     tapvid,
@@ -193,6 +194,33 @@ def test_tapvid(data, sequence, tmp_path):
         np.testing.assert_array_equal(frame[..., ::-1], cv2.imread(str(sequence / f"images/{k:06d}.png")))
 
 
+def test_eventkubric(data, sequence, tmp_path, monkeypatch):
+    monkeypatch.setattr(event_kubric, "TIMES", 5)
+    monkeypatch.setattr(event_kubric, "SECONDS", 0.4)
+    folder = exported(data, tmp_path, "eventkubric")
+    (x, y, t, p), rgb, points, occluded = eventkubric_sample(folder / "train/sequence_000000", 5, 0.4)
+    tracks, events = read_tracks(sequence), read_events(sequence / "events.h5")
+    part = events.window(tracks["t_us"][0], tracks["t_us"][0] + 400_000)
+    for name, theirs in (("x", x), ("y", y), ("t", t // 1000 + tracks["t_us"][0]), ("p", (p + 1) // 2)):
+        np.testing.assert_array_equal(getattr(part, name), theirs)
+    np.testing.assert_allclose(points - 0.5, tracks["target_points"], atol=1e-4)  # theirs count from the corner
+    np.testing.assert_array_equal(occluded, tracks["occluded"])
+    for k, frame in enumerate(rgb):
+        np.testing.assert_array_equal(frame[..., ::-1], cv2.imread(str(sequence / f"images/{k:06d}.png")))
+
+
+def test_generate_writes_a_layout_too_when_all_are_whole(tmp_path, capsys):
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text(yaml.safe_dump(RECIPE))
+    asked = ["generate", str(recipe), "--out", f"{tmp_path}/out", "--quiet", "--layout"]
+    assert run([*asked, "colmap"]) == 2 and "no such layout" in capsys.readouterr().err
+    (tmp_path / "out-tapvid").mkdir()
+    assert run([*asked, "tapvid"]) == 2 and "out-tapvid" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists(), "nothing is made for an export that cannot be written"
+    assert run([*asked, "blinkflow"]) == 0
+    assert blinkflow_sequence(next((tmp_path / "out-blinkflow/training").rglob("config.yaml")).parent)
+
+
 @pytest.mark.parametrize(
     "layout, lines",
     [
@@ -201,6 +229,7 @@ def test_tapvid(data, sequence, tmp_path):
         ("blinkflow", ["labels: {flow: [forward]}"]),
         ("mvsec", ["labels: {flow: [forward]}", "labels: {images: true}"]),
         ("tapvid", ["tracks: {points: 256}", "labels: {images: true}"]),
+        ("eventkubric", ["labels: {images: true}"]),
     ],
 )
 def test_what_lacks_is_named_with_the_yaml_that_makes_it(layout, lines, bare, tmp_path, capsys):

@@ -1,0 +1,168 @@
+"""Times BlinkGL's emulators in turns with the programs that their authors published, on the same frames.
+
+    python -m blinkgl.tools.peers --v2e CHECKOUT --voltmeter CHECKOUT [--rounds 5] [--frames 24] [--page]
+
+``--v2e`` is a checkout of SensorsINI/v2e, ``--voltmeter`` of Lynn0306/DVS-Voltmeter; either may be left out. Each
+program runs in a process of its own with one thread, on a clip of 640x480 at 1000 frames/s (`bench.clip`). The first
+frame, which only sets the state, is not timed. ``--page`` writes docs/peers.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from unittest.mock import MagicMock
+
+import numpy as np
+
+from blinkgl.machine.bench import machine_line
+from blinkgl.tools.bench import FPS, HEIGHT, WIDTH, clip
+
+PAGE = Path("docs/peers.md")
+NOT_USED = ("screeninfo", "easygui", "tkinter", "engineering_notation", "dv_processing")
+"""Modules that v2e imports for its windows and output files and that need not be installed here."""
+PARAMETERS = {
+    "v2e": "its command line's defaults",
+    "voltmeter": "the authors' values for a DVS346",
+}
+K = (0.00018 * 29250, 20, 0.0001, 1e-7, 5e-9, 0.00001)
+"""k1 to k6 of the authors' DVS346."""
+Step = Callable[[np.ndarray, float], int]
+"""Takes an 8-bit frame and its time in seconds; returns the number of events."""
+
+
+def ours(kind: str) -> Step:
+    """A step of our emulator with :data:`PARAMETERS`."""
+    from blinkgl.events.table import make_emulator
+    from blinkgl.recordings.simulation import emulator_config
+
+    values = {"v2e": {"start": "zero"}, "voltmeter": dict(zip(("k1", "k2", "k3", "k4", "k5", "k6"), K, strict=True))}
+    emulator = make_emulator(emulator_config({"emulator": kind, **values[kind]}), HEIGHT, WIDTH, seed=0)
+    # Linear light, as the authors' programs take codes.
+    return lambda frame, t: len(emulator.step(frame.astype(np.float32) / 255, round(t * 1e9)))
+
+
+def v2e(checkout: str) -> Step:
+    """A step of v2e's own emulator."""
+    import torch
+
+    torch.set_num_threads(1)
+    sys.path.insert(0, checkout)
+    sys.modules.update({name: MagicMock() for name in NOT_USED if name not in sys.modules})
+    emulator = importlib.import_module("v2ecore.emulator").EventEmulator(
+        pos_thres=0.2,
+        neg_thres=0.2,
+        sigma_thres=0.03,
+        cutoff_hz=300,
+        leak_rate_hz=0.01,
+        shot_noise_rate_hz=0.001,
+        refractory_period_s=0.0005,
+        device="cpu",
+    )
+
+    def step(frame: np.ndarray, t: float) -> int:
+        events = emulator.generate_events(frame.astype(np.float32), t)
+        return 0 if events is None else len(events)
+
+    return step
+
+
+def voltmeter(checkout: str) -> Step:
+    """A step of the DVS-Voltmeter authors' own simulator."""
+    import torch
+
+    torch.set_num_threads(1)
+    sys.path.insert(0, checkout)
+    sys.modules.setdefault("easydict", MagicMock())
+    config = MagicMock()
+    config.SENSOR.K = K
+    simulator = importlib.import_module("src.simulator").EventSim(config, "", "")
+
+    def step(frame: np.ndarray, t: float) -> int:
+        events = simulator.generate_events(frame, round(t * 1e6))
+        return 0 if events is None else len(events)
+
+    return step
+
+
+def timed(program: str, checkout: str, density: str, frames: int) -> dict[str, float]:
+    """Processor ms a frame and events of a program, in this process."""
+    pictures = clip(density, frames + 1)
+    step = PEERS[program](checkout) if checkout else ours(program)
+    for warm in (0, 1):  # compiling and first allocations
+        step(pictures[warm], warm / FPS)
+    began, events = time.process_time(), 0
+    for number in range(2, frames + 1):
+        events += step(pictures[number], number / FPS)
+    return {"ms": 1000 * (time.process_time() - began) / (frames - 1), "events": events}
+
+
+PEERS = {"v2e": v2e, "voltmeter": voltmeter}
+
+
+def in_a_process(program: str, checkout: str, density: str, frames: int) -> dict[str, float]:
+    """:func:`timed`, with one thread of everything."""
+    one = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    command = [sys.executable, "-m", "blinkgl.tools.peers", "--answer", program, checkout, density, str(frames)]
+    done = subprocess.run(command, env={**os.environ, **one}, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(done.stderr)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def table(checkouts: dict[str, str], rounds: int, frames: int) -> str:
+    """The figures as Markdown: medians of the rounds, programs in turns."""
+    lines = [
+        "|model|events per pixel and frame|authors' program, ms|BlinkGL, ms|times as fast|\n|---|---|---|---|---|\n"
+    ]
+    for model, checkout in checkouts.items():
+        for density in ("mid", "dense"):
+            turns = [[in_a_process(model, c, density, frames) for c in (checkout, "")] for _ in range(rounds)]
+            theirs, own = (median(turn[k]["ms"] for turn in turns) for k in (0, 1))
+            rates = [turns[0][k]["events"] / (frames - 1) / (HEIGHT * WIDTH) for k in (0, 1)]
+            lines.append(
+                f"|{model}: {PARAMETERS[model]}|{rates[0]:.3f}, ours {rates[1]:.3f}|{theirs:.1f}|{own:.1f}|"
+                f"{theirs / own:.1f}|\n"
+            )
+            print(lines[-1], end="", flush=True)
+    return "".join(lines)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name in PEERS:
+        parser.add_argument(f"--{name}", metavar="CHECKOUT")
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--frames", type=int, default=24)
+    parser.add_argument("--page", action="store_true", help=f"write {PAGE}")
+    parser.add_argument("--answer", nargs=4, help=argparse.SUPPRESS)
+    options = parser.parse_args(arguments)
+    if options.answer:
+        program, checkout, density, frames = options.answer
+        print(json.dumps(timed(program, checkout, density, int(frames))))
+        return
+    checkouts = {name: path for name in PEERS if (path := getattr(options, name))}
+    if not checkouts:
+        raise SystemExit("error: --v2e or --voltmeter: a checkout is needed")
+    made = table(checkouts, options.rounds, options.frames)
+    if options.page:
+        PAGE.write_text(
+            "# Speed beside the authors' programs\n\n"
+            "Made by `python -m blinkgl.tools.peers --v2e CHECKOUT --voltmeter CHECKOUT --page`; do not edit.\n\n"
+            f"{machine_line()}. 640x480, 1000 frames/s, one thread each, in turns; medians of {options.rounds} rounds, "
+            "processor milliseconds a frame. ESIM's authors publish C++ and CUDA, which it does not build.\n\n"
+            f"{made}",
+            encoding="utf-8",
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -226,7 +226,7 @@ def test_a_part_of_the_wrong_kind_is_named(part, line, problem):
     refused(toy_with(part, line), problem)
 
 
-# --- a label (docs/extending.md shows this class) -------------------------------------------------------------------
+# --- a label (examples/own_label.py shows this class) ---------------------------------------------------------------
 
 
 class Position(Label):

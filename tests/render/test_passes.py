@@ -1,5 +1,5 @@
 """Passes that read passes, and the handles of what they draw. The toys are defined here and nowhere else;
-docs/extending.md shows them."""
+docs/extending.md leads here."""
 
 import inspect
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ PLAIN = RenderConfig(image_antialiasing="none")
 TOYS = Path(__file__).parent / "toys"
 
 
-# --- a pass that reads another one's picture (docs/extending.md shows this class) -------------------------------------
+# --- a pass that reads another one's picture --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

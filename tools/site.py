@@ -39,6 +39,8 @@ ERROR_PAGE = "404.html"
 """Is shown at any address by a server, so its links start at the root."""
 MOVED = "moved.txt"
 """In docs/: old and new places of pages and sections that moved, one pair a line; ``#`` begins a comment."""
+PICTURE = re.compile(r'<p>(<img alt="([^"]+)" src="[^"]+" ?/?>)</p>')
+"""A picture in a paragraph of its own."""
 STUB = """<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -117,7 +119,17 @@ def build(root: Path, out: Path) -> None:
             shutil.rmtree(out)
         out.parent.mkdir(parents=True, exist_ok=True)
         shutil.copytree(copy / "out/site", out)
+        write_captions(out)
         write_stubs(out, moved)
+
+
+def write_captions(site: Path) -> None:
+    """Show the description of every picture that is a paragraph of its own below the picture."""
+    for path in site.glob("*.html"):
+        text = path.read_text(encoding="utf-8")
+        shown = PICTURE.sub(r"<figure>\1<figcaption>\2</figcaption></figure>", text)
+        if shown != text:
+            path.write_text(shown, encoding="utf-8")
 
 
 def moved_places(text: str) -> dict[str, dict[str, str]]:

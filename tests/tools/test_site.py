@@ -46,6 +46,22 @@ def test_the_reference_has_every_name_of_the_front_door_and_every_room(built):
     )
 
 
+def test_pictures_have_captions_and_are_there(built):
+    page = (built / "scenes.html").read_text(encoding="utf-8")
+    assert "<figcaption>People who dance</figcaption></figure>" in page
+    for path in built.glob("*.html"):
+        text = path.read_text(encoding="utf-8")
+        assert not site.PICTURE.search(text), path.name
+        assert 'alt=""' not in text, f"{path.name}: a picture without a description"
+
+
+def test_the_site_offers_search_dark_mode_and_copying_of_code(built):
+    for path in built.glob("*.html"):
+        text = path.read_text(encoding="utf-8")
+        if 'http-equiv="refresh"' not in text:
+            assert 'data-md-component="search"' in text and "slate" in text and "content.code.copy" in text, path.name
+
+
 def test_old_addresses_lead_to_where_the_pages_are_now(built):
     for page, places in site.moved_places((REPOSITORY / "docs" / site.MOVED).read_text(encoding="utf-8")).items():
         stub = (built / page).read_text(encoding="utf-8")

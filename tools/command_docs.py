@@ -8,6 +8,7 @@ A test fails when the page and the commands differ.
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator
 
 import typer
@@ -23,6 +24,9 @@ Made from the commands by `python -m blinkgl.tools.command_docs`; do not edit. `
 `shader check` found something wrong; 2 your input or the machine (`error: …`, one line); 3 done but for
 sequences (`trade --suite`: scenes) that were set aside; 130 interrupted.
 """
+SHARED_BY = 3
+"""An option of so many commands is described once."""
+HEAD = "|option|meaning|default, limits|\n|---|---|---|\n"
 REMARKS = re.compile(r"\s*\[([^\]]*)\]$")
 """What ``--help`` says last of an option, ``[default: 4; 1<=x<=1000]``."""
 
@@ -30,9 +34,12 @@ REMARKS = re.compile(r"\s*\[([^\]]*)\]$")
 def page() -> str:
     """The page as Markdown."""
     roots = (("blinkgl", blinkgl_app), ("eflow", eflow_app))
-    return HEADER + "".join(
-        _section(name, command) for root, app in roots for name, command in _commands(root, typer.main.get_command(app))
-    )
+    commands = [found for root, app in roots for found in _commands(root, typer.main.get_command(app))]
+    rows = {name: _rows(name, command) for name, command in commands}
+    count = Counter(row for found in rows.values() for row in found)
+    shared = [row for row in count if count[row] >= SHARED_BY and row.startswith("|`-")]
+    table = f"\n## Options of several commands\n\n{HEAD}{''.join(shared)}"
+    return HEADER + table + "".join(_section(name, command, rows[name], shared) for name, command in commands)
 
 
 def _commands(name: str, command) -> Iterator[tuple[str, object]]:
@@ -46,19 +53,29 @@ def _commands(name: str, command) -> Iterator[tuple[str, object]]:
         yield from _commands(f"{name} {child}", below)
 
 
-def _section(name: str, command) -> str:
+def _rows(name: str, command) -> list[str]:
+    """The rows of a command's table, an argument or an option each."""
     context = typer.Context(command, info_name=name)
-    records = [record for parameter in command.params if (record := parameter.get_help_record(context))]
-    rows = "".join(_row(*record) for record in records)
+    return [_row(*record) for parameter in command.params if (record := parameter.get_help_record(context))]
+
+
+def _section(name: str, command, rows: list[str], shared: list[str]) -> str:
+    context = typer.Context(command, info_name=name)
     usage = " ".join([name, *(piece.strip("{}") for piece in command.collect_usage_pieces(context))])
-    table = f"\n| | meaning | |\n|---|---|---|\n{rows}" if records else ""
-    return f"\n## {name}\n\n{' '.join((command.help or '').split())}\n\n```\n{usage}\n```\n{table}"
+    own = [row for row in rows if row not in shared]
+    also = ", ".join(row.split("|")[1] for row in rows if row in shared)
+    table = f"\n{HEAD}{''.join(own)}" if own else ""
+    return (
+        f"\n## {name}\n\n{' '.join((command.help or '').split())}\n\n```\n{usage}\n```\n{table}"
+        f"{f'{chr(10)}Also: {also}.{chr(10)}' if also else ''}"
+    )
 
 
 def _row(names: str, meaning: str) -> str:
     remarks = REMARKS.search(meaning)
     names = names.replace(" range>", ">")
-    return f"| `{names}` | {_cell(REMARKS.sub('', meaning))} | {_cell(remarks[1]) if remarks else ''} |\n"
+    limits = _cell(remarks[1]).replace("default: ", "") if remarks else ""
+    return f"|`{names}`|{_cell(REMARKS.sub('', meaning))}|{limits}|\n"
 
 
 def _cell(text: str) -> str:

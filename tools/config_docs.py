@@ -67,7 +67,7 @@ def _primitives() -> str:
             "parameters: {radius: 0.2, height: 2}}`. All stand upright (z is their axis) and are centred on the "
             "origin; sizes are in the world's units (m), before the object's `scale`.\n\n"
         ),
-        "| kind | parameters and defaults | what it is |\n|---|---|---|\n",
+        "|kind|parameters and defaults|what it is|\n|---|---|---|\n",
     ]
     for kind in PRIMITIVES:
         build = BUILDERS[kind]
@@ -75,9 +75,9 @@ def _primitives() -> str:
             f"`{name}: {list(value) if isinstance(value, tuple) else value}`"
             for name, value in parameters(kind).items()
         )
-        lines.append(f"| `{kind}` | {values} | {' '.join((build.__doc__ or '').split()).replace('``', '`')} |\n")
-    lines.append("\n| parameter | meaning |\n|---|---|\n")
-    lines += [f"| `{name}` | {meaning} |\n" for name, meaning in PARAMETERS.items()]
+        lines.append(f"|`{kind}`|{values}|{' '.join((build.__doc__ or '').split()).replace('``', '`')}|\n")
+    lines.append("\n|parameter|meaning|\n|---|---|\n")
+    lines += [f"|`{name}`|{meaning}|\n" for name, meaning in PARAMETERS.items()]
     return "".join(lines)
 
 
@@ -126,7 +126,7 @@ class _Page:
         if known is not None:
             default = default.replace("see below", f"see {known}")
             meaning += f"; keys: {known}" if "see" not in default else ""
-        return f"| `{name}` | {_type(info)} | {default} | {meaning} |\n"
+        return f"|`{name}`|{_type(info)}|{default}|{meaning}|\n"
 
     def _shown(self, title: str, rows: dict[str, str]) -> list[str]:
         """Return the table of the rows that no other section has; a sentence names the others."""
@@ -141,7 +141,7 @@ class _Page:
             self.said.setdefault(row, title)
         sentences = [f"As in {place}: {', '.join(f'`{n}`' for n in names)}." for place, names in elsewhere.items()]
         shown = [row for name, row in rows.items() if name not in left_out]
-        head = ["\n| key | type | default | meaning |\n|---|---|---|---|\n"] if shown else []
+        head = ["\n|key|type|default|meaning|\n|---|---|---|---|\n"] if shown else []
         return ["\n" + " ".join(sentences) + "\n"] * bool(sentences) + head + shown
 
 
@@ -166,12 +166,15 @@ def _is_list(annotation: Any) -> bool:
 
 
 def _type(info: FieldInfo) -> str:
-    limits = []
+    """ "number 0 … 1", "integer ≥ 1", "text"."""
+    low = high = ""
     for m in info.metadata:
-        for attribute, sign in (("gt", ">"), ("ge", "≥"), ("lt", "<"), ("le", "≤")):
+        for attribute, sign in (("gt", "> "), ("ge", "≥ "), ("lt", "< "), ("le", "≤ ")):
             if isinstance(m, getattr(annotated_types, attribute.capitalize())):
-                limits.append(f"{sign} {getattr(m, attribute):g}")
-    return (_name(info.annotation) + (" " + ", ".join(limits) if limits else "")).replace("|", "\\|")
+                limit = f"{getattr(m, attribute):g}".replace("e+0", "e").replace("e+", "e")
+                low, high = (low, sign + limit) if attribute in ("lt", "le") else (sign + limit, high)
+    limits = f"{low[2:]}…{high[2:]}" if low[:1] == "≥" and high[:1] == "≤" else ", ".join(filter(None, (low, high)))
+    return " ".join(filter(None, (_name(info.annotation), limits))).replace("|", "\\|")
 
 
 def _name(annotation: Any) -> str:

@@ -110,9 +110,11 @@ def section(name: str, output: str, root: Path = ROOT) -> str:
     """The example's part of the page."""
     source = (root / f"{name}.py").read_text(encoding="utf-8")
     title = re.match(r'"""(.*?)"""', source, re.S)[1].strip()
-    body = source.partition('"""\n\n')[2].partition("\n\nif __name__")[0].rstrip()
     picture = f"\n![{PICTURES[name][2]}](images/{PICTURES[name][1]})\n" if name in PICTURES else ""
-    return f"## {name}\n\n{title}\n\n```python\n{body}\n```\n\nIt prints:\n\n```\n{output.rstrip()}\n```\n{picture}"
+    return (
+        f'## {name}\n\n{title}\n\n???+ example "examples/{name}.py"\n\n    ``` {{.python}}\n    --8<-- "examples/{name}.py"\n'
+        f"    ```\n\nIt prints:\n\n```\n{output.rstrip()}\n```\n{picture}"
+    )
 
 
 def without_numbers(text: str) -> str:

@@ -21,7 +21,17 @@ from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
-SOURCES = ("mkdocs.yml", "docs", "blinkgl", "eflow", "tools/docstrings.py", "CHANGELOG.md", "changes", "towncrier.toml")
+SOURCES = (
+    "mkdocs.yml",
+    "docs",
+    "examples",
+    "blinkgl",
+    "eflow",
+    "tools/docstrings.py",
+    "CHANGELOG.md",
+    "changes",
+    "towncrier.toml",
+)
 """What the site is made of."""
 FETCHED = {
     ("script", "src"),

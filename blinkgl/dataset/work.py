@@ -7,6 +7,7 @@ messages (dicts that JSON can carry):
     {"kind": "hello", "pid", "environment", "assets"}          ready
     {"kind": "progress", "task", "frames", "events", "fraction", "seconds": by stage so far,
      "omissions": what is not drawn}
+    {"kind": "said", "task", "text": a line for the user, about compiling}
     {"kind": "done", "task", "report": {…}, "bytes", "cpu_s", "peak_rss_kib"}
     {"kind": "failed", "task", "error": one line, "expected": a BlinkGLError, "final": no use
     trying again, "stop": nor anything else}
@@ -37,6 +38,7 @@ from blinkgl.dataset.plan import Plan, digest
 from blinkgl.dataset.report import SequenceReport
 from blinkgl.errors import BlinkGLError, ConfigError, OutputError, may_pass
 from blinkgl.gl import GLContext, create_context
+from blinkgl.machine.compiling import announced_compiling
 from blinkgl.machine.posix import peak_kib
 
 Message = dict[str, Any]
@@ -161,14 +163,15 @@ class Maker:
             # A lost context fails the sequence that it was lost in; the next attempt begins with a new one.
             self.renew()
             config = self.plan.config(task)
-            report = generate_sequence(
-                config,
-                task.index,
-                self.job.out,
-                self.gl,
-                base=Path(self.job.base),
-                progress=progress,
-            )
+            with announced_compiling(lambda text: tell({"kind": "said", "task": number, "text": text})):
+                report = generate_sequence(
+                    config,
+                    task.index,
+                    self.job.out,
+                    self.gl,
+                    base=Path(self.job.base),
+                    progress=progress,
+                )
         except (KeyboardInterrupt, SystemExit):
             log.write("interrupted")
             raise

@@ -11,18 +11,17 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events.emulator import Emulator
-from blinkgl.events.packing import JIT
 from blinkgl.events.pixels import PixelNoise
 from blinkgl.events.resets import FrameResets
 from blinkgl.events.table import EMULATORS, make_emulator
 from blinkgl.events.truth import Surfaces, SurfaceTruth
+from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import OPTIONAL, Events
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -45,7 +44,7 @@ _PS_PER_US = 1_000_000
 _NO_EVENT_YET = -(2**62)
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def _serve(t_us, y, event_ps, row_ps, waiting, state, keep, out_us):
     """``waiting``: ring of the times (ps) at which the last accepted events left.
     ``state``: accepted, bus free (ps), row."""

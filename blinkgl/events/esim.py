@@ -19,18 +19,18 @@ from __future__ import annotations
 
 from typing import ClassVar, NamedTuple
 
-import numba
 import numpy as np
 from numba.extending import register_jitable
 
 from blinkgl.config.events import EsimConfig
 from blinkgl.events.arith import Q_ONE, log_q25
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
-from blinkgl.events.packing import JIT, T_SHIFT, compact_flags, copy_block, lookup_block
+from blinkgl.events.packing import T_SHIFT, compact_flags, copy_block, lookup_block
 from blinkgl.events.philox import Stream, in_blocks, normal2, pixel_counters
 from blinkgl.events.response import Response, smallest_threshold
 from blinkgl.events.table import register
 from blinkgl.events.threads import take_part
+from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
 # Typed constants: an int literal is int64 to numba and would widen the int32 loops. _FAR_BELOW is the
@@ -75,7 +75,7 @@ class Interval(NamedTuple):
     width: int
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def log_block(intensity: np.ndarray, eps: float, out: np.ndarray) -> None:
     """ln(intensity + eps) into ``out``, int32, 2^-25."""
     # No branch and no call of libm in the loop, so that LLVM vectorises it.
@@ -83,7 +83,7 @@ def log_block(intensity: np.ndarray, eps: float, out: np.ndarray) -> None:
         out[i] = log_q25(np.float32(intensity[i] + eps))
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def _flag_block(level, upper, lower, flags):
     """Flag (uint8) the pixels at or beyond a level, and return how far the farthest is beyond (negative: none is)."""
     farthest = _FAR_BELOW
@@ -107,7 +107,7 @@ def crossing_ns(part: float, whole: float, dt_ns: int) -> int:
     return (quotient << 20) + ((rest << 20) + part * low) // whole
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def _emit_block(active, count, first, now, p, v, cap, packed, begin):
     """Write the events of the listed pixels of one block to ``packed[begin:]``, in raster order, and move their
     levels. Return (end of the events, events cut by ``cap``)."""
@@ -174,7 +174,7 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin):
     return out, cut
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p, v):
     """Process the blocks of a band, see :meth:`Emulator._run`."""
     # Scratch memory of one block. compact_flags writes eight numbers at a time, so ``active`` has eight
@@ -213,7 +213,7 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
     return stop_block, filled, cut
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def _bands(taken, start, edges, progress, share, packed, frame, codes, table, p, v):
     # A row of ``progress`` is a band: next block, events written, events cut. A thread takes bands
     # until none is left.

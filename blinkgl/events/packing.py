@@ -10,11 +10,11 @@ Causes, where they are asked for, take the two uppermost bits of y: a sensor the
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numba.extending import register_jitable
 
 from blinkgl.events.threads import run, take_part
+from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Cause, Events
 
 # Bit 0: polarity; 1 to 16: x; 17 to 32: y; 33 and up: time. Causes: bits 31 and 32.
@@ -28,10 +28,6 @@ MAX_INTERVAL_NS = (2**30 - 1) * 1000
 _SINGLE_PASS_BITS, _DIGIT_BITS = 14, 11
 _EVENTS_PER_THREAD, _PARTS_PER_THREAD = 2**15, 2
 """Fewer events than that are sorted in the time another thread takes to wake up."""
-
-# nogil: bands run in threads. error_model "numpy": a division by zero gives inf or NaN instead of an
-# exception, whose test would keep loops from vectorising.
-JIT = dict(nogil=True, cache=True, error_model="numpy", boundscheck=False)
 
 
 @register_jitable
@@ -47,13 +43,13 @@ def cause_of(light: float, leak: float, noise: float) -> int:
 # so what has been sorted by lower digits stays sorted, and the first pass keeps the raster order.
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def _count_digits(packed, start, stop, shift, mask, histogram):
     for i in range(start, stop):
         histogram[(packed[i] >> shift) & mask] += 1
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def _scatter(packed, start, stop, shift, mask, offsets, out):
     for i in range(start, stop):
         digit = (packed[i] >> shift) & mask
@@ -62,7 +58,7 @@ def _scatter(packed, start, stop, shift, mask, offsets, out):
         offsets[digit] += 1
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def _histograms_to_offsets(histogram):
     """Replace counts by their exclusive prefix sum over (digit, band): where each band writes its events of each
     digit."""
@@ -74,7 +70,7 @@ def _histograms_to_offsets(histogram):
             total += count
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def _unpack(packed, start, stop, base_us, x, y, t, p):
     # Slices that are indexed from 0: the loop then vectorises.
     word, xs, ys, ts, ps = packed[start:stop], x[start:stop], y[start:stop], t[start:stop], p[start:stop]
@@ -85,7 +81,7 @@ def _unpack(packed, start, stop, base_us, x, y, t, p):
         ps[i] = np.uint8(word[i] & 1)
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def _unpack_causes(packed, start, stop, y, cause):
     word, ys, causes = packed[start:stop], y[start:stop], cause[start:stop]
     for i in range(word.size):
@@ -97,7 +93,7 @@ def _unpack_causes(packed, start, stop, y, cause):
 # The three below work through parts of the events, each taken by the next thread that is free.
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def _count_parts(taken, start, packed, starts, counts, first_row, shift, mask, histogram):
     # A part is a range of rows; its digits are counted in its own row of ``histogram``.
     part = take_part(taken, start)
@@ -108,7 +104,7 @@ def _count_parts(taken, start, packed, starts, counts, first_row, shift, mask, h
         part = take_part(taken, start)
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def _scatter_parts(taken, start, packed, starts, counts, first_row, shift, mask, offsets, out):
     # Every part has its own write positions, so threads never write to the same place.
     part = take_part(taken, start)
@@ -118,7 +114,7 @@ def _scatter_parts(taken, start, packed, starts, counts, first_row, shift, mask,
         part = take_part(taken, start)
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 # ``edges`` cut the sorted events into parts of about the same length.
 def _unpack_parts(taken, start, packed, edges, base_us, x, y, t, p, cause):
     part = take_part(taken, start)
@@ -224,21 +220,21 @@ def _even_split(counts: np.ndarray, parts: int) -> np.ndarray:
 # They take slices and index them from 0: numba then vectorises them, which it does not with an offset in the index.
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def copy_block(source: np.ndarray, target: np.ndarray) -> None:
     """``target[:] = source``."""
     for i in range(source.size):
         target[i] = source[i]
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def scale_block(frame: np.ndarray, scale: float, out: np.ndarray) -> None:
     """``out[:] = frame * scale``."""
     for i in range(frame.size):
         out[i] = frame[i] * scale
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def lookup_block(codes: np.ndarray, table: np.ndarray, out: np.ndarray) -> None:
     """``out[:] = table[codes]``."""
     for i in range(codes.size):
@@ -255,7 +251,7 @@ for _mask in range(256):
 _BIT_COUNTS = np.array([_mask.bit_count() for _mask in range(256)], np.int64)
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def compact_flags(flags: np.ndarray, scratch: np.ndarray, first_pixel: int, out: np.ndarray) -> int:
     """Numbers ``first_pixel + i`` of the set flags into ``out``; returns how many.
 

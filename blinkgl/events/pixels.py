@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numba
 import numpy as np
 
 from blinkgl.config.readout import PixelsConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events.arith import exp_f64, log_f64
-from blinkgl.events.packing import JIT
 from blinkgl.events.philox import Stream, normal2, pixel_counters, uniform2
+from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import OPTIONAL, Cause, Events
 
 # Events drawn at once; the highest rate, one event per microsecond; the longest time before the
@@ -24,7 +23,7 @@ _BATCH, _MOST_HZ, _LONGEST_BEFORE_S = 1024, 1e6, 5.0
 _DEFECT, _OWN = np.uint64(Stream.DEFECT), np.uint64(Stream.OWN_NOISE)
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def _awake(pixel, t_us, dead_us, last):
     """Return (n,) bool: which events come at least ``dead_us`` after the last such event of their pixel. ``last`` is
     updated."""

@@ -22,7 +22,6 @@ from __future__ import annotations
 
 from typing import ClassVar, NamedTuple
 
-import numba
 import numpy as np
 
 from blinkgl.config.events import EsimConfig, V2eConfig
@@ -30,7 +29,7 @@ from blinkgl.errors import EventDataError
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
 from blinkgl.events.esim import draw_thresholds
 from blinkgl.events.noise import noise_table
-from blinkgl.events.packing import JIT, compact_flags, copy_block, lookup_block, scale_block
+from blinkgl.events.packing import compact_flags, copy_block, lookup_block, scale_block
 from blinkgl.events.response import Response, smallest_threshold
 from blinkgl.events.table import register
 from blinkgl.events.threads import take_part
@@ -56,6 +55,7 @@ from blinkgl.events.v2e_model import (
     shot_draw,
     shot_tables,
 )
+from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
 _F = np.float32
@@ -107,7 +107,7 @@ class Interval(NamedTuple):
     bound_per_pixel: int
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x_table, p, v):
     """Process the blocks of a band, see :meth:`Emulator._run`."""
     cut, pixels = 0, p.x.size
@@ -182,7 +182,7 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
     return stop_block, filled, cut
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def _bands(taken, start, edges, progress, share, packed, frame, codes, table, x_table, p, v):
     # A row of ``progress`` is a band: next block, events written, events cut. A thread takes bands
     # until none is left.

@@ -6,13 +6,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 from numba.extending import register_jitable
 
 from blinkgl.events.arith import select
 from blinkgl.events.emulator import BLOCK
-from blinkgl.events.packing import CAUSE_SHIFT, JIT, T_SHIFT, cause_of
+from blinkgl.events.packing import CAUSE_SHIFT, T_SHIFT, cause_of
 from blinkgl.events.philox import Stream, normal2, rough_normal, uniform2
 from blinkgl.events.v2e_model import (
     DARKEST,
@@ -26,6 +25,7 @@ from blinkgl.events.v2e_model import (
     shot_factor,
     signal_at,
 )
+from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Cause
 
 _F = np.float32
@@ -39,14 +39,14 @@ DRAWS = 16
 """Candidates of shot noise that are drawn in one go, at most."""
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def lin_log_block(intensity: np.ndarray, out: np.ndarray) -> None:
     """``out[:]`` = lin-log of ``intensity`` (DN)."""
     for i in range(intensity.size):
         out[i] = lin_log(intensity[i])
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def relax_block(
     lag: np.ndarray,
     before: np.ndarray,
@@ -65,14 +65,14 @@ def relax_block(
         z[i] = now[i] + lag_now
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def add_scaled_block(a: np.ndarray, scale: float, out: np.ndarray) -> None:
     """``out[:] += a * scale``."""
     for i in range(a.size):
         out[i] += a[i] * scale
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def noise_block(
     noise: np.ndarray,
     intensity_before: np.ndarray,
@@ -101,7 +101,7 @@ def noise_block(
         z[i] += value
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def flag_block(z: np.ndarray, upper: np.ndarray, lower: np.ndarray, flags: np.ndarray) -> float:
     """Flags (uint8) of the pixels at or beyond a level; returns how far the farthest is beyond (negative: none is)."""
     farthest = _FAR_BELOW
@@ -115,7 +115,7 @@ def flag_block(z: np.ndarray, upper: np.ndarray, lower: np.ndarray, flags: np.nd
     return np.int32(farthest).view(np.float32)
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def _shot_draws(seed, block, index, rate_per_ns, gaps, picks, accepts):
     """Draw the candidates from number ``index`` on: more than needed, but in vector instructions."""
     for j in range(gaps.size):
@@ -125,7 +125,7 @@ def _shot_draws(seed, block, index, rate_per_ns, gaps, picks, accepts):
         accepts[j], _ = uniform2(seed, block, _SHOT, number * _U2 + _U1)
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def shot_block(
     block: int,
     pixels_in_block: int,
@@ -207,7 +207,7 @@ _NEVER_NS = 2**62
 _NANOSECONDS = 2**41 - 1  # bits 1 to 41 of a key: its time
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def emit(
     active: np.ndarray,
     first: int,

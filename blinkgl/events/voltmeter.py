@@ -30,7 +30,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numba.extending import register_jitable
 
@@ -38,7 +37,6 @@ from blinkgl.config.events import EsimConfig, VoltmeterConfig
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
 from blinkgl.events.packing import (
     CAUSE_SHIFT,
-    JIT,
     T_SHIFT,
     cause_of,
     compact_flags,
@@ -63,6 +61,7 @@ from blinkgl.events.voltmeter_model import (
     start_by_leak,
     start_voltage,
 )
+from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
 _F = np.float32
@@ -110,7 +109,7 @@ class Interval(NamedTuple):
     bound_per_pixel: int
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def _sense_block(before, now, v, unspent, interval, v_end, unspent_end, flags):
     """Write mean and variance of V at the end to ``v_end`` and ``unspent_end``, and flag the pixels to look at.
     Return the largest mean number of events."""
@@ -135,7 +134,7 @@ def _sense_block(before, now, v, unspent, interval, v_end, unspent_end, flags):
     return np.int32(most).view(np.float32)
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def _share_block(before, now, by_light, by_leak, interval, light_end, leak_end):
     """Compute how far light and leak have moved V by the interval's end if nothing fires."""
     dt_us = interval.dt_ns * 1e-3
@@ -163,7 +162,7 @@ def cause_at(side: int, since_us: float, light: float, leak: float, mu: float, l
     return cause_of(side * by_light, side * by_leak, 1.0 - side * (by_light + by_leak))
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_end, p, v, cap, packed, begin):
     """Write the events of the listed pixels of one block to ``packed[begin:]``, in raster order, and move their
     voltages.
@@ -278,7 +277,7 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
     return out, cut
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p, v):
     """Process the blocks of a band, see :meth:`Emulator._run`."""
     cut, pixels = 0, p.v.size
@@ -327,7 +326,7 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
     return stop_block, filled, cut
 
 
-@numba.njit(**JIT)
+@kernel(error_model="numpy")
 def _bands(taken, start, edges, progress, share, packed, frame, codes, table, p, v):
     # A row of ``progress`` is a band: next block, events written, events cut. A thread takes bands
     # until none is left.

@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
 from blinkgl.config.images import NS_PER_US, AutoExposureConfig
+from blinkgl.machine.kernels import kernel
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def instants(exposure: Exposure, speed: float, max_px: float, lens: int, most: i
     return int(min(most, max(1.0, math.ceil(min(moving, 1e9) - 1e-6), math.ceil(focusing - 1e-6))))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def accumulate(total: np.ndarray, image: np.ndarray, weights: np.ndarray) -> None:
     """Adds weights[row] * image to total, (H, W, 3) float64 each, image float32 (H, W, 3 or more)."""
     height, width, channels = total.shape

@@ -12,12 +12,12 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-import numba
 import numpy as np
 from numba.extending import register_jitable
 
 from blinkgl.events.arith import exp_f64, log_f64
 from blinkgl.events.philox import normal2, uniform2
+from blinkgl.machine.kernels import kernel
 from blinkgl.srgb import linear_from_srgb, srgb_from_linear
 
 PATTERNS = {
@@ -95,7 +95,7 @@ def poisson(mean: float, seed: int, pixel: int, index: int) -> float:
     return np.floor(mean)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def readings(
     light: np.ndarray,
     electrons_of_light: float,

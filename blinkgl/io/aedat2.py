@@ -17,11 +17,11 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import numba
 import numpy as np
 
 from blinkgl.errors import AssetError
 from blinkgl.io.columns import CameraFrame, G, ImuSamples
+from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
 MAGIC = b"#!AER-DAT"
@@ -219,7 +219,7 @@ def _kinds(address: np.ndarray) -> np.ndarray:
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _unwrap(address, kinds, stamp, state, height, width, t):
     """Fill times, int64 µs, and return (index of the first bad record, or -1; 1: outside the sensor, 2: backwards).
 
@@ -287,7 +287,7 @@ def _rectangular(mask: np.ndarray) -> bool:
     return bool(mask[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].all())
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _assemble(address, t, begin, reset, signal, times):
     """Return the index of the next frame's first sample: a reset or another read of a pixel that was read."""
     for i in range(begin, len(address)):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import functools
 
-import numba
 import numpy as np
+
+from blinkgl.machine.kernels import kernel
 
 INVALID = np.array([40, 40, 40], np.uint8)
 _RADIUS = 255
@@ -51,7 +52,7 @@ def flow_colour(flow: np.ndarray, maximum: float | None = None, valid: np.ndarra
     return rgb
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _largest_speed(flow, valid):
     largest = 0.0
     for y in range(flow.shape[0]):
@@ -62,7 +63,7 @@ def _largest_speed(flow, valid):
     return largest
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _look_up(flow, valid, maximum, wheel, invalid, rgb):
     radius = wheel.shape[0] // 2
     for y in range(flow.shape[0]):
@@ -79,7 +80,7 @@ def _look_up(flow, valid, maximum, wheel, invalid, rgb):
                     rgb[y, x, c] = invalid[c]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def count_events(x: np.ndarray, y: np.ndarray, p: np.ndarray, counts: np.ndarray) -> None:
     """Adds events to ``counts`` (2, H, W) uint16 by polarity, saturating."""
     for i in range(len(x)):
@@ -99,7 +100,7 @@ def event_colour(counts: np.ndarray) -> np.ndarray:
 _SHADE = np.rint(255 * (1 - np.exp(-0.9 * np.arange(9)))).astype(np.uint8)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _shade(counts, shade, rgb):
     for y in range(rgb.shape[0]):
         for x in range(rgb.shape[1]):

@@ -9,11 +9,11 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-import numba
 import numpy as np
 
 from blinkgl.errors import AssetError
 from blinkgl.io.columns import check_size
+from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
 _HEADER = 20
@@ -54,7 +54,7 @@ class EventStreamReader:
             raise AssetError("truncated: the last event is not whole", where=str(self.path))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _decode(data, state, x, y, t, p):
     """Returns how many events became whole."""
     n = 0

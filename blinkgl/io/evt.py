@@ -17,12 +17,12 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import numba
 import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import check_events, check_size, refuse_causes
+from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
 _WORD = {"evt2": np.dtype("<u4"), "evt21": np.dtype("<u8"), "evt3": np.dtype("<u2")}
@@ -191,7 +191,7 @@ def _read_header(path: Path) -> tuple[str, int]:
     return "\n".join(lines), start
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _decode_evt2(words, masks, state, x, y, t, p):
     """Returns (events, index of the first word of an unknown type, or whose mask leaves the 11 bits of x; -1: none).
 
@@ -232,7 +232,7 @@ def _decode_evt2(words, masks, state, x, y, t, p):
     return n, bad
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _encode_evt3(x, y, t, p, state, first, words):
     n = 0
     time, row = state
@@ -263,7 +263,7 @@ def _encode_evt3(x, y, t, p, state, first, words):
     return n
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _decode_evt3(words, state, x, y, t, p):
     """Returns (events, index of the first word of an unknown type, or whose vector leaves
     the 11 bits of x; -1: none)."""

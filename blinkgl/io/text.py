@@ -14,12 +14,12 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import numba
 import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import check_events, check_size, refuse_causes
+from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
 _LONGEST_LINE = 1 << 16
@@ -166,7 +166,7 @@ class TextWriter:
             pass
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 # Characters by their codes: 45 "-", 43 "+", 46 ".", 48 to 57 digits, 101 and 69 "e", "E".
 def _number(buffer, i):
     """Return (mantissa, decimal exponent, integer?, next index); next index -1: not a number, or more digits than
@@ -205,7 +205,7 @@ def _number(buffer, i):
     return (-mantissa if negative else mantissa), exponent, integer, i
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _scaled(mantissa, exponent):
     """Return mantissa · 10^exponent rounded to the nearest integer, exactly (half away from zero); ok False when it
     overflows."""
@@ -225,7 +225,7 @@ def _scaled(mantissa, exponent):
     return (value if mantissa >= 0 else -value), True
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _parse(buffer, x, y, t, p, unit):
     """Parse the events in whole lines of text. Return (count, index of the first bad line or -1, bad for its unit of
     time?).
@@ -278,7 +278,7 @@ def _parse(buffer, x, y, t, p, unit):
     return n, -1, False
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _put(value, digits, buffer, n):
     """Write the decimal digits of ``value``, at least ``digits`` of them, to ``buffer[n:]`` and return the new end."""
     # The number of digits first, then the digits from the last one on.
@@ -292,7 +292,7 @@ def _put(value, digits, buffer, n):
     return n + length
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _print(x, y, t, p, separator, micro, buffer):
     n = 0
     for i in range(len(t)):

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 import typer
 
 from blinkgl.errors import BlinkGLError, ConfigError
+from blinkgl.machine.compiling import announced_compiling
 from blinkgl.machine.extras import EXTRAS, install
 from blinkgl.machine.interrupts import interruptible
 from blinkgl.machine.terminal import never_fail_to_print
@@ -29,7 +30,7 @@ def run_app(
     arguments = [a for a in arguments if a != "--debug"] or ["--help"]
     try:
         # Not standalone: typer then hands errors up instead of printing its own boxes.
-        with interruptible():
+        with interruptible(), announced_compiling(lambda text: print(text, file=sys.stderr)):
             status = app(arguments, prog_name=program, standalone_mode=False)
         return status if isinstance(status, int) else 0
     except (KeyboardInterrupt, typer.Abort):
@@ -113,17 +114,6 @@ def user_line(error: Exception) -> str | None:
             code = errno.ENOSPC
         if code in _MACHINE_ERRNOS:
             return f"{error.filename}: {os.strerror(code).lower()}" if error.filename else os.strerror(code).lower()
-    if (folder := _damaged_kernels(error)) is not None:
-        return f"{folder}: the kernels that numba keeps there are damaged; remove the folder, they are compiled anew"
-    return None
-
-
-def _damaged_kernels(error: Exception) -> str | None:
-    """The folder of numba's kernels that could not be read, where reading one is what failed."""
-    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
-    for frame in reversed(frames):
-        if frame.f_code.co_filename.replace(os.sep, "/").endswith("numba/core/caching.py"):
-            return getattr(frame.f_locals.get("self"), "_cache_path", None)
     return None
 
 

@@ -1,64 +1,78 @@
-"""How long this process has spent compiling kernels, and a clock that stands still meanwhile.
+"""How long this process has spent compiling kernels, a clock that stands still meanwhile, and the lines that say so.
 
-numba compiles a kernel the first time it is called with arguments of some types and keeps the result on disk (beside
-the source, in the user's cache folder where that is not writable, or in NUMBA_CACHE_DIR); on a machine that has done so
-the figure is 0. It is no part of what anything costs, so it must not be in anybody's seconds.
+A machine compiles each kernel once (:mod:`~blinkgl.machine.kernels`), so the time is no part of what anything costs and
+must not be in anybody's seconds. numba is not imported here: commands that need no kernel start without it.
 """
 
 from __future__ import annotations
 
 import contextlib
 import time
+import warnings
 from collections.abc import Callable, Iterator
 
-from numba.core import event
+SAY_EVERY_S = 10.0
+"""Seconds of compiling between two lines: a program that prints nothing for a minute looks as if it hung."""
 
 
-class _Watch(event.Listener):
+class Watch:
     """Wall seconds between the start of the outermost compilation and its end. numba compiles under
     one lock, so they nest and never overlap."""
 
     def __init__(self) -> None:
-        self.seconds, self._depth, self._began = 0.0, 0, 0.0
+        self.seconds, self.kernels, self._depth, self._began = 0.0, 0, 0, 0.0
+        self._next_line_s = 0.0
         self.say: Callable[[str], None] | None = None
 
-    def on_start(self, event: event.Event) -> None:
+    def start(self) -> None:
         self._depth += 1
         if self._depth == 1:
             self._began = time.perf_counter()
-            if self.say is not None:
-                say, self.say = self.say, None
-                say("compiling kernels, once per machine: this may take a minute or two")
+            if self.say is not None and not self._next_line_s:
+                self.say("compiling kernels, once per machine: this may take a minute or two")
+                self._next_line_s = self.seconds + SAY_EVERY_S
 
-    def on_end(self, event: event.Event) -> None:
+    def end(self) -> None:
         self._depth -= 1
         if self._depth == 0:
             self.seconds += time.perf_counter() - self._began
+            self.kernels += 1
+            if self.say is not None and self.seconds >= self._next_line_s:
+                self.say(f"compiling kernels: {self.kernels} done in {self.seconds:.0f} s")
+                self._next_line_s = self.seconds + SAY_EVERY_S
 
 
-_watch = _Watch()
-event.register("numba:compile", _watch)
+watch = Watch()
+"""Of this process; :mod:`~blinkgl.machine.kernels` tells it when numba compiles."""
 
 
 def compiled_s() -> float:
     """Wall seconds spent compiling kernels in this process so far; loading them from disk does not count."""
-    return _watch.seconds
+    return watch.seconds
 
 
 @contextlib.contextmanager
 def announced_compiling(say: Callable[[str], None]) -> Iterator[None]:
-    """Calls ``say`` with a sentence when a kernel is compiled inside, once: a program that prints nothing for a minute
-    looks as if it hung."""
-    _watch.say = say
+    """Calls ``say`` with a sentence when the first kernel is compiled inside, and with another every
+    :data:`SAY_EVERY_S` seconds of compiling. The innermost of several listeners is told."""
+    outer, watch.say = watch.say, say
     try:
         yield
     finally:
-        _watch.say = None
+        watch.say = outer
+
+
+def kernel_cache_failed(what: str) -> None:
+    """Says ``what`` is wrong with the kernels on disk, to whoever is told of compiling, else as a warning."""
+    if watch.say is not None:
+        watch.say(f"warning: {what}")
+    else:
+        warnings.warn(what, RuntimeWarning, stacklevel=2)
 
 
 def working_clock() -> float:
     """``time.perf_counter()`` without the compilation."""
-    return time.perf_counter() - _watch.seconds
+    return time.perf_counter() - watch.seconds
 
 
 def compiling_line(seconds: float) -> str:

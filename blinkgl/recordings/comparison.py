@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
-import numba
 import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.formats import ENDINGS, EventFile, open_events
 from blinkgl.io.images import NpzReader, npy_header, numpy_errors
+from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
@@ -306,7 +306,7 @@ def _accumulate(
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _collect(x, y, t, p, origin, counts, sums, last, iei, bins):
     """Adds events to the count and polarity maps and to the histogram of inter-event
     intervals (ten bins per decade of µs)."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numba
 import numpy as np
 from numpy.typing import DTypeLike
 
 from blinkgl.errors import ConfigError, EventDataError
+from blinkgl.machine.kernels import kernel
 from blinkgl.recordings.fitting import Fitting
 from blinkgl.recordings.frame_noise import FrameNoise, frame_noise
 from blinkgl.srgb import linear_from_srgb
@@ -67,7 +67,7 @@ class Decoder:
         return linear_from_srgb(code) if gamma == "srgb" else code ** code.dtype.type(gamma)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _luma_by_table(frame, table, weights, out):
     for y in range(out.shape[0]):
         for x in range(out.shape[1]):

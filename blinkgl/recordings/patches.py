@@ -7,9 +7,9 @@ border), some of the whole sensor (bursts), some of the patches beside it in spa
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
 SIDE_PX = 16
@@ -121,7 +121,7 @@ def _bursts(t: np.ndarray, window: float) -> np.ndarray:
     return np.log((count + 1) / (usual + 1))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _of_pixels(x, y, t, p, window, size, sums):
     """Sums over each pixel's own events in a patch."""
     last = np.full(size, -1, np.int64)
@@ -158,7 +158,7 @@ def _of_pixels(x, y, t, p, window, size, sums):
         last[at], before[at] = t[i], p[i]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _of_neighbours(x, y, t, p, window, size, sums):
     """Sums over the events of the eight pixels round each event, before it."""
     height, width = size
@@ -187,7 +187,7 @@ def _of_neighbours(x, y, t, p, window, size, sums):
         last[r, c], before[r, c] = t[i], p[i]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _of_times(x, y, t, window, bursts, sums):
     """Events that have the same time as the one before, wherever that is, and how busy the sensor was."""
     for i in range(len(t)):

@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import cv2
-import numba
 import numpy as np
 
+from blinkgl.machine.kernels import kernel
 from blinkgl.recordings.bursts import inside_any
 from blinkgl.recordings.clip import TILE_PX, Clip
 from blinkgl.recordings.comparison import BLUR_PX
@@ -158,7 +158,7 @@ def _histogram(counts: np.ndarray, group: np.ndarray) -> np.ndarray:
     return flat.reshape(GROUPS, len(COUNTS)).astype(np.float64)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _collect(where, t, p, edges, bursts, group, total, isi):
     """Counts by interval, pixel and polarity, and the histogram of the intervals between a pixel's events, of those
     without a burst between them, in which there may have been another."""

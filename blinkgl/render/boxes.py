@@ -7,11 +7,11 @@ triangles are fine.
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 
 from blinkgl.camera import CameraModel
 from blinkgl.labels.semantics import Categories, category_of, class_of
+from blinkgl.machine.kernels import kernel
 from blinkgl.render.casting import vertices_at
 from blinkgl.render.moment import cam_from_obj
 from blinkgl.scene.types import Scene, SceneObject
@@ -139,7 +139,7 @@ _EDGE = 1e-9
 """px: so near to an edge a pixel's centre is in the triangles on both sides of it."""
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def cover(px: np.ndarray, faces: np.ndarray, mask: np.ndarray) -> None:
     """Sets ``mask`` (H, W) where a pixel's centre is in one of the triangles (F, 3) of (V, 2) float64 px, their edges
     included."""
@@ -177,7 +177,7 @@ def cover(px: np.ndarray, faces: np.ndarray, mask: np.ndarray) -> None:
                 mask[y, x] = True
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def extents(ids: np.ndarray, count: int) -> np.ndarray:
     """(count, 5) int64: of every id below ``count`` the first and last column and row of its pixels, as x0, y0, x1, y1,
     and how many there are."""

@@ -18,9 +18,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
-import numba as nb
 import numpy as np
 
+from blinkgl.machine.kernels import kernel
 from blinkgl.render.mesh_edges import Contour, write_planes
 
 if TYPE_CHECKING:
@@ -148,7 +148,7 @@ class Lines:
         return self._pixels[:pixels], self._sorted[:count]
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _emit(numbers, bodies, T_cam_obj, mvps, pool, width, height, out):
     """Write the lines of all objects and return their number. numbers, bodies : of each object, its contour's place in
     the pool and its own in the scene."""
@@ -170,7 +170,7 @@ def _emit(numbers, bodies, T_cam_obj, mvps, pool, width, height, out):
     return count
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _emit_one(mvp, pool, mine, front, width, height, out, count):
     """Append the lines of one object, whose edges are ``mine`` of the pool's, to the first ``count``, and return the
     new number."""
@@ -253,7 +253,7 @@ def _emit_one(mvp, pool, mine, front, width, height, out, count):
     return count
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _most(lines):
     """Return an upper bound of the number of pixels crossed."""
     count = 0
@@ -263,7 +263,7 @@ def _most(lines):
     return count
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _around(x, y):
     """Return where a ray from a pixel's centre leaves its square, along the boundary, in half sides: 8 all round."""
     # A line that ends in the pixel's centre has no direction.
@@ -274,7 +274,7 @@ def _around(x, y):
     return (2.0 if y > 0.0 else 6.0) - x / y
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _cross(lines, width, height, out, places):
     """Write the crossings of each line, in order along it, and each one's pixel, y * width + x. Return their number.
 
@@ -329,7 +329,7 @@ def _cross(lines, width, height, out, places):
     return count
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _by_pixel(crossings, places, width, counts, pixels, out):
     """Write the crossings to ``out``, those of a pixel together, and return the number of pixels. counts : zeros,
     left so."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-import numba as nb
 import numpy as np
+
+from blinkgl.machine.kernels import kernel
 
 if TYPE_CHECKING:
     from blinkgl.scene.types import Mesh
@@ -155,7 +156,7 @@ def _joined(edges: np.ndarray, places: int) -> np.ndarray:
     return np.ascontiguousarray(np.delete(edges, border[first + 1], axis=0))
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def write_planes(places: np.ndarray, faces: np.ndarray, out: np.ndarray) -> None:
     """Write (F, 4) float64, see :class:`Contour`."""
     # Normal by the cross product of two sides, of twice the triangle's area; its product with a corner.

@@ -8,9 +8,9 @@ wide (:func:`near_thin`) four that agree are not believed, either.
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 
+from blinkgl.machine.kernels import kernel
 from blinkgl.render import casting
 from blinkgl.scene.types import Scene
 
@@ -32,7 +32,7 @@ REACH = 4
 """Pixels about it in which it may go on unseen: a wire of a third of a pixel meets a centre that often."""
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def near_thin(ids: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """(H, W) bool: whether an object is drawn within :data:`REACH` px (in x and y) that is no more than :data:`NARROW`
     px wide there, across or down, between others that are farther away.
@@ -69,7 +69,7 @@ def near_thin(ids: np.ndarray, depth: np.ndarray) -> np.ndarray:
     return near
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def judged_by_samples(
     flow: np.ndarray,
     z_there: np.ndarray,
@@ -162,7 +162,7 @@ def occlusion_mask(
     return verdict == HIDDEN
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def undecided(verdict: np.ndarray, flow: np.ndarray, z_there: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of the points of which ``verdict`` is UNDECIDED, row by row: (N,) number of the pixel, (N, 2) float64 px where
     they are then, (N,) float64 how far away."""
@@ -185,7 +185,7 @@ def undecided(verdict: np.ndarray, flow: np.ndarray, z_there: np.ndarray) -> tup
     return where, place, depth
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def flow_and_reach(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(H, W, 2) float32 px, 0 where not valid, and (H, W) bool of the shader's (H, W, 4): u, v, Z at the other time,
     which is to be above 0, and whether something is hit."""

@@ -14,8 +14,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
+
+from blinkgl.machine.kernels import kernel
 
 LEAF_TRIANGLES = 4
 _STACK = 64  # the tree is balanced: 64 levels are more than any mesh in memory needs
@@ -88,7 +89,7 @@ class Holes(NamedTuple):
 
 # Slices that are assigned and argsort would take longer to compile than all the rest here: numba brings a string
 # library along for the message that shapes differ.
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _sort_stably(order, a, b, centre, axis, spare):
     """Sort order[a:b] by the centroids along an axis; equal ones keep their order. spare : room for b - a."""
     width = 1
@@ -108,7 +109,7 @@ def _sort_stably(order, a, b, centre, axis, spare):
         width *= 2
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _build(triangles, lower, upper, child, count):
     """Build the tree by median splits along the longest side of the centroids' box. Return (order, number of nodes)."""
     n = triangles.shape[0]
@@ -210,7 +211,7 @@ def _holes(parts: int, holes: list[Holes | None]) -> tuple[np.ndarray, ...]:
     return mask, np.concatenate(uvs), np.array(rows, np.int64).reshape(-1, 6), cutoffs, np.concatenate(texels)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _texel_index(i, size, wrap):
     if wrap == 2:
         return min(max(i, 0), size - 1)
@@ -221,7 +222,7 @@ def _texel_index(i, size, wrap):
     return i % size
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _is_hole(mask, uvs, cutoff, texels, face, a, b, c):
     """Return whether the point of a face with these barycentrics is cut out, bilinear in ``texels``. mask : a row of
     ``Forest.masks``."""
@@ -239,7 +240,7 @@ def _is_hole(mask, uvs, cutoff, texels, face, a, b, c):
     return top * (1.0 - fy) + bottom * fy < cutoff
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _shear(d):
     """Return the axes and the shear that turn direction d into +z (Woop et al., section 3.1): kx, ky, kz, sx, sy,
     sz."""
@@ -257,7 +258,7 @@ def _shear(d):
     return kx, ky, kz, d[kx] / d[kz], d[ky] / d[kz], 1.0 / d[kz]
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _triangle(tri, o, kx, ky, kz, sx, sy, sz):
     """Return (s, u, v, w, front): ray parameter and barycentrics of corners 0, 1, 2; s = inf for a miss."""
     # Corners relative to the ray's origin, sheared so that the ray runs along z (Woop et al., section
@@ -277,14 +278,14 @@ def _triangle(tri, o, kx, ky, kz, sx, sy, sz):
     return sz * (u * az + v * bz + w * cz), u, v, w, det > 0.0
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 # The ray (rx, ry, 1) in the part's axes: the parameter stays the depth.
 def _local_ray(axes, rx, ry, d):
     for k in range(3):
         d[k] = axes[k, 0] * rx + axes[k, 1] * ry + axes[k, 2]
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _balls(forest, origins, axes):
     """Return balls around the parts, slightly too large, in camera axes: (P, 3) middles, (P,) radii, and (P,) the
     square of the length of the tangents from the camera's centre, a little too short; <= 0: it is inside. Most
@@ -310,7 +311,7 @@ def _balls(forest, origins, axes):
     return centre, radius, outside
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def nearest_tree(
     forest: Forest,
     origins: np.ndarray,

@@ -21,7 +21,7 @@ Time = Annotated[
 ]
 Shaders = Annotated[str | None, typer.Option("--shaders", help="Use an edited copy of the shaders/ folder.")]
 Overrides = Annotated[
-    list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value of CONFIG; may be repeated.")
+    list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")
 ]
 Json = Annotated[bool, typer.Option("--json", help="Machine-readable output.")]
 DIFFERENT = 1  # exit status of `diff` over the tolerance, and of `check` with an error

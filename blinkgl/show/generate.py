@@ -19,7 +19,7 @@ from blinkgl.dataset.report import STAGES, SequenceReport, Totals
 from blinkgl.dataset.run import Listener, Outcome, run_dataset
 from blinkgl.dataset.work import Message, report_of
 from blinkgl.errors import ConfigError
-from blinkgl.machine.compiling import announced_compiling, compiling_line
+from blinkgl.machine.compiling import compiling_line
 from blinkgl.machine.terminal import causes_line, plain_column, plain_console, say
 
 MAX_NOTES = 20
@@ -48,7 +48,7 @@ def run(
     template = load_run(config, overrides, seed=seed)
     console = plain_console(quiet=quiet)
     display = None if quiet else Display(console, Path(out))
-    with announced_compiling(lambda text: say(console, text)), _shown(view, Path(out), display) as listener:
+    with _shown(view, Path(out), display) as listener:
         outcome = run_dataset(
             template,
             out,
@@ -107,6 +107,11 @@ class Display:
 
     def message(self, name: str, message: Message) -> None:
         kind = message["kind"]
+        if kind == "said":
+            if message["text"] not in self._notes:  # several workers say the same
+                self._notes.add(message["text"])
+                self._say(message["text"])
+            return
         self._note(message.get("omissions") or message.get("report", {}).get("omissions") or ())
         if kind == "progress":
             self._at_work[name] = (message["fraction"], message["frames"], message["events"])

@@ -10,10 +10,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import cv2
-import numba
 import numpy as np
 
 from blinkgl.errors import EventDataError
+from blinkgl.machine.kernels import kernel
 from blinkgl.srgb import to_srgb8
 
 Timed = tuple[np.ndarray, int]
@@ -152,7 +152,7 @@ def _between(a, b, t_a, t_b, forward, backward, steps) -> Iterator[Timed]:
         )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _look(light, log, places, out):
     """Write the light at ``places`` (H, W, 2), x and y in px, to ``out``; the border continues outwards."""
     height, width = log.shape
@@ -181,7 +181,7 @@ def _look(light, log, places, out):
             out[row, column] = min(max(value, min(a, b, c, d)), max(a, b, c, d))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _catmull_rom(f, out):
     """Compute the weights of the four samples around a place that is ``f`` beyond the second: exact for parabolas."""
     half, one = np.float32(0.5), np.float32(1)

@@ -10,8 +10,9 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 
-import numba as nb
 import numpy as np
+
+from blinkgl.machine.kernels import kernel
 
 NS_PER_S = 1_000_000_000
 _PROPOSED = 0.98
@@ -125,7 +126,7 @@ class Ticks:
 # How fast the fastest pixel is.
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _largest_squared(velocity):
     largest = np.float32(0.0)
     for y in range(velocity.shape[0]):

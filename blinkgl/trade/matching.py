@@ -14,13 +14,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
+from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
 _MISSED, _EXTRA, _MATCH = np.uint8(0), np.uint8(1), np.uint8(2)
-_JIT = dict(cache=True, nogil=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +68,7 @@ def _trains(events: Events, height: int, width: int) -> tuple[np.ndarray, np.nda
     return starts, order
 
 
-@numba.njit(**_JIT)
+@kernel
 def _group(x, y, p, width, starts, order):
     """Counting sort, stable: the order of time is kept within a train."""
     for i in range(len(x)):
@@ -83,7 +82,7 @@ def _group(x, y, p, width, starts, order):
         place[k] += 1
 
 
-@numba.njit(**_JIT)
+@kernel
 def _match(starts_a, order_a, t_a, starts_b, order_b, t_b, limit, partner):
     """Dynamic programming per train. cost[i][j]: the least cost (in half µs, so that integers suffice) of the first i
     events of a and the first j of b. Row i holds j from low[i], the number of b's events too early for event i - 1 of

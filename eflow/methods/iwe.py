@@ -6,13 +6,13 @@ CVPR 2018; Stoffregen et al., ECCV 2020).
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from blinkgl.machine.kernels import kernel
 from eflow.data.window import Window
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def vote(x: np.ndarray, y: np.ndarray, image: np.ndarray) -> None:
     """Adds 1 for every point (x, y), float64 px, to the four pixels round it, bilinearly; what is outside is lost."""
     height, width = image.shape
@@ -28,7 +28,7 @@ def vote(x: np.ndarray, y: np.ndarray, image: np.ndarray) -> None:
         image[row + 1, column + 1] += a * b
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def slope_at(x: np.ndarray, y: np.ndarray, image: np.ndarray, out: np.ndarray) -> None:
     """out (N, 2): derivative of sum(image * votes) by each point's x and y; the adjoint of :func:`vote`."""
     height, width = image.shape

@@ -16,12 +16,12 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from blinkgl.machine.kernels import kernel
 from eflow.precision import fp32
 
 # Up to so many tokens the whole volume is held: beyond, its memory grows with their square.
@@ -232,7 +232,7 @@ def _lookup_cpu(levels: list[Tensor], coords: Tensor, radius: int) -> Tensor:
     return torch.from_numpy(out).view(n, h, w, -1).permute(0, 3, 1, 2)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _taps(volume, coords, scale, radius, first, out):
     _, h, w = volume.shape
     side = 2 * radius + 1

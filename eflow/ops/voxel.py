@@ -5,8 +5,9 @@ The kernels are serial and release the GIL: loader workers are the parallelism.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from blinkgl.machine.kernels import kernel
 
 
 def voxel_grid(
@@ -45,7 +46,7 @@ def voxel_grid(
     return grid
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _splat_t(x, y, t, p, t0, t1, scale, grid):
     bins, height, width = grid.shape
     outside = 0
@@ -65,7 +66,7 @@ def _splat_t(x, y, t, p, t0, t1, scale, grid):
     return outside
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _splat_xyt(x, y, t, p, t0, t1, scale, grid):
     bins, height, width = grid.shape
     outside = 0
@@ -96,7 +97,7 @@ def _splat_xyt(x, y, t, p, t0, t1, scale, grid):
     return outside
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _normalise(cells, everything):
     # Two passes in float64: mean first, then the sum of squared deviations, which does not cancel.
     n, total = 0, 0.0
@@ -132,7 +133,7 @@ def count_slices(
     return counts
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _count(x, y, t, p, t0, span, counts):
     slices, _, height, width = counts.shape
     outside = 0
@@ -158,7 +159,7 @@ def counts_and_times(
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _latest(x, y, t, p, t0, span, out):
     _, height, width = out.shape
     outside = 0

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from blinkgl.config.physics import BodyConfig
+from blinkgl.machine.kernels import kernel
 from blinkgl.scene.shapes.deformer import filled
 from blinkgl.scene.types import SceneObject
 
@@ -128,7 +128,7 @@ def damping_ratio(restitution: float, steps: float) -> float:
     return low
 
 
-@njit(cache=True)
+@kernel
 def _given_back(ratio: float, steps: float) -> float:
     """Return the mean share of its speed with which a body leaves the contact, by the engine's recurrence."""
     # w: angle of the spring per step. The contact only pushes, hence min(..., 0).

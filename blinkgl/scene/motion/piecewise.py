@@ -9,10 +9,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from blinkgl.machine.kernels import kernel
 
 
-@njit(cache=True)
+@kernel
 def hermite_piece(
     h: float,
     p0: np.ndarray,
@@ -77,7 +78,7 @@ def thin(
     return keep
 
 
-@njit(cache=True)
+@kernel
 def _thin(step, positions, velocities, quaternions, rates, tolerance, angle, keep):
     cp, cr = np.empty((4, 3)), np.empty((4, 3))
     last = len(positions) - 1
@@ -110,7 +111,7 @@ def _thin(step, positions, velocities, quaternions, rates, tolerance, angle, kee
         a = b
 
 
-@njit(cache=True)
+@kernel
 def _passes(a, b, step, positions, quaternions, cp, cr, square, half):
     for i in range(a + 1, b):
         # Position by Horner's scheme, then rotation.
@@ -143,13 +144,13 @@ def _passes(a, b, step, positions, quaternions, cp, cr, square, half):
 
 
 # The piece that holds t; the first and last go on beyond their ends.
-@njit(cache=True)
+@kernel
 def _piece(t, knots):
     i = np.searchsorted(knots, t, side="right") - 1
     return min(max(i, 0), len(knots) - 2)
 
 
-@njit(cache=True)
+@kernel
 def pose(t: int, knots: np.ndarray, cp: np.ndarray, cr: np.ndarray, rot: np.ndarray, T: np.ndarray) -> None:
     """Write the pose at a time, held beyond both ends."""
     t = min(max(t, knots[0]), knots[-1])
@@ -182,14 +183,14 @@ def pose(t: int, knots: np.ndarray, cp: np.ndarray, cr: np.ndarray, rot: np.ndar
     T[3, 3] = 1.0
 
 
-@njit(cache=True)
+@kernel
 def poses(times: np.ndarray, knots: np.ndarray, cp: np.ndarray, cr: np.ndarray, rot: np.ndarray, T: np.ndarray) -> None:
     """Write the poses at (n,) times."""
     for k in range(len(times)):
         pose(times[k], knots, cp, cr, rot, T[k])
 
 
-@njit(cache=True)
+@kernel
 def derivative(t: int, knots: np.ndarray, cp: np.ndarray, cr: np.ndarray, rot: np.ndarray, D: np.ndarray) -> None:
     """Write D = dT/dt. Body rate w = J_r(phi) phi' with the right Jacobian of SO(3), J_r = I - (1 - cos a)/a^2
     [phi]x + (a - sin a)/a^3 [phi]x^2, a = |phi|."""
@@ -222,7 +223,7 @@ def derivative(t: int, knots: np.ndarray, cp: np.ndarray, cr: np.ndarray, rot: n
         D[r, 2] = T[r, 0] * w1 - T[r, 1] * w0
 
 
-@njit(cache=True)
+@kernel
 def _quadratic_bound(c, ua, ub):
     """Return an upper bound of |p'(u)| over [ua, ub] for the cubic p: the largest norm of the three Bezier points of
     p'."""
@@ -240,7 +241,7 @@ def _quadratic_bound(c, ua, ub):
     return math.sqrt(best)
 
 
-@njit(cache=True)
+@kernel
 def _cubic_bound(c, ua, ub):
     """Return an upper bound of |p(u)| over [ua, ub]: the largest norm of the four Bezier points of p."""
     # The blossom of a cubic at (v, w, x): a control point each.
@@ -257,7 +258,7 @@ def _cubic_bound(c, ua, ub):
     return math.sqrt(best)
 
 
-@njit(cache=True)
+@kernel
 def approach_bound(
     ta: int,
     tb: int,
@@ -296,7 +297,7 @@ def approach_bound(
     return best
 
 
-@njit(cache=True)
+@kernel
 def speed_bound(ta: int, tb: int, knots: np.ndarray, cp: np.ndarray, cr: np.ndarray) -> tuple[float, float]:
     """Return upper bounds over [ta, tb] of the speed of the origin and of the angular rate."""
     if tb < knots[0] or ta > knots[-1] or tb < ta:

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from blinkgl.machine.kernels import kernel
 from blinkgl.scene.shapes.skeleton import Locals
 
 PATHS = ("translation", "rotation", "scale")
@@ -133,7 +133,7 @@ class Clip:
         return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _evaluate(time, speed, joint, path, kind, first, times, values, out):
     """Writes what the tracks give at a time of the clip into ``out``, :class:`Locals`, and rates per second of the
     sequence's clock."""
@@ -193,7 +193,7 @@ def _evaluate(time, speed, joint, path, kind, first, times, values, out):
                     S[joint[track], k], dS[joint[track], k] = value[k], speed * rate[k]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _slerp(a, b, s, ds, value, rate):
     """Along the shorter arc between unit quaternions, and its rate where s grows by ds per second."""
     cosine = 0.0

@@ -9,8 +9,8 @@ some phases and put into this form once, by the fast Fourier transform.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from blinkgl.machine.kernels import kernel
 from blinkgl.scene.shapes.skeleton import Locals
 
 HARMONICS = 12
@@ -57,7 +57,7 @@ class Cycle:
         return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _evaluate(phi, rate, cosines, sines, offsets, T, R, dT, dR):
     """Writes the joints' places and turns at a phase, and their rates, where phi grows by ``rate`` per second."""
     rows = cosines.shape[1]
@@ -95,7 +95,7 @@ def _evaluate(phi, rate, cosines, sines, offsets, T, R, dT, dR):
         R[i - 1], dR[i - 1] = q, d
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _product(a, b, out):
     """Of quaternions x, y, z, w."""
     out[0] = a[3] * b[0] + a[0] * b[3] + a[1] * b[2] - a[2] * b[1]

@@ -23,8 +23,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numba import njit
 from scipy.spatial import ConvexHull, HalfspaceIntersection
+
+from blinkgl.machine.kernels import kernel
 
 if TYPE_CHECKING:
     from blinkgl.config.deform import DeformConfig
@@ -184,7 +185,7 @@ class Sweep:
         return vertices, faces.astype(np.int32)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _reach(points, halves, order, reach):
     """Raises ``reach``, (162,) how far (V, 3) points go in each direction; the mean of those that go furthest.
     halves, order : of :func:`_directions`. Point by point and one sign after the other, so that a processor takes
@@ -211,7 +212,7 @@ def _reach(points, halves, order, reach):
     return mean
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _widen(points, low, high):
     """Widens the box low to high, (3,) both, to hold (V, 3) points."""
     for i in range(len(points)):
@@ -219,7 +220,7 @@ def _widen(points, low, high):
             low[j], high[j] = min(low[j], points[i, j]), max(high[j], points[i, j])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _largest_difference(a, b):
     """The largest distance between the rows of (V, 3) a and b."""
     most = 0.0

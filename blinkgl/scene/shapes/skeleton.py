@@ -13,8 +13,9 @@ from collections import OrderedDict
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
+
+from blinkgl.machine.kernels import kernel
 
 _KEPT = 4
 
@@ -104,7 +105,7 @@ class Skeleton:
         return self._kept[t_ns]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _world(parents, fixed, T, R, S, dT, dR, dS, world, rate):
     """Transforms of all joints, parents first, and their rates by the product rule."""
     L, D, F, G = np.zeros((4, 4)), np.zeros((4, 4)), np.empty((4, 4)), np.empty((4, 4))
@@ -144,14 +145,14 @@ def _world(parents, fixed, T, R, S, dT, dR, dS, world, rate):
                         rate[i, r, c] += world[parent, r, k] * G[k, c]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _turn(x, y, z, w, out):
     out[0, 0], out[0, 1], out[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
     out[1, 0], out[1, 1], out[1, 2] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
     out[2, 0], out[2, 1], out[2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _times(a, b, out):
     for r in range(4):
         for c in range(4):

@@ -15,10 +15,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from blinkgl.errors import AssetError
+from blinkgl.machine.kernels import kernel
 from blinkgl.scene.shapes.deformer import Deformer
 from blinkgl.scene.shapes.skeleton import Locals, Skeleton, Still
 from blinkgl.scene.types import Mesh
@@ -226,7 +226,7 @@ class Skin(Deformer):
         return self._packed(self.matrices(there_ns)[0] - self.matrices(t_ns)[0], weights)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _followed(points, joints, weights, matrices, place):
     """(V, 3) of (V, 3) points, (V, k) joints and weights, (m, 3, 4) matrices whose last columns count ``place``
     times."""

@@ -1,0 +1,130 @@
+"""The decorator of every compiled function.
+
+numba compiles a kernel the first time it is called with arguments of some types and keeps the result on disk: beside
+the source, in the user's cache folder where that is not writable, or in NUMBA_CACHE_DIR. What it keeps has no check
+sum, so a damaged file raises whatever unpickling raises, or runs as it is. Here an entry is read only if its check sum
+is right; any other is compiled again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import zlib
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from types import FunctionType
+from typing import Any, Literal
+
+import numba
+from numba.core import event
+from numba.core.caching import FunctionCache, IndexDataCacheFile
+
+from blinkgl.machine.compiling import kernel_cache_failed, watch
+
+_said: set[str] = set()
+"""Folders that a line was said about."""
+
+
+class _Listener(event.Listener):
+    def on_start(self, event: event.Event) -> None:
+        watch.start()
+
+    def on_end(self, event: event.Event) -> None:
+        watch.end()
+
+
+event.register("numba:compile", _Listener())
+
+
+class _CheckedFile(IndexDataCacheFile):
+    """numba's files of one kernel. Each entry ends with a check sum and names its key, so that a damaged index cannot
+    lead to the code of other types."""
+
+    def save(self, key: Any, data: Any) -> None:
+        super().save(key, (key, data))
+
+    def load(self, key: Any) -> Any:
+        entry = super().load(key)
+        if entry is None:
+            return None
+        its_key, data = entry
+        if its_key != key:
+            raise ValueError("the index of the kernel cache leads to another entry")
+        return data
+
+    def _dump(self, obj: Any) -> bytes:
+        content = super()._dump(obj)
+        return content + _checksum(content)  # pickle stops reading where an object ends
+
+    def _load_data(self, name: str) -> Any:
+        content = Path(self._data_path(name)).read_bytes()
+        if _checksum(content[:-4]) != content[-4:]:
+            raise ValueError("an entry of the kernel cache does not fit its check sum")
+        return super()._load_data(name)
+
+
+def _checksum(content: bytes) -> bytes:
+    return zlib.crc32(content).to_bytes(4, "little")
+
+
+class _Cache(FunctionCache):
+    """numba's cache of one kernel. A file that cannot be read or written costs a compilation and a line."""
+
+    def __init__(self, function: Callable):
+        super().__init__(function)
+        stamp = self._impl.locator.get_source_stamp(), _stamps_of_imports(function.__module__)
+        self._cache_file = _CheckedFile(self._cache_path, self._impl.filename_base, stamp)
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:  # noqa: BLE001 - damaged bytes raise anything
+            self._say("the kernels kept there are damaged or unreadable and are compiled again")
+            with contextlib.suppress(OSError):
+                self.flush()
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            self._say(f"kernels cannot be kept there ({error.strerror}) and are compiled in every process")
+
+    def _say(self, what: str) -> None:
+        if self.cache_path not in _said:
+            _said.add(self.cache_path)
+            kernel_cache_failed(f"{self.cache_path}: {what}")
+
+
+@cache
+def _stamps_of_imports(module: str) -> tuple[tuple[str, float, int], ...]:
+    """(module, time of change, size) of all modules of ours whose functions ``module`` has imported, directly or by
+    others. numba looks at the kernel's own file alone and would go on with the old code of a function that it calls.
+    No kernel calls a function of the configuration."""
+    seen, waiting = {module}, [module]
+    while waiting:
+        for value in vars(sys.modules[waiting.pop()]).values():
+            function = getattr(value, "py_func", value)
+            name = function.__module__ if isinstance(function, FunctionType) else ""
+            if name.startswith(("blinkgl.", "eflow.")) and "config" not in name and name not in seen:
+                seen.add(name)
+                waiting.append(name)
+    files = {name: os.stat(file) for name in sorted(seen) if (file := getattr(sys.modules.get(name), "__file__", None))}
+    return tuple((name, found.st_mtime, found.st_size) for name, found in files.items())
+
+
+def kernel(function: Callable | None = None, *, error_model: Literal["python", "numpy"] = "python") -> Any:
+    """Decorates a function that numba compiles, without the interpreter's lock, and keeps on disk.
+
+    error_model : "numpy" divides by zero as NumPy does, without a branch; "python" raises ZeroDivisionError."""
+    if function is None:
+        return lambda f: kernel(f, error_model=error_model)
+    dispatcher: Any = numba.njit(nogil=True, error_model=error_model)(function)
+    try:
+        dispatcher._cache = _Cache(function)  # noqa: SLF001 - what njit(cache=True) does, with a class of its own
+    except RuntimeError as error:  # numba found no folder that can be written
+        kernel_cache_failed(f"{error}; kernels are compiled in every process")
+    return dispatcher

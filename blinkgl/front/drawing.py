@@ -75,7 +75,9 @@ class Renderer:
         labels : as of :func:`record`, "events" left out, which is of no time.
         to, back_to : s, where forward and backward lead; default: one label interval on and back."""
         if of_events := [name for name in OF_EVENTS if name in label_names(labels)]:
-            raise ConfigError("is of events and not of a time", where="labels", value=of_events[0], accepted="record()")
+            raise ConfigError(
+                "belongs to events, not to a time", where="labels", value=of_events[0], accepted="record()"
+            )
         asked = validate(LabelsConfig, labels_tree(labels), where="labels")
         request = asked_for(asked)
         for name in request:

@@ -81,7 +81,7 @@ class RigSensor(Piece):
             check.one_of(events, "RigSensor.events", bool, "True, False or None")
         if emulator is not None:
             if events is False:
-                raise ConfigError("of a sensor without events", where="RigSensor.emulator", value=emulator)
+                raise ConfigError("the sensor has no events", where="RigSensor.emulator", value=emulator)
             tree["events"] = events_tree(emulator)
         elif events is not None:
             tree["events"] = {} if events else None

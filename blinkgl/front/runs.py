@@ -113,7 +113,7 @@ def generate(
     template = configured(source, rig, **settings)
     if isinstance(source, Scene) and not source.on_disk:
         raise ConfigError(
-            "the scene holds arrays, which the data set could not be made from again",
+            "the scene holds arrays, from which the data set could not be made again",
             where="source",
             value=source,
             accepted="meshes and images in files, or record()",

@@ -262,7 +262,9 @@ class Mesh(_Object):
                 "only glTF files have animations", where="Mesh.animation", value=animation, accepted="None, or deform"
             )
         if animation is not None and deform is not None:
-            raise ConfigError("a body deforms by one thing", where="Mesh.deform", accepted="deform or animation")
+            raise ConfigError(
+                "deform and animation exclude each other", where="Mesh.deform", accepted="deform or animation"
+            )
         self.tree = self._placed(name, material, pose, scale, category, body, deform, animation)
         if file is not None:
             check.existing(file, "Mesh.file")

@@ -147,7 +147,7 @@ def test_poses_from_matrices(tmp_path):
     for wrong, said in (
         (np.diag([1.0, 1, -1, 1]), "Pose.from_matrix: the matrix mirrors"),
         (2 * np.eye(4), "the last row of a pose is not 0, 0, 0, 1"),
-        (np.eye(3), r"Pose.from_matrix: not such an array .*expected an array \(4, 4\)"),
+        (np.eye(3), r"Pose.from_matrix: array of another type or shape .*expected an array \(4, 4\)"),
     ):
         with pytest.raises(blinkgl.ConfigError, match=said):
             blinkgl.Pose.from_matrix(wrong)

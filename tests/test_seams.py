@@ -226,7 +226,7 @@ def test_a_part_of_the_wrong_kind_is_named(part, line, problem):
     refused(toy_with(part, line), problem)
 
 
-# --- a label (docs/extending.md shows this class) -------------------------------------------------------------------
+# --- a label (examples/own_label.py has nearly this class) ----------------------------------------------------------
 
 
 class Position(Label):
@@ -343,13 +343,14 @@ def test_shader_diff_judges_a_toy_label(position, tmp_path, capsys, monkeypatch)
     assert re.match(r"error: include/labels/position.glsl:5: .*locla", capsys.readouterr().err)
 
 
-def test_the_page_shows_this_toy_label():
+def test_the_page_leads_to_a_whole_label():
+    """The example is run by test_examples.py."""
     text = (Path(__file__).parents[1] / "docs" / "extending.md").read_text(encoding="utf-8")
-    assert inspect.getsource(Position) in text
+    assert "(examples.md#own_label)" in text.partition("## A label")[2].partition("\n## ")[0]
+    example = (Path(__file__).parents[1] / "examples" / "own_label.py").read_text(encoding="utf-8")
     shown = {"__name__": __name__}
-    block = text.partition("## A label")[2].partition("```python\n")[2].partition("```")[0]
-    exec(block.replace("register(Position())", ""), shown)
-    assert shown["Position"]().name == "position"
+    exec(example, shown)
+    assert shown["Position"]().name == Position().name
 
 
 def position_with(**changes):

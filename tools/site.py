@@ -1,4 +1,4 @@
-"""Builds the documentation site and looks at every page: no dead link, nothing fetched, no page that none leads to.
+"""Builds the documentation site and checks every page: no dead link, nothing fetched, every page linked.
 
     python -m blinkgl.tools.site [--out out/site]
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import json
 import posixpath
 import re
 import shutil
@@ -46,6 +47,25 @@ NOT_LOADED = {"canonical", "prev", "next", "alternate", "author"}
 """Of `<link rel=…>`: says something, loads nothing."""
 ERROR_PAGE = "404.html"
 """Is shown at any address by a server, so its links start at the root."""
+MOVED = "moved.txt"
+"""In docs/: old and new places of pages and sections that moved, one pair a line; ``#`` begins a comment."""
+PICTURE = re.compile(r'<p>(<img alt="([^"]+)" src="[^"]+" ?/?>)</p>')
+"""A picture in a paragraph of its own."""
+STUB = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<title>Moved</title>
+<meta name="robots" content="noindex">
+<script>location.replace(({places})[location.hash] || {target});</script>
+<meta http-equiv="refresh" content="0; url={address}">
+</head>
+<body>
+<p>This page has moved: <a href="{address}">{address}</a></p>
+{links}
+</body>
+</html>
+"""
 
 
 class BuildError(RuntimeError):
@@ -60,6 +80,7 @@ class _Page(HTMLParser):
         self.anchors: set[str] = set()
         self.links: list[str] = []
         self.loads: list[str] = []
+        self.moved = False  # a page that only leads on
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
@@ -72,6 +93,9 @@ class _Page(HTMLParser):
                 self.loads.append(value)
             elif tag == "a" and key == "href":
                 self.links.append(value)
+        if tag == "meta" and (values.get("http-equiv") or "").lower() == "refresh":
+            self.moved = True
+            self.links.append((values.get("content") or "").partition("url=")[2])
 
 
 def build(root: Path, out: Path) -> None:
@@ -90,6 +114,8 @@ def build(root: Path, out: Path) -> None:
             else:
                 shutil.copy(source, target)
         (copy / "docs/changelog.md").write_text(changelog(copy), encoding="utf-8")
+        moved = moved_places((copy / "docs" / MOVED).read_text(encoding="utf-8"))
+        (copy / "docs" / MOVED).unlink()
         done = subprocess.run(
             [sys.executable, "-m", "zensical", "build", "--clean", "--strict"],
             cwd=copy,
@@ -103,6 +129,51 @@ def build(root: Path, out: Path) -> None:
             shutil.rmtree(out)
         out.parent.mkdir(parents=True, exist_ok=True)
         shutil.copytree(copy / "out/site", out)
+        write_captions(out)
+        write_stubs(out, moved)
+
+
+def write_captions(site: Path) -> None:
+    """Show the description of every picture that is a paragraph of its own below the picture."""
+    for path in site.glob("*.html"):
+        text = path.read_text(encoding="utf-8")
+        shown = PICTURE.sub(r"<figure>\1<figcaption>\2</figcaption></figure>", text)
+        if shown != text:
+            path.write_text(shown, encoding="utf-8")
+
+
+def moved_places(text: str) -> dict[str, dict[str, str]]:
+    """Old page -> its old anchor, with ``#`` ("" for the page itself) -> new place. Raises BuildError.
+
+    text : lines ``OLD.html[#ANCHOR] NEW.html[#ANCHOR]``."""
+    pages: dict[str, dict[str, str]] = {}
+    for line in text.splitlines():
+        if not line.strip() or line.startswith("#"):
+            continue
+        places = line.split()
+        if len(places) != 2:
+            raise BuildError(f"docs/{MOVED}: expected an old and a new place, got {line!r}")
+        page, mark, anchor = places[0].partition("#")
+        pages.setdefault(page, {})[mark + anchor] = places[1]
+    for page, places in pages.items():
+        if "" not in places:
+            raise BuildError(f"docs/{MOVED}: {page} needs a line without an anchor")
+    return pages
+
+
+def write_stubs(site: Path, pages: dict[str, dict[str, str]]) -> None:
+    """Write a page at each old place that leads to the new one. Raises BuildError where a page is still there."""
+    for page, places in pages.items():
+        if (site / page).exists():
+            raise BuildError(f"docs/{MOVED}: {page} has not moved")
+        links = [f'<p><a id="{old[1:]}" href="{new}">{new}</a></p>' for old, new in places.items() if old]
+        text = STUB.format(
+            places=json.dumps({old: new for old, new in places.items() if old}),
+            target=json.dumps(places[""]),
+            address=places[""],
+            links="\n".join(links),
+        )
+        (site / page).write_text(text, encoding="utf-8")
 
 
 def changelog(root: Path) -> str:
@@ -160,7 +231,9 @@ def problems(site: Path) -> list[str]:
         if name in led_to and name not in seen:
             seen.add(name)
             ahead += led_to[name]
-    return found + [f"{name}: no link leads here" for name in pages if name not in seen]
+    return found + [
+        f"{name}: no link leads here" for name, page in pages.items() if name not in seen and not page.moved
+    ]
 
 
 def markdown_problems(path: Path) -> list[str]:

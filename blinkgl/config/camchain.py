@@ -178,7 +178,7 @@ def _numbers(table: dict[str, Any], key: str, counts: tuple[int, ...], where: st
         values = []
     if not isinstance(given, list) or len(values) != len(given) or len(values) not in counts:
         said = " or ".join(map(str, counts))
-        raise ConfigError("not its numbers", where=f"{where}.{key}", value=given, accepted=f"a list of {said} numbers")
+        raise ConfigError("wrong numbers", where=f"{where}.{key}", value=given, accepted=f"a list of {said} numbers")
     if not all(map(math.isfinite, values)):
         raise ConfigError("not finite", where=f"{where}.{key}", value=given, accepted="finite numbers")
     return values

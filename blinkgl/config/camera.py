@@ -152,10 +152,12 @@ def calibrated(camera: Any, base: Path) -> Any:
     given, name = camera["calibration"], camera.get("calibration_name")
     for key, value in (("calibration", given), ("calibration_name", name)):
         if is_distribution(value) or not isinstance(value, (str, type(None))):
-            raise ConfigError("not a text", where=f"camera.{key}", value=value, accepted="one, of a whole run")
+            raise ConfigError(
+                "not text", where=f"camera.{key}", value=value, accepted="text, the same for the whole run"
+            )
     if twice := [key for key in _OF_A_CALIBRATION if own.get(key) is not None]:
         raise ConfigError(
-            "the calibration says that",
+            "the calibration sets this key",
             where=f"camera.{twice[0]}",
             value=own[twice[0]],
             accepted="either camera.calibration or the key",

@@ -159,7 +159,7 @@ def spelled_out(tree: dict[str, Any], fills: Iterable[Callable[[dict[str, Any]],
     for key in ("images", "imu", "tracks"):
         if tree.get(key) is not None:
             raise ConfigError(
-                "a rig's sensors have it, not the rig",
+                "belongs to a sensor, not to the rig",
                 where=key,
                 accepted=f"{key} in one of `sensors`",
             )
@@ -240,7 +240,7 @@ def check_pairs(sensors: Sequence[RigSensorConfig]) -> None:
         if one.pair is None:
             if one.sees and getattr(one.labels, "disparity", False):
                 raise ConfigError(
-                    "this sensor has no other eye",
+                    "this sensor has no pair",
                     where=f"sensors.{k}.labels.disparity",
                     accepted=f"false, or a `pair` for '{one.name}'",
                 )

@@ -109,7 +109,7 @@ def _validated(tree: dict[str, Any]) -> SequenceConfig:
     config = validate(SequenceConfig, tree)
     if config.labels.disparity:  # type: ignore[missing-attribute]
         raise ConfigError(
-            "a single camera has no other eye",
+            "a single camera has no disparity",
             where="labels.disparity",
             accepted="false, or rig: stereo, or sensors with a `pair` (docs/rigs.md)",
         )

@@ -142,5 +142,5 @@ def array(value: Any, where: str, shape: tuple[int | None, ...], accepted: str) 
     fits = made.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, made.shape))
     if not fits or made.dtype.kind not in "fiub":
         got = f"{made.dtype} {made.shape}" if isinstance(value, np.ndarray) else value
-        raise ConfigError("not such an array", where=where, value=got, accepted=accepted)
+        raise ConfigError("array of another type or shape", where=where, value=got, accepted=accepted)
     return made

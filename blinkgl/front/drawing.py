@@ -51,15 +51,15 @@ class Renderer:
         self.close()
 
     def close(self) -> None:
-        """Lets go of OpenGL."""
+        """Release OpenGL."""
         self._stack.close()
 
     def luminance(self, t: float) -> np.ndarray:
-        """(H, W) float32 linear luminance at t s: what emulators take."""
+        """Return (H, W) float32 linear luminance at t s, the input of emulators."""
         return self._renderer.luminance(_ns(t, "t")).read()
 
     def image(self, t: float) -> np.ndarray:
-        """(H, W, 3) uint8 sRGB at t s."""
+        """Return (H, W, 3) uint8 sRGB at t s."""
         return to_srgb8(self._renderer.colour(_ns(t, "t")).read())
 
     def frame(
@@ -75,7 +75,9 @@ class Renderer:
         labels : as of :func:`record`, "events" left out, which is of no time.
         to, back_to : s, where forward and backward lead; default: one label interval on and back."""
         if of_events := [name for name in OF_EVENTS if name in label_names(labels)]:
-            raise ConfigError("is of events and not of a time", where="labels", value=of_events[0], accepted="record()")
+            raise ConfigError(
+                "belongs to events, not to a time", where="labels", value=of_events[0], accepted="record()"
+            )
         asked = validate(LabelsConfig, labels_tree(labels), where="labels")
         request = asked_for(asked)
         for name in request:
@@ -97,10 +99,10 @@ def _ns(seconds: float, where: str) -> int:
 def render_frame(
     source: Source, t: float, labels: Sequence[str | float] = ("images",), *, index: int = 0, to: float | None = None
 ) -> LabelFrame:
-    """One :class:`LabelFrame` at t s; for many, a :class:`Renderer` saves making OpenGL's context each time.
+    """Return one :class:`LabelFrame` at t s; for many, a :class:`Renderer` saves making OpenGL's context each time.
 
     labels : as of :func:`record`; images are ``.colour``, (H, W, 3) float32 linear, flow is
     ``.forward``, px, others have their own names.
-    to : s, where the flow leads; default: one label interval on.   Raises as :class:`Renderer`."""
+    to : s, time that the flow leads to; default: one label interval on.   Raises as :class:`Renderer`."""
     with Renderer(source, index=index) as renderer:
         return renderer.frame(t, labels, to=to)

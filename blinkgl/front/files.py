@@ -29,7 +29,7 @@ _SIDE = 65535
 
 @check.public
 def open_events(path: str | os.PathLike) -> EventFile:
-    """An event file for reading in pieces: ``with open_events(path) as file: for events in file.chunks(): …``;
+    """Open an event file for reading in pieces: ``with open_events(path) as file: for events in file.chunks(): …``;
     ``height``, ``width`` in px, None where the file does not say (``file.sized()`` finds out), times in µs.
     Formats and endings: docs/formats.md. Of .aedat4 and .aedat also ``file.frames()``, the camera's own frames, and
     ``file.imu()``, its inertial unit.
@@ -40,9 +40,9 @@ def open_events(path: str | os.PathLike) -> EventFile:
 
 @check.public
 def read_events(path: str | os.PathLike, *, truth: bool = False) -> Events:
-    """All :class:`Events` of a file, t in µs, in memory.
+    """Return all :class:`Events` of a file, t in µs, in memory.
 
-    truth : of a sequence's ``events.h5`` also what made them (``Events.truth``), from ``event_labels.h5`` beside it.
+    truth : also read what made them (``Events.truth``), from ``event_labels.h5`` beside a sequence's ``events.h5``.
     Raises AssetError and EventDataError (times that run backwards …)."""
     with open_events(path) as file:
         events = file.read()
@@ -64,7 +64,7 @@ def write_events(
     time_unit: str = "s",
     overwrite: bool = True,
 ) -> int:
-    """Writes events, or chunks in order, of a sensor of height x width px; the file appears
+    """Write events, or chunks in order, of a sensor of height x width px; the file appears
     whole or not at all. Returns how many.
 
     path : its ending names the format (docs/formats.md).   t_offset_us : DSEC's, µs.
@@ -109,7 +109,7 @@ def convert(
     time_unit: str = "s",
     overwrite: bool = True,
 ) -> int:
-    """Copies events from one file format to another, in pieces. Returns how many events.
+    """Copy events from one file format to another, in pieces. Returns how many events.
 
     size : (height, width), px, where ``source`` does not say.   time_unit : as of :func:`write_events`.
     zero_time : count times from the first event. Raises AssetError, OutputError, EventDataError, ConfigError."""
@@ -142,7 +142,7 @@ def _sensor_size(sensor: str | None) -> tuple[int, int] | None:
 
 @check.public
 def read_flow(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
-    """flow (H, W, 2) float32 px, +x right, +y down (0 where invalid), and valid (H, W) bool,
+    """Return flow (H, W, 2) float32 px, +x right, +y down (0 where invalid), and valid (H, W) bool,
     of a .png (DSEC), .flo or .npy file.
 
     Raises AssetError: missing, damaged, or no flow."""
@@ -153,7 +153,7 @@ def read_flow(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
 
 @check.public
 def write_flow(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray | None = None) -> int:
-    """Writes flow (H, W, 2) px and valid (H, W) bool (default: all) as .png (DSEC's 16
+    """Write flow (H, W, 2) px and valid (H, W) bool (default: all) as .png (DSEC's 16
     bit), .flo or .npy, by the ending.
 
     Returns how many valid pixels the format could not hold; they are stored as invalid. Raises
@@ -173,7 +173,7 @@ def write_flow(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray | No
 
 @check.public
 def read_trajectory(path: str | os.PathLike, *, form: str | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Times (N,) int64 ns and poses T_world_body (N, 4, 4) float64 of TUM's text or EuRoC's CSV.
+    """Return times (N,) int64 ns and poses T_world_body (N, 4, 4) float64 of TUM's text or EuRoC's CSV.
 
     form : "tum" or "euroc"; None: EuRoC's where lines have commas.
     Raises AssetError, naming the line: no pose, times that do not increase, a gap."""
@@ -186,7 +186,7 @@ def read_trajectory(path: str | os.PathLike, *, form: str | None = None) -> tupl
 
 @check.public
 def write_trajectory(path: str | os.PathLike, t_ns: np.ndarray, poses: np.ndarray) -> None:
-    """Writes poses (N, 4, 4) at t_ns (N,) whole ns as TUM's text, t x y z qx qy qz qw: those of a sequence's
+    """Write poses (N, 4, 4) at t_ns (N,) whole ns as TUM's text, t x y z qx qy qz qw: those of a sequence's
     ``poses.npz`` are ``t_ns`` and ``T_world_cam``. Raises OutputError, ConfigError."""
     from blinkgl.io import trajectories
 
@@ -210,9 +210,9 @@ def compare(
     zero_time: bool = False,
     judge: bool = False,
 ) -> Comparison:
-    """How alike two event files are, over the time they share: ``rows()`` is a table, ``to_dict()`` numbers.
+    """Compare two event files over the time they share: ``rows()`` is a table, ``to_dict()`` numbers.
 
-    b : event file; None: ``a`` is described.
+    b : event file; None: only ``a`` is described.
     frames : video or folder of images both are compared with.   fps : of the frames, Hz.
     interval_ms : ms, of rates and correlations.   zero_time : count both from their first event.
     judge : also how well a classifier tells b from a, and the halves of each: ``told_apart``, ``halves``.
@@ -231,7 +231,7 @@ def compare(
 
 
 class ReadingOptions(TypedDict, total=False):
-    """How the frames beside a recording are to be understood, as :func:`blinkgl.calibrate` says it."""
+    """Options of frames beside a recording; :func:`blinkgl.calibrate` describes them."""
 
     gamma: str | float
     interpolate: str
@@ -253,12 +253,12 @@ def calibrate(
     seed: int = 0,
     **reading: Unpack[ReadingOptions],
 ) -> Calibration:
-    """Fits an emulator to a camera's own recording. ``config`` of the result is the emulator as fitted, ``values`` and
-    ``uncertainty`` are of its fitted keys, ``untold`` says why others were left alone, ``judged`` how near it comes in
-    the half that was fitted and in the other, ``sensor()`` is the table of a sensor file.
+    """Fit an emulator to a camera's own recording. ``config`` of the result is the emulator as fitted, ``values`` and
+    ``uncertainty`` belong to its fitted keys, ``untold`` says why others were not fitted, ``judged`` how near it
+    comes in the fitted half and in the other, ``sensor()`` is the table of a sensor file.
 
     recording : event file.   frames : what the camera saw, of its size (default: the recording's own).   emulator : a
-    name, or a mapping where the fit begins.   fixed : its keys that stay as they are there.   still : a scene that
+    name, or a mapping from which the fit begins.   fixed : its keys that stay as they are there.   still : a scene that
     stands still in constant light, without frames: noise alone.   fps : of the frames, Hz.   timestamps : file
     of the frames' times.   gamma : of their codes, "linear", "srgb" or an exponent.   interpolate : between them,
     "motion" or "linear".   max_px : of "motion", px.   frame_delay_ms : added to their times, ms; None: found.
@@ -294,7 +294,7 @@ def calibrate(
 
 
 class FrameOptions(TypedDict, total=False):
-    """How frames become events, as :func:`blinkgl.simulate` says it."""
+    """Options of frames that become events; :func:`blinkgl.simulate` describes them."""
 
     fps: float | None
     emulator: EmulatorSettings
@@ -344,7 +344,7 @@ def simulate_file(
     overwrite: bool = True,
     **frames: Unpack[FrameOptions],
 ) -> SimulationReport:
-    """A video, a folder of images or .npy frames (N, H, W[, 3]) to an event file, as
+    """Turn a video, a folder of images or .npy frames (N, H, W[, 3]) into an event file, as
     ``blinkgl simulate``; files appear whole or not at all.
 
     timestamps : file of times, one a frame.   size : (height, width), px, that frames are cropped and scaled to; None:

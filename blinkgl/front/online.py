@@ -44,7 +44,7 @@ class OnlineSequences:
         every ``world``-th block of one stream. Together they have each sample once, the same ones whatever ``world``.
         Default: what `torchrun` (``RANK``, ``WORLD_SIZE``) or Ray Train say of this process; then its workers render on
         one of several graphics cards, that of its ``LOCAL_RANK``. ``world=1``: the whole stream in every process.
-    first : the sample to go on with; samples before it are not rendered, but for those mixed with it.
+    first : the sample to continue with; samples before it are not rendered, but for those mixed with it.
 
     Sample n is a function of (recipe, seed, rank, world, n): not of workers, of who takes it, or of what came before.
     Every sample is given once. Two blocks (of ``block`` samples, from eight sequences) are rendered ahead, then
@@ -114,11 +114,11 @@ class OnlineSequences:
         return self.stream.block
 
     def __getitem__(self, n: int) -> WindowSample | StreamSample:
-        """Sample n, waited for; it is given once."""
+        """Return sample n when it is ready; each sample is given once."""
         return self.stream.take(check.whole(n, "n", self.first, 2**62))
 
     def __iter__(self) -> Iterator[WindowSample | StreamSample]:
-        """Samples from ``first`` on, without an end."""
+        """Iterate over samples from ``first`` on, without an end."""
         return (self.stream.take(n) for n in itertools.count(self.first))
 
     def batches(self, size: int, collate: Callable[[list], Any] = list, *, count: int | None = None) -> Batches:
@@ -141,7 +141,7 @@ class OnlineSequences:
         return Batches(self.stream, self.first, size, collate, count)
 
     def close(self) -> None:
-        """Ends the workers and leaves nothing behind."""
+        """End the workers and remove everything that they keep."""
         self.stream.close()
 
     def __enter__(self) -> OnlineSequences:

@@ -71,7 +71,7 @@ def signed_by(model: type[Config], **called: str) -> Callable[[type[P]], type[P]
 
 
 class Pose(Piece):
-    """Where a body or a camera is, and at most one way to say how it is turned.
+    """Position and orientation of a body or a camera; give at most one form of the orientation.
 
     position : (3,) m.   euler : (3,) degrees about the world's x, then y, then z.   quaternion : (4,) w, x, y, z.
     look_at : (3,) m, the point that a camera's z axis, or a body's x axis, is turned to. At
@@ -107,7 +107,7 @@ class Pose(Piece):
 
 @check.public
 def look_at(position: Vector, target: Vector) -> Pose:
-    """A :class:`Pose` at ``position`` (3,) m, turned to the point ``target`` (3,) m; a camera's
+    """Return a :class:`Pose` at ``position`` (3,) m, turned to the point ``target`` (3,) m; a camera's
     horizon is level. Raises ConfigError."""
     return Pose(position, look_at=target)
 

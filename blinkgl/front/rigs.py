@@ -6,8 +6,8 @@
         RigSensor("imu", imu="adis16448", position=(0.05, 0.02, 0)),
     )
 
-The camera of the :class:`~blinkgl.front.scenes.Scene` moves the rig: its pose is the rig's, and what sensors do not say
-of their own cameras they have of it.
+The camera of the :class:`~blinkgl.front.scenes.Scene` moves the rig: its pose is the rig's, and keys that a sensor's
+camera does not set come from it.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class RigSensor(Piece):
     axes; or quaternion : (4,) w, x, y, z; or matrix : (4, 4) T_rig_sensor, from the sensor's axes to the rig's, in the
     place of all of them.
     pair : name of the other eye of a rectified stereo pair.
-    camera : :class:`Camera` without a pose, or a table of ``camera:`` that is laid over the scene's; None: the scene's.
+    camera : :class:`Camera` without a pose, or a table of ``camera:`` over the scene's; None: the scene's.
     events : whether it makes events; None: where it has neither images nor imu.
     emulator, sensor, labels, images, imu, tracks : as of :func:`record`; None: emulator, sensor and labels are the
     run's, the others are not there.   readout : a table of ``readout:``.
@@ -81,7 +81,7 @@ class RigSensor(Piece):
             check.one_of(events, "RigSensor.events", bool, "True, False or None")
         if emulator is not None:
             if events is False:
-                raise ConfigError("of a sensor without events", where="RigSensor.emulator", value=emulator)
+                raise ConfigError("the sensor has no events", where="RigSensor.emulator", value=emulator)
             tree["events"] = events_tree(emulator)
         elif events is not None:
             tree["events"] = {} if events else None
@@ -117,9 +117,9 @@ def _camera_tree(camera: Camera | Mapping[str, Any]) -> dict[str, Any]:
 class Rig(Piece):
     """Sensors that move together: ``record_rig(scene, Rig(RigSensor("left"), RigSensor("imu", imu="adis16448")))``.
 
-    sensors : :class:`RigSensor`, each of its own name.   preset : "stereo", "davis", "dsec" or "mvsec": its sensors
-    first, those of ``sensors`` laid over the ones of the same names (docs/rigs.md).
-    Raises ConfigError; what hangs on the scene's camera is found when the rig is used."""
+    sensors : :class:`RigSensor`, with different names.   preset : "stereo", "davis", "dsec" or "mvsec": its sensors
+    first, changed by those of ``sensors`` with the same names (docs/rigs.md).
+    Raises ConfigError; what depends on the scene's camera is checked when the rig is used."""
 
     def __init__(self, *sensors: RigSensor, preset: str | None = None):
         for k, one in enumerate(sensors):
@@ -138,7 +138,7 @@ class Rig(Piece):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of ``sensors``; a preset has its own besides."""
+        """Return the names of ``sensors``; a preset has its own in addition."""
         return tuple(one.tree["name"] for one in self.sensors)
 
 

@@ -42,7 +42,7 @@ Source = Scene | RunTemplate
 
 
 class Timeline:
-    """When frames are drawn for the emulator: ``Timeline("displacement", max_px=0.5)``.
+    """Times at which frames are drawn for the emulator: ``Timeline("displacement", max_px=0.5)``.
 
     kind : "uniform" (fps, Hz), "displacement" (max_px, px) or "brightness" (max_fraction_of_threshold).
     values : keys of that kind, see ``timeline:`` in docs/configuration.md.
@@ -63,7 +63,7 @@ class Timeline:
 
 @check.public
 def load(path: str | os.PathLike, overrides: Sequence[str] = (), *, seed: int | None = None) -> RunTemplate:
-    """The run that a YAML file describes, checked: what :func:`generate`, :func:`record`, :func:`render_frame` take.
+    """Read and check the run that a YAML file describes, for :func:`generate`, :func:`record`, :func:`render_frame`.
 
     overrides : "path.to.key=value", as ``--set``.   seed : instead of the file's.
     ``load(path).sequence(3)`` is the configuration of sequence 3, every value drawn.
@@ -75,7 +75,7 @@ def load(path: str | os.PathLike, overrides: Sequence[str] = (), *, seed: int | 
 
 
 class Settings(TypedDict, total=False):
-    """What is laid over the source of a run, as :func:`blinkgl.record` says it; what is None is the source's."""
+    """Values over those of a run's source; :func:`blinkgl.record` describes them. None keeps the source's."""
 
     emulator: EmulatorSettings | None
     sensor: str | None
@@ -98,12 +98,12 @@ def generate(
     rig: Rig | str | None = None,
     **settings: Unpack[Settings],
 ) -> Outcome:
-    """Makes a data set below the folder ``out``, as ``blinkgl generate`` does: the same files, bit for bit.
+    """Make a data set below the folder ``out``, as ``blinkgl generate`` does: the same files, bit for bit.
 
     source : :class:`Scene` or what :func:`load` gave.   num : how many sequences (of each group at
     most).   workers : processes; 1: this one.
-    resume : go on where ``out`` holds sequences of this run.   settings : emulator, sensor, timeline, quality, labels,
-    images, imu, tracks as of :func:`record`, rig as of :func:`record_rig`.
+    resume : continue where ``out`` holds sequences of this run.   settings : emulator, sensor, timeline, quality,
+    labels, images, imu, tracks as of :func:`record`, rig as of :func:`record_rig`.
     Returns what was made (``made.events``, ``made.labels`` …) and what was set aside.
     Raises BlinkGLError: ConfigError (also a scene with arrays in it: save them to files
     first), AssetError, GLError, OutputError."""
@@ -113,7 +113,7 @@ def generate(
     template = configured(source, rig, **settings)
     if isinstance(source, Scene) and not source.on_disk:
         raise ConfigError(
-            "the scene holds arrays, which the data set could not be made from again",
+            "the scene holds arrays, from which the data set could not be made again",
             where="source",
             value=source,
             accepted="meshes and images in files, or record()",
@@ -126,9 +126,10 @@ def generate(
 
 @check.public
 def verify(folder: str | os.PathLike, *, deep: int = 0, seed: int = 0) -> Verification:
-    """Looks through a data set; ``.clean`` says whether all is well, ``.problems`` what is not, by sequence.
+    """Check a data set; ``.clean`` says whether it has no problem, ``.problems`` lists them by sequence.
 
-    deep : so many sequences are made again and compared.   seed : draws which. Raises AssetError: no data set there."""
+    deep : number of sequences that are made again and compared.   seed : selects them.
+    Raises AssetError: no data set there."""
     from blinkgl.dataset.verify import verify_dataset
 
     return verify_dataset(check.path(folder, "folder"), deep=check.whole(deep, "deep", 0, 2**31), seed=check.seed(seed))

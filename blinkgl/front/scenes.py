@@ -6,8 +6,8 @@ drawn from the same data classes.
     scene += Primitive("cuboid", material=Material(procedural="bricks"))
 
 World: right-handed, z up. Lengths in metres, angles in degrees, times in seconds on the scene's clock. All pieces are
-values: nothing changes them, ``scene + body`` is another scene. Whatever cannot be used raises ConfigError when the
-piece is made, and names the argument.
+values: nothing changes them, ``scene + body`` is another scene. A wrong argument raises ConfigError, which names
+it, when the piece is made.
 """
 
 from __future__ import annotations
@@ -73,21 +73,21 @@ class Camera(Piece):
 
 @signed_by(BodyConfig)
 class Body(Piece):
-    """What falls, or is fallen on: ``Primitive("cuboid", body=Body(velocity=(1, 0, 2)))`` (docs/scenes.md, "Dynamics").
+    """Physics of a body: ``Primitive("cuboid", body=Body(velocity=(1, 0, 2)))`` (docs/scenes.md, "Dynamics").
 
-    kind : "dynamic" falls; "fixed" stays, or goes its way, whatever hits it; "none" is not there.
+    kind : "dynamic" falls; "fixed" stays, or follows its path, whatever hits it; "none" takes no part.
     mass : kg, or by density : kg/m³ (default 700).
     friction : Coulomb's coefficient.   rolling : the same of rolling, of the radius.
     restitution : share of the speed that an impact leaves.
     velocity : (3,) m/s, of the centre of mass at the start.   spin : (3,) degrees/s about the world's axes.
-    Raises ConfigError; no MuJoCo, and bodies inside each other, are found when the scene is built."""
+    Raises ConfigError; a missing MuJoCo and bodies inside each other are found when the scene is built."""
 
     def __init__(self, kind: Literal["dynamic", "fixed", "none"] = "dynamic", **keys: Any):
         self.tree = self._checked(BodyConfig, check.given(kind=kind, **keys))
 
 
 class Deform(Piece):
-    """How a body's shape changes with time, by formula: ``Mesh("tree.glb", deform=Deform("bend", angle=10))``.
+    """Change of a body's shape over time, by a formula: ``Mesh("tree.glb", deform=Deform("bend", angle=10))``.
 
     kind : "wave", "flag", "twist", "bend", "breathe", or that of a deformer of your own.
     keys : of that kind (docs/configuration.md, "deform"), such as ``amplitude`` and ``wavelength`` in parts of the
@@ -107,7 +107,7 @@ class Animation(Piece):
     clip : name or number of the animation.   file : another glTF file that it is taken from, whose joints have the
     same names; None: the mesh's own.   speed : of the clip's own, negative backwards.   phase : s of the clip at
     time 0.   loop : begins again at its end; False: held before its first and after its last key.
-    Raises ConfigError; a clip that the file does not have is found when the scene is built."""
+    Raises ConfigError; a clip that the file lacks is found when the scene is built."""
 
     def __init__(
         self,
@@ -127,8 +127,8 @@ class Way(Piece):
 
     points : (N, 3) m, two or more, which the curve passes smoothly; beyond its ends it goes straight on.
     speed : m/s; None: as fast as a figure's steps or a fish's strokes take it, 1 for other bodies.
-    closed : from the last point back to the first, and on.   level : the body's z axis stays up; False: its nose goes
-    up and down with the way.   start : share of the way that lies behind it at time 0.
+    closed : from the last point back to the first, and on.   level : the body's z axis stays up; False: its x axis goes
+    up and down with the way.   start : share of the way already covered at time 0.
     Raises ConfigError."""
 
     def __init__(
@@ -179,15 +179,15 @@ class _Object(Piece):
 
 class Primitive(_Object):
     """A body of a known shape: cuboid, sphere, icosphere, cylinder, cone, torus, capsule, prism, pyramid, grid, die,
-    or one that lives: figure, flag, fish.
+    or one that moves by itself: figure, flag, fish.
 
     parameters : the shape's sizes (m) and numbers of faces, such as ``extents=(1, 1, 2)``, and what a figure does,
     such as ``clip="dance"`` (docs/configuration.md, "primitives").
-    material : :class:`Material`, default white, or the coat of what lives.   scale : one factor, or (3,).
+    material : :class:`Material`, default white, or the coat of figures, flags and fish.   scale : one factor, or (3,).
     pose : :class:`Pose`, :class:`Keyframes`, :class:`Trajectory`, :class:`Way` or a position (3,).
-    name : default the shape's.   category : "object", "ground", "wall" or "sky": what collisions make of it.
-    body : what it is where things fall, :class:`Body`; None: in the way.
-    deform : how its shape changes, :class:`Deform`; None: not, or as what lives does by itself.
+    name : default the shape's.   category : "object", "ground", "wall" or "sky", for collisions.
+    body : its physics, :class:`Body`; None: an obstacle.
+    deform : change of its shape, :class:`Deform`; None: none, or that of figures, flags and fish.
     Raises ConfigError."""
 
     def __init__(
@@ -229,7 +229,7 @@ class Mesh(_Object):
     uvs : (V, 2), (0, 0) the texture's top left, v down; default: projected along the axes of a box.
     material : :class:`Material`; default: the file's own, or white.   pose, scale, name,
     category, body, deform : as of :class:`Primitive`.
-    animation : of a glTF file, what it plays: a clip's name or number, looped, or an :class:`Animation`; None: nothing.
+    animation : of a glTF file: a clip's name or number, looped, or an :class:`Animation`; None: nothing is played.
     Raises ConfigError; a damaged file raises when the scene is built."""
 
     def __init__(
@@ -262,7 +262,9 @@ class Mesh(_Object):
                 "only glTF files have animations", where="Mesh.animation", value=animation, accepted="None, or deform"
             )
         if animation is not None and deform is not None:
-            raise ConfigError("a body deforms by one thing", where="Mesh.deform", accepted="deform or animation")
+            raise ConfigError(
+                "deform and animation exclude each other", where="Mesh.deform", accepted="deform or animation"
+            )
         self.tree = self._placed(name, material, pose, scale, category, body, deform, animation)
         if file is not None:
             check.existing(file, "Mesh.file")
@@ -292,14 +294,14 @@ def _triangles(vertices: ArrayLike, faces: ArrayLike, uvs: ArrayLike | None) -> 
 
 
 class Scene(Piece):
-    """Bodies before a camera, for a time. ``scene + body`` is a scene with one more.
+    """Bodies before a camera, for a duration. ``scene + body`` is a scene with one more.
 
     camera : :class:`Camera`.   objects : :class:`Primitive` and :class:`Mesh`; ids count from 1 in this order.
     light : :class:`Light`.   background : linear radiance where nothing is hit.   fog : density per metre and linear
     radiance of fog between the camera and everything; None: clear air.
     duration, label_rate, start : s, Hz, s, as ``time:`` of a YAML: labels at ``label_rate``, the first one label
     interval after ``start``, so that a recording runs from ``start`` to ``start + duration + 1 / label_rate``.
-    collisions : stop what collides where it does.   gravity : (3,) m/s², of no effect while no object is a dynamic
+    collisions : stop bodies where they collide.   gravity : (3,) m/s², without effect if no object is a dynamic
     :class:`Body`.   seed : of the sensor's noise.
     Raises ConfigError."""
 

@@ -55,10 +55,10 @@ DvsVoltmeter.__doc__ = (
 
 @check.public
 def load_sensor(name: str, unit: int | None = None) -> SensorConfig:
-    """The values of a shipped camera: davis240c, davis346, dvxplorer, gen31_vga, imx636
+    """Return the values of a shipped camera: davis240c, davis346, dvxplorer, gen31_vga, imx636
     (case and punctuation do not matter), or of a sensor file by its path.
 
     ``width``, ``height`` (px), ``contrast_threshold`` (ln units), ``refractory_us`` (µs), ``readout`` …, None where
-    the file does not say; ``values("v2e")`` is what they say of an emulator's keys.
+    the file does not say; ``values("v2e")`` gives an emulator's keys.
     unit : where values are distributions over units: the unit of this number; None: the middle. Raises ConfigError."""
     return _load_sensor(name, None if unit is None else check.whole(unit, "unit", 0, 2**31))

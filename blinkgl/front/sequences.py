@@ -40,7 +40,7 @@ def simulate_sequence(
     pictures_hz: float | None = None,
     **settings: Unpack[Settings],
 ) -> Simulation:
-    """What happens in one sequence, in the order of time; nothing is written and nothing kept:
+    """Iterate over one sequence in the order of time; nothing is written and nothing is kept:
 
         for item in simulate_sequence(scene):
             match item:
@@ -49,14 +49,14 @@ def simulate_sequence(
                 case CameraImage(): item.image                        # of `images:`, codes
 
     All events before a label's time come before its :class:`GroundTruth`, and no others. OpenGL is
-    held until the loop ends, however it does.
+    released when the loop ends, also by an error.
 
     source : :class:`Scene` or what :func:`load` gave, recorded frames (``frames:``)
     included.   index : number of the sequence.
     settings : emulator, sensor, timeline, quality, labels, images, imu, tracks as of :func:`record`; what ``labels``
     does not name is not drawn; ``imu()`` and ``tracks()`` of the iterator give the last two.
     events : False leaves them out.
-    pictures_hz : gives a :class:`Picture` so many times per second of simulated time, at event frames.
+    pictures_hz : number of :class:`Picture` per second of simulated time, at event frames.
     The iterator has ``config``, ``height``, ``width``, ``t0_ns``, ``t1_ns``, and counts ``frames``, ``events``,
     ``labels``. Iterate over it once, or use it in ``with`` where it may never be. Raises ConfigError, AssetError,
     GLError and, as it goes, EventDataError."""
@@ -76,13 +76,13 @@ class Recording:
     """A sequence in memory.
 
     events : all of them, t in µs on the scene's clock.   t_us : (K,) int64, times of the labels.
-    labels : K times :class:`LabelFrame`; what was not asked for is None in it.
+    labels : K times :class:`LabelFrame`; labels that were not requested are None.
     images : (K + 1, H, W, 3) uint8 sRGB at ``image_t_us`` (K + 1,) int64 (recorded ones as they are), or None.
     config : every value as drawn.   frames : how many the emulator saw.
-    lost : events that its limit and the read-out swallowed.
-    camera : :class:`CameraImage` of the frame camera, where ``images:`` asks for one.
-    imu : what an inertial unit measured, :class:`~blinkgl.sequence.inertial.Inertial`; None: there is none.
-    tracks : points followed, :class:`~blinkgl.render.tracks.Tracks`; None: nobody asked."""
+    lost : events that its limit and the read-out dropped.
+    camera : :class:`CameraImage` of the frame camera, with ``images:``.
+    imu : measurements of the inertial unit, :class:`~blinkgl.sequence.inertial.Inertial`; None: there is none.
+    tracks : tracked points, :class:`~blinkgl.render.tracks.Tracks`; None: not requested."""
 
     events: Events
     t_us: np.ndarray
@@ -98,7 +98,7 @@ class Recording:
 
     @property
     def flow(self) -> np.ndarray:
-        """(K, H, W, 2) float32 px, +x right, +y down, from each label's time to the next; 0
+        """Flow (K, H, W, 2) float32 px, +x right, +y down, from each label's time to the next; 0
         where :attr:`valid` is False."""
         return np.stack([flow.flow for flow in self._forward()])
 
@@ -108,7 +108,7 @@ class Recording:
         return np.stack([flow.valid for flow in self._forward()])
 
     def window(self, k: int) -> Events:
-        """Events from label ``k``'s time until the next one's, those that flow ``k`` spans."""
+        """Return the events from label ``k``'s time until the next one's, which flow ``k`` spans."""
         k = check.whole(k, "k", 0, len(self.t_us) - 1)
         return self.events.window(int(self.t_us[k]), int(self.image_t_us[k + 1]))
 
@@ -121,11 +121,11 @@ class Recording:
 
 @check.public
 def record(source: Source, *, index: int = 0, **settings: Unpack[Settings]) -> Recording:
-    """Events, images and ground truth of one sequence as arrays: what :func:`generate` writes, held in memory.
+    """Return events, images and ground truth of one sequence as arrays, what :func:`generate` writes.
 
     source : :class:`Scene` or what :func:`load` gave.   index : number of the sequence.
     emulator : "esim", "v2e", "voltmeter", or a table with its values, ``{"emulator": "v2e", "cutoff_hz": 200}``.
-    sensor : camera whose size, emulator values and read-out are taken, such as "davis346".
+    sensor : camera that gives size, emulator values and read-out, such as "davis346".
     timeline : :class:`Timeline`.
     quality : "fast", "balanced" (the default), "accurate" or "reference".
     labels : names of labels, such as images, forward and backward (flow), occlusion, depth
@@ -133,7 +133,7 @@ def record(source: Source, *, index: int = 0, **settings: Unpack[Settings]) -> R
     event, ``events.truth``; default: the source's.
     images : a frame camera: the name of a preset, "deblurring", or a table of ``images:``, ``{"exposure_us": 10000}``.
     imu : an inertial unit: the name of a preset, "adis16448", or a table of ``imu:``, ``{"rate": 400}``.
-    tracks : points on surfaces, followed: "grid", "surface", or a table of ``tracks:``, ``{"points": 100}``.
+    tracks : points on surfaces: "grid", "surface", or a table of ``tracks:``, ``{"points": 100}``.
     Raises ConfigError, AssetError, GLError, EventDataError."""
     config = _configured(source, index, settings)
     gathered = Gathered()
@@ -192,14 +192,14 @@ class Gathered:
 def simulate_rig(
     source: Source, rig: Rig | str | None = None, *, index: int = 0, **settings: Unpack[Settings]
 ) -> RigSequence:
-    """What happens at the sensors of one rig, in the order of time; nothing is written and nothing kept:
+    """Iterate over what a rig's sensors record, in the order of time; nothing is written and nothing is kept:
 
         for member, item in simulate_rig(scene, "stereo"):
             member.name, item                 # "left", EventChunk(…): items as of simulate_sequence
 
     source : :class:`Scene`, whose camera's pose is the rig's, or what :func:`load` gave.
     rig : :class:`Rig`, or a preset's name; None: the source's.   index : number of the sequence.
-    settings : emulator, sensor, timeline, quality, labels of all its cameras that say nothing else, as of
+    settings : emulator, sensor, timeline, quality, labels of all its cameras that do not set them, as of
     :func:`record`.
     The iterator has ``config``, ``scene``, ``t0_ns``, ``t1_ns`` and ``members``, one of each camera, as
     :func:`simulate_sequence` gives them; ``inertial_units()`` is what the other sensors measured. Iterate over it once,
@@ -241,7 +241,7 @@ class RigRecording:
 def record_rig(
     source: Source, rig: Rig | str | None = None, *, index: int = 0, **settings: Unpack[Settings]
 ) -> RigRecording:
-    """What all sensors of a rig record of one sequence, as arrays: what :func:`generate` writes, held in memory.
+    """Return what all sensors of a rig record of one sequence, as arrays, what :func:`generate` writes.
 
     Arguments as of :func:`simulate_rig`. Raises ConfigError, AssetError, GLError, EventDataError."""
     with simulate_rig(source, rig, index=index, **settings) as sequence:

@@ -58,18 +58,18 @@ class Light(Piece):
 
 @signed_by(MaterialConfig, texture="image")
 class Material(Piece):
-    """A surface: ``color`` times at most one texture, matt or with a gloss, and light of its own.
+    """A surface: ``color`` times at most one texture, matt or glossy, with or without emission.
 
     image : an image file (sRGB; .hdr is linear), or an array: (h, w, 3) uint8 sRGB, or
     float, linear light from 0 to 1; row 0 is the top.
-    color : (3,) linear factor.   procedural, seed : kind and number of a made-up texture, such as "bricks".
-    photograph : one that scikit-image brings, such as "astronaut".   uv_scale : (2,) repeats.
+    color : (3,) linear factor.   procedural, seed : kind and number of a computed texture, such as "bricks".
+    photograph : one of scikit-image's, such as "astronaut".   uv_scale : (2,) repeats.
     max_size : px, longer sides of a file are reduced.
     unlit : radiance = albedo, whatever the light.   double_sided : draw back faces.
     metallic, roughness : 0 to 1; 0 and 1 are matt; times ``metallic_roughness_map``, its blue and its green.
     emission : (3,) linear radiance of its own; times ``emission_map``, sRGB.
     normal_map : x to the right in the picture, y up, z outwards, 0 to 255 for -1 to 1; ``normal_scale`` times its x, y.
-    mask : what is there: holes where it is below ``cutoff`` (0 to 1).
+    mask : opacity: holes where it is below ``cutoff`` (0 to 1).
     Maps are files, or arrays (h, w, 3) uint8, of the mask (h, w) uint8.
     Raises ConfigError."""
 

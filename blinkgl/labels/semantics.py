@@ -79,7 +79,7 @@ class Semantics(Label):
                 value=[pattern for pattern, _ in categories],
                 accepted="patterns of "
                 + ", ".join(dict.fromkeys(class_of(thing) for thing in scene.objects))
-                + "; '*': 0 lets scenes pass that have none",
+                + "; '*': 0 accepts scenes without any",
             )
 
     def facts(self, scene: Scene, labels: LabelsConfig) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class Boxes:
-    """N objects of which something would be in the picture, did nothing hide it, in the scene's order.
+    """Boxes of N objects, in the scene's order, of which some part would be in the picture if nothing hid it.
 
     instance : (N,) int64, as in ``ids``.   category : (N,) int64, as in ``semantics``.   kind : (N,) text, what the
     name says it is.
@@ -18,7 +18,7 @@ class Boxes:
     -0.5, -0.5, 0.5, 0.5); 0 where none does.   visible_pixels : (N,) int64.
     amodal_box : (N, 4) float64 px, of all of it before the near plane, whether hidden, in the picture or beside it.
     cut_box : (N, 4) float64 px, the same, cut at the picture's edges.
-    amodal_pixels : (N,) int64, pixels of the picture that would show it, did nothing hide it.
+    amodal_pixels : (N,) int64, pixels of the picture that would show it if nothing hid it.
     size : (N, 3) float64, of its box in space along that one's axes, world units.
     T_cam_box, T_world_box : (N, 4, 4) float64, from the box's axes, which are the object's, and its middle, to the
     camera's and to the world's.   occluded : (N,) float64, share of ``amodal_pixels`` that is hidden.
@@ -63,6 +63,6 @@ SHAPES: dict[str, tuple[tuple[int, ...], str]] = {
 
 
 def no_boxes() -> dict[str, Any]:
-    """Return the arrays of no object, but for ``resolution``."""
+    """Return boxes of no object in a picture of this ``resolution``."""
     kinds = {"i": np.int64, "f": np.float64, "U": "U1"}
     return {name: np.zeros((0, *more), kinds[kind]) for name, (more, kind) in SHAPES.items()}

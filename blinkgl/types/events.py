@@ -11,9 +11,11 @@ from blinkgl.errors import EventDataError
 
 
 class Cause(IntEnum):
-    """What moved a pixel to the threshold that it fired at. Of the parts that its signal has moved by since its last
-    event (or the end of the dead time after it), in the direction of the crossing, the largest is the cause; the light
-    where two are alike. An event that an emulator draws by itself, V2E's shot noise, is its own.
+    """The origin of an event: what moved the pixel to its threshold.
+
+    Of the parts that its signal has moved by since its last event (or the end of the dead time after it), in the
+    direction of the crossing, the largest is the cause; the light where two are alike. An event that an emulator draws
+    by itself, V2E's shot noise, is its own.
 
     So every event has one cause, the parts add up to the threshold, and an event is a noise event where the light alone
     would have brought the pixel less than its noise did. The numbers are part of the file format."""
@@ -41,7 +43,7 @@ class Events:
     x, y : (N,) uint16 pixel column and row, (0, 0) the top-left pixel.
     t    : (N,) int64 microseconds, non-decreasing inside a chunk and across the chunks of one emulator.
     p    : (N,) uint8, 1 brighter (ON), 0 darker (OFF).
-    cause : (N,) uint8 of :class:`Cause`, or None where nobody asked for it (``events.causes``) or knows.
+    cause : (N,) uint8 of :class:`Cause`, or None where it was not requested (``events.causes``) or is unknown.
     truth : (N,) of :data:`TRUTH`, the surface that made each (:mod:`blinkgl.events.truth`), or None likewise
         (``labels.events``): ``truth["instance"]`` (N,), ``truth["depth"]`` (N,), ``truth["velocity"]`` (N, 2).
 
@@ -84,20 +86,20 @@ class Events:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of those there are: "x", "y", "t", "p" and perhaps "cause" and "truth"."""
+        """Return the names of the columns that are present: "x", "y", "t", "p" and perhaps "cause" and "truth"."""
         return ("x", "y", "t", "p", *(name for name in OPTIONAL if getattr(self, name) is not None))
 
     def part(self, which: slice | np.ndarray) -> Events:
-        """Those of a slice (views) or of an index array or mask (copies), which must keep the order of time."""
+        """Return the events of a slice (views), an index array or a mask (copies); the order of time must stay."""
         return Events(**{k: getattr(self, k)[which] for k in self.columns})
 
     def copy(self) -> Events:
-        """With memory of its own."""
+        """Return a copy with memory of its own."""
         return Events(**{k: getattr(self, k).copy() for k in self.columns})
 
     @staticmethod
     def concatenate(chunks: list[Events] | tuple[Events, ...]) -> Events:
-        """Chunks joined in the given order (they must already be in time order); with causes and truth where all
+        """Join chunks in the given order (they must already be in time order); with causes and truth where all
         that are not empty have them."""
         full = [c for c in chunks if len(c)] or list(chunks[:1])
         if not full:
@@ -106,22 +108,22 @@ class Events:
         return Events(**{k: np.concatenate([getattr(c, k) for c in full]) for k in known})
 
     def window(self, t0_us: int, t1_us: int) -> Events:
-        """Events of the half-open window [t0_us, t1_us); views, no copy."""
+        """Return the events of the half-open window [t0_us, t1_us); views, no copy."""
         i, j = np.searchsorted(self.t, (t0_us, t1_us), side="left")
         return self.part(slice(i, j))
 
     def split(self, t_us: int) -> tuple[Events, Events]:
-        """Those before t_us, and the rest; views, no copy."""
+        """Return the events before t_us, and the rest; views, no copy."""
         cut = int(np.searchsorted(self.t, t_us, side="left"))
         return self.part(slice(cut)), self.part(slice(cut, None))
 
 
 def named_causes(counts: np.ndarray) -> dict[str, int]:
-    """Of :func:`count_causes`: {"signal": n, "leak": n, "shot": n, "hot": n}."""
+    """Return the counts of :func:`count_causes` by name: {"signal": n, "leak": n, "shot": n, "hot": n}."""
     return {cause.name.lower(): int(counts[cause]) for cause in Cause}
 
 
 def count_causes(events: Events) -> np.ndarray:
-    """(4,) int64, events by :class:`Cause`; zeros without causes."""
+    """Return (4,) int64, events by :class:`Cause`; zeros without causes."""
     counts = np.zeros(len(Cause), np.int64)
     return counts if events.cause is None else counts + np.bincount(events.cause, minlength=len(Cause))[: len(Cause)]

@@ -8,7 +8,7 @@ import pytest
 
 @pytest.fixture
 def promise(request):
-    """Asserts ``measured <= bound`` (a NaN fails). docs/extremes.md holds the same names and bounds."""
+    """Asserts ``measured <= bound`` (a NaN fails). docs/limits.md states the bounds."""
 
     def check(name: str, measured: float, bound: float, unit: str = "") -> None:
         request.node.user_properties.append(("promise", (name, float(measured), float(bound), unit)))

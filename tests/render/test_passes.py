@@ -1,7 +1,6 @@
 """Passes that read passes, and the handles of what they draw. The toys are defined here and nowhere else;
-docs/extending.md shows them."""
+docs/extending.md leads here."""
 
-import inspect
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -26,7 +25,7 @@ PLAIN = RenderConfig(image_antialiasing="none")
 TOYS = Path(__file__).parent / "toys"
 
 
-# --- a pass that reads another one's picture (docs/extending.md shows this class) -------------------------------------
+# --- a pass that reads another one's picture --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -151,12 +150,10 @@ def test_mistakes_of_a_pass_are_named(gl):
             renderer.draw(ShadowMap((0.0, 0.0, 3.0)), 0).read()
 
 
-def test_the_page_shows_these_toys():
+def test_the_page_leads_to_these_toys():
     text = (Path(__file__).parents[2] / "docs" / "extending.md").read_text(encoding="utf-8")
-    for shown in (EdgeBand, ShadowMap, Lamplight):
-        assert inspect.getsource(shown).strip() in text, shown.__name__
-    for name in ("edge_band", "shadow_map", "lamplight"):
-        assert (TOYS / f"{name}.glsl").read_text(encoding="utf-8").strip() in text, name
+    section = text.partition("## A pass")[2].partition("\n## ")[0]
+    assert EdgeBand.__name__ in section and "tests/render/test_passes.py" in section
 
 
 # --- handles ----------------------------------------------------------------------------------------------------------

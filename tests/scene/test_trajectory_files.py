@@ -240,7 +240,7 @@ def test_a_body_of_which_the_file_says_nothing(flight, change, said):
 def test_a_place_on_the_body_that_is_none():
     with pytest.raises(ConfigError, match="Trajectory.T_body_sensor: the matrix mirrors"):
         Trajectory("a.txt", T_body_sensor=np.diag([1.0, 1, -1, 1]))
-    with pytest.raises(ConfigError, match="Trajectory.T_body_sensor: not such an array"):
+    with pytest.raises(ConfigError, match="Trajectory.T_body_sensor: array of another type or shape"):
         Trajectory("a.txt", T_body_sensor=np.eye(3))
 
 

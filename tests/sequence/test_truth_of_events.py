@@ -107,7 +107,7 @@ def test_the_events_are_those_that_come_without_it():
 
 def test_what_has_no_place_for_it_says_so(tmp_path):
     scene = apart()
-    with pytest.raises(ConfigError, match="is of events and not of a time"):
+    with pytest.raises(ConfigError, match="belongs to events, not to a time"):
         render_frame(scene, 0.0, labels=["events"])
     events = record(scene, labels=["events"]).events
     with pytest.raises(OutputError, match="event files do not hold what made the events"):

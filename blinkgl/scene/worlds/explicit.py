@@ -119,7 +119,7 @@ def _objects(
         if item.deform is not None:
             if animation is not None:
                 raise ConfigError(
-                    "an object deforms by one thing", where=f"{where}.deform", accepted="deform or animation"
+                    "deform and animation exclude each other", where=f"{where}.deform", accepted="deform or animation"
                 )
             parts = deforming(parts, item.deform)
         path = _object_path(item, parts, t0_ns, t1_ns, where, base)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import sys
 
 import pytest
+
+from blinkgl.machine import command_line
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -63,6 +66,12 @@ class _Lender:
             del self.context.release
             self.context.release()
         self.context, self.lent = None, False
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_line_about_compiling():
+    """Which command of the tests is the first to need a kernel depends on their order; its errors do not."""
+    command_line.announced_compiling = lambda say: contextlib.nullcontext()
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -6,9 +6,10 @@ import sys
 import numba
 import numpy as np
 import pytest
+import typer
 
 import blinkgl.events.v2e  # noqa: F401 - looked at by name
-from blinkgl.machine import compiling, kernels
+from blinkgl.machine import command_line, compiling, kernels
 from blinkgl.machine.kernels import kernel
 from blinkgl.sequence.request import StageClock
 
@@ -152,3 +153,16 @@ def test_an_edit_of_a_function_that_a_kernel_calls_is_seen():
     of_v2e = {name for name, _, _ in kernels._stamps_of_imports("blinkgl.events.v2e")}
     assert {f"blinkgl.events.{name}" for name in ("v2e", "v2e_blocks", "v2e_model", "arith", "philox")} <= of_v2e
     assert not any("config" in name for name in of_v2e), "no kernel calls those"
+
+
+def test_every_command_says_that_it_compiles(monkeypatch, capsys, watch):
+    app = typer.Typer()
+
+    @app.command()
+    def some(nothing: bool = False) -> None:
+        watch.start()
+        watch.end()
+
+    monkeypatch.setattr(command_line, "announced_compiling", compiling.announced_compiling)
+    assert command_line.run_app(app, ["--nothing"], "some", "BlinkGL") == 0
+    assert "compiling kernels, once per machine" in capsys.readouterr().err

@@ -321,6 +321,8 @@ def made_of_frame_camera_runs(tmp_path_factory):
 def test_images_are_written_beside_everything_else_and_verified(made_of_frame_camera_runs):
     report, out = made_of_frame_camera_runs
     lines = read_exposures(report.path)
+    assert all(e.start_us < e.middle_us < e.end_us for e in lines)
+    assert lines[0].middle_us == pytest.approx((lines[0].start_us + lines[0].end_us) / 2, abs=1)
     assert len(lines) == 10 and [round(e.start_us) for e in lines[:3]] == [500_000, 514_286, 528_571]
     assert not (report.path / "images").exists(), "in the place of the instantaneous ones"
     for name in ("images", "clean", "sharp"):

@@ -4,7 +4,7 @@ An even scene, still or on a ramp, is watched at 50, 500 and 5,000 frames/s and 
 to 40 ms), and what comes out is compared with the law of the stated equation, which is exact and knows no frames: the
 rate per pixel; the interval between two events of a pixel (Kolmogorov-Smirnov distance and its probability); its
 spread; the wait for the first event, which says whether the start is that of a scene watched for long.
-``test_noise_laws.py`` holds the cases to error probabilities.
+``test_random.py`` holds the cases to error probabilities.
 """
 
 from __future__ import annotations

@@ -184,3 +184,11 @@ def test_a_camera_with_all_of_it():
     alive = (~noise.dead[free.y.astype(int) * W + free.x]).sum()
     own = len(full) + camera.late + camera.dropped - alive
     assert abs(own - noise.rates.sum() * 0.07) < 6 * np.sqrt(noise.rates.sum() * 0.07)
+
+
+def test_a_step_includes_its_last_microsecond():
+    _, drawn = noise_of(NOISY, [0, 100_000])
+    at = int(drawn.t[len(drawn) // 2])
+    stage, until = noise_of(NOISY, [0, at])
+    assert until.t[-1] == at
+    assert stage.step(Events.empty(), 100_000).t[0] > at

@@ -1,4 +1,4 @@
-"""V2E: frequency response, crossing times, dead time. Its twin is tests/tensors, its noise test_noise_laws.py."""
+"""V2E: frequency response, crossing times, dead time. Its twin is tests/tensors, its noise test_random.py."""
 
 from __future__ import annotations
 

@@ -1,12 +1,14 @@
 """`blinkgl export --layout`: what other people's loaders ask for, restated in loaders.py, and what they then hold."""
 
 import shutil
+from types import SimpleNamespace
 
 import cv2
 import h5py
 import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
 
 from blinkgl import read_events
 from blinkgl.cli import run
@@ -17,7 +19,7 @@ from blinkgl.io.flow import read_flow_npy
 from blinkgl.io.formats import open_events
 from blinkgl.io.imu import read_imu
 from blinkgl.io.tracks import read_tracks
-from blinkgl.layouts import LAYOUTS, event_kubric, export as exporting, export_layout
+from blinkgl.layouts import LAYOUTS, dsec, event_kubric, export as exporting, export_layout
 from loaders import (
     blinkflow_sequence,
     dsec_disparity,
@@ -334,6 +336,18 @@ def stereo(tmp_path_factory):
         )
         / "train/sequence_000000"
     )
+
+
+def test_only_eyes_that_look_the_same_way_side_by_side_have_a_baseline():
+    def eye(*pose):
+        T = np.eye(4)
+        T[:3, 3], T[:3, :3] = pose[:3], Rotation.from_rotvec(pose[3:]).as_matrix()
+        return SimpleNamespace(camera=SimpleNamespace(K=np.eye(3)), poses={"T_world_cam": T[None]})
+
+    straight = eye(0, 0, 0, 0, 0, 0)
+    assert dsec._baseline(straight, eye(0.2, 0, 0, 0, 0, 0)) == pytest.approx(0.2)
+    for other in ((0.2, 0.1, 0, 0, 0, 0), (-0.2, 0, 0, 0, 0, 0), (0.2, 0, 0, 0, 0.05, 0), (0.2, 0, 0, 0.05, 0, 0)):
+        assert dsec._baseline(straight, eye(*other)) is None, other
 
 
 def test_a_stereo_rig_has_a_right_eye_disparity_and_a_calibration(stereo, tmp_path):

@@ -42,6 +42,19 @@ def events_of(frames, **options) -> tuple[Events, SimulationReport]:
     return Events.concatenate(list(frames_to_events(frames, report=report, **options))), report
 
 
+def test_where_nearly_all_blocks_change_smoothly_no_noise_is_told():
+    """Light that moves is in nearly every block of these frames, and white noise in one of twenty."""
+    y, x = np.mgrid[:480, :640]
+    rng = np.random.default_rng(0)
+    frames = []
+    for k in range(4):
+        frame = 0.4 + 0.2 * np.sin(2 * np.pi * (x + 2 * k) / 24) * np.cos(2 * np.pi * (y - k) / 32)
+        frame[:24] = 0.4 + 0.02 * rng.standard_normal((24, 640))
+        frames.append(frame.astype(np.float32))
+    assert frame_noise(frames, CODE) is None
+    assert frame_noise([frame[:24] for frame in frames], CODE) is not None, "which is noise by itself"
+
+
 @pytest.mark.parametrize("step_px", [0.0, 2.0])
 @pytest.mark.parametrize(("constant", "slope"), [((2 * CODE) ** 2, 0.0), (CODE**2, 2e-4), (1e-7, 5e-4)])
 def test_noise_is_found_at_every_brightness(constant, slope, step_px):

@@ -199,6 +199,10 @@ def test_tangents_run_with_the_texture():
     along = tangents(ball)
     assert np.abs((along[:, :3] * ball.normals).sum(axis=1)).max() < 1e-5
     assert np.allclose(np.linalg.norm(along[:, :3], axis=1), 1, atol=1e-6)
+    blank = replace(ball, uvs=np.zeros_like(ball.uvs))  # says nothing: any direction in the surface
+    along = tangents(blank)
+    assert np.abs((along[:, :3] * blank.normals).sum(axis=1)).max() < 1e-5
+    assert np.allclose(np.linalg.norm(along[:, :3], axis=1), 1, atol=1e-6)
     odd = quad(splits=4)
     odd = replace(odd, uvs=np.column_stack([np.abs(odd.uvs[:, 0] - 0.5), odd.uvs[:, 1]]).astype(np.float32))
     whole, index = split_mirrored(odd)

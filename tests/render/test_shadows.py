@@ -153,6 +153,16 @@ def test_a_still_camera_sees_shadows_move(gl):
             np.testing.assert_array_equal(renderer.luminance(t).read(), whole.luminance(t).read())
 
 
+def test_the_shadow_of_a_lamp_that_moves_over_a_still_scene_is_drawn_anew(gl):
+    path = drift((-2, 3, 3), (2, 3, 3), Rotation.from_matrix(lamp_pose((0, 0, 0), (0.1, 0.3, -1.0))[:3, :3]))
+    lamps = (Lamp("spot", (8.0, 8.0, 8.0), path),)
+    world = sunlit(thing("box", 2, cube(0.5), still((0.2, 4.0, 0.6))), lamps=lamps, size=256)
+    with Renderer(gl, world, PLAIN) as renderer:
+        seen = [renderer.luminance(t).read().copy() for t in (0, SECOND)]
+    np.testing.assert_array_equal(seen[1], drawn(gl, world, SECOND))
+    assert np.abs(seen[1] - seen[0]).max() > 0.05
+
+
 def test_who_casts(gl):
     """Objects and walls; not the ground, the sky, nor what is unlit."""
     for category, unlit, casts in (

@@ -20,10 +20,11 @@ from blinkgl import (
     write_events,
 )
 from blinkgl.config.run import RunTemplate
+from blinkgl.events.truth import Surfaces, SurfaceTruth
 from blinkgl.front.runs import configured
 from blinkgl.sequence import simulate_sequence
 from blinkgl.sequence.request import SequenceRequest
-from blinkgl.types.events import Cause
+from blinkgl.types.events import Cause, Events
 
 SQUARES = np.where(((np.indices((64, 64)) // 8).sum(0) % 2)[..., None], (230, 200, 60), (40, 60, 110)).astype(np.uint8)
 CAMERA = Camera(72, 48, fov=60, pose=look_at((-3, 0, 0), (0, 0, 0)))
@@ -113,3 +114,19 @@ def test_what_has_no_place_for_it_says_so(tmp_path):
     with pytest.raises(OutputError, match="event files do not hold what made the events"):
         write_events(tmp_path / "e.h5", events, 48, 72)
     assert not list(tmp_path.iterdir())
+
+
+def test_what_a_pixel_still_follows_gives_way_to_the_same_instance_where_it_is_now():
+    one = lambda instance, depth: Surfaces(
+        np.array([[instance]]), np.array([[depth]], np.float32), np.zeros((1, 1, 2), np.float32)
+    )
+    truth = SurfaceTruth()
+    truth.see(0, one(1, 2.0))
+    truth.see(1_000_000, one(2, 5.0), np.array([[1.0]]))  # 1 has left, and is followed for a second
+    event = Events(np.zeros(1, np.uint16), np.zeros(1, np.uint16), np.array([1_900]), np.ones(1, np.uint8))
+    truth.see(2_000_000, one(2, 5.0), np.array([[1.0]]))
+    assert truth.of(event, 2_000_000)["instance"] == 1
+    truth.see(3_000_000, one(1, 3.0), np.array([[1.0]]))
+    late = Events(event.x, event.y, np.array([2_900]), event.p)
+    made = truth.of(late, 3_000_000)
+    assert made["instance"] == 1 and made["depth"] == 3.0

@@ -70,6 +70,13 @@ def test_a_smooth_sky_is_its_harmonics():
     assert error.mean() < 0.01 * true.mean()
 
 
+def test_whether_there_is_a_sun_does_not_depend_on_the_exposure():
+    towards = np.array([0.3, 0.2, 0.93]) / np.linalg.norm([0.3, 0.2, 0.93])
+    for brightness, suns in ((3.0, 0), (5000.0, 1)):
+        image = sky(128, towards, 0.03, brightness)
+        assert [len(environment(factor * image).suns) for factor in (0.01, 1.0, 100.0)] == [suns] * 3
+
+
 def test_a_sun_is_found_and_taken_out():
     towards = np.array([0.3, -0.6, 0.74])
     towards /= np.linalg.norm(towards)

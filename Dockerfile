@@ -13,7 +13,7 @@ ENV DEBIAN_FRONTEND=noninteractive PIP_DISABLE_PIP_VERSION_CHECK=1 PATH=/opt/bli
 RUN apt-get update -q && apt-get install -y -q --no-install-recommends python3 python3-venv libegl1 libgl1 libgl1-mesa-dri libosmesa6 && rm -rf /var/lib/apt/lists/*
 RUN python3 -m venv /opt/blinkgl/venv
 WORKDIR /opt/blinkgl/source
-COPY setup.cfg pyproject.toml constraints.txt README.md LICENSE ./
+COPY setup.cfg setup.py pyproject.toml constraints.txt README.md LICENSE ./
 COPY blinkgl ./blinkgl
 COPY eflow ./eflow
 COPY shaders ./shaders

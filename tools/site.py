@@ -58,7 +58,7 @@ STUB = """<!DOCTYPE html>
 <title>Moved</title>
 <meta name="robots" content="noindex">
 <script>location.replace(({places})[location.hash] || {target});</script>
-<meta http-equiv="refresh" content="0; url={address}">
+<noscript><meta http-equiv="refresh" content="0; url={address}"></noscript>
 </head>
 <body>
 <p>This page has moved: <a href="{address}">{address}</a></p>

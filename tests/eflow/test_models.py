@@ -1,6 +1,7 @@
 """The networks: size and arithmetic as published, the equalities between them, and what they refuse."""
 
 import math
+import re
 
 import pytest
 
@@ -148,9 +149,12 @@ def test_spikes_reset_to_zero_and_pass_gradients_where_they_fired():
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_sizes_of_every_network(name):
-    """tiny about a million parameters, and each size takes its smallest input and answers at its size."""
+    """tiny about a million parameters, as many as the configuration says, and it takes its smallest input and answers
+    at its size."""
     with torch.device("meta"):
         parameters = [parameters_of(build(name=name, size=size)) for size in SIZES]
+    said = NETWORKS[name].Config.model_fields["size"].description
+    assert re.findall(r"[0-9.]+ M", said) == [f"{n / 1e6:.2f} M" for n in parameters]
     assert parameters[0] > parameters[1] > parameters[2] and 0.8e6 < parameters[2] < 1.6e6
     model = build(name=name, size="tiny")
     assert predict(model, batch_for(model, 1, model.least, model.least + 4)).flow.shape[-2:] == (

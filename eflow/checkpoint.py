@@ -290,6 +290,7 @@ _OTHER = {
     "optim.loss.relative": 0.0,
     "optim.loss.log": 0.0,
     "data.augment.transpose": 0.0,
+    "model.quick": False,
 }
 """Keys that earlier versions had or lacked, and their defaults: what those versions compute today."""
 

@@ -104,6 +104,11 @@ class EFlowFormerConfig(_Refined):
     attention: Literal["separable", "twins"] = Field(
         "separable", description="twins: keys reduced by a dense convolution, and an MLP after each attention"
     )
+    quick: bool = Field(
+        False,
+        description="for trainings of minutes, not the paper's: three convolutions in place of each CNN, a U-Net whose "
+        "own flow starts the GRU (init, match_prior and context_norm mean nothing), no enhancement layers by default",
+    )
     layers: int | None = Field(None, ge=0, le=32, description="enhancement layers; null: the size's")
     init: Literal["match", "zero"] = Field(
         "match", description="start of the GRU: the matching layer's flow, or zero as E-RAFT"

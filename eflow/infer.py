@@ -71,7 +71,6 @@ def predict(model: FlowModel, batch: dict, *, precision: str = "fp32") -> FlowPr
         out.kind,
         out.has_match,
         out.low,
-        out.backward_match,
     )
 
 

@@ -165,9 +165,6 @@ class EFlowFormer(Eraft):
         # matched * 0 keeps the matching layer in the graph, so that all parameters have a gradient.
         return (matched if warm is None else matched * 0 + warm), bilinear_upsample(matched) if self.training else None
 
-    def backward(self, correlation) -> Tensor | None:
-        return correlation.match_backward(*self._prior()) if self.want_backward else None
-
     def _prior(self) -> tuple[Tensor | None, Tensor | None]:
         """Return the cost of a displacement and the gain of the logits, both learnt: without them the softmax of
         features that know nothing yet is flat, and its expectation the middle of the image, far worse than no
@@ -176,6 +173,3 @@ class EFlowFormer(Eraft):
             return None, None
         # Logarithms keep both positive.
         return (RATE * self.log_prior.float()).exp(), (RATE * self.log_gain.float()).exp()
-
-    want_backward = False
-    """True: the prediction carries ``backward_match`` (a second softmax over the same volume)."""

@@ -230,7 +230,6 @@ class Eraft(FlowModel):
             flows if self.training else flows[-1:],
             has_match=self.training and first is not None,
             low=flow,
-            backward_match=self.backward(correlation),
         )
 
     @torch.no_grad()
@@ -276,9 +275,6 @@ class Eraft(FlowModel):
         n, _, h, w = like.shape
         zero = torch.zeros(n, 2, h, w, device=like.device, dtype=torch.float32)
         return (zero if warm is None else zero + warm), None
-
-    def backward(self, correlation) -> Tensor | None:
-        return None
 
     def _correlation(self, f1: Tensor, f2: Tensor):
         tokens = f1.shape[-1] * f1.shape[-2]

@@ -285,8 +285,9 @@ class Log:
         """Rows of an earlier part of the run, up to the checkpoint; its columns are kept: a resumed run may validate on
         other sets."""
         lines = self.table.read_text(encoding="utf-8").splitlines(keepends=True) if self.table.is_file() else []
-        # A power cut can leave half a line.
-        rows = list(csv.DictReader(line for line in lines if line.endswith("\n")))
+        # A power cut can leave half a line; a table of another program is not gone on with.
+        ours = lines[:1] and lines[0].startswith(",".join(self.COLUMNS))
+        rows = list(csv.DictReader(line for line in lines if line.endswith("\n"))) if ours else []
         self.columns = list(dict.fromkeys([*self.COLUMNS, *(rows[0] if rows else ()), *self.columns]))
         return [row for row in rows if int(row["step"]) <= self.start]
 

@@ -284,8 +284,15 @@ def read_state(folder: Path) -> dict[str, Any]:
 
 _FREE = {"run"}
 """Parts of the configuration that may change between a run and its resumption (how it runs, not what it computes)."""
-_GONE = {"optim.clock": "wall", "optim.scale_gamma": 1.0, "optim.loss.relative": 0.0, "optim.loss.log": 0.0}
-"""Keys that earlier versions had, and their defaults: what they compute today."""
+_OTHER = {
+    "optim.clock": "wall",
+    "optim.scale_gamma": 1.0,
+    "optim.loss.relative": 0.0,
+    "optim.loss.log": 0.0,
+    "data.augment.transpose": 0.0,
+    "model.quick": False,
+}
+"""Keys that earlier versions had or lacked, and their defaults: what those versions compute today."""
 
 
 def resume_run(out: Path, config: TrainConfig, model: FlowModel, optimizer, ema) -> tuple[int, float]:
@@ -294,8 +301,8 @@ def resume_run(out: Path, config: TrainConfig, model: FlowModel, optimizer, ema)
     if folder is None:
         raise AssetError("no checkpoint to resume from", where=str(out), accepted="a run folder of eflow train")
     state = read_state(folder)
-    saved, now = _leaves(state.get("config", {})), {**_GONE, **_leaves(json.loads(config.model_dump_json()))}
-    saved = {**_GONE, **saved}
+    saved, now = _leaves(state.get("config", {})), {**_OTHER, **_leaves(json.loads(config.model_dump_json()))}
+    saved = {**_OTHER, **saved}
     for path in sorted({*saved, *now}):
         free = path.split(".")[0] in _FREE or re.fullmatch(r"data\.(train\.\d+\.)?workers", path)
         if not free and saved.get(path) != now.get(path):

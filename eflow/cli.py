@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -13,39 +13,38 @@ from blinkgl import __version__
 from blinkgl.errors import ConfigError
 from blinkgl.machine.command_line import run_app
 from blinkgl.machine.interrupts import interruptible
-from eflow.methods.table import METHODS, make_method
-
-if TYPE_CHECKING:
-    from eflow.config import SourceConfig
+from eflow.cli_arguments import (
+    Answer,
+    Dataset,
+    Device,
+    Focal,
+    GroundTruth,
+    Iterations,
+    Network,
+    Overrides,
+    Precision,
+    Protocol,
+    Quiet,
+    Raw,
+    Sharpen,
+    Sharpened,
+    Span,
+    Truth,
+    WarmStart,
+    Whole,
+    WindowMs,
+    known_format,
+    method_named,
+    network_of,
+    one_of,
+    precision_for,
+    rendered,
+    size_of,
+    windows_of,
+)
+from eflow.methods.table import METHODS
 
 app = typer.Typer(name="eflow", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-
-Precision = Annotated[str, typer.Option(help="fp32, or bf16 (autocast with fp32 islands).")]
-Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
-Answer = Annotated[
-    str,
-    typer.Argument(
-        help="Run folder, checkpoint folder or .safetensors file; or a network that comes with the package (eflow "
-        f"models); or a method that needs no training: {', '.join(METHODS)}."
-    ),
-]
-Network = Annotated[
-    str,
-    typer.Argument(
-        help="Run folder, checkpoint folder or .safetensors file; or a network that comes with the package (eflow "
-        "models)."
-    ),
-]
-Focal = Annotated[
-    float | None, typer.Option(min=1e-3, help="Focal length in px: contrast-rotation needs it.", show_default=False)
-]
-Overrides = Annotated[
-    list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")
-]
-WindowMs = Annotated[
-    str | None,
-    typer.Option(metavar="LOW-HIGH", help="Of a recipe: lengths of windows; default: its label interval."),
-]
 
 
 @app.callback()
@@ -92,7 +91,7 @@ def train(
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on from the newest checkpoint in the run folder.")
     ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Train a network. SIGINT and SIGTERM write a checkpoint and exit 0."""
     from eflow.config import load_train_config
@@ -130,7 +129,7 @@ def render(
     seed: Annotated[int, typer.Option(min=0, help="Other windows for each.")] = 0,
     overrides: Overrides = None,
     workers: Annotated[int, typer.Option("--workers", "-w", min=0, help="Rendering processes.")] = 1,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Render windows of a recipe into a folder that several trainings can share. Ctrl-C keeps what is there by then."""
     from blinkgl.sequence_files.sequence_dir import refuse_existing
@@ -138,8 +137,8 @@ def render(
     from eflow.data.pool import render_pool
     from eflow.progress import Counting
 
-    _one_of("--split", split, ("train", "test"))
-    source = _windows_of(
+    one_of("--split", split, ("train", "test"))
+    source = windows_of(
         recipe,
         window_ms,
         samples=per_sequence,
@@ -161,35 +160,19 @@ def render(
 @app.command()
 def evaluate(
     checkpoint: Answer,
-    dataset: Annotated[
-        str,
-        typer.Argument(
-            help="Folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences, or of rendered windows; or a recipe (.yaml), "
-            "whose groups of split test are rendered for it."
-        ),
-    ],
+    dataset: Dataset,
     out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for results.json and pictures.")] = None,
     window_ms: WindowMs = None,
     format: Annotated[str, typer.Option(help="auto, blinkgl, dsec, mvsec, blinkflow or windows.")] = "auto",
     dt: Annotated[int, typer.Option(help="MVSEC: 1 or 4 images.")] = 1,
-    protocol: Annotated[
-        str, typer.Option(help="MVSEC: which frames and rows are scored: all, ste-flownet or e-raft (20 Hz).")
-    ] = "all",
-    ground_truth: Annotated[
-        str | None,
-        typer.Option(
-            "--ground-truth",
-            help="MVSEC: propagated through the 20 Hz flow, or one field scaled; default: the protocol's.",
-        ),
-    ] = None,
+    protocol: Protocol = "all",
+    ground_truth: GroundTruth = None,
     pictures: Annotated[int, typer.Option(min=0, help="Number of pictures.")] = 12,
-    iterations: Annotated[int | None, typer.Option(min=1, help="GRU iterations, where the network has them.")] = None,
+    iterations: Iterations = None,
     empty: Annotated[str, typer.Option(help="Windows without events: error or skip.")] = "error",
     limit: Annotated[int | None, typer.Option(min=1, help="Score only so many samples, evenly spaced.")] = None,
-    sharpen: Annotated[
-        bool, typer.Option("--sharpen", help="A network's flow as long as makes the events of its windows sharpest.")
-    ] = False,
-    raw: Annotated[bool, typer.Option("--raw", help="The last weights instead of the averaged ones.")] = False,
+    sharpen: Sharpened = False,
+    raw: Raw = False,
     focal: Focal = None,
     precision: Precision = "fp32",
     device: Device = "auto",
@@ -199,19 +182,19 @@ def evaluate(
     from eflow.data.sources import open_source
     from eflow.evaluate import evaluate as score, show
 
-    _one_of("--empty", empty, ("error", "skip"))
-    model = _method(checkpoint, focal, iterations=iterations, raw=raw)
+    one_of("--empty", empty, ("error", "skip"))
+    model = method_named(checkpoint, focal, iterations=iterations, raw=raw)
     if model is None:
-        model = _model(checkpoint, device, raw, precision, iterations)
-        precision = _precision(model, precision)
+        model = network_of(checkpoint, device, raw, precision, iterations)
+        precision = precision_for(model, precision)
     console = plain_console(stderr=True)
     if dataset.endswith((".yaml", ".yml")):
         with console.status("rendering"):
-            source = _rendered(dataset, window_ms, limit)
+            source = rendered(dataset, window_ms, limit)
     elif window_ms is not None:
         raise ConfigError("only of a recipe", where="--window-ms", value=window_ms, accepted="a dataset FILE.yaml")
     else:
-        source = open_source(dataset, _format(format), dt=dt, protocol=protocol, truth=ground_truth)
+        source = open_source(dataset, known_format(format), dt=dt, protocol=protocol, truth=ground_truth)
     with console.status("evaluating") as status:
         result = score(
             model,
@@ -234,33 +217,19 @@ def predict(
     checkpoint: Answer,
     events: Annotated[str, typer.Argument(help="Event file: DSEC h5, EVT2/EVT3 raw, AEDAT4, text, npz …")],
     out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for flow and pictures.")] = None,
-    window_ms: Annotated[
-        str,
-        typer.Option(
-            "--window-ms", help="Δ: length of each of the two windows; auto: as things move by about 5 px in it."
-        ),
-    ] = "100",
+    window_ms: Span = "100",
     start_ms: Annotated[float | None, typer.Option("--start-ms", help="From this time after the first event.")] = None,
     end_ms: Annotated[float | None, typer.Option("--end-ms", help="Up to this time after the first event.")] = None,
-    whole: Annotated[
-        bool, typer.Option("--whole", help="One flow: all of the file as one window, or its halves as a pair.")
-    ] = False,
-    truth: Annotated[
-        str | None, typer.Option(help="Ground truth of the flow (.npy, .png, .flo): prints AEE and cosine.")
-    ] = None,
+    whole: Whole = False,
+    truth: Truth = None,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Sensor size, where the file does not say.")] = None,
     npy: Annotated[bool, typer.Option("--npy", help="Also float32 .npy.")] = False,
     video: Annotated[str | None, typer.Option(help="Also a video of events and flow, .mp4.")] = None,
-    warm_start: Annotated[
-        bool, typer.Option("--warm-start", help="Start each window's refinement from the last flow.")
-    ] = False,
-    sharpen: Annotated[
-        bool,
-        typer.Option(help="A network's flow as long as makes the events of its windows sharpest; else as it says."),
-    ] = True,
+    warm_start: WarmStart = False,
+    sharpen: Sharpen = True,
     empty: Annotated[str, typer.Option(help="Windows without events: error, or zero flow.")] = "error",
-    raw: Annotated[bool, typer.Option("--raw", help="The last weights instead of the averaged ones.")] = False,
-    iterations: Annotated[int | None, typer.Option(min=1, help="GRU iterations, where the network has them.")] = None,
+    raw: Raw = False,
+    iterations: Iterations = None,
     focal: Focal = None,
     precision: Precision = "fp32",
     device: Device = "auto",
@@ -273,11 +242,11 @@ def predict(
     from eflow.flow_of_file import Outputs, WindowsAsked, milliseconds, show_flows
     from eflow.infer import doubts
 
-    _one_of("--empty", empty, ("error", "zero"))
+    one_of("--empty", empty, ("error", "zero"))
     asked = WindowsAsked(milliseconds(window_ms), start_ms, end_ms, whole)
-    method = _method(checkpoint, focal, iterations=iterations, raw=raw, warm_start=warm_start)
-    model = None if method is not None else _model(checkpoint, device, raw, precision, iterations)
-    file = infer.open_sized(events, _size(size))
+    method = method_named(checkpoint, focal, iterations=iterations, raw=raw, warm_start=warm_start)
+    model = None if method is not None else network_of(checkpoint, device, raw, precision, iterations)
+    file = infer.open_sized(events, size_of(size))
     for line in doubts(next(iter(file.chunks()), Events.empty()), file.height, file.width):
         typer.echo(f"{events}: {line}", err=True)
     outputs = Outputs(out, video, npy, infer.read_truth(truth, file.height, file.width) if truth else None)
@@ -285,7 +254,7 @@ def predict(
     if model is None:
         predictor = infer.MethodPredictor(method, *shape, empty=empty)
     else:
-        precision = _precision(model, precision)
+        precision = precision_for(model, precision)
         options = {"warm_start": warm_start, "precision": precision, "empty": empty, "sharpen": sharpen}
         predictor = infer.Predictor(model, *shape, **options)
     reads = ("old", "new") if model is None else model.reads
@@ -306,9 +275,9 @@ def submit(
     from blinkgl.machine.terminal import plain_console
     from eflow.submit import submit_blinkflow, submit_dsec
 
-    _one_of("--benchmark", benchmark, ("dsec", "blinkflow"))
-    model = _model(checkpoint, device, False, precision)
-    precision = _precision(model, precision)
+    one_of("--benchmark", benchmark, ("dsec", "blinkflow"))
+    model = network_of(checkpoint, device, False, precision)
+    precision = precision_for(model, precision)
     with plain_console(stderr=True).status("predicting") as status:
         options = {"precision": precision, "progress": lambda i, n: status.update(f"{i}/{n} flows")}
         count = (
@@ -362,7 +331,7 @@ def pack(
     name: Annotated[str, typer.Option(help="What it will be called by.")],
     card: Annotated[str, typer.Option(help="YAML: about, data, training, scores, limits, commands (docs/eflow.md).")],
     out: Annotated[str, typer.Option("--out", "-o", help="Folder that its folder is made in; eflow/weights ships it.")],
-    raw: Annotated[bool, typer.Option("--raw", help="The last weights instead of the averaged ones.")] = False,
+    raw: Raw = False,
 ) -> None:
     """Make a training a network that can come with the package: weights and a card, 5 MB at most.
 
@@ -373,90 +342,6 @@ def pack(
     typer.echo(f"written: {folder}")
     for line in shipped.lines(full):
         typer.echo(line)
-
-
-def _method(name: str, focal: float | None, **network: object):
-    """The method of that name, unless a file has it; None: a network's. network : options that only those have."""
-    if name not in METHODS or Path(name).exists():
-        if focal is not None:
-            raise ConfigError("only a method takes it", where="--focal", value=focal, accepted=", ".join(METHODS))
-        return None
-    for option, value in network.items():
-        if value:
-            raise ConfigError(f"{name} is no network", where="--" + option.replace("_", "-"), value=value)
-    return make_method(name, focal)
-
-
-def _model(checkpoint: str, device: str, raw: bool, precision: str, iterations: int | None = None):
-    import torch
-
-    from eflow.allocator import keep_memory
-    from eflow.checkpoint import load_model
-
-    _one_of("--precision", precision, ("fp32", "bf16"))
-    _one_of("--device", device, ("auto", "cpu", "cuda"))
-    if device == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("no CUDA device on this machine", where="--device", value=device, accepted="cpu or auto")
-    keep_memory()
-    model = load_model(checkpoint, averaged=not raw)
-    if iterations is not None:
-        if not hasattr(model.config, "iterations"):
-            raise ConfigError("this network has no iterations", where="--iterations", value=model.config.name)
-        model.config = model.config.model_copy(update={"iterations": iterations})
-    return model.to("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
-
-
-def _precision(model, wanted: str) -> str:
-    from eflow.precision import precision_on
-
-    return precision_on(next(model.parameters()).device, wanted)
-
-
-def _format(name: str) -> str:
-    from eflow.data.sources import FORMATS
-
-    _one_of("--format", name, ("auto", *FORMATS))
-    return name
-
-
-def _one_of(option: str, value: str, accepted: tuple[str, ...]) -> None:
-    if value not in accepted:
-        raise ConfigError("unknown choice", where=option, value=value, accepted=", ".join(accepted))
-
-
-def _rendered(recipe: str, window_ms: str | None, limit: int | None):
-    """Samples of a recipe, held in memory."""
-    from eflow.data.online import held
-
-    return held(_windows_of(recipe, window_ms, samples=4, min_events=40, max_flow=40.0), limit or 128)
-
-
-def _windows_of(recipe: str, window_ms: str | None, **how) -> SourceConfig:
-    """The online source of a recipe, as a command line asks for it."""
-    from blinkgl.config.problems import validate
-    from eflow.config import SourceConfig
-
-    tree: dict = {"recipe": recipe, "online": True, **how}
-    if window_ms is not None:
-        ends = window_ms.split("-")
-        try:
-            tree["window_ms"] = tuple(float(end) for end in (ends if len(ends) > 1 else 2 * ends))
-            validate(SourceConfig, tree)
-        except (ValueError, ConfigError):
-            raise ConfigError(
-                "not lengths of windows", where="--window-ms", value=window_ms, accepted="LOW-HIGH in ms, such as 5-100"
-            ) from None
-    return validate(SourceConfig, tree)
-
-
-def _size(text: str | None) -> tuple[int, int] | None:
-    """ "640x480" to (480, 640)."""
-    if text is None:
-        return None
-    width, x, height = text.lower().partition("x")
-    if not (x and width.isdigit() and height.isdigit() and 0 < int(width) < 65536 and 0 < int(height) < 65536):
-        raise ConfigError("not a size", where="--size", value=text, accepted="WIDTHxHEIGHT, e.g. 640x480")
-    return int(height), int(width)
 
 
 GONE = {

@@ -89,16 +89,25 @@ class EraftConfig(_Refined):
     """E-RAFT (Gehrig et al., 3DV 2021)."""
 
     name: Literal["eraft"] = "eraft"
-    size: Size = Field("base", description="widths: 5.3 M parameters as published; small 2.4 M; tiny 0.9 M")
+    size: Size = Field("base", description="widths: 5.33 M parameters as published; small 2.95 M; tiny 1.06 M")
 
 
 class EFlowFormerConfig(_Refined):
     """E-FlowFormer (BlinkFlow, IROS 2023)."""
 
     name: Literal["eflowformer"] = "eflowformer"
-    size: Size = Field("base", description="4 layers; small: 2 layers; tiny: 1 layer, and widths as tiny E-RAFT")
+    size: Size = Field(
+        "base",
+        description="12.76 M parameters: 4 layers as published; small 3.89 M: 2 layers; tiny 1.53 M: 1 layer; "
+        "otherwise widths of E-RAFT's sizes",
+    )
     attention: Literal["separable", "twins"] = Field(
         "separable", description="twins: keys reduced by a dense convolution, and an MLP after each attention"
+    )
+    quick: bool = Field(
+        False,
+        description="for trainings of minutes, not the paper's: three convolutions in place of each CNN, a U-Net whose "
+        "own flow starts the GRU (init, match_prior and context_norm mean nothing), no enhancement layers by default",
     )
     layers: int | None = Field(None, ge=0, le=32, description="enhancement layers; null: the size's")
     init: Literal["match", "zero"] = Field(
@@ -117,7 +126,9 @@ class EvFlowNetConfig(Config):
     """EV-FlowNet (Zhu et al., RSS 2018), supervised."""
 
     name: Literal["ev_flownet"] = "ev_flownet"
-    size: Size = Field("base", description="widths of 64 as published, 32, 16 channels")
+    size: Size = Field(
+        "base", description="14.13 M parameters: 64 channels as published; small 3.54 M: 32; tiny 0.89 M: 16"
+    )
     input: Literal["counts", "voxel"] = Field(
         "counts", description="4 channels of counts and latest times, or a voxel grid"
     )
@@ -136,7 +147,9 @@ class SpikeFlowNetConfig(Config):
     """Spike-FlowNet (Lee et al., ECCV 2020), supervised."""
 
     name: Literal["spike_flownet"] = "spike_flownet"
-    size: Size = Field("base", description="widths of 64 as published, 32, 16 channels")
+    size: Size = Field(
+        "base", description="13.04 M parameters: 64 channels as published; small 3.42 M: 32; tiny 0.93 M: 16"
+    )
     width: int | None = Field(
         None, ge=4, le=512, multiple_of=4, description="channels of the first encoder; null: the size's"
     )
@@ -149,7 +162,9 @@ class SteFlowNetConfig(Config):
 
     name: Literal["ste_flownet"] = "ste_flownet"
     size: Size = Field(
-        "base", description="widths of 64 as published, 32, 8 channels; tiny looks 2 instead of 4 px round"
+        "base",
+        description="48.33 M parameters: 64 channels as published; small 13.04 M: 32; tiny 1.24 M: 8, and it looks 2 "
+        "instead of 4 cells round",
     )
     width: int | None = Field(
         None, ge=4, le=512, multiple_of=4, description="channels of the first encoder; null: the size's"
@@ -168,6 +183,9 @@ class AugmentConfig(Config):
 
     horizontal_flip: Probability = Field(0.5, description="probability of mirroring left and right")
     vertical_flip: Probability = Field(0.1, description="probability of turning upside down")
+    transpose: Probability = Field(
+        0.0, description="probability that rows and columns change places; needs a square data.crop"
+    )
     polarity: Probability = Field(0.5, description="probability that all polarities are swapped")
     time_reversal: Probability = Field(
         0.0, description="film backwards, target the backward flow; needs backward labels"
@@ -264,6 +282,11 @@ class DataConfig(Config):
     def _one_size(crop, scaling):
         if crop is None and scaling:
             raise Refused("scaled samples differ in size: set crop, or augment.scale_probability to 0")
+
+    @rule("crop", "augment.transpose")
+    def _square(crop, transpose):
+        if transpose and (crop is None or crop[0] != crop[1]):
+            raise Refused("transposed samples differ in size: set a square crop, or augment.transpose to 0")
 
 
 class LossConfig(Config):

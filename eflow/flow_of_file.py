@@ -95,7 +95,7 @@ def show_flows(
                 shown.add(caption, events_of(tensor), flow)
         if not count:
             raise BlinkGLError(
-                f"shorter than two windows of {span / 1000:g} ms",
+                f"shorter than {'two windows' if 'old' in reads else 'a window'} of {span / 1000:g} ms",
                 where=str(file.path),
                 accepted="a smaller --window-ms, or --whole",
             )

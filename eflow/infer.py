@@ -71,7 +71,6 @@ def predict(model: FlowModel, batch: dict, *, precision: str = "fp32") -> FlowPr
         out.kind,
         out.has_match,
         out.low,
-        out.backward_match,
     )
 
 
@@ -95,7 +94,8 @@ def windows(
     """Successive windows of an event file: reference times start + Δ, start + 2Δ, … while
     both windows lie inside [start, end); from start on where only the new one is read.
 
-    start_us, end_us : default the first event's time and the last's + 1. Streams; holds two windows and a chunk."""
+    start_us, end_us : default the first event's time and the last's + 1. Streams; holds two windows and a chunk.
+    Raises EventDataError: no event in :data:`JUMP` windows, since a clock that was set anew would give billions."""
     pending, t, skipped = Events.empty(), None, span_us if "old" in reads else 0
     last = None
     for chunk in file.chunks():
@@ -105,6 +105,12 @@ def windows(
             t = start_us + skipped
         last = int(chunk.t[-1])
         while last >= t + span_us and (end_us is None or t + span_us <= end_us):
+            if pending.t[0] > t + JUMP * span_us:
+                raise EventDataError(
+                    f"event times jump by {(int(pending.t[0]) - t) * 1e-6:.6g} s",
+                    where=f"{file.path}, {(t - start_us) / 1000:g} ms after the first",
+                    accepted="--end-ms before the jump or --start-ms behind it",
+                )
             yield _pair(pending, t, span_us)
             pending = pending.window(t, last + 1)
             t += span_us
@@ -114,6 +120,8 @@ def windows(
         yield _pair(pending, t, span_us)
 
 
+JUMP = 10_000
+"""Windows without an event from which on a recording's clock is taken to have jumped."""
 LIKELY_PX = 5.0
 """Displacement in a window that :func:`likely_span` looks for: networks are trained on 2 to 8 px."""
 
@@ -126,7 +134,7 @@ def likely_span(
     """(Δ, the longest that there is), µs: how long things in the recording take to move by about :data:`LIKELY_PX`.
     ``predictor``'s own flow where there are events, at three places of the recording, tells how fast they are; tried
     with shorter and longer windows until it stands. From 1 ms to half of the recording, or all of it for a predictor
-    that ``reads`` the new window alone. Raises EventDataError: no events."""
+    that ``reads`` the new window alone. Raises EventDataError: no events, or none at those places."""
     ends = [(int(c.t[0]), int(c.t[-1])) for c in file.chunks() if len(c)]
     if not ends:
         raise EventDataError("holds no events", where=str(file.path))
@@ -143,8 +151,11 @@ def likely_span(
                 continue
             flow, _ = predictor(window)
             speeds.append(float(np.median(np.hypot(*flow[window.new.y, window.new.x].T))))
-        speed = float(np.median(speeds)) if speeds else 0.0
-        factor = min(max(LIKELY_PX / max(speed, 1e-3), 0.4), 2.5)
+        if not speeds:
+            raise EventDataError(
+                "no events where they are looked for", where=str(file.path), accepted="a length instead of auto"
+            )
+        factor = min(max(LIKELY_PX / max(float(np.median(speeds)), 1e-3), 0.4), 2.5)
         span = int(min(max(span * factor, 1000), longest))
         if 0.8 < factor < 1.25:
             break
@@ -157,7 +168,7 @@ def whole_file(file: EventFile, reads: tuple[str, ...] = ("old", "new")) -> tupl
     file at constant image velocity."""
     events = file.read()
     if len(events) < 2:
-        raise EventDataError("no events", where=str(file.path))
+        raise EventDataError("fewer than two events", where=str(file.path))
     t0, t1 = int(events.t[0]), int(events.t[-1]) + 1
     t = (t0 + t1) // 2 if "old" in reads else t0
     cut = lambda a, b: Window(*(getattr(events.window(a, b), k) for k in "xytp"), a, b)

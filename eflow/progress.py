@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import json
 import signal
 import sys
@@ -244,11 +245,16 @@ class Signals:
 
 
 class Log:
-    """log.jsonl, one object per line, and tensorboard. On resuming, lines past the checkpoint
-    are dropped: those steps run again."""
+    """log.jsonl, one object per line, tensorboard, and log.csv, a row for each line with the columns that a plot wants.
+    On resuming, lines past the checkpoint are dropped: those steps run again, and seconds go on from the last row.
 
-    def __init__(self, out: Path, start: int, enabled: bool):
-        self.path, self.start, self.enabled = out / "log.jsonl", start, enabled
+    batch : samples of a step.   validated : columns of the validation's scores."""
+
+    COLUMNS = ("step", "samples", "processor_s", "wall_s", "loss", "epe", "lr")
+
+    def __init__(self, out: Path, start: int, batch: int, validated: Iterable[str], enabled: bool):
+        self.path, self.start, self.batch, self.enabled = out / "log.jsonl", start, batch, enabled
+        self.table, self.columns = out / "log.csv", [*self.COLUMNS, *validated]
 
     def __enter__(self) -> Log:
         if self.enabled:
@@ -261,19 +267,44 @@ class Log:
                 ]
                 self.path.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
                 self._file = open(self.path, "a", encoding="utf-8")
+            with output_errors(self.table):
+                kept = self._kept_rows()
+                self._table_file = open(self.table, "w", encoding="utf-8", newline="")
+                self._rows = csv.DictWriter(self._table_file, self.columns, extrasaction="ignore", lineterminator="\n")
+                self._rows.writeheader()
+                self._rows.writerows(kept)
+                self._table_file.flush()
+            before = [float(kept[-1][key]) if kept else 0.0 for key in ("processor_s", "wall_s")]
+            self._began = before[0] - time.process_time(), before[1] - time.monotonic()
             from torch.utils.tensorboard import SummaryWriter
 
             self._board = SummaryWriter(str(self.path.parent / "tb"), purge_step=self.start + 1 if self.start else None)
         return self
 
+    def _kept_rows(self) -> list[dict[str, str]]:
+        """Rows of an earlier part of the run, up to the checkpoint; its columns are kept: a resumed run may validate on
+        other sets."""
+        lines = self.table.read_text(encoding="utf-8").splitlines(keepends=True) if self.table.is_file() else []
+        # A power cut can leave half a line; a table of another program is not gone on with.
+        ours = lines[:1] and lines[0].startswith(",".join(self.COLUMNS))
+        rows = list(csv.DictReader(line for line in lines if line.endswith("\n"))) if ours else []
+        self.columns = list(dict.fromkeys([*self.COLUMNS, *(rows[0] if rows else ()), *self.columns]))
+        return [row for row in rows if int(row["step"]) <= self.start]
+
     def write(self, step: int, kind: str, **values: float) -> None:
         with output_errors(self.path):
             self._file.write(json.dumps({"step": step, "kind": kind, **values}) + "\n")
             self._file.flush()
+        seconds = round(self._began[0] + time.process_time(), 3), round(self._began[1] + time.monotonic(), 3)
+        row = {"step": step, "samples": step * self.batch, "processor_s": seconds[0], "wall_s": seconds[1]}
+        with output_errors(self.table):
+            self._rows.writerow({**values, **row})
+            self._table_file.flush()
         for k, v in values.items():
             self._board.add_scalar(f"{kind}/{k}", v, step)
 
     def __exit__(self, *_) -> None:
         if self.enabled:
             self._file.close()
+            self._table_file.close()
             self._board.close()

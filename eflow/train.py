@@ -1,13 +1,16 @@
-"""The training loop. Reads top to bottom; runs on the CPU, one GPU, or several:
+"""The training loop, top to bottom: :func:`train`, what a run is made of, its loop, one step, what is written.
+
+On the CPU or one GPU (``run.device``; auto takes a GPU where there is one), and on several:
 
     eflow train configs/eflow/smoke.yaml --out out/smoke
+    eflow train configs/eflow/smoke.yaml --out out/smoke --resume
     torchrun --nproc-per-node 8 -m eflow.cli train configs/eflow/eflowformer.yaml --out out/base
 
-A run folder holds config.yaml, log.jsonl, tb/ (tensorboard), checkpoints/<step>/ and pictures/. SIGINT and SIGTERM end
-the current step, write a checkpoint and exit 0; ``--resume`` goes on from the newest one and is, on the CPU, bit for
-bit what the uninterrupted run would have been: data order and augmentation are functions of (seed, step), the rate of
-the step alone. (With ``optim.minutes`` the rate goes by the clock, which checkpoints keep, and a run that is as
-long on another day is another run.)
+A run folder holds config.yaml, log.csv and log.jsonl, tb/ (tensorboard), checkpoints/<step>/ and pictures/. SIGINT and
+SIGTERM end the current step, write a checkpoint and exit 0. ``--resume`` goes on from the newest checkpoint and is, on
+the CPU, bit for bit what the uninterrupted run would have been: data order and augmentation are functions of (seed,
+step), the rate of the step alone. (With ``optim.minutes`` the rate goes by the clock, which checkpoints keep; such a
+run does not repeat bit for bit.)
 """
 
 from __future__ import annotations
@@ -31,16 +34,17 @@ from blinkgl.errors import ConfigError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.sequence_files.sequence_dir import refuse_existing
 from eflow import checkpoint as ckpt
-from eflow.allocator import keep_memory
 from eflow.checkpoint import resume_run, weights_of
 from eflow.config import OptimConfig, TrainConfig
 from eflow.data.dataset import FlowDataset, StepSampler, batches, is_endless
 from eflow.data.sources import Source
+from eflow.devices import agree, compile_errors, setup, to_device
 from eflow.metrics import sequence_loss
 from eflow.models import FlowModel, build_model
 from eflow.pictures import comparison, events_of, write_picture
-from eflow.precision import precision_on, use_tf32
+from eflow.precision import precision_on
 from eflow.progress import Log, Readings, Signals, TrainProgress, Waiting, told
+from eflow.schedule import Course, learning_rate
 from eflow.training_data import check_sizes, training_sets, validate, validation_sets
 
 
@@ -54,50 +58,6 @@ class TrainResult:
     loss: float
 
 
-def learning_rate(done: float, peak: float, warmup: float, cooldown: float) -> float:
-    """The rate when a share ``done`` (0 … 1) of the training is over: linear from peak / 25 up to ``peak`` over its
-    first ``warmup``, then ``peak``, and linear down to peak / 25e4 over its last ``cooldown``."""
-    start, end = peak / 25, peak / 25e4
-    if done < warmup:
-        return start + (peak - start) * done / warmup
-    if done < 1 - cooldown:
-        return peak
-    return peak + (end - peak) * min((done - (1 - cooldown)) / max(cooldown, 1e-9), 1)
-
-
-@dataclass
-class Course:
-    """How far a training is, by steps and, where ``optim.minutes`` says so, by the clock of all its parts together.
-
-    before : seconds of the parts before this one."""
-
-    optim: OptimConfig
-    began: float
-    before: float
-    clock: Callable[[], float]
-
-    @property
-    def seconds(self) -> float:
-        return self.before + self.clock() - self.began
-
-    def done(self, step: int, device: torch.device, world: int) -> float:
-        """Share of the training that is over after ``step`` steps; the same on all ranks."""
-        share = step / self.optim.steps
-        if self.optim.minutes is None:
-            return share
-        if world == 1:
-            return max(share, self.seconds / (60 * self.optim.minutes))
-        seconds = torch.tensor(self.seconds, dtype=torch.float64, device=device)
-        dist.broadcast(seconds, 0)
-        return max(share, float(seconds) / (60 * self.optim.minutes))
-
-    def minutes_left(self, time_limit: float | None) -> float | None:
-        """Until the end or this call's ``time_limit``; None where there is no clock."""
-        ends = [] if time_limit is None else [time_limit]
-        ends += [] if self.optim.minutes is None else [self.optim.minutes - self.before / 60]
-        return min(ends, default=None)
-
-
 def train(
     config: TrainConfig,
     out: str | os.PathLike,
@@ -107,20 +67,19 @@ def train(
     quiet: bool = False,
     clock: Callable[[], float] = time.monotonic,
 ) -> TrainResult:
-    """Trains to the end of ``config.optim.steps`` or ``minutes``. ``stop_after``: leave after this many steps of this
-    call, as a signal would. clock : seconds, of ``optim.minutes``.
+    """Train to the end of ``config.optim.steps`` or ``minutes`` and return how it ended.
+
+    stop_after : leave after this many steps of this call, as a signal would. clock : seconds, of ``optim.minutes``.
 
     Raises ConfigError, AssetError, EventDataError (data), OutputError (run folder exists), TrainingError (loss not
     finite: the batch's sample names are in ``nan_batch.json``)."""
-    with contextlib.ExitStack() as stack:  # of what renders while it is trained on
-        made = Training(config, Path(out), stack, resume=resume, stop_after=stop_after, clock=clock, quiet=quiet)
-        return made.run()
+    with contextlib.ExitStack() as stack:  # ends the processes that render while it is trained on
+        training = Training(config, Path(out), stack, resume=resume, stop_after=stop_after, clock=clock, quiet=quiet)
+        return training.run()
 
 
 class Training:
-    """One call's part of a run: made ready when it is made, and gone through once by :meth:`run`.
-
-    stack : ends what renders while it is trained on."""
+    """One call's part of a run: everything is made ready by the constructor, :meth:`run` goes through it once."""
 
     def __init__(
         self,
@@ -133,7 +92,8 @@ class Training:
         clock: Callable[[], float],
         quiet: bool,
     ):
-        self.rank, self.world, self.device = _setup(config)
+        self.rank, self.world, self.device = setup(config)
+        # One process writes and speaks for all of them.
         self.lead, self.out, self.quiet = self.rank == 0, out, quiet
         precision = precision_on(self.device, config.run.precision, quiet=not self.lead)
         self.config = config.model_copy(update={"run": config.run.model_copy(update={"precision": precision})})
@@ -141,12 +101,39 @@ class Training:
             importlib.import_module("torch.utils.tensorboard")  # where it is missing, nothing has been written yet
         if self.lead and not resume:
             refuse_existing(out)
-        self.model = self._network(from_weights=not resume)
+        spent = self._make_network(resume)
+        self.stop = config.optim.steps if stop_after is None else min(config.optim.steps, self.start + stop_after)
+        self._make_data(stack)
+        self.net = self._parallel()
+        self.net.train()
+        if self.lead:
+            _write_config(out, self.config)
+        self.began, self.read = time.monotonic(), Readings(out)
+        self.course = Course(config.optim, clock(), spent, clock)
+        self.done = self.course.done(self.start, self.device, self.world)
+        self.path = out
+        """The newest checkpoint; the run's folder on ranks that write none."""
+
+    def _make_network(self, resume: bool) -> float:
+        """Make network, optimiser and averaged weights, as a checkpoint left them or new; return the seconds that the
+        run has had."""
+        config = self.config
+        torch.manual_seed(config.seed)
+        self.model = build_model(config.model)
+        if config.init_from and not resume:
+            ckpt.load_weights(self.model, *weights_of(config))
+        self.model.to(self.device)
+        if config.run.channels_last:
+            self.model.to(memory_format=torch.channels_last)
         self.optimizer = _optimizer(self.model, config.optim, self.device)
         self.ema = {k: v.detach().clone() for k, v in self.model.state_dict().items()} if config.optim.ema else None
-        start, spent = resume_run(out, self.config, self.model, self.optimizer, self.ema) if resume else (0, 0.0)
+        start, spent = resume_run(self.out, config, self.model, self.optimizer, self.ema) if resume else (0, 0.0)
         self.start = self.step = start
-        self.stop = config.optim.steps if stop_after is None else min(config.optim.steps, start + stop_after)
+        return spent
+
+    def _make_data(self, stack: contextlib.ExitStack) -> None:
+        """Open the sets to train and validate on; refuse what the network cannot take before anything is written."""
+        config = self.config
         if config.data.batch % self.world:
             raise ConfigError(
                 "not a multiple of the number of processes",
@@ -154,7 +141,7 @@ class Training:
                 value=config.data.batch,
                 accepted=f"a multiple of {self.world}",
             )
-        self.mixture, self.sources = training_sets(config, start, self.rank, self.world, stack)
+        self.mixture, self.sources = training_sets(config, self.start, self.rank, self.world, stack)
         self.dataset = FlowDataset(
             self.sources,
             self.model.representation,
@@ -166,40 +153,29 @@ class Training:
         )
         check_sizes(self.dataset, self.model, config.data.crop)
         self.validation = validation_sets(config, self.model) if self.lead else []
-        if config.run.compile and hasattr(self.model, "update"):
-            self.model.update.compile()
-        self.net = self.model
-        if self.world > 1:
-            devices = [self.device.index] if self.device.type == "cuda" else None
-            self.net = DistributedDataParallel(self.model, device_ids=devices)
-        self.net.train()
-        if self.lead:
-            _write_config(out, self.config)
-        self.began, self.read = time.monotonic(), Readings(out)
-        self.course = Course(config.optim, clock(), spent, clock)
-        self.done = self.course.done(start, self.device, self.world)
-        self.path = out
-        """The newest checkpoint; the run's folder on ranks that write none."""
 
-    def _network(self, from_weights: bool) -> FlowModel:
-        torch.manual_seed(self.config.seed)
-        model = build_model(self.config.model)
-        if self.config.init_from and from_weights:
-            ckpt.load_weights(model, *weights_of(self.config))
-        model.to(self.device)
-        if self.config.run.channels_last:
-            model.to(memory_format=torch.channels_last)
-        return model
+    def _parallel(self) -> torch.nn.Module:
+        """Return the network as steps call it: compiled, or wrapped to average gradients over processes."""
+        if self.config.run.compile and hasattr(self.model, "update"):
+            self.model.update.compile()
+        if self.world == 1:
+            return self.model
+        return DistributedDataParallel(
+            self.model, device_ids=[self.device.index] if self.device.type == "cuda" else None
+        )
+
+    # ---- the loop ----------------------------------------------------------------------------------------------------
 
     def run(self) -> TrainResult:
-        """Goes through the steps that are left, and ends the process group."""
+        """Go through the steps that are left, and end the process group."""
         config, device = self.config, self.device
         stop = self.start if self.done >= 1 else self.stop
         sampler = StepSampler(self.mixture, config.data.batch, self.start, stop, self.rank, self.world)
         reason = None
+        validated = [f"{name}/{what}" for name, *_ in self.validation for what in ("AEE", "zero")]
         with (
             Signals() as signals,
-            Log(self.out, self.start, enabled=self.lead) as log,
+            Log(self.out, self.start, config.data.batch, validated, enabled=self.lead) as log,
             TrainProgress(
                 config.optim.steps,
                 self.start,
@@ -211,15 +187,22 @@ class Training:
         ):
             waiting = Waiting(batches(self.dataset, sampler, config.data.workers, pin=device.type == "cuda"))
             for batch in waiting:
-                batch = _to_device(batch, device, config.run.channels_last)
+                batch = to_device(batch, device, config.run.channels_last)
                 rate, flow = self._take(batch)
-                # What is between processes, or between device and host, makes everybody wait: now and then is enough.
+                # What passes between processes, or between device and host, makes everybody wait: now and then is
+                # enough.
                 looking = self.step == self.start + 1 or self._every("log", "validate", "checkpoint")
                 reason = self._reason(signals, looking)
-                last = self.step == self.stop or self.done >= 1
-                progress.update(self.step, self.read.values() if looking or last or reason else ())
+                progress.update(self.step, self.read.values() if looking or self._last or reason else ())
                 if self.lead:
-                    self._tell(batch, flow, rate, reason, log, progress, waiting)
+                    self._log(log, rate, progress, waiting)
+                    if self._every("picture"):
+                        _picture(self.out / "pictures" / f"{self.step:09d}.png", batch, flow)
+                    # The clock ends a training as its last step does; a signal is in a hurry.
+                    if self.validation and (self._every("validate") or reason in ("finished", "time limit")):
+                        self._validate(log, progress)
+                    if self._every("checkpoint") or reason is not None:
+                        self.path = self._save()
                 if reason is not None:
                     break
             else:
@@ -233,7 +216,7 @@ class Training:
         return TrainResult(self.step, reason or "finished", self.path, self.read.loss)
 
     def _take(self, batch: dict) -> tuple[float, Tensor]:
-        """One step; the rate that it was taken at and the last field."""
+        """Take one step; return the rate that it was taken at and the flow it saw, (N, 2, H, W) px."""
         optim = self.config.optim
         rate = learning_rate(self.done, optim.lr, optim.warmup, optim.cooldown)
         for group in self.optimizer.param_groups:
@@ -246,12 +229,17 @@ class Training:
         self.optimizer.step()
         self.step += 1
         if self.ema is not None:
+            # The first steps average over few weights, so that the random start is soon forgotten.
             _average(self.ema, self.model, min(optim.ema, self.step / (self.step + 10)))
         return rate, flow
 
     def _every(self, *whats: str) -> bool:
         """Whether this step is one of those at which one of these things is done."""
         return any(self.step % getattr(self.config.run, f"{what}_every") == 0 for what in whats)
+
+    @property
+    def _last(self) -> bool:
+        return self.step == self.stop or self.done >= 1
 
     def _reason(self, signals: Signals, looking: bool) -> str | None:
         """Why the training ends after this step; None: it goes on. The same on all ranks."""
@@ -262,23 +250,15 @@ class Training:
         last = self.step == self.stop
         if self.world > 1 and not (looking or last):
             return None
-        limit = "time limit" if _over(self.began, self.config.run.time_limit) else None
-        reason = signals.reason or limit or ("stop" if last else None)
-        return _agree(reason, self.device) if self.world > 1 else reason
+        minutes = self.config.run.time_limit
+        over = minutes is not None and time.monotonic() - self.began > 60 * minutes
+        reason = signals.reason or ("time limit" if over else None) or ("stop" if last else None)
+        return agree(reason, self.device) if self.world > 1 else reason
 
-    def _tell(
-        self,
-        batch: dict,
-        flow: Tensor,
-        rate: float,
-        reason: str | None,
-        log: Log,
-        progress: TrainProgress,
-        waiting: Waiting,
-    ) -> None:
-        """Log, picture, validation and checkpoint, where this step has them."""
-        last = self.step == self.stop or self.done >= 1
-        if self._every("log") or last:
+    # ---- what is written ---------------------------------------------------------------------------------------------
+
+    def _log(self, log: Log, rate: float, progress: TrainProgress, waiting: Waiting) -> None:
+        if self._every("log") or self._last:
             log.write(
                 self.step,
                 "train",
@@ -291,17 +271,13 @@ class Training:
                 waited=waiting.share,
                 **_rendering(self.sources),
             )
-        if self._every("picture"):
-            _picture(self.out / "pictures" / f"{self.step:09d}.png", batch, flow)
-        # The clock ends a training as its last step does; a signal is in a hurry.
-        ended = reason in ("finished", "time limit")
-        if self.validation and (self._every("validate") or ended):
-            size = -(-self.config.data.batch // self.world)
-            scores = validate(self.model, self.ema, self.validation, self.config.run.precision, size)
-            log.write(self.step, "validation", **scores)
-            progress.note(self.step, scores)
-        if self._every("checkpoint") or reason is not None:
-            self.path = self._save()
+
+    def _validate(self, log: Log, progress: TrainProgress) -> None:
+        # Batches of what one process trains on: more might not fit its card.
+        size = -(-self.config.data.batch // self.world)
+        scores = validate(self.model, self.ema, self.validation, self.config.run.precision, size)
+        log.write(self.step, "validation", **scores)
+        progress.note(self.step, scores)
 
     def _save(self) -> Path:
         about = {"seconds": self.course.seconds, "config": json.loads(self.config.model_dump_json())}
@@ -326,7 +302,7 @@ def _forward(net, batch: dict, config: TrainConfig, world: int) -> tuple[Tensor,
     """loss, end-point error of the last field, and that field; nothing is read back from the device."""
     kind = batch["new"].device.type
     with (
-        _compile_errors(config.run.compile),
+        compile_errors(config.run.compile),
         torch.autocast(kind, torch.bfloat16, enabled=config.run.precision == "bf16"),
     ):
         prediction = net({k: batch[k] for k in ("old", "new") if k in batch})
@@ -366,48 +342,6 @@ def _rendering(sources: list[Source]) -> dict[str, float]:
     }
 
 
-@contextlib.contextmanager
-def _compile_errors(enabled: bool):
-    """What torch.compile needs and does not find (a C++ compiler, Triton) is the machine's lack, not a bug of ours."""
-    try:
-        yield
-    except Exception as error:
-        if enabled and type(error).__module__.startswith(("torch._dynamo", "torch._inductor")):
-            reason = next(iter(str(error).strip().splitlines()), type(error).__name__)
-            raise ConfigError(
-                f"torch.compile does not work here: {reason}", where="run.compile", value=True, accepted="false"
-            ) from error
-        raise
-
-
-def _setup(config: TrainConfig) -> tuple[int, int, torch.device]:
-    """(rank, world, device); joins torchrun's process group where there is one."""
-    rank, world, local = (int(os.environ.get(k, d)) for k, d in (("RANK", 0), ("WORLD_SIZE", 1), ("LOCAL_RANK", 0)))
-    kind = config.run.device
-    if kind == "auto":
-        kind = "cuda" if torch.cuda.is_available() else "cpu"
-    if kind == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("no CUDA device on this machine", where="run.device", value="cuda", accepted="cpu or auto")
-    device = torch.device("cuda", local) if kind == "cuda" else torch.device("cpu")
-    if kind == "cuda":
-        torch.cuda.set_device(device)
-        use_tf32(device, config.run.tf32)
-    if kind == "cpu":
-        keep_memory()
-    if config.run.threads:
-        torch.set_num_threads(config.run.threads)
-    if world > 1 and not dist.is_initialized():
-        dist.init_process_group("nccl" if kind == "cuda" else "gloo")
-    return rank, world, device
-
-
-def _to_device(batch: dict, device: torch.device, channels_last: bool) -> dict:
-    out = {k: v.to(device, non_blocking=True) if torch.is_tensor(v) else v for k, v in batch.items()}
-    if channels_last:
-        out.update({k: out[k].contiguous(memory_format=torch.channels_last) for k in ("old", "new") if k in out})
-    return out
-
-
 @torch.no_grad()
 def _average(ema: dict[str, Tensor], model: FlowModel, decay: float) -> None:
     for k, v in model.state_dict().items():
@@ -425,18 +359,6 @@ def _picture(path: Path, batch: dict, flow: Tensor) -> None:
             batch["valid"][0].cpu().numpy(),
         ),
     )
-
-
-def _over(began: float, minutes: float | None) -> bool:
-    return minutes is not None and time.monotonic() - began > 60 * minutes
-
-
-def _agree(reason: str | None, device: torch.device) -> str | None:
-    """All ranks stop at the same step: the first reason any of them has; None goes on."""
-    codes = [None, "signal", "time limit", "stop"]
-    code = torch.tensor(codes.index(reason), device=device)
-    dist.all_reduce(code, op=dist.ReduceOp.MAX)
-    return codes[int(code)]
 
 
 def as_yaml(config: TrainConfig) -> str:

@@ -3,6 +3,7 @@
     eflow render configs/eflow/real_data.yaml --out out/lengths -n 500 --split test --seed 99 --per-sequence 4 \\
         --window-ms 1.5-100 --max-flow 24 --min-density 0.008
     python -m blinkgl.tools.flow_lengths real_small out/lengths
+    python -m blinkgl.tools.flow_lengths real_small out/lengths --views     # the error of mirrored, thinned … windows
 
 Two tables of medians, each of the network's flow as it is and as long as makes the events sharpest (`eflow predict`):
 over the windows of a rendered pool, by their true length; and over pans across photographs (one velocity everywhere,
@@ -13,7 +14,8 @@ from __future__ import annotations
 
 import argparse
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -26,6 +28,7 @@ from blinkgl.tools.real_recordings import cut, table
 from blinkgl.types.events import Events
 from eflow.checkpoint import load_model
 from eflow.data.sources import open_source
+from eflow.data.window import RawSample
 from eflow.infer import Predictor, StreamWindow
 from eflow.models import FlowModel
 
@@ -78,6 +81,55 @@ def of_pans() -> Iterator[tuple[StreamWindow, np.ndarray]]:
             yield cut(events, int(events.t[-1]) - 1000 - span, span), flow
 
 
+def enlarged(sample: RawSample, factor: int) -> RawSample:
+    """The same events on a sensor of ``factor`` times the rows and columns, and the flow that they have there."""
+    apart = lambda w: replace(w, x=w.x * factor, y=w.y * factor)
+    larger = lambda a: a.repeat(factor, 0).repeat(factor, 1)
+    return replace(
+        sample,
+        old=apart(sample.old),
+        new=apart(sample.new),
+        height=sample.height * factor,
+        width=sample.width * factor,
+        flow=larger(sample.flow) * factor,
+        valid=larger(sample.valid),
+    )
+
+
+VIEWS: dict[str, Callable[[RawSample], RawSample]] = {
+    "as it is": lambda s: s,
+    "mirrored": lambda s: s.flip("x"),
+    "upside down": lambda s: s.flip("y"),
+    "transposed": lambda s: s.transpose(),
+    "time reversed": lambda s: s.reverse(),
+    "polarity swapped": lambda s: s.invert(),
+    "5 % of the events": lambda s: s.drop(0.95, np.random.default_rng(0)),
+    "noise of 3 /s/px": lambda s: s.noise(3.0, np.random.default_rng(0)),
+    "coordinates doubled": lambda s: enlarged(s, 2),
+    "coordinates tripled": lambda s: enlarged(s, 3),
+}
+
+
+def of_views(model: FlowModel, path: str, limit: int) -> list[list[object]]:
+    """A row for each view of the windows of a pool: error and zero flow's, px over all pixels, their ratio, and that
+    beside the ratio of the windows as they are."""
+    source, rows = open_source(path), []
+    chosen = np.linspace(0, len(source) - 1, min(limit, len(source))).round().astype(int)
+    for name, view in VIEWS.items():
+        errors = []
+        for i in chosen:
+            s = view(source[int(i)])
+            predictor = Predictor(model, s.height, s.width, empty="zero")
+            flow = predictor(StreamWindow(s.new.t0, s.old, s.new))[0][s.valid]
+            if len(flow):
+                true = s.flow[s.valid]
+                errors.append((np.hypot(*(flow - true).T).mean(), np.hypot(*true.T).mean()))
+        error, zero = np.mean(errors, axis=0)
+        ratio = float(error / zero)
+        rows.append([name, float(error), float(zero), ratio, ratio / rows[0][3] if rows else 1.0])
+    return rows
+
+
 def judged(model: FlowModel, pairs: Iterable[tuple[StreamWindow, np.ndarray]]) -> Iterator[Judged]:
     """Of every pair whose new window has events enough."""
     for pair, truth in pairs:
@@ -113,8 +165,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("network", help="checkpoint, or a packaged network")
     parser.add_argument("pool", help="folder of `eflow render`")
+    parser.add_argument("--views", action="store_true", help="errors of changed windows in place of lengths")
+    parser.add_argument("--limit", type=int, default=200, help="windows of the pool that --views takes")
     options = parser.parse_args()
     model, heads = load_model(options.network), ["windows", "length", "length, sharp", "error", "error, sharp"]
+    if options.views:
+        rows = of_views(model, options.pool, options.limit)
+        say(plain_console(), table("view", ["error, px", "zero flow", "ratio", "to as it is"], rows))
+        return
     pool = list(judged(model, of_pool(options.pool)))
     say(plain_console(), table("true length", heads, rows_of(pool, itertools.pairwise(BINS))))
     pans = list(judged(model, of_pans()))

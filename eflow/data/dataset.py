@@ -210,11 +210,14 @@ def augmented(sample: RawSample, a: AugmentConfig, rng: np.random.Generator) -> 
     """The event-level augmentations, each with its own probability; all draws happen, so that
     switching one off moves no other."""
     u = rng.random(7)
-    noise_rng, hot_rng, drop_rng = rng.spawn(3)
+    # Children are numbered: the first three stay the same when there is one more.
+    noise_rng, hot_rng, drop_rng, view_rng = rng.spawn(4)
     if u[0] < a.horizontal_flip:
         sample = sample.flip("x")
     if u[1] < a.vertical_flip:
         sample = sample.flip("y")
+    if view_rng.random() < a.transpose:
+        sample = sample.transpose()
     if u[2] < a.polarity:
         sample = sample.invert()
     if u[3] < a.time_reversal:

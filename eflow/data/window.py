@@ -37,6 +37,10 @@ class Window:
         column = getattr(self, axis)
         return replace(self, **{axis: (column.dtype.type(size - 1) - column).astype(column.dtype)})
 
+    def transposed(self) -> Window:
+        """Rows and columns exchanged."""
+        return replace(self, x=self.y, y=self.x)
+
     def inverted(self) -> Window:
         """Polarity swapped (a copy: windows may be shared)."""
         return replace(self, p=1 - self.p)
@@ -107,6 +111,23 @@ class RawSample:
             new=self.new.flipped(axis, size),
             flow=signed(self.flow),
             backward=signed(self.backward),
+            valid=turn(self.valid),
+            backward_valid=turn(self.backward_valid),
+            mask=turn(self.mask),
+        )
+
+    def transpose(self) -> RawSample:
+        """Rows and columns exchanged, of the flow its components, too."""
+        turn = lambda a: None if a is None else a.swapaxes(0, 1)
+        swapped = lambda f: None if f is None else turn(f)[..., ::-1]
+        return replace(
+            self,
+            old=self.old.transposed(),
+            new=self.new.transposed(),
+            height=self.width,
+            width=self.height,
+            flow=swapped(self.flow),
+            backward=swapped(self.backward),
             valid=turn(self.valid),
             backward_valid=turn(self.backward_valid),
             mask=turn(self.mask),

@@ -26,9 +26,14 @@ NETWORKS: dict[str, type[FlowModel]] = {
 """By the key ``name`` of their configuration; nothing else lists networks."""
 SIZES = ("base", "small", "tiny")
 
+_QUICK = {"size": "tiny", "quick": True, "levels": 2, "iterations": 2, "train_iterations": 2}
+
 PRESETS: dict[str, dict] = {
     name if size == "base" else f"{name}-{size}": {"name": name, "size": size} for name in NETWORKS for size in SIZES
-} | {"eflowformer-twins": {"name": "eflowformer", "layers": 2, "attention": "twins"}}
+} | {
+    "eflowformer-twins": {"name": "eflowformer", "layers": 2, "attention": "twins"},
+    "eflowformer-quick": {"name": "eflowformer", **_QUICK},
+}
 """Names that ``eflow train --model`` takes: every network in every size."""
 
 __all__ = [

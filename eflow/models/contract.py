@@ -27,15 +27,12 @@ class FlowPrediction:
     has_match : flows[0] is the matching layer's field, not the refinement's.
     low : (N, 2, H/8, W/8) final low-resolution flow in units of low-resolution px, for a
     warm start; None where there is none.
-    backward_match : (N, 2, H/8, W/8) the same volume's match t -> t - Δ direction (new to
-    old), low-resolution px; or None.
     """
 
     flows: list[Tensor]
     kind: str = "sequence"
     has_match: bool = False
     low: Tensor | None = None
-    backward_match: Tensor | None = None
 
     @property
     def flow(self) -> Tensor:

@@ -3,15 +3,19 @@ features and a supervised matching layer."""
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from eflow.config import EFlowFormerConfig
 from eflow.models.contract import initialise
 from eflow.models.eraft import Eraft
+from eflow.models.unets import Consensus, Residual, double
 from eflow.ops.attention import ConditionalPosition, GlobalAttention, WindowAttention, sine_position
+from eflow.ops.correlation import channels_of, pixel_grid
 from eflow.ops.upsample import bilinear_upsample
 
 LAYERS = {"base": 4, "small": 2, "tiny": 1}
@@ -74,24 +78,75 @@ class EnhancementLayer(nn.Module):
         return x + self.mlp_cross(x)
 
 
+class QuickContext(nn.Module):
+    """A U-Net of one more scale over both windows' features at 1/8 and the correlation round zero flow: state and
+    context of the GRU, and a flow of its own. An affine field fitted at the coarsest scale carries motion to where no
+    events are (:class:`~eflow.models.unets.Consensus`)."""
+
+    def __init__(self, features: int, taps: int, hidden: int):
+        super().__init__()
+        seen, deep = 3 * features, 2 * features
+        self.cost = nn.Conv2d(taps, features, 1)
+        self.down = nn.Conv2d(seen, deep, 3, 2, 1)
+        self.deep = nn.Sequential(Residual(deep), Consensus(deep), Residual(deep))
+        self.up = nn.Conv2d(deep + seen, 2 * hidden, 3, padding=1)
+        self.context, self.flow = (nn.Conv2d(2 * hidden, c, 3, padding=1) for c in (2 * hidden, 2))
+
+    def forward(self, old: Tensor, new: Tensor, taps: Tensor) -> tuple[Tensor, Tensor]:
+        """Features (N, C, h, w) and taps (N, taps, h, w) -> (N, 2 hidden, h, w) and flow (N, 2, h, w), px of 1/8."""
+        seen = torch.cat([new, old, F.relu(self.cost(taps))], 1)
+        deep = self.deep(F.relu(self.down(seen)))
+        # Half of an odd size is rounded up: what is beyond is cut.
+        deep = double(deep)[..., : seen.shape[-2], : seen.shape[-1]]
+        both = F.relu(self.up(torch.cat([deep, seen], 1)))
+        return self.context(both), self.flow(both).float()
+
+
 class EFlowFormer(Eraft):
-    """With ``layers=0`` and ``init="zero"`` it is E-RAFT, parameter names included."""
+    """With ``layers=0`` and ``init="zero"`` it is E-RAFT, parameter names included. With ``quick`` it keeps the
+    correlation, the layers (none unless ``layers`` says so) and the GRU, and has cheaper encoders and another start."""
 
     Config = EFlowFormerConfig
 
     def __init__(self, config: EFlowFormerConfig):
         super().__init__(config)
-        count = LAYERS[config.size] if config.layers is None else config.layers
+        count = config.layers
+        if count is None:
+            count = 0 if config.quick else LAYERS[config.size]
         dim = self.widths.features
         self.layers = nn.ModuleList([EnhancementLayer(dim, config.attention == "twins") for _ in range(count)])
         self.norm = nn.LayerNorm(dim) if count else None
         self.log_prior = self.log_gain = None
-        if config.init == "match" and config.match_prior is not None:
+        self.project = None
+        if config.quick:
+            self.project = nn.Conv2d(self.widths.trunk[-1], dim, 1)
+            initialise(self.project)
+            nn.init.normal_(self.context.flow.weight, std=1e-3)  # its flow is near zero at the start
+        elif config.init == "match" and config.match_prior is not None:
             # Each displacement of match_prior cells costs half a unit of the logit: 1 / (2 sigma^2).
             # Logits of features that know nothing yet differ by 1; the gain makes them small beside the prior.
             self.log_prior = nn.Parameter(torch.tensor(-math.log(2 * config.match_prior**2) / RATE))
             self.log_gain = nn.Parameter(torch.tensor(math.log(START_GAIN) / RATE))
         initialise(self.layers)
+
+    def encoders(self) -> tuple[nn.Module, nn.Module]:
+        if not self.config.quick:
+            return super().encoders()
+        w = self.widths
+        widths = itertools.pairwise((self.config.input.bins, *w.trunk))
+        layers = [part for a, b in widths for part in (nn.Conv2d(a, b, 3, 2, 1), nn.ReLU(inplace=True))]
+        return nn.Sequential(*layers), QuickContext(w.trunk[-1], channels_of(w.levels, w.radius), w.hidden)
+
+    def encode(self, batch: dict) -> tuple:
+        if self.project is None:
+            return super().encode(batch)
+        both = self.features(torch.cat([batch["old"], batch["new"]]))
+        correlation = self._correlation(*self.enhance(*self.project(both).chunk(2)))
+        old, new = both.chunk(2)
+        still = pixel_grid(*old.shape[-2:], old).expand(len(old), -1, -1, -1)
+        seen, flow = self.context(old, new, correlation.lookup(still))
+        first, warm = bilinear_upsample(flow) if self.training else None, batch.get("flow_init")
+        return correlation, seen, flow if warm is None else warm, first
 
     def enhance(self, f1: Tensor, f2: Tensor) -> tuple[Tensor, Tensor]:
         if not len(self.layers):
@@ -110,9 +165,6 @@ class EFlowFormer(Eraft):
         # matched * 0 keeps the matching layer in the graph, so that all parameters have a gradient.
         return (matched if warm is None else matched * 0 + warm), bilinear_upsample(matched) if self.training else None
 
-    def backward(self, correlation) -> Tensor | None:
-        return correlation.match_backward(*self._prior()) if self.want_backward else None
-
     def _prior(self) -> tuple[Tensor | None, Tensor | None]:
         """Return the cost of a displacement and the gain of the logits, both learnt: without them the softmax of
         features that know nothing yet is flat, and its expectation the middle of the image, far worse than no
@@ -121,6 +173,3 @@ class EFlowFormer(Eraft):
             return None, None
         # Logarithms keep both positive.
         return (RATE * self.log_prior.float()).exp(), (RATE * self.log_gain.float()).exp()
-
-    want_backward = False
-    """True: the prediction carries ``backward_match`` (a second softmax over the same volume)."""

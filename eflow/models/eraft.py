@@ -189,8 +189,7 @@ class Eraft(FlowModel):
         unseen = max(config.iterations - config.train_iterations, 0)
         self._most = unseen if config.burn_in is None else config.burn_in
         self.representation = VoxelGrid(config.input.bins, config.input.normalise, config.input.bounds)
-        self.features = Trunk(config.input.bins, w.trunk, w.features, "instance")
-        self.context = Trunk(config.input.bins, w.trunk, 2 * w.hidden, config.context_norm)
+        self.features, self.context = self.encoders()
         self.update = Update(channels_of(w.levels, w.radius), w.hidden)
         self.plain = False
         initialise(self)
@@ -200,16 +199,13 @@ class Eraft(FlowModel):
     def forward(self, batch: dict) -> FlowPrediction:
         """Optional ``batch["flow_init"]`` (N, 2, H/8, W/8): warm start, low-resolution px."""
         self.check_input(batch)
-        # Shared weights: both windows go through in one batch.
-        f1, f2 = self.enhance(*self.features(torch.cat([batch["old"], batch["new"]])).chunk(2))
+        correlation, seen, flow, first = self.encode(batch)
         # One network gives the GRU's first state and its context.
-        h, c = self.context(batch["new"]).chunk(2, 1)
+        h, c = seen.chunk(2, 1)
         h, c = torch.tanh(h), F.relu(c)
-        correlation = self._correlation(f1, f2)
-        flow, first = self.start(correlation, batch.get("flow_init"), f1)
         flows = [] if first is None or not self.training else [first]
 
-        grid = pixel_grid(*f1.shape[-2:], f1)
+        grid = pixel_grid(*h.shape[-2:], h)
         context = c if self.plain else self.update.gru.prepare(c)
         iterations = self.config.train_iterations if self.training else self.config.iterations
         h, flow = self._burn_in(h, flow, context, correlation, grid) if self.training else (h, flow)
@@ -234,7 +230,6 @@ class Eraft(FlowModel):
             flows if self.training else flows[-1:],
             has_match=self.training and first is not None,
             low=flow,
-            backward_match=self.backward(correlation),
         )
 
     @torch.no_grad()
@@ -256,6 +251,22 @@ class Eraft(FlowModel):
 
     # ---- what E-FlowFormer changes -------------------------------------------------------------------------------
 
+    def encoders(self) -> tuple[nn.Module, nn.Module]:
+        """Make what gives the features that are compared, and what gives state and context."""
+        bins, w = self.config.input.bins, self.widths
+        return (
+            Trunk(bins, w.trunk, w.features, "instance"),
+            Trunk(bins, w.trunk, 2 * w.hidden, self.config.context_norm),
+        )
+
+    def encode(self, batch: dict) -> tuple:
+        """Return the correlation, state and context (N, 2 hidden, h, w) before their activations, and :meth:`start`'s
+        two fields."""
+        # Shared weights: both windows go through in one batch.
+        f1, f2 = self.enhance(*self.features(torch.cat([batch["old"], batch["new"]])).chunk(2))
+        correlation = self._correlation(f1, f2)
+        return correlation, self.context(batch["new"]), *self.start(correlation, batch.get("flow_init"), f1)
+
     def enhance(self, f1: Tensor, f2: Tensor) -> tuple[Tensor, Tensor]:
         return f1, f2
 
@@ -264,9 +275,6 @@ class Eraft(FlowModel):
         n, _, h, w = like.shape
         zero = torch.zeros(n, 2, h, w, device=like.device, dtype=torch.float32)
         return (zero if warm is None else zero + warm), None
-
-    def backward(self, correlation) -> Tensor | None:
-        return None
 
     def _correlation(self, f1: Tensor, f2: Tensor):
         tokens = f1.shape[-1] * f1.shape[-2]

@@ -85,11 +85,6 @@ class DenseCorrelation:
         _, h, w = self.shape
         return expected_flow(self.volume, h, w, prior, gain)
 
-    def match_backward(self, prior: Tensor | None = None, gain: Tensor | None = None) -> Tensor:
-        """The same volume's match from f2's pixels to f1, at no further product."""
-        _, h, w = self.shape
-        return expected_flow(self.volume.transpose(1, 2), h, w, prior, gain)
-
 
 class OnDemandCorrelation:
     """No volume: memory linear in the number of tokens, arithmetic per lookup (2r+2)^2 dot products per token and
@@ -133,12 +128,8 @@ class OnDemandCorrelation:
             return torch.cat(rows, 1).view(n, h, w, -1).permute(0, 3, 1, 2)
 
     def match(self, prior: Tensor | None = None, gain: Tensor | None = None) -> Tensor:
-        return self._match(self.f1, self.levels[0].flatten(2), prior, gain)
-
-    def match_backward(self, prior: Tensor | None = None, gain: Tensor | None = None) -> Tensor:
-        return self._match(self.levels[0].flatten(2).transpose(1, 2), self.f1.transpose(1, 2), prior, gain)
-
-    def _match(self, source: Tensor, target: Tensor, prior: Tensor | None, gain: Tensor | None) -> Tensor:
+        """As :meth:`DenseCorrelation.match`."""
+        source, target = self.f1, self.levels[0].flatten(2)
         n, h, w = self.shape
         with fp32(source):
             parts = [

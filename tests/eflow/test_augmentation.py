@@ -53,12 +53,19 @@ def test_on_voxels_they_are_exact(rectified):
         close(of(s.flip("y")), before[..., ::-1, :])
         close(of(s.invert()), -before)
         close(of(s.reverse()), -before[::-1, ::-1])
+        turned = s.transpose()
+        close(np.stack([grid(w, W, H) for w in (turned.old, turned.new)]), before.swapaxes(-1, -2))
 
 
 def test_flow_follows():
     s = sample()
     np.testing.assert_array_equal(s.flip("x").flow, s.flow[:, ::-1] * np.float32([-1, 1]))
     np.testing.assert_array_equal(s.flip("y").flow, s.flow[::-1] * np.float32([1, -1]))
+    turned = s.transpose()
+    assert (turned.height, turned.width) == (W, H)
+    np.testing.assert_array_equal(turned.flow[3, 5], s.flow[5, 3, ::-1])
+    np.testing.assert_array_equal(turned.valid, s.valid.T)
+    np.testing.assert_array_equal(turned.transpose().flow, s.flow)
     assert s.invert().flow is s.flow
     r = s.reverse()
     np.testing.assert_array_equal(r.flow, s.backward)  # the backward flow, not minus the forward flow

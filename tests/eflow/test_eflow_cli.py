@@ -16,6 +16,7 @@ from shared_data import shared  # noqa: E402
 
 import eflow  # noqa: E402
 from blinkgl.io.formats import write_events  # noqa: E402
+from blinkgl.types.events import Events  # noqa: E402
 from eflow import checkpoint as ckpt, infer, submit  # noqa: E402
 from eflow.cli import run  # noqa: E402
 from eflow.models import build_model, model_config  # noqa: E402
@@ -271,9 +272,41 @@ def test_submit_blinkflow(network, tmp_path, full, capsys):
 def test_a_silent_window(network, tmp_path, capsys):
     events = moving_events(64, 64, 0, SPAN)
     late = moving_events(64, 64, 3 * SPAN, 4 * SPAN)
-    from blinkgl.types.events import Events
-
     write_events(tmp_path / "e.npz", Events.concatenate([events, late]), 64, 64)
     assert run(["predict", network, str(tmp_path / "e.npz")]) == 2
     assert "no events in the" in capsys.readouterr().err
     assert run(["predict", network, str(tmp_path / "e.npz"), "--empty", "zero"]) == 0
+
+
+@pytest.mark.parametrize(
+    "name, options, said",
+    [
+        ("none", [], "holds no events"),
+        ("none", ["--whole"], "fewer than two events"),
+        ("one", [], "shorter than a window of 100 ms"),
+        ("one", ["--whole"], "fewer than two events"),
+        ("one", ["--window-ms", "auto"], "no events where they are looked for; expected a length instead of auto"),
+        ("jump", ["--window-ms", "auto"], "no events where they are looked for"),
+        ("jump", ["--empty", "zero", "--no-sharpen"], "event times jump by 3.6e+09 s; expected --end-ms before"),
+        ("pixel", [], None),
+        ("pixel", ["--whole"], None),
+        ("pixel", ["--window-ms", "auto"], None),
+    ],
+)
+def test_recordings_with_little_in_them(network, tmp_path, capsys, name, options, said):
+    """Each gives flow, or one line and exit status 2."""
+    some = moving_events(64, 72, 0, 90_000, n=400)  # so few that no line is said of their rate
+    later = Events(some.x, some.y, some.t + 3600 * 10**12, some.p)
+    made = {
+        "none": some.part(slice(0, 0)),
+        "one": some.part(slice(0, 1)),
+        "jump": Events.concatenate([some, later]),
+        "pixel": Events(np.full_like(some.x, 5), np.full_like(some.y, 6), some.t * 2, some.p),
+    }[name]
+    write_events(tmp_path / "e.npz", made, 64, 72)
+    assert run(["predict", network, str(tmp_path / "e.npz"), *options]) == (0 if said is None else 2)
+    printed = capsys.readouterr()
+    if said is None:
+        assert "mean speed" in printed.out
+    else:
+        assert said in printed.err and printed.err.startswith("error: ") and printed.err.count("\n") == 1

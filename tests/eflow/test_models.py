@@ -1,6 +1,7 @@
 """The networks: size and arithmetic as published, the equalities between them, and what they refuse."""
 
 import math
+import re
 
 import pytest
 
@@ -12,7 +13,7 @@ from blinkgl.errors import BlinkGLError  # noqa: E402
 from eflow.config import LossConfig  # noqa: E402
 from eflow.infer import predict  # noqa: E402
 from eflow.metrics import pixel_error, sequence_loss  # noqa: E402
-from eflow.models import NETWORKS, SIZES, FlowPrediction, build_model, model_config, parameters_of  # noqa: E402
+from eflow.models import NETWORKS, SIZES, FlowPrediction, build_model, model_config, parameters_of, preset  # noqa: E402
 from eflow.models.unets import Consensus  # noqa: E402
 
 
@@ -97,6 +98,27 @@ def test_fast_path_equals_the_raft_style_twin_and_on_demand_correlation(name):
     assert (fast - on_demand).abs().max() < 1e-3
 
 
+def test_the_quick_eflowformer_trains_every_parameter_from_a_flow_of_its_own():
+    """Its first field is the U-Net's; sizes of an odd number of cells and no volume in memory change nothing."""
+    torch.manual_seed(0)
+    model = build_model(model_config(preset("eflowformer-quick"))).train()
+    batch = batch_for(model, 1, 72, 88)
+    prediction = model(batch)
+    assert prediction.has_match and [f.shape for f in prediction.flows] == [(1, 2, 72, 88)] * 3
+    sequence_loss(prediction, torch.ones(1, 2, 72, 88), torch.ones(1, 72, 88, dtype=torch.bool)).backward()
+    assert not [n for n, p in model.named_parameters() if p.grad is None or not p.grad.abs().max() > 0]
+    loud(model)
+    dense = predict(model, batch).flow
+    model.plain = True
+    plain = predict(model, batch).flow
+    model.plain, model.config = False, model.config.model_copy(update={"correlation": "on_demand"})
+    assert (dense - plain).abs().max() < 1e-3 and (dense - predict(model, batch).flow).abs().max() < 1e-3
+    started = predict(model, {**batch, "flow_init": torch.full((1, 2, 9, 11), 5.0)}).flow
+    assert (started - dense).mean() > 20, "a warm start takes the place of its own"
+    with torch.device("meta"):
+        assert parameters_of(build_model(model_config(preset("eflowformer-quick")))) < 1.8e6
+
+
 def loud(model) -> None:
     """Freshly initialised heads say next to nothing; give them a voice."""
     torch.manual_seed(9)
@@ -148,9 +170,12 @@ def test_spikes_reset_to_zero_and_pass_gradients_where_they_fired():
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_sizes_of_every_network(name):
-    """tiny about a million parameters, and each size takes its smallest input and answers at its size."""
+    """tiny about a million parameters, as many as the configuration says, and it takes its smallest input and answers
+    at its size."""
     with torch.device("meta"):
         parameters = [parameters_of(build(name=name, size=size)) for size in SIZES]
+    said = NETWORKS[name].Config.model_fields["size"].description
+    assert re.findall(r"[0-9.]+ M", said) == [f"{n / 1e6:.2f} M" for n in parameters]
     assert parameters[0] > parameters[1] > parameters[2] and 0.8e6 < parameters[2] < 1.6e6
     model = build(name=name, size="tiny")
     assert predict(model, batch_for(model, 1, model.least, model.least + 4)).flow.shape[-2:] == (

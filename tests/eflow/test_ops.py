@@ -68,7 +68,6 @@ def test_matching_dense_equals_on_demand_equals_the_definition(maps):
     expected = (volume.softmax(-1) @ grid[0].T).transpose(1, 2).view(2, 2, h, w) - grid.view(1, 2, h, w)
     for flow in (dense.match(), on_demand.match()):
         assert (flow - expected).abs().max() < 1e-4
-    assert (dense.match_backward() - on_demand.match_backward()).abs().max() < 1e-4
 
 
 def test_convex_upsampling_equals_its_twin_and_keeps_constants():

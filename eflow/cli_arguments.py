@@ -1,0 +1,168 @@
+"""What the ``eflow`` commands take: options that several of them share, and from words to values."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from blinkgl.errors import ConfigError
+from eflow.methods.table import METHODS, make_method
+
+if TYPE_CHECKING:
+    from eflow.config import SourceConfig
+
+Precision = Annotated[str, typer.Option(help="fp32, or bf16 (autocast with fp32 islands).")]
+Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
+Answer = Annotated[
+    str,
+    typer.Argument(
+        help="Run folder, checkpoint folder or .safetensors file; or a network that comes with the package (eflow "
+        f"models); or a method that needs no training: {', '.join(METHODS)}."
+    ),
+]
+Network = Annotated[
+    str,
+    typer.Argument(
+        help="Run folder, checkpoint folder or .safetensors file; or a network that comes with the package (eflow "
+        "models)."
+    ),
+]
+Focal = Annotated[
+    float | None, typer.Option(min=1e-3, help="Focal length in px: contrast-rotation needs it.", show_default=False)
+]
+Overrides = Annotated[
+    list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")
+]
+WindowMs = Annotated[
+    str | None,
+    typer.Option(metavar="LOW-HIGH", help="Of a recipe: lengths of windows; default: its label interval."),
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
+Raw = Annotated[bool, typer.Option("--raw", help="The last weights instead of the averaged ones.")]
+Iterations = Annotated[int | None, typer.Option(min=1, help="GRU iterations, where the network has them.")]
+
+Dataset = Annotated[
+    str,
+    typer.Argument(
+        help="Folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences, or of rendered windows; or a recipe (.yaml), "
+        "whose groups of split test are rendered for it."
+    ),
+]
+Protocol = Annotated[
+    str, typer.Option(help="MVSEC: which frames and rows are scored: all, ste-flownet or e-raft (20 Hz).")
+]
+GroundTruth = Annotated[
+    str | None,
+    typer.Option(
+        "--ground-truth",
+        help="MVSEC: propagated through the 20 Hz flow, or one field scaled; default: the protocol's.",
+    ),
+]
+Sharpened = Annotated[
+    bool, typer.Option("--sharpen", help="A network's flow as long as makes the events of its windows sharpest.")
+]
+Span = Annotated[
+    str,
+    typer.Option("--window-ms", help="Δ: length of each of the two windows; auto: as things move by about 5 px in it."),
+]
+Whole = Annotated[
+    bool, typer.Option("--whole", help="One flow: all of the file as one window, or its halves as a pair.")
+]
+Truth = Annotated[str | None, typer.Option(help="Ground truth of the flow (.npy, .png, .flo): prints AEE and cosine.")]
+WarmStart = Annotated[bool, typer.Option("--warm-start", help="Start each window's refinement from the last flow.")]
+Sharpen = Annotated[
+    bool,
+    typer.Option(help="A network's flow as long as makes the events of its windows sharpest; else as it says."),
+]
+
+
+def method_named(name: str, focal: float | None, **network: object):
+    """Return the method of that name, unless a file has it; None for a network's.
+
+    network : options that only networks have; with a method, a value that is set is a ConfigError."""
+    if name not in METHODS or Path(name).exists():
+        if focal is not None:
+            raise ConfigError("only a method takes it", where="--focal", value=focal, accepted=", ".join(METHODS))
+        return None
+    for option, value in network.items():
+        if value:
+            raise ConfigError(f"{name} is no network", where="--" + option.replace("_", "-"), value=value)
+    return make_method(name, focal)
+
+
+def network_of(checkpoint: str, device: str, raw: bool, precision: str, iterations: int | None = None):
+    """Return the trained network on its device. Raises ConfigError: an option that it, or this machine, has not."""
+    import torch
+
+    from eflow.allocator import keep_memory
+    from eflow.checkpoint import load_model
+
+    one_of("--precision", precision, ("fp32", "bf16"))
+    one_of("--device", device, ("auto", "cpu", "cuda"))
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("no CUDA device on this machine", where="--device", value=device, accepted="cpu or auto")
+    keep_memory()
+    model = load_model(checkpoint, averaged=not raw)
+    if iterations is not None:
+        if not hasattr(model.config, "iterations"):
+            raise ConfigError("this network has no iterations", where="--iterations", value=model.config.name)
+        model.config = model.config.model_copy(update={"iterations": iterations})
+    return model.to("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def precision_for(model, wanted: str) -> str:
+    """Return fp32 where bf16 is wanted of a device without it."""
+    from eflow.precision import precision_on
+
+    return precision_on(next(model.parameters()).device, wanted)
+
+
+def known_format(name: str) -> str:
+    """Return the name of a data set's layout. Raises ConfigError."""
+    from eflow.data.sources import FORMATS
+
+    one_of("--format", name, ("auto", *FORMATS))
+    return name
+
+
+def one_of(option: str, value: str, accepted: tuple[str, ...]) -> None:
+    """Raises ConfigError where the value is not among those accepted."""
+    if value not in accepted:
+        raise ConfigError("unknown choice", where=option, value=value, accepted=", ".join(accepted))
+
+
+def rendered(recipe: str, window_ms: str | None, limit: int | None):
+    """Return samples of a recipe, held in memory."""
+    from eflow.data.online import held
+
+    return held(windows_of(recipe, window_ms, samples=4, min_events=40, max_flow=40.0), limit or 128)
+
+
+def windows_of(recipe: str, window_ms: str | None, **how) -> SourceConfig:
+    """Return the online source of a recipe, as a command line asks for it."""
+    from blinkgl.config.problems import validate
+    from eflow.config import SourceConfig
+
+    tree: dict = {"recipe": recipe, "online": True, **how}
+    if window_ms is not None:
+        ends = window_ms.split("-")
+        try:
+            tree["window_ms"] = tuple(float(end) for end in (ends if len(ends) > 1 else 2 * ends))
+            validate(SourceConfig, tree)
+        except (ValueError, ConfigError):
+            raise ConfigError(
+                "not lengths of windows", where="--window-ms", value=window_ms, accepted="LOW-HIGH in ms, such as 5-100"
+            ) from None
+    return validate(SourceConfig, tree)
+
+
+def size_of(text: str | None) -> tuple[int, int] | None:
+    """Return (480, 640) for "640x480". Raises ConfigError."""
+    if text is None:
+        return None
+    width, x, height = text.lower().partition("x")
+    if not (x and width.isdigit() and height.isdigit() and 0 < int(width) < 65536 and 0 < int(height) < 65536):
+        raise ConfigError("not a size", where="--size", value=text, accepted="WIDTHxHEIGHT, e.g. 640x480")
+    return int(height), int(width)

@@ -14,6 +14,7 @@ from blinkgl.config.events import V2eConfig, VoltmeterConfig
 from blinkgl.events import V2e, make_emulator, v2e_model as v2e
 from blinkgl.events.noise import noise_size
 from tests.events.clips import run
+from tests.events.noise_laws import shot_rate
 
 MS = 10**6
 QUIET = dict(threshold_sigma=0.0, leak_rate_hz=0.0, shot_noise_rate_hz=0.0, refractory_us=0.0)
@@ -255,3 +256,19 @@ def test_the_voltmeters_mean_is_theirs():
     theirs = GOLDEN["voltmeter_mean"]
     assert abs(found - theirs).mean() < 0.01
     assert found.sum() / theirs.sum() == pytest.approx(1, abs=0.002)
+
+
+def test_the_first_shot_noise_comes_after_as_long_as_any_other():
+    """Blocks of pixels share a clock, whose first interval begins at the first frame."""
+    height, width, t_ns = 200, 320, 50 * MS
+    light = np.full((height, width), 0.4, np.float32)
+    asked = 31 / (height * width * t_ns * 1e-9)  # half an event a block
+    counts = []
+    for seed in range(12):
+        emulator = make_emulator(
+            V2eConfig(**{**QUIET, "shot_noise_rate_hz": asked}, cutoff_hz=0.0), height, width, seed
+        )
+        emulator.step(light, 0)
+        counts.append(len(emulator.step(light, t_ns)))
+    expected = 12 * 31 * shot_rate(1.0, 0.4)
+    assert abs(sum(counts) - expected) < 4 * np.sqrt(expected)

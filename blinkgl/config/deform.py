@@ -6,7 +6,7 @@ Lengths are in parts of the mesh's own size, so that one setting suits any mesh.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
@@ -168,7 +168,7 @@ class AnimationConfig(Config):
     phase: float = Field(0.0, ge=-1e6, le=1e6, description="s of the clip at time 0")
     loop: bool = Field(True, description="begins again at its end; false: held before its first and after its last key")
 
-    removed: ClassVar = {
+    removed: ClassVar[Any] = {
         "blend": Removed("one clip; mix two in Blender and export the mixture", lambda value: value is None),
         "share": Removed("no share: two clips are no longer mixed", lambda value: value in (0.5, None)),
     }

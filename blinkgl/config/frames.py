@@ -3,7 +3,7 @@ TartanAir's, instead of from a scene."""
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -53,7 +53,7 @@ class FramesConfig(Config):
         description="99th percentile of the given flow, px, above which frames are too far apart to interpolate and "
         "their sequence is set aside; null: no check",
     )
-    removed: ClassVar = {
+    removed: ClassVar[Any] = {
         "qualify": Removed("max_displacement", lambda value: value is None or isinstance(value, dict)),
         "factor": Removed("no factor: it was of interpolate: cubic, which is gone", lambda value: value == 4),
         "backward": Removed("no flow back: nothing reads it", lambda value: value is None),

@@ -62,7 +62,7 @@ class LabelsConfig(Growing):
 
     settings : keys that are no label's name."""
 
-    settings: ClassVar = ("events", "pixels", "flow", "float_flow", "occlusion")
+    settings: ClassVar[Any] = ("events", "pixels", "flow", "float_flow", "occlusion")
     events: bool = Field(
         False,
         description="what made each event: instance, depth and image velocity of the surface, and the cause "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field
 
@@ -81,7 +81,7 @@ class EnvironmentConfig(Config):
     )
     heading: float = Field(0.0, ge=-360, le=360, description="degrees by which it is turned from +x towards +y")
     visible: bool = Field(True, description="whether it is drawn, as a sky at infinity")
-    removed: ClassVar = {"size": Removed("no size: a panorama is at infinity", lambda value: value == 100)}
+    removed: ClassVar[Any] = {"size": Removed("no size: a panorama is at infinity", lambda value: value == 100)}
 
 
 class LightConfig(Config):
@@ -152,11 +152,11 @@ class RandomLightsConfig(Config):
         ("point", "spot"), description="each light is one of these, all as likely"
     )
     strength: PositiveRange = Field((3.0, 30.0), description="of point and spot lights, see light.lights; log-uniform")
-    sun_strength: ClassVar = (0.1, 0.6)
+    sun_strength: ClassVar[Any] = (0.1, 0.6)
     """Of further suns; log-uniform."""
-    saturation: ClassVar = 0.5
+    saturation: ClassVar[Any] = 0.5
     """How colourful they are at most; the brightest channel is 1 and all hues are as likely."""
-    fixed: ClassVar = ("sun_strength", "saturation")
+    fixed: ClassVar[Any] = ("sun_strength", "saturation")
     height: PositiveRange = Field((2.0, 6.0), description="above the ground, m; uniform")
     angle: PositiveRange = Field((30.0, 100.0), description="of a spot light's cone, degrees; uniform")
 

@@ -49,9 +49,9 @@ class ImuConfig(Config):
     accelerometer_random_walk: float = Field(0.0, **_NOISE, description="of the bias, m/s³/√Hz")
     gyroscope_noise_density: float = Field(0.0, **_NOISE, description="white noise, rad/s/√Hz")
     gyroscope_random_walk: float = Field(0.0, **_NOISE, description="of the bias, rad/s²/√Hz")
-    accelerometer_bias: ClassVar = (0.0, 0.0, 0.0)
-    gyroscope_bias: ClassVar = (0.0, 0.0, 0.0)
-    fixed: ClassVar = ("accelerometer_bias", "gyroscope_bias")
+    accelerometer_bias: ClassVar[Any] = (0.0, 0.0, 0.0)
+    gyroscope_bias: ClassVar[Any] = (0.0, 0.0, 0.0)
+    fixed: ClassVar[Any] = ("accelerometer_bias", "gyroscope_bias")
 
     @property
     def noisy(self) -> bool:

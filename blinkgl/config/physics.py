@@ -13,7 +13,7 @@ scene:
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
@@ -91,7 +91,7 @@ class BodyConfig(Config):
         (0.0, 0.0, 0.0), description="angular velocity at the start about the world's axes, deg/s"
     )
 
-    removed: ClassVar = {"shape": Removed("the mesh's own hull, box or ball", lambda value: value == "auto")}
+    removed: ClassVar[Any] = {"shape": Removed("the mesh's own hull, box or ball", lambda value: value == "auto")}
 
     @rule("kind", "velocity", "spin")
     def _only_what_moves_has_a_velocity(kind, velocity, spin):

@@ -3,7 +3,7 @@ and its clock. In this order; what is not said is not there."""
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from pydantic import Field
 
@@ -74,7 +74,7 @@ class ReadoutConfig(Config):
     """The bus between pixels and time stamps; see :mod:`blinkgl.events.camera`. Before it the pixels' own noise:
     :mod:`blinkgl.events.pixels`."""
 
-    removed: ClassVar = {
+    removed: ClassVar[Any] = {
         "filters": Removed("events filtered after they were written", lambda value: not value),
         "latency": Removed("the key left out: v2e's cutoff_hz makes events late", lambda value: value is None),
     }

@@ -7,7 +7,7 @@ whether they exist; the models here only know shapes, units and limits.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
@@ -71,11 +71,11 @@ class PoolConfig(Config):
         "z for obj, ply, stl. Resting objects stand on it",
     )
     max_faces: int = Field(50_000, ge=1, le=50_000_000, description="a mesh with more triangles is refused")
-    removed: ClassVar = {
+    removed: ClassVar[Any] = {
         "urdfs": Removed("folders: [...]", lambda value: value in (False, "auto")),
     }
-    max_file_mb: ClassVar = 512.0
-    fixed: ClassVar = ("max_file_mb",)
+    max_file_mb: ClassVar[Any] = 512.0
+    fixed: ClassVar[Any] = ("max_file_mb",)
     test_fraction: Fraction = Field(0.1, description="fraction of meshes kept for split 'test', chosen by content hash")
     keep_materials: bool = Field(False, description="use the meshes' own colours and textures where they have any")
     animation: Literal["random", "rest"] = Field(
@@ -142,9 +142,9 @@ class RegionConfig(Config):
 
     width: float = Field(30.0, gt=0, le=1e6, description="edge in x and y, m")
     height: float = Field(8.0, gt=0, le=1e6, description="m")
-    camera_height: ClassVar = (1.0, 3.5)
+    camera_height: ClassVar[Any] = (1.0, 3.5)
     """m, the camera's first height above the ground; uniform."""
-    fixed: ClassVar = ("camera_height",)
+    fixed: ClassVar[Any] = ("camera_height",)
 
 
 class RandomSceneConfig(Config):
@@ -169,7 +169,7 @@ class RandomSceneConfig(Config):
         0.3, gt=0, le=1e4, description="radius of the sphere round the camera centre that touches nothing, m"
     )
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
-    removed: ClassVar = {
+    removed: ClassVar[Any] = {
         "walls": Removed(
             "a scene: {kind: explicit} with objects of category: wall",
             lambda value: value is False or (isinstance(value, dict) and not value.get("count")),
@@ -227,9 +227,9 @@ class MeshConfig(Config):
         "(x, y, z) is drawn at (x, -z, y). auto: y for glb and gltf, as their standard says; z (the file's own "
         "coordinates) for obj, ply, stl",
     )
-    project_uvs: ClassVar = False
-    uv_size: ClassVar = 1.0
-    fixed: ClassVar = ("project_uvs", "uv_size")
+    project_uvs: ClassVar[Any] = False
+    uv_size: ClassVar[Any] = 1.0
+    fixed: ClassVar[Any] = ("project_uvs", "uv_size")
 
     @rule("primitive", "file")
     def _one(primitive, file):
@@ -349,8 +349,8 @@ class ExplicitSceneConfig(Config):
     light: LightConfig = LightConfig()
     fog: FogConfig | None = FOG
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
-    max_faces: ClassVar = 5_000_000
-    fixed: ClassVar = ("max_faces",)
+    max_faces: ClassVar[Any] = 5_000_000
+    fixed: ClassVar[Any] = ("max_faces",)
 
     @rule("objects.*.mesh", "#meshes")
     def _meshes_are_known(used, known):
@@ -415,9 +415,9 @@ class FileSceneConfig(Config):
         description="factor on the file's lights, whose lux and candela are divided by 683 lm/W, as Blender's exporter "
         "multiplies them",
     )
-    max_faces: ClassVar = 5_000_000
-    max_texture_size: ClassVar = 2048
-    fixed: ClassVar = ("max_faces", "max_texture_size")
+    max_faces: ClassVar[Any] = 5_000_000
+    max_texture_size: ClassVar[Any] = 2048
+    fixed: ClassVar[Any] = ("max_faces", "max_texture_size")
 
     @rule("lights", "light.unlit")
     def _lit(lights, unlit):

@@ -155,7 +155,7 @@ class RenderConfig(Config):
         le=8,
         description="added to the mip level that is looked up, log2: -1 is sharper by 2, and aliases more",
     )
-    removed: ClassVar = {
+    removed: ClassVar[Any] = {
         "lod": Removed(
             "meshes that are as fine as you want them drawn",
             lambda value: isinstance(value, dict) and value.get("enabled", False) is False,
@@ -168,9 +168,9 @@ class PreviewConfig(Config):
 
     enabled: bool = Field(True, description="false: no preview")
     rate: float = Field(30.0, gt=0, le=1e4, description="pictures per second of simulated time, Hz")
-    slowdown: ClassVar = 2.0
+    slowdown: ClassVar[Any] = 2.0
     """Play-back is this many times slower than the simulation."""
-    fixed: ClassVar = ("slowdown",)
+    fixed: ClassVar[Any] = ("slowdown",)
 
 
 def _file_name(name: str) -> str:

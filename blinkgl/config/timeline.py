@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -17,7 +17,7 @@ _NO_RECONSTRUCTION = {
 
 
 class _Timeline(Config):
-    removed: ClassVar = _NO_RECONSTRUCTION
+    removed: ClassVar[Any] = _NO_RECONSTRUCTION
 
 
 class UniformTimeline(_Timeline):
@@ -54,7 +54,7 @@ class DisplacementTimeline(_AdaptiveTimeline):
     """Event frames so far apart that pixels move no more than ``max_px`` from one to the next, by
     the speeds at both ends of the step."""
 
-    removed: ClassVar = {
+    removed: ClassVar[Any] = {
         **_NO_RECONSTRUCTION,
         "first_look": Removed("the key left out, or quality: fast for fewer frames", lambda value: value is False),
     }

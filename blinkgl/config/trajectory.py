@@ -107,6 +107,6 @@ class CameraMotion(MotionConfig):
     shake: float = Field(
         0.0, ge=0, le=30, description="hand shake on top: standard deviation of the rotation about each axis, deg"
     )
-    shake_rate: ClassVar = 8.0
+    shake_rate: ClassVar[Any] = 8.0
     """Shake impulses per second."""
-    fixed: ClassVar = ("shake_rate",)
+    fixed: ClassVar[Any] = ("shake_rate",)

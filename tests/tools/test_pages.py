@@ -1,4 +1,4 @@
-"""Every YAML block of the hand-written pages is a configuration that is accepted, alone or as a part of one."""
+"""Every YAML block of the hand-written pages is accepted, alone or as a part of a configuration; README's program runs."""
 
 from __future__ import annotations
 
@@ -88,3 +88,10 @@ def test_the_configuration_of_eflow_is_accepted(tmp_path):
     path = tmp_path / "train.yaml"
     path.write_text("model: {name: ev_flownet, size: tiny}\n" + text)
     load_train_config(path)
+
+
+def test_the_program_of_readme_runs():
+    (program,) = re.findall(r"^```python\n(.*?)^```", (REPOSITORY / "README.md").read_text("utf-8"), re.S | re.M)
+    names: dict = {}
+    exec(program, names)
+    assert len(names["events"]) > 1000 and names["flow"].shape[1:] == (240, 320, 2)

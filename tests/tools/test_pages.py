@@ -1,4 +1,4 @@
-"""Every YAML block of the hand-written pages is accepted, alone or as a part of a configuration; README's program runs."""
+"""Every YAML block of the hand-written pages is accepted, alone or as a part of a configuration; README runs."""
 
 from __future__ import annotations
 

@@ -2,8 +2,8 @@
 
     import blinkgl
 
-gives every name in ``__all__``, each by this one path; what lies in the rooms below may move. Names are loaded when
-they are first used, so that ``import blinkgl`` itself takes no time.
+provides every name in ``__all__``. Use only these paths; the modules below may move. Names are loaded when they are
+first used, so that ``import blinkgl`` itself is fast.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _HOMES = {
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 
-if TYPE_CHECKING:  # what a type checker and an editor see; a test compares it with the table
+if TYPE_CHECKING:  # for type checkers and editors; a test compares it with the table
     from blinkgl.errors import AssetError, BlinkGLError, ConfigError, EventDataError, GLError, OutputError
     from blinkgl.front.drawing import Renderer, render_frame
     from blinkgl.front.files import (
@@ -154,7 +154,7 @@ __all__ = [
 ]
 
 
-if not TYPE_CHECKING:  # a checker would take every misspelt name for one of these
+if not TYPE_CHECKING:  # hidden from type checkers, which would accept every misspelt name
 
     def __getattr__(name: str) -> Any:
         if name not in _HOME:

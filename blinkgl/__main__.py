@@ -1,4 +1,4 @@
-"""``python -m blinkgl`` is ``blinkgl``."""
+"""Run the ``blinkgl`` command by ``python -m blinkgl``."""
 
 from blinkgl.cli import main
 

@@ -1,10 +1,9 @@
-"""The ``blinkgl`` command: thin functions over the library, one line per error.
+"""The ``blinkgl`` command: thin functions over the library; each error is one line.
 
-Exit status: 0 done; 1 `shader diff` or `shader check` found something wrong; 2 the user's input or machine
-(``error: …`` on stderr, one line); 3 done but for sequences (`trade --suite`: scenes) that were set aside; 130
-interrupted. A traceback means a bug in BlinkGL, or ``--debug``. What a command does and prints is
-``blinkgl.show.COMMAND.run``, which returns the status; it is imported inside the function, so that ``--help`` answers
-at once.
+Exit status: 0 success; 1 `shader diff` or `shader check` found a problem; 2 an error of the user's input or machine
+(``error: …`` on stderr, one line); 3 success except for skipped sequences (`trade --suite`: scenes); 130 interrupted. A
+traceback means a bug in BlinkGL, or ``--debug``. ``blinkgl.show.COMMAND.run`` does the work, prints the output and
+returns the status; it is imported inside the function, so that ``--help`` is fast.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ def _global_options(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
     debug: Annotated[
-        bool, typer.Option("--debug", help="Show the traceback of an error; allowed after the command, too.")
+        bool, typer.Option("--debug", help="Show the traceback of an error; may also follow the command.")
     ] = False,
 ) -> None:
     """Event-camera and optical-flow data sets by rasterisation."""
@@ -50,8 +49,8 @@ def doctor(
     backend: Annotated[str, typer.Option(help="OpenGL backend to examine: auto, egl or osmesa.")] = "auto",
     device: Annotated[int, typer.Option(min=0, help="EGL device to examine.")] = 0,
 ) -> int:
-    """Say what this machine offers, what is missing, and the command that mends it. Exit
-    status 2 if something required is missing."""
+    """Report what this machine offers, what is missing, and the command that installs it. Exit status 2 if something
+    required is missing."""
     from blinkgl.show import doctor as command
 
     return command.run(backend, device, as_json)
@@ -59,7 +58,7 @@ def doctor(
 
 @app.command()
 def configs() -> int:
-    """List the runs that ship: their names stand wherever a command takes a YAML file."""
+    """List the shipped runs. Every command that takes a YAML file also takes their names."""
     from blinkgl.show import configs as command
 
     return command.run()
@@ -67,7 +66,7 @@ def configs() -> int:
 
 @app.command()
 def generate(
-    config: Annotated[str, typer.Argument(help="YAML file, or the name of one that ships (blinkgl configs).")],
+    config: Annotated[str, typer.Argument(help="YAML file, or the name of a shipped one (blinkgl configs).")],
     out: Annotated[
         str, typer.Option("--out", "-o", help="Folder for the data set; sequences go to OUT/SPLIT/NAME_000000 ….")
     ],
@@ -81,37 +80,38 @@ def generate(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no table.")] = False,
     workers: Annotated[
         int | None,
-        typer.Option("--workers", "-w", min=1, help="Processes to make sequences in (default: this one alone)."),
+        typer.Option("--workers", "-w", min=1, help="Processes that generate sequences (default: only this one)."),
     ] = None,
     executor: Annotated[str, typer.Option(help="Where workers run: local, or ray (extra [cluster]).")] = "local",
     address: Annotated[
         str | None,
-        typer.Option(
-            help="ray: address of a running cluster (default: RAY_ADDRESS, else one of its own on 127.0.0.1)."
-        ),
+        typer.Option(help="ray: address of a running cluster (default: RAY_ADDRESS, else a new one on 127.0.0.1)."),
     ] = None,
-    gpus: Annotated[float, typer.Option(min=0, help="ray: GPUs per worker; a fraction shares one.")] = 0.0,
+    gpus: Annotated[float, typer.Option(min=0, help="ray: GPUs per worker; a fraction shares a GPU.")] = 0.0,
     devices: Annotated[
-        str | None, typer.Option(help="local: EGL devices dealt out to the workers, e.g. 0,1 (default: all cards).")
+        str | None,
+        typer.Option(help="local: EGL devices to distribute over the workers, e.g. 0,1 (default: all GPUs)."),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run: make only what is not whole.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue a run: generate only the sequences that are not complete.")
+    ] = False,
     mixed: Annotated[
         bool,
-        typer.Option("--mixed", help="Go on although recipe, assets or software have changed since the run began."),
+        typer.Option("--mixed", help="Continue although recipe, assets or software have changed since the run began."),
     ] = False,
     time_limit: Annotated[
         float,
-        typer.Option(min=0, help="Seconds that one attempt at a sequence may take; 0: no limit. Needs --workers."),
+        typer.Option(min=0, help="Time limit of one attempt at a sequence, s; 0: none. Needs --workers."),
     ] = 3600.0,
     view: Annotated[
-        bool, typer.Option("--view", help="Show each sequence in the browser when it is whole (extra [view]).")
+        bool, typer.Option("--view", help="Show each complete sequence in the browser (extra [view]).")
     ] = False,
     layout: Annotated[
-        str | None, typer.Option(help="When all are whole, write them as OUT-LAYOUT, too (blinkgl export --layout).")
+        str | None, typer.Option(help="When all are complete, also write them as OUT-LAYOUT (blinkgl export --layout).")
     ] = None,
 ) -> int:
-    """Generate event + optical-flow sequences from one YAML file. Exit status 3: done, but
-    some sequences were set aside."""
+    """Generate sequences of events and optical flow from one YAML file. Exit status 3: done, but some sequences were
+    skipped."""
     from blinkgl.show import generate as command
     from blinkgl.show.generate import choose_executor
 
@@ -134,17 +134,15 @@ def generate(
 
 @app.command()
 def view(
-    sequences: Annotated[
-        list[str], typer.Argument(metavar="SEQUENCE", help="Folders of sequences, or of data sets of them.")
-    ],
-    port: Annotated[int | None, typer.Option(help="Of 127.0.0.1 (default: the first free one from 8080 on).")] = None,
+    sequences: Annotated[list[str], typer.Argument(metavar="SEQUENCE", help="Folders of sequences or data sets.")],
+    port: Annotated[int | None, typer.Option(help="Port on 127.0.0.1 (default: the first free one from 8080).")] = None,
     save: Annotated[
-        str | None, typer.Option("--save", metavar="FILE.html", help="Instead: one sequence as a file for any browser.")
+        str | None,
+        typer.Option("--save", metavar="FILE.html", help="Save one sequence as a file for any browser instead."),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
 ) -> int:
-    """Look at sequences in the browser: frames, events, labels and the scene in space (extra [view]). Ctrl-C ends
-    it."""
+    """View sequences in the browser: frames, events, labels and the scene in 3-D (extra [view]). Ctrl-C ends it."""
     from blinkgl.show import view as command
 
     return command.run(sequences, port=port, save=save, overwrite=overwrite)
@@ -154,16 +152,16 @@ def view(
 def verify(
     folder: Annotated[str, typer.Argument(metavar="DIR", help="Data set, split or sequence.")],
     deep: Annotated[
-        bool, typer.Option("--deep", help="Also generate a sample of sequences again and compare bit by bit.")
+        bool, typer.Option("--deep", help="Also generate a sample of sequences again and compare them bit by bit.")
     ] = False,
-    sample: Annotated[int, typer.Option(min=1, help="How many sequences --deep makes again.")] = 3,
-    seed: Annotated[int, typer.Option(min=0, help="Which ones.")] = 0,
+    sample: Annotated[int, typer.Option(min=1, help="Number of sequences that --deep generates again.")] = 3,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the sample.")] = 0,
     base: Annotated[
-        str | None, typer.Option(help="Folder the recipe's relative paths start from (default: as the run recorded).")
+        str | None, typer.Option(help="Folder for the recipe's relative paths (default: as recorded).")
     ] = None,
 ) -> int:
-    """Check a data set: names, manifests, checksums, contents, what the recipe draws. Exit status 2 when something is
-    wrong; what could not be compared is noted, and said in the last line."""
+    """Check a data set: names, manifests, checksums, contents, drawn values. Exit status 2 when something is wrong; the
+    last line lists what could not be compared."""
     from blinkgl.show import verify as command
 
     return command.run(folder, deep=sample if deep else 0, seed=seed, base=base)
@@ -171,16 +169,16 @@ def verify(
 
 @app.command()
 def explain(
-    config: Annotated[str, typer.Argument(help="YAML file, or the name of one that ships (blinkgl configs).")],
+    config: Annotated[str, typer.Argument(help="YAML file, or the name of a shipped one (blinkgl configs).")],
     sequence: Annotated[
-        int | None, typer.Option("--sequence", min=0, help="Which sequence (default: the first).")
+        int | None, typer.Option("--sequence", min=0, help="Number of the sequence (default: the first).")
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
     overrides: Annotated[
         list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")
     ] = None,
 ) -> int:
-    """Say what a run will model, what it leaves out and why, and what it will cost. Writes nothing."""
+    """Report what a run models, what it leaves out and why, and its cost. Writes nothing."""
     from blinkgl.show import explain as command
 
     return command.run(config, sequence=sequence, seed=seed, overrides=overrides or [])
@@ -191,7 +189,7 @@ def trade(
     config: Annotated[
         str | None,
         typer.Argument(
-            help="YAML file, or the name of one that ships (blinkgl configs). With --suite: a folder of your scenes."
+            help="YAML file, or the name of a shipped one (blinkgl configs). With --suite: a folder of your scenes."
         ),
     ] = None,
     out: Annotated[
@@ -201,14 +199,15 @@ def trade(
         ),
     ] = "trade",
     suite: Annotated[
-        bool, typer.Option("--suite", help="The shipped scenes, each hard in another way, in place of one.")
+        bool,
+        typer.Option("--suite", help="Measure the shipped scenes, each difficult in a different way, instead of one."),
     ] = False,
     scene: Annotated[
         list[str] | None,
         typer.Option("--scene", metavar="TEXT", help="--suite: only scenes whose name contains this; may be repeated."),
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Fewer settings, fewer pixels, a shorter clip: minutes.")
+        bool, typer.Option("--quick", help="Fewer settings, fewer pixels, a shorter clip: takes minutes.")
     ] = False,
     only: Annotated[
         list[str] | None,
@@ -216,41 +215,39 @@ def trade(
     ] = None,
     skip: Annotated[
         list[str] | None,
-        typer.Option("--skip", metavar="TEXT", help="No settings whose name contains this; may be repeated."),
+        typer.Option("--skip", metavar="TEXT", help="Leave out settings whose name contains this; may be repeated."),
     ] = None,
     overrides: Annotated[
         list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
     sequence: Annotated[
-        int | None, typer.Option("--sequence", min=0, help="Which sequence (default: the first).")
+        int | None, typer.Option("--sequence", min=0, help="Number of the sequence (default: the first).")
     ] = None,
     clip: Annotated[
-        float | None, typer.Option(min=1e-4, help="Simulated seconds (default: one label interval; --quick: 0.05).")
+        float | None, typer.Option(min=1e-4, help="Simulated time, s (default: one label interval; --quick: 0.05).")
     ] = None,
-    limit_ms: Annotated[
-        float, typer.Option(min=0.001, help="Events further apart than this are not the same event.")
-    ] = 10.0,
+    limit_ms: Annotated[float, typer.Option(min=0.001, help="Largest time difference of matching events, ms.")] = 10.0,
     rounds: Annotated[int | None, typer.Option(min=1, help="Timed rounds over all settings (default: 3).")] = None,
     minutes: Annotated[
         float | None,
-        typer.Option(min=0.1, help="Give up on further rounds and finer references after about this long."),
+        typer.Option(min=0.1, help="Start no further rounds or finer references after about this time."),
     ] = None,
     cost: Annotated[
         str | None,
-        typer.Option(help="What the front is drawn over: wall (default), or cpu on a busy machine (--suite: cpu)."),
+        typer.Option(help="Cost axis of the front: wall (default), or cpu on a busy machine (--suite: cpu)."),
     ] = None,
     reference_set: Annotated[
         list[str] | None,
         typer.Option(
             metavar="scene.a=b",
-            help="Judge by a scene that has more: an effect that the settings leave out, such as "
-            "scene.light.shadows=soft; may be repeated.",
+            help="Reference with an effect that the settings leave out, such as scene.light.shadows=soft; "
+            "may be repeated.",
         ),
     ] = None,
 ) -> int:
-    """Measure what accuracy costs: settings timed and judged against a converged reference,
-    as a table, a plot and a page."""
+    """Measure the cost of accuracy: settings are timed and compared with a converged reference; writes a table, a plot
+    and a page."""
     from blinkgl.show import trade as command
 
     if suite:
@@ -297,8 +294,8 @@ def trade(
 @app.command()
 def report(
     folder: Annotated[str, typer.Argument(metavar="DIR", help="Data set.")],
-    out: Annotated[str | None, typer.Option("--out", "-o", help="The page (default: DIR/report.html).")] = None,
-    examples: Annotated[int, typer.Option(min=0, max=100, help="Sequences shown in pictures.")] = 6,
+    out: Annotated[str | None, typer.Option("--out", "-o", help="Output page (default: DIR/report.html).")] = None,
+    examples: Annotated[int, typer.Option(min=0, max=100, help="Number of sequences shown in pictures.")] = 6,
 ) -> int:
     """Write one self-contained HTML page about a data set, and its index.jsonl."""
     from blinkgl.show import report as command
@@ -308,8 +305,8 @@ def report(
 
 @app.command()
 def export(
-    folder: Annotated[str, typer.Argument(metavar="DIR", help="Data set, or one sequence of it.")],
-    out: Annotated[str, typer.Option("--out", "-o", help="Folder to write, as a whole or not at all.")],
+    folder: Annotated[str, typer.Argument(metavar="DIR", help="Data set, or one of its sequences.")],
+    out: Annotated[str, typer.Option("--out", "-o", help="Output folder, written completely or not at all.")],
     layout: Annotated[
         str | None,
         typer.Option(
@@ -317,13 +314,16 @@ def export(
             "multiflow or eventkubric."
         ),
     ] = None,
-    shard_mb: Annotated[float | None, typer.Option("--shard-mb", min=1, help="Size of a shard (default: 512).")] = None,
+    shard_mb: Annotated[
+        float | None, typer.Option("--shard-mb", min=1, help="Size of a shard, MB (default: 512).")
+    ] = None,
     seed: Annotated[
         int | None,
-        typer.Option(min=0, help="Order of the samples in shards; a reader then only has to shuffle shards."),
+        typer.Option(min=0, help="Seed of the samples' order in shards; a reader then only needs to shuffle shards."),
     ] = None,
 ) -> int:
-    """Write a data set as WebDataset shards, one sample per flow label, or as another data set's loaders read it."""
+    """Write a data set as WebDataset shards, one sample per flow label, or in the layout of another data set's
+    loaders."""
     from blinkgl.show import export as command
 
     return command.run(folder, out, layout=layout, shard_mb=shard_mb, seed=seed)
@@ -338,21 +338,21 @@ app.command("import")(import_)
 
 
 GONE = {
-    "qualify": "blinkgl explain CONFIG, or generate: frames are checked where they are converted",
+    "qualify": "blinkgl explain CONFIG, or generate: frames are checked when they are converted",
     "trade --reference": "--reference-set: scenes are no longer path-traced",
-    "trade --resume": "--scene for some of its scenes: a suite is measured in one go",
-    "simulate --factor": "--max-px: it was of --interpolate cubic, which is gone",
-    "calibrate --flicker": "--frames or --still: no scene is guessed without frames",
-    "calibrate --edge": "--frames or --still: no scene is guessed without frames",
-    "convert --format": "an ending that names the format: .raw is EVT3, .h5 DSEC's layout",
+    "trade --resume": "--scene for some of its scenes: a suite is measured in one run",
+    "simulate --factor": "--max-px: --factor belonged to --interpolate cubic, which was removed",
+    "calibrate --flicker": "--frames or --still: a scene is no longer guessed",
+    "calibrate --edge": "--frames or --still: a scene is no longer guessed",
+    "convert --format": "a file name whose ending gives the format: .raw is EVT3, .h5 DSEC's layout",
     "import --texture-size": "colours baked in Blender",
     "import --bake-seconds": "colours baked in Blender",
-    "export --scene": "the sequence's config.yaml and poses.npz: scenes are no longer written as glTF",
-    "report --card": "report.html and index.jsonl: the page of a data hub is yours to write",
+    "export --scene": "the sequence's config.yaml and poses.npz: scenes are no longer exported as glTF",
+    "report --card": "report.html and index.jsonl: write the page of a data hub yourself",
     "shader time": "your driver's profiler, or blinkgl trade: passes are no longer timed",
-    "shader show --active": "all lines, as the compiler gets them",
+    "shader show --active": "all lines, as the compiler reads them",
 }
-"""What earlier versions had, and what to do instead."""
+"""Commands and options of earlier versions, and what to use instead."""
 
 
 def run(arguments: list[str]) -> int:

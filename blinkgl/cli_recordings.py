@@ -28,38 +28,34 @@ def simulate(
     ] = None,
     size: Annotated[
         str | None,
-        typer.Option(
-            help="WIDTHxHEIGHT that frames are cropped and scaled to (default: the sensor's, else their own)."
-        ),
+        typer.Option(help="WIDTHxHEIGHT to crop and scale frames to (default: the sensor's, else their own)."),
     ] = None,
     config: Annotated[str | None, typer.Option("--config", help="YAML file of emulator parameters.")] = None,
     overrides: Annotated[
         list[str] | None, typer.Option("--set", metavar="key=value", help="Emulator parameter; may be repeated.")
     ] = None,
     fps: Annotated[
-        float | None, typer.Option(help="Frames per second (default: the video's, or the time stamps).")
+        float | None, typer.Option(help="Frames per second (default: the video's, or from the time stamps).")
     ] = None,
     timestamps: Annotated[
-        str | None, typer.Option(help="File of frame times: µs as integers, or seconds with a point.")
+        str | None, typer.Option(help="File of frame times: integers in µs, or decimals in s.")
     ] = None,
     gamma: Annotated[
         str | None,
         typer.Option(
-            help="srgb, linear or an exponent (default: linear for floats and a recording's frames, for grey images "
-            "of the sensor's size what its own frames are, else srgb)."
+            help="srgb, linear or an exponent (default: linear for floats and for a recording's frames; "
+            "the sensor's own for grey images of its size; else srgb)."
         ),
     ] = None,
     interpolate: Annotated[str, typer.Option(help="Between frames: linear, or motion (dense-flow warp).")] = "linear",
     max_px: Annotated[float, typer.Option(min=0.01, help="motion: largest displacement per step, px.")] = 1.0,
-    keep_noise: Annotated[
-        bool, typer.Option("--keep-noise", help="Make events of the frames' own noise, too (default: none).")
-    ] = False,
+    keep_noise: Annotated[bool, typer.Option("--keep-noise", help="Make events of the frames' noise, too.")] = False,
     seed: Annotated[int, typer.Option(help="Seed of the emulator.")] = 0,
     preview: Annotated[str | None, typer.Option(help="Also write a video of frames and events, .mp4.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
 ) -> int:
-    """Turn any video into events."""
+    """Convert any video into events."""
     from blinkgl.show import simulate as command
 
     return command.run(
@@ -86,24 +82,27 @@ def simulate(
 def compare(
     a: Annotated[str, typer.Argument(metavar="A", help="Event file.")],
     b: Annotated[
-        str | None, typer.Argument(metavar="B", help="Event file (of any size), or frames (video, folder, .npy).")
+        str | None, typer.Argument(metavar="B", help="Event file (any size), or frames (video, folder, .npy).")
     ] = None,
-    frames: Annotated[str | None, typer.Option(help="Frames of the scene, for the log-intensity change.")] = None,
+    frames: Annotated[str | None, typer.Option(help="Frames of the scene, to measure log-intensity changes.")] = None,
     out: Annotated[str | None, typer.Option("--out", "-o", help="Folder for compare.json and compare.png.")] = None,
     fps: Annotated[float | None, typer.Option(help="Frame rate of the frames.")] = None,
-    timestamps: Annotated[str | None, typer.Option(help="Frame times.")] = None,
+    timestamps: Annotated[str | None, typer.Option(help="File of frame times.")] = None,
     gamma: Annotated[
-        str, typer.Option(help="Of the frames: linear, as a camera's own are, srgb or an exponent.")
+        str, typer.Option(help="Curve of the frames: linear (a camera's own), srgb or an exponent.")
     ] = "linear",
-    frame_delay_ms: Annotated[float, typer.Option(help="Added to the frame times, ms.")] = 0.0,
-    interval_ms: Annotated[float, typer.Option(min=0.001, help="Interval where there are no frames, ms.")] = 20.0,
-    zero_time: Annotated[bool, typer.Option("--zero-time", help="Count both from their first event.")] = False,
+    frame_delay_ms: Annotated[float, typer.Option(help="Offset added to the frame times, ms.")] = 0.0,
+    interval_ms: Annotated[float, typer.Option(min=0.001, help="Interval without frames, ms.")] = 20.0,
+    zero_time: Annotated[bool, typer.Option("--zero-time", help="Start both at their first event.")] = False,
     judge: Annotated[
-        bool, typer.Option("--judge", help="Also say how well a classifier tells A from B, and the halves of each.")
+        bool,
+        typer.Option(
+            "--judge", help="Also report how well a classifier distinguishes A from B, and the halves of each."
+        ),
     ] = False,
 ) -> int:
-    """Describe a recording, or compare it with another or with frames: counts, rates,
-    intervals, polarity against brightness."""
+    """Describe a recording, or compare it with another or with frames: counts, rates, intervals, polarity against
+    brightness."""
     from blinkgl.show import compare as command
 
     return command.run(
@@ -124,40 +123,45 @@ def compare(
 def calibrate(
     recording: Annotated[str, typer.Argument(metavar="RECORDING", help="Event file of a camera.")],
     out: Annotated[
-        str, typer.Option("--out", "-o", help="The sensor file, .yaml; a page goes beside it, .html.")
+        str,
+        typer.Option(
+            "--out", "-o", help="Output sensor file, .yaml; a page of the same name, .html, is written beside it."
+        ),
     ] = "sensor.yaml",
     frames: Annotated[
         str | None,
-        typer.Option(help="What the camera saw, of its size (default: the recording's own frames)."),
+        typer.Option(help="Frames of the scene at the camera's size (default: the recording's own)."),
     ] = None,
     still: Annotated[
-        bool, typer.Option("--still", help="No frames: a scene that stands still in constant light. Noise alone.")
+        bool, typer.Option("--still", help="No frames: a static scene in constant light. Fits only noise.")
     ] = False,
     emulator: Annotated[
         str,
-        typer.Option("--emulator", "-e", help="esim, v2e or voltmeter; with --still also pixels: noise beside any."),
+        typer.Option(
+            "--emulator", "-e", help="esim, v2e or voltmeter; with --still also pixels: noise for any emulator."
+        ),
     ] = "esim",
-    sensor: Annotated[str | None, typer.Option("--sensor", help="A sensor whose values the fit begins with.")] = None,
+    sensor: Annotated[str | None, typer.Option("--sensor", help="Sensor with the initial values of the fit.")] = None,
     overrides: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="key=value", help="Emulator parameter that is not fitted; may be repeated."),
+        typer.Option("--set", metavar="key=value", help="Emulator parameter to keep fixed; may be repeated."),
     ] = None,
     fps: Annotated[float | None, typer.Option(help="Frame rate of the frames.")] = None,
-    timestamps: Annotated[str | None, typer.Option(help="Frame times.")] = None,
+    timestamps: Annotated[str | None, typer.Option(help="File of frame times.")] = None,
     gamma: Annotated[
-        str, typer.Option(help="Of the frames: linear, as a camera's own are, srgb or an exponent.")
+        str, typer.Option(help="Curve of the frames: linear (a camera's own), srgb or an exponent.")
     ] = "linear",
     interpolate: Annotated[str, typer.Option(help="Between frames: motion (dense-flow warp) or linear.")] = "motion",
     max_px: Annotated[float, typer.Option(min=0.01, help="motion: largest displacement per step, px.")] = 1.0,
     frame_delay_ms: Annotated[
-        float | None, typer.Option(help="Added to the frame times, ms (default: found from both).")
+        float | None, typer.Option(help="Offset added to the frame times, ms (default: estimated).")
     ] = None,
-    starts: Annotated[int, typer.Option(min=1, max=20, help="Of the search.")] = 3,
-    seed: Annotated[int, typer.Option(min=0, help="Of the simulations and of the search.")] = 0,
+    starts: Annotated[int, typer.Option(min=1, max=20, help="Starting points of the search.")] = 3,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulations and the search.")] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
 ) -> int:
-    """Fit an emulator to a camera's own recording: a sensor file, and a page that says how near it comes."""
+    """Fit an emulator to a camera's recording; writes a sensor file, and a page that shows how close the fit is."""
     from blinkgl.show import calibrate as command
 
     return command.run(
@@ -190,16 +194,16 @@ def convert(
             ".mat, .txt, .csv, .npz, .npy.",
         ),
     ],
-    target: Annotated[str, typer.Argument(metavar="OUT", help="Event file; its ending names the format.")],
+    target: Annotated[str, typer.Argument(metavar="OUT", help="Event file; its ending selects the format.")],
     size: Annotated[
-        str | None, typer.Option(help="WIDTHxHEIGHT, where the file does not say (default: guessed).")
+        str | None, typer.Option(help="WIDTHxHEIGHT, if the file does not give it (default: guessed).")
     ] = None,
     zero_time: Annotated[
         bool, typer.Option("--zero-time", help="Shift times so that the first event is at 0.")
     ] = False,
     time_unit: Annotated[
         str,
-        typer.Option("--time-unit", help="Of .txt and .csv: s (six decimals), or us (integers; a .csv as faery's)."),
+        typer.Option("--time-unit", help="For .txt and .csv: s (six decimals), or us (integers; .csv as faery's)."),
     ] = "s",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
 ) -> int:
@@ -213,12 +217,13 @@ def import_(
     source: Annotated[
         str, typer.Argument(metavar="SCENE", help=".blend, .fbx, .usd/.usda/.usdc/.usdz, .dae, .abc or .obj.")
     ],
-    out: Annotated[str, typer.Option("--out", "-o", help="The GLB to write.")],
+    out: Annotated[str, typer.Option("--out", "-o", help="Output GLB.")],
     scene: Annotated[
-        str | None, typer.Option("--scene", help="Name of the file's scene (default: the one it was saved in).")
+        str | None, typer.Option("--scene", help="Name of the file's scene (default: the active one).")
     ] = None,
     frames: Annotated[
-        tuple[int, int] | None, typer.Option("--frames", metavar="FIRST LAST", help="Default: the scene's range.")
+        tuple[int, int] | None,
+        typer.Option("--frames", metavar="FIRST LAST", help="Range of frames (default: the scene's)."),
     ] = None,
     fps: Annotated[
         float | None,
@@ -226,20 +231,18 @@ def import_(
     ] = None,
     keys_per_frame: Annotated[
         int,
-        typer.Option("--keys-per-frame", min=1, max=64, help="Key frames per frame; between them motion is straight."),
+        typer.Option("--keys-per-frame", min=1, max=64, help="Key frames per frame; motion between them is linear."),
     ] = 1,
     clips: Annotated[
-        bool, typer.Option("--clips", help="An animation per action, not one of the scene as it plays.")
+        bool, typer.Option("--clips", help="One animation per action instead of one for the scene.")
     ] = False,
-    time_limit: Annotated[
-        float, typer.Option("--time-limit", min=1, help="Seconds that Blender may take altogether.")
-    ] = 900.0,
+    time_limit: Annotated[float, typer.Option("--time-limit", min=1, help="Time limit of Blender, s.")] = 900.0,
     as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no table.")] = False,
 ) -> int:
-    """Make a GLB of a scene of Blender's or of a format that Blender reads (extra [cycles]), and say what came and what
-    could not."""
+    """Convert a scene of Blender, or of a format that Blender reads, to GLB (extra [cycles]); report what was converted
+    and what was not."""
     from blinkgl.show import import_ as command
 
     return command.run(

@@ -1,9 +1,8 @@
-"""Errors that are meant for the person at the keyboard.
+"""Errors that a user can cause and read.
 
-Everything a user can cause (a misspelt key, a missing mesh, a full disk) is raised as a
-:class:`BlinkGLError` whose ``str`` is one line: where it is (a config path, a file), the value, and what
-would be accepted. The command line prints that line and exits with status 2; ``--debug`` shows the
-traceback. Programming errors stay ordinary exceptions.
+Every such error (a misspelt key, a missing mesh, a full disk) is raised as a :class:`BlinkGLError` whose ``str`` is one
+line: the place (a config path, a file), the problem, the value, and what is accepted. The command line prints that line
+and exits with status 2; ``--debug`` shows the traceback. Programming errors are ordinary exceptions.
 """
 
 from __future__ import annotations
@@ -18,32 +17,31 @@ _MAX_TEXT_CHARS = 400
 def _short(value: Any) -> str:
     try:
         text = " ".join(repr(value).split())
-    except ValueError:  # Python prints no whole number of more than 4300 digits
+    except ValueError:  # Python does not print integers of more than 4300 digits
         text = "a number of thousands of digits"
     return text if len(text) <= _MAX_VALUE_CHARS else text[: _MAX_VALUE_CHARS - 1] + "…"
 
 
 def _plain(text: str) -> str:
-    """One readable line: what a file or a key is called may hold anything, and be of any length."""
+    """Return ``text`` as one readable line; names of files and keys may contain anything and have any length."""
     text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
     return text if len(text) <= _MAX_TEXT_CHARS else f"{text[: _MAX_TEXT_CHARS // 2]}…{text[-_MAX_TEXT_CHARS // 2 :]}"
 
 
 class BlinkGLError(Exception):
-    """One line for the user.
+    """An error for the user, one line.
 
     Parameters
     ----------
     problem : what is wrong, without a trailing full stop.
-    where : config path (``scene.objects.count``), file or frame the problem is at.
-    value : the offending value; shown shortened. Leave out when there is none.
-    accepted : what would be accepted, or the command that mends it.
+    where : config path (``scene.objects.count``), file or frame of the problem.
+    value : the wrong value; it is shortened for display. Leave it out when there is none.
+    accepted : what is accepted, or the command that solves the problem.
     """
 
     exit_status = 2
     passing = False
-    """Whether the same work may succeed when it is tried again without anybody mending anything;
-    see :func:`may_pass`."""
+    """Whether the same work may succeed when it is tried again without any change; see :func:`may_pass`."""
 
     def __init__(self, problem: str, *, where: str | None = None, value: Any = ..., accepted: str | None = None):
         self.problem, self.where, self.value, self.accepted = problem, where, value, accepted
@@ -64,26 +62,25 @@ class ConfigError(BlinkGLError):
 
 
 class AssetError(BlinkGLError):
-    """A mesh, texture, video or other input file that is missing, corrupt or beyond a limit."""
+    """A mesh, texture, video or other input file that is missing, corrupt or too large."""
 
 
 class GLError(BlinkGLError):
-    """No usable OpenGL, or a shader that does not compile."""
+    """OpenGL is not usable, or a shader does not compile."""
 
-    passing = True  # a card that was reset, or that another process fills
+    passing = True  # a GPU was reset, or another process fills it
 
 
 class OutputError(BlinkGLError):
-    """Output that cannot be written: existing folder, full disk, no permission."""
+    """Output cannot be written: existing folder, full disk, no permission."""
 
     passing = True
 
 
 class EventDataError(BlinkGLError):
-    """Frames or events outside the emulator's or a format's contract (time order, range, shape).
+    """Frames or events that violate the emulator's or a format's requirements (time order, range, shape).
 
-    pixel : (x, y) of the pixel of a frame that is at fault, where it is one.   t_ns : time of
-    the frame that is, where it is known."""
+    pixel : (x, y) of the wrong pixel of a frame, if it is one.   t_ns : time of the wrong frame, if it is known."""
 
     pixel: tuple[int, int] | None = None
     t_ns: int | None = None
@@ -119,11 +116,11 @@ _BUGS = (
 
 
 def may_pass(error: BaseException) -> bool:
-    """Whether work that failed with ``error`` is worth another attempt with the same input.
+    """Return whether work that failed with ``error`` is worth another attempt with the same input.
 
-    True for what the machine did: memory, a file system that did not answer (also as the cause of another error: an
-    asset that a network disk would not give), output, OpenGL, and whatever has no name here (moderngl and drivers raise
-    bare exceptions). False for what the input decides alone: configuration, assets, events, and bugs."""
+    True for errors of the machine: memory, a file system that did not answer (also as the cause of another error, such
+    as an asset on a network disk), output, OpenGL, and unknown exceptions (moderngl and drivers raise bare ones). False
+    for errors that the input alone determines: configuration, assets, events, and bugs."""
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, MemoryError) or (isinstance(cause, OSError) and cause.errno in _MACHINE_TROUBLE):

@@ -1,4 +1,4 @@
-"""``eflow train``'s YAML, validated; the model part also travels inside every checkpoint."""
+"""The validated YAML of ``eflow train``; every checkpoint stores its model part."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from eflow import shipped
 class VoxelConfig(Config):
     """Input of the correlation networks."""
 
-    bins: int = Field(15, ge=2, le=64, description="time bins")
+    bins: int = Field(15, ge=2, le=64, description="number of time bins")
     normalise: Literal["nonzero", "all", "none"] = Field(
-        "nonzero", description="cells that mean and std are taken over"
+        "nonzero", description="cells over which mean and std are computed"
     )
     bounds: Literal["window", "events"] = Field(
         "window", description="bins span the window, or its first to last event (E-RAFT's loader)"
@@ -27,41 +27,42 @@ class VoxelConfig(Config):
 
 
 Size = Literal["tiny", "small", "base"]
-"""How large a network is: ``base`` as published, ``tiny`` about a million parameters, which a CPU trains in minutes."""
+"""Size of a network: ``base`` as published, ``tiny`` about a million parameters, which a CPU trains in minutes."""
 
 
 class _Refined(Config):
-    """What E-RAFT and E-FlowFormer share."""
+    """Options that E-RAFT and E-FlowFormer share."""
 
     input: VoxelConfig = Field(VoxelConfig(), description="the voxel grid")
     trunk: tuple[int, int, int] | None = Field(
-        None, description="channels of the CNNs at 1/2, 1/4 and 1/8; null: the size's"
+        None, description="channels of the CNNs at 1/2, 1/4 and 1/8; null: by size"
     )
-    features: int | None = Field(
-        None, ge=16, le=1024, multiple_of=16, description="channels that are correlated; null: the size's"
-    )
+    features: int | None = Field(None, ge=16, le=1024, multiple_of=16, description="correlated channels; null: by size")
     hidden: int | None = Field(
-        None, ge=16, le=1024, multiple_of=4, description="channels of the GRU's state; null: the size's"
+        None, ge=16, le=1024, multiple_of=4, description="channels of the GRU's state; null: by size"
     )
     levels: int | None = Field(
-        None, ge=1, le=4, description="of the correlation pyramid; the least input is 8 * 2^levels px; null: the size's"
+        None,
+        ge=1,
+        le=4,
+        description="levels of the correlation pyramid; the smallest input is 8 * 2^levels px; null: by size",
     )
-    radius: int | None = Field(None, ge=1, le=8, description="of a correlation look-up, cells; null: the size's")
+    radius: int | None = Field(None, ge=1, le=8, description="radius of a correlation lookup, cells; null: by size")
     iterations: int = Field(12, ge=1, le=64, description="GRU iterations in evaluation")
-    train_iterations: int = Field(12, ge=1, le=64, description="GRU iterations in training that gradients pass through")
+    train_iterations: int = Field(12, ge=1, le=64, description="GRU iterations in training with gradients")
     burn_in: int | None = Field(
         None,
         ge=0,
         le=64,
-        description="at most so many iterations before those, without gradients (none in half of the steps, else a "
-        "random number), so that further iterations converge; null: iterations - train_iterations",
+        description="largest number of preceding iterations without gradients (none in half of the steps, else "
+        "random), so that further iterations converge; null: iterations - train_iterations",
     )
     damping: float = Field(
         0.5,
         ge=0,
         le=1,
-        description="in evaluation, the step of iteration k beyond train_iterations and burn_in is multiplied by this "
-        "to the power of k, so that what nothing was trained for stands still",
+        description="in evaluation, the step of iteration k beyond train_iterations and burn_in is multiplied by "
+        "this to the power of k, so that untrained iterations converge",
     )
     context_norm: Literal["batch", "instance"] = Field(
         "batch", description="norm of the context CNN; instance for batches of one or two"
@@ -71,12 +72,12 @@ class _Refined(Config):
         False, description="recompute each iteration in the backward pass: less memory, ~30 % slower"
     )
     border: Literal["replicate", "zero"] = Field(
-        "replicate", description="flow beyond the edge in the convex upsampling; zero: as E-RAFT's own code"
+        "replicate", description="flow outside the image in the convex upsampling; zero: as E-RAFT's code"
     )
     padding: Literal["end", "start"] = Field(
         "end",
-        description="where inputs of other sizes are filled up: right and bottom to multiples of 8, or left and top to "
-        "multiples of 32 as E-RAFT's own code does",
+        description="where inputs are padded: right and bottom to multiples of 8, or left and top to multiples "
+        "of 32 as E-RAFT's code",
     )
 
     @rule("trunk")
@@ -106,19 +107,19 @@ class EFlowFormerConfig(_Refined):
     )
     quick: bool = Field(
         False,
-        description="for trainings of minutes, not the paper's: three convolutions in place of each CNN, a U-Net whose "
-        "own flow starts the GRU (init, match_prior and context_norm mean nothing), no enhancement layers by default",
+        description="for trainings of minutes, not the paper's: three convolutions replace each CNN, a U-Net's flow "
+        "starts the GRU (init, match_prior and context_norm are not used), no enhancement layers by default",
     )
-    layers: int | None = Field(None, ge=0, le=32, description="enhancement layers; null: the size's")
+    layers: int | None = Field(None, ge=0, le=32, description="enhancement layers; null: by size")
     init: Literal["match", "zero"] = Field(
-        "match", description="start of the GRU: the matching layer's flow, or zero as E-RAFT"
+        "match", description="initial flow of the GRU: the matching layer's flow, or zero as E-RAFT"
     )
     match_prior: float | None = Field(
         0.5,
         gt=0,
         le=1000,
-        description="matching layer: standard deviation, in cells of 8 px, of a learned prior for short flow, at the "
-        "start; null: none, and it starts with flow to the middle of the image",
+        description="matching layer: initial standard deviation, cells of 8 px, of a learned prior for short "
+        "flow; null: none, so it starts with flow to the image centre",
     )
 
 
@@ -134,12 +135,12 @@ class EvFlowNetConfig(Config):
     )
     bins: int = Field(15, ge=2, le=64, description="time bins of the voxel input")
     width: int | None = Field(
-        None, ge=4, le=512, multiple_of=2, description="channels of the first encoder; null: the size's"
+        None, ge=4, le=512, multiple_of=2, description="channels of the first encoder; null: by size"
     )
     consensus: bool = Field(
         False,
-        description="at the coarsest scale, an affine field is fitted to each feature over the image and added: what "
-        "moves everywhere is known where nothing happens (not in the paper)",
+        description="fits an affine field to each feature of the coarsest scale and adds it, which gives global "
+        "motion to areas without events (not in the paper)",
     )
 
 
@@ -151,7 +152,7 @@ class SpikeFlowNetConfig(Config):
         "base", description="13.04 M parameters: 64 channels as published; small 3.42 M: 32; tiny 0.93 M: 16"
     )
     width: int | None = Field(
-        None, ge=4, le=512, multiple_of=4, description="channels of the first encoder; null: the size's"
+        None, ge=4, le=512, multiple_of=4, description="channels of the first encoder; null: by size"
     )
     steps: int = Field(5, ge=1, le=50, description="spike time steps per group")
     threshold: float = Field(0.75, gt=0, description="firing threshold of the integrate-and-fire neurons")
@@ -163,15 +164,15 @@ class SteFlowNetConfig(Config):
     name: Literal["ste_flownet"] = "ste_flownet"
     size: Size = Field(
         "base",
-        description="48.33 M parameters: 64 channels as published; small 13.04 M: 32; tiny 1.24 M: 8, and it looks 2 "
-        "instead of 4 cells round",
+        description="48.33 M parameters: 64 channels as published; small 13.04 M: 32; tiny 1.24 M: 8, and a "
+        "radius of 2 cells instead of 4",
     )
     width: int | None = Field(
-        None, ge=4, le=512, multiple_of=4, description="channels of the first encoder; null: the size's"
+        None, ge=4, le=512, multiple_of=4, description="channels of the first encoder; null: by size"
     )
-    radius: int | None = Field(None, ge=1, le=8, description="of the local correlation, cells; null: the size's")
-    slices: int = Field(5, ge=2, le=20, description="count slices of the window")
-    sweeps: int = Field(3, ge=1, le=10, description="times that the slices are gone through")
+    radius: int | None = Field(None, ge=1, le=8, description="radius of the local correlation, cells; null: by size")
+    slices: int = Field(5, ge=2, le=20, description="slices of the window, of equal duration")
+    sweeps: int = Field(3, ge=1, le=10, description="passes over the slices")
 
 
 ModelConfig = one_of("name", EraftConfig, EFlowFormerConfig, EvFlowNetConfig, SpikeFlowNetConfig, SteFlowNetConfig)
@@ -179,26 +180,24 @@ Probability = Annotated[float, Field(ge=0, le=1)]
 
 
 class AugmentConfig(Config):
-    """Probabilities and strengths; the draws depend on (seed, epoch, position) alone."""
+    """Probabilities and strengths; the draws depend only on (seed, epoch, position)."""
 
-    horizontal_flip: Probability = Field(0.5, description="probability of mirroring left and right")
-    vertical_flip: Probability = Field(0.1, description="probability of turning upside down")
-    transpose: Probability = Field(
-        0.0, description="probability that rows and columns change places; needs a square data.crop"
-    )
-    polarity: Probability = Field(0.5, description="probability that all polarities are swapped")
+    horizontal_flip: Probability = Field(0.5, description="probability of flipping horizontally")
+    vertical_flip: Probability = Field(0.1, description="probability of flipping vertically")
+    transpose: Probability = Field(0.0, description="probability of transposing; needs a square data.crop")
+    polarity: Probability = Field(0.5, description="probability of swapping all polarities")
     time_reversal: Probability = Field(
-        0.0, description="film backwards, target the backward flow; needs backward labels"
+        0.0, description="probability of reversing time, with the backward flow as target; needs backward labels"
     )
-    drop_probability: Probability = Field(0.3, description="probability that events are dropped")
-    drop: float = Field(0.3, ge=0, lt=1, description="largest fraction of events dropped")
-    hot_probability: Probability = Field(0.2, description="probability that hot pixels are added")
+    drop_probability: Probability = Field(0.3, description="probability of dropping events")
+    drop: float = Field(0.3, ge=0, lt=1, description="largest fraction of dropped events")
+    hot_probability: Probability = Field(0.2, description="probability of adding hot pixels")
     hot_pixels: int = Field(20, ge=1, le=100_000, description="largest number of hot pixels")
     hot_rate: float = Field(500.0, ge=0, le=1e6, description="largest rate of a hot pixel, events/s")
-    noise_probability: Probability = Field(0.3, description="probability that background noise is added")
+    noise_probability: Probability = Field(0.3, description="probability of adding background noise")
     noise_rate: float = Field(1.0, ge=0, le=1e4, description="largest rate of background noise, events/s per pixel")
-    scale_probability: Probability = Field(0.3, description="probability of another scale; needs data.crop")
-    scale: tuple[float, float] = Field((-0.2, 0.5), description="exponent of 2 of the scale factor, [low, high]")
+    scale_probability: Probability = Field(0.3, description="probability of scaling; needs data.crop")
+    scale: tuple[float, float] = Field((-0.2, 0.5), description="log2 of the scale factor, [low, high]")
 
     @rule("scale")
     def _ordered(scale):
@@ -207,24 +206,24 @@ class AugmentConfig(Config):
 
 
 class SourceConfig(Config):
-    """One data set: a folder, or a recipe that is rendered while it is trained on."""
+    """One data set: a folder, or a recipe that is rendered during training."""
 
     path: str | None = Field(None, description="folder; relative to the YAML file")
     format: Literal["auto", "blinkgl", "dsec", "mvsec", "blinkflow", "windows"] = Field(
-        "auto", description="layout of the set; auto: told by its files"
+        "auto", description="layout of the set; auto: detected from its files"
     )
-    dt: Literal[1, 4] = Field(1, description="MVSEC: images between the ends of the flow")
-    weight: float = Field(1.0, gt=0, le=1e6, description="share of this set in the mixture")
+    dt: Literal[1, 4] = Field(1, description="MVSEC: number of images between the ends of the flow")
+    weight: float = Field(1.0, gt=0, le=1e6, description="relative weight of this set in the mixture")
     recipe: str | None = Field(
-        None, description="YAML file of `blinkgl generate`, in place of a folder; relative to the YAML file"
+        None, description="YAML file of `blinkgl generate`, instead of a folder; relative to the YAML file"
     )
-    online: bool = Field(False, description="render the recipe's sequences while training; no sample comes twice")
+    online: bool = Field(False, description="render the recipe's sequences during training; no sample is repeated")
     set: tuple[str, ...] = Field((), description="overrides of the recipe, as `a.b=c`")
-    workers: int = Field(1, ge=0, le=256, description="rendering processes; 0: rendered in the training process")
-    samples: int = Field(8, ge=1, le=1000, description="windows out of each sequence, each with its own flow")
+    workers: int = Field(1, ge=0, le=256, description="rendering processes; 0: render in the training process")
+    samples: int = Field(8, ge=1, le=1000, description="windows per sequence, each with its own flow")
     window_ms: tuple[float, float] | None = Field(
         None,
-        description="lengths of the windows, [shortest, longest], log-uniform; null: the recipe's label interval",
+        description="window lengths, [shortest, longest], log-uniform; null: the recipe's label interval",
     )
     min_events: int = Field(1, ge=1, le=10**9, description="fewest events in each of a sample's two windows")
     max_flow: float = Field(400.0, gt=0, le=1e4, description="longest median flow of a sample, px")
@@ -232,8 +231,8 @@ class SourceConfig(Config):
         0.0,
         ge=0,
         le=1e3,
-        description="fewest events per pixel of the new window and px of its mean flow (0.3 px where that is shorter): "
-        "below 0.01 hardly anything can be told",
+        description="fewest events per pixel of the new window and per px of its mean flow (at least 0.3 px): "
+        "below 0.01 the flow can hardly be estimated",
     )
 
     @rule("path", "recipe", "online")
@@ -257,17 +256,17 @@ class SourceConfig(Config):
 
 
 class DataConfig(Config):
-    """What is trained and validated on."""
+    """Training and validation data."""
 
-    train: tuple[SourceConfig, ...] = Field(min_length=1, description="sets that are trained on, mixed by weight")
+    train: tuple[SourceConfig, ...] = Field(min_length=1, description="training sets, mixed by weight")
     validate_on: tuple[SourceConfig, ...] = Field((), description="validation sets; the first samples of each are used")
     validate_samples: int = Field(64, ge=1, description="samples of each validation set, evenly spaced")
     crop: tuple[int, int] | None = Field(None, description="[height, width] of the random crop, px; null: whole frames")
     batch: int = Field(6, ge=1, le=4096, description="samples per step, over all GPUs")
-    workers: int = Field(0, ge=0, le=256, description="loader processes per GPU; 0 loads in the training process")
-    empty: Literal["error", "skip"] = Field("error", description="a sample without events: stop, or take the next one")
+    workers: int = Field(0, ge=0, le=256, description="loader processes per GPU; 0: load in the training process")
+    empty: Literal["error", "skip"] = Field("error", description="a sample without events: an error, or the next one")
     augment: AugmentConfig | None = Field(
-        AugmentConfig(), description="random changes to the training samples; null: none"
+        AugmentConfig(), description="random changes of the training samples; null: none"
     )
 
     @rule("train.*.workers", "train.*.online", "workers")
@@ -290,49 +289,47 @@ class DataConfig(Config):
 
 
 class LossConfig(Config):
-    """What is made small: a sum of terms of each pixel's error, by weight."""
+    """The loss: a weighted sum of terms of each pixel's error."""
 
-    l1: float = Field(1.0, ge=0, le=1e6, description="weight of the components' absolute errors, px")
+    l1: float = Field(1.0, ge=0, le=1e6, description="weight of the absolute error of the components, px")
     epe: float = Field(0.0, ge=0, le=1e6, description="weight of the end-point error, px")
-    length: float = Field(
-        0.0, ge=0, le=1e6, description="weight of the logarithm of predicted over true length (with knee), either way"
-    )
+    length: float = Field(0.0, ge=0, le=1e6, description="weight of |log(predicted / true length)| (with knee)")
     knee: float = Field(
         1.0,
         gt=0,
         le=1e3,
-        description="px that both lengths have more of in the logarithm",
+        description="added to both lengths in the logarithm, px",
     )
 
     @rule("l1", "epe")
     def _something(l1, epe):
-        if not l1 + epe:  # length alone has no direction
+        if not l1 + epe:  # the length alone has no direction
             raise Refused("no term has a weight", where="l1", value=0, accepted="l1 or epe above 0")
 
 
 class OptimConfig(Config):
-    """AdamW; the rate rises, stays, and falls towards the end, by steps or by the clock."""
+    """AdamW and its schedule: the learning rate rises, stays, and falls, by steps or by time."""
 
-    steps: int = Field(200_000, ge=1, le=10**9, description="updates of the weights")
+    steps: int = Field(200_000, ge=1, le=10**9, description="number of weight updates")
     minutes: float | None = Field(
         None,
         gt=0,
         le=1e6,
-        description="training ends after so many minutes if that is before the last step, and the rate goes by "
-        "whichever is nearer its end (counted over resumed parts; such a run does not repeat bit for bit); null: "
-        "by steps alone",
+        description="minutes after which training ends, if before the last step; the schedule then follows time "
+        "or steps, whichever is nearer to the end (resumed parts included; such a run is not exactly "
+        "repeatable); null: only steps",
     )
     lr: float = Field(2e-4, gt=0, le=1, description="peak learning rate")
-    warmup: float = Field(0.05, ge=0, lt=1, description="share of the training that the rate rises over")
-    cooldown: float = Field(0.4, ge=0, le=1, description="share of the training, its last, that the rate falls over")
-    weight_decay: float = Field(1e-4, ge=0, le=1, description="of AdamW, decoupled")
-    clip: float = Field(1.0, gt=0, description="largest gradient norm")
-    loss: LossConfig = Field(LossConfig(), description="what is made small")
-    gamma: float = Field(0.8, gt=0, le=1, description="decay of the loss towards early iterations")
-    match_weight: float = Field(
-        0.5, ge=0, description="weight of the matching layer's term of the loss, where the last iteration's is 1"
+    warmup: float = Field(0.05, ge=0, lt=1, description="fraction of the training in which the rate rises")
+    cooldown: float = Field(
+        0.4, ge=0, le=1, description="fraction of the training, at its end, in which the rate falls"
     )
-    ema: float = Field(0.999, ge=0, lt=1, description="decay of the averaged weights; 0: none")
+    weight_decay: float = Field(1e-4, ge=0, le=1, description="decoupled weight decay of AdamW")
+    clip: float = Field(1.0, gt=0, description="largest gradient norm")
+    loss: LossConfig = Field(LossConfig(), description="terms of the loss")
+    gamma: float = Field(0.8, gt=0, le=1, description="decay of the loss towards early iterations")
+    match_weight: float = Field(0.5, ge=0, description="weight of the matching layer's loss; the last iteration's is 1")
+    ema: float = Field(0.999, ge=0, lt=1, description="decay of the weight average; 0: none")
 
     @rule("warmup", "cooldown")
     def _fit(warmup, cooldown):
@@ -343,20 +340,20 @@ class OptimConfig(Config):
 
 
 class RunConfig(Config):
-    """How it runs and what it writes."""
+    """How a training runs and what it writes."""
 
-    device: Literal["auto", "cpu", "cuda"] = Field("auto", description="auto: a card where there is one")
+    device: Literal["auto", "cpu", "cuda"] = Field("auto", description="auto: a GPU if there is one")
     precision: Literal["fp32", "bf16"] = Field(
-        "fp32", description="bf16: autocast with fp32 islands; fp32 where the device has no bf16 instructions"
+        "fp32", description="bf16: autocast with fp32 islands; fp32 if the device has no bf16 instructions"
     )
-    tf32: bool = Field(True, description="a card with TF32 units makes fp32 products of those, but in fp32 islands")
-    channels_last: bool = Field(False, description="memory layout that some cards convolve faster in")
+    tf32: bool = Field(True, description="use TF32 units for fp32 products, except in fp32 islands")
+    channels_last: bool = Field(False, description="memory layout with faster convolutions on some GPUs")
     compile: bool = Field(False, description="torch.compile of the update step")
-    threads: int | None = Field(None, ge=1, description="CPU threads; null: torch's choice")
+    threads: int | None = Field(None, ge=1, description="CPU threads; null: torch's default")
     log_every: int = Field(20, ge=1, description="steps between log lines")
     validate_every: int = Field(2000, ge=1, description="steps between validations")
     checkpoint_every: int = Field(2000, ge=1, description="steps between checkpoints")
-    keep_checkpoints: int = Field(3, ge=1, description="older ones are deleted")
+    keep_checkpoints: int = Field(3, ge=1, description="number of kept checkpoints; older ones are deleted")
     picture_every: int = Field(2000, ge=1, description="steps between sample pictures")
     time_limit: float | None = Field(
         None,
@@ -371,13 +368,13 @@ class TrainConfig(Config):
 
     seed: int = Field(0, ge=0, lt=2**63, description="of weights, order and augmentation; 0 is a seed")
     model: ModelConfig = Field(description="the network")
-    data: DataConfig = Field(description="what is trained and validated on")
-    optim: OptimConfig = Field(OptimConfig(), description="AdamW, its schedule and the loss")
+    data: DataConfig = Field(description="training and validation data")
+    optim: OptimConfig = Field(OptimConfig(), description="optimiser, its schedule and the loss")
     run: RunConfig = Field(RunConfig(), description="how it runs and what it writes")
     init_from: str | None = Field(
         None,
-        description="checkpoint whose weights training starts from (fine-tuning), or the name of a network that comes "
-        "with the package",
+        description="checkpoint with the initial weights (fine-tuning), or the name of a network that ships with "
+        "the package",
     )
 
 
@@ -389,11 +386,11 @@ def load_train_config(
     data: Sequence[str] = (),
     minutes: float | None = None,
 ) -> TrainConfig:
-    """Reads a YAML file and applies ``a.b=c`` overrides; data paths become absolute, from the YAML file's folder.
+    """Read a YAML file and apply ``a.b=c`` overrides; data paths become absolute, relative to the YAML file's folder.
 
-    model, data, minutes : what a command line says in place of the file's ``model``, ``data.train`` (folders, or
-    recipes, which are rendered meanwhile) and ``optim.minutes``, from the working folder. path : None: nothing but
-    those and the overrides; images are then not scaled, which would need a crop.
+    model, data, minutes : values of the command line that replace the file's ``model``, ``data.train`` (folders, or
+    recipes to render during training) and ``optim.minutes``; relative to the working folder. path : None: only those
+    and the overrides; images are then not scaled, which would need a crop.
     Raises ConfigError: missing file, bad YAML, unknown key, bad value; without a file, no model or no data."""
     tree = {} if path is None else read_table(path)
     if path is None and not any(text.partition("=")[0].startswith("data.augment") for text in overrides):
@@ -412,7 +409,7 @@ def load_train_config(
         tree = {**tree, "optim": {**(tree.get("optim") or {}), "minutes": minutes}}
     path = Path("train.yaml" if path is None else path)
     config = validate(TrainConfig, apply_overrides(tree, overrides))
-    absolute = lambda p: str(path.parent.resolve() / p)  # an absolute p stays
+    absolute = lambda p: str(path.parent.resolve() / p)  # an absolute p is unchanged
     sources = {
         k: tuple(
             s.model_copy(update={key: absolute(p) for key in ("path", "recipe") if (p := getattr(s, key)) is not None})
@@ -429,7 +426,8 @@ def load_train_config(
 
 
 def _start(init_from: str | None, absolute: Callable[[str], str]) -> str | None:
-    """A file beside the YAML goes before a shipped network of that name."""
+    """Return a checkpoint's path or a shipped network's name; a file beside the YAML goes before a network of that
+    name."""
     if not init_from:
         return None
     path = absolute(init_from)

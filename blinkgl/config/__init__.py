@@ -1,7 +1,7 @@
-"""The room of the YAML: what a person may write, and whether it makes sense.
+"""Configuration: the YAML keys a user may write, and their validation.
 
-In:    text of a stranger, key=value overrides, a seed.
-Out:   frozen, validated models of plain values (``SequenceConfig``), or one line that names the key.
-Start: sequence.py (``load_run``); reader.py alone knows YAML, base.py puts errors into
-words, one module per other room.
+In:    YAML text from an untrusted user, key=value overrides, a seed.
+Out:   frozen, validated models of plain values (``SequenceConfig``), or a one-line error that names the key.
+Start: sequence.py (``load_run``). reader.py alone parses YAML, base.py defines the models, and each other module
+configures one other room.
 """

@@ -1,7 +1,7 @@
-"""Base of every config model: what keys it has, what it checks, and errors in one line that a stranger understands.
+"""Base of every config model: its keys, its checks and its one-line errors.
 
-A model checks one value by its field, and several values *together* by a :func:`rule`, which is given the values of the
-keys that it names and nothing else:
+A field checks one value. A :func:`rule` checks several values *together*; it receives the values of the keys that it
+names and nothing else:
 
     class AdaptiveTimeline(Config):
         min_step_us: float = Field(200.0, ge=0.001)
@@ -40,7 +40,8 @@ Path = tuple[str, ...]
 
 
 class Refused(ValueError):
-    """What a rule raises: the problem, and where it is (a key of the rule's model), the value and what is accepted."""
+    """The error that a rule raises: the problem, its place (a key of the rule's model), the value and what is
+    accepted."""
 
     def __init__(self, problem: str, *, where: str = "", value: Any = ..., accepted: str | None = None):
         super().__init__(problem)
@@ -49,9 +50,9 @@ class Refused(ValueError):
 
 @dataclass(frozen=True)
 class Rule:
-    """``check`` of the values of ``keys``, paths below the rule's model. ``*`` in a key: all entries of a list or
-    table, as a tuple; a leading ``?``: whether there is a value (not null); a leading ``#``: the names in a table, or
-    the numbers of a list's entries, as a tuple. A key below something that is null is None."""
+    """A check of the values of ``keys``, which are paths below the rule's model. ``*`` in a key gives all entries of a
+    list or table as a tuple. A leading ``?`` gives whether there is a value (not null). A leading ``#`` gives the names
+    in a table, or the indices of a list, as a tuple. A key below null gives None."""
 
     keys: tuple[str, ...]
     check: Callable[..., None]
@@ -61,7 +62,7 @@ class Rule:
 
 
 def rule(*keys: str) -> Callable[[Callable[..., None]], Rule]:
-    """Makes a rule of the model in whose body it stands; the function takes one value per key, in order."""
+    """Make a rule of the model in whose body it is defined; the function takes one value per key, in order."""
     return lambda function: Rule(keys, function)
 
 
@@ -70,8 +71,8 @@ _known: ContextVar[dict[tuple[type, int], tuple[Any, Any]] | None] = ContextVar(
 
 @contextmanager
 def remembering() -> Iterator[None]:
-    """Inside, a table that is the same object as one before is not looked at again: its model is the same object, too.
-    For many trees that share their parts, which nobody changes meanwhile."""
+    """Validate a table only once inside this context: the same table object gives the same model object. Used for many
+    trees that share tables; the tables must not be changed meanwhile."""
     token = _known.set({})
     try:
         yield
@@ -80,23 +81,23 @@ def remembering() -> Iterator[None]:
 
 
 class Removed(NamedTuple):
-    """A key that earlier versions had. Every ``config.yaml`` that they wrote has it, so it is read where its value
-    means what happens without it, and refused where it does not.
+    """A key of earlier versions. It is accepted where its value means the present behaviour, because the
+    ``config.yaml`` files of those versions contain it, and refused otherwise.
 
-    instead : what to write, in a sentence's end.   is_off : whether a value means what happens now."""
+    instead : what to write instead, the end of a sentence.   is_off : whether a value means the present behaviour."""
 
     instead: str
     is_off: Callable[[Any], bool]
 
 
 class Config(BaseModel):
-    """Frozen; unknown keys, NaN and infinity are refused. Numbers written as strings ("1e-4") are converted,
+    """A frozen model. It refuses unknown keys, NaN and infinity. Numbers written as strings ("1e-4") are converted,
     because YAML 1.1 reads ``1e-4`` as a string.
 
-    presets : values that the key ``preset`` of a model gives to those of its other keys that are not given.
-    instead : keys that are given in the place of another, which then is null where it is not given itself.
+    presets : defaults of the other keys for each value of the key ``preset``.
+    instead : key -> the key that it replaces; the replaced key is then null unless it is given itself.
     removed : keys of earlier versions; see :class:`Removed`.
-    fixed : keys of earlier versions that have one value now, a constant of the class."""
+    fixed : keys of earlier versions whose value is now a constant of the class."""
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True, ignored_types=(Rule,)
@@ -111,7 +112,7 @@ class Config(BaseModel):
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
         found = {
             name: value
-            # From the base down, so that a subclass may replace a rule of the same name.
+            # From the base class down, so that a subclass may replace a rule of the same name.
             for base in reversed(cls.__mro__)
             for name, value in vars(base).items()
             if isinstance(value, Rule)
@@ -119,7 +120,7 @@ class Config(BaseModel):
         cls.rules = tuple(found.values())
         for name, one in found.items():
             for key in one.keys:
-                # A rule of a key that was renamed would otherwise never run again, silently.
+                # Without this check, a rule of a renamed key would silently never run again.
                 if not _fits(cls, _steps(key)):
                     raise TypeError(f"{cls.__name__}.{name}: there is no key {key}")
 
@@ -155,8 +156,8 @@ class Config(BaseModel):
 
     @classmethod
     def completed(cls, data: dict[str, Any]) -> dict[str, Any]:
-        """``data`` with keys that follow from others that are given; what cannot be used is left as it is, for the
-        validation that comes next."""
+        """Return ``data`` with the keys that follow from other given keys. Invalid values are left as they are:
+        validation, which comes next, refuses them."""
         return data
 
     @model_validator(mode="after")
@@ -165,22 +166,22 @@ class Config(BaseModel):
             one(self)
         return self
 
-    @model_validator(mode="wrap")  # the last, so that it is round the others
+    @model_validator(mode="wrap")  # last, so that it wraps the other validators
     @classmethod
     def _remembered(cls, data: Any, handler: Callable[[Any], Any]) -> Any:
-        # Corners of one template share most of their tables: each of those is validated once.
+        # The corners of one template share most of their tables; each shared table is validated once.
         known = _known.get()
         if known is None or not isinstance(data, dict):
             return handler(data)
         found = known.get((cls, id(data)))
         if found is None:
-            found = known[cls, id(data)] = data, handler(data)  # the data, too: nothing else may get its place
+            found = known[cls, id(data)] = data, handler(data)  # keep the data alive: its id must not be reused
         return found[1]
 
 
 def one_of(tag: str, *models: type[Config], default: str | None = None) -> Any:
-    """Annotation of a field that is one of ``models``, told apart by the value of the key ``tag``; where that key is
-    not given it is ``default``, so that a table may say only what it changes."""
+    """Return the annotation of a field that is one of ``models``, chosen by the value of the key ``tag``. Without that
+    key it is ``default``, so that a table may contain only what it changes."""
     union: Any = typing.Union[models]  # type: ignore[not-a-type]  # noqa: UP007 - of as many as there are
     if default is None:
         return Annotated[union, Discriminator(tag)]
@@ -195,53 +196,52 @@ M = TypeVar("M", bound=Config)
 
 
 class Members(Generic[M]):
-    """Models told apart by the value of their key ``tag`` (``default`` where that is not given), in the order in which
+    """Models distinguished by the value of their key ``tag`` (``default`` where it is not given), in the order in which
     they were added. More may be added at any time: see :class:`Family`."""
 
     def __init__(self, tag: str, default: str):
         self.tag, self.default = tag, default
         self.models: dict[str, type[M]] = {}
-        """By the value of the tag."""
+        """The models by the value of their tag."""
         self._adapter: TypeAdapter | None = None
 
     def add(self, model: type[M]) -> None:
-        """Raises TypeError for a model without the tag, or with another's value of it."""
+        """Add a model. Raises TypeError for a model without the tag, or with a value of it that another model has."""
         tag = tag_of(model)
         if tag is None or tag[0] != self.tag:
             raise TypeError(f"{model.__name__} has no key `{self.tag}: Literal[...]` of one name")
         if self.models.get(tag[1], model) is not model:
             raise TypeError(f"there is another {self.tag} '{tag[1]}'")
-        # The union is made anew when it is asked for next.
+        # The union is rebuilt when it is needed next.
         self.models[tag[1]], self._adapter = model, None
 
     def remove(self, value: str) -> None:
-        """Raises KeyError where there is none."""
+        """Remove the model of this tag value. Raises KeyError where there is none."""
         del self.models[value]
         self._adapter = None
 
     def adapter(self) -> TypeAdapter:
-        """Of the union of the models as they are now."""
+        """Return the validator of the union of the present models."""
         if self._adapter is None:
             self._adapter = TypeAdapter(one_of(self.tag, *self.models.values(), default=self.default))
         return self._adapter
 
 
 def stands_for_many(annotation: Any) -> bool:
-    """Whether it is the model that stands for a :class:`Family`, and not a member of it."""
+    """Return whether ``annotation`` is the base model of a :class:`Family` and not one of its members."""
     return isinstance(annotation, type) and isinstance(vars(annotation).get("members"), Members)
 
 
 class Family(Config):
-    """A model that stands for all that are in its ``members``: a field annotated by it takes any of those. Which there
-    are is looked up when a value is validated and when the models are walked (:func:`members`), not when the field's
-    model is made; so one that is added later counts as much as the first. Members are subclasses of it, by which they
-    are known to share what it declares."""
+    """A base model that accepts any of its ``members`` as a field annotation. The members are looked up when a value is
+    validated and when the models are listed (:func:`members`), not when the field's model is defined, so members may be
+    added later. Members are subclasses of it and share the keys that it declares."""
 
     members: ClassVar[Members[Any]]
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> core_schema.CoreSchema:
-        # A function in place of a schema: pydantic would keep the members of now for good.
+        # A function instead of a schema, because pydantic would freeze the present members.
         if not stands_for_many(cls):
             return handler(source)
         return core_schema.no_info_plain_validator_function(lambda data: cls.members.adapter().validate_python(data))
@@ -252,9 +252,8 @@ class Family(Config):
 
 
 class Growing(Config):
-    """A model whose keys may be added to and taken away at any time. What keys it has is looked up when a value is
-    validated, so that models with a field of it
-    (``labels: Labels = Field(default_factory=Labels)``) need not be made again."""
+    """A model whose keys may be added and removed at any time. The keys are looked up when a value is validated, so
+    that models with a field of it (``labels: Labels = Field(default_factory=Labels)``) need not be rebuilt."""
 
     _made: ClassVar[bool] = False
 
@@ -265,18 +264,18 @@ class Growing(Config):
 
     @classmethod
     def add_key(cls, name: str, annotation: Any, info: FieldInfo, before: str | None = None) -> None:
-        """before : key that it is to stand in front of; default: it is the last. Raises TypeError for a name that is
-        taken, or that a model cannot have as a key."""
+        """Add a key before the key ``before``, or at the end. Raises TypeError for a name that is in use or cannot be a
+        key."""
         if name in cls.model_fields or not name.isidentifier() or name.startswith("_") or hasattr(BaseModel, name):
             raise TypeError(f"'{name}' " + ("is a key already" if name in cls.model_fields else "cannot be a key"))
         fields = {**cls.model_fields, name: FieldInfo.from_annotated_attribute(annotation, info)}
-        # Keys are listed in the order of the fields: on pages, in manifests, in error messages.
+        # Pages, manifests and error messages list keys in the order of the fields.
         later = list(cls.model_fields)[list(cls.model_fields).index(before) :] if before in cls.model_fields else []
         cls._regrown({key: fields[key] for key in (*(key for key in fields if key not in later), *later)})
 
     @classmethod
     def remove_key(cls, name: str) -> None:
-        """Raises KeyError where there is none."""
+        """Remove a key. Raises KeyError where there is none."""
         fields = dict(cls.model_fields)
         del fields[name]
         cls._regrown(fields)
@@ -291,7 +290,7 @@ class Growing(Config):
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> core_schema.CoreSchema:
-        # While the class is being made its own schema is wanted; afterwards a call that looks it up.
+        # While the class is being defined it needs its own schema; afterwards a call that looks it up.
         if not vars(cls).get("_made", False):
             return handler(source)
         return core_schema.no_info_plain_validator_function(lambda data: cls.model_validate(data))  # noqa: PLW0108
@@ -302,7 +301,7 @@ class Growing(Config):
 
 
 def tag_of(model: type[BaseModel]) -> tuple[str, str] | None:
-    """Key and value that tell the model from the others of its union; None for a model that stands alone."""
+    """Return the key and value that distinguish the model from the others of its union; None for a single model."""
     for key in ("kind", "emulator", "name"):
         if key in model.model_fields:
             annotation = model.model_fields[key].annotation
@@ -315,7 +314,7 @@ def tag_of(model: type[BaseModel]) -> tuple[str, str] | None:
 
 
 def members(annotation: Any) -> list[Any]:
-    """Members of a union (through Annotated) or of a family, without null; another annotation alone."""
+    """Return the members of a union (through Annotated) or of a family, without null; another annotation alone."""
     if stands_for_many(annotation):
         return list(annotation.members.models.values())
     origin = typing.get_origin(annotation)
@@ -327,13 +326,13 @@ def members(annotation: Any) -> list[Any]:
 
 
 def is_model(annotation: Any) -> bool:
-    """Whether it is a pydantic model and nothing more."""
+    """Return whether ``annotation`` is a pydantic model class."""
     return isinstance(annotation, type) and issubclass(annotation, BaseModel)
 
 
 def below(annotation: Any, step: str | int) -> list[Any]:
-    """Annotations of what stands at key or index ``step`` ("*": any) of a value of
-    ``annotation``; [] where nothing can."""
+    """Return the annotations of the value at key or index ``step`` ("*": any) of a value of ``annotation``; [] where
+    there can be none."""
     if is_model(annotation):
         info = annotation.model_fields.get(step)
         return [] if info is None else members(info.annotation)
@@ -341,7 +340,7 @@ def below(annotation: Any, step: str | int) -> list[Any]:
     if origin is dict:
         return members(arguments[1])
     if origin in (tuple, list) and (isinstance(step, int) or step == "*" or str(step).isdigit()):
-        # A tuple of fixed length has an annotation for each place, others one for all.
+        # A tuple of fixed length has one annotation per place, other lists have one for all entries.
         if origin is tuple and arguments and arguments[-1] is not Ellipsis:
             at = 0 if step == "*" else int(step)
             return members(arguments[at]) if at < len(arguments) else []
@@ -350,7 +349,7 @@ def below(annotation: Any, step: str | int) -> list[Any]:
 
 
 def limits_below(annotation: Any, step: str | int) -> FieldInfo | None:
-    """The limits of an entry of a list, which stand in its annotation."""
+    """Return the limits of an entry of a list, which its annotation holds."""
     arguments = typing.get_args(annotation)
     if typing.get_origin(annotation) not in (tuple, list) or not str(step).isdigit() or not arguments:
         return None

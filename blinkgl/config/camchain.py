@@ -1,6 +1,6 @@
-"""Calibrations of cameras as YAML: Kalibr's camchain, and DSEC's ``cam_to_cam.yaml``.
+"""Camera calibrations in YAML: Kalibr's camchain, DSEC's ``cam_to_cam.yaml`` and EuRoC's ``sensor.yaml``.
 
-Kalibr, one table a camera, each with its place beside the one before::
+Kalibr has one table per camera, each with its pose relative to the camera before::
 
     cam0:
       camera_model: pinhole
@@ -10,11 +10,11 @@ Kalibr, one table a camera, each with its place beside the one before::
       resolution: [640, 480]
     cam1: {…, T_cn_cnm1: 4 x 4, from the axes of cam0 to those of cam1}
 
-EuRoC has a file of one camera, its ``sensor.yaml``, whose distortion is called radial-tangential, and whose ``T_BS`` is
-its place on the body that the trajectory is of.
+EuRoC has one file per camera. Its distortion is called radial-tangential, and ``T_BS`` is the camera's pose on the body
+that the trajectory describes.
 
-DSEC has the tables under ``intrinsics``, with ``camera_matrix`` for ``intrinsics``, and those of the rectified pictures
-(``camRect0`` …) beside them. Both count pixels as BlinkGL does: (0, 0) is the centre of the top-left one.
+DSEC has the tables under ``intrinsics``, with ``camera_matrix`` instead of ``intrinsics``, and beside them those of the
+rectified images (``camRect0`` …). All count pixels as BlinkGL does: (0, 0) is the centre of the top-left pixel.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ _EUROC = {"radial-tangential": "radtan"}
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
-    """camera : its model.   T_cam_before : (4, 4) float64 rigid, from the axes of the camera before it in the chain to
-    its own (Kalibr's T_cn_cnm1); None where that is not said."""
+    """A camera of a calibration file. camera : its model.   T_cam_before : (4, 4) float64 rigid, from the axes of the
+    previous camera of the chain to its own (Kalibr's T_cn_cnm1); None where it is not given."""
 
     camera: CameraModel
     T_cam_before: np.ndarray | None = None
 
 
 def read_camchain(path: str | Path) -> dict[str, Calibrated]:
-    """The cameras of a calibration in any of the forms, by name, in the file's order; of DSEC's the raw ones alone, of
-    EuRoC's ``cam0``.
+    """Return the cameras of a calibration in any of these formats, by name, in the file's order: DSEC's raw cameras
+    only, and EuRoC's as ``cam0``.
 
-    Raises ConfigError naming file, camera and key: what is no such file, models that are not drawn, a wrong number of
-    coefficients, values that no camera has, distortion that folds inside the picture, places that are not rigid."""
+    Raises ConfigError naming file, camera and key for another kind of file, an unsupported model, a wrong number of
+    coefficients, impossible values, a distortion that folds inside the image, or a transform that is not rigid."""
     where = str(path)
     tree = read_table(path, "a calibration: cam0, cam1, …")
     dsec = isinstance(tree.get("intrinsics"), dict)
@@ -80,8 +80,8 @@ def read_camchain(path: str | Path) -> dict[str, Calibrated]:
 
 
 def read_place_on_body(path: str | Path) -> np.ndarray:
-    """(4, 4) float64 T_body_sensor, the ``T_BS`` of EuRoC's ``sensor.yaml``, its rounded rotation made exact.
-    Raises ConfigError."""
+    """Return T_body_sensor, (4, 4) float64: the ``T_BS`` of EuRoC's ``sensor.yaml`` with its rounded rotation made
+    exact. Raises ConfigError."""
     given = read_table(path, "EuRoC's sensor.yaml").get("T_BS")
     data = given.get("data") if isinstance(given, dict) else given
     if isinstance(data, list) and len(data) == 16:
@@ -90,7 +90,7 @@ def read_place_on_body(path: str | Path) -> np.ndarray:
 
 
 def camchain_yaml(cameras: Mapping[str, Calibrated]) -> str:
-    """Text of a Kalibr camchain. Raises ValueError for a camera without a model of Kalibr's."""
+    """Return the text of a Kalibr camchain. Raises ValueError for a camera that Kalibr has no model of."""
     tree: dict[str, Any] = {}
     for name, one in cameras.items():
         table = {"camera_model": "pinhole", **_lens(one.camera, "intrinsics")}
@@ -105,11 +105,11 @@ def cam_to_cam_yaml(
     numbers: Sequence[int] | None = None,
     disparity_to_depth: Mapping[str, Any] | None = None,
 ) -> str:
-    """Text of DSEC's ``cam_to_cam.yaml``: the raw cameras cam0 … and the rectified ones, whose axes are theirs
-    (:func:`blinkgl.camera.pinhole.rectified`).
+    """Return the text of DSEC's ``cam_to_cam.yaml``: the raw cameras cam0 … and the rectified ones, which have the same
+    axes (:func:`blinkgl.camera.pinhole.rectified`).
 
-    numbers : of the cameras, where they are not 0, 1, …: DSEC's right event camera is cam3.   disparity_to_depth : the
-    table of that name, ``cams_03`` -> 4 x 4."""
+    numbers : the cameras' numbers where they are not 0, 1, …: DSEC's right event camera is cam3.   disparity_to_depth :
+    the table of that name, ``cams_03`` -> 4 x 4."""
     numbers = range(len(cameras)) if numbers is None else numbers
     intrinsics: dict[str, Any] = {}
     extrinsics: dict[str, Any] = {}
@@ -130,7 +130,7 @@ def _lens(camera: CameraModel, key: str) -> dict[str, Any]:
     if not drawn and not isinstance(camera, PinHole):
         raise ValueError(f"{camera.kind} is no model of a calibration file")
     numbers = [float(v) for v in camera.distortion]
-    if camera.kind == "radtan" and numbers[4] == 0.0:  # Kalibr knows four
+    if camera.kind == "radtan" and numbers[4] == 0.0:  # Kalibr has four coefficients
         numbers = numbers[:4]
     return {
         "distortion_model": camera.kind if drawn else "none",

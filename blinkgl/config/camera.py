@@ -1,11 +1,11 @@
-"""``camera:`` of the YAML: size, intrinsics and lens.
+"""The ``camera:`` section: size, intrinsics and lens.
 
-camera: {width: 346, height: 260, fov: 60}                       # a pin-hole camera
-camera: {width: 640, height: 480, focal: 560, lens: radtan, distortion: [-0.37, 0.19, 1.0e-4, -2.0e-4]}
-camera: {calibration: camchain.yaml, calibration_name: cam1}     # Kalibr's, or DSEC's cam_to_cam.yaml
+camera: {width: 346, height: 260, fov: 60}                       # a pinhole camera
+camera: {width: 640, height: 480, focal: 560, lens: radtan, distortion: [-0.37, 0.19, 1.0e-4, -2.0e-4]} camera:
+{calibration: camchain.yaml, calibration_name: cam1}     # Kalibr's, or DSEC's cam_to_cam.yaml
 
-A calibration is read where the run is read and becomes the keys that it stands for, so that a sequence says all by
-itself.
+A calibration is replaced by the keys that it gives when the run is read, so that a sequence's configuration is complete
+without the file.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from blinkgl.errors import ConfigError
 _KEYS = ("width", "height", "lens", "distortion", "fov", "focal", "fx", "fy", "cx", "cy", "near")
 _OF_A_CALIBRATION = ("lens", "distortion", "fov", "focal", "fx", "fy", "cx", "cy")
 COUNTS = {"pinhole": (0,), "radtan": (4, 5), "equidistant": (4,)}
-"""How many coefficients a lens has."""
+"""Numbers of coefficients that a lens model may have."""
 
 
 class CameraConfig(Config):
-    """One camera, and its lens. Give the field of view, the focal length, or one for each axis."""
+    """One camera and its lens. Give the field of view, the focal length, or one focal length per axis."""
 
     width: int = Field(346, ge=1, le=16384, description="columns, px")
     height: int = Field(260, ge=1, le=16384, description="rows, px")
@@ -37,7 +37,7 @@ class CameraConfig(Config):
         None,
         gt=0.01,
         lt=179.9,
-        description="horizontal field of view, degrees, as it would be with all of `distortion` 0; default 60",
+        description="horizontal field of view, degrees, without `distortion`; default 60",
     )
     focal: float | None = Field(None, ge=1e-3, le=1e9, description="focal length, px (fx = fy)")
     fx: float | None = Field(None, ge=1e-3, le=1e9, description="focal length along x, px; with fy")
@@ -46,21 +46,21 @@ class CameraConfig(Config):
         None, ge=-1e6, le=1e6, description="principal point x, px; default the image centre, (width - 1) / 2"
     )
     cy: float | None = Field(None, ge=-1e6, le=1e6, description="principal point y, px; default (height - 1) / 2")
-    near: float = Field(0.05, ge=1e-9, le=1e9, description="near plane: nothing nearer is drawn, world units")
+    near: float = Field(0.05, ge=1e-9, le=1e9, description="near plane, world units: nothing nearer is drawn")
     lens: Literal["pinhole", "radtan", "equidistant"] = Field(
         "pinhole",
-        description="radtan: OpenCV's and Kalibr's plumb bob; equidistant: their fisheye (docs/cameras.md)",
+        description="radtan: plumb bob model of OpenCV and Kalibr; equidistant: their fisheye model (docs/cameras.md)",
     )
     distortion: tuple[Annotated[float, Field(ge=-1e6, le=1e6)], ...] = Field(
-        (), max_length=8, description="of radtan k1, k2, p1, p2 and, if there is one, k3; of equidistant k1 to k4"
+        (), max_length=8, description="radtan: k1, k2, p1, p2 and optionally k3; equidistant: k1 to k4"
     )
     calibration: str | None = Field(
         None,
-        description="YAML file of Kalibr (camchain), DSEC (cam_to_cam) or EuRoC (sensor): gives size, lens, "
-        "distortion, fx, fy, cx and cy, which it becomes when the run is read",
+        description="YAML file of Kalibr (camchain), DSEC (cam_to_cam) or EuRoC (sensor); its size, lens, "
+        "distortion, fx, fy, cx and cy replace this key when the run is read",
     )
     calibration_name: str | None = Field(
-        None, description="which camera of the calibration; default its only one, or cam0"
+        None, description="which camera of the calibration; default: its only one, or cam0"
     )
 
     @rule("fov", "focal", "fx", "fy")
@@ -97,7 +97,7 @@ class CameraConfig(Config):
 
     @rule(*_KEYS)
     def _can_be_drawn(width: int, height: int, lens: str, distortion: tuple[float, ...], *rest: Any):
-        if lens == "pinhole" or len(distortion) not in COUNTS[lens]:  # of which its own rule speaks
+        if lens == "pinhole" or len(distortion) not in COUNTS[lens]:  # the rule of distortion reports this
             return
         try:
             seen_through(_model(width, height, lens, distortion, *rest))
@@ -106,12 +106,12 @@ class CameraConfig(Config):
 
     @property
     def model(self) -> CameraModel:
-        """The camera that the keys describe."""
+        """Return the camera that the keys describe."""
         return _model(*(getattr(self, key) for key in _KEYS))
 
     def scaled(self, factor: float) -> dict[str, Any]:
-        """The keys of a camera that sees the same with ``factor`` times the pixels in x and y,
-        as near as whole pixels come to it."""
+        """Return the keys of a camera with the same view and ``factor`` times the pixels in x and y, rounded to whole
+        pixels."""
         said = {key: (value + 0.5) * factor - 0.5 for key in ("cx", "cy") if (value := getattr(self, key)) is not None}
         said |= {key: value * factor for key in ("focal", "fx", "fy") if (value := getattr(self, key)) is not None}
         said |= {"fov": self.fov} if self.fov is not None else {}
@@ -136,14 +136,14 @@ def _model(width, height, lens, distortion, fov, focal, fx, fy, cx, cy, near) ->
 
 
 def camera_radius(camera: CameraModel, clearance: float) -> float:
-    """How far a random world's camera keeps from everything: its clearance, or a little more
-    than the near plane's corners."""
+    """Return the distance that a random world's camera keeps from everything: its clearance, or a little more than the
+    distance of the near plane's corners."""
     return max(clearance, 1.01 * camera.near_corner)
 
 
 def calibrated(camera: Any, base: Path) -> Any:
-    """A ``camera:`` table with the keys of its calibration in that one's place, read from ``base``; without one as it
-    stands. Raises ConfigError."""
+    """Return a ``camera:`` table with its calibration, read from ``base``, replaced by the calibration's keys. A table
+    without a calibration is returned unchanged. Raises ConfigError."""
     if not isinstance(camera, dict) or camera.get("calibration") is None:
         return camera
     from blinkgl.config.camchain import read_camchain
@@ -185,7 +185,7 @@ def calibrated(camera: Any, base: Path) -> Any:
 
 
 def camera_keys(camera: CameraModel) -> dict[str, Any]:
-    """The keys of ``camera:`` that describe a camera model, without ``near``."""
+    """Return the keys of ``camera:`` that describe a camera model, without ``near``."""
     said: dict[str, Any] = {"width": camera.width, "height": camera.height}
     said |= zip(("fx", "fy", "cx", "cy"), camera.intrinsics)
     return said | ({"lens": camera.kind, "distortion": list(camera.distortion)} if camera.coefficients else {})

@@ -1,6 +1,6 @@
-"""``deform:`` of an object: how its shape changes with time, by formula.
+"""The ``deform:`` key of an object: how its shape changes with time, by formula.
 
-Lengths are in parts of the mesh's own size, so that one setting suits any mesh. What runs stands in
+Lengths are fractions of the mesh's size, so that one setting suits any mesh. The code is in
 :mod:`blinkgl.scene.shapes`.
 """
 
@@ -17,23 +17,23 @@ if TYPE_CHECKING:
     import numpy as np
 
 Axis = Literal["x", "y", "z"]
-Period = Annotated[float, Field(ge=0.001, le=1e6, description="s of one oscillation")]
+Period = Annotated[float, Field(ge=0.001, le=1e6, description="duration of one oscillation, s")]
 _Strength = Annotated[float, Field(ge=0, le=10)]
 _Period = Annotated[float, Field(ge=0.001, le=1e6)]
 StrengthRange = Annotated[tuple[_Strength, _Strength], BeforeValidator(as_pair), AfterValidator(ordered)]
 PeriodRange = Annotated[tuple[_Period, _Period], BeforeValidator(as_pair), AfterValidator(ordered)]
-Phase = Annotated[float, Field(ge=-360, le=360, description="degrees of the oscillation at time 0")]
+Phase = Annotated[float, Field(ge=-360, le=360, description="phase of the oscillation at time 0, degrees")]
 
 
 class DeformConfig(Family):
-    """The configuration of any deformer; a member declares its ``kind: Literal["..."] = "..."`` and takes no
-    argument without a default."""
+    """Base of the deformer configurations. A member declares its ``kind: Literal["..."] = "..."``; all its other keys
+    have defaults."""
 
     members: ClassVar[Members[DeformConfig]] = Members("kind", default="wave")
 
     @classmethod
     def drawn(cls, rng: np.random.Generator, strength: float, period: float) -> DeformConfig:
-        """One of the kind for a random world. strength : of its motion, 1: what its defaults are.   period : s."""
+        """Draw a deformer of this kind for a random world. strength : of the motion, 1: the defaults.   period : s."""
         given = {"period": period, "phase": float(rng.uniform(-180, 180))}
         return cls(**{key: value for key, value in given.items() if key in cls.model_fields})
 
@@ -49,13 +49,13 @@ def _across(along: str, towards: str) -> None:
 
 
 class WaveConfig(DeformConfig):
-    """A wave that runs along one axis and moves the surface along another."""
+    """A wave travels along one axis and moves the surface along another."""
 
     kind: Literal["wave"] = "wave"
-    along: Axis = Field("x", description="axis that the wave runs along, of the object at rest")
+    along: Axis = Field("x", description="axis that the wave travels along, of the object at rest")
     towards: Axis = Field("z", description="axis that the surface moves along")
-    amplitude: float = Field(0.08, ge=0, le=1, description="parts of the object's length along ``along``")
-    wavelength: float = Field(1.0, ge=0.05, le=100, description="parts of the object's length along ``along``")
+    amplitude: float = Field(0.08, ge=0, le=1, description="as a fraction of the object's length along ``along``")
+    wavelength: float = Field(1.0, ge=0.05, le=100, description="as a fraction of the object's length along ``along``")
     period: Period = 1.0
     phase: Phase = 0.0
 
@@ -70,18 +70,19 @@ class WaveConfig(DeformConfig):
 
 
 class FlagConfig(DeformConfig):
-    """Cloth in wind: held at one end, waving the more the further from it, with a second, shorter wave aslant."""
+    """Cloth in wind, held at one end: the motion grows with the distance from that end, and a second, shorter wave
+    crosses it."""
 
     kind: Literal["flag"] = "flag"
     along: Axis = Field("x", description="axis between the held end and the free one, of the object at rest")
     held: Literal["low", "high"] = Field(
-        "low", description="end of ``along`` that is held; along z, high: a sheet on a line"
+        "low", description="held end of ``along``; `along: z, held: high` is a sheet on a line"
     )
     towards: Axis = Field("y", description="axis that the cloth moves along")
     amplitude: float = Field(
-        0.12, ge=0, le=1, description="at the free end, parts of the object's length along ``along``"
+        0.12, ge=0, le=1, description="at the free end, as a fraction of the object's length along ``along``"
     )
-    wavelength: float = Field(0.8, ge=0.05, le=100, description="parts of the object's length along ``along``")
+    wavelength: float = Field(0.8, ge=0.05, le=100, description="as a fraction of the object's length along ``along``")
     period: Period = 0.7
     phase: Phase = 0.0
 
@@ -96,13 +97,13 @@ class FlagConfig(DeformConfig):
 
 
 class TwistConfig(DeformConfig):
-    """To and fro about an axis, the more the further from one end."""
+    """Twists to and fro about an axis; the angle grows with the distance from the held end."""
 
     kind: Literal["twist"] = "twist"
-    along: Axis = Field("z", description="axis that it is twisted about, of the object at rest")
-    angle: float = Field(60.0, ge=-720, le=720, description="degrees between the two ends, at most")
+    along: Axis = Field("z", description="axis of the twist, of the object at rest")
+    angle: float = Field(60.0, ge=-720, le=720, description="largest angle between the two ends, degrees")
     held: float = Field(
-        0.5, ge=0, le=1, description="where along the axis nothing turns: 0 the low end, 1 the high one"
+        0.5, ge=0, le=1, description="position along the axis that does not turn: 0 the low end, 1 the high end"
     )
     period: Period = 2.0
     phase: Phase = 0.0
@@ -115,14 +116,14 @@ class TwistConfig(DeformConfig):
 
 
 class BendConfig(DeformConfig):
-    """To and fro about an axis across: each slice is turned about the held one, the more the further it is away."""
+    """Bends to and fro: each slice turns about the held one, by an angle that grows with its distance."""
 
     kind: Literal["bend"] = "bend"
     along: Axis = Field("z", description="axis that is bent, of the object at rest")
-    towards: Axis = Field("x", description="axis that it is bent towards")
-    angle: float = Field(35.0, ge=-180, le=180, description="degrees of the slice furthest away, at most")
+    towards: Axis = Field("x", description="axis that it bends towards")
+    angle: float = Field(35.0, ge=-180, le=180, description="largest angle of the farthest slice, degrees")
     held: float = Field(
-        0.0, ge=0, le=1, description="where along the axis nothing turns: 0 the low end, 1 the high one"
+        0.0, ge=0, le=1, description="position along the axis that does not turn: 0 the low end, 1 the high end"
     )
     period: Period = 2.0
     phase: Phase = 0.0
@@ -137,7 +138,7 @@ class BendConfig(DeformConfig):
 
 
 class BreatheConfig(DeformConfig):
-    """Larger and smaller about the middle."""
+    """Grows and shrinks about its middle."""
 
     kind: Literal["breathe"] = "breathe"
     amount: tuple[
@@ -145,7 +146,9 @@ class BreatheConfig(DeformConfig):
         Annotated[float, Field(ge=-0.9, le=0.9)],
         Annotated[float, Field(ge=-0.9, le=0.9)],
     ] = Field(
-        (0.1, 0.1, 0.1), description="parts of the size along x, y, z; negative: smaller while others grow (a jelly)"
+        (0.1, 0.1, 0.1),
+        description="as fractions of the size along x, y, z; a negative one shrinks while the others grow (a "
+        "jellyfish)",
     )
     period: Period = 1.5
     phase: Phase = 0.0
@@ -157,16 +160,19 @@ class BreatheConfig(DeformConfig):
 
 
 class AnimationConfig(Config):
-    """One clip of a glTF file, and how it runs."""
+    """One clip of a glTF file, and how it is played."""
 
     clip: str | int = Field(0, description="name or index of the animation")
     file: str | None = Field(
         None,
-        description="another gltf or glb file to take the clip from, whose joints have the same names; null: the same",
+        description="another gltf or glb file with the clip, whose joints have the same names; null: the mesh's "
+        "own file",
     )
-    speed: float = Field(1.0, ge=-100, le=100, description="of the clip's own; negative: backwards")
-    phase: float = Field(0.0, ge=-1e6, le=1e6, description="s of the clip at time 0")
-    loop: bool = Field(True, description="begins again at its end; false: held before its first and after its last key")
+    speed: float = Field(1.0, ge=-100, le=100, description="factor on the clip's speed; negative: backwards")
+    phase: float = Field(0.0, ge=-1e6, le=1e6, description="time within the clip at time 0, s")
+    loop: bool = Field(
+        True, description="true: repeats; false: holds the first pose before it and the last pose after it"
+    )
 
     removed: ClassVar[Any] = {
         "blend": Removed("one clip; mix two in Blender and export the mixture", lambda value: value is None),
@@ -175,17 +181,19 @@ class AnimationConfig(Config):
 
 
 def animation_of(value: str | int | AnimationConfig | None, loop: bool = True) -> AnimationConfig | None:
-    """A clip's name or index as what it stands for."""
+    """Return the animation that a clip's name or index means."""
     return AnimationConfig(clip=value, loop=loop) if isinstance(value, (str, int)) else value
 
 
 class RandomDeformConfig(Config):
-    """The share of a random world's objects that change their shapes, by formula."""
+    """The fraction of a random world's objects that change their shape by formula."""
 
     share: float = Field(0.0, ge=0, le=1, description="fraction of the objects")
-    kinds: tuple[str, ...] = Field((), description="kinds of ``deform`` that are drawn, with equal chances; []: all")
-    strength: StrengthRange = Field((0.5, 1.5), description="of the motion, 1: the defaults of each kind; uniform")
-    period: PeriodRange = Field((0.5, 3.0), description="s of one oscillation; log-uniform")
+    kinds: tuple[str, ...] = Field((), description="kinds of ``deform`` that are drawn with equal chances; []: all")
+    strength: StrengthRange = Field(
+        (0.5, 1.5), description="strength of the motion, 1: the defaults of each kind; uniform"
+    )
+    period: PeriodRange = Field((0.5, 3.0), description="duration of one oscillation, s; log-uniform")
 
     @rule("kinds")
     def _known(kinds: tuple[str, ...]):

@@ -34,24 +34,24 @@ from blinkgl.errors import ConfigError
 from blinkgl.rng import Role
 
 _KINDS = ("uniform", "log_uniform", "normal", "integer", "choice", "weighted", "shares")
-_GOLDEN = 0x9E3779B97F4A7C15  # 2^64 / golden ratio: k times this, modulo 2^64, is the most even sequence there is
+_GOLDEN = 0x9E3779B97F4A7C15  # 2^64 / golden ratio: its multiples modulo 2^64 are spread as evenly as possible
 
 
 def is_distribution(node: Any) -> bool:
-    """Whether plain data is a distribution: a table of one key that names a kind."""
+    """Return whether plain data is a distribution: a table of one key that names a kind."""
     return isinstance(node, dict) and len(node) == 1 and next(iter(node)) in _KINDS
 
 
 def draw(tree: Any, seed: int, sequence: int) -> Any:
-    """``tree`` (plain YAML data) with every distribution replaced by the value drawn for ``sequence``.
+    """Return ``tree`` (plain YAML data) with every distribution replaced by the value drawn for ``sequence``.
 
     Raises ConfigError (with the path) for a malformed distribution."""
     return _walk(tree, (), lambda path, kind, spec: _draw_one(path, kind, spec, seed, sequence))
 
 
 def options(path: tuple[str, ...], node: dict[str, Any], between: bool = False) -> list[Any]:
-    """What stands for all that the distribution ``node`` can draw: both ends of a range, every choice. ``between``:
-    also a value inside the range. Raises ConfigError (with the path) for a malformed one."""
+    """Return values that represent all that the distribution ``node`` can draw: both ends of a range, every choice.
+    ``between``: also a value inside the range. Raises ConfigError (with the path) for a malformed one."""
     kind, spec = next(iter(node.items()))
     _check(path, kind, spec)
     if kind == "shares":
@@ -65,9 +65,9 @@ def options(path: tuple[str, ...], node: dict[str, Any], between: bool = False) 
 
 
 def middle(tree: Any) -> Any:
-    """``tree`` with the middle of every distribution in its place: half-way between the ends of a range (of their
-    logarithms for ``log_uniform``; the lower of two integers), and the value in the list of choices that half of the
-    chances have been dealt out by. Raises ConfigError (with the path) for a malformed one."""
+    """Return ``tree`` with every distribution replaced by its middle: half-way between the ends of a range (of their
+    logarithms for ``log_uniform``; the lower of two integers), and of choices the value at which half of the chances
+    are reached. Raises ConfigError (with the path) for a malformed one."""
     return _walk(tree, (), _middle)
 
 
@@ -160,7 +160,7 @@ _RULES: dict[str, tuple[Callable[[Any], bool], str, str]] = {
     "log_uniform": (_is_log_range, "a logarithmic range", "[low, high], 0 < low <= high"),
     "integer": (_is_integers, "a range of whole numbers", "[low, high], two integers, low <= high"),
 }
-"""Kind -> whether its parameters are right, what they are, and what is accepted."""
+"""Kind -> whether its parameters are valid, what they are, and what is accepted."""
 
 
 def _check(path: tuple[str, ...], kind: str, spec: Any) -> None:
@@ -187,7 +187,7 @@ def _draw_one(path: tuple[str, ...], kind: str, spec: Any, seed: int, sequence: 
         return list(spec)[int(rng.choice(len(weights), p=weights / weights.sum()))]
     if kind == "normal":
         mean, deviation, low, high = (_number(x) for x in spec)
-        for _ in range(1000):  # what is cut off is drawn again
+        for _ in range(1000):  # values outside the limits are drawn again
             value = float(rng.normal(mean, deviation))
             if low <= value <= high:
                 return value
@@ -196,13 +196,13 @@ def _draw_one(path: tuple[str, ...], kind: str, spec: Any, seed: int, sequence: 
     if kind == "integer":
         return int(rng.integers(int(low), int(high), endpoint=True))
     if kind == "log_uniform":
-        # exp(log(b)) may be above b.
+        # exp(log(b)) may exceed b
         return min(max(float(math.exp(rng.uniform(math.log(low), math.log(high)))), low), high)
     return float(rng.uniform(low, high))
 
 
 def _share_at(u: float, spec: list[dict[str, Any]]) -> Any:
-    """The value whose stretch of [0, 1) holds u."""
+    """Return the value whose part of [0, 1) contains u."""
     given = [part for part in spec if _number(part["share"]) > 0]
     upper = 0.0
     for part in given:
@@ -213,32 +213,31 @@ def _share_at(u: float, spec: list[dict[str, Any]]) -> Any:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Which plain configurations stand for all that a template can draw, so that a template is accepted or refused when
-# it is read.
+# Plain configurations that represent all that a template can draw, so that a template is accepted or refused when it is
+# read.
 #
-# A sequence draws every distribution of its template. Here every distribution gives an end of its range or one of
-# its choices (besides both ends a value between them is tried: 2.5 is no number of objects though 2 and 3 are), in
-# as many trees as are needed for each of them to come several times, dealt so that they meet in all mixtures: what
-# two or three distributions decide together is refused here. A combination of many that only few draws have may be
-# missed; the sequence that draws it is refused alone.
+# A sequence draws every distribution of its template. Here every distribution gives an end of its range or one of its
+# choices (a value between the ends is tried, too: 2.5 is not a number of objects although 2 and 3 are). There are
+# enough trees for each option to occur several times, in all combinations of two or three distributions, so a conflict
+# between those is refused here. A rare combination of many may be missed; the sequence that draws it is then refused.
 
 LEAST, MOST = 64, 160
-"""Trees of a template."""
+"""Fewest and most trees of a template."""
 _EACH = 4
-"""Trees for each option of a distribution."""
+"""Trees per option of a distribution."""
 
 
 @dataclass(frozen=True)
 class Fill:
-    """Values laid under what a configuration says: ``values(*reads)`` returns a tree of them.
+    """Values laid under a configuration: ``values(*reads)`` returns a tree of them.
 
-    reads : keys whose values it is given, as they are said; None: not said."""
+    reads : the keys whose values it receives, as they are written; None where a key is not given."""
 
     reads: tuple[str, ...]
     values: Callable[..., dict[str, Any]]
 
     def __call__(self, tree: dict[str, Any]) -> dict[str, Any]:
-        """``tree`` over the fill's values."""
+        """Return ``tree`` laid over the fill's values."""
         return _lay(self.values(*(_said(tree, key.split(".")) for key in self.reads)), tree)
 
 
@@ -249,15 +248,15 @@ def _said(tree: Any, path: list[str]) -> Any:
 
 
 def _lay(under: Any, over: Any) -> Any:
-    """Tables key by key; anything else that is said wins."""
+    """Lay ``over`` on ``under``: tables key by key; any other value of ``over`` replaces the one below."""
     if not (isinstance(under, dict) and isinstance(over, dict)):
         return over
     return {**under, **{key: _lay(under[key], value) if key in under else value for key, value in over.items()}}
 
 
 def sites(tree: Any) -> dict[Path, int]:
-    """Paths of all distributions, those inside the choices of others included, outermost first, and how many options
-    they have. Raises ConfigError for a bad one."""
+    """Return the paths of all distributions and their numbers of options, outermost first, including those inside the
+    choices of others. Raises ConfigError for a bad one."""
     found: dict[Path, int] = {}
 
     def walk(node: Any, path: Path) -> None:
@@ -275,8 +274,8 @@ def sites(tree: Any) -> dict[Path, int]:
 
 
 def corners(tree: Any) -> Iterator[Any]:
-    """Plain trees that stand for all that ``tree`` can draw, as this module says; the first has every first option.
-    What does not vary is shared by all of them. Raises ConfigError for a bad distribution."""
+    """Yield plain trees that represent all that ``tree`` can draw (see the comment above); the first has every first
+    option. They share the parts that do not vary. Raises ConfigError for a bad distribution."""
     if not (every := sites(tree)):
         yield tree
         return
@@ -287,7 +286,7 @@ def corners(tree: Any) -> Iterator[Any]:
 
 
 class _Dealer:
-    """Gives every distribution its options in rounds, each round in an order of its own."""
+    """Gives every distribution its options in rounds; each round has its own order."""
 
     def __init__(self):
         self._random = random.Random(0)
@@ -304,7 +303,7 @@ class _Dealer:
 
 
 def _chosen(node: Any, path: Path, pick: Callable[[Path, dict[str, Any]], Any]) -> Any:
-    """The node with ``pick``'s option of every distribution; the same object where it has none."""
+    """Return the node with every distribution replaced by ``pick``'s option; the same object where there is none."""
     if is_distribution(node):
         return _chosen(pick(path, node), path, pick)
     children = _children(node)

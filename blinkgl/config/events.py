@@ -1,8 +1,7 @@
-"""Event emulators: parameters, units, defaults and where each comes from.
+"""Configurations of the event emulators: parameters, units, defaults and the source of each.
 
-``emulator`` picks the model; ``preset`` fills in published parameter sets, and any key given beside it wins over the
-preset. What configuration has to know of an emulator stands in its model here; what runs, and the
-table of both, in :mod:`blinkgl.events.table`.
+``emulator`` selects the model. ``preset`` fills in a published parameter set; a key given beside it overrides the
+preset. The code of the emulators, and the table that connects both, is in :mod:`blinkgl.events.table`.
 """
 
 from __future__ import annotations
@@ -24,33 +23,33 @@ _MAX_EVENTS = Field(
     2**25,
     ge=1_000,
     le=2**31 - 1,
-    description="Most events one step may emit, shared out equally among blocks "
-    "of 1024 pixels (a block may always emit one per pixel). Where more could fire, each pixel of the block "
-    "is cut to the same number; levels still move, the cut events are counted in `emulator.saturated`. "
-    "2^25 events need about 1 GB while they are sorted.",
+    description="Most events one step may emit, divided equally among blocks of 1024 pixels (a block may always "
+    "emit one per pixel). Above its limit every pixel of a block is cut to the same number; levels "
+    "still move, and `emulator.saturated` counts the cut events. Sorting 2^25 events needs about 1 "
+    "GB.",
 )
 _CAUSES = Field(
     False,
-    description="Mark every event by what caused it (`Events.cause`; `events/cause` in HDF5, `cause` in .npz): "
-    "0 signal, 1 leak, 2 shot noise, 3 hot pixel. The events are the same.",
+    description="Mark every event with its cause (`Events.cause`; `events/cause` in HDF5, `cause` in .npz): 0 "
+    "signal, 1 leak, 2 shot noise, 3 hot pixel. The events are the same.",
 )
 Device = Literal["auto", "cpu", "cuda"]
 _DEVICE: Any = Field(
     "auto",
-    description="Where events are made: `cpu`, by compiled loops; `cuda`, by torch on a card, which takes frames that "
-    "the same card has drawn without moving them (straight lines between frames alone). The events are the same. "
-    "`auto`: `cuda` where a card draws the frames, torch has a card and a short trial gives the same events; else "
-    "`cpu`.",
+    description="Where events are computed: `cpu`, compiled loops; `cuda`, torch on a GPU, which takes frames "
+    "rendered on the same GPU without copying them (only with straight lines between frames). The "
+    "events are the same. `auto`: `cuda` where a GPU renders the frames, torch can use it and a "
+    "short trial gives the same events; else `cpu`.",
 )
 _THRESHOLD = dict(ge=0.001, le=10.0)
 
 
 class Fitted(NamedTuple):
-    """Ends of what a calibration tries for a key, more than 0; it goes in steps of a ratio. The lower end of a noise is
-    as good as none.
+    """The range that a calibration tries for a key, > 0, in steps of constant ratio. The lower end of a noise is as
+    good as none.
 
-    usual, factor : what cameras have, and one standard deviation of it as a ratio (thresholds of DAVIS settings from
-    0.11 to 0.56 have been published; a dark offset of 20 codes, Lin et al. 2022); None: nothing is known."""
+    usual, factor : the value that cameras have, and one standard deviation of it as a ratio (published DAVIS thresholds
+    range from 0.11 to 0.56; a dark offset of 20 codes, Lin et al. 2022); None: not known."""
 
     low: float
     high: float
@@ -99,8 +98,8 @@ _VOLTMETER_FITTED = {
 
 
 class EmulatorConfig(Family):
-    """The configuration of any emulator; a field is ``events: EmulatorConfig = EsimConfig()``. A member declares its
-    name, ``emulator: Literal["..."] = "..."``, takes no argument without a default, and says what stands here."""
+    """Base of the emulator configurations; a field is ``events: EmulatorConfig = EsimConfig()``. A member declares its
+    name, ``emulator: Literal["..."] = "..."``, gives every key a default, and defines the attributes below."""
 
     members: ClassVar[Members[EmulatorConfig]] = Members("emulator", default="esim")
 
@@ -108,21 +107,21 @@ class EmulatorConfig(Family):
 
         @property
         def emulator(self) -> str:
-            """The name."""
+            """Return the emulator's name."""
 
     fitted: ClassVar[Mapping[str, Fitted]] = MappingProxyType({})
-    """Keys that `blinkgl calibrate` finds from a recording."""
+    """Keys that `blinkgl calibrate` estimates from a recording."""
     one_threshold: ClassVar[bool] = False
-    """Nothing of it says how many events are ON and how many OFF: a calibration then asks for both together."""
+    """Whether ON and OFF events cannot be weighted separately: a calibration then uses their sum."""
 
     @classmethod
     @abstractmethod
     def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:
-        """Values of those of its keys of which a camera's data sheet says something; None where this one does not."""
+        """Return the values of the keys that a camera's data sheet describes; None where this sensor gives none."""
 
 
 def _with_both_thresholds(data: dict[str, Any], default: float) -> dict[str, Any]:
-    """The threshold that is not given, from the one that is and ``threshold_ratio``."""
+    """Return ``data`` with the missing threshold computed from the given one and ``threshold_ratio``."""
     ratio, off = data.get("threshold_ratio"), data.get("contrast_threshold_off")
     if ratio is None or (off is not None and "contrast_threshold" in data):
         return data
@@ -145,7 +144,7 @@ def _pixel(sensor: SensorConfig) -> dict[str, Any]:
 
 
 class _TwoThresholds:
-    """What holds for emulators with ``contrast_threshold``, ``contrast_threshold_off`` and ``threshold_ratio``."""
+    """Shared by emulators with ``contrast_threshold``, ``contrast_threshold_off`` and ``threshold_ratio``."""
 
     if TYPE_CHECKING:
         model_fields: ClassVar[dict[str, Any]]
@@ -186,35 +185,35 @@ class EsimConfig(_TwoThresholds, EmulatorConfig):
         None,
         ge=0.01,
         le=100,
-        description="OFF threshold over contrast_threshold, instead of contrast_threshold_off; or, where only that is "
-        "given, ON over OFF.",
+        description="OFF threshold / contrast_threshold, instead of contrast_threshold_off; where only "
+        "contrast_threshold_off is given, ON / OFF.",
     )
     threshold_sigma: float = Field(
         0.021,
         ge=0,
         le=5,
-        description="Standard deviation of C+ and C- over the pixels, in ln "
-        "units (rpg_esim's default 0.021), drawn once per pixel; each threshold stays >= 0.01 "
-        "(or >= half of a smaller nominal one).",
+        description="Standard deviation of C+ and C- over the pixels, ln units (rpg_esim: 0.021), drawn once per "
+        "pixel; each threshold stays >= 0.01 (or >= half of a smaller nominal one).",
     )
     threshold_jitter: float = Field(
         0.0,
         ge=0,
         le=5,
-        description="Standard deviation of the threshold from event to event, in ln units, drawn once per event.",
+        description="Standard deviation of the threshold from event to event, ln units, drawn once per event.",
     )
     log_eps: float = Field(
         1e-3,
         ge=1e-9,
         le=1e6,
-        description="Added to the intensity before the logarithm, in the units "
-        "of the intensity (rpg_esim's default 1e-3 for intensities in [0, 1]).",
+        description="Added to the intensity before the logarithm, in units of the intensity (rpg_esim: 1e-3 for "
+        "intensities in [0, 1]).",
     )
     refractory_us: float = Field(
         0.0,
         ge=0,
         le=1e9,
-        description="Dead time of a pixel after an event, microseconds; a level passed in it is lost, as in rpg_esim.",
+        description="Dead time of a pixel after an event, microseconds; a level crossed during it is lost, as in "
+        "rpg_esim.",
     )
     max_events_per_step: int = _MAX_EVENTS
     causes: bool = _CAUSES
@@ -273,8 +272,8 @@ class V2eConfig(_TwoThresholds, EmulatorConfig):
         None,
         ge=0.01,
         le=100,
-        description="OFF threshold over contrast_threshold, instead of contrast_threshold_off; or, where only that is "
-        "given, ON over OFF.",
+        description="OFF threshold / contrast_threshold, instead of contrast_threshold_off; where only "
+        "contrast_threshold_off is given, ON / OFF.",
     )
     threshold_sigma: float = Field(
         0.03,
@@ -286,7 +285,7 @@ class V2eConfig(_TwoThresholds, EmulatorConfig):
         255.0,
         gt=0,
         le=1e9,
-        description="Digital number of luminance 1.0: v2e's lin-log joint (20) and its 275 are on the 8-bit scale.",
+        description="Digital number of luminance 1.0; v2e's lin-log limit (20) and its 275 refer to 8-bit values.",
     )
     cutoff_hz: float = Field(
         300.0,
@@ -313,24 +312,24 @@ class V2eConfig(_TwoThresholds, EmulatorConfig):
         0.001,
         ge=0,
         le=1e4,
-        description="Noise events per second and pixel in the dark, ON and "
-        "OFF together (v2e: 0.001); at full scale a quarter of it.",
+        description="Noise events per second and pixel in the dark, ON and OFF together (v2e: 0.001); a quarter "
+        "of it at full scale.",
     )
     photoreceptor_noise: bool = Field(
         False,
-        description="Make the noise events by low-passed noise before the comparator, "
-        "at the rate shot_noise_rate_hz, instead of drawing events; needs cutoff_hz > 0.",
+        description="Make noise events by low-pass filtered noise before the comparator, at the rate "
+        "shot_noise_rate_hz, instead of drawing them; needs cutoff_hz > 0.",
     )
     refractory_us: float = Field(500.0, ge=0, le=1e9, description="Dead time after an event, microseconds (v2e: 500).")
     start: Literal["stationary", "balanced", "zero"] = Field(
         "stationary",
-        description="Where a pixel stands between its levels at the first frame. `stationary`: as in a still scene "
-        "that was watched for long, which leak has brought nearer to ON (each pixel to another place): short clips "
-        "then have more ON events than a scene that has been moving. `balanced`: as after a signal that went up as "
-        "often as down. `zero`: every pixel has just fired, as v2e starts. Without leak the first and the last are "
-        "the same.",
+        description="State of the pixels between their levels at the first frame. `stationary`: as after a long "
+        "time in front of a still scene, where leak has moved each pixel towards ON; short clips "
+        "then have more ON events than a moving scene. `balanced`: as after a signal that rose as "
+        "often as it fell. `zero`: every pixel has just fired, as in v2e. Without leak `stationary` "
+        "and `zero` are the same.",
     )
-    hot_pixel_fraction: float = Field(0.0, ge=0, le=1, description="Share of pixels that fire by themselves.")
+    hot_pixel_fraction: float = Field(0.0, ge=0, le=1, description="Fraction of pixels that fire without a signal.")
     hot_pixel_rate_hz: float = Field(100.0, ge=0, le=1e5, description="Mean rate of a hot pixel, Hz, ON.")
     max_events_per_step: int = _MAX_EVENTS
     causes: bool = _CAUSES
@@ -377,9 +376,11 @@ class VoltmeterConfig(EmulatorConfig):
     )
     k2: float = Field(20.0, gt=0, le=1e4, description="Dark-current offset, digital numbers.")
     k3: float = Field(1e-4, ge=0, le=1, description="Photon shot noise, sqrt(DN) per sqrt(us).")
-    k4: float = Field(1e-7, ge=-1, le=1, description="Leak by temperature (junction leakage), thresholds per us.")
+    k4: float = Field(
+        1e-7, ge=-1, le=1, description="Temperature-dependent leak (junction leakage), thresholds per us."
+    )
     k5: float = Field(5e-9, ge=-1, le=1, description="Leak by parasitic photocurrent, thresholds per us and DN.")
-    k6: float = Field(1e-5, ge=0, le=1, description="Noise of the circuit, thresholds per sqrt(us).")
+    k6: float = Field(1e-5, ge=0, le=1, description="Circuit noise, thresholds per sqrt(us).")
     full_scale: float = Field(
         255.0, gt=0, le=1e9, description="Digital number of luminance 1.0 (the constants are on the 8-bit scale)."
     )
@@ -388,15 +389,15 @@ class VoltmeterConfig(EmulatorConfig):
     )
     start: Literal["stationary", "zero"] = Field(
         "stationary",
-        description="V at the first frame: as of a scene that has stood still for long, or 0 everywhere (as in the "
-        "authors' program: the first leak events of a flat image then come together).",
+        description="V at the first frame: as after a long time in front of a still scene, or 0 everywhere (as "
+        "in the authors' program, where the first leak events of a flat image coincide).",
     )
     max_events_per_step: int = _MAX_EVENTS
     causes: bool = _CAUSES
 
     @classmethod
     def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:
-        """The constants of the nearest calibrated camera, with the gain that the threshold asks for."""
+        """Return the constants of the nearest calibrated camera, with the gain that gives the sensor's threshold."""
         gain = None if sensor.contrast_threshold is None else 1 / sensor.contrast_threshold
         return {"preset": "DVS346", "refractory_us": sensor.refractory_us, "k1": gain}
 

@@ -1,13 +1,13 @@
-"""What a run names becomes what it stands for, once, when it is read: a run and its sequences then say all by
-themselves, wherever they are read next.
+"""Replace the names in a run's configuration by what they refer to, once, when it is read. A run and its sequences are
+then complete without other files.
 
-    scene: {from: FILE, …}        the scene of another YAML file, the other keys laid over it
+    scene: {from: FILE, …}        the scene of another YAML file, with the other keys laid over it
     camera: {calibration: FILE}   the intrinsics of a calibration (blinkgl.config.camera)
-    sensor: FILE                  the table of a sensor's file, or of a shipped one whose values are distributions
-    events: {recipe: NAME, …}     an emulator as a published training set had it, the other keys laid over it
+    sensor: FILE                  the table of a sensor file, or of a shipped sensor whose values are distributions
+    events: {recipe: NAME, …}     the emulator of a published training set, with the other keys laid over it
 
-These stand at the top, in groups and, but for scenes, at the sensors of a rig; also as options of a distribution.
-(``quality:`` and ``rig:`` are filled in later, when a sequence has been drawn: blinkgl.config.run.)
+These may be at the top level, in groups and, except scenes, at the sensors of a rig; also as options of a distribution.
+(``quality:`` and ``rig:`` are filled in when a sequence has been drawn: blinkgl.config.run.)
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ from blinkgl.errors import ConfigError
 
 
 class Recipe(Config):
-    """A shipped recipe as its file says it."""
+    """A shipped recipe file."""
 
-    about: str = Field(description="Which data set or program, and its paper.")
-    events: dict[str, Any] = Field(description="Keys of `events:`; distributions are drawn once a sequence.")
-    sources: dict[str, str] = Field(description="Where each value comes from, by key.")
-    differs: str = Field("", description="In what this is not what they did.")
+    about: str = Field(description="The data set or program, and its paper.")
+    events: dict[str, Any] = Field(description="Keys of `events:`; distributions are drawn once per sequence.")
+    sources: dict[str, str] = Field(description="Source of each value, by key.")
+    differs: str = Field("", description="Differences from the original.")
 
 
 def load_recipe(name: str) -> Recipe:
-    """A shipped recipe. Raises ConfigError naming the known ones."""
+    """Return a shipped recipe. Raises ConfigError listing the known ones."""
     known = shipped_names("emulators")
     if not isinstance(name, str) or name not in known:
         raise ConfigError("unknown recipe", where="events.recipe", value=name, accepted=f"one of {', '.join(known)}")
@@ -53,8 +53,8 @@ def load_recipe(name: str) -> Recipe:
 
 
 def expanded(tree: Table, base: Path) -> Table:
-    """``tree`` with its calibrations and sensors' files, read from ``base``, and recipes spelled out. Raises
-    ConfigError."""
+    """Return ``tree`` with its calibrations, sensor files (paths relative to ``base``) and recipes replaced by their
+    content. Raises ConfigError."""
     meanings = {
         "camera": partial(calibrated, base=base),
         "sensor": partial(sensor_file_or_name, base=base),
@@ -76,7 +76,7 @@ def _recipe(events: Any) -> Any:
 
 
 def _over(events: Table, own: Table) -> Table:
-    """``own`` keys over those of a recipe."""
+    """Return a recipe's keys with ``own`` laid over them."""
     if own.get("emulator", events.get("emulator")) != events.get("emulator"):
         raise ConfigError(
             "the recipe is of another emulator",
@@ -88,7 +88,7 @@ def _over(events: Table, own: Table) -> Table:
 
 
 def with_scenes(tree: Table, base: Path) -> Table:
-    """``tree`` with every ``scene: {from: FILE, …}`` replaced by that file's scene. Raises ConfigError."""
+    """Return ``tree`` with every ``scene: {from: FILE, …}`` replaced by that file's scene. Raises ConfigError."""
     groups = tree.get("groups")
     named = [(f"groups.{name}.", group) for name, group in groups.items()] if isinstance(groups, dict) else []
     for prefix, table in (("", tree), *named):

@@ -1,5 +1,4 @@
-"""``frames:`` section: sequences converted from recorded or rendered frames, such as
-TartanAir's, instead of from a scene."""
+"""The ``frames:`` section: sequences made from recorded or rendered frames, such as TartanAir's, instead of a scene."""
 
 from __future__ import annotations
 
@@ -11,16 +10,16 @@ from blinkgl.config.base import Config, Refused, Removed, rule
 from blinkgl.config.values import Paths
 
 MAX_SPAN_S = (2**32 - 1) * 1e-6
-"""Longest recording of one event file, s: DSEC counts its microseconds in 32 bits."""
+"""Longest recording of one event file, s: DSEC stores microseconds in 32 bits."""
 
 
 class FramesConfig(Config):
-    """Frames of a folder through the event emulator; a flow file per pair of frames becomes the label."""
+    """Folders of frames as input of the event emulator; a flow file per pair of frames becomes the label."""
 
     folders: Paths = Field(
         (),
-        description="folders of one sequence each, or patterns such as `/data/tartanair/*/*/P0*`; sequence n takes "
-        "the n-th in alphabetical order",
+        description="folders of one sequence each, or patterns such as `/data/tartanair/*/*/P0*`; sequence n "
+        "uses the n-th in alphabetical order",
     )
     images: str = Field("image_left", description="sub-folder of the images, or '.'")
     flow: str | None = Field(
@@ -32,26 +31,27 @@ class FramesConfig(Config):
         10.0,
         ge=0.001,
         le=1e6,
-        description="frames per second that the frames are taken to have, Hz; flow labels come at this rate",
+        description="frame rate that is assumed for the frames, Hz; flow labels have this rate",
     )
-    first: int = Field(0, ge=0, description="frames left out at the beginning")
+    first: int = Field(0, ge=0, description="frames skipped at the beginning")
     count: int | None = Field(None, ge=3, description="frames used; null: all")
     gamma: Literal["srgb", "linear"] = Field("srgb", description="transfer curve of the images")
     interpolate: Literal["linear", "motion"] = Field(
         "motion", description="between frames: as `blinkgl simulate --interpolate`"
     )
-    max_px: float = Field(1.0, gt=0, le=1e3, description="motion: largest displacement per step, px")
+    max_px: float = Field(1.0, gt=0, le=1e3, description="for motion: largest displacement per step, px")
     keep_noise: bool = Field(
         False,
-        description="make events of the images' own noise, too: otherwise it is found from the first images, and what "
-        "it explains makes none (images without noise are taken as they are)",
+        description="make events of the images' noise, too; otherwise the noise is estimated from the first "
+        "images and changes that it explains cause no events (images without noise are used "
+        "unchanged)",
     )
     max_displacement: float | None = Field(
         17.0,
         gt=0,
         le=1e4,
-        description="99th percentile of the given flow, px, above which frames are too far apart to interpolate and "
-        "their sequence is set aside; null: no check",
+        description="99th percentile of the given flow, px, above which frames are too far apart to interpolate "
+        "and their sequence is skipped; null: no check",
     )
     removed: ClassVar[Any] = {
         "qualify": Removed("max_displacement", lambda value: value is None or isinstance(value, dict)),
@@ -65,7 +65,7 @@ class FramesConfig(Config):
 
 
 def check_span(frames: int, fps: float) -> None:
-    """Refuses ``frames`` frames at ``fps`` that are longer than one event file can hold."""
+    """Raise Refused for ``frames`` frames at ``fps`` that are longer than one event file can hold."""
     if (frames - 1) / fps > MAX_SPAN_S:
         raise Refused(
             f"{frames} frames at this rate last {(frames - 1) / fps:.6g} s, more than the {MAX_SPAN_S:.1f} s that an "

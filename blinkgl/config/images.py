@@ -1,4 +1,4 @@
-"""``images:`` of the YAML: the frame camera beside the event camera (:mod:`blinkgl.imaging`)."""
+"""The ``images:`` section: the frame camera beside the event camera (:mod:`blinkgl.imaging`)."""
 
 from __future__ import annotations
 
@@ -11,26 +11,28 @@ from blinkgl.config.base import Config, Refused, rule
 
 NS_PER_S, NS_PER_US = 1_000_000_000, 1000
 MAX_IMAGES = 1_000_000
-"""Files have numbers of six digits."""
+"""File names have six digits."""
 
 
 class LensConfig(Config):
-    """A thin lens: what is nearer or farther than what is in focus is seen as a disc."""
+    """A thin lens: a point out of focus is imaged as a disc."""
 
     aperture: float = Field(gt=0, le=1e6, description="diameter of the lens, world units; focal length / f-number")
-    focus: float = Field(gt=0, le=1e9, description="depth along the optical axis that is in focus, world units")
+    focus: float = Field(gt=0, le=1e9, description="depth in focus, along the optical axis, world units")
 
 
 class AutoExposureConfig(Config):
-    """Exposure and gain follow the light, one image late and with a lag. The time changes first, the gain beyond it."""
+    """Exposure and gain follow the light, one image late and with a lag. The time changes first, then the gain."""
 
     target: float = Field(
-        0.18, gt=0, lt=1, description="mean of the image that it steers to, linear; 1 is the largest code"
+        0.18, gt=0, lt=1, description="mean of the image that it aims at, linear; 1 is the largest code"
     )
-    lag: float = Field(0.2, ge=0, le=1e4, description="time constant, s, in which 63 % of the way is gone; 0: at once")
-    shortest_us: float = Field(20.0, ge=1, le=1e9, description="the exposure is never shorter, µs")
-    longest_us: float = Field(20000.0, ge=1, le=1e9, description="the exposure is never longer, µs")
-    max_gain_db: float = Field(24.0, ge=0, le=60, description="the gain is never higher, dB")
+    lag: float = Field(
+        0.2, ge=0, le=1e4, description="time constant, s, after which 63 % of a change is done; 0: immediate"
+    )
+    shortest_us: float = Field(20.0, ge=1, le=1e9, description="shortest exposure, µs")
+    longest_us: float = Field(20000.0, ge=1, le=1e9, description="longest exposure, µs")
+    max_gain_db: float = Field(24.0, ge=0, le=60, description="highest gain, dB")
 
     @rule("shortest_us", "longest_us")
     def _ordered(shortest, longest):
@@ -44,8 +46,8 @@ class AutoExposureConfig(Config):
 
 
 class ImagesConfig(Config):
-    """A frame camera that looks through the event camera's pixels: images with exposure, shutter, lens and noise, at
-    times of its own. Where it is asked for, `labels.images` is false unless that is said."""
+    """A frame camera that shares the event camera's pixels: images with exposure, shutter, lens and noise, at their own
+    times. It sets `labels.images` to false unless that is given."""
 
     presets: ClassVar[dict[str, dict[str, Any]]] = {
         "plain": {},
@@ -80,60 +82,66 @@ class ImagesConfig(Config):
     instead: ClassVar[dict[str, str]] = {"times": "rate"}
 
     preset: Literal["plain", "deblurring", "interpolation", "low_light", "rolling_shutter", "raw"] = Field(
-        "plain", description="gives the other keys the values of a use (docs/images.md); what is said beside it wins"
+        "plain",
+        description="gives the other keys the values of a use (docs/images.md); keys given beside it override it",
     )
     rate: float | None = Field(
         30.0,
         gt=0,
         le=1e5,
-        description="images per second, Hz, the first exposed from the sequence's start on; null beside `times`",
+        description="images per second, Hz, the first exposed at the sequence's start; null with `times`",
     )
     times: tuple[float, ...] | None = Field(
-        None, min_length=1, max_length=MAX_IMAGES, description="when exposures begin instead, s on the sequence's clock"
+        None,
+        min_length=1,
+        max_length=MAX_IMAGES,
+        description="starts of exposures, s on the sequence's clock, instead of a rate",
     )
     exposure_us: float = Field(5000.0, ge=1, le=1e9, description="exposure time of each pixel, µs")
     row_us: float = Field(
-        0.0, ge=0, le=1e6, description="rolling shutter: each row is exposed so much later than the one above, µs"
+        0.0, ge=0, le=1e6, description="rolling shutter: delay of each row's exposure after the row above, µs"
     )
     max_px: float = Field(
         0.5,
         gt=0,
         le=1e3,
-        description="an image is the mean of so many instants that nothing moves farther from one to the next, px",
+        description="an image is the mean of enough instants that nothing moves farther than this between two, px",
     )
-    max_instants: int = Field(256, ge=1, le=65536, description="but of no more than this")
+    max_instants: int = Field(256, ge=1, le=65536, description="largest number of instants per image")
     white: float = Field(
-        1.0, gt=0, le=1e9, description="linear radiance of the largest code, with the exposure and gain given here"
+        1.0, gt=0, le=1e9, description="linear radiance of the largest code, at the exposure and gain given here"
     )
     gain_db: float = Field(
         0.0,
         ge=0,
         le=60,
-        description="gain, dB: white then takes full_well / gain electrons, so more gain is more noise",
+        description="gain, dB: white then equals full_well / gain electrons, so a higher gain gives more noise",
     )
-    full_well: float = Field(10000.0, ge=1, le=1e9, description="electrons that a pixel holds; more light adds none")
-    photon_noise: bool = Field(False, description="electrons are Poisson distributed")
+    full_well: float = Field(10000.0, ge=1, le=1e9, description="electrons at which a pixel saturates")
+    photon_noise: bool = Field(False, description="Poisson distributed electrons")
     read_noise: float = Field(0.0, ge=0, le=1e6, description="standard deviation of the read-out, electrons")
-    black: float = Field(0.0, ge=0, le=0.5, description="what no light reads as, a fraction of the linear scale")
-    bits: int = Field(8, ge=8, le=16, description="of a code; more than 8 are written as 16-bit PNG, codes as they are")
-    response: Literal["srgb", "gamma", "linear"] = Field("srgb", description="how linear light becomes codes")
-    gamma: float = Field(2.2, ge=0.1, le=10, description="of `response: gamma`: code = light ^ (1 / gamma)")
+    black: float = Field(0.0, ge=0, le=0.5, description="value without light, a fraction of the linear scale")
+    bits: int = Field(
+        8, ge=8, le=16, description="bits per code; more than 8 are written as 16-bit PNG with unscaled codes"
+    )
+    response: Literal["srgb", "gamma", "linear"] = Field("srgb", description="curve from linear light to codes")
+    gamma: float = Field(2.2, ge=0.1, le=10, description="for `response: gamma`: code = light ^ (1 / gamma)")
     bayer: Literal["rggb", "bggr", "grbg", "gbrg"] | None = Field(
         None,
-        description="one colour per pixel by this pattern (row by row from the top left): one channel, as read out",
+        description="one colour per pixel in this pattern (row by row from the top left): one channel, as read out",
     )
     vignetting: float = Field(
         0.0,
         ge=0,
         le=1,
-        description="share of the natural fall-off, cos^4 of the angle to the optical axis; 1: all of it",
+        description="fraction of the natural fall-off, cos^4 of the angle to the optical axis; 1: all of it",
     )
-    lens: LensConfig | None = Field(None, description="null: a pin-hole, everything is sharp")
-    auto_exposure: AutoExposureConfig | None = Field(None, description="null: exposure and gain stay")
+    lens: LensConfig | None = Field(None, description="null: a pinhole, everything is in focus")
+    auto_exposure: AutoExposureConfig | None = Field(None, description="null: constant exposure and gain")
     also: tuple[Literal["sharp", "clean"], ...] = Field(
         (),
-        description="written side by side with each image. sharp: as seen at the middle of the exposure, all rows at "
-        "once, through a pin-hole, without noise. clean: the same image without noise",
+        description="further pictures written for each image. sharp: at the middle of the exposure, global "
+        "shutter, pinhole, no noise. clean: the same image without noise",
     )
 
     @rule(
@@ -199,27 +207,28 @@ class ImagesConfig(Config):
 
     @property
     def pictures(self) -> tuple[str, ...]:
-        """What is written of each image: "images", and those of ``also``."""
+        """Return what is written of each image: "images", and those of ``also``."""
         return ("images", *(name for name in ("sharp", "clean") if name in self.also))
 
     @property
     def longest_us(self) -> float:
-        """Longest that a pixel is exposed, µs."""
+        """Return the longest exposure of a pixel, µs."""
         return self.exposure_us if self.auto_exposure is None else self.auto_exposure.longest_us
 
     @property
     def noisy(self) -> bool:
-        """Whether two seeds give two images."""
+        """Return whether two seeds give different images."""
         return self.photon_noise or self.read_noise > 0
 
 
 def readout_us(rows: int, row_us: float) -> float:
-    """From the first row's exposure to the last one's, µs."""
+    """Return the time from the first row's exposure to the last row's, µs."""
     return (rows - 1) * row_us
 
 
 def exposure_starts(images: ImagesConfig, t0_ns: int, t1_ns: int, rows: int) -> list[int]:
-    """When exposures of the first row begin, ns: all whose last row's ends within [t0, t1] however long they become."""
+    """Return the starts of the first row's exposures, ns: all whose last row ends within [t0, t1] at the longest
+    exposure."""
     lasts_ns = round(NS_PER_US * (images.longest_us + readout_us(rows, images.row_us)))
     if images.rate is None:
         return [round(NS_PER_S * t) for t in images.times or ()]
@@ -235,7 +244,7 @@ def check_images(
     start: float,
     seconds: float,
 ) -> None:
-    """Of a sequence from ``start`` on, s, that lasts so many: raises Refused, where ``images:`` stands."""
+    """Check a sequence that begins at ``start``, s, and lasts ``seconds``. Raises Refused."""
     whole_us = lasts_us + rows_us
     if rate is not None:
         if rows_us * rate > 1e6 * (1 + 1e-9):

@@ -1,5 +1,5 @@
-"""``labels:``: which ground truth is written. Rows of :mod:`blinkgl.labels` say what each is; a label that is added
-while the program runs, and has no key here, gets one of its own."""
+"""The ``labels:`` section: which ground truth is written. The rows of :mod:`blinkgl.labels` define each label; a label
+that is added at run time and has no key here gets one."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ _ACCEPTED = (
 
 
 def _where_to(value: Any) -> str | float:
-    """An entry of ``labels.flow``: a direction, or seconds, which may be written as a fraction. Raises Refused."""
+    """Return an entry of ``labels.flow``: a direction, or an interval in s, which may be written as a fraction. Raises
+    Refused."""
     if isinstance(value, str) and value in ("forward", "backward"):
         return value
-    # No Fraction: that of "1e999999999" is a number of as many digits, and takes hours.
+    # Not Fraction: for "1e999999999" it builds a number of as many digits, which takes hours.
     top, slash, bottom = value.partition("/") if isinstance(value, str) else (value, "", "1")
     try:
         seconds = math.nan if isinstance(value, bool) else float(top) / float(bottom if slash else 1)
@@ -32,7 +33,7 @@ def _where_to(value: Any) -> str | float:
 
 
 def _each_once(flow: tuple[str | float, ...]) -> tuple[str | float, ...]:
-    """Raises Refused for an interval that is there twice."""
+    """Return the entries. Raises Refused for an interval that is given twice."""
     known: set[int] = set()
     for one in (one for one in flow if isinstance(one, float)):
         if round(one * 1e6) in known:
@@ -42,7 +43,7 @@ def _each_once(flow: tuple[str | float, ...]) -> tuple[str | float, ...]:
 
 
 def _a_table(value: Any) -> Any:
-    """One message for what is neither of the two, instead of one for each."""
+    """Check a table of patterns, so that a wrong value gives one message instead of one per member of the union."""
     if isinstance(value, bool):
         return value
     if not isinstance(value, dict):
@@ -58,20 +59,20 @@ def _a_table(value: Any) -> Any:
 
 
 class LabelsConfig(Growing):
-    """What is written at label times. A pass that nobody asks for is not compiled, allocated or run.
-
-    settings : keys that are no label's name."""
+    """Ground truth at label times. A pass that no label needs is not compiled, allocated or run."""
 
     settings: ClassVar[Any] = ("events", "pixels", "flow", "float_flow", "occlusion")
+    """Keys that do not name a label."""
     events: bool = Field(
         False,
-        description="what made each event: instance, depth and image velocity of the surface, and the cause "
-        "(`events.causes` is then true unless that is said), in event_labels.h5, a row per event; docs/formats.md",
+        description="source of each event: instance, depth and image velocity of the surface, and the cause "
+        "(sets `events.causes` to true unless it is given), in event_labels.h5, a row per event; "
+        "docs/formats.md",
     )
     pixels: Literal["sensor", "rectified"] = Field(
         "sensor",
-        description="of a lens that distorts: whether labels at label times and tracks are in the sensor's own pixels, "
-        "as the events are, or in those of the rectified pin-hole picture (docs/cameras.md)",
+        description="for a lens with distortion: labels at label times and tracks use the sensor's pixels, as "
+        "events do, or those of the rectified pinhole image (docs/cameras.md)",
     )
     images: bool = Field(True, description="sRGB PNG of the colour pass")
     flow: Annotated[
@@ -80,41 +81,42 @@ class LabelsConfig(Growing):
     ] = Field(
         ("forward",),
         max_length=1000,
-        description="optical flow: forward to the next label and backward to the one before, DSEC 16-bit PNG; numbers "
-        "are intervals of one's own, s, from each label's time on (`0.01`, `1/30`; negative: back), float32 .h5 "
-        "(docs/over_time.md)",
+        description="optical flow: forward to the next label and backward to the previous one, DSEC 16-bit PNG; "
+        "numbers are other intervals, s, from each label's time (`0.01`, `1/30`; negative: "
+        "backward), float32 .h5 (docs/over_time.md)",
     )
-    float_flow: tuple[Literal["npy", "flo"], ...] = Field((), description="float32 flow besides the PNG")
-    occlusion: bool = Field(True, description="masks of pixels that are not visible at the flow's other end")
+    float_flow: tuple[Literal["npy", "flo"], ...] = Field((), description="float32 flow in addition to the PNG")
+    occlusion: bool = Field(True, description="masks of pixels that are not visible at the other end of the flow")
     depth: bool = Field(False, description="float32 .npy, world units along the optical axis")
     disparity: bool = Field(
         False,
-        description="float32 .npy, px: x in the left eye less x in the right of a stereo pair, 0 where nothing is hit "
-        "(docs/rigs.md)",
+        description="float32 .npy, px: x in the left image minus x in the right image of a stereo pair, 0 where "
+        "nothing is hit (docs/rigs.md)",
     )
     ids: bool = Field(False, description="instance ids, 16-bit PNG")
     normals: bool = Field(False, description="unit normals in camera axes, float32 .npy")
     velocity: bool = Field(False, description="instantaneous image velocity, px/s, float32 .npy")
     scene_flow: bool = Field(
         False,
-        description="3-D motion of the surface to the next label, world units in the camera's axes at the label's "
-        "time, 0 for what stands still, float32 .npy",
+        description="3-D motion of the surface to the next label, world units in the camera's axes at the "
+        "label's time, 0 for static surfaces, float32 .npy",
     )
     semantics: Annotated[bool | dict[str, int], BeforeValidator(_a_table)] = Field(
         False,
-        description='category of what is seen, 16-bit PNG: a table of patterns, `{"wall-*": 1, "chair*": 7, "*": 0}`, '
-        "the first that fits an object's name, its meshes' or its category counts, 0 where none does; true: by kind of "
-        "shape, sky 1, ground 2, wall 3, cuboid 4 … (docs/boxes.md)",
+        description="category of each pixel, 16-bit PNG. Table: patterns such as "
+        '`{"wall-*": 1, "chair*": 7, "*": 0}`; the first that matches an object\'s name, mesh or '
+        "category counts, 0 where none matches. true: by kind of shape, sky 1, ground 2, wall 3, "
+        "cuboid 4 … (docs/boxes.md)",
     )
     boxes: bool = Field(
         False,
-        description="boxes of objects, in the picture (visible, whole) and in space, .npz and KITTI's text "
+        description="bounding boxes of objects, in the image (visible, whole) and in 3-D, .npz and KITTI's text "
         "(docs/boxes.md)",
     )
 
 
 def fill_causes(events: bool | None, emulator: str | None) -> dict[str, Any]:
-    """Whose truth is asked for say their causes, too, where their emulator knows them."""
+    """Return ``causes: true`` for emulators that know their events' causes where ``labels.events`` is on."""
     name = EmulatorConfig.members.default if emulator is None else emulator
     model = EmulatorConfig.members.models.get(name) if isinstance(name, str) else None
     return {"events": {"causes": True}} if events is True and model and "causes" in model.model_fields else {}

@@ -1,4 +1,4 @@
-"""``light:`` of a scene: lamps, panoramas, fog."""
+"""Lights of a scene: ``light:``, random lights, panoramas and fog."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from blinkgl.config.values import (
     Vector3,
 )
 
-MAX_LIGHTS = 31  # and the sun
+MAX_LIGHTS = 31  # plus the sun
 
 
 class _LampConfig(Config):
     strength: Radiance = Field(
         1.0,
-        description="radiance of a white surface that faces it; of a point or spot light 1 m away from it, falling "
-        "with the square of the distance",
+        description="radiance of a white surface that faces it; for point and spot lights at a distance of 1 m, "
+        "falling with the square of the distance",
     )
     color: Color = Field((1.0, 1.0, 1.0), description="linear factor")
 
@@ -36,20 +36,20 @@ class SunLampConfig(_LampConfig):
     kind: Literal["sun"]
     elevation: float = Field(60.0, ge=-90, le=90, description="degrees above the horizon")
     azimuth: float = Field(40.0, ge=-360, le=360, description="degrees from +x towards +y")
-    size: float = Field(0.53, ge=0, le=45, description="its diameter in the sky, degrees: softens soft shadows")
+    size: float = Field(0.53, ge=0, le=45, description="angular diameter, degrees: softens soft shadows")
 
 
 class _PlacedLampConfig(_LampConfig):
     position: Position = Field(description="m")
     reach: Positive | None = Field(
         None,
-        description="m at which it has faded to nothing, by 1 - (distance / reach)^4; null: it falls with the square "
-        "of the distance alone",
+        description="distance, m, at which it has faded to zero, by 1 - (distance / reach)^4; null: it falls "
+        "only with the square of the distance",
     )
 
 
 class PointLampConfig(_PlacedLampConfig):
-    """Shines to all sides."""
+    """Shines in all directions."""
 
     kind: Literal["point"]
 
@@ -58,10 +58,10 @@ class SpotLampConfig(_PlacedLampConfig):
     """Shines in a cone."""
 
     kind: Literal["spot"]
-    look_at: Position = Field(description="a point on the cone's axis, m")
-    angle: float = Field(60.0, ge=0.5, le=170, description="of the whole cone, degrees")
-    edge: Fraction = Field(0.2, description="share of the half angle over which it fades out")
-    size: float = Field(0.1, ge=0, le=1e3, description="its diameter, m: softens soft shadows")
+    look_at: Position = Field(description="a point on the axis of the cone, m")
+    angle: float = Field(60.0, ge=0.5, le=170, description="full angle of the cone, degrees")
+    edge: Fraction = Field(0.2, description="fraction of the half angle over which it fades out")
+    size: float = Field(0.1, ge=0, le=1e3, description="diameter, m: softens soft shadows")
 
     @rule("look_at", "position")
     def _some_direction(look_at, position):
@@ -73,20 +73,19 @@ LampConfig = one_of("kind", SunLampConfig, PointLampConfig, SpotLampConfig)
 
 
 class EnvironmentConfig(Config):
-    """A panorama that lights a scene in the place of light.sun and light.sky, and is seen as its sky."""
+    """A panorama that lights a scene instead of light.sun and light.sky, and is seen as its sky."""
 
-    map: str = Field(description="equirectangular image: hdr or exr, or one of 8 bits, which knows no bright sun")
+    map: str = Field(description="equirectangular image: hdr or exr; an 8-bit image has no bright sun")
     strength: Radiance = Field(
-        1.0, description="factor on its radiance, which is exposed so that its 90th percentile is 0.8"
+        1.0, description="factor on its radiance, which is scaled so that its 90th percentile is 0.8"
     )
-    heading: float = Field(0.0, ge=-360, le=360, description="degrees by which it is turned from +x towards +y")
-    visible: bool = Field(True, description="whether it is drawn, as a sky at infinity")
+    heading: float = Field(0.0, ge=-360, le=360, description="rotation, degrees from +x towards +y")
+    visible: bool = Field(True, description="whether it is drawn as a sky at infinity")
     removed: ClassVar[Any] = {"size": Removed("no size: a panorama is at infinity", lambda value: value == 100)}
 
 
 class LightConfig(Config):
-    """A sun and a sky, white as long as nobody says otherwise: E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 n_z), and
-    lights beside them."""
+    """A sun and a sky, white by default: E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 n_z), and further lights."""
 
     sun: float = Field(0.6, ge=0, le=1e9, description="strength of the sun, radiance of a white facing surface")
     sky: float = Field(0.4, ge=0, le=1e9, description="strength of the sky")
@@ -101,24 +100,24 @@ class LightConfig(Config):
     )
     sun_color: Color = Field((1.0, 1.0, 1.0), description="linear factor")
     sky_color: Color = Field((1.0, 1.0, 1.0), description="linear factor")
-    sun_size: float = Field(0.53, ge=0, le=45, description="its diameter in the sky, degrees: softens soft shadows")
-    lights: tuple[LampConfig, ...] = Field(
-        (), description="suns, point and spot lights beside the sun and the sky, in the world's coordinates"
-    )
+    sun_size: float = Field(0.53, ge=0, le=45, description="angular diameter, degrees: softens soft shadows")
+    lights: tuple[LampConfig, ...] = Field((), description="further suns, point and spot lights, in world coordinates")
     environment: EnvironmentConfig | None = Field(
         None,
-        description="a panorama that lights the scene; null: the sun and the sky shine. In random worlds: sky.lights",
+        description="a panorama that lights the scene; null: the sun and the sky. In random worlds use sky.lights",
     )
     shadows: Annotated[Literal["off", "hard", "soft"], BeforeValidator(lambda v: "off" if v is False else v)] = Field(
         "off",
-        description="of objects and walls, cast by the sun, further suns and spot lights, four at most (soft: two); "
-        "hard: edges are as wide as a texel of the shadow map; soft: by the size of the light, up to 48 texels",
+        description="shadows of objects and walls from the sun, further suns and spot lights, at most four "
+        "(soft: two); hard: edges as wide as a texel of the shadow map; soft: edges depend on the "
+        "size of the light, up to 48 texels",
     )
-    shadow_size: int = Field(1024, ge=64, le=8192, description="texels a side of each shadow map")
+    shadow_size: int = Field(1024, ge=64, le=8192, description="side of each shadow map, texels")
     unlit: bool = Field(False, description="radiance = albedo on every surface")
 
     def sun_direction(self, elevation: float = 60.0, azimuth: float = 40.0) -> Vector3:
-        """Unit vector towards the sun; the arguments (degrees) stand where the configuration leaves the angle open."""
+        """Return the unit vector towards the sun; the arguments (degrees) replace angles that the configuration leaves
+        open."""
         return direction_of(
             elevation if self.sun_elevation is None else self.sun_elevation,
             azimuth if self.sun_azimuth is None else self.sun_azimuth,
@@ -137,28 +136,30 @@ class LightConfig(Config):
 
 
 def direction_of(elevation: float, azimuth: float) -> Vector3:
-    """Unit vector in the world, of angles in degrees: above the horizon, and from +x towards +y."""
+    """Return the world unit vector at these angles in degrees: above the horizon, and from +x towards +y."""
     e, a = math.radians(elevation), math.radians(azimuth)
     return math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)
 
 
 class RandomLightsConfig(Config):
-    """Lights that a random world has beside its sun and sky, each at a place above the ground of the region."""
+    """Further lights of a random world, each at a random position in the region, above the ground."""
 
     count: tuple[Annotated[int, Field(ge=0, le=MAX_LIGHTS)], Annotated[int, Field(ge=0, le=MAX_LIGHTS)]] = Field(
-        (1, 3), description="[fewest, most] lights; every number as likely"
+        (1, 3), description="[fewest, most] lights; all numbers equally likely"
     )
     kinds: Annotated[tuple[Literal["sun", "point", "spot"], ...], Field(min_length=1)] = Field(
-        ("point", "spot"), description="each light is one of these, all as likely"
+        ("point", "spot"), description="kinds that are drawn, equally likely"
     )
-    strength: PositiveRange = Field((3.0, 30.0), description="of point and spot lights, see light.lights; log-uniform")
+    strength: PositiveRange = Field(
+        (3.0, 30.0), description="strength of point and spot lights, see light.lights; log-uniform"
+    )
     sun_strength: ClassVar[Any] = (0.1, 0.6)
-    """Of further suns; log-uniform."""
+    """Strength of further suns; log-uniform."""
     saturation: ClassVar[Any] = 0.5
-    """How colourful they are at most; the brightest channel is 1 and all hues are as likely."""
+    """Largest saturation of a colour; the brightest channel is 1 and all hues are equally likely."""
     fixed: ClassVar[Any] = ("sun_strength", "saturation")
     height: PositiveRange = Field((2.0, 6.0), description="above the ground, m; uniform")
-    angle: PositiveRange = Field((30.0, 100.0), description="of a spot light's cone, degrees; uniform")
+    angle: PositiveRange = Field((30.0, 100.0), description="angle of a spot light's cone, degrees; uniform")
 
     @rule("count")
     def _fewest_first(count: tuple[int, int]):
@@ -172,10 +173,12 @@ class RandomLightsConfig(Config):
 
 
 class FogConfig(Config):
-    """A medium that swallows light and sends its own, for event frames and images alike."""
+    """A medium that absorbs light and adds its own, for event frames and images."""
 
-    density: float = Field(gt=0, le=1e6, description="per world unit: light from 1 / density away has faded to 37 %")
-    radiance: Radiance = Field(0.7, description="linear radiance of fog alone, which is what the background becomes")
+    density: float = Field(
+        gt=0, le=1e6, description="density per world unit: 37 % of the light is left after 1 / density"
+    )
+    radiance: Radiance = Field(0.7, description="linear radiance of the fog itself, which replaces the background")
 
 
 FOG = Field(None, description="null: clear air")

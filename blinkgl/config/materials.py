@@ -1,4 +1,4 @@
-"""What a surface of an explicit scene is made of (docs/materials.md)."""
+"""Materials of an explicit scene (docs/materials.md)."""
 
 from __future__ import annotations
 
@@ -15,42 +15,41 @@ Repeats = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
 class MaterialConfig(Config):
-    """A colour, times at most one texture; what more a surface is."""
+    """A colour times at most one texture, and further properties of the surface."""
 
     texture: str | None = Field(None, description="image file, sRGB, or .hdr, linear")
     procedural: Literal[TextureKind, "pips"] | None = Field(
         None, description="kind of procedural texture; pips: the faces of a die"
     )
-    seed: int = Field(0, ge=0, description="which procedural texture of that kind")
+    seed: int = Field(0, ge=0, description="number of the procedural texture of that kind")
     photograph: str | None = Field(
         None, description="name of a photograph bundled with scikit-image, such as astronaut"
     )
     max_size: int = Field(2048, ge=1, le=16384, description="longer texture sides are reduced to this, px")
     color: tuple[Radiance, Radiance, Radiance] = Field((1.0, 1.0, 1.0), description="linear factor")
     uv_scale: tuple[Repeats, Repeats] = Field((1.0, 1.0), description="texture repeats per unit of texture coordinate")
-    unlit: bool = Field(False, description="radiance = albedo, whatever the light")
-    double_sided: bool = Field(False, description="draw back faces, with the normal turned round")
-    metallic: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="how much of it is metal")
+    unlit: bool = Field(False, description="radiance = albedo, independent of light")
+    double_sided: bool = Field(False, description="draw back faces, with the normal reversed")
+    metallic: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="fraction that is metal")
     roughness: Annotated[float, Field(ge=0, le=1)] = Field(
-        1.0, description="0: a mirror; 1, of what is no metal: matt, without any reflection"
+        1.0, description="0: a mirror; 1 for a non-metal: matt, without reflection"
     )
     metallic_roughness_map: str | None = Field(
         None,
-        description="image file of numbers, as in glTF: its blue channel times metallic, its green one times roughness",
+        description="linear image file, as in glTF: its blue channel times metallic, its green channel times roughness",
     )
-    normal_map: str | None = Field(
-        None, description="image file of normals: x to the right in the picture, y up, z outwards, as in glTF"
-    )
+    normal_map: str | None = Field(None, description="image file of normals, as in glTF: x right, y up, z outwards")
     normal_scale: Annotated[float, Field(ge=-100, le=100)] = Field(
-        1.0, description="factor on the x and y of the normal map; y alone the other way: swap it in the picture"
+        1.0, description="factor on x and y of the normal map; to flip y alone, invert it in the image"
     )
-    emission: tuple[Radiance, Radiance, Radiance] = Field((0.0, 0.0, 0.0), description="radiance of its own, linear")
+    emission: tuple[Radiance, Radiance, Radiance] = Field((0.0, 0.0, 0.0), description="emitted radiance, linear")
     emission_map: str | None = Field(None, description="image file, sRGB, times emission")
     mask: str | None = Field(
         None,
-        description="image file of what is there: holes where its opacity, or its grey if it has none, is below cutoff",
+        description="image file: the surface has holes where its opacity (its grey value if it has none) is "
+        "below cutoff",
     )
-    cutoff: Annotated[float, Field(gt=0, le=1)] = Field(0.5, description="of the mask, 1 being white or opaque")
+    cutoff: Annotated[float, Field(gt=0, le=1)] = Field(0.5, description="threshold of the mask; 1 is white or opaque")
 
     @rule("texture", "procedural", "photograph")
     def _one(*sources):
@@ -60,7 +59,7 @@ class MaterialConfig(Config):
 
     @property
     def files(self) -> dict[str, str]:
-        """What it reads, by key."""
+        """Return the files that the material reads, by key."""
         keys = ("texture", "metallic_roughness_map", "normal_map", "emission_map", "mask")
         return {key: file for key in keys if (file := getattr(self, key)) is not None}
 

@@ -1,4 +1,4 @@
-"""``imu:`` and ``tracks:``: what is measured and followed over time, beside events and labels (docs/over_time.md)."""
+"""The ``imu:`` and ``tracks:`` sections: time series beside events and labels (docs/over_time.md)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pydantic import Field
 from blinkgl.config.base import Config, Refused
 
 # ---------------------------------------------------------------------------------------------------------------------
-# ``imu:`` of the YAML: the inertial unit on the camera (:mod:`blinkgl.sequence.inertial`).
+# The ``imu:`` section: the inertial unit on the camera (:mod:`blinkgl.sequence.inertial`).
 
 MAX_SAMPLES = 10_000_000
 _Vector = tuple[float, float, float]
@@ -17,8 +17,8 @@ _NOISE = dict(ge=0, le=1e3)
 
 
 class ImuConfig(Config):
-    """An inertial unit fixed to the camera: what it would measure, and what it does with noise and biases. World units
-    are metres. Densities are those of Kalibr's imu.yaml: of continuous time, whatever the rate."""
+    """An inertial unit fixed to the camera. World units are metres. Noise densities are those of Kalibr's imu.yaml: of
+    continuous time, independent of the rate."""
 
     presets: ClassVar[dict[str, dict[str, Any]]] = {
         "ideal": {},
@@ -32,30 +32,30 @@ class ImuConfig(Config):
 
     preset: Literal["ideal", "adis16448"] = Field(
         "ideal",
-        description="gives the noise: none, or that of EuRoC's unit as its sensor.yaml has it; what is said beside it "
-        "wins",
+        description="noise values: ideal has none, adis16448 those of EuRoC's sensor.yaml; keys given beside it "
+        "override them",
     )
-    rate: float = Field(200.0, gt=0, le=1000, description="measurements per second, Hz, from the sequence's start on")
+    rate: float = Field(200.0, gt=0, le=1000, description="measurements per second, Hz, from the sequence's start")
     position: _Vector = Field(
-        (0.0, 0.0, 0.0), description="where it is, m, on the camera's axes: x right, y down, z forward"
+        (0.0, 0.0, 0.0), description="position, m, in the camera's axes: x right, y down, z forward"
     )
     rotation: _Vector = Field(
         (0.0, 0.0, 0.0),
-        description="how it is turned, degrees about x, y and z of the camera's axes, one after the other; 0, 0, 0: it "
-        "has the camera's axes",
+        description="rotation, degrees about x, y and z of the camera's axes, in this order; 0, 0, 0: the "
+        "camera's axes",
     )
-    gravity: _Vector = Field((0.0, 0.0, -9.81), description="acceleration of free fall, m/s², world axes")
+    gravity: _Vector = Field((0.0, 0.0, -9.81), description="gravitational acceleration, m/s², world axes")
     accelerometer_noise_density: float = Field(0.0, **_NOISE, description="white noise, m/s²/√Hz")
-    accelerometer_random_walk: float = Field(0.0, **_NOISE, description="of the bias, m/s³/√Hz")
+    accelerometer_random_walk: float = Field(0.0, **_NOISE, description="random walk of the bias, m/s³/√Hz")
     gyroscope_noise_density: float = Field(0.0, **_NOISE, description="white noise, rad/s/√Hz")
-    gyroscope_random_walk: float = Field(0.0, **_NOISE, description="of the bias, rad/s²/√Hz")
+    gyroscope_random_walk: float = Field(0.0, **_NOISE, description="random walk of the bias, rad/s²/√Hz")
     accelerometer_bias: ClassVar[Any] = (0.0, 0.0, 0.0)
     gyroscope_bias: ClassVar[Any] = (0.0, 0.0, 0.0)
     fixed: ClassVar[Any] = ("accelerometer_bias", "gyroscope_bias")
 
     @property
     def noisy(self) -> bool:
-        """Whether two seeds measure two things."""
+        """Return whether two seeds give different measurements."""
         return any(
             (
                 self.accelerometer_noise_density,
@@ -67,17 +67,17 @@ class ImuConfig(Config):
 
 
 def imu_count(rate: float, t0_ns: int, t1_ns: int) -> int:
-    """Measurements in [t0, t1], both included where one falls there."""
+    """Return the number of measurements in [t0, t1], both ends included."""
     return int((t1_ns - t0_ns) * 1e-9 * rate + 1e-9) + 1
 
 
 def imu_times(rate: float, t0_ns: int, t1_ns: int) -> list[int]:
-    """When it measures, ns."""
+    """Return the times of the measurements, ns."""
     return [t0_ns + round(k * 1e9 / rate) for k in range(imu_count(rate, t0_ns, t1_ns))]
 
 
 def check_imu(rate: float, seconds: float) -> None:
-    """Raises Refused, where ``imu:`` stands, for a sequence of more measurements than are held."""
+    """Raise Refused for a sequence with more measurements than fit into memory."""
     if rate * seconds > MAX_SAMPLES:
         raise Refused(
             f"{rate * seconds:.0f} measurements",
@@ -88,37 +88,36 @@ def check_imu(rate: float, seconds: float) -> None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# ``tracks:`` of the YAML: points on surfaces that are followed through the sequence (:mod:`blinkgl.render.tracks`).
+# The ``tracks:`` section: points on surfaces that are followed through the sequence (:mod:`blinkgl.render.tracks`).
 
 MAX_POSITIONS = 50_000_000
-"""Points times times: what is held in memory."""
+"""Largest number of points times the number of times, all of which are held in memory."""
 
 
 class TracksConfig(Config):
-    """Points on surfaces, followed: where each is in the image and in the world, and whether it is seen, in
-    tracks.npz."""
+    """Points on surfaces that are followed: image position, world position and visibility of each, in tracks.npz."""
 
-    points: int = Field(256, ge=1, le=1_000_000, description="how many, at most")
+    points: int = Field(256, ge=1, le=1_000_000, description="largest number of points")
     choose: Literal["grid", "surface"] = Field(
         "grid",
-        description="grid: what the pixels of a regular grid see at the first time; surface: places drawn evenly on "
-        "the bodies' surfaces, of which those are kept that are ever seen",
+        description="grid: the surface points at the pixels of a regular grid at the first time; surface: points "
+        "drawn uniformly on the surfaces, of which those that are visible at some time are kept",
     )
     rate: float | None = Field(
         None,
         gt=0,
         le=1e5,
-        description="positions per second, Hz, from the first label's time on; null: at the labels' times",
+        description="positions per second, Hz, from the first label's time; null: at the labels' times",
     )
 
 
 def track_times(rate: float | None, first_ns: int, end_ns: int, interval_ns: int) -> range:
-    """Times of positions, ns: from the first label's on, one ``rate`` apart (None: a label interval)."""
+    """Return the times of positions, ns: from the first label's time, at ``rate`` (None: the label interval)."""
     return range(first_ns, end_ns + 1, interval_ns if rate is None else max(1, round(1e9 / rate)))
 
 
 def check_tracks(points: int, rate: float, seconds: float) -> None:
-    """Raises Refused, where ``tracks:`` stands, for more positions than are held."""
+    """Raise Refused for more positions than fit into memory."""
     count = seconds * rate + 1
     if points * count > MAX_POSITIONS:
         raise Refused(

@@ -1,14 +1,15 @@
-"""``physics:`` of a scene and of its objects: what falls, bounces and is thrown. Computed by MuJoCo before anything is
-drawn (:mod:`blinkgl.scene.motion.dynamics`); the models here only know units and limits.
+"""The ``physics:`` section of a scene and of its objects: bodies that fall, bounce and are thrown. MuJoCo computes the
+motion before anything is drawn (:mod:`blinkgl.scene.motion.dynamics`); these models define only units and limits.
 
 scene:
   kind: explicit
   physics: {gravity: [0, 0, -9.81]}
   objects:
-    - {mesh: floor, category: ground}                      # stands still: things fall on it
+    - {mesh: floor, category: ground}                      # static: things fall on it
     - mesh: die
       position: [0, 0, 1.5]
       physics: {mass: 0.1, restitution: 0.5, velocity: [1, 0, 2], spin: [0, 720, 90]}
+
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ _Velocity = Annotated[float, Field(ge=-1e4, le=1e4)]
 _Spin = Annotated[float, Field(ge=-36_000.0, le=36_000.0)]
 _Friction = Annotated[float, Field(ge=0, le=10)]
 _Density = Annotated[float, Field(gt=0, le=1e9)]
-# Above this a stack of soft contacts gains energy from rounding; a super ball has 0.9.
+# Above this value a stack of soft contacts gains energy from rounding; a super ball has 0.9.
 _Restitution = Annotated[float, Field(ge=0, le=0.95)]
 
 
@@ -34,58 +35,65 @@ def _range_of(number):
 
 
 class PhysicsConfig(Config):
-    """What all bodies of a scene share. World units are metres, or gravity is to be said in theirs."""
+    """Physics of a whole scene. World units are metres; in other units, give gravity in those."""
 
     gravity: tuple[_Acceleration, _Acceleration, _Acceleration] = Field((0.0, 0.0, -9.81), description="m/s²")
     rate: float = Field(
         20_000.0,
         ge=1000,
         le=1e6,
-        description="steps of the engine per second, Hz; time to compute goes with it. An impact lasts 1.6 ms, "
-        "in which a body sinks in by a third of its speed times that (5 m/s: 2.5 mm), but never less "
-        "than 16 steps",
+        description="steps of the physics engine per second, Hz; computing time is proportional to it. An impact "
+        "lasts 1.6 ms, but at least 16 steps; during it a body sinks in by a third of its speed "
+        "times that time (5 m/s: 2.5 mm)",
     )
     max_speed: float = Field(
-        200.0, gt=0, le=1e4, description="m/s; a body that is faster ends the sequence with an error: it exploded"
+        200.0,
+        gt=0,
+        le=1e4,
+        description="m/s; a faster body means that the simulation diverged, and ends the sequence with an error",
     )
 
 
 class RandomPhysicsConfig(PhysicsConfig):
-    """Of a random world: a share of the objects is dropped where it was placed, or thrown. They meet the ground,
-    each other, objects on their trajectories and the camera's clearance, and stay in the region: its sides hold
-    them back, seen or not."""
+    """Physics of a random world: a fraction of the objects falls from where it was placed, or is thrown. They collide
+    with the ground, each other, objects on trajectories and the camera's clearance. Invisible walls keep them in the
+    region."""
 
-    max_speed: float = Field(50.0, gt=0, le=1e4, description="m/s; an object that comes to be faster is left out")
-    share: float = Field(0.5, ge=0, le=1, description="share of the objects that fall; the others: object_motion")
-    thrown: float = Field(0.5, ge=0, le=1, description="share of those that is thrown; the others are dropped")
-    speed: SpeedRange = Field((1.0, 6.0), description="of the thrown, m/s: a number or [low, high]; uniform")
-    spin: RateRange = Field((0.0, 540.0), description="turning of the thrown, deg/s: a number or [low, high]; uniform")
+    max_speed: float = Field(50.0, gt=0, le=1e4, description="m/s; an object that becomes faster is left out")
+    share: float = Field(
+        0.5, ge=0, le=1, description="fraction of the objects that fall; the others follow object_motion"
+    )
+    thrown: float = Field(0.5, ge=0, le=1, description="fraction of those that is thrown; the others are dropped")
+    speed: SpeedRange = Field((1.0, 6.0), description="speed of thrown objects, m/s: a number or [low, high]; uniform")
+    spin: RateRange = Field(
+        (0.0, 540.0), description="rotation rate of thrown objects, deg/s: a number or [low, high]; uniform"
+    )
     density: _range_of(_Density) = Field((100.0, 2000.0), description="kg/m³: a number or [low, high]; log-uniform")
     friction: _range_of(_Friction) = Field((0.2, 0.9), description="a number or [low, high]; uniform")
     restitution: _range_of(_Restitution) = Field((0.1, 0.8), description="a number or [low, high]; uniform")
-    rolling: float = Field(0.01, ge=0, le=1, description="rolling friction, of a body's radius")
+    rolling: float = Field(0.01, ge=0, le=1, description="rolling friction, as a fraction of a body's radius")
 
 
 class BodyConfig(Config):
-    """What the engine makes of one object. What touches is each part's convex hull (a box and a ball where the mesh is
-    one, a flat ground without end): hollows are filled. Where two surfaces meet, the larger friction and the smaller
-    restitution count. An object without this, in a scene with physics, is in the way, and what hits it has both
-    numbers; sky is never."""
+    """Physics of one object. Each part collides as its convex hull, so hollows are filled (a box and a ball are exact,
+    a flat ground is infinite). Where two surfaces meet, the larger friction and the smaller restitution count. An
+    object without this table, in a scene with physics, is an obstacle, and the friction and restitution of the other
+    body count. The sky never collides."""
 
     kind: Literal["dynamic", "fixed", "none"] = Field(
         "dynamic",
-        description="dynamic: falls and is pushed; fixed: stays where it is, or on its key frames, whatever hits it; "
-        "none: is not there",
+        description="dynamic: falls and is pushed; fixed: stays in place, or on its key frames, whatever hits "
+        "it; none: does not collide",
     )
-    mass: float | None = Field(None, gt=0, le=1e12, description="kg; null: by its density")
+    mass: float | None = Field(None, gt=0, le=1e12, description="kg; null: from the density")
     density: _Density = Field(700.0, description="kg/m³ (wood)")
-    friction: _Friction = Field(0.5, description="Coulomb's coefficient")
-    rolling: float = Field(0.01, ge=0, le=1, description="rolling friction, of the body's radius")
+    friction: _Friction = Field(0.5, description="coefficient of Coulomb friction")
+    rolling: float = Field(0.01, ge=0, le=1, description="rolling friction, as a fraction of the body's radius")
     restitution: _Restitution = Field(
-        0.5, description="speed after an impact against a fixed surface over that before it"
+        0.5, description="speed after an impact on a fixed surface divided by the speed before it"
     )
     velocity: tuple[_Velocity, _Velocity, _Velocity] = Field(
-        (0.0, 0.0, 0.0), description="of the centre of mass at the start, m/s"
+        (0.0, 0.0, 0.0), description="velocity of the centre of mass at the start, m/s"
     )
     spin: tuple[_Spin, _Spin, _Spin] = Field(
         (0.0, 0.0, 0.0), description="angular velocity at the start about the world's axes, deg/s"
@@ -101,4 +109,4 @@ class BodyConfig(Config):
 
 
 IN_THE_WAY = BodyConfig(kind="fixed", friction=0.0, rolling=0.0, restitution=0.95)
-"""An object that says nothing: what hits it decides."""
+"""Physics of an object without its own table: the values of the body that hits it count."""

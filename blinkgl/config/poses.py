@@ -1,4 +1,4 @@
-"""Where bodies and cameras are: poses, key frames, trajectories of files, ways."""
+"""Positions and orientations of bodies and cameras: poses, key frames, trajectory files, ways."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from blinkgl.config.values import (
 )
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A rigid transform that a person gives as four rows of four.
+# A rigid transform as four rows of four numbers.
 
 _Row = tuple[float, float, float, float]
 Matrix = tuple[_Row, _Row, _Row, _Row]
@@ -24,7 +24,7 @@ _RIGID = 1e-4
 
 
 def check_rigid(matrix: Any, where: str) -> None:
-    """Raises Refused for (4, 4) numbers that are no rotation and place, roundings apart."""
+    """Raise Refused for (4, 4) numbers that are not a rotation and a translation, apart from rounding."""
     T = np.array(matrix, np.float64)
     R = T[:3, :3]
     if not np.abs(T[3] - [0, 0, 0, 1]).max() < 1e-9:
@@ -40,7 +40,7 @@ def check_rigid(matrix: Any, where: str) -> None:
 
 
 def rigid_matrix(matrix: Any) -> np.ndarray:
-    """(4, 4) float64 of what :func:`check_rigid` takes, its rounded rotation made exact."""
+    """Return a valid matrix (:func:`check_rigid`) as (4, 4) float64 with its rounded rotation made exact."""
     T = np.array(matrix, np.float64)
     u, _, v = np.linalg.svd(T[:3, :3])
     nearest = u @ v
@@ -51,15 +51,15 @@ def rigid_matrix(matrix: Any) -> np.ndarray:
 
 
 class PoseConfig(Config):
-    """Position, and at most one way to say the orientation."""
+    """A position, and at most one kind of orientation."""
 
     position: Position = Field((0.0, 0.0, 0.0), description="m")
     quaternion: tuple[float, float, float, float] | None = Field(
-        None, description="[w, x, y, z], need not be normalised"
+        None, description="[w, x, y, z], normalised automatically"
     )
     euler: Vector3 | None = Field(None, description="degrees about the fixed x, y, z axes, applied in this order")
     look_at: Position | None = Field(
-        None, description="point that the camera's z axis, or an object's x axis, is turned to"
+        None, description="point towards which the camera's z axis, or an object's x axis, is turned"
     )
 
     @rule("quaternion", "euler", "look_at")
@@ -88,36 +88,42 @@ class KeyframeConfig(PoseConfig):
 
 
 class TrajectoryConfig(Config):
-    """Poses of a file, and a C2 spline through them. They are T_world_body: of a camera with OpenCV's axes, of an
-    object with its own. The file has to cover the sequence."""
+    """Poses from a file, connected by a C2 spline. They are T_world_body: of a camera with OpenCV's axes, of an object
+    with its own. The file must cover the sequence."""
 
     file: str = Field(description="TUM: t x y z qx qy qz qw; or EuRoC's CSV: t, x, y, z, qw, qx, qy, qz")
-    form: Literal["auto", "tum", "euroc"] = Field("auto", description="auto: EuRoC's where lines have commas")
+    form: Literal["auto", "tum", "euroc"] = Field("auto", description="auto: EuRoC where lines have commas")
     start: float | None = Field(
         None,
         ge=-1e10,
         le=1e10,
-        description="s on the file's clock that are 0 s on the sequence's; null: the first pose is at time.start",
+        description="time on the file's clock, s, that is 0 s of the sequence; null: the first pose is at time.start",
     )
     smooth: float = Field(
         0.0,
         ge=0,
         le=60,
-        description="each pose becomes the mean of those within so many s before and after, weighed by a triangle; 0: "
-        "the spline passes them all",
+        description="replaces each pose by the mean of the poses within this time before and after, s, with "
+        "triangular weights; 0: the spline passes through all poses",
     )
     speed_limit: float = Field(
         100.0,
         gt=0,
         le=1e9,
-        description="world units/s from one pose to the next: what is faster is taken for a jump, or for poses in mm, "
-        "and refused",
+        description="largest speed from one pose to the next, world units/s; a higher one is refused as a jump, "
+        "or as poses in mm",
     )
-    turn_limit: float = Field(7200.0, gt=0, le=1e9, description="degrees/s from one pose to the next, likewise")
+    turn_limit: float = Field(
+        7200.0,
+        gt=0,
+        le=1e9,
+        description="largest turning rate from one pose to the next, degrees/s; a higher one is refused",
+    )
     T_body_sensor: str | Matrix | None = Field(
         None,
-        description="where this camera or object is on the body whose poses the file has, from its axes to the body's: "
-        "EuRoC's sensor.yaml, whose T_BS that is, or four rows of four; null: it is that body",
+        description="pose of this camera or object on the body whose poses the file has: a transform from its "
+        "axes to the body's, as EuRoC's sensor.yaml (its T_BS) or four rows of four; null: it is "
+        "that body",
     )
 
     @rule("T_body_sensor")
@@ -127,16 +133,16 @@ class TrajectoryConfig(Config):
 
 
 class KeyedMotionConfig(PoseConfig):
-    """A fixed pose, key frames, or a trajectory from a file; before the first and after the last the pose is held.
-    From one key frame to the next a body turns the shortest way (for ``spline``: near it), so ``euler`` may change
-    by less than 180 degrees per step; whole turns need key frames in between."""
+    """A fixed pose, key frames, or a trajectory from a file. The first pose is held before its time and the last after
+    it. Between key frames a body turns the shortest way (for ``spline``: near it), so ``euler`` may change by less than
+    180 degrees per step; full turns need more key frames."""
 
     keyframes: tuple[KeyframeConfig, ...] = Field((), description="two or more poses with increasing times")
     interpolation: Literal["spline", "linear"] = Field(
         "spline", description="between key frames: C2 spline, or straight lines and slerp"
     )
 
-    trajectory: TrajectoryConfig | None = Field(None, description="poses of a file, in place of a pose or key frames")
+    trajectory: TrajectoryConfig | None = Field(None, description="poses from a file, instead of a pose or key frames")
 
     @rule("?trajectory", "#keyframes", "position", "quaternion", "euler", "look_at")
     def _one_source(trajectory, keyframes, position, *orientation):
@@ -162,7 +168,7 @@ class KeyedMotionConfig(PoseConfig):
 
     @rule("keyframes.*.euler", "keyframes.*.quaternion", "keyframes.*.look_at")
     def _shortest_turns(eulers: tuple, quaternions: tuple, look_ats: tuple):
-        # Between poses the body turns the shortest way: half a turn has no shortest way, and more would go back.
+        # Between poses the body turns the shortest way: half a turn has none, and more would turn back.
         otherwise = [q is not None or at is not None for q, at in zip(quaternions, look_ats)]
         for k in range(len(eulers) - 1):
             if otherwise[k] or otherwise[k + 1]:
@@ -176,19 +182,21 @@ class KeyedMotionConfig(PoseConfig):
 
 
 class WayConfig(Config):
-    """A curve that a body follows at one speed, its x axis ahead; beyond an open end it goes straight on."""
+    """A curve that a body follows at constant speed, its x axis forward; beyond an open end it continues straight."""
 
-    points: tuple[Position, ...] = Field(description="two or more places, m; the curve is smooth and passes them all")
+    points: tuple[Position, ...] = Field(
+        description="two or more points, m; the curve is smooth and passes through all"
+    )
     speed: float | None = Field(
         None,
         gt=0,
         le=1e4,
-        description="m/s; null: as fast as a figure's steps or a fish's strokes take it, so that feet do not slide; "
-        "1 for other bodies",
+        description="m/s; null: the speed at which a figure's feet do not slide and a fish's strokes fit; 1 for "
+        "other bodies",
     )
-    closed: bool = Field(False, description="from the last point back to the first, and on")
-    level: bool = Field(True, description="its z axis stays up; false: its x axis goes up and down with the way")
-    start: Fraction = Field(0.0, description="share of the way that lies behind it at time 0")
+    closed: bool = Field(False, description="from the last point back to the first, repeatedly")
+    level: bool = Field(True, description="true: its z axis stays up; false: its x axis follows the slope")
+    start: Fraction = Field(0.0, description="fraction of the way that it has covered at time 0")
 
     @rule("#points", "closed")
     def _a_way(points, closed):

@@ -1,6 +1,6 @@
-"""The kinds of primitive bodies: what a YAML may name, and the numbers that data sets hold of them.
+"""Kinds of primitive bodies: the names that a YAML may use, and the numbers that data sets store for them.
 
-A new kind is a row here and a builder in ``scene/geometry`` (docs/extending.md).
+A new kind needs a row here and a builder in ``scene/geometry`` (docs/extending.md).
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from typing import Literal, NamedTuple
 
 
 class PrimitiveKind(NamedTuple):
-    """use : "pool", a rigid body that random worlds draw; "living", one that moves by itself, drawn where it is asked
-    for by name; "prop", for explicit scenes alone.
-    category : its number among ``labels: {semantics: true}``; None: 255, as of any other name.
-    seed : what its random shapes hang on; None: its name."""
+    """A kind of primitive. use : "pool", a rigid body that random worlds draw; "living", a body that moves by itself
+    and is drawn only if it is named; "prop", only for explicit scenes.
+    category : its number in ``labels: {semantics: true}``; None: 255, as for any other name.
+    seed : the number that its random shapes depend on; None: its name."""
 
     use: Literal["pool", "living", "prop"]
     category: int | None = None
@@ -36,7 +36,7 @@ PRIMITIVES = {
     "flag": PrimitiveKind("living", 14, 10),
     "fish": PrimitiveKind("living", 15, 11),
 }
-"""By name. Seeds and categories of the kinds that data sets were made with are fixed numbers, whatever comes later."""
+"""The kinds by name. Seeds and categories of kinds in published data sets must never change."""
 
 
 def kinds(*uses: str) -> tuple[str, ...]:
@@ -45,6 +45,6 @@ def kinds(*uses: str) -> tuple[str, ...]:
 
 
 def seed_of(name: str) -> int:
-    """Return the number that a kind's random shapes are seeded by; adding another kind does not change it."""
+    """Return the seed of a kind's random shapes; adding another kind does not change it."""
     seed = PRIMITIVES[name].seed
     return zlib.crc32(name.encode()) if seed is None else seed

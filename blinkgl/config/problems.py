@@ -1,4 +1,4 @@
-"""Validation errors as one line: the config path, what is wrong in plain words, the value, what is accepted."""
+"""Validation errors as one line: the config path, the problem in plain words, the value, and what is accepted."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def _dotted(*names: str) -> str:
 
 
 def validate(model: type[Config], data: Any, *, where: str = "") -> Any:
-    """``model`` built from plain data; raises :class:`ConfigError` naming the first bad path, its value and
-    what is accepted (for an unknown key: the nearest valid one)."""
+    """Return ``model`` built from plain data. Raises :class:`ConfigError` naming the first bad path, its value and what
+    is accepted (for an unknown key: the nearest valid one)."""
     try:
         return model.model_validate(data)
     except ValidationError as error:
@@ -33,7 +33,7 @@ def validate(model: type[Config], data: Any, *, where: str = "") -> Any:
 
 
 def validate_field(model: type[Config], name: str, value: Any) -> Any:
-    """``value`` as the model's field ``name`` alone would hold it. Raises ConfigError as :func:`validate`."""
+    """Return ``value`` validated as the model's field ``name``. Raises ConfigError as :func:`validate`."""
     info = model.model_fields[name]
     try:
         parts = (info.annotation, *info.metadata)
@@ -72,13 +72,13 @@ PROBLEMS = {
     "less_than_equal": "too large",
     "multiple_of": "not a multiple",
 }
-"""What pydantic's types of error are in plain words; `missing`, `extra_forbidden`, `value_error` and the tags of unions
-are put into words where they are translated."""
+"""Plain words for pydantic's error types. `missing`, `extra_forbidden`, `value_error` and the tags of unions are
+handled where they are translated."""
 
 
 def _translate(model: type[BaseModel], error: ValidationError, where: str, start: Path = ()) -> ConfigError:
-    # Unknown keys first: a misspelt key usually also causes a "missing" error, and the misspelling is the cause. Then
-    # what a rule refuses: of a union ("text or a table") it says what is wrong with the table that was given.
+    # Unknown keys come first: a misspelt key usually also causes a "missing" error. Then the errors of rules: for a
+    # union ("text or a table") they say what is wrong with the given table.
     order = {"extra_forbidden": 0, "value_error": 1}
     problems = sorted(error.errors(include_url=False), key=lambda e: order.get(e["type"], 2))
     first = problems[0]
@@ -120,7 +120,7 @@ def _translate(model: type[BaseModel], error: ValidationError, where: str, start
 
 
 def _nearest(model: type[BaseModel], path: list[str], owners: list[type[BaseModel]]) -> str:
-    """What an unknown key may have been: the nearest known one, or the sibling kind that has it."""
+    """Return what an unknown key may mean: the nearest known key, or the sibling kind that has the key."""
     known = sorted({name for owner in owners for name in owner.model_fields})
     if (near := nearest(path[-1], known)).endswith("(nearest)"):
         return near
@@ -133,8 +133,8 @@ def _nearest(model: type[BaseModel], path: list[str], owners: list[type[BaseMode
 
 
 def nearest(name: str, known: list[str]) -> str:
-    """The known name nearest to ``name``, as text; all where none is near."""
-    # Who says "threshold" means "contrast_threshold" and not "threshold_sigma", which has more letters in common.
+    """Return the known name nearest to ``name``, as text; all names where none is near."""
+    # "threshold" means "contrast_threshold" and not "threshold_sigma", although that shares more letters.
     near = [one for one in known if one.endswith(f"_{name}")]
     in_units = [one for one in known if one in [f"{name}_{unit}" for unit in ("us", "ms", "s", "hz", "px")]]
     near = in_units or near or difflib.get_close_matches(name, known, n=1)
@@ -144,8 +144,8 @@ def nearest(name: str, known: list[str]) -> str:
 def _locate(
     model: type[BaseModel], loc: tuple, kind: str
 ) -> tuple[list[str], list[type[BaseModel]], list[Any], FieldInfo | None]:
-    """Config path of a pydantic location without the labels that pydantic inserts for members of unions; the models
-    that may own its last key; the annotations that are accepted there; and the field that they are of."""
+    """Return the config path of a pydantic location without pydantic's labels for members of unions, the models that
+    may own its last key, the annotations that are accepted there, and their field."""
     path: list[str] = []
     here: list[Any] = members(model)
     owners: list[type[BaseModel]] = []
@@ -169,12 +169,12 @@ def _locate(
         elif number == len(loc) - 1 and kind in ("extra_forbidden", "missing"):
             path.append(str(step))
             owners = models
-        # anything else is a label: a member of a union, a function, "[key]"
+        # anything else is a pydantic label: a member of a union, a function, "[key]"
     return path, owners, here, info
 
 
 def describe(annotations: list[Any], info: FieldInfo | None = None) -> str:
-    """What a field accepts, in words."""
+    """Return what a field accepts, in words."""
     words = list(dict.fromkeys(_word(a, info) for a in annotations))
     if info is not None and type(None) in typing.get_args(info.annotation):
         words.append("null")

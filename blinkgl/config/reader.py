@@ -1,11 +1,11 @@
-"""The one place that knows YAML: text in, plain data out (tables with text keys, lists, text,
-numbers, true/false, null), and back.
+"""The only module that parses and writes YAML. Plain data are tables with text keys, lists, text, numbers, true/false
+and null.
 
-Whoever wrote the file may be a stranger, so what a file may cost is bounded before it is built: its size, its depth,
-the length of its numbers, and the number of values *after* aliases and merge keys are expanded (a few hundred bytes of
-aliases to aliases make billions). Plain tags only; a key given twice in one table is an error; a table may override
-what its merge key (``<<: *base``) brings. Dates are text, since nothing here is a date. ``1e-4``
-is text in YAML 1.1: the models convert it.
+The file may come from an untrusted user, so its cost is limited before it is built: its size, its depth, the length of
+its numbers, and the number of values *after* aliases and merge keys are expanded (a few hundred bytes of nested aliases
+can make billions of values). Only plain tags are accepted. A key that is given twice in one table is an error; a table
+may override the keys of its merge key (``<<: *base``). Dates are read as text. ``1e-4`` is text in YAML 1.1; the models
+convert it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ MAX_VALUES = 100_000
 MAX_DEPTH = 50
 MAX_DIGITS = 100
 
-# libyaml's parser hands out events one by one, without recursion; the composing that counts is Python's either way.
+# libyaml's parser emits events without recursion; the composer, which counts values, is Python code in both cases.
 _Events: Any = getattr(yaml, "cyaml", None) and yaml.cyaml.CParser
 if not _Events:
 
@@ -43,7 +43,7 @@ if not _Events:
 
 
 class _Loader(Composer, _Events, SafeConstructor, Resolver):
-    """Composes with a count of the values that the document expands to; refuses what is not plain data."""
+    """A composer that counts the values that the document expands to and refuses anything but plain data."""
 
     yaml_constructors: dict = {}  # noqa: RUF012 - as PyYAML declares it
     yaml_implicit_resolvers: dict = {  # noqa: RUF012
@@ -60,7 +60,7 @@ class _Loader(Composer, _Events, SafeConstructor, Resolver):
         self._sizes: dict[int, int] = {}
 
     def compose_node(self, parent: Node | None, index: Any) -> Node | None:
-        """As Composer's; an alias counts as everything behind it."""
+        """Compose a node as Composer does; an alias counts as all values that it refers to."""
         before = self._values
         if self.check_event(yaml.AliasEvent):
             event = self.peek_event()
@@ -90,8 +90,8 @@ class _Loader(Composer, _Events, SafeConstructor, Resolver):
             raise ComposerError(None, None, f"more than {MAX_VALUES} values, aliases expanded", event.start_mark)
 
     def plain_map(self, node: MappingNode) -> dict[str, Any]:
-        """Table of a mapping. The keys are constructed before merge keys are flattened:
-        only the table's own may clash."""
+        """Return the table of a mapping. Its keys are constructed before merge keys are flattened, so that only
+        duplicates among the table's own keys are errors."""
         if not isinstance(node, MappingNode):
             raise ConstructorError(None, None, "not a table", node.start_mark)
         self._refuse_twice(node)
@@ -107,7 +107,7 @@ class _Loader(Composer, _Events, SafeConstructor, Resolver):
             seen.add(key)
 
     def flatten_mapping(self, node: MappingNode) -> None:
-        """As SafeConstructor's, once per table: an alias to a table comes by again."""
+        """Flatten merge keys as SafeConstructor does, but only once per table: aliases visit a table again."""
         if any(key.tag.endswith(":merge") for key, _ in node.value):
             super().flatten_mapping(node)
 
@@ -118,14 +118,14 @@ class _Loader(Composer, _Events, SafeConstructor, Resolver):
         return key
 
     def plain_scalar(self, node: ScalarNode) -> Any:
-        """Text, number, true/false or null, by its tag. No one writes a number of a hundred digits, and Python will not
-        print one of five thousand."""
+        """Return text, a number, true/false or null, by the node's tag. Very long numbers are refused: nobody needs a
+        hundred digits, and Python refuses to print five thousand."""
         kind = node.tag.rpartition(":")[2]
         if kind in ("int", "float") and len(node.value) > MAX_DIGITS:
             raise ConstructorError(None, None, f"a number of {len(node.value)} digits", node.start_mark)
         try:
             return getattr(self, f"construct_yaml_{kind}")(node)
-        except (ValueError, LookupError):  # only where the tag is written out: !!int abc
+        except (ValueError, LookupError):  # only for an explicit tag such as !!int abc
             raise ConstructorError(None, None, f"not a YAML {kind}", node.start_mark) from None
 
     def plain_seq(self, node: Node) -> list:
@@ -142,8 +142,8 @@ _Loader.yaml_constructors[None] = SafeConstructor.construct_undefined
 
 
 def parse_yaml(text: str, where: str) -> Any:
-    """Plain data from YAML text (None for an empty one); ConfigError with line and column
-    when it is not YAML, or too much of it.
+    """Return plain data from YAML text (None for an empty text). Raises ConfigError with line and column for invalid or
+    too large YAML.
 
     where : file or option, for the message."""
     if len(text) > MAX_BYTES:
@@ -163,7 +163,8 @@ def parse_yaml(text: str, where: str) -> Any:
 
 
 def read_yaml(path: str | Path) -> Any:
-    """Plain data of a YAML file. ConfigError: missing, unreadable, no regular file, too large, not UTF-8, not YAML."""
+    """Return the plain data of a YAML file. Raises ConfigError for a file that is missing, unreadable, not regular, too
+    large, not UTF-8 or not YAML."""
     path = Path(path)
     where = str(path)
     try:
@@ -181,7 +182,7 @@ def read_yaml(path: str | Path) -> Any:
         raise ConfigError(
             f"cannot be read: {(error.strerror or str(error)).lower()}", where=where, accepted="a YAML file"
         ) from None
-    except ValueError:  # bytes that are no UTF-8, or a NUL in the name
+    except ValueError:  # bytes that are not UTF-8, or a NUL in the name
         raise ConfigError(
             "cannot be read: not text in UTF-8", where=where, accepted="a YAML text file in UTF-8"
         ) from None
@@ -189,7 +190,7 @@ def read_yaml(path: str | Path) -> Any:
 
 
 def read_table(path: str | Path, accepted: str = "key: value lines") -> dict[str, Any]:
-    """:func:`read_yaml` of a file that has to hold a table; an empty file is an empty table."""
+    """Return :func:`read_yaml` of a file that must hold a table; an empty file is an empty table."""
     tree = read_yaml(path)
     if tree is None:
         return {}
@@ -199,12 +200,12 @@ def read_table(path: str | Path, accepted: str = "key: value lines") -> dict[str
 
 
 def to_yaml(tree: Any) -> str:
-    """YAML text that :func:`parse_yaml` reads as ``tree``; keys in their order, no aliases."""
+    """Return YAML text that :func:`parse_yaml` reads as ``tree``; keys keep their order, without aliases."""
     return yaml.dump(tree, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
 
 
 def to_short_yaml(tree: Any) -> str:
-    """The same with the innermost tables and lists on a line each, for people to take over."""
+    """Return YAML text with each innermost table or list on one line, easy to copy."""
     return yaml.dump(tree, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=110)
 
 
@@ -214,17 +215,17 @@ class _Dumper(yaml.SafeDumper):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Plain trees of configurations, as YAML gives them: laid over one another, changed in several places at once.
+# Plain trees of configurations as read from YAML, and operations on them: merging, and changes in several places.
 
 Table = dict[str, Any]
 _TAGS = ("kind", "emulator")
 _WHOLE = ("sensor",)
-"""Keys whose tables are not mixed: another camera is another camera."""
+"""Keys whose tables are replaced as a whole: a sensor is not mixed from two."""
 
 
 def merge(common: Any, own: Any) -> Any:
-    """``own`` laid over ``common``: tables key by key; anything else, a distribution, or a table of another kind
-    (``kind: explicit`` over ``kind: random``) replaces what was there."""
+    """Return ``own`` laid over ``common``: tables key by key. Any other value, a distribution, or a table of another
+    kind (``kind: explicit`` over ``kind: random``) replaces the common value."""
     both = (
         isinstance(common, dict) and isinstance(own, dict) and not is_distribution(common) and not is_distribution(own)
     )
@@ -235,7 +236,7 @@ def merge(common: Any, own: Any) -> Any:
 
 
 def each_option(node: Any, change: Callable[[Any], Any]) -> Any:
-    """``node`` changed, or each of the options that it is drawn from."""
+    """Return ``node`` changed by ``change``, or with each option of its distribution changed."""
     if not is_distribution(node):
         return change(node)
     kind, spec = next(iter(node.items()))
@@ -247,7 +248,7 @@ def each_option(node: Any, change: Callable[[Any], Any]) -> Any:
 
 
 def with_groups(tree: Table, change: Callable[[Table], Table]) -> Table:
-    """``tree`` changed, and each of the groups that it holds; what is no group is left to validation."""
+    """Return ``tree`` and each of its groups changed by ``change``; invalid groups are left to validation."""
     changed, groups = change(tree), tree.get("groups")
     if isinstance(groups, dict):
         changed["groups"] = {
@@ -258,7 +259,7 @@ def with_groups(tree: Table, change: Callable[[Table], Table]) -> Table:
 
 
 def with_sections(tree: Table, change: Callable[[Table], Table]) -> Table:
-    """``tree`` with the table of every sensor that ``sensors:`` lists changed."""
+    """Return ``tree`` with the table of each sensor in ``sensors:`` changed."""
     given = tree.get("sensors")
     if not isinstance(given, list):
         return tree
@@ -266,7 +267,7 @@ def with_sections(tree: Table, change: Callable[[Table], Table]) -> Table:
 
 
 def apply_overrides(tree: Table, overrides: Sequence[str]) -> Table:
-    """Copy of ``tree`` with ``--set`` options applied; tables on the way are made when absent."""
+    """Return a copy of ``tree`` with ``--set`` options applied; missing tables on the path are created."""
     tree = copy.deepcopy(tree)
     for option in overrides:
         dotted, equals, text = option.partition("=")
@@ -302,18 +303,18 @@ def apply_overrides(tree: Table, overrides: Sequence[str]) -> Table:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What ships with the program, by name: runs, and tables of sensors, rigs, quality presets, emulators' recipes.
+# Files that ship with the program, by name: runs, and tables of sensors, rigs, quality presets and recipes.
 
 
 @lru_cache
 def shipped_names(kind: str) -> tuple[str, ...]:
-    """Names of all of a kind, a folder of ``blinkgl/configs``, sorted."""
+    """Return the sorted names of all tables of a kind, which is a folder of ``blinkgl/configs``."""
     files = (resources.files("blinkgl.configs") / kind).iterdir()
     return tuple(sorted(file.name.removesuffix(".yaml") for file in files if file.name.endswith(".yaml")))
 
 
 def shipped(kind: str, name: str) -> dict[str, Any]:
-    """A copy of the table of this name, one of :func:`shipped_names`."""
+    """Return a copy of the table of this name (see :func:`shipped_names`)."""
     return copy.deepcopy(_read(kind, name))
 
 
@@ -328,14 +329,14 @@ _RUNS = ("*.yaml", "scenes/*.yaml", "eflow/*_data.yaml")
 
 @lru_cache
 def shipped_runs() -> dict[str, Path]:
-    """The files of whole runs, by name: "demo", "flags" …"""
+    """Return the files of shipped runs by name: "demo", "flags" …"""
     folder = Path(str(resources.files("blinkgl.configs")))
     return {path.stem: path for pattern in _RUNS for path in sorted(folder.glob(pattern))}
 
 
 def run_file(given: str | Path) -> Path:
-    """The file ``given``, or, where there is none, the shipped run that it names: "demo", "demo.yaml" and
-    "configs/demo.yaml" are one. (A folder is none: after ``generate demo --out demo`` there is one.) Raises
+    """Return the file ``given`` or, where there is none, the shipped run of that name: "demo", "demo.yaml" and
+    "configs/demo.yaml" are the same. (A folder does not count: ``generate demo --out demo`` creates one.) Raises
     ConfigError."""
     path = Path(given)
     shipped_one = shipped_runs().get(path.stem)

@@ -1,5 +1,5 @@
-"""What stands between the pixels of a sensor and the outside: pixels that are broken or noisy by themselves, the bus
-and its clock. In this order; what is not said is not there."""
+"""The ``readout:`` section, what happens to events between pixels and output: defective or noisy pixels, the bus, its
+clock, in this order. Parts that are not given are absent."""
 
 from __future__ import annotations
 
@@ -11,14 +11,12 @@ from blinkgl.config.base import Config, Refused, Removed, rule
 
 
 class PixelsConfig(Config):
-    """Pixels that are dead, hot, or fire in the dark, whatever the emulator: drawn once, from the sequence's seed.
+    """Dead, hot and noisy pixels, independent of the emulator; drawn once from the sequence's seed.
 
-    Noise events are a Poisson process of each pixel's own rate, beside the emulator's events and without a word to its
-    comparators. Rates are log-normal over the pixels, hot ones about a median of their own. Some are answered: noise
-    that passed one threshold comes back through the other, so that an event of the opposite polarity follows, later by
-    a log-normal time. Both are in the rates. Hot pixels answer nothing; each prefers ON or OFF by itself: its share is
-    logit-normal. (What dvxplorer_constant_light shows: a hot pixel's events are 40 % more of one polarity than of the
-    other, those of other pixels balance each other.)"""
+    Each pixel's noise events are a Poisson process; they do not change the emulator's state. Rates are log-normal over
+    the pixels; hot pixels have their own median. A noise event may be followed by one of opposite polarity after a
+    log-normal time; the rates include both. Hot pixels have no such answers; the share of ON events of each is
+    logit-normal."""
 
     dead_fraction: float = Field(0.0, ge=0, le=1, description="Share of pixels that never fire.")
     hot_fraction: float = Field(0.0, ge=0, le=1, description="Share of pixels that are hot.")
@@ -34,34 +32,38 @@ class PixelsConfig(Config):
         description="Spread of the hot pixels' shares: standard deviation of log(ON share / OFF share).",
     )
     on_share: float = Field(
-        0.5, ge=0, le=1, description="Share of ON events of the other pixels, among those that answer no other."
+        0.5,
+        ge=0,
+        le=1,
+        description="Fraction of ON events among the other pixels' noise events, without those that follow another.",
     )
     answered: float = Field(
         0.0,
         ge=0,
         le=1,
-        description="Share of the other pixels' noise events that one of the opposite polarity follows.",
+        description="Fraction of the other pixels' noise events that are followed by one of opposite polarity.",
     )
-    answer_ms: float = Field(30.0, ge=0.001, le=1e3, description="Median time from an event to its answer, ms.")
+    answer_ms: float = Field(30.0, ge=0.001, le=1e3, description="Median time from an event to this answer, ms.")
     answer_spread_decades: float = Field(0.5, ge=0, le=1, description="Spread of that time, decades.")
     refractory_us: float = Field(
         0.0,
         ge=0,
         le=1e6,
-        description="Dead time of a pixel's noise after an event of it, microseconds; rates are without.",
+        description="Dead time of a pixel's noise after its own noise event, microseconds; the rates are those "
+        "without dead time.",
     )
 
 
 class FrameResetsConfig(Config):
-    """A camera of events and frames: where the frame's pixels are reset, the signal of all event pixels jumps and comes
-    back, and those that stand near their threshold fire; see :mod:`blinkgl.events.resets`."""
+    """A camera of events and frames: each reset of the frame's pixels makes the signal of all event pixels jump and
+    return, and pixels near their threshold fire; see :mod:`blinkgl.events.resets`."""
 
-    interval_ms: float = Field(gt=2, le=10_000, description="Time from one reset to the next, ms: that of the frames.")
+    interval_ms: float = Field(gt=2, le=10_000, description="Time between resets, ms: the frame interval.")
     kick: float = Field(
-        gt=0, le=5, description="Height of the jump, in thresholds (the smaller of the emulator's ON and OFF ones)."
+        gt=0, le=5, description="Height of the jump, in units of the smaller of the emulator's ON and OFF thresholds."
     )
-    length_ms: float = Field(1.0, gt=0, le=1000, description="Time that the signal takes to come back, ms.")
-    first_ms: float = Field(0.0, ge=0, le=10_000, description="First reset after the first frame, ms.")
+    length_ms: float = Field(1.0, gt=0, le=1000, description="Time until the signal has returned, ms.")
+    first_ms: float = Field(0.0, ge=0, le=10_000, description="Time of the first reset after the first frame, ms.")
 
     @rule("interval_ms", "length_ms")
     def _over_before_the_next(interval: float, length: float):
@@ -71,8 +73,8 @@ class FrameResetsConfig(Config):
 
 
 class ReadoutConfig(Config):
-    """The bus between pixels and time stamps; see :mod:`blinkgl.events.camera`. Before it the pixels' own noise:
-    :mod:`blinkgl.events.pixels`."""
+    """The bus between pixels and time stamps (:mod:`blinkgl.events.camera`), and before it the pixels' noise
+    (:mod:`blinkgl.events.pixels`)."""
 
     removed: ClassVar[Any] = {
         "filters": Removed("events filtered after they were written", lambda value: not value),
@@ -83,26 +85,29 @@ class ReadoutConfig(Config):
         None,
         ge=1,
         le=1e12,
-        description="Peak rate of the bus, events per second; null: no bus, no event is late or lost.",
+        description="Peak rate of the bus, events per second; null: no bus, so no event is late or lost.",
     )
     row_ns: float = Field(
         0.0,
         ge=0,
         le=1e6,
-        description="Time to open a row before its events go out, nanoseconds; 0: every event is arbitrated by itself.",
+        description="Time to open a row before its events are sent, nanoseconds; 0: events are arbitrated one by one.",
     )
     queue_events: int = Field(
-        4096, ge=1, le=2**24, description="Events that may wait for the bus; one that finds the queue full is lost."
+        4096,
+        ge=1,
+        le=2**24,
+        description="Events that may wait for the bus; an event that finds the queue full is lost.",
     )
     clock_us: int = Field(
         1,
         ge=1,
         le=1_000_000,
-        description="Time stamps are multiples of this, microseconds: the last one that has passed.",
+        description="Resolution of time stamps, microseconds: they are rounded down to multiples of this.",
     )
     pixels: PixelsConfig | None = Field(None, description="Dead, hot and noisy pixels; null: none.")
     frame_resets: FrameResetsConfig | None = Field(
-        None, description="Bursts of events that the camera's frames set off; null: none."
+        None, description="Bursts of events caused by the camera's frames; null: none."
     )
 
     @rule("events_per_second", "row_ns", "queue_events")
@@ -117,10 +122,10 @@ class ReadoutConfig(Config):
 
     @property
     def drain_us(self) -> float:
-        """Longest that an event may wait for the bus, microseconds: the time that a full queue takes to empty."""
+        """Return the longest wait of an event for the bus, microseconds: the time that a full queue takes to empty."""
         return drain_us(self.events_per_second, self.row_ns, self.queue_events)
 
 
 def drain_us(events_per_second: float | None, row_ns: float, queue_events: int) -> float:
-    """Longest wait for a bus, microseconds (see :class:`ReadoutConfig`)."""
+    """Return the longest wait for a bus, microseconds (see :class:`ReadoutConfig`)."""
     return 0.0 if events_per_second is None else (queue_events + 1) * (1e6 / events_per_second + row_ns / 1000)

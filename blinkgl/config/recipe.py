@@ -1,20 +1,21 @@
 """A whole data set in one file: groups of sequences that share most of their parameters.
 
     seed: 2023
-    camera: {width: 640, height: 480}         # what all groups have in common
+    camera: {width: 640, height: 480}         # common to all groups
     groups:
-      flying_train:                           # the name of the sequences, unless output.name says otherwise
+      flying_train:                           # the name of the sequences, unless output.name is given
         output: {split: train, sequences: 3362}
         events: {shares: [{share: 0.8, value: {emulator: v2e}}, {share: 0.2, value: {emulator: voltmeter}}]}
       flying_test:
         output: {split: test, sequences: 200}
         events: {emulator: voltmeter}
       e_tartan:
-        enabled: false                        # described, but not made until somebody turns it on
+        enabled: false                        # described, but not generated until it is enabled
         ...
 
-A group is the common part with the group's own keys laid over it. Each group has a seed of its own, derived from the
-recipe's seed and the group's name, so that growing, adding or leaving out one group changes no sequence of another.
+A group is the common part with the group's keys laid over it. Each group has its own seed, derived from the recipe's
+seed and the group's name, so that changing the size of one group, adding or removing one changes no sequence of
+another.
 """
 
 from __future__ import annotations
@@ -45,26 +46,26 @@ class Group:
 
     @property
     def identity(self) -> str:
-        """SHA-256 over everything that decides what sequence n is: not how many there are."""
+        """Return the SHA-256 of everything that determines sequence n; the number of sequences is not part of it."""
         tree = copy.deepcopy(self.template.tree)
         if isinstance(tree.get("output"), dict):
             for key in ("sequences", "first_index"):
                 tree["output"].pop(key, None)
-        # Keys keep their type (1 is not "1") and their order decides nothing.
+        # Keys keep their type (1 is not "1"); their order does not matter.
         text = json.dumps(_plain(tree), sort_keys=True, ensure_ascii=False)
         return hashlib.sha256(text.encode()).hexdigest()
 
 
 def all_groups(template: RunTemplate) -> tuple[Group, ...]:
-    """The groups of a recipe, disabled ones included; a plain configuration is one group without a name. All that they
-    can draw has been checked.
+    """Return the groups of a recipe, disabled ones included; a plain configuration is one group without a name. All
+    that they can draw has been checked.
 
-    Raises ConfigError: no groups, a misnamed one, two that write the same folders."""
+    Raises ConfigError for no groups, an invalid name, or two groups that write the same folders."""
     return template.groups
 
 
 def split(template: RunTemplate) -> tuple[Group, ...]:
-    """:func:`all_groups`, made anew."""
+    """Return :func:`all_groups`, not cached."""
     if "groups" not in template.tree:
         return (_group("", template.tree, template, True),)
     groups = template.tree["groups"]
@@ -117,7 +118,7 @@ def _group(name: str, tree: dict[str, Any], template: RunTemplate, enabled: bool
 
 
 def derived_seed(seed: int, name: str) -> int:
-    """63-bit seed of the group ``name``."""
+    """Return the 63-bit seed of the group ``name``."""
     return int.from_bytes(hashlib.sha256(f"{seed}/{name}".encode()).digest()[:8], "little") >> 1
 
 

@@ -1,13 +1,13 @@
-"""``rig:`` and ``sensors:`` of the YAML: several sensors on one body that moves.
+"""The ``rig:`` and ``sensors:`` sections: several sensors on one moving body.
 
-    rig: stereo                                   # a preset: its sensors, and what is said beside them
+    rig: stereo                                   # a preset: its sensors; keys given beside it override it
     sensors:
       - {name: right, place: {position: [0.2, 0, 0]}}       # laid over the preset's sensor of this name
-      - {name: imu, imu: {rate: 400}}                       # one more
+      - {name: imu, imu: {rate: 400}}                       # a further sensor
 
-A sensor's table has the sections of a single camera's configuration (:data:`SECTIONS`); what it does not say of
-:data:`INHERITED` is as at the top. Everything here works on plain trees, after what is drawn has been drawn and before
-anything is validated, so that what comes out says all by itself.
+A sensor's table has the sections of a single camera's configuration (:data:`SECTIONS`). Sections of :data:`INHERITED`
+that it does not give come from the top level. This module works on plain trees, after distributions have been drawn and
+before validation, so that its result is complete.
 """
 
 from __future__ import annotations
@@ -36,25 +36,25 @@ from blinkgl.config.values import Position, Vector3
 from blinkgl.errors import ConfigError
 
 SECTIONS = ("camera", "sensor", "events", "readout", "labels", "images", "imu", "tracks")
-"""Of a single camera's configuration, that each sensor has for itself."""
+"""Sections of a single camera's configuration that each sensor has."""
 INHERITED = ("camera", "sensor", "events", "readout", "labels")
-"""What a sensor has as the top says it, where it says nothing. The others are nobody's until a sensor asks."""
+"""Sections that a sensor inherits from the top level. The others apply only to a sensor that gives them."""
 _SHARED = ("time", "timeline")
 
 
 class PlaceConfig(Config):
-    """Where a sensor is on its rig: T_rig_sensor, from the sensor's axes to the rig's. Both are OpenCV's, x right, y
-    down, z forward, and the rig's are where a single camera would be: ``scene.camera`` moves the rig."""
+    """Pose of a sensor on its rig: T_rig_sensor, from the sensor's axes to the rig's. Both are OpenCV's, x right, y
+    down, z forward. The rig's axes are where a single camera would be: ``scene.camera`` moves the rig."""
 
-    position: Position = Field((0.0, 0.0, 0.0), description="m, on the rig's axes: x right, y down, z forward")
+    position: Position = Field((0.0, 0.0, 0.0), description="m, in the rig's axes: x right, y down, z forward")
     euler: Vector3 | None = Field(None, description="degrees about the rig's x, y, z axes, applied in this order")
     quaternion: tuple[float, float, float, float] | None = Field(
-        None, description="[w, x, y, z], need not be normalised"
+        None, description="[w, x, y, z], normalised automatically"
     )
     matrix: Matrix | None = Field(
         None,
-        description="T_rig_sensor, four rows of four, in place of the others. Rounded rotations are made exact. "
-        "(Kalibr's T_cn_cnm1 is the inverse of one camera's place on the camera before)",
+        description="T_rig_sensor, four rows of four, instead of the others. Rounded rotations are made exact. "
+        "(Kalibr's T_cn_cnm1 is the inverse of a camera's pose relative to the previous one)",
     )
 
     @rule("euler", "quaternion", "matrix", "position")
@@ -77,7 +77,7 @@ class PlaceConfig(Config):
 
     @property
     def T(self) -> np.ndarray:
-        """(4, 4) float64 T_rig_sensor."""
+        """Return T_rig_sensor, (4, 4) float64."""
         from scipy.spatial.transform import Rotation
 
         if self.matrix is not None:
@@ -103,36 +103,38 @@ def _sensor_name(name: str) -> str:
 
 
 class RigSensorConfig(Config):
-    """One device on a rig: an event camera, a frame camera, an inertial unit, or several of them in one housing, which
-    then look through one lens. `events` is as at the top, unless there are `images` or an `imu` and nothing is said of
-    it: then there are no events."""
+    """One device on a rig: an event camera, a frame camera, an inertial unit, or several in one housing that share one
+    lens. `events` is as at the top level, but absent for a sensor with `images` or `imu` that does not give it."""
 
-    name: Annotated[str, AfterValidator(_sensor_name)] = Field(description="of its folder in the sequence's")
-    place: PlaceConfig = Field(PlaceConfig(), description="where it is on the rig; {}: where a single camera would be")
-    pair: str | None = Field(
-        None, description="name of the other eye of a rectified stereo pair, which `labels.disparity` speaks of"
+    name: Annotated[str, AfterValidator(_sensor_name)] = Field(
+        description="name of its folder in the sequence's folder"
     )
-    camera: CameraConfig = Field(CameraConfig(), description="as at the top, whose keys it has where it says none")
-    sensor: Sensor | None = Field(None, description="as at the top")
-    events: EmulatorConfig | None = Field(None, description="as at the top, over whose keys it is laid; null: none")
-    readout: ReadoutConfig | None = Field(None, description="as at the top")
+    place: PlaceConfig = Field(PlaceConfig(), description="pose on the rig; {}: where a single camera would be")
+    pair: str | None = Field(
+        None, description="name of the other camera of a rectified stereo pair, for `labels.disparity`"
+    )
+    camera: CameraConfig = Field(CameraConfig(), description="as at the top level, whose keys it inherits")
+    sensor: Sensor | None = Field(None, description="as at the top level")
+    events: EmulatorConfig | None = Field(None, description="as at the top level, whose keys it inherits; null: none")
+    readout: ReadoutConfig | None = Field(None, description="as at the top level")
     labels: LabelsConfig = Field(
-        default_factory=LabelsConfig, description="as at the top; of a camera without events none but those said here"
+        default_factory=LabelsConfig,
+        description="as at the top level; a camera without events has only those given here",
     )
     images: ImagesConfig | None = Field(None, description="a frame camera (docs/images.md); null: none")
     imu: ImuConfig | None = Field(
-        None, description="an inertial unit, its position and rotation on the sensor's own axes; null: none"
+        None, description="an inertial unit, with position and rotation in the sensor's axes; null: none"
     )
     tracks: TracksConfig | None = Field(None, description="points on surfaces, followed through this camera")
 
     @property
     def sees(self) -> bool:
-        """Whether it is a camera."""
+        """Return whether it is a camera."""
         return self.events is not None or self.images is not None
 
 
 def load_rig(name: Any) -> list[dict[str, Any]]:
-    """Sensors of a shipped rig, as plain trees. Raises ConfigError for an unknown one."""
+    """Return the sensors of a shipped rig as plain trees. Raises ConfigError for an unknown one."""
     known = shipped_names("rigs")
     if name not in known:
         raise ConfigError("unknown rig", where="rig", value=name, accepted=f"one of {', '.join(known)}")
@@ -140,15 +142,16 @@ def load_rig(name: Any) -> list[dict[str, Any]]:
 
 
 def is_rig(tree: Any) -> bool:
-    """Whether a configuration is of several sensors."""
+    """Return whether a configuration has several sensors."""
     return isinstance(tree, dict) and (tree.get("rig") is not None or tree.get("sensors") is not None)
 
 
 def spelled_out(tree: dict[str, Any], fills: Iterable[Callable[[dict[str, Any]], dict[str, Any]]]) -> dict[str, Any]:
-    """``tree`` with every sensor of its rig complete: a preset's under what is said, the top's sections under both,
-    then what ``fills`` make of a single camera's sections. Doing it again changes nothing.
+    """Return ``tree`` with every sensor of its rig complete: the sensor's own keys over the preset's, both over the top
+    level's sections, then completed by ``fills`` as a single camera's sections. Repeating it changes nothing.
 
-    Raises ConfigError: an unknown rig, none or no list of sensors, two of one name, sections that are no sensor's."""
+    Raises ConfigError for an unknown rig, no list of sensors or an empty one, two sensors of one name, or sections that
+    a sensor cannot have."""
     given = tree.get("sensors")
     own = [] if given is None else given
     if not isinstance(own, list):
@@ -171,7 +174,7 @@ def spelled_out(tree: dict[str, Any], fills: Iterable[Callable[[dict[str, Any]],
 
 
 def _laid(own: list[dict[str, Any]], base: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A preset's sensors under those of the same names, in its order; then the others."""
+    """Return a preset's sensors, in its order, with those of the same names laid over them, then the others."""
     said: dict[Any, dict[str, Any]] = {}
     for k, one in enumerate(own):
         name = one.get("name")
@@ -219,11 +222,11 @@ def _complete(
 
 
 _FOCAL = (("fov",), ("focal",), ("fx", "fy"))
-"""Ways to say how long a lens is, of which a camera has one."""
+"""Alternative ways to give the focal length; a camera has one."""
 
 
 def _drop_other_focal(above: Any, own: Any) -> None:
-    """A sensor that says how long its lens is in one way does not have what the top says in another."""
+    """Drop the top level's focal length where a sensor gives its own in another way."""
     if isinstance(above, dict) and isinstance(own, dict):
         said = [keys for keys in _FOCAL if any(own.get(key) is not None for key in keys)]
         for keys in _FOCAL:
@@ -233,8 +236,8 @@ def _drop_other_focal(above: Any, own: Any) -> None:
 
 
 def check_pairs(sensors: Sequence[RigSensorConfig]) -> None:
-    """Raises ConfigError where a sensor's `pair` is none of the cameras, or no other eye: two eyes of a rectified pair
-    have one camera model and differ in place along the x axis that they share."""
+    """Raise ConfigError where a sensor's `pair` is not a camera of the rig or the two are not a rectified pair: they
+    need the same camera model and poses that differ only along their common x axis."""
     for k, one in enumerate(sensors):
         where = f"sensors.{k}.pair"
         if one.pair is None:
@@ -259,7 +262,7 @@ def check_pairs(sensors: Sequence[RigSensorConfig]) -> None:
 
 
 def baseline_of(one: RigSensorConfig, other: RigSensorConfig) -> float | None:
-    """m along the x axis of ``one`` to ``other``; None: the two are not a rectified pair."""
+    """Return the distance along the x axis of ``one`` to ``other``, m; None where the two are not a rectified pair."""
     a, b = one.camera.model, other.camera.model
     if a != replace(b, near=a.near) or not isinstance(a, PinHole):
         return None

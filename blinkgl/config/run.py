@@ -1,4 +1,4 @@
-"""A YAML file as a template of sequences: overrides, sensors and scenes of other files, draws, checks."""
+"""A YAML file as a template of sequences: overrides, sensor and scene files, draws, checks."""
 
 from __future__ import annotations
 
@@ -44,38 +44,38 @@ _OF_THE_RUN = ("seed", "output", "gl")
 class RunTemplate:
     """A run before its per-sequence parameters are drawn.
 
-    tree : plain data as read, overrides applied.   base : folder that relative paths in it start from.
+    tree : plain data as read, overrides applied.   base : folder that relative paths start from.
     """
 
     tree: dict[str, Any]
     base: Path
 
     def sequence(self, index: int) -> SequenceConfig:
-        """The validated configuration of sequence ``index`` (>= 0). Raises ConfigError, also where the file describes
-        several groups of sequences (:mod:`blinkgl.config.recipe` takes those apart)."""
+        """Return the validated configuration of sequence ``index`` (>= 0). Raises ConfigError, also where the file has
+        several groups of sequences (:mod:`blinkgl.config.recipe` separates those)."""
         if "groups" in self.tree:
             raise ConfigError("the recipe has groups; only a group has numbered sequences", where="groups")
         return _validated(draw(self.tree, self.seed, index))
 
     @property
     def seed(self) -> int:
-        """The run's seed as every sequence has it. Raises ConfigError."""
+        """Return the run's seed, the same for every sequence. Raises ConfigError."""
         return validate_field(SequenceConfig, "seed", self.tree.get("seed", 0))
 
     def check(self) -> SequenceConfig:
-        """Validates what stands for all that can be drawn, in every group; returns the first. Raises ConfigError before
-        any work starts."""
+        """Validate configurations that represent all that can be drawn, in every group; return the first. Raises
+        ConfigError before any work starts."""
         return self._first
 
     @cached_property
     def groups(self) -> tuple[Group, ...]:
-        """As of :func:`blinkgl.config.recipe.all_groups`."""
+        """Return the groups of :func:`blinkgl.config.recipe.all_groups`."""
         from blinkgl.config.recipe import split
 
         return split(self)
 
     @cached_property
-    def _first(self) -> SequenceConfig:  # kept: a large recipe stands for thousands of configurations
+    def _first(self) -> SequenceConfig:  # cached: a large recipe has thousands of configurations to check
         if "groups" in self.tree:
             return self.groups[0].template.check()
         if is_distribution(self.tree):
@@ -93,14 +93,15 @@ class RunTemplate:
         return self.corners()[0]
 
     def corners(self) -> list[SequenceConfig]:
-        """Configurations that stand for all that can be drawn (:mod:`blinkgl.config.draw`). Raises ConfigError."""
+        """Return configurations that represent all that can be drawn (:mod:`blinkgl.config.draw`). Raises
+        ConfigError."""
         with remembering():
             return [_validated(tree) for tree in corners(with_default(self.tree))]
 
 
 def _validated(tree: dict[str, Any]) -> SequenceConfig:
-    """SequenceConfig of plain data, with the values of a named quality and sensor filled in
-    where the tree says nothing."""
+    """Return the SequenceConfig of plain data; the values of a named quality and sensor fill in the keys that are not
+    given."""
     tree = with_default(tree)
     if is_rig(tree):
         return _validated_rig(tree)
@@ -117,7 +118,7 @@ def _validated(tree: dict[str, Any]) -> SequenceConfig:
 
 
 def _validated_rig(tree: dict[str, Any]) -> SequenceConfig:
-    """The same of a rig: each sensor is validated as the single camera that it would be, by the same rules."""
+    """Return the SequenceConfig of a rig. Each sensor is validated by the rules of a single camera."""
     tree = with_whole_sensors(tree, FILLS)
     for fill in FILLS:
         tree = fill(tree)
@@ -141,18 +142,18 @@ def _validated_rig(tree: dict[str, Any]) -> SequenceConfig:
 
 
 def load_run(path: str | Path, overrides: Sequence[str] = (), *, seed: int | None = None) -> RunTemplate:
-    """Reads a YAML file and the files that its scenes come from, applies ``a.b=c`` overrides (c is YAML) and an
-    optional seed, checks all that can be drawn.
+    """Read a YAML file and the files that its scenes refer to, apply ``a.b=c`` overrides (c is YAML) and an optional
+    seed, and check all that can be drawn.
 
-    path : of a file, or the name of a run that ships, such as "demo" (:func:`~blinkgl.config.reader.shipped_runs`).
-    Raises ConfigError: missing or unreadable file, bad YAML (with line and column), unknown key, bad value."""
+    path : a file, or the name of a shipped run such as "demo" (:func:`~blinkgl.config.reader.shipped_runs`). Raises
+    ConfigError: missing or unreadable file, bad YAML (with line and column), unknown key, bad value."""
     path = run_file(path)
     base = path.parent
     tree = apply_overrides(with_scenes(read_table(path), base), overrides)
     tree = expanded(tree, base)
     if seed is not None:
         tree["seed"] = seed
-    if "seed" in tree and not is_distribution(tree["seed"]):  # which check() refuses
+    if "seed" in tree and not is_distribution(tree["seed"]):  # check() refuses a distribution here
         tree["seed"] = validate_field(SequenceConfig, "seed", tree["seed"])
     template = RunTemplate(tree, base)
     template.check()

@@ -1,7 +1,7 @@
-"""``scene:`` of the YAML: a random world, an explicit scene, or a scene file.
+"""The ``scene:`` section: a random world, an explicit scene, or a scene file.
 
-Relative paths are resolved against the YAML file's folder by :mod:`blinkgl.scene.build`, which also finds out
-whether they exist; the models here only know shapes, units and limits.
+:mod:`blinkgl.scene.build` resolves relative paths against the YAML file's folder and checks that the files exist; these
+models define only shapes, units and limits.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ class ObjectsConfig(Config):
     distance: PositiveRange = Field(
         (2.0, 20.0), description="distance from the camera's first position, m; log-uniform"
     )
-    flying: Fraction = Field(0.5, description="fraction that flies; the others rest on the ground")
+    flying: Fraction = Field(0.5, description="fraction of flying objects; the others rest on the ground")
     in_view: Fraction = Field(
-        0.85, description="fraction placed in the camera's first field of view; the others anywhere around it"
+        0.85, description="fraction placed in the camera's first field of view; the others are anywhere around it"
     )
     tint: Fraction = Field(0.3, description="strength of the random colour factor on each object's texture")
     texture_scale: PositiveRange = Field(
@@ -54,72 +54,73 @@ class ObjectsConfig(Config):
 
 
 class PoolConfig(Config):
-    """Where the random world's objects come from."""
+    """Source of the random world's objects."""
 
     primitives: Annotated[
         Literal["all"] | tuple[Literal[POOLED], ...], word_or_list(("all",), POOLED)  # type: ignore[invalid-literal]
     ] = Field(
         "all",
-        description="'all', which are the rigid ones, or a list of kinds; [] for none. A figure walks, runs, dances or "
-        "waves, a fish swims, a flag flies",
+        description="all: the rigid ones; or a list of kinds; []: none. A figure walks, runs, dances or waves, a "
+        "fish swims, a flag flies",
     )
-    variants: int = Field(24, ge=1, le=10_000, description="shapes of each primitive kind (aspect ratios, sides)")
+    variants: int = Field(24, ge=1, le=10_000, description="random shapes per primitive kind (aspect ratios, sides)")
     folders: Paths = Field((), description="folders searched recursively for obj, ply, stl, glb, gltf")
     up: Literal["auto", "y", "z"] = Field(
         "auto",
-        description="the axis of the folders' files that points up; auto: y for glb and gltf, "
-        "z for obj, ply, stl. Resting objects stand on it",
+        description="upward axis of the folders' files, on which objects rest; auto: y for glb and gltf, z for "
+        "obj, ply, stl",
     )
-    max_faces: int = Field(50_000, ge=1, le=50_000_000, description="a mesh with more triangles is refused")
+    max_faces: int = Field(50_000, ge=1, le=50_000_000, description="meshes with more triangles are refused")
     removed: ClassVar[Any] = {
         "urdfs": Removed("folders: [...]", lambda value: value in (False, "auto")),
     }
     max_file_mb: ClassVar[Any] = 512.0
     fixed: ClassVar[Any] = ("max_file_mb",)
     test_fraction: Fraction = Field(0.1, description="fraction of meshes kept for split 'test', chosen by content hash")
-    keep_materials: bool = Field(False, description="use the meshes' own colours and textures where they have any")
+    keep_materials: bool = Field(False, description="use the meshes' own colours and textures, if any")
     animation: Literal["random", "rest"] = Field(
-        "random", description="what a file with animations does: it plays one of them, looped, or keeps its rest shape"
+        "random", description="files with animations: random plays one of them, repeated; rest keeps the rest shape"
     )
-    bad_assets: Literal["error", "skip"] = Field("error", description="skip logs an unusable mesh and draws another")
+    bad_assets: Literal["error", "skip"] = Field("error", description="skip: logs an unusable mesh and draws another")
 
 
 class TexturesConfig(Config):
-    """Where the random world's textures come from."""
+    """Source of the random world's textures."""
 
     procedural: Annotated[bool | tuple[TextureKind, ...], word_or_list((True, False), TEXTURE_KINDS)] = Field(
         True, description="true, false or a list of kinds"
     )
-    variants: int = Field(40, ge=1, le=100_000, description="textures of each procedural kind")
+    variants: int = Field(40, ge=1, le=100_000, description="textures per procedural kind")
     photographs: bool = Field(True, description="the photographs bundled with scikit-image")
     folders: Paths = Field((), description="folders searched recursively for images (also .hdr)")
     max_size: int = Field(512, ge=8, le=8192, description="longer image sides are reduced to this, px")
     test_fraction: Fraction = Field(
         0.1, description="fraction of textures kept for split 'test', chosen by content hash"
     )
-    bad_assets: Literal["error", "skip"] = Field("error", description="skip logs an unreadable image and draws another")
+    bad_assets: Literal["error", "skip"] = Field(
+        "error", description="skip: logs an unreadable image and draws another"
+    )
 
 
 class SkyConfig(Config):
-    """Textured box around everything, seen from inside, unlit."""
+    """Textured box around the scene, seen from inside, unlit."""
 
     kind: Literal["box"] = "box"
     size: float = Field(100.0, gt=0, le=1e6, description="edge length, m")
     subdivisions: int = Field(
-        4, ge=1, le=256, description="cells per edge; 1 costs a third of the flow's precision, more than 4 gains none"
+        4, ge=1, le=256, description="cells per edge; 1 loses a third of the flow's precision, more than 4 gains none"
     )
     repeat: PositiveRange = Field((1.0, 3.0), description="texture repeats per face; log-uniform")
-    per_face: bool = Field(True, description="a texture of its own on each face, or one on all")
+    per_face: bool = Field(True, description="true: one texture per face; false: one for all")
     brightness: PositiveRange = Field((0.6, 1.1), description="factor on the texture's radiance; uniform")
     panoramas: Paths = Field(
         (),
-        description="equirectangular images or folders of them (jpg, png, hdr, exr) drawn at infinity in the place of "
-        "the box, whose size is the ground's alone then",
+        description="equirectangular images or folders of them (jpg, png, hdr, exr), drawn at infinity instead "
+        "of the box; size then applies only to the ground",
     )
     lights: bool = Field(
         False,
-        description="the panorama lights the world, too, in the place of light.sun and light.sky: what is drawn and "
-        "what shines are one picture",
+        description="the panorama also lights the world, instead of light.sun and light.sky",
     )
 
     @rule("lights", "#panoramas")
@@ -131,19 +132,19 @@ class SkyConfig(Config):
 class GroundConfig(Config):
     """Textured square at a constant height."""
 
-    size: float | None = Field(None, gt=0, le=1e6, description="edge length, m; null: as the sky box")
+    size: float | None = Field(None, gt=0, le=1e6, description="edge length, m; null: that of the sky box")
     height: float = Field(0.0, description="z of the ground, m")
-    subdivisions: int = Field(8, ge=1, le=1024, description="cells per edge; more gains no precision, less costs some")
+    subdivisions: int = Field(8, ge=1, le=1024, description="cells per edge; more gains no precision and costs time")
     tile: PositiveRange = Field((2.0, 8.0), description="edge of one texture repeat, m; log-uniform")
 
 
 class RegionConfig(Config):
-    """Box in which the camera and the objects live, centred on the z axis, standing on the ground."""
+    """Box that contains the camera and the objects, on the ground, centred on the z axis."""
 
     width: float = Field(30.0, gt=0, le=1e6, description="edge in x and y, m")
     height: float = Field(8.0, gt=0, le=1e6, description="m")
     camera_height: ClassVar[Any] = (1.0, 3.5)
-    """m, the camera's first height above the ground; uniform."""
+    """Height of the camera's first position above the ground, m; uniform."""
     fixed: ClassVar[Any] = ("camera_height",)
 
 
@@ -155,18 +156,18 @@ class RandomSceneConfig(Config):
     pool: PoolConfig = PoolConfig()
     textures: TexturesConfig = TexturesConfig()
     region: RegionConfig = RegionConfig()
-    sky: SkyConfig | None = Field(SkyConfig(), description="null: none, the background is seen")
-    ground: GroundConfig | None = Field(GroundConfig(), description="null: none; then every object flies")
+    sky: SkyConfig | None = Field(SkyConfig(), description="null: no sky, only the background")
+    ground: GroundConfig | None = Field(GroundConfig(), description="null: no ground; all objects fly")
     light: LightConfig = LightConfig()
     fog: FogConfig | None = FOG
     lights: RandomLightsConfig | None = Field(
-        None, description="null: none but those of light.lights; {} is enough for one to three point and spot lights"
+        None, description="null: only light.lights; {}: one to three point and spot lights"
     )
     object_motion: ObjectMotion = ObjectMotion(static_share=0.3)
     camera_motion: CameraMotion = CameraMotion()
     physics: RandomPhysicsConfig | None = Field(None, description="null: nothing falls. Needs the extra [physics]")
     camera_clearance: float = Field(
-        0.3, gt=0, le=1e4, description="radius of the sphere round the camera centre that touches nothing, m"
+        0.3, gt=0, le=1e4, description="radius of the empty sphere around the camera centre, m"
     )
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     removed: ClassVar[Any] = {
@@ -218,14 +219,14 @@ class MeshConfig(Config):
     )
     parameters: dict[str, Annotated[int | float | Vector3 | str, BeforeValidator(parameter_value)]] = Field(
         {},
-        description="the primitive's sizes, numbers of faces, and what it does: see [primitives](#primitives)",
+        description="sizes, numbers of faces and motion of the primitive: see [primitives](#primitives)",
     )
     file: str | None = Field(None, description="obj, ply, stl, glb or gltf file")
     up: Literal["auto", "y", "z"] = Field(
         "auto",
-        description="the file's axis that points up, which becomes the world's z: with y, the file's "
-        "(x, y, z) is drawn at (x, -z, y). auto: y for glb and gltf, as their standard says; z (the file's own "
-        "coordinates) for obj, ply, stl",
+        description="upward axis of the file, which becomes the world's z: with y, the file's (x, y, z) is drawn "
+        "at (x, -z, y). auto: y for glb and gltf, by their standard; z (unchanged coordinates) for "
+        "obj, ply, stl",
     )
     project_uvs: ClassVar[Any] = False
     uv_size: ClassVar[Any] = 1.0
@@ -252,27 +253,25 @@ class ObjectConfig(KeyedMotionConfig):
 
     name: str | None = Field(None, description="null: the mesh's name")
     mesh: str = Field(description="a name under scene.meshes")
-    material: str | None = Field(None, description="a name under scene.materials; null: the file's own materials")
+    material: str | None = Field(None, description="a name under scene.materials; null: the file's materials")
     scale: Annotated[float | Vector3, BeforeValidator(number_or_three), AfterValidator(greater_than_zero)] = Field(
-        1.0, description="factor on the mesh, one or per axis"
+        1.0, description="factor on the mesh, one or one per axis"
     )
     category: Literal["object", "ground", "wall", "sky"] = Field(
-        "object", description="what it is: collisions and drawing order"
+        "object", description="role of the object: for collisions and drawing order"
     )
     animation: str | int | AnimationConfig | None = Field(
-        None, description="clip of the mesh's gltf or glb file that it plays, looped; null: the file at rest"
+        None, description="clip of the mesh's gltf or glb file to play, repeated; null: the rest shape"
     )
     physics: BodyConfig | None = Field(
         None,
-        description="what it is to the engine of a scene with physics; null: it is in the way, where it stands "
-        "or moves",
+        description="its physics in a scene with physics; null: an obstacle at its place or on its path",
     )
     deform: DeformConfig | None = Field(
         None,
-        description="how its shape changes with time, by formula, whatever it does by itself; null: it is rigid, but "
-        "for figure, flag, fish",
+        description="change of shape by formula, replacing its own motion; null: rigid, except figure, flag, fish",
     )
-    way: WayConfig | None = Field(None, description="a curve that it follows, in place of a pose or key frames")
+    way: WayConfig | None = Field(None, description="a curve that it follows, instead of a pose or key frames")
 
     @rule("?way", "?trajectory")
     def _a_way_or_a_trajectory(way, trajectory):
@@ -317,8 +316,8 @@ def _known(used, known, key: str, table: str, at=None) -> None:
 
 
 def object_names(names: Iterable[str | None], meshes: Iterable[str]) -> list[str]:
-    """Names of an explicit scene's objects: as given (None: not), else the mesh's, with the
-    object's number where that is taken."""
+    """Return the names of an explicit scene's objects: the given name, else the mesh's (None: not given), with the
+    object's number where that is in use."""
     made: list[str] = []
     for number, (name, mesh) in enumerate(zip(names, meshes)):
         name = name or (mesh if mesh not in made else f"{mesh}#{number}")
@@ -329,22 +328,21 @@ def object_names(names: Iterable[str | None], meshes: Iterable[str]) -> list[str
 
 
 class ExplicitSceneConfig(Config):
-    """A custom scene: named meshes and materials, objects with poses or key frames, the camera likewise."""
+    """A custom scene: named meshes and materials, objects and a camera with poses or key frames."""
 
     kind: Literal["explicit"]
     meshes: dict[str, MeshConfig] = Field({}, description="by name")
     materials: dict[str, MaterialConfig] = Field({}, description="by name")
-    objects: tuple[ObjectConfig, ...] = Field(min_length=1, description="at least one")
+    objects: tuple[ObjectConfig, ...] = Field(min_length=1, description="one or more")
     collisions: bool = Field(
         False,
-        description="true: find collisions along the trajectories and stop what collides there (what falls is not "
-        "looked at: see physics)",
+        description="true: find collisions along the trajectories and stop the objects that collide (not those "
+        "that fall: see physics)",
     )
     camera: KeyedMotionConfig = Field(description="pose or key frames; OpenCV axes: x right, y down, z forward")
     physics: PhysicsConfig | None = Field(
         None,
-        description="null: nothing falls. {} is enough: gravity for objects that say physics. Needs the extra "
-        "[physics]",
+        description="null: nothing falls. {}: gravity for objects with physics. Needs the extra [physics]",
     )
     light: LightConfig = LightConfig()
     fog: FogConfig | None = FOG
@@ -386,34 +384,32 @@ class ExplicitSceneConfig(Config):
 
 
 class FileSceneConfig(Config):
-    """A finished glTF/GLB scene with its cameras, materials and node animations. The file's y axis points up, as its
-    standard says, and is drawn as the world's z: the file's (x, y, z) is at (x, -z, y). Poses given here are in that
-    z-up world."""
+    """A complete glTF/GLB scene with cameras, materials and node animations. The file's y axis points up, by its
+    standard, and becomes the world's z: the file's (x, y, z) is at (x, -z, y). Poses given here are in that z-up
+    world."""
 
     kind: Literal["file"]
     path: str = Field(description="gltf or glb file")
     camera: str | int | None = Field(None, description="name or index of the file's camera; null: the first")
-    pose: KeyedMotionConfig | None = Field(
-        None, description="camera motion used instead of the file's camera (z-up world)"
-    )
+    pose: KeyedMotionConfig | None = Field(None, description="camera motion instead of the file's camera (z-up world)")
     intrinsics: Literal["config", "file"] = Field(
-        "config", description="focal length from the YAML's camera or from the file's (yfov)"
+        "config", description="source of the focal length: camera of the YAML, or the file (yfov)"
     )
     animation: str | int | AnimationConfig | None = Field(
-        0, description="name or index of the animation played, at the file's own times; null: none"
+        0, description="name or index of the animation to play, at the file's times; null: none"
     )
     light: LightConfig = LightConfig()
     fog: FogConfig | None = FOG
     lights: Literal["config", "file"] = Field(
         "config",
-        description="file: the file's own lights (KHR_lights_punctual) shine in the place of light.sun, beside "
-        "light.sky and light.lights",
+        description="file: the file's lights (KHR_lights_punctual) replace light.sun; light.sky and light.lights "
+        "remain",
     )
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     lights_gain: Positive = Field(
         1.0,
-        description="factor on the file's lights, whose lux and candela are divided by 683 lm/W, as Blender's exporter "
-        "multiplies them",
+        description="factor on the file's lights; their lux and candela are divided by 683 lm/W, the factor of "
+        "Blender's exporter",
     )
     max_faces: ClassVar[Any] = 5_000_000
     max_texture_size: ClassVar[Any] = 2048

@@ -1,22 +1,22 @@
-"""Sensors: what is known of a camera, in a form the emulators can use.
+"""Sensors: the known properties of a camera, in a form that the emulators can use.
 
-A sensor is a YAML file, shipped or a person's own:
+A sensor is a YAML file, shipped or a user's own:
 
     name: my DAVIS
     width: 346
     height: 260
-    contrast_threshold: 0.3                    # of any emulator, where nothing more exact is said below
-    emulators:                                 # keys of `events:` by emulator; they win over the above
+    contrast_threshold: 0.3                    # of any emulator, unless given more exactly below
+    emulators:                                 # keys of `events:` by emulator; they override the above
       esim: {contrast_threshold: 0.29, log_eps: 0.03}
       voltmeter: {preset: DVS346, k1: {log_uniform: [1.8, 4.1]}}
     readout: {events_per_second: 12.0e+6}
-    sources:                                   # where values come from, by their place in the file
+    sources:                                   # sources of the values, by their place in the file
       contrast_threshold: data sheet, table 2
       emulators.esim: fitted here to slider_depth, first half
     uncertainty: {emulators.esim.log_eps: 0.004}
 
-A value may be a distribution over units and bias settings (:mod:`blinkgl.config.draw`): two cameras of one name differ.
-A sequence draws one unit; whoever wants a single camera takes the middle, or a unit by number (:func:`load_sensor`).
+A value may be a distribution over units and bias settings (:mod:`blinkgl.config.draw`), because two cameras of one name
+differ. A sequence draws one unit; :func:`load_sensor` returns the middle, or a unit by number.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from blinkgl.errors import ConfigError
 
 
 def _emulator_tables(tables: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """A field's own look and no rule: what is looked at together is one emulator's keys, not those of all."""
+    """Check the keys of each emulator by a field validator: a rule would combine the keys of all emulators."""
     models = EmulatorConfig.members.models
     for name, keys in tables.items():
         if name not in models:
@@ -53,10 +53,10 @@ def _emulator_tables(tables: dict[str, dict[str, Any]]) -> dict[str, dict[str, A
 
 
 class SensorConfig(Config):
-    """One camera, one unit of it. Thresholds are in ln units: a contrast of 15 % is ln 1.15 = 0.14. What is null is not
-    known, and the emulator's own default holds."""
+    """One camera, one unit of it. Thresholds are in ln units: a contrast of 15 % is ln 1.15 = 0.14. Null means unknown:
+    the emulator's default applies."""
 
-    name: str = Field(description="The camera's name.")
+    name: str = Field(description="Name of the camera.")
     width: int = Field(ge=1, le=65535, description="Columns, px.")
     height: int = Field(ge=1, le=65535, description="Rows, px.")
     pixel_pitch_um: float | None = Field(
@@ -64,8 +64,8 @@ class SensorConfig(Config):
     )
     frame_gamma: Literal["linear", "srgb"] | Annotated[float, Field(gt=0, le=10)] | None = Field(
         None,
-        description="Curve from the codes of the camera's own frames to light: `linear`, `srgb` or an exponent. Grey "
-        "images of the sensor's size are taken for its own where nobody says what they are.",
+        description="Curve from the codes of the camera's own frames to light: `linear`, `srgb` or an exponent. "
+        "Grey images of the sensor's size are taken as its own unless specified.",
     )
     contrast_threshold: float | None = Field(None, ge=0.001, le=10, description="Nominal ON threshold, ln units.")
     contrast_threshold_off: float | None = Field(
@@ -84,18 +84,16 @@ class SensorConfig(Config):
     )
     emulators: Annotated[dict[str, dict[str, Any]], AfterValidator(_emulator_tables)] = Field(
         {},
-        description="Keys of `events:` by the emulator's name: what was fitted or published for that model. They win "
-        "over the values above.",
+        description="Keys of `events:` by emulator, fitted or published for that model. They override the values "
+        "above.",
     )
-    readout: ReadoutConfig | None = Field(
-        None, description="What is behind the pixels: their defects and latency, the bus and its clock."
-    )
+    readout: ReadoutConfig | None = Field(None, description="Defects and latency of the pixels, the bus and its clock.")
     sources: dict[str, str] = Field(
         {},
-        description="Where values come from, by their dotted place in the file, or that of the table that they are in.",
+        description="Source of each value, by its dotted place in the file or that of its table.",
     )
     uncertainty: dict[str, float] = Field(
-        {}, description="Standard deviations of fitted values, by their dotted place, in the value's unit."
+        {}, description="Standard deviations of fitted values, by dotted place, in the value's unit."
     )
 
     @rule("#sources", "#uncertainty", "#emulators")
@@ -109,13 +107,13 @@ class SensorConfig(Config):
 
     @property
     def pixels_known(self) -> bool:
-        """Whether anything is said of what its pixels do: else the emulators' defaults stand for it."""
+        """Return whether anything is known about its pixels; otherwise the emulators' defaults apply."""
         keys = ("contrast_threshold", "contrast_threshold_off", "threshold_sigma", "cutoff_hz", "refractory_us",
                 "leak_rate_hz", "shot_noise_rate_hz", "emulators")  # fmt: skip
         return any(getattr(self, key) not in (None, {}) for key in keys)
 
     def values(self, emulator: Any) -> dict[str, Any]:
-        """What this sensor says about the keys of the emulator of this name; of one that is not known nothing."""
+        """Return the sensor's values for the keys of the emulator of this name; none for an unknown one."""
         models = EmulatorConfig.members.models
         if not isinstance(emulator, str) or emulator not in models:
             return {}
@@ -123,7 +121,8 @@ class SensorConfig(Config):
         return {**said, **copy.deepcopy(self.emulators.get(emulator, {}))}
 
     def emulator(self, emulator: str, **overrides: Any) -> EmulatorConfig:
-        """Config of the emulator of this name with this sensor's values, ``overrides`` on top. Raises ConfigError."""
+        """Return the configuration of the emulator of this name with this sensor's values, then ``overrides``. Raises
+        ConfigError."""
         models = EmulatorConfig.members.models
         if not isinstance(emulator, str) or emulator not in models:
             raise ConfigError(
@@ -133,29 +132,29 @@ class SensorConfig(Config):
 
 
 def sensor_names() -> tuple[str, ...]:
-    """Names of the shipped sensors, as ``load_sensor`` takes them."""
+    """Return the names of the shipped sensors, as ``load_sensor`` takes them."""
     return shipped_names("sensors")
 
 
 def load_sensor(name: str, unit: int | None = None) -> SensorConfig:
-    """A shipped sensor by name (case and punctuation do not matter), or one of a YAML file by its path (ending in .yaml
-    or .yml). Raises ConfigError naming the known ones, or what is wrong with the file.
+    """Return a shipped sensor by name (ignoring case and punctuation), or one of a YAML file by its path (ending in
+    .yaml or .yml). Raises ConfigError naming the known ones, or the problem with the file.
 
-    unit : of a sensor whose values are distributions over units: the unit of this number, drawn by it alone; None: the
-    middle of every distribution."""
+    unit : number of a unit, for a sensor whose values are distributions over units; its values depend only on this
+    number. None: the middle of every distribution."""
     table = sensor_table(name)
     _check(table, str(name))
     return validate(SensorConfig, middle(table) if unit is None else draw(table, unit, 0), where=str(name))
 
 
 def _check(table: dict[str, Any], where: str) -> None:
-    """Validates what stands for all that a sensor can draw. Raises ConfigError."""
+    """Validate values that represent all that a sensor can draw. Raises ConfigError."""
     for tree in corners(table):
         validate(SensorConfig, tree, where=where)
 
 
 def sensor_table(name: Any) -> dict[str, Any]:
-    """What a sensor's file says, distributions as they stand (a copy). Raises ConfigError as :func:`load_sensor`."""
+    """Return a copy of a sensor file's table, distributions included. Raises ConfigError as :func:`load_sensor`."""
     if is_sensor_file(name):
         return read_table(name, "a sensor: name, width, height, ...")
     known = known_sensor(name)
@@ -170,12 +169,12 @@ def sensor_table(name: Any) -> dict[str, Any]:
 
 
 def is_sensor_file(name: Any) -> bool:
-    """Whether a sensor's name is the path of a file."""
+    """Return whether a sensor's name is the path of a file."""
     return isinstance(name, str) and name.lower().endswith((".yaml", ".yml"))
 
 
 def known_sensor(name: Any) -> str | None:
-    """The name in :func:`sensor_names` that ``name`` means; None for one that is not shipped."""
+    """Return the name in :func:`sensor_names` that ``name`` means; None if it is not shipped."""
     plain = lambda s: "".join(c for c in s.lower() if c.isalnum())
     return (
         next((known for known in sensor_names() if plain(known) == plain(name)), None)
@@ -185,9 +184,9 @@ def known_sensor(name: Any) -> str | None:
 
 
 def sensor_file_or_name(sensor: Any, base: Path) -> Any:
-    """What a run's key ``sensor`` says, with the table of a file in the place of its path (from ``base``). A shipped
-    sensor whose values are distributions is spelled out, too, because a sequence has to say which unit it drew; the
-    others stay a name. Raises ConfigError."""
+    """Return the value of a run's key ``sensor`` with a file's path (relative to ``base``) replaced by its table. A
+    shipped sensor with distributions becomes its table, too, because a sequence must record the unit it drew; the
+    others remain a name. Raises ConfigError."""
     if is_sensor_file(sensor):
         table = sensor_table(str(base / sensor))
         _check(table, str(base / sensor))
@@ -205,11 +204,11 @@ def _has_distributions(node: Any) -> bool:
 
 
 def fill_sensor(sensor: Any, emulator: Any) -> dict[str, Any]:
-    """What ``sensor``, a name or a table, says about a configuration with ``emulator`` (None: the
-    default one); nothing for an unknown one, and for a table that is none."""
+    """Return the keys that ``sensor``, a name or a table, gives to a configuration with ``emulator`` (None: the default
+    one); none for an unknown sensor or an invalid table."""
     try:
         camera = validate(SensorConfig, sensor) if isinstance(sensor, dict) else load_sensor(sensor)
-    except ConfigError:  # of which the configuration's own key speaks
+    except ConfigError:  # the check of the key sensor reports this
         return {}
     said = {
         "camera": {"width": camera.width, "height": camera.height},

@@ -1,7 +1,7 @@
-"""The whole configuration of a generation run, and of one sequence of it.
+"""The configuration of a generation run, and of one of its sequences.
 
-``load_run(path, overrides)`` reads a YAML file; ``RunTemplate.sequence(i)`` draws the i-th sequence's parameters
-and returns a frozen, validated :class:`SequenceConfig` of plain values. What can be drawn is checked when the file is
+``load_run(path, overrides)`` reads a YAML file; ``RunTemplate.sequence(i)`` draws the i-th sequence's parameters and
+returns a frozen, validated :class:`SequenceConfig` of plain values. All that can be drawn is checked when the file is
 read (:mod:`blinkgl.config.draw`).
 """
 
@@ -34,35 +34,33 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# ``gl:`` section: which OpenGL implementation renders.
+# The ``gl:`` section: the OpenGL implementation that renders.
 
 
 class GLConfig(Config):
-    """Where the OpenGL context comes from (see :func:`blinkgl.gl.create_context`)."""
+    """The OpenGL implementation (see :func:`blinkgl.gl.create_context`)."""
 
     backend: Literal["auto", "egl", "osmesa"] = Field(
-        "auto", description="auto: EGL, and OSMesa (software) when EGL is missing; egl or osmesa: that one or an error"
+        "auto", description="auto: EGL, or OSMesa (software) if EGL is missing; egl or osmesa: only that one"
     )
-    device: int = Field(
-        0, ge=0, description="number of the EGL device as `blinkgl doctor` lists them; without meaning for osmesa"
-    )
+    device: int = Field(0, ge=0, description="number of the EGL device in `blinkgl doctor`; not used by osmesa")
 
 
 NS_PER_S = 1_000_000_000
 MAX_LABELS = 1_000_000
-"""Files of a sequence have numbers of six digits."""
+"""File names of a sequence have six digits."""
 
 
 class TimeConfig(Config):
-    """Labels at ``label_rate`` over ``duration`` seconds; the simulation starts one label interval earlier
-    (pre-roll), so that every label has a full window of events before and after it."""
+    """Labels at ``label_rate`` over ``duration`` seconds; the simulation starts one label interval earlier (pre-roll),
+    so that every label has a full window of events before and after it."""
 
     duration: float = Field(
         1.0,
         gt=0,
         le=86400 * 2,
-        description="labelled time, s; with a label interval before and one after at most 71.6 minutes, which is "
-        "what an event file can hold",
+        description="labelled time, s; at most 71.6 minutes with one label interval before and after, the limit "
+        "of an event file",
     )
     label_rate: float = Field(10.0, gt=0, le=1e5, description="labels (flow, images) per second, Hz")
     start: float = Field(0.0, ge=0, le=1e7, description="clock at the start of the pre-roll, s")
@@ -89,39 +87,39 @@ class TimeConfig(Config):
 
     @property
     def interval_ns(self) -> int:
-        """Label interval, ns."""
+        """Return the label interval, ns."""
         return round(NS_PER_S / self.label_rate)
 
     @property
     def label_count(self) -> int:
-        """Number of labels with flow to the next one."""
+        """Return the number of labels with flow to the next one."""
         return int(self.duration * self.label_rate + 1e-9)
 
     @property
     def t0_ns(self) -> int:
-        """Start of the pre-roll."""
+        """Return the start of the pre-roll, ns."""
         return round(self.start * NS_PER_S)
 
     @property
     def t1_ns(self) -> int:
-        """End of the last label's interval."""
+        """Return the end of the last label's interval, ns."""
         return self.t0_ns + (self.label_count + 1) * self.interval_ns
 
     @property
     def label_times_ns(self) -> range:
-        """label_count + 1 times; flow k runs from label k to label k + 1."""
+        """Return the label_count + 1 times, ns; flow k runs from label k to label k + 1."""
         return range(self.t0_ns + self.interval_ns, self.t1_ns + 1, self.interval_ns)
 
 
 def span_s(duration: float, label_rate: float) -> float:
-    """From the start of the pre-roll to the end of the last label's interval, s; at most
-    half a label more than it is."""
+    """Return the time from the start of the pre-roll to the end of the last label's interval, s; at most half a label
+    too long."""
     return duration + 1 / label_rate
 
 
 def _is_offered(name: Any) -> Any:
-    """Raises Refused for multi-sampling, which 0.1.0 had: no preset took it, since it cost more than ``taps4`` and had
-    more error than ``ssaa2`` (docs/trade.md)."""
+    """Refuse multi-sampling, which 0.1.0 had: it cost more than ``taps4`` and had more error than ``ssaa2``
+    (docs/trade.md)."""
     if name == "msaa4":
         raise Refused(
             "multi-sampling was removed", value=name, accepted="edges, which filters silhouettes and textures"
@@ -134,26 +132,28 @@ ImageAntialiasing = Annotated[Literal["none", "edges", "edges2", "ssaa2", "ssaa4
 
 
 class RenderConfig(Config):
-    """How a frame is drawn."""
+    """Quality of drawing."""
 
     antialiasing: Antialiasing = Field(
         "none",
-        description="event frames: taps4 filters textures (4 lookups a pixel); edges silhouettes, too, by the areas of "
-        "their surfaces, and lookups lie along the way of foreshortening; ssaa2 and ssaa4 draw 2 x 2 and 4 x 4 finer "
-        "and average everything, edges2 draws edges 2 x 2 finer. Labels are never filtered. Costs: docs/trade.md",
+        description="event frames. taps4: filters textures (4 lookups per pixel); edges: filters silhouettes, "
+        "too, by surface area, and its lookups follow the foreshortening; edges2: edges at 2 x 2 "
+        "resolution; ssaa2 and ssaa4: averages 2 x 2 and 4 x 4 samples. Labels are never filtered. "
+        "Costs: docs/trade.md",
     )
     image_antialiasing: ImageAntialiasing = Field("ssaa2", description="the same for the colour images at label times")
     anisotropy: float = Field(
         1.0,
         ge=1,
         le=16,
-        description="texture anisotropy, 1 is off (on software GL: half as fast, and seconds a frame beside a horizon)",
+        description="texture anisotropy, 1: off (with software GL: half the speed, and seconds per frame near a "
+        "horizon)",
     )
     mip_bias: float = Field(
         0.0,
         ge=-8,
         le=8,
-        description="added to the mip level that is looked up, log2: -1 is sharper by 2, and aliases more",
+        description="added to the mip level, log2: -1 doubles the sharpness, with more aliasing",
     )
     removed: ClassVar[Any] = {
         "lod": Removed(
@@ -164,12 +164,12 @@ class RenderConfig(Config):
 
 
 class PreviewConfig(Config):
-    """preview.mp4: frames, events and flow side by side."""
+    """The video preview.mp4: frames, events and flow side by side."""
 
     enabled: bool = Field(True, description="false: no preview")
-    rate: float = Field(30.0, gt=0, le=1e4, description="pictures per second of simulated time, Hz")
+    rate: float = Field(30.0, gt=0, le=1e4, description="frames per second of simulated time, Hz")
     slowdown: ClassVar[Any] = 2.0
-    """Play-back is this many times slower than the simulation."""
+    """The video plays this many times slower than the simulation."""
     fixed: ClassVar[Any] = ("slowdown",)
 
 
@@ -184,26 +184,26 @@ def _file_name(name: str) -> str:
 
 
 class OutputConfig(Config):
-    """Where sequences go below the output folder: `OUT/SPLIT/NAME_000000`, …"""
+    """Names and number of the sequences: `OUT/SPLIT/NAME_000000`, …"""
 
     name: Annotated[str, AfterValidator(_file_name)] = Field("sequence", description="name of the sequences")
     split: Literal["train", "test"] = Field(
-        "train", description="which side of the object and texture pools; disjoint by content"
+        "train", description="split of the object and texture pools, which are disjoint by content"
     )
-    sequences: int = Field(1, ge=1, le=10_000_000, description="how many (--num overrides)")
+    sequences: int = Field(1, ge=1, le=10_000_000, description="number of sequences (--num overrides it)")
     first_index: int = Field(
-        0, ge=0, le=10_000_000, description="number of the first; sequence n depends on the seed and n alone"
+        0, ge=0, le=10_000_000, description="number of the first; sequence n depends only on the seed and n"
     )
     compression: Literal["zstd", "lz4", "gzip"] = Field(
         "zstd",
-        description="of events.h5 and event_labels.h5: zstd inside Blosc, as DSEC's files; lz4, too, written faster "
-        "and some percent larger; gzip, which h5py reads without hdf5plugin, written slower",
+        description="for events.h5 and event_labels.h5: zstd in Blosc, as DSEC's files; lz4 is faster to write "
+        "and some percent larger; gzip is slower to write, but h5py reads it without hdf5plugin",
     )
 
 
 class CameraOnRig(NamedTuple):
-    """One camera of a sequence's rig: its number among the sensors, the name of its folder ("" of a single camera),
-    what a single camera would have to say to be it, and whether it gives events."""
+    """One camera of a sequence's rig: its index among the sensors, the name of its folder ("" for a single camera), the
+    configuration of an equivalent single camera, and whether it gives events."""
 
     number: int
     name: str
@@ -212,39 +212,39 @@ class CameraOnRig(NamedTuple):
 
 
 class SequenceConfig(Config):
-    """One sequence, every value plain and final."""
+    """One sequence; all values are plain and final."""
 
-    seed: int = Field(0, ge=0, lt=2**63, description="of the whole run; 0 is a seed")
-    output: OutputConfig = Field(OutputConfig(), description="where sequences go")
+    seed: int = Field(0, ge=0, lt=2**63, description="seed of the whole run; 0 is a seed")
+    output: OutputConfig = Field(OutputConfig(), description="names and number of the sequences")
     camera: CameraConfig = Field(CameraConfig(), description="resolution, intrinsics and lens")
     time: TimeConfig = Field(TimeConfig(), description="duration and label rate")
     quality: Quality | None = Field(
         DEFAULT,
-        description="fast, balanced, accurate or reference: gives timeline and render the values of a measured "
-        "point of speed against accuracy (docs/trade.md); what is said beside it wins. null: every key has the "
-        "default that stands in its own table",
+        description="fast, balanced, accurate or reference: sets timeline and render to a measured trade-off of "
+        "speed and accuracy (docs/trade.md); keys given beside it override it. null: the defaults of "
+        "each table",
     )
-    timeline: TimelineConfig = Field(DisplacementTimeline(), description="when event frames are drawn")
-    scene: SceneConfig = Field(RandomSceneConfig(), description="what is in front of the camera and how it moves")
+    timeline: TimelineConfig = Field(DisplacementTimeline(), description="times of the event frames")
+    scene: SceneConfig = Field(RandomSceneConfig(), description="objects, lights, camera motion")
     frames: FramesConfig | None = Field(
         None,
-        description="recorded frames to convert; then nothing is rendered, and `camera`, `time`, "
-        "`timeline`, `scene` and `render` have no meaning",
+        description="recorded frames to convert instead of rendering; `camera`, `time`, `timeline`, `scene` and "
+        "`render` are then not used",
     )
-    render: RenderConfig = Field(RenderConfig(), description="how a frame is drawn")
+    render: RenderConfig = Field(RenderConfig(), description="quality of drawing")
     sensor: Sensor | None = Field(
         None,
-        description="davis240c, davis346, dvxplorer, gen31_vga or imx636, or the path of a sensor file (its table may "
-        "stand here, too): gives camera.width and height, events and readout the camera's values; what is said beside "
-        "it wins",
+        description="davis240c, davis346, dvxplorer, gen31_vga, imx636, or the path of a sensor file (or its "
+        "table): sets camera.width, camera.height, events and readout; keys given beside it override "
+        "it",
     )
-    events: EmulatorConfig = Field(EsimConfig(), description="the event camera's model and parameters")
+    events: EmulatorConfig = Field(EsimConfig(), description="event camera model and parameters")
     readout: ReadoutConfig | None = Field(
         None,
-        description="what is behind the pixels: their defects and latency, the bus (events above its rate are late, "
-        "then lost) and its clock, filters; null: nothing",
+        description="after the pixels: defects and latency, the bus (events above its rate are late, then lost), "
+        "its clock, filters; null: none",
     )
-    labels: LabelsConfig = Field(default_factory=LabelsConfig, description="which ground truth is written")
+    labels: LabelsConfig = Field(default_factory=LabelsConfig, description="ground truth to write")
     images: ImagesConfig | None = Field(
         None, description="a frame camera beside the event camera (docs/images.md); null: none"
     )
@@ -253,16 +253,16 @@ class SequenceConfig(Config):
         None, description="points on surfaces, followed through the sequence (docs/over_time.md); null: none"
     )
     rig: Literal["davis", "dsec", "mvsec", "stereo"] | None = Field(
-        None, description="sensors of a known rig (docs/rigs.md); what `sensors` says beside it wins, name by name"
+        None, description="sensors of a known rig (docs/rigs.md); `sensors` given beside it override them by name"
     )
     sensors: tuple[RigSensorConfig, ...] | None = Field(
-        None, min_length=1, description="several sensors on one rig that moves (docs/rigs.md); null: a single camera"
+        None, min_length=1, description="several sensors on one moving rig (docs/rigs.md); null: a single camera"
     )
     preview: PreviewConfig = Field(PreviewConfig(), description="preview.mp4")
-    gl: GLConfig = Field(GLConfig(), description="which OpenGL to use")
+    gl: GLConfig = Field(GLConfig(), description="OpenGL implementation")
 
     def cameras(self) -> list[CameraOnRig]:
-        """All that see, in their order; a single camera is the only one of its rig, and has no name."""
+        """Return all cameras in order. A single camera is a rig of one, without a name."""
         if self.sensors is None:
             return [CameraOnRig(0, "", self, True)]
         return [
@@ -272,8 +272,9 @@ class SequenceConfig(Config):
         ]
 
     def of_sensor(self, number: int) -> SequenceConfig:
-        """What a single camera would have to say to be the rig's sensor of this number at the rig's origin, without a
-        preview: that one is the rig's. Of a sensor without events `events` is as at the top, which nobody asks."""
+        """Return the configuration of a single camera at the rig's origin that equals the sensor of this number,
+        without a preview (the preview belongs to the rig). A sensor without events keeps the top level's `events`,
+        which are not used."""
         assert self.sensors is not None
         one = self.sensors[number]
         own: dict[str, Any] = {key: getattr(one, key) for key in SECTIONS}

@@ -1,4 +1,4 @@
-"""When event frames are drawn."""
+"""The ``timeline:`` section: times of the event frames."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ class _AdaptiveTimeline(_Timeline):
         4,
         ge=1,
         le=64,
-        description="the small picture that decides the step looks at every n-th pixel in x and y; 1 at all of them",
+        description="the step is chosen from a small picture with every n-th pixel in x and y; 1: all",
     )
-    min_step_us: float = Field(200.0, ge=0.001, description="the step is never shorter, µs")
+    min_step_us: float = Field(200.0, ge=0.001, description="shortest step, µs")
     max_step_us: float = Field(
         20000.0,
         ge=0.001,
         le=1e9,
-        description="the step is never longer, µs; emulators take frames at most 17 minutes apart",
+        description="longest step, µs; emulators take frames at most 17 minutes apart",
     )
 
     @rule("min_step_us", "max_step_us")
@@ -51,8 +51,7 @@ class _AdaptiveTimeline(_Timeline):
 
 
 class DisplacementTimeline(_AdaptiveTimeline):
-    """Event frames so far apart that pixels move no more than ``max_px`` from one to the next, by
-    the speeds at both ends of the step."""
+    """Event frames between which pixels move at most ``max_px``, by the speeds at both ends of the step."""
 
     removed: ClassVar[Any] = {
         **_NO_RECONSTRUCTION,
@@ -61,29 +60,32 @@ class DisplacementTimeline(_AdaptiveTimeline):
 
     kind: Literal["displacement"] = "displacement"
     max_px: float = Field(
-        0.5, gt=0, le=1e4, description="displacement between two frames, px, that the percentile keeps to"
+        0.5, gt=0, le=1e4, description="largest displacement between two frames, px, for the percentile"
     )
     percentile: float = Field(
-        100.0, gt=0, le=100, description="of the speeds of the pixels that move; 100 bounds every sampled pixel"
+        100.0, gt=0, le=100, description="percentile of the speeds of moving pixels; 100 bounds every sampled pixel"
     )
     max_px_peak: float | None = Field(
         None,
         gt=0,
         le=1e4,
-        description="what the fastest sampled pixel keeps to besides, px; for a percentile below 100",
+        description="an additional limit for the fastest sampled pixel, px; for a percentile below 100",
     )
 
 
 class BrightnessTimeline(_AdaptiveTimeline):
-    """Event frames so far apart that the signal changes by no more than a fraction of the contrast threshold, by
-    |dL/dt| from the shader at both ends of the step."""
+    """Event frames between which the signal changes by at most a fraction of the contrast threshold, by |dL/dt| from
+    the shader at both ends of the step."""
 
     kind: Literal["brightness"] = "brightness"
     max_fraction_of_threshold: float = Field(
-        1.0, gt=0, le=100, description="change between two frames, in smallest nominal contrast thresholds"
+        1.0,
+        gt=0,
+        le=100,
+        description="largest change between two frames, in units of the smallest nominal contrast threshold",
     )
     percentile: float = Field(
-        95.0, gt=0, le=100, description="of |dL/dt| over the pixels that change; 100 bounds every sampled pixel"
+        95.0, gt=0, le=100, description="percentile of |dL/dt| over the changing pixels; 100 bounds every sampled pixel"
     )
 
 

@@ -1,4 +1,4 @@
-"""Kinds of values that many keys take: ranges, vectors, colours."""
+"""Value types of many keys: ranges, vectors, colours."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def _as_list(value: Any) -> Any:
 
 
 def word_or_list(words: tuple, kinds: tuple[str, ...] = ()) -> BeforeValidator:
-    """Refuses what is neither one of ``words`` nor a list of ``kinds``: pydantic would name
-    the union's first member only."""
+    """Return a validator that refuses what is neither one of ``words`` nor a list of ``kinds``; pydantic's message
+    would name only the union's first member."""
 
     def check(value: Any) -> Any:
         listed = isinstance(value, (list, tuple)) and kinds
@@ -57,7 +57,7 @@ def number_or_three(value: Any) -> Any:
 
 
 def parameter_value(value: Any) -> Any:
-    """A word is not looked at before the primitive sees it; YAML 1.1 reads 1e-1 as text, too."""
+    """Return a word unchanged, for the primitive to check, and a number as a number (YAML 1.1 reads 1e-1 as text)."""
     if isinstance(value, str):
         try:
             return float(value)
@@ -89,8 +89,8 @@ Paths = Annotated[tuple[str, ...], BeforeValidator(_as_list)]
 Vector3 = tuple[float, float, float]
 
 
-# At 1e9 units float64 still tells 1e-7 units apart; beyond, a unit was mistaken, and float32 matrices would overflow in
-# the end.
+# At 1e9 units float64 still resolves 1e-7 units; a larger value has the wrong unit, and would overflow float32
+# matrices.
 Coordinate = Annotated[float, Field(ge=-1e9, le=1e9)]
 
 

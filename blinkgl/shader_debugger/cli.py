@@ -1,4 +1,4 @@
-"""The ``blinkgl shader`` commands. Imports nothing heavy: each command imports what it needs when it runs."""
+"""The ``blinkgl shader`` commands. Each command imports what it needs when it runs, so that this module is light."""
 
 from __future__ import annotations
 
@@ -8,23 +8,26 @@ from typing import Annotated
 import typer
 
 app = typer.Typer(
-    name="shader", no_args_is_help=True, rich_markup_mode=None, help="See what every pass wrote at a pixel, and why."
+    name="shader",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    help="Inspect what every pass wrote at a pixel, and why.",
 )
 
-Config = Annotated[str, typer.Argument(help="YAML file, or the name of one that ships, as for `blinkgl generate`.")]
+Config = Annotated[str, typer.Argument(help="YAML file, or the name of a shipped one, as for `blinkgl generate`.")]
 Seed = Annotated[int | None, typer.Option("--seed", help="Seed of the run (default: the file's).")]
 Sequence = Annotated[
     int | None, typer.Option("--sequence", "-n", min=0, help="Number of the sequence (default: the run's first).")
 ]
 Time = Annotated[
-    float | None, typer.Option("--time", "-t", help="Moment on the sequence's clock, s (default: the first label).")
+    float | None, typer.Option("--time", "-t", help="Time on the sequence's clock, s (default: the first label).")
 ]
 Shaders = Annotated[str | None, typer.Option("--shaders", help="Use an edited copy of the shaders/ folder.")]
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")
 ]
 Json = Annotated[bool, typer.Option("--json", help="Machine-readable output.")]
-DIFFERENT = 1  # exit status of `diff` over the tolerance, and of `check` with an error
+DIFFERENT = 1  # exit status of `diff` above the tolerance, and of `check` with an error
 
 
 def _subject(config, seed, sequence, overrides):
@@ -50,7 +53,7 @@ def passes(
     overrides: Overrides = None,
     names: Annotated[list[str] | None, typer.Option("--pass", help="Only this buffer; may be repeated.")] = None,
 ) -> None:
-    """Write every buffer of one moment as a labelled PNG and .npy, and a contact sheet."""
+    """Write every buffer at one time as a labelled PNG and .npy, and a contact sheet."""
     from blinkgl.shader_debugger.commands import write_passes
 
     subject = _subject(config, seed, sequence, overrides)
@@ -69,8 +72,8 @@ def probe(
     overrides: Overrides = None,
     json: Json = False,
 ) -> None:
-    """Print every buffer at a pixel beside the float64 reference, where the point is, and why
-    it is invalid or occluded."""
+    """Print every buffer at a pixel beside the float64 reference, the point's position, and why it is invalid or
+    occluded."""
     from blinkgl.shader_debugger.commands import run_probe
 
     subject = _subject(config, seed, sequence, overrides)
@@ -97,13 +100,13 @@ def diff(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Compare whole images with the float64 reference. Exit status 1 when a buffer is over its tolerance."""
+    """Compare whole images with the float64 reference. Exit status 1 when a buffer exceeds its tolerance."""
     from blinkgl.shader_debugger import commands
 
     subject = _subject(config, seed, sequence, overrides)
     found, reports = commands.run_diff(subject, _when(subject, time), names, tolerance or [], shaders, out)
     typer.echo(commands.diff_json(found, reports) if json else commands.diff_text(found, reports))
-    # For scripts: 0 says that all that was graded agrees.
+    # Exit status for scripts: 0 means that all compared buffers agree.
     if not found["passed"]:
         raise typer.Exit(DIFFERENT)
 
@@ -111,14 +114,15 @@ def diff(
 @app.command()
 def check(
     files: Annotated[
-        list[str] | None, typer.Argument(help="Shader files; includes stand for all that include them (default: all).")
+        list[str] | None,
+        typer.Argument(help="Shader files; an include means all files that include it (default: all)."),
     ] = None,
     shaders: Shaders = None,
     backend: Annotated[str, typer.Option(help="OpenGL backend: auto, egl or osmesa.")] = "auto",
     device: Annotated[int, typer.Option(min=0, help="EGL device.")] = 0,
     json: Json = False,
 ) -> None:
-    """Compile every program in every variant any configuration can ask for. Exit status 1 on an error."""
+    """Compile every program in every variant that a configuration can need. Exit status 1 on an error."""
     from blinkgl.shader_debugger import check as checking
 
     result = checking.check(files or [], shaders, backend, device)
@@ -131,13 +135,14 @@ def check(
 def show(
     program: Annotated[str, typer.Argument(help="File in the shader folder, such as label.glsl.")],
     define: Annotated[
-        list[str] | None, typer.Option("--define", "-D", metavar="NAME[=VALUE]", help="May be repeated.")
+        list[str] | None,
+        typer.Option("--define", "-D", metavar="NAME[=VALUE]", help="Preprocessor define; may be repeated."),
     ] = None,
     stage: Annotated[str, typer.Option(help="vertex, geometry, fragment, or both for all.")] = "both",
-    numbers: Annotated[bool, typer.Option("--numbers", help="File and line before each line.")] = False,
+    numbers: Annotated[bool, typer.Option("--numbers", help="Print file and line before each line.")] = False,
     shaders: Shaders = None,
 ) -> None:
-    """Print a program's source as the compiler gets it, includes and defines written out."""
+    """Print a program's source as the compiler reads it, with includes and defines expanded."""
     from blinkgl.shader_debugger.check import show_source
 
     typer.echo(show_source(program, define or [], stage, numbers, shaders), nl=False)
@@ -146,9 +151,9 @@ def show(
 @app.command()
 def serve(
     config: Config,
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any free port.")] = 8765,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port; 0: any free one.")] = 8765,
     host: Annotated[
-        str, typer.Option("--host", help="Address to listen on; anything but 127.0.0.1 lets others in.")
+        str, typer.Option("--host", help="Address to listen on; any but 127.0.0.1 allows access from other machines.")
     ] = "127.0.0.1",
     time: Time = None,
     seed: Seed = None,
@@ -156,8 +161,8 @@ def serve(
     shaders: Shaders = None,
     overrides: Overrides = None,
 ) -> None:
-    """A local page: passes, scrubbing, probe by click, differences, and shaders that
-    reload when saved. Ctrl-C ends it."""
+    """Serve a local page: passes, a time slider, probing by click, differences, and shaders that reload when saved.
+    Ctrl-C ends it."""
     from blinkgl.shader_debugger.server import serve as run_server
 
     subject = _subject(config, seed, sequence, overrides)

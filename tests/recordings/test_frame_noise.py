@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+import skimage.data
 
 from blinkgl.cli import run
 from blinkgl.config.events import EsimConfig
@@ -53,6 +54,26 @@ def test_where_nearly_all_blocks_change_smoothly_no_noise_is_told():
         frames.append(frame.astype(np.float32))
     assert frame_noise(frames, CODE) is None
     assert frame_noise([frame[:24] for frame in frames], CODE) is not None, "which is noise by itself"
+
+
+@pytest.mark.parametrize("photograph", ["grass", "gravel", "coins"])
+@pytest.mark.parametrize("step_px", [0.5, 2.0, 7.0])
+def test_a_fine_texture_that_moves_is_no_noise(photograph, step_px):
+    image = getattr(skimage.data, photograph)().astype(np.float32)
+    frames = []
+    for k in range(5):
+        # At twice the size, so that every frame is as sharp as the others.
+        shift = np.float32([[1, 0, -20 - 2 * step_px * k], [0, 1, -20 - 1.2 * step_px * k]])
+        large = cv2.warpAffine(image, shift, (480, 360), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        moved = cv2.resize(large, (240, 180), interpolation=cv2.INTER_AREA).clip(0, 255)
+        frames.append(((np.round(moved) / 255) ** 2.2).astype(np.float32))
+    assert frame_noise(frames, CODE) is None
+
+
+@pytest.mark.parametrize("sigma", [0.01, 0.04])
+def test_noise_is_found_where_nothing_else_is(sigma):
+    frames = 0.4 + sigma * np.random.default_rng(0).standard_normal((5, 180, 240))
+    assert frame_noise(list(frames.astype(np.float32)), CODE).typical[1] == pytest.approx(sigma, rel=0.1)
 
 
 @pytest.mark.parametrize("step_px", [0.0, 2.0])

@@ -1,9 +1,9 @@
 """The ``blinkgl`` command: thin functions over the library; each error is one line.
 
 Exit status: 0 success; 1 `shader diff` or `shader check` found a problem; 2 an error of the user's input or machine
-(``error: …`` on stderr, one line); 3 success except for skipped sequences (`trade --suite`: scenes); 130 interrupted. A
-traceback means a bug in BlinkGL, or ``--debug``. ``blinkgl.show.COMMAND.run`` does the work, prints the output and
-returns the status; it is imported inside the function, so that ``--help`` is fast.
+(``error: …`` on stderr, one line); 3 success except for sequences (`trade --suite`: scenes) that were set
+aside; 130 interrupted. A traceback means a bug in BlinkGL, or ``--debug``. ``blinkgl.show.COMMAND.run`` does the work,
+prints the output and returns the status; it is imported inside the function, so that ``--help`` is fast.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def generate(
     ] = None,
 ) -> int:
     """Generate sequences of events and optical flow from one YAML file. Exit status 3: done, but some sequences were
-    skipped."""
+    set aside."""
     from blinkgl.show import generate as command
     from blinkgl.show.generate import choose_executor
 

@@ -145,7 +145,7 @@ def test_poses_from_matrices(tmp_path):
     body = blinkgl.Pose.from_matrix(T[2])
     np.testing.assert_allclose(body.tree["position"], T[2, :3, 3])
     for wrong, said in (
-        (np.diag([1.0, 1, -1, 1]), "Pose.from_matrix: the matrix mirrors"),
+        (np.diag([1.0, 1, -1, 1]), "Pose.from_matrix: the matrix contains a reflection"),
         (2 * np.eye(4), "the last row of a pose is not 0, 0, 0, 1"),
         (np.eye(3), r"Pose.from_matrix: array of another type or shape .*expected an array \(4, 4\)"),
     ):
@@ -153,7 +153,7 @@ def test_poses_from_matrices(tmp_path):
             blinkgl.Pose.from_matrix(wrong)
     with pytest.raises(blinkgl.ConfigError, match=r"from_arrays.times_s: times do not increase"):
         blinkgl.Keyframes.from_arrays([0, 1, 1, 2, 3], T)
-    with pytest.raises(blinkgl.ConfigError, match=r"from_arrays.T\[3\]: the matrix mirrors"):
+    with pytest.raises(blinkgl.ConfigError, match=r"from_arrays.T\[3\]: the matrix contains a reflection"):
         blinkgl.Keyframes.from_arrays(times, np.where(np.arange(5)[:, None, None] == 3, np.diag([1.0, 1, -1, 1]), T))
 
 
@@ -174,7 +174,7 @@ def test_arrays_as_mesh_and_image():
     assert np.allclose(frame.depth[8:24, 8:24], 2, atol=1e-4) and (frame.ids[8:24, 8:24] == 1).all()
     assert frame.colour[16, 6].max() > 0.9 and frame.colour[16, 26].max() < 0.1
     assert not scene.on_disk
-    with pytest.raises(blinkgl.ConfigError, match="^source: the scene holds arrays"):
+    with pytest.raises(blinkgl.ConfigError, match="^source: the scene contains arrays"):
         blinkgl.generate(scene, "nowhere")
 
 

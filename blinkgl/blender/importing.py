@@ -124,7 +124,7 @@ def _check_options(source: Path, out: Path, frames, fps, keys_per_frame, time_li
         accepted = ", ".join(ENDINGS)
         if source.suffix.lower() in (".glb", ".gltf"):
             accepted += " (a glTF file is used as it is: scene: {kind: file, path: …})"
-        raise AssetError("not a kind of scene that Blender reads", where=str(source), accepted=accepted)
+        raise AssetError("Blender cannot read this format", where=str(source), accepted=accepted)
     try:
         with open(source, "rb") as file:
             empty = not file.read(1)
@@ -135,7 +135,7 @@ def _check_options(source: Path, out: Path, frames, fps, keys_per_frame, time_li
     if out.suffix.lower() != ".glb":
         raise ConfigError("not a GLB", where="--out", value=str(out), accepted="a file name that ends in .glb")
     if frames is not None and (len(frames) != 2 or not -_FRAME <= frames[0] <= frames[1] <= _FRAME):
-        raise ConfigError("no range of frames", where="--frames", value=tuple(frames), accepted="FIRST LAST")
+        raise ConfigError("not a range of frames", where="--frames", value=tuple(frames), accepted="FIRST LAST")
     for option, value, low, high in (
         ("--fps", 24.0 if fps is None else fps, 1, 10_000),
         ("--keys-per-frame", keys_per_frame, 1, 64),

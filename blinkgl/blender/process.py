@@ -118,7 +118,7 @@ class Blender:
             try:
                 words = json.loads(line)
             except ValueError:
-                raise BlinkGLError("Blender's answer cannot be read", where=interpreter(), value=line[:80]) from None
+                raise BlinkGLError("Blender's output cannot be read", where=interpreter(), value=line[:80]) from None
             if "error" in words:
                 raise BlinkGLError(
                     words["error"], where=words.get("where", interpreter()), accepted=words.get("accepted", REMEDY)
@@ -143,7 +143,7 @@ class Blender:
             left = None if self._ends is None else max(self._ends - time.monotonic(), 0.0)
             if not select.select([pipe], [], [], left)[0]:
                 raise BlinkGLError(
-                    f"Blender did not come to an end in {self.limit_s:g} s (while {self.doing})",
+                    f"Blender did not finish within {self.limit_s:g} s (while {self.doing})",
                     accepted="a longer time limit",
                 )
             data = os.read(pipe, 1 << 16)

@@ -87,10 +87,10 @@ class DistortedModel(CameraModel):
         if blind.any():
             away = np.linalg.norm(sides - [self.cx, self.cy], axis=-1)
             raise ConfigError(
-                "the distortion turns back inside the picture",
+                "the distortion folds inside the image",
                 where=type(self).__name__,
                 value=f"{min(self.reach * min(self.fx, self.fy), away[blind].min()):.1f} px from the principal point",
-                accepted=f"coefficients that reach the picture's corners, up to {away.max():.1f} px",
+                accepted=f"coefficients that are monotonic up to the image corners,  {away.max():.1f} px",
             )
 
     @property

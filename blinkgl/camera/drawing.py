@@ -44,8 +44,7 @@ def _seen_through(camera: DistortedModel) -> PinHole:
     angle = float(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]).max())
     if angle > WIDEST:
         raise ConfigError(
-            f"the lens sees {math.degrees(angle):.1f} degrees off its axis, too much for the one flat picture that is "
-            "drawn",
+            f"the lens sees up to {math.degrees(angle):.1f} degrees off its axis, too far for one perspective image",
             value=list(camera.distortion),
             accepted=f"at most {math.degrees(WIDEST):.0f} degrees: a longer focal length, or fewer pixels",
         )
@@ -61,7 +60,7 @@ def _seen_through(camera: DistortedModel) -> PinHole:
     y0, y1 = math.floor(top * focal) - MARGIN, math.ceil(bottom * focal) + MARGIN
     if max(x1 - x0, y1 - y0) > LARGEST:
         raise ConfigError(
-            f"the flat picture that is drawn for this lens would have {x1 - x0}x{y1 - y0} px",
+            f"the perspective image that this lens needs would have {x1 - x0}x{y1 - y0} px",
             value=list(camera.distortion),
             accepted=f"at most {LARGEST} along a side: less distortion, or fewer pixels",
         )

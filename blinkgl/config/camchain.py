@@ -67,7 +67,7 @@ def read_camchain(path: str | Path) -> dict[str, Calibrated]:
     }
     if not found:
         raise ConfigError(
-            "no camera in it", where=where, value=sorted(map(str, tree))[:5], accepted="cam0: {intrinsics: …, …}"
+            "the file has no camera", where=where, value=sorted(map(str, tree))[:5], accepted="cam0: {intrinsics: …, …}"
         )
     for k, (name, one) in enumerate(found.items()):
         given, key = tables[name].get("T_cn_cnm1"), "T_cn_cnm1"
@@ -128,7 +128,7 @@ def cam_to_cam_yaml(
 def _lens(camera: CameraModel, key: str) -> dict[str, Any]:
     drawn = camera.coefficients and camera.kind in _COUNTS
     if not drawn and not isinstance(camera, PinHole):
-        raise ValueError(f"{camera.kind} is no model of a calibration file")
+        raise ValueError(f"{camera.kind} cannot be written to a calibration file")
     numbers = [float(v) for v in camera.distortion]
     if camera.kind == "radtan" and numbers[4] == 0.0:  # Kalibr has four coefficients
         numbers = numbers[:4]
@@ -143,9 +143,7 @@ def _lens(camera: CameraModel, key: str) -> dict[str, Any]:
 def _camera(table: dict[str, Any], where: str, key: str) -> Calibrated:
     model = table.get("camera_model", "pinhole")
     if model != "pinhole":
-        raise ConfigError(
-            "a camera model that is not drawn", where=f"{where}.camera_model", value=model, accepted="pinhole"
-        )
+        raise ConfigError("unsupported camera model", where=f"{where}.camera_model", value=model, accepted="pinhole")
     size = _numbers(table, "resolution", (2,), where)
     if any(v != round(v) for v in size):
         raise ConfigError("not a size", where=f"{where}.resolution", value=size, accepted="[width, height], whole px")
@@ -192,6 +190,9 @@ def _rigid(given: Any, where: str) -> np.ndarray:
     right = T.shape == (4, 4) and np.isfinite(T).all() and np.allclose(T[3], [0, 0, 0, 1])
     if not right or not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=_RIGID) or np.linalg.det(T[:3, :3]) < 0:
         raise ConfigError(
-            "not a rigid transform", where=where, value=given, accepted="4 rows of 4 numbers: a rotation and a place"
+            "not a rigid transform",
+            where=where,
+            value=given,
+            accepted="4 rows of 4 numbers: a rotation and a translation",
         )
     return T

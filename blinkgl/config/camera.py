@@ -176,7 +176,7 @@ def calibrated(camera: Any, base: Path) -> Any:
     for key in ("width", "height"):
         if own.get(key) is not None and own[key] != getattr(seen, key):
             raise ConfigError(
-                f"the calibration is of another resolution, {seen.width}x{seen.height} px",
+                f"the calibration has another resolution, {seen.width}x{seen.height} px",
                 where=f"camera.{key}",
                 value=own[key],
                 accepted=f"{getattr(seen, key)}, or nothing",

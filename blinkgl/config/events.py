@@ -157,7 +157,7 @@ class _TwoThresholds:
     def _the_ratio_is_theirs(ratio: float | None, on: float, off: float):
         if ratio is not None and not any(math.isclose(off, on * r, rel_tol=1e-6) for r in (ratio, 1 / ratio)):
             raise Refused(
-                "is not the ratio of the two thresholds that are given beside it",
+                "not the ratio of the two thresholds",
                 where="threshold_ratio",
                 value=ratio,
                 accepted=f"one of them, or {off / on:.6g}",
@@ -249,7 +249,7 @@ V2E_PRESETS = {
 
 _NO_COMPAT = {
     "compat": Removed(
-        "the key left out; docs/concepts.md says how near these events are to those of the authors' programs",
+        "the key left out; docs/concepts.md says how these events differ from those of the authors' programs",
         lambda value: value == "none",
     )
 }

@@ -79,7 +79,7 @@ def _over(events: Table, own: Table) -> Table:
     """Return a recipe's keys with ``own`` laid over them."""
     if own.get("emulator", events.get("emulator")) != events.get("emulator"):
         raise ConfigError(
-            "the recipe is of another emulator",
+            "the recipe uses another emulator",
             where="events.emulator",
             value=own["emulator"],
             accepted=f"{events.get('emulator')}, or no recipe",
@@ -105,6 +105,6 @@ def _scene_from(own: Table, where: str, base: Path) -> Table:
     scene = read_table(base / given).get("scene")
     if not isinstance(scene, dict) or "from" in scene:
         raise ConfigError(
-            "the file has no scene of its own", where=where, value=given, accepted="a file with a table scene"
+            "the file has no table scene", where=where, value=given, accepted="a file with the table scene"
         )
     return merge(scene, own)

@@ -55,8 +55,10 @@ class FramesConfig(Config):
     )
     removed: ClassVar[Any] = {
         "qualify": Removed("max_displacement", lambda value: value is None or isinstance(value, dict)),
-        "factor": Removed("no factor: it was of interpolate: cubic, which is gone", lambda value: value == 4),
-        "backward": Removed("no flow back: nothing reads it", lambda value: value is None),
+        "factor": Removed(
+            "the key left out: it belonged to interpolate: cubic, which was removed", lambda value: value == 4
+        ),
+        "backward": Removed("the key left out: it has no effect", lambda value: value is None),
     }
 
     @rule("fps", "count")

@@ -152,14 +152,14 @@ class ImagesConfig(Config):
             return
         if not shortest <= exposure <= longest:
             raise Refused(
-                "automatic exposure begins with an exposure outside its limits",
+                "the first exposure is outside the limits of auto_exposure",
                 where="exposure_us",
                 value=exposure,
                 accepted=f"from {shortest:g} to {longest:g} (auto_exposure)",
             )
         if gain > most_db:
             raise Refused(
-                "automatic exposure begins with a gain above its limit",
+                "the first gain is above the limit of auto_exposure",
                 where="gain_db",
                 value=gain,
                 accepted=f"at most {most_db:g} (auto_exposure.max_gain_db)",
@@ -169,7 +169,7 @@ class ImagesConfig(Config):
     def _either(rate: float | None, times: tuple[float, ...] | None):
         if (rate is None) == (times is None):
             raise Refused(
-                "nothing says when images are taken" if times is None else "images are taken at a rate or at times",
+                "neither a rate nor times are given" if times is None else "images are taken at a rate or at times",
                 where="rate",
                 value=rate,
                 accepted="a rate" if times is None else "null beside images.times",
@@ -181,7 +181,7 @@ class ImagesConfig(Config):
         exposure = exposure if longest is None else longest
         if rate is not None and exposure * rate > 1e6 * (1 + 1e-9):
             raise Refused(
-                "an exposure lasts into the next image's",
+                "the exposure is longer than the image interval",
                 where=key,
                 value=exposure,
                 accepted=f"at most {1e6 / rate:g}, or a lower rate",
@@ -189,7 +189,7 @@ class ImagesConfig(Config):
         for before, after in pairwise(times or ()):
             if after - before < 1e-6 * exposure * (1 - 1e-9):
                 raise Refused(
-                    "times of exposures are out of order, or nearer to one another than an exposure lasts",
+                    "exposure times are out of order, or closer than the exposure time",
                     where="times",
                     value=[before, after],
                     accepted=f"increasing, {1e-6 * exposure:g} s apart at least",
@@ -198,12 +198,12 @@ class ImagesConfig(Config):
     @rule("response", "gamma")
     def _gamma_is_used(response, gamma):
         if response != "gamma" and gamma != 2.2:
-            raise Refused("only `response: gamma` has a gamma", where="gamma", value=gamma, accepted="response: gamma")
+            raise Refused("gamma needs `response: gamma`", where="gamma", value=gamma, accepted="response: gamma")
 
     @rule("also")
     def _each_once(also: tuple[str, ...]):
         if len(set(also)) < len(also):
-            raise Refused("named twice", where="also", value=list(also), accepted="sharp and clean, each once")
+            raise Refused("given twice", where="also", value=list(also), accepted="sharp and clean, each once")
 
     @property
     def pictures(self) -> tuple[str, ...]:
@@ -249,7 +249,7 @@ def check_images(
     if rate is not None:
         if rows_us * rate > 1e6 * (1 + 1e-9):
             raise Refused(
-                "the rows are not read before the next image begins",
+                "the read-out of the rows is longer than the image interval",
                 where="images.row_us",
                 value=rows_us,
                 accepted=f"at most {1e6 / rate:g} µs for all rows together, or a lower rate",
@@ -266,12 +266,12 @@ def check_images(
                 f"{seconds * rate:.0f} images",
                 where="images.rate",
                 value=rate,
-                accepted=f"a sequence of at most {MAX_IMAGES} of them",
+                accepted=f"at most {MAX_IMAGES} in a sequence",
             )
     for before, after in pairwise(times or ()):
         if 1e6 * (after - before) < rows_us * (1 - 1e-9):
             raise Refused(
-                "the rows are not read before the next image begins",
+                "the read-out of the rows is longer than the image interval",
                 where="images.times",
                 value=[before, after],
                 accepted=f"{1e-6 * rows_us:g} s apart at least, or a smaller images.row_us",

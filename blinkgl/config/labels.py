@@ -28,7 +28,7 @@ def _where_to(value: Any) -> str | float:
     except (ValueError, TypeError, ZeroDivisionError, OverflowError):
         seconds = math.nan
     if not 1e-6 <= abs(seconds) <= 4300:
-        raise Refused("no direction, and no interval", value=value, accepted=_ACCEPTED)
+        raise Refused("not a direction or an interval", value=value, accepted=_ACCEPTED)
     return seconds
 
 
@@ -37,7 +37,7 @@ def _each_once(flow: tuple[str | float, ...]) -> tuple[str | float, ...]:
     known: set[int] = set()
     for one in (one for one in flow if isinstance(one, float)):
         if round(one * 1e6) in known:
-            raise Refused("an interval twice", value=one, accepted="each once")
+            raise Refused("an interval is given twice", value=one, accepted="each once")
         known.add(round(one * 1e6))
     return flow
 
@@ -48,13 +48,13 @@ def _a_table(value: Any) -> Any:
         return value
     if not isinstance(value, dict):
         raise Refused(
-            "no table of patterns", value=value, accepted="a table such as {'chair*': 7, '*': 0}, or true or false"
+            "not a table of patterns", value=value, accepted="a table such as {'chair*': 7, '*': 0}, or true or false"
         )
     for pattern, number in value.items():
         if not isinstance(pattern, str) or not 1 <= len(pattern) <= 200:
             raise Refused("not a pattern of names", value=pattern, accepted="text of 1 to 200 characters")
         if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number <= 65535:
-            raise Refused(f"no number of a category for '{pattern}'", value=number, accepted="0 to 65535")
+            raise Refused(f"not a category number for '{pattern}'", value=number, accepted="0 to 65535")
     return value
 
 

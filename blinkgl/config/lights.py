@@ -81,7 +81,9 @@ class EnvironmentConfig(Config):
     )
     heading: float = Field(0.0, ge=-360, le=360, description="rotation, degrees from +x towards +y")
     visible: bool = Field(True, description="whether it is drawn as a sky at infinity")
-    removed: ClassVar[Any] = {"size": Removed("no size: a panorama is at infinity", lambda value: value == 100)}
+    removed: ClassVar[Any] = {
+        "size": Removed("the key left out: a panorama is at infinity", lambda value: value == 100)
+    }
 
 
 class LightConfig(Config):
@@ -132,7 +134,7 @@ class LightConfig(Config):
     def _lit(unlit, lights, environment, shadows):
         for where, given in (("lights", [*lights]), ("environment", environment), ("shadows", shadows != "off")):
             if unlit and given:
-                raise Refused("nothing is lit by them", where=where, value="unlit: true", accepted="unlit: false")
+                raise Refused("these lights have no effect", where=where, value="unlit: true", accepted="unlit: false")
 
 
 def direction_of(elevation: float, azimuth: float) -> Vector3:

@@ -67,7 +67,7 @@ class MaterialConfig(Config):
     def _a_map_of_nothing(emission_map, emission):
         if emission_map is not None and not any(emission):
             raise Refused(
-                "a map of light that is none: it is multiplied by emission",
+                "emission_map has no effect: emission, which multiplies it, is 0",
                 where="emission",
                 value=list(emission),
                 accepted="a radiance above 0, such as [1, 1, 1]",
@@ -78,7 +78,7 @@ class MaterialConfig(Config):
         given = [k for k, v in zip(("normal_map", "metallic_roughness_map", "emission_map"), maps) if v is not None]
         if unlit and given:
             raise Refused(
-                "an unlit surface shows its colour whatever its maps say",
+                "this map has no effect on an unlit surface",
                 where=given[0],
                 value=maps[0] or maps[1] or maps[2],
                 accepted="unlit: false, or no such map",

@@ -83,7 +83,7 @@ def check_imu(rate: float, seconds: float) -> None:
             f"{rate * seconds:.0f} measurements",
             where="imu.rate",
             value=rate,
-            accepted=f"a sequence of at most {MAX_SAMPLES} of them",
+            accepted=f"at most {MAX_SAMPLES} in a sequence",
         )
 
 

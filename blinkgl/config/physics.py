@@ -9,7 +9,6 @@ scene:
     - mesh: die
       position: [0, 0, 1.5]
       physics: {mass: 0.1, restitution: 0.5, velocity: [1, 0, 2], spin: [0, 720, 90]}
-
 """
 
 from __future__ import annotations
@@ -105,7 +104,9 @@ class BodyConfig(Config):
     def _only_what_moves_has_a_velocity(kind, velocity, spin):
         for key, value in (("velocity", velocity), ("spin", spin)):
             if kind != "dynamic" and any(value):
-                raise Refused(f"a {kind} body has none", where=key, value=list(value), accepted="kind: dynamic")
+                raise Refused(
+                    f"a {kind} body does not use this key", where=key, value=list(value), accepted="kind: dynamic"
+                )
 
 
 IN_THE_WAY = BodyConfig(kind="fixed", friction=0.0, rolling=0.0, restitution=0.95)

@@ -32,7 +32,7 @@ def check_rigid(matrix: Any, where: str) -> None:
     orthogonal = np.abs(R @ R.T - np.eye(3)).max() < _RIGID
     if not (orthogonal and np.linalg.det(R) > 0):
         raise Refused(
-            "the matrix mirrors, which no place does" if orthogonal else "the matrix is no rotation",
+            "the matrix contains a reflection" if orthogonal else "the matrix is no rotation",
             where=where,
             value=np.round(R, 6).tolist(),
             accepted=f"R Rᵀ = 1 to {_RIGID:g} and determinant +1",
@@ -152,7 +152,7 @@ class KeyedMotionConfig(PoseConfig):
     @rule("keyframes.*.time")
     def _in_order(times: tuple[float, ...]):
         if len(times) == 1:
-            raise Refused("one key frame is no motion; give two or more, or a fixed pose", where="keyframes")
+            raise Refused("one key frame is not enough; give two or more, or a fixed pose", where="keyframes")
         for k, (before, after) in enumerate(itertools.pairwise(times)):
             if after - before < 1e-6:
                 raise Refused(
@@ -202,4 +202,4 @@ class WayConfig(Config):
     def _a_way(points, closed):
         least, given = (3 if closed else 2), len([*points])
         if given < least:
-            raise Refused(f"a way needs {least} points or more", where="points", value=given)
+            raise Refused(f"a way needs at least {least} points", where="points", value=given)

@@ -68,7 +68,7 @@ class FrameResetsConfig(Config):
     @rule("interval_ms", "length_ms")
     def _over_before_the_next(interval: float, length: float):
         if length + 1 > interval:
-            raise Refused("the jump lasts into the next one", where="length_ms", value=length,
+            raise Refused("the jump does not end before the next one", where="length_ms", value=length,
                           accepted=f"at most {interval - 1:g}, a millisecond less than interval_ms")  # fmt: skip
 
 
@@ -114,7 +114,7 @@ class ReadoutConfig(Config):
     def _queue_empties(rate: float | None, row_ns: float, queue: int):
         if drain_us(rate, row_ns, queue) > 2**32:
             raise Refused(
-                "the last event of a full queue would wait for more than an hour",
+                "the last event of a full queue would wait more than an hour",
                 where="queue_events",
                 value=queue,
                 accepted="a shorter queue or a faster bus",

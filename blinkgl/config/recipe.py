@@ -82,7 +82,7 @@ def split(template: RunTemplate) -> tuple[Group, ...]:
         own = dict(own)
         enabled = own.pop("enabled", True)
         if not isinstance(enabled, bool):
-            raise ConfigError("not a switch", where=f"{where}.enabled", value=enabled, accepted="true or false")
+            raise ConfigError("not true or false", where=f"{where}.enabled", value=enabled, accepted="true or false")
         tree = merge(common, own)
         if "seed" not in own:
             tree["seed"] = derived_seed(template.seed, name)

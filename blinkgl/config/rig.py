@@ -63,7 +63,7 @@ class PlaceConfig(Config):
         if len(turned) > 1:
             raise Refused("only one of euler, quaternion, matrix may be given, not " + " and ".join(turned))
         if matrix is not None and any(position):
-            raise Refused("the matrix has a position already", where="position", value=list(position))
+            raise Refused("the matrix contains the position", where="position", value=list(position))
 
     @rule("quaternion")
     def _some_rotation(quaternion: tuple[float, ...] | None):
@@ -169,7 +169,7 @@ def spelled_out(tree: dict[str, Any], fills: Iterable[Callable[[dict[str, Any]],
     base = [] if tree.get("rig") is None else load_rig(tree["rig"])
     tables = _laid(own, base)
     if not tables:
-        raise ConfigError("a rig without a sensor", where="sensors", value=own, accepted="one or more")
+        raise ConfigError("the rig has no sensor", where="sensors", value=own, accepted="one or more")
     return {**tree, "sensors": [_complete(one, k, tree, fills) for k, one in enumerate(tables)]}
 
 
@@ -181,7 +181,10 @@ def _laid(own: list[dict[str, Any]], base: list[dict[str, Any]]) -> list[dict[st
         low = name.lower() if isinstance(name, str) else k
         if low in said:
             raise ConfigError(
-                "two sensors have one name", where=f"sensors.{k}.name", value=name, accepted="a name each, in any case"
+                "two sensors have the same name",
+                where=f"sensors.{k}.name",
+                value=name,
+                accepted="different names, ignoring case",
             )
         said[low] = one
     under = {one["name"]: one for one in base}
@@ -197,9 +200,9 @@ def _complete(
     for key in _SHARED:
         if key in own:
             raise ConfigError(
-                "the sensors of a rig share one clock and one timeline",
+                "the sensors of a rig share the clock and the timeline",
                 where=f"sensors.{number}.{key}",
-                accepted=f"{key} at the top",
+                accepted=f"{key} at the top level",
             )
     other = own.get("images") is not None or own.get("imu") is not None
     events = own["events"] is not None if "events" in own else not other
@@ -256,8 +259,8 @@ def check_pairs(sensors: Sequence[RigSensorConfig]) -> None:
                 "the two are not a rectified pair",
                 where=where,
                 value=one.pair,
-                accepted="equal `camera` keys without distortion, equal rotations, and places that differ along the "
-                "cameras' x axis alone",
+                accepted="equal `camera` keys without distortion, equal rotations, and positions that differ "
+                "only along the cameras' x axis",
             )
 
 

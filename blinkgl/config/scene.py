@@ -126,7 +126,9 @@ class SkyConfig(Config):
     @rule("lights", "#panoramas")
     def _a_panorama_lights(lights, panoramas):
         if lights and not [*panoramas]:
-            raise Refused("only panoramas light", where="lights", value=lights, accepted="false, or sky.panoramas")
+            raise Refused(
+                "only panoramas can light the scene", where="lights", value=lights, accepted="false, or sky.panoramas"
+            )
 
 
 class GroundConfig(Config):
@@ -172,7 +174,7 @@ class RandomSceneConfig(Config):
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     removed: ClassVar[Any] = {
         "walls": Removed(
-            "a scene: {kind: explicit} with objects of category: wall",
+            "scene: {kind: explicit} with objects of category: wall",
             lambda value: value is False or (isinstance(value, dict) and not value.get("count")),
         )
     }
@@ -182,11 +184,11 @@ class RandomSceneConfig(Config):
         for where, given in (("lights", lights), ("sky.lights", sky_lights)):
             if given and unlit:
                 raise Refused(
-                    "nothing is lit by them", where=where, value="light.unlit: true", accepted="light.unlit: false"
+                    "these lights have no effect", where=where, value="light.unlit: true", accepted="light.unlit: false"
                 )
         if environment:
             raise Refused(
-                "a random world is lit by its own sky",
+                "a random world uses the light of its sky",
                 where="light.environment",
                 accepted="sky.panoramas and sky.lights",
             )
@@ -202,7 +204,7 @@ class RandomSceneConfig(Config):
         low = RegionConfig.camera_height[0]
         if height <= low:
             raise Refused(
-                "the camera begins above it", where="region.height", value=height, accepted=f"more than {low:g} m"
+                "the camera starts above it", where="region.height", value=height, accepted=f"more than {low:g} m"
             )
 
     @rule("objects.size", "region.height")
@@ -322,7 +324,7 @@ def object_names(names: Iterable[str | None], meshes: Iterable[str]) -> list[str
     for number, (name, mesh) in enumerate(zip(names, meshes)):
         name = name or (mesh if mesh not in made else f"{mesh}#{number}")
         if name in made:
-            raise Refused("the name is given to two objects", where=f"objects.{number}.name", value=name)
+            raise Refused("two objects have this name", where=f"objects.{number}.name", value=name)
         made.append(name)
     return made
 
@@ -365,7 +367,9 @@ class ExplicitSceneConfig(Config):
                 )
         if physics and "dynamic" not in kinds:
             raise Refused(
-                "no object falls", where="physics", accepted="objects with physics, of kind dynamic, or physics: null"
+                "no object has dynamic physics",
+                where="physics",
+                accepted="objects with physics, of kind dynamic, or physics: null",
             )
 
     @rule("objects.*.name", "objects.*.mesh")
@@ -419,7 +423,7 @@ class FileSceneConfig(Config):
     def _lit(lights, unlit):
         if lights == "file" and unlit:
             raise Refused(
-                "nothing is lit by them", where="lights", value=lights, accepted="config, or light.unlit: false"
+                "these lights have no effect", where="lights", value=lights, accepted="config, or light.unlit: false"
             )
 
 

@@ -103,7 +103,7 @@ class SensorConfig(Config):
                 key, *rest = name.split(".")
                 known = key in SensorConfig.model_fields and key not in ("sources", "uncertainty")
                 if not known or (key == "emulators" and rest and rest[0] not in emulators):
-                    raise Refused("there is no such value in the file", where=table, value=name)
+                    raise Refused("the file has no such value", where=table, value=name)
 
     @property
     def pixels_known(self) -> bool:

@@ -287,7 +287,7 @@ class SequenceConfig(Config):
     def _frames_have_no_rig(sensors: bool, frames: bool):
         if sensors and frames:
             raise Refused(
-                "recorded frames were seen by one camera",
+                "recorded frames have only one camera",
                 where="sensors",
                 accepted="null, or a scene instead of frames",
             )
@@ -296,7 +296,10 @@ class SequenceConfig(Config):
     def _own_intrinsics(sensors: bool, intrinsics: str | None):
         if sensors and intrinsics == "file":
             raise Refused(
-                "the cameras of a rig are not the file's", where="scene.intrinsics", value=intrinsics, accepted="config"
+                "the file's camera cannot be used for a rig",
+                where="scene.intrinsics",
+                value=intrinsics,
+                accepted="config",
             )
 
     @rule("camera.lens", "scene.intrinsics")
@@ -313,7 +316,7 @@ class SequenceConfig(Config):
     def _late_events_fit(duration: float, label_rate: float, rate: float | None, row_ns: float, queue: int):
         if rate is not None and span_s(duration, label_rate) + 1e-6 * drain_us(rate, row_ns, queue) > MAX_SPAN_S:
             raise Refused(
-                "events that wait for the read-out would leave it after the end of the file",
+                "delayed events of the read-out would be later than an event file can hold",
                 where="time.duration",
                 value=duration,
                 accepted=f"at most {MAX_SPAN_S - 1 / label_rate - 1e-6 * drain_us(rate, row_ns, queue):.6g}",
@@ -335,7 +338,7 @@ class SequenceConfig(Config):
         for one in () if frames else flow:
             if isinstance(one, float) and abs(one) > most + 1e-6:
                 raise Refused(
-                    "no label's flow leads so far: it would end outside the sequence",
+                    "the interval is too long: the flow would end outside the sequence",
                     where="labels.flow",
                     value=one,
                     accepted=f"intervals of at most {most:.6g} s, or a longer time.duration",
@@ -345,7 +348,7 @@ class SequenceConfig(Config):
     def _frames_have_no_camera(images: bool, frames: bool):
         if images and frames:
             raise Refused(
-                "recorded frames are images already: nothing is there to be exposed",
+                "recorded frames are already images",
                 where="images",
                 accepted="null, or a scene instead of frames",
             )
@@ -404,7 +407,7 @@ class SequenceConfig(Config):
         least = camera_radius(camera.model, clearance)
         if least > height:
             raise Refused(
-                "the region is too low for a camera that keeps this far from everything",
+                "the region is too low for the camera's clearance",
                 where="scene.region.height",
                 value=height,
                 accepted=f"at least {least:.4g} m (scene.camera_clearance, or the distance of the near "

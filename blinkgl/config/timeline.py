@@ -10,7 +10,8 @@ from blinkgl.config.base import Config, Refused, Removed, one_of, rule
 
 _NO_RECONSTRUCTION = {
     "reconstruction": Removed(
-        "the key left out (events are timed on straight lines between frames; a smaller max_px makes better times)",
+        "the key left out (event times are interpolated linearly between frames; a smaller max_px "
+        "makes them more accurate)",
         lambda value: value == "linear",
     )
 }

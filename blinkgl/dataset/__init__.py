@@ -1,9 +1,9 @@
-"""From a configuration to sequence directories, one or a million.
+"""Generation of sequence directories from a configuration, one or a million.
 
-In:    a ``RunTemplate``, a folder, where workers run.
-Out:   folders that appear whole or not at all, what they cost, what is wrong with them.
-Start: generate.py (one sequence, readable top to bottom); run.py makes many, verify/ looks at what is there,
-explain.py says what it would be.
+In:    a ``RunTemplate``, a folder, an executor.
+Out:   folders that appear completely or not at all, their cost, their problems.
+Start: generate.py (one sequence, readable top to bottom); run.py makes many, verify.py checks the existing ones,
+explain.py describes a run in advance.
 """
 
 from blinkgl.dataset.generate import SequenceReport, generate_run, generate_sequence

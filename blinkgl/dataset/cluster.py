@@ -1,8 +1,8 @@
-"""The same tasks on Ray (extra ``[cluster]``): an existing cluster, or a local one that lives as long as the run.
+"""Execution on Ray (extra ``[cluster]``): an existing cluster, or a local one for the duration of the run.
 
 All nodes need this BlinkGL, the recipe's asset folders and the output folder under the same paths (a shared file
-system): a sequence is written by the node that made it. Before any work each node is asked for its
-versions and the content hashes of its assets.
+system): a sequence is written by the node that made it. Before any work each node reports its versions and the content
+hashes of its assets.
 """
 
 from __future__ import annotations
@@ -27,20 +27,19 @@ _CONNECT_S = 5.0
 
 
 class RayCluster:
-    """Executor of :mod:`blinkgl.dataset.run` on Ray. A worker that is lost costs an
-    attempt, a node that is lost does not.
+    """Executor of :mod:`blinkgl.dataset.run` on Ray. A lost worker costs an attempt, a lost node does not.
 
-    workers : tasks at a time; default: as many as the cluster has CPUs, new nodes included.
+    workers : tasks at a time; default: the number of CPUs of the cluster, new nodes included.
     address : of a running cluster ("host:6379", "auto", "ray://host:10001"); default: the one this process is connected
-        to, else that of the environment's RAY_ADDRESS, else one of its own on this machine, closed with the run. That
-        one has no dashboard and listens on 127.0.0.1 alone: whoever reaches a Ray port may run code (Ray 2.60 asks for
-        a token, earlier versions for nothing).
-    gpus : GPUs per task, e.g. 0.25 for four tasks on each. Ray deals them out; the task
-    draws on that card's EGL device.
+        to, else that of the environment's RAY_ADDRESS, else a new one on this machine, closed with the run. That one
+        has no dashboard and listens only on 127.0.0.1: anyone who reaches a Ray port may run code (Ray 2.60 requires a
+        token, earlier versions nothing).
+    gpus : GPUs per task, e.g. 0.25 for four tasks on each. Ray assigns them; the task draws on that GPU's EGL
+    device.
     """
 
     def __init__(self, workers: int | None = None, *, address: str | None = None, gpus: float = 0.0):
-        # Ray reads these when it is imported and started; they are taken back when the run is over.
+        # Ray reads these when it is imported and started; they are restored after the run.
         self._own_variables = [
             name for name in ("RAY_USAGE_STATS_ENABLED", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO") if name not in os.environ
         ]
@@ -58,7 +57,7 @@ class RayCluster:
         self._tasks: dict[Any, int] = {}  # object reference -> task
         self._reasons: dict[int, str] = {}  # task -> why it was killed
         self._board = None
-        self._folder: str | None = None  # of a cluster of ours
+        self._folder: str | None = None  # of our own cluster
 
     def open(self, job: Work) -> list[Message]:
         ray = self._ray
@@ -68,7 +67,7 @@ class RayCluster:
         if not nodes:
             raise ConfigError("the cluster has no node with a CPU", where="--address", value=self._address)
         self._job = ray.put(job.to_dict())
-        # A node that joins later is asked, too: by its first task, against this.
+        # A node that joins later is compared by its first task.
         hellos = [self._ask(node) for node in nodes]
         self._expected = hellos[0]["environment"], hellos[0]["assets"]
         here = self._affinity(ray.get_runtime_context().get_node_id(), soft=True)
@@ -107,7 +106,7 @@ class RayCluster:
             return
         try:
             for reference in self._tasks:
-                ray.cancel(reference)  # as Ctrl-C: what is being made is thrown away
+                ray.cancel(reference)  # as Ctrl-C: the sequence in progress is discarded
             if self._tasks:
                 _, left = ray.wait(list(self._tasks), num_returns=len(self._tasks), timeout=_STOP_S)
                 for reference in left:
@@ -163,8 +162,8 @@ class RayCluster:
         self._ours = True
 
     def _start_own(self) -> None:
-        """A cluster on 127.0.0.1 alone, with its files where no other user of the machine can read or write them."""
-        # 0700; Ray opens its own folder in it to everybody.
+        """Start a cluster only on 127.0.0.1, with its files unreadable for other users of the machine."""
+        # 0700; Ray's own folder in it is readable by everybody.
         self._folder = tempfile.mkdtemp(prefix="ray-", dir=_short_folder())
         with _loopback_only():
             self._ray.init(
@@ -233,7 +232,7 @@ class RayCluster:
 
 
 class _Board:
-    """Where workers pin the latest about their task, for the driver's display."""
+    """Latest progress of each worker's task, for the driver's display."""
 
     def __init__(self) -> None:
         self._latest: dict[int, Message] = {}
@@ -254,7 +253,7 @@ def _open(job: dict[str, Any]) -> tuple[Maker, Message]:
     import numba
     import ray
 
-    # One CPU is what a task asks Ray for. numba is imported by now, OpenGL's library is not.
+    # A task requests one CPU from Ray. numba is already imported here, OpenGL's library is not.
     os.environ.update({k: v for k, v in thread_environment(2, 2).items() if k == "LP_NUM_THREADS"})
     numba.set_num_threads(1)
     if _maker is not None:
@@ -267,8 +266,8 @@ def _open(job: dict[str, Any]) -> tuple[Maker, Message]:
 
 
 def _egl_device(gpu_ids: list) -> int | None:
-    """The EGL device of the card Ray gave to this task: cards are numbered alike, but EGL
-    lists software devices, too."""
+    """Return the EGL device of the GPU that Ray assigned to this task: GPUs have the same order, but EGL also lists
+    software devices."""
     if not gpu_ids or not str(gpu_ids[0]).isdigit():
         return None
     cards = [number for number, text in enumerate(egl_devices()) if "software" not in text.lower()]
@@ -293,7 +292,7 @@ def _work(job: dict[str, Any], task: int, attempt: int, expected: tuple[dict[str
                     f"{different}",
                 }
             if hello["assets"] != expected[1]:
-                return {"kind": "refused", "error": f"node {socket.gethostname()} sees other meshes or textures"}
+                return {"kind": "refused", "error": f"node {socket.gethostname()} finds other meshes or textures"}
     except BlinkGLError as error:
         return {"kind": "refused", "error": str(error)}
     return _maker.make(task, attempt, board.put.remote)
@@ -310,7 +309,7 @@ def _first_line(error: BaseException) -> str:
 
 
 def _reachable(address: str) -> None:
-    """ConfigError at once, where Ray itself would try for half a minute."""
+    """Raise ConfigError at once, where Ray itself would try for half a minute."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not host or not port.isdigit():
         raise ConfigError(
@@ -329,19 +328,19 @@ def _reachable(address: str) -> None:
 
 @contextlib.contextmanager
 def _loopback_only() -> Iterator[None]:
-    """Makes Ray take 127.0.0.1 for this machine's address, and so bind all its servers to it.
+    """Make Ray use 127.0.0.1 as this machine's address, so that all its servers bind to it.
 
-    Ray does so by itself on macOS and Windows, where it knows no clusters of machines; the constant behind that is read
-    when a cluster starts. (``_node_ip_address="127.0.0.1"`` is turned into the outward address by Ray.)"""
+    Ray does so on macOS and Windows, where it does not support clusters; it reads the constant behind that when a
+    cluster starts. (Ray replaces ``_node_ip_address="127.0.0.1"`` by the external address.)"""
     from ray._private import ray_constants
 
     before = getattr(ray_constants, "ENABLE_RAY_CLUSTER", None)
     if before is None:
         raise ConfigError(
-            "this Ray cannot be told to listen to this machine alone",
+            "this version of Ray cannot be restricted to this machine",
             where="--executor",
             value="ray",
-            accepted="Ray 2.60; or a cluster of your own and its --address",
+            accepted="Ray 2.60; or your own cluster with --address",
         )
     ray_constants.ENABLE_RAY_CLUSTER = False
     try:
@@ -351,7 +350,7 @@ def _loopback_only() -> Iterator[None]:
 
 
 def _short_folder() -> str:
-    """Where temporary files go, unless its name leaves no room for those of Ray's sockets:
-    Unix allows 107 characters."""
+    """Return the folder for temporary files, unless its name is too long for Ray's sockets: Unix allows 107
+    characters."""
     folder = tempfile.gettempdir()
     return folder if len(folder) <= 20 else "/tmp"

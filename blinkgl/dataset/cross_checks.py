@@ -1,4 +1,4 @@
-"""What lies between sequences: strangers, the index, twins, and the recipe that they are of."""
+"""Checks across sequences: foreign entries, the index, duplicates, and the recipe."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from blinkgl.sequence_files.index import INDEX, entry, read_index
 from blinkgl.sequence_files.sequence_dir import MANIFEST
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What looking at a data set finds.
+# Results of a verification.
 
 
 @dataclass
 class Verification:
-    """``problems``: sequence (or "." for the data set) -> lines. ``notes``: what was not looked at, and why.
+    """Results. ``problems``: sequence (or "." for the data set) -> lines. ``notes``: what was not checked, and why.
 
-    ``deep``: sequences that were made again, the same bit by bit or not. ``in_part``: those of them that differ from
-    what this machine makes and were made on another; there only what no machine has a say in was compared."""
+    ``deep``: sequences that were generated again, equal or not. ``in_part``: those of them that differ from this
+    machine's result and were made on another; for these only machine-independent parts were compared."""
 
     sequences: int = 0
     problems: dict[str, list[str]] = field(default_factory=dict)
@@ -56,7 +56,8 @@ class Known:
 
 
 def guarded(check: Callable[[], list[str]]) -> list[str]:
-    """``check()``, or as its only line what stopped it: libraries meet damaged files with exceptions of every kind."""
+    """Return ``check()``, or its exception as the only line: libraries raise exceptions of every kind for damaged
+    files."""
     try:
         return check()
     except BlinkGLError as error:
@@ -69,11 +70,11 @@ _AT_TOP = {INDEX, "report.html"}
 
 
 _MOST_MISSING = 1000
-"""Missing sequences that get a line each; the others are counted."""
+"""Number of missing sequences with a line each; the others are counted."""
 
 
 def strangers(root: Path, folders: list[Path]) -> list[str]:
-    """What lies in the data set and belongs to no sequence."""
+    """Return entries of the data set that belong to no sequence."""
     problems = []
     known = set(folders)
     parents = {folder.parent for folder in folders} | {root}
@@ -97,7 +98,7 @@ def strangers(root: Path, folders: list[Path]) -> list[str]:
 
 
 def index(root: Path, folders: list[Path]) -> list[str]:
-    """The index says what the manifests say."""
+    """Return where the index differs from the manifests."""
     try:
         (root / INDEX).lstat()
     except FileNotFoundError:
@@ -113,8 +114,8 @@ def index(root: Path, folders: list[Path]) -> list[str]:
 
 
 def twins(known: dict[str, Known], result: Verification) -> dict[str, list[str]]:
-    """Sequences of random worlds with the events or the poses of another draw. Of a scene of one's own and of recorded
-    frames twins may be what was asked for: a note."""
+    """Return sequences of random worlds with the events or the poses of another draw. Duplicates of an explicit scene
+    or of recorded frames may be intended: they give a note."""
     seen: dict[tuple[str, str], str] = {}
     problems: dict[str, list[str]] = {}
     for name, one in known.items():
@@ -142,7 +143,7 @@ def twins(known: dict[str, Known], result: Verification) -> dict[str, list[str]]
 
 
 def _files_of_first(manifest: dict[str, Any]) -> dict[str, Any]:
-    """Files of a sequence, of a rig's first camera alone."""
+    """Return files of a sequence, for a rig of its first camera only."""
     if not manifest.get("cameras"):
         return manifest["files"]
     own = manifest["cameras"][0] + "/"
@@ -150,8 +151,7 @@ def _files_of_first(manifest: dict[str, Any]) -> dict[str, Any]:
 
 
 def against_run(root: Path, folders: list[Path], known: dict[str, Known], result: Verification) -> list[str]:
-    """Sequences that the recipe asks for and are not there, or are and it draws others; what
-    the run says of its OpenGL."""
+    """Return sequences of the recipe that are missing, extra ones, and differences from the run's OpenGL."""
     plan, record = plan_of(root), RunFolder(root).read("run.json") or {}
     if plan is None:
         result.notes.append("no record of the run here: sequences were not compared with a recipe")
@@ -201,7 +201,7 @@ def against_run(root: Path, folders: list[Path], known: dict[str, Known], result
 
 
 def made_with(manifest: dict[str, Any]) -> dict[str, str]:
-    """Versions and OpenGL, under the names that the run's record has for them."""
+    """Return versions and OpenGL, under the names of the run's record."""
     gl = manifest.get("opengl") or {}
     return {
         **(manifest.get("versions") or {}),
@@ -214,8 +214,7 @@ def _called(template: RunTemplate) -> str:
 
 
 def comparable(config: SequenceConfig) -> dict[str, Any]:
-    """Plain data without what a sequence's own configuration says otherwise than the recipe:
-    its number, and which of the folders."""
+    """Return plain data without what a sequence's own configuration changes: its number, and which of the folders."""
     tree = json.loads(config.model_dump_json())
     for key in ("sequences", "first_index"):
         tree["output"].pop(key)
@@ -225,7 +224,8 @@ def comparable(config: SequenceConfig) -> dict[str, Any]:
 
 
 def first_difference(a: Any, b: Any, path: str = "") -> str:
-    """Dotted path, "" when they agree. Numbers that a text form rounds are equal."""
+    """Return the dotted path of the first difference, "" when they are equal. Numbers that a text form rounds are
+    equal."""
     if isinstance(a, dict) and isinstance(b, dict):
         for key in sorted(a.keys() | b.keys()):
             if where := first_difference(a.get(key), b.get(key), f"{path}.{key}" if path else key):
@@ -235,7 +235,8 @@ def first_difference(a: Any, b: Any, path: str = "") -> str:
 
 
 def plan_of(root: Path) -> Plan | None:
-    """The plan of the run that made ``root``; None without a record of one. Raises BlinkGLError: a damaged record."""
+    """Return the plan of the run that made ``root``; None without a record of one. Raises BlinkGLError: a damaged
+    record."""
     known = RunFolder(root).read("run.json")
     if known is None:
         return None

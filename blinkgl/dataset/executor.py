@@ -1,12 +1,11 @@
-"""Who makes the sequences: this process, or a pool of processes on this machine. (Many machines:
-:mod:`blinkgl.dataset.cluster`.)
+"""Executors: this process, or a pool of processes on this machine. (Many machines: :mod:`blinkgl.dataset.cluster`.)
 
-All keep one contract, so that the loop in :mod:`blinkgl.dataset.run` does not know which it has:
+All have the same interface, so that the loop in :mod:`blinkgl.dataset.run` works with any of them:
 
-    open(job)               ready to work, or BlinkGLError. Returns the workers' hellos.
-    free()                  how many more tasks it would start on at once
+    open(job)               prepare for work, or BlinkGLError. Returns the workers' hellos.
+    free()                  number of further tasks it would start at once
     submit(task, attempt)
-    poll(timeout_s)         messages that came in meanwhile; a worker that died is a "failed" of its task
+    poll(timeout_s)         messages received meanwhile; a dead worker is a "failed" of its task
     kill(task, reason)      the task took too long
     close()                 stops everything, waits, leaves no half sequence and no process
 """
@@ -35,9 +34,9 @@ _BAD_STARTS = 3
 
 
 class StartError(BlinkGLError):
-    """Workers ended before they could say why. What they wrote, which the message names, stays.
+    """Workers ended before they could report the reason. Their output, which the message names, is kept.
 
-    log : where that is."""
+    log : its path."""
 
     def __init__(self, problem: str, log: Path):
         super().__init__(problem, where="--workers", accepted=f"see {log}")
@@ -45,10 +44,10 @@ class StartError(BlinkGLError):
 
 
 class Executor(Protocol):
-    """Who makes the tasks of a run: :class:`Inline`, :class:`Local`, and Ray's in :mod:`blinkgl.dataset.cluster`."""
+    """Runs the tasks of a run: :class:`Inline`, :class:`Local`, and Ray's in :mod:`blinkgl.dataset.cluster`."""
 
     listener: Callable[[Message], None]
-    """Called with progress that does not come by ``poll`` (:class:`Inline`)."""
+    """Called with progress that ``poll`` does not return (:class:`Inline`)."""
 
     def open(self, job: Work) -> list[Message]: ...
     def free(self) -> int: ...
@@ -59,7 +58,7 @@ class Executor(Protocol):
 
 
 class Inline:
-    """This process. No time limit: nobody is there to stop it."""
+    """Runs tasks in this process, without a time limit."""
 
     def __init__(self) -> None:
         self.listener: Callable[[Message], None] = lambda message: None
@@ -93,12 +92,12 @@ class Inline:
 class Local:
     """``workers`` processes, each with its own OpenGL context and its share of the cores.
 
-    devices : EGL devices, dealt out to the workers in turn. Default: all graphics cards there are, if there are several
-        and the configuration asks for no other than the first; else the configuration's.
+    devices : EGL devices, distributed over the workers. Default: all graphics cards, if there are several and the
+        configuration does not select another than the first; else the configuration's.
     cores : that they share. Default: all that this process may use.
 
-    A worker that dies is replaced. Workers have sessions of their own, so that Ctrl-C reaches only the driver, and
-    leave when the driver's end of their standard input closes, however it died.
+    A worker that dies is replaced. Workers have their own sessions, so that Ctrl-C reaches only the driver, and end
+    when the driver's end of their standard input closes for any reason.
     """
 
     def __init__(self, workers: int, devices: list[int] | None = None, cores: int | None = None):
@@ -122,11 +121,12 @@ class Local:
         if self._devices is None:
             self._devices = several_cards(job)
         cores = self._cores or len(os.sched_getaffinity(0))
-        # numba and OpenGL read these once, when they are loaded, so they are in a worker's environment from its start.
+        # numba and OpenGL read these once, when they are loaded, so they must be in a worker's environment from its
+        # start.
         self._environment = {**os.environ, **thread_environment(self._wanted, cores)}
         for slot in range(self._wanted):
             self._start(slot)
-        # A run begins when every worker has said hello: what their machines and assets are is compared before any work.
+        # A run begins when every worker has said hello: their machines and assets are compared before any work.
         hellos, deadline = [], time.monotonic() + _START_S
         while len(hellos) < self._wanted:
             hellos += [m for m in self.poll(1.0) if m["kind"] == "hello"]
@@ -138,7 +138,7 @@ class Local:
         return sum(p.ready and p.task is None for p in self._processes)
 
     def submit(self, task: int, attempt: int) -> None:
-        # There is one: the driver submits only after ``free`` has said so.
+        # There is one: the driver submits only when ``free`` allows it.
         process = next(p for p in self._processes if p.ready and p.task is None)
         process.task = task
         process.send({"task": task, "attempt": attempt})
@@ -149,11 +149,11 @@ class Local:
             process: _Process = key.data
             lines, ended = process.read()
             for message in lines:
-                # The job itself cannot be done (assets, OpenGL): another worker would be refused likewise.
+                # The job itself is impossible (assets, OpenGL): another worker would be refused likewise.
                 if message["kind"] == "refused":
                     raise BlinkGLError(message["error"])
                 if message["kind"] == "hello":
-                    # Only starts that fail one after the other say that no worker can start.
+                    # Only consecutive failed starts mean that no worker can start.
                     process.ready, self._bad_starts = True, 0
                 if message["kind"] in ("done", "failed"):
                     process.task = None
@@ -166,13 +166,13 @@ class Local:
         for process in self._processes:
             if process.task == task:
                 process.reason = reason
-                # SIGKILL: a worker that hangs in a driver does not hear SIGTERM. ``poll`` reports its task.
+                # SIGKILL: a worker that hangs in a driver does not react to SIGTERM. ``poll`` reports its task.
                 process.popen.kill()
 
     def close(self) -> None:
         for process in self._processes:
             process.stop()
-        # One deadline for all of them: they stop at the same time, not one after the other.
+        # One deadline for all of them: they stop at the same time.
         deadline = time.monotonic() + _STOP_S
         for process in self._processes:
             try:
@@ -192,7 +192,7 @@ class Local:
         process.send({"job": self._job.to_dict(), "maker": self._job.maker, "device": device})
 
     def _bury(self, process: _Process) -> list[Message]:
-        """The process ended by itself: its task failed, and another takes its place."""
+        """Handle a process that ended by itself: its task failed, and another replaces it."""
         # A closed pipe is always readable: the selector would spin on it.
         self._selector.unregister(process.channel)
         self._processes.remove(process)
@@ -224,9 +224,9 @@ class _Process:
     def __init__(self, slot: int, log: Path, environment: dict[str, str]):
         self.slot, self.log = slot, log
         self.ready, self.task, self.reason = False, None, ""
-        # Bytes after the last newline: a message may come in two reads.
+        # Bytes after the last newline: a message may arrive in two reads.
         self._rest = b""
-        # Messages have a pipe of their own: libraries and drivers print to standard output, which is the log.
+        # Messages have their own pipe: libraries and drivers print to standard output, which is the log.
         self.channel, write_end = os.pipe()
         try:
             log.parent.mkdir(parents=True, exist_ok=True)
@@ -250,18 +250,18 @@ class _Process:
         try:
             self.popen.stdin.write(json.dumps(order).encode() + b"\n")
             self.popen.stdin.flush()
-        except OSError:  # it died this moment; the end of its channel tells
+        except OSError:  # it died just now; the end of its channel will be seen
             pass
 
     def read(self) -> tuple[list[Message], bool]:
-        """Whole messages that have come, and whether the channel has ended."""
+        """Return complete messages received, and whether the channel has ended."""
         data = os.read(self.channel, 1 << 16)
         *lines, self._rest = (self._rest + data).split(b"\n")
         return [json.loads(line) for line in lines if line], not data
 
     def stop(self) -> None:
         if self.popen.poll() is None:
-            # The signal interrupts a sequence that is being made; the closed input ends a worker that waits.
+            # The signal interrupts a sequence in progress; the closed input ends a waiting worker.
             self.popen.terminate()
         try:
             self.popen.stdin.close()
@@ -277,8 +277,8 @@ class _Process:
 
 
 def several_cards(job: Work) -> list[int] | None:
-    """The machine's graphics cards as EGL devices, when there are several and the
-    configuration leaves the choice open."""
+    """Return the machine's graphics cards as EGL devices, when there are several and the configuration does not choose
+    one."""
     wanted = [group.template.check().gl for group in job.plan().used]
     if any(gl.backend == "osmesa" or gl.device != 0 for gl in wanted) or os.environ.get("GLCONTEXT_DEVICE_INDEX"):
         return None

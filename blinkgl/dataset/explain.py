@@ -1,6 +1,6 @@
-"""``blinkgl explain CONFIG``: what a run will model, what it leaves out and why, and what it is likely to cost.
+"""``blinkgl explain CONFIG``: what a run models, what it leaves out and why, and its likely cost.
 
-The scene of one sequence is built and a handful of its frames are drawn and timed (or, of recorded frames, converted);
+The scene of one sequence is built and a few of its frames are drawn and timed (or, for recorded frames, converted);
 nothing is written.
 """
 
@@ -37,7 +37,7 @@ from blinkgl.sequence.recorded import RECORDED
 from blinkgl.sequence.rendered import surfaces_at
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What a configuration's time steps and filters are beside the default preset.
+# Time steps and filters of a configuration compared with the default preset.
 
 COMPARED = {
     "timeline": (
@@ -52,7 +52,7 @@ COMPARED = {
 
 
 def quality_in_words(config: SequenceConfig) -> str:
-    """One line for ``explain``."""
+    """Return one line for ``explain``."""
     preset = load_quality(DEFAULT)
     usual = {
         "timeline": {**DisplacementTimeline().model_dump(), **preset["timeline"]},
@@ -98,7 +98,7 @@ class Pass:
 
 @dataclass
 class Explanation:
-    """What a run will model, leave out and cost, in words and numbers."""
+    """What a run models, leaves out and costs, in words and numbers."""
 
     scene: dict[str, str] = field(default_factory=dict)
     passes: list[Pass] = field(default_factory=list)
@@ -109,13 +109,12 @@ class Explanation:
     machine: str = ""
 
     def add(self, name: str, why: str, count: int, each_s: float) -> None:
-        """One more pass, from the time of one of it."""
+        """Add one more pass, from the time of a single one."""
         self.passes.append(Pass(name, why, count, each_s * count))
 
 
 def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
-    """Explains one sequence (default: the first), of a recipe its first group's. Raises what generating it would
-    raise."""
+    """Explain one sequence (default: the first), of a recipe its first group's. Raises the errors of generating it."""
     if "groups" in template.tree:
         result = explain(template.groups[0].template, sequence)
         result.scene = {"group": f"{template.groups[0].name}, the first of {len(template.groups)}", **result.scene}
@@ -144,7 +143,7 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
 
 
 def _join(result: Explanation, name: str, one: Explanation) -> None:
-    """What is said of one camera, to what is said of those before it; all sensors have the times of one."""
+    """Add the explanation of one camera to those of the cameras before it; all sensors have the same times."""
     prefix = f"{name}: " if name else ""
     same = {key: value for key, value in result.scene.items() if one.scene.get(key) == value}
     result.scene |= {key if key in same or not prefix else prefix + key: v for key, v in one.scene.items()}
@@ -154,8 +153,7 @@ def _join(result: Explanation, name: str, one: Explanation) -> None:
 
 
 def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanation:
-    """A sequence that is converted from recorded frames: nothing is rendered; the first few
-    frames are converted and timed."""
+    """Explain a sequence of recorded frames: nothing is rendered; the first few frames are converted and timed."""
     frames = config.frames
     probe = simulate_sequence(SequenceRequest(config, index, base, labels=False))
     files, flows, masks = probe.files, probe.flows, probe.masks
@@ -206,7 +204,7 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
 
 
 def _living(scene: Scene) -> dict[str, str]:
-    """Rows of what changes its shape and of what falls, where there is any."""
+    """Return rows on deforming and falling objects, if any."""
     kinds = Counter(type(p.mesh.deformer).__name__.lower() for o in scene.objects for p in o.parts if p.mesh.deformer)
     rows = {}
     if kinds:
@@ -252,7 +250,7 @@ def _fog(scene: Scene) -> dict[str, str]:
 
 
 def _shining(light: Light) -> str:
-    """What shines, in words."""
+    """Return the lights in words."""
     if light.plain:
         return "sun and sky"
     count = Counter(lamp.kind for lamp in lamps_of(light))
@@ -276,16 +274,16 @@ def _timed(run, times) -> float:
 
 
 def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer, result: Explanation) -> None:
-    """Adds every kind of drawing, a few of each timed."""
+    """Add every kind of drawing, a few of each timed."""
     times = [int(t) for t in np.linspace(scene.t0_ns, scene.t1_ns, PROBES)]
     probe = simulate_sequence(SequenceRequest(config, index, labels=False, scene=scene, renderer=renderer))
-    seen = [chunk.t_ns for chunk in islice(probe.chunks(), 2 * PROBES)]  # a short stretch of it, as it will be
+    seen = [chunk.t_ns for chunk in islice(probe.chunks(), 2 * PROBES)]  # a short part of the real sequence
     event_s = _timed(lambda t: renderer.luminance(t).view(), times)
     result.frames = _event_frames(config, probe, times, (scene.t1_ns - scene.t0_ns) * 1e-9)
     result.add("event frames", f"timeline: {config.timeline.kind}", result.frames, event_s)
     if config.timeline.kind != "uniform":
         name = "brightness" if config.timeline.kind == "brightness" else "velocity"
-        count = int(1.1 * result.frames)  # a step is cut again now and then
+        count = int(1.1 * result.frames)  # a step is sometimes shortened
         why = f"decides the step; every {config.timeline.sample_every}. pixel"
         result.add(name, why, count, _timed(probe.timeline.pace, times))
     _pictures(config, renderer, times[:3], (scene.t1_ns - scene.t0_ns) * 1e-9, result)
@@ -298,10 +296,10 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
 
 
 def _event_frames(config: SequenceConfig, probe: Simulation, times: list[int], duration: float) -> int:
-    """How many event frames there will be, from the pace at a few times."""
+    """Return the number of event frames, from the pace at a few times."""
     timeline = config.timeline
     if timeline.kind == "uniform":
-        return math.ceil(duration * timeline.fps - 1e-6) + 1  # one at the end, whatever the rate
+        return math.ceil(duration * timeline.fps - 1e-6) + 1  # one at the end, at any rate
     steps = np.clip(
         [1 / max(probe.timeline.pace(t), 1e-12) for t in times],
         timeline.min_step_us * 1e-6,
@@ -313,7 +311,7 @@ def _event_frames(config: SequenceConfig, probe: Simulation, times: list[int], d
 def _pictures(
     config: SequenceConfig, renderer: Renderer, times: list[int], duration: float, result: Explanation
 ) -> None:
-    """Images, labels, the truth of events and the preview."""
+    """Add images, labels, the truth of events and the preview."""
     request, labels = asked_for(config.labels), config.time.label_count
     if "images" in request:
         why = f"images at {config.time.label_rate:g} Hz, anti-aliasing {config.render.image_antialiasing}"
@@ -333,7 +331,7 @@ def _pictures(
 
 
 def _over_time(config: SequenceConfig, scene: Scene, renderer: Renderer, result: Explanation) -> None:
-    """The inertial unit and the point tracks."""
+    """Add the inertial unit and the point tracks."""
     t0, t1 = scene.t0_ns, scene.t1_ns
     if config.imu is not None:
         count = imu_count(config.imu.rate, t0, t1)
@@ -353,7 +351,7 @@ def _over_time(config: SequenceConfig, scene: Scene, renderer: Renderer, result:
 
 
 def _over_intervals(request: LabelRequest, config: SequenceConfig) -> str:
-    """How many of the labels lead to all times that intervals of ``labels.flow`` ask for; "" where none do."""
+    """Return how many of the labels lead to all times of the intervals in ``labels.flow``; "" where none do."""
     if not request.each:
         return ""
     intervals, time = request.intervals_ns, config.time
@@ -366,7 +364,7 @@ def _over_intervals(request: LabelRequest, config: SequenceConfig) -> str:
 
 
 def _frame_camera(images: ImagesConfig, renderer: Renderer, scene: Scene) -> Pass:
-    """A few of its images, timed."""
+    """Return the pass of a few of its images, timed."""
     camera = FrameCamera(renderer, images, 0, (scene.t0_ns, scene.t1_ns))
     count = min(3, len(camera))
     camera.take()

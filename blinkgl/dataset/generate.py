@@ -1,4 +1,4 @@
-"""Generates sequences: one consumer of :func:`~blinkgl.sequence.rig.simulate_rig`, and the plainest loop around it."""
+"""Generation of sequences: writes the items of :func:`~blinkgl.sequence.rig.simulate_rig`, in a simple loop."""
 
 from __future__ import annotations
 
@@ -28,13 +28,12 @@ from blinkgl.sequence_files.rig_dir import RigWriter, write_lens
 from blinkgl.sequence_files.sequence_dir import SequenceWriter, refuse_existing
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Feeds the preview while a sequence happens.
+# Passes a sequence's items to the preview.
 
 
 class PreviewRecorder:
-    """Context manager; does nothing where no sequence gives pictures. The flow panel shows the instantaneous
-    velocity times the label interval, which is what the flow labels look like for small
-    motions; recorded frames have none.
+    """Context manager; does nothing where no sequence has pictures. The flow panel shows the instantaneous velocity
+    times the label interval, which equals the flow labels for small motions; recorded frames have none.
 
     sequences : of one camera, or of those of a rig, shown one below the other by their names."""
 
@@ -62,7 +61,7 @@ class PreviewRecorder:
         self._video = RigPreviewWriter(writer.path("preview.mp4"), panels, rate / config.slowdown)
 
     def take(self, sequence: Simulation, item: Item) -> None:
-        """All that happens in a sequence, in order."""
+        """Add the items of a sequence, in order."""
         if self._video is None or (number := self._shown.get(id(sequence))) is None:
             return
         if isinstance(item, EventChunk):
@@ -86,12 +85,12 @@ class PreviewRecorder:
 def generate_run(
     template: RunTemplate, out: str | Path, num: int | None = None, progress: Progress | None = None
 ) -> Iterator[SequenceReport]:
-    """Generates ``num`` (default: the configuration's ``output.sequences``) sequences below ``out``, in order, in this
-    process, yielding a report after each. The first error ends it;
-    :mod:`blinkgl.dataset.run` is the loop that does not give up.
+    """Generate ``num`` (default: the configuration's ``output.sequences``) sequences below ``out``, in order, in this
+    process, and yield a report after each. The first error ends it; :mod:`blinkgl.dataset.run` is the loop that
+    continues.
 
-    Raises BlinkGLError: any configuration or asset error, no OpenGL, or an output folder that exists; the folders
-    are looked at before any work starts."""
+    Raises BlinkGLError: any configuration or asset error, no OpenGL, or an existing output folder; folders are checked
+    before any work starts."""
     check_output(out)
     plan = Plan.of(template, num)
     for _, task in plan.tasks.present(Path(out)):
@@ -115,11 +114,11 @@ def generate_sequence(
     base: Path = Path("."),
     progress: Progress | None = None,
 ) -> SequenceReport:
-    """Generates one sequence directory, whole or not at all: what happens in the sequence, written down.
+    """Generate one sequence directory, completely or not at all.
 
-    gl : context to draw with; not looked at (None) for a sequence that is converted from frames.
+    gl : context to draw with; not used (None) for a sequence that is converted from frames.
     base : folder that relative paths in the configuration start from.
-    Raises BlinkGLError for anything the user or the machine caused."""
+    Raises BlinkGLError for every error of the user or the machine."""
     report = SequenceReport(index, Path(out) / sequence_name(config.output, index))
     pictures_hz = config.preview.rate if config.preview.enabled else None
     request = SequenceRequest(config, index, base, pictures_hz=pictures_hz)
@@ -149,7 +148,7 @@ def generate_sequence(
 
 
 def folder_of(rig: RigSequence, path: Path) -> SequenceWriter:
-    """What writes the sequence's own folder."""
+    """Return the writer of the sequence's own folder."""
     text = config_yaml(rig.config, rig.index)
     if rig.config.sensors is None:
         return writer_of(rig.members[0], path, text)
@@ -157,7 +156,7 @@ def folder_of(rig: RigSequence, path: Path) -> SequenceWriter:
 
 
 def _writers(rig: RigSequence, folder: SequenceWriter, stack: ExitStack) -> dict[str, SequenceWriter]:
-    """What writes each camera, by name: a folder below ``folder``; a single camera has that one for itself."""
+    """Return the writer of each camera, by name: a folder below ``folder``; a single camera uses ``folder`` itself."""
     if not isinstance(folder, RigWriter):
         return {rig.members[0].name: folder}
     writers = {}
@@ -169,7 +168,7 @@ def _writers(rig: RigSequence, folder: SequenceWriter, stack: ExitStack) -> dict
 
 
 def writer_of(sequence: Simulation, path: Path, config_text: str) -> SequenceWriter:
-    """What writes a sequence to ``path``. config_text : of its config.yaml."""
+    """Return the writer of a sequence to ``path``. config_text : of its config.yaml."""
     return SequenceWriter(
         path,
         sequence.height,
@@ -184,7 +183,7 @@ def writer_of(sequence: Simulation, path: Path, config_text: str) -> SequenceWri
 
 
 def write_item(writer: SequenceWriter, sequence: Simulation, item: Item) -> None:
-    """Writes what has happened, but pictures for those who watch."""
+    """Write an item, except pictures for display."""
     if isinstance(item, Picture):
         return
     with sequence.clock("write"):
@@ -198,7 +197,7 @@ def write_item(writer: SequenceWriter, sequence: Simulation, item: Item) -> None
 
 
 def write_end(writer: SequenceWriter, sequence: Simulation) -> None:
-    """Writes what is known when all has happened."""
+    """Write what is known only at the end."""
     with sequence.clock("write"):
         if poses := sequence.poses():
             writer.poses(**poses)
@@ -220,7 +219,7 @@ def _write_labels(writer: SequenceWriter, truth: GroundTruth) -> None:
 
 
 def exposure_line(image: CameraImage) -> ExposureLine:
-    """What the list of exposures says of an image."""
+    """Return an image's line in the list of exposures."""
     return ExposureLine(
         image.start_ns / 1000,
         image.end_ns / 1000,
@@ -232,7 +231,7 @@ def exposure_line(image: CameraImage) -> ExposureLine:
 
 
 def manifest_info(sequence: Simulation) -> dict:
-    """What a person needs to know where the sequence came from; no clock times (same seed, same manifest)."""
+    """Return the manifest's entries about a sequence's source; no clock times (same seed, same manifest)."""
     config = sequence.config
     opencv = {} if config.frames is None else {"opencv": cv2.__version__}
     return {
@@ -253,7 +252,7 @@ def manifest_info(sequence: Simulation) -> dict:
 
 
 def _shared_info(rig: RigSequence) -> dict:
-    """As :func:`manifest_info`, of what the sensors of a rig have in common."""
+    """Return :func:`manifest_info` of what the sensors of a rig have in common."""
     facts = rig.members[0].facts() if rig.members else {}
     common = ("opengl", "timeline", "triangles", "objects", "scene_log", "not_drawn", "dynamics")
     return {
@@ -266,7 +265,8 @@ def _shared_info(rig: RigSequence) -> dict:
 
 
 def made_by(config: SequenceConfig, index: int, libraries: Mapping[str, str]) -> dict:
-    """Of a manifest: which sequence it is, and by what it was made. libraries : versions beside those always used."""
+    """Return a manifest's entries: which sequence it is, and what made it. libraries : versions besides those always
+    used."""
     import numba
 
     versions = {"python": platform.python_version(), "numpy": np.__version__, "numba": numba.__version__}

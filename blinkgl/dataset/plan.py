@@ -1,5 +1,4 @@
-"""What a run has to make: the list of sequences, and what identifies the run so that another
-day's workers can go on with it."""
+"""The plan of a run: the list of sequences, and the identity of the run, so that it can be continued later."""
 
 from __future__ import annotations
 
@@ -50,8 +49,7 @@ _NUMBERED = re.compile(r"(.+)_([0-9]{6,})")
 
 
 class Tasks(Sequence[Task]):
-    """The sequences of a run by number, made when they are asked for: a run of millions
-    takes no more memory than one of ten.
+    """The sequences of a run by number, made when requested: a run of millions takes no more memory than one of ten.
 
     parts : (group, output, first, count) of each group that has sequences, in order.
     """
@@ -65,7 +63,7 @@ class Tasks(Sequence[Task]):
 
     @property
     def splits(self) -> list[str]:
-        """The folders below the data set that sequences go to."""
+        """Return the folders below the data set that sequences go to."""
         return sorted({output.split for _, output, _, _ in self._parts})
 
     def __len__(self) -> int:
@@ -89,7 +87,7 @@ class Tasks(Sequence[Task]):
         return Task(group, index, sequence_name(output, index))
 
     def number(self, name: str) -> int | None:
-        """Of the task with this name; None when the run has no such sequence."""
+        """Return the number of the task with this name; None when the run has no such sequence."""
         matched = _NUMBERED.fullmatch(name)
         part = self._by_prefix.get(matched.group(1)) if matched else None
         if part is None:
@@ -100,8 +98,7 @@ class Tasks(Sequence[Task]):
         return self._starts[part] + index - first if inside else None
 
     def present(self, out: Path) -> Iterator[tuple[int, Task]]:
-        """The tasks at whose names something lies below ``out``, in no order. Looks at what
-        is there, not for all that could be."""
+        """Yield the existing tasks below ``out``, in any order. It lists the folder, not all possible tasks."""
         for split in self.splits:
             try:
                 entries = os.scandir(out / split)
@@ -115,19 +112,20 @@ class Tasks(Sequence[Task]):
 
 @dataclass(frozen=True)
 class Plan:
-    """The sequences of a run, in order. ``groups`` also holds those that are switched off: they identify the recipe."""
+    """The sequences of a run, in order. ``groups`` includes disabled ones: they identify the recipe."""
 
     template: RunTemplate
     groups: tuple[Group, ...]
     tasks: Tasks
     counts: dict[str, int]
-    """How many sequences of each group that has any."""
+    """Number of sequences of each group that has any."""
 
     @classmethod
     def of(cls, template: RunTemplate, num: int | None = None) -> Plan:
-        """``num``: at most so many of each group (a configuration without groups: exactly so many).
+        """Return the plan. ``num``: at most this many of each group (a configuration without groups: exactly this
+        many).
 
-        Raises ConfigError: any bad value of the recipe, or every group switched off."""
+        Raises ConfigError: any bad value of the recipe, or all groups disabled."""
         groups = all_groups(template)
         parts = []
         for group in groups:
@@ -136,7 +134,7 @@ class Plan:
             if group.enabled:
                 parts.append((group.name, output, group.first, count))
         if not parts:
-            raise ConfigError("every group is switched off", where="groups", accepted="enabled: true in at least one")
+            raise ConfigError("all groups are disabled", where="groups", accepted="enabled: true in at least one")
         return cls(template, groups, Tasks(parts), {name: count for name, _, _, count in parts})
 
     @cached_property
@@ -144,24 +142,24 @@ class Plan:
         return {group.name: group for group in self.groups}
 
     def config(self, task: Task) -> SequenceConfig:
-        """The sequence's configuration, every value drawn. Raises ConfigError."""
+        """Return the sequence's configuration, every value drawn. Raises ConfigError."""
         return self.by_name[task.group].template.sequence(task.index)
 
     @cached_property
     def used(self) -> tuple[Group, ...]:
-        """The groups that have tasks."""
+        """Return the groups that have tasks."""
         return tuple(group for group in self.groups if group.name in self.counts)
 
     @property
     def identity(self) -> dict[str, str]:
-        """Group -> hash of its recipe, without the numbers of sequences: a run may be made longer."""
+        """Return group -> hash of its recipe, without the numbers of sequences, so that a run may be extended."""
         return {group.name: group.identity for group in self.groups}
 
     def check_assets(self) -> dict[str, str]:
-        """Content hash of every file that the run's scenes may use, by name; frame folders by name and size.
+        """Return the content hash of every file that the run's scenes may use, by name; frame folders by name and size.
 
-        Raises ConfigError and AssetError: missing folders, empty pools, pools too small for
-        the split, too few frame folders."""
+        Raises ConfigError and AssetError: missing folders, empty pools, pools too small for the split, too few frame
+        folders."""
         hashes: dict[str, str] = {}
         for group in self.used:
             try:
@@ -178,17 +176,17 @@ class Plan:
         return hashes
 
     def libraries(self) -> dict[str, str]:
-        """Versions of those that only some runs use and that have a say in the bytes. Raises ConfigError where one is
-        not installed."""
+        """Return versions of libraries that only some runs use and that affect the bytes. Raises ConfigError where one
+        is not installed."""
         return {"mujoco": engine_version()} if any(_falls(group.template.tree) for group in self.used) else {}
 
     def recipe_text(self) -> str:
-        """The recipe with all overrides, as YAML that ``load_run`` takes."""
+        """Return the recipe with all overrides, as YAML that ``load_run`` reads."""
         return to_yaml(self.template.tree)
 
 
 _ASSET_CORNERS = 48
-"""Configurations whose files are looked at: enough for every choice of a file, few enough for scenes that take long."""
+"""Configurations whose files are checked: enough for every choice of a file, few enough for scenes that take long."""
 
 
 def _check_group(group: Group, count: int, hashes: dict[str, str]) -> None:
@@ -207,7 +205,7 @@ def _check_group(group: Group, count: int, hashes: dict[str, str]) -> None:
                     accepted=f"at least {last + 1} folders, or fewer output.sequences",
                 )
             for folder in folders:
-                # One bad folder is set aside alone; frames too far apart are the recipe's fault.
+                # One bad folder is set aside alone; frames that are too far apart are an error of the recipe.
                 with suppress(AssetError):
                     used_images(config.frames, folder)
                 for path in sorted(folder.rglob("*")):
@@ -221,7 +219,7 @@ def _check_group(group: Group, count: int, hashes: dict[str, str]) -> None:
 
 
 def _asset_corners(template: RunTemplate) -> Iterator[SequenceConfig]:
-    """Configurations that stand for the scenes and frame folders that can be drawn; each once."""
+    """Yield configurations that represent the scenes and frame folders that can be drawn; each once."""
     seen = set()
     for config in template.corners()[:_ASSET_CORNERS]:
         said = repr((config.scene, config.frames))
@@ -231,7 +229,7 @@ def _asset_corners(template: RunTemplate) -> Iterator[SequenceConfig]:
 
 
 def _falls(tree: Any) -> bool:
-    """Whether some draw of a recipe may have physics."""
+    """Return whether some draw of a recipe may have physics."""
     if isinstance(tree, dict):
         return tree.get("physics") is not None or any(_falls(value) for value in tree.values())
     return isinstance(tree, (list, tuple)) and any(_falls(value) for value in tree)
@@ -266,15 +264,15 @@ def _hash_scene_files(scene, base: Path, hashes: dict[str, str]) -> None:
 
 
 def digest(hashes: dict[str, str]) -> str:
-    """One hash of :meth:`Plan.check_assets`, to compare machines by."""
+    """Return one hash of :meth:`Plan.check_assets`, to compare machines."""
     return hashlib.sha256(json.dumps(hashes, sort_keys=True).encode()).hexdigest()
 
 
 def check_output(out: str | Path) -> None:
-    """OutputError when ``out`` cannot become a folder of sequences.
+    """Raise OutputError when ``out`` cannot become a folder of sequences.
 
-    ``out`` itself may be a symbolic link; what BlinkGL makes below it may not be one already: sequences would go, and
-    what is not whole would be moved, where nobody looks for a data set."""
+    ``out`` itself may be a symbolic link; what BlinkGL makes below it may not be one already: sequences would be
+    written, and incomplete ones moved, to an unexpected place."""
     out = Path(out)
     if out.exists() and not out.is_dir():
         raise OutputError("is a file", where=str(out), accepted="a folder")

@@ -1,4 +1,4 @@
-"""What making one sequence cost, and the configuration that makes it again."""
+"""The cost of one sequence, and the configuration that reproduces it."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ if TYPE_CHECKING:
     from blinkgl.sequence.rig import RigSequence
 
 STAGES = ("scene", "render", "read-back", "events", "images", "write", "preview")
-"""What the seconds of a sequence are told apart by; the rest is "other"."""
+"""The stages of a sequence's time; the rest is "other"."""
 Progress = Callable[["SequenceReport", float], None]
-"""Called now and then with the running report and the fraction done, 0 … 1."""
+"""Called regularly with the running report and the fraction done, 0 … 1."""
 
 
 @dataclass
 class SequenceReport:
-    """What one sequence cost and holds. Times in wall seconds; they are shown, never written into the data set."""
+    """The cost and content of one sequence. Times in wall seconds; they are displayed, never written into the data
+    set."""
 
     index: int
     path: Path
@@ -36,14 +37,14 @@ class SequenceReport:
     total_s: float = 0.0
     """without ``compile_s``"""
     compile_s: float = 0.0
-    """compiling kernels; 0 but for a machine's first sequence of a kind"""
+    """time to compile kernels; 0 except for a machine's first sequence of a kind"""
     causes: dict[str, int] = field(default_factory=dict)
-    """events by what caused them; empty unless ``events.causes`` asks for it"""
+    """events by cause; empty unless ``events.causes`` is on"""
     omissions: tuple[str, ...] = ()
-    """what files of the scene ask for and is not drawn, a line per file"""
+    """undrawn features of the scene's files, a line per file"""
 
     def count(self, sequence: RigSequence) -> None:
-        """What there is of it so far."""
+        """Count the items so far."""
         self.frames, self.events, self.labels, self.seconds = (
             sequence.frames,
             sequence.events,
@@ -53,7 +54,7 @@ class SequenceReport:
         self.causes = sequence.causes
 
     def finish(self, sequence: RigSequence, flushed_s: float) -> None:
-        """All there is, now that its files are. flushed_s : what closing them took."""
+        """Complete the report when the files exist. flushed_s : time to close them."""
         self.count(sequence)
         self.seconds["write"] += flushed_s
         self.simulated_s = (sequence.t1_ns - sequence.t0_ns) * 1e-9
@@ -62,7 +63,7 @@ class SequenceReport:
 
 
 def losses(saturated: int, dropped: int, late: int) -> dict[str, int]:
-    """The manifest's figures of events that were made and are not in the file; see docs/formats.md."""
+    """Return the manifest's counts of events that were made but are not in the file; see docs/formats.md."""
     return {
         "events_cut_by_max_events_per_step": saturated,
         "events_lost_in_readout": dropped,
@@ -72,7 +73,7 @@ def losses(saturated: int, dropped: int, late: int) -> dict[str, int]:
 
 @dataclass
 class Totals:
-    """What many sequences cost together: as large for a million as for one. ``first`` is the first that was added."""
+    """The total cost of many sequences, in constant memory. ``first`` is the first that was added."""
 
     count: int = 0
     first: SequenceReport | None = None
@@ -96,7 +97,7 @@ class Totals:
         self.events += report.events
         self.labels += report.labels
         self.total_s += report.total_s
-        self.compile_s = max(self.compile_s, report.compile_s)  # workers compile at once
+        self.compile_s = max(self.compile_s, report.compile_s)  # workers compile at the same time
         for cause, events in report.causes.items():
             self.causes[cause] = self.causes.get(cause, 0) + events
         for stage, seconds in report.seconds.items():
@@ -104,7 +105,7 @@ class Totals:
         return self
 
     def summary(self) -> dict[str, float]:
-        """Totals of a run: counts, wall seconds per stage, and the rates the table shows."""
+        """Return totals of a run: counts, wall seconds per stage, and the rates of the table."""
         stages = {name: self.seconds.get(name, 0.0) for name in STAGES}
         stages["other"] = max(0.0, self.total_s - sum(stages.values()))
         return {
@@ -121,11 +122,11 @@ class Totals:
 
 
 _NOT_SAID_AS_NULL = ("frames", "physics", "deform", "images", "fog", "rig", "sensors")
-"""Keys of what came later than the first data sets: a sequence without it has the bytes that it had."""
+"""Keys added after the first data sets: without them a sequence keeps its bytes."""
 
 
 def config_yaml(config: SequenceConfig, index: int) -> str:
-    """The resolved configuration as YAML; ``blinkgl generate`` takes it and makes this one sequence again."""
+    """Return the resolved configuration as YAML; ``blinkgl generate`` reproduces this one sequence from it."""
     tree = json.loads(config.model_dump_json())
     tree["output"].update(first_index=index, sequences=1)
     scene = tree.get("scene") or {}

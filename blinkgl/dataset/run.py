@@ -1,9 +1,9 @@
-"""Makes a whole data set and does not give up: any executor, any interruption, nothing made twice, nothing half made.
+"""Makes a whole data set with any executor. It survives interruptions and makes nothing twice and nothing half.
 
     outcome = run_dataset(load_run("configs/blinkflow_mini.yaml"), "out/mini", Local(workers=2), resume=True)
 
-What a sequence holds depends on the recipe, its group and its number alone. So the order, the workers and the number of
-attempts leave no trace in it, and a run may be cut anywhere and continued.
+A sequence depends only on the recipe, its group and its number. So the order, the workers and the number of attempts do
+not affect it, and a run may be interrupted at any point and continued.
 """
 
 from __future__ import annotations
@@ -27,14 +27,15 @@ from blinkgl.machine.interrupts import interruptible
 from blinkgl.sequence_files.index import write_index
 
 ATTEMPTS = 3
-"""A sequence is set aside after so many failures that could have passed, or one that could not
+"""A sequence is set aside after this many temporary failures, or one permanent failure
 (:func:`blinkgl.errors.may_pass`)."""
 _POLL_S = 0.5
 
 
 @dataclass
 class Outcome:
-    """What a run did. ``found``: sequences that were whole already; ``set_aside``: name -> reason of those given up."""
+    """The result of a run. ``found``: sequences that were complete already; ``set_aside``: name -> reason of those
+    given up."""
 
     planned: int
     found: int = 0
@@ -42,13 +43,13 @@ class Outcome:
     set_aside: dict[str, str] = field(default_factory=dict)
     elapsed_s: float = 0.0
     surprises: int = 0
-    """Failures that were no BlinkGLError: dead workers, time limits, bugs."""
+    """Failures without a BlinkGLError: dead workers, time limits, bugs."""
     damaged: dict[str, str] = field(default_factory=dict)
-    """Folders found damaged and moved to ``.run/damaged``: name -> what was wrong."""
+    """Folders found damaged and moved to ``.run/damaged``: name -> the problem."""
 
 
 class Listener(Protocol):
-    """What a display has to offer; see :mod:`blinkgl.show.generate`."""
+    """The interface of a display; see :mod:`blinkgl.show.generate`."""
 
     def begin(self, plan: Plan, outcome: Outcome) -> None: ...
     def message(self, name: str, message: Message) -> None: ...
@@ -66,17 +67,17 @@ def run_dataset(
     time_limit_s: float = 0.0,
     listener: Listener | None = None,
 ) -> Outcome:
-    """Makes every sequence of ``template`` below ``out`` that is not whole yet.
+    """Make every sequence of ``template`` below ``out`` that is not complete yet.
 
     executor : default :class:`~blinkgl.dataset.executor.Inline`.
-    resume : go on with a run in ``out``; without it, a sequence folder that exists is an error.
-    mixed : go on although the recipe, the assets or the software are not those the run began with.
+    resume : continue a run in ``out``; without it, an existing sequence folder is an error.
+    mixed : continue although the recipe, the assets or the software have changed since the run began.
     time_limit_s : wall time of one attempt at one sequence; 0: none.
 
-    Raises BlinkGLError when no sequence at all could be made; nothing but logs is left then, and another recipe may
-    start in ``out``. Raises, before any work: ConfigError and AssetError (recipe, assets), GLError, OutputError (folder
-    of another recipe, another run at work in it, cannot be written). Raises during work: OutputError when the disk is
-    full, KeyboardInterrupt for Ctrl-C and SIGTERM; whole sequences stay, and ``resume`` goes on.
+    Raises BlinkGLError when no sequence could be made; only logs are left then, and another recipe may start in
+    ``out``. Raises, before any work: ConfigError and AssetError (recipe, assets), GLError, OutputError (folder of
+    another recipe, in use by another run, cannot be written). Raises during work: OutputError when the disk is full,
+    KeyboardInterrupt for Ctrl-C and SIGTERM; complete sequences stay, and ``resume`` continues.
     """
     executor = executor or Inline()
     out = Path(out)
@@ -84,11 +85,11 @@ def run_dataset(
     plan = Plan.of(template, num)
     assets = plan.check_assets()
     folder = RunFolder(out)
-    with interruptible(signal.SIGTERM), folder.locked():  # batch systems and `docker stop` end a run as Ctrl-C does
+    with interruptible(signal.SIGTERM), folder.locked():  # batch systems and `docker stop` end a run like Ctrl-C
         folder.check(plan, assets, mixed)
         outcome = _found(plan, folder, resume)
         missing = outcome.planned - outcome.found
-        # Absolute: workers on other machines start in other folders, and a link may be turned while the run is on.
+        # Absolute: workers on other machines start in other folders, and a link may change during the run.
         job = Job(str(out.resolve()), str(template.base.resolve()), plan.recipe_text(), num)
         keep_logs = False
         try:
@@ -117,8 +118,8 @@ def run_dataset(
                     folder.take_back_logs()
             elif folder.in_place:
                 folder.sweep(plan)
-                with contextlib.suppress(OutputError):  # on a full disk the first error is the one to hear of
-                    # Deleted under us; without it nobody could tell whose run this is.
+                with contextlib.suppress(OutputError):  # on a full disk the first error is the one to report
+                    # Deleted during the run; without it the recipe of the run would be unknown.
                     if folder.read("run.json") is None:
                         folder.begin(plan, assets, folder.environment, num)
                 folder.write_failures(outcome.set_aside, plan)
@@ -138,7 +139,7 @@ def run_dataset(
 
 
 def _found(plan: Plan, folder: RunFolder, resume: bool) -> Outcome:
-    """What is there already. OutputError when there is something and nobody said ``resume``."""
+    """Return what exists already. Raises OutputError for existing sequences without ``resume``."""
     outcome = Outcome(len(plan.tasks))
     for _, task in plan.tasks.present(folder.out):
         state = folder.state(task.name)
@@ -161,7 +162,7 @@ def _loop(
     plan: Plan, executor: Executor, folder: RunFolder, outcome: Outcome, time_limit_s: float, listener: Listener | None
 ) -> None:
     running: dict[int, tuple[int, float]] = {}  # task -> attempt, since when
-    # What is there was looked at before; damaged things have been put away by now.
+    # Existing entries were checked before; damaged ones have been moved away by now.
     fresh = ((number, 1) for number, task in enumerate(plan.tasks) if not folder.occupied(task.name))
     again: deque[tuple[int, int]] = deque()
 
@@ -181,7 +182,7 @@ def _loop(
             running[number] = (attempt, time.monotonic())
             executor.submit(number, attempt)
         for message in executor.poll(_POLL_S):
-            if message["kind"] == "hello":  # a worker in place of a dead one
+            if message["kind"] == "hello":  # replacement of a dead worker
                 _agree(message, environment, None)
                 continue
             number = message["task"]
@@ -203,7 +204,7 @@ def _loop(
                         f"{outcome.planned} sequences whole",
                         accepted="run again with --resume when that is mended",
                     )
-                elif message.get("lost"):  # no fault of the sequence's: a whole machine went
+                elif message.get("lost"):  # not the sequence's fault: a whole machine was lost
                     again.append((number, attempt))
                 elif attempt >= ATTEMPTS or message["final"]:
                     outcome.set_aside[task.name] = message["error"]
@@ -220,7 +221,7 @@ def _loop(
 
 
 def _agree(hello: Message, environment: dict[str, str], assets: str | None) -> None:
-    """Workers that differ in anything that decides the bytes must not work on one data set."""
+    """Raise an error for workers that differ in anything that affects the bytes."""
     if different := environment_differences(hello["environment"], environment):
         raise ConfigError(
             f"workers differ in version or hardware: {different}",
@@ -229,7 +230,7 @@ def _agree(hello: Message, environment: dict[str, str], assets: str | None) -> N
         )
     if assets is not None and hello["assets"] != assets:
         raise ConfigError(
-            "a worker sees other meshes or textures than the driver",
+            "a worker finds other meshes or textures than the driver",
             where="--executor",
             accepted="the same files on all machines",
         )

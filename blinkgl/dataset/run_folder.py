@@ -36,7 +36,7 @@ FORMAT = "blinkgl-run"
 CHECKSUMS = "checksums.json"
 _BEGUN = ("run.json", "recipe.yaml", "assets.json")
 _ENDED = ("costs.jsonl", "failed.json")
-"""Records that are whole when a run begins, and when it ends."""
+"""Records that are complete when a run begins, and when it ends."""
 
 
 class _Run(BaseModel):
@@ -77,7 +77,7 @@ _COST = TypeAdapter(_Cost)
 
 
 class RunFolder:
-    """``.run`` below ``out``. Reading is free; writing needs :meth:`locked`, then :meth:`begin`."""
+    """The folder ``.run`` below ``out``. Reading needs no lock; writing needs :meth:`locked`, then :meth:`begin`."""
 
     def __init__(self, out: Path):
         self.out, self.path = out, out / RUN_FOLDER
@@ -87,7 +87,7 @@ class RunFolder:
     # ---- may this run go on here? ---------------------------------------------------------------------------------
 
     def check(self, plan: Plan, assets: dict[str, str], mixed: bool) -> None:
-        """OutputError when the folder holds a run of another recipe or of other assets, unless ``mixed``."""
+        """Raise OutputError when the folder contains a run of another recipe or of other assets, unless ``mixed``."""
         known = self.read("run.json")
         if known is None or mixed:
             return
@@ -97,9 +97,9 @@ class RunFolder:
                 n or "the configuration" for n in ours.keys() | theirs.keys() if ours.get(n) != theirs.get(n)
             )
             raise OutputError(
-                f"holds the run of another recipe (different: {', '.join(names)})",
+                f"contains a run of another recipe (different: {', '.join(names)})",
                 where=str(self.out),
-                accepted="another --out, or --mixed to add to it all the same",
+                accepted="another --out, or --mixed to add to it anyway",
             )
         before = self.read("assets.json")
         if before is not None and before != assets:
@@ -107,13 +107,13 @@ class RunFolder:
             how = ["changed" if n in before and n in assets else "gone" if n in before else "new" for n in changed]
             said = ", ".join(f"{n} ({h})" for n, h in list(zip(changed, how))[:3]) + (" …" if len(changed) > 3 else "")
             raise OutputError(
-                f"the pools are not those the run began with: {said}",
+                f"the pools have changed since the run began: {said}",
                 where=str(self.out),
-                accepted="the same files, or --mixed to go on with these",
+                accepted="the same files, or --mixed to continue with these",
             )
 
     def check_environment(self, environment: dict[str, str], mixed: bool) -> None:
-        """OutputError when the run began with other versions or another OpenGL, unless ``mixed``."""
+        """Raise OutputError when the run began with other versions or another OpenGL, unless ``mixed``."""
         known = (self.read("run.json") or {}).get("environment") or {}
         if not mixed and (
             different := [f"{k} {known[k]}, now {v}" for k, v in environment.items() if k in known and known[k] != v]
@@ -121,13 +121,13 @@ class RunFolder:
             raise OutputError(
                 "the run began with another installation: " + "; ".join(different),
                 where=str(self.out),
-                accepted="the same, or --mixed to go on with this one (bytes may differ)",
+                accepted="the same, or --mixed to continue with this one (bytes may differ)",
             )
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
-        """One run at a time per folder; the lock goes when the process does. Makes the folder, and takes it away when
-        it is empty in the end: a run that was refused leaves nothing."""
+        """Lock the folder for one run; the lock ends with the process. The folder is made, and removed if it is empty
+        in the end: a refused run leaves nothing."""
         made = self._make()
         self._handle = self._lock()
         try:
@@ -141,32 +141,35 @@ class RunFolder:
         finally:
             if self._handle is not None:
                 os.close(self._handle)
-            with contextlib.suppress(OSError):  # what is not empty stays
+            with contextlib.suppress(OSError):  # non-empty folders stay
                 for folder in made:
                     folder.rmdir()
 
     def _make(self) -> list[Path]:
-        """The folders that were made, innermost first."""
+        """Return the folders that were made, innermost first."""
         missing = [folder for folder in (self.out, *self.out.parents) if not folder.exists()]
         with output_errors(self.out):
             self.out.mkdir(parents=True, exist_ok=True)
         return missing
 
     def _lock(self) -> int | None:
-        """The open folder, locked; None where the system cannot, and two runs in one folder are not told apart."""
+        """Return the open, locked folder; None where the system has no locks, so that two runs in one folder are not
+        detected."""
         while fcntl is not None:
             with output_errors(self.out):
                 handle = os.open(self.out, os.O_RDONLY | os.O_DIRECTORY)
             try:
                 if not os.access(self.out, os.W_OK | os.X_OK):
-                    raise OutputError("cannot be written", where=str(self.out), accepted="a folder you may write to")
+                    raise OutputError(
+                        "cannot be written", where=str(self.out), accepted="a folder with write permission"
+                    )
                 try:
                     fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError:
                     raise OutputError(
-                        "another run is at work in this folder",
+                        "another run uses this folder",
                         where=str(self.out),
-                        accepted="another --out, or --resume when it is over",
+                        accepted="another --out, or --resume after it has ended",
                     ) from None
                 except OSError:  # a file system without locks
                     pass
@@ -175,19 +178,19 @@ class RunFolder:
             except BaseException:
                 os.close(handle)
                 raise
-            # Another run was refused, and took the folder away, between our opening and our locking it.
+            # Another run was refused and removed the folder between our opening and our locking it.
             os.close(handle)
             self._make()
         return None
 
     def check_in_place(self) -> None:
-        """OutputError when the folder that was locked is no longer the one at ``out``:
-        deleted, moved or replaced under the run."""
+        """Raise OutputError when the locked folder is no longer the one at ``out``: deleted, moved or replaced during
+        the run."""
         if not _same(self.out, self._handle):
             raise OutputError(
-                "was deleted, moved or replaced while the run was at work in it",
+                "was deleted, moved or replaced during the run",
                 where=str(self.out),
-                accepted="a folder that stays where it is",
+                accepted="a folder that is not moved",
             )
 
     @property
@@ -198,7 +201,7 @@ class RunFolder:
         return (self.path / "logs").glob("worker-*.log")
 
     def take_back_logs(self) -> None:
-        """Removes what starting workers left of a run that did not begin."""
+        """Remove what starting workers left of a run that did not begin."""
         if self._fresh:
             shutil.rmtree(self.path, ignore_errors=True)
             return
@@ -208,7 +211,7 @@ class RunFolder:
     # ---- sequences ------------------------------------------------------------------------------------------------
 
     def state(self, name: str) -> str | None:
-        """None: not there. "": whole, as far as file sizes tell. Else what is wrong with it."""
+        """Return None: not there; "": complete, as far as file sizes tell; else the problem."""
         path = self.out / name
         if not path.exists() and not path.is_symlink():
             return None
@@ -219,7 +222,7 @@ class RunFolder:
         return "; ".join(verify_sequence(path, checksums=False)[:1])
 
     def put_away(self, name: str) -> None:
-        """Moves what lies at a sequence's name, and is not whole, to ``damaged/``: it is not ours to delete."""
+        """Move an incomplete entry at a sequence's name to ``damaged/``; it is not deleted."""
         target = self.path / "damaged" / name
         with output_errors(target):
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -229,7 +232,7 @@ class RunFolder:
             os.rename(self.out / name, final)
 
     def occupied(self, name: str) -> bool:
-        """Whether something other than an empty folder lies at a sequence's name."""
+        """Return whether something other than an empty folder is at a sequence's name."""
         try:
             with os.scandir(self.out / name) as entries:
                 return any(True for _ in entries)
@@ -239,8 +242,8 @@ class RunFolder:
             return True
 
     def sweep(self, plan: Plan) -> None:
-        """Removes what dead writers of this machine left. Those of another machine, or of before a start of this one,
-        cannot be asked whether they live: theirs stay, and `verify` names them."""
+        """Remove leftovers of dead writers of this machine. Those of another machine, or of before this one's restart,
+        cannot be tested: they stay, and `verify` names them."""
         for folder in [*(self.out / split for split in plan.tasks.splits), self.out, self.path]:
             with contextlib.suppress(OSError):
                 remove_stale(folder)
@@ -248,7 +251,8 @@ class RunFolder:
     # ---- records --------------------------------------------------------------------------------------------------
 
     def begin(self, plan: Plan, assets: dict[str, str], environment: dict[str, str], num: int | None) -> None:
-        """Writes what identifies the run. Its record of the beginning stays: ``mixed`` does not launder a data set."""
+        """Write what identifies the run. Its first record is kept: ``mixed`` does not hide what a data set was begun
+        with."""
         self.environment = environment
         known = self.read("run.json") or {"environment": environment, "groups": plan.identity}
         later = known.get("mixed", [])
@@ -269,19 +273,19 @@ class RunFolder:
         self._write("assets.json", assets)
         with atomic_file(self.path / "recipe.yaml") as path, output_errors(path):
             path.write_text(plan.recipe_text(), encoding="utf-8")
-        # Costs and failures are written as the run goes on: until it ends they have no checksum.
+        # Costs and failures are written during the run: they have no checksum until it ends.
         self.seal(_BEGUN)
         self.begun = True
 
     def seal(self, names: Sequence[str]) -> None:
-        """Writes the checksums of those records that there are. Raises OutputError."""
+        """Write the checksums of the existing records. Raises OutputError."""
         with output_errors(self.path):
             there = [name for name in names if (self.path / name).is_file()]
             self._write(CHECKSUMS, {name: digest_of(self.path / name)["sha256"] for name in there})
 
     def altered(self) -> list[str]:
-        """Records that are not what the run wrote, one line each. Runs of format_version 1 have no checksums, but a
-        list of them that is there counts."""
+        """Return records that differ from what the run wrote, one line each. Runs of format_version 1 need no
+        checksums, but existing ones count."""
         path = self.path / CHECKSUMS
         try:
             text = read_text(path)
@@ -303,15 +307,14 @@ class RunFolder:
         return [f"{RUN_FOLDER}/{line}" for line in lines]
 
     def forget(self, plan: Plan, keep_logs: bool) -> None:
-        """Takes back :meth:`begin` for a run of which nothing came. What was put away stays:
-        it is not ours to delete."""
+        """Undo :meth:`begin` for a run without results. Entries moved to ``damaged/`` stay there."""
         for name in (*_BEGUN, *_ENDED, CHECKSUMS):
             (self.path / name).unlink(missing_ok=True)
         (self.out / "index.jsonl").unlink(missing_ok=True)
         if not keep_logs:
             shutil.rmtree(self.path / "logs", ignore_errors=True)
         for folder in (self.path, *(self.out / split for split in plan.tasks.splits)):
-            with contextlib.suppress(OSError):  # what is not empty stays
+            with contextlib.suppress(OSError):  # non-empty folders stay
                 folder.rmdir()
 
     def add_cost(self, task: Task, message: Message, attempt: int) -> None:
@@ -332,7 +335,7 @@ class RunFolder:
         SequenceLog(self.out, name).write(text)
 
     def write_failures(self, set_aside: dict[str, str], plan: Plan) -> None:
-        """Those of this run, and of runs before it that are still not whole."""
+        """Write the failures of this run, and of earlier runs whose sequences are still incomplete."""
         before = self.read("failed.json") or {}
         still = {name: reason for name, reason in {**before, **set_aside}.items() if self.state(name) != ""}
         with contextlib.suppress(OutputError):
@@ -341,7 +344,7 @@ class RunFolder:
             self.seal((*_BEGUN, *_ENDED))
 
     def costs(self) -> list[dict[str, Any]]:
-        """The last line of each sequence; a line cut by a crash is left out."""
+        """Return the last line of each sequence; a line cut by a crash is left out."""
         found: dict[str, dict[str, Any]] = {}
         with contextlib.suppress(FileNotFoundError, AssetError):
             for line in read_text(self.path / "costs.jsonl").splitlines():
@@ -351,8 +354,7 @@ class RunFolder:
         return list(found.values())
 
     def read(self, name: str) -> dict[str, Any] | None:
-        """A JSON file of the folder, of the shape it has here; None when there is none.
-        OutputError when it is damaged."""
+        """Return a JSON file of the folder, checked; None when there is none. Raises OutputError when it is damaged."""
         path = self.path / name
         try:
             return parse(read_text(path), _RECORDS[name])
@@ -363,7 +365,7 @@ class RunFolder:
             raise OutputError(
                 f"the run's record is damaged: {problem}",
                 where=str(path),
-                accepted="a readable file; without it the run cannot be told from another recipe's",
+                accepted="a readable file; without it the run's recipe is unknown",
             ) from error
 
     def _write(self, name: str, data: dict[str, Any]) -> None:

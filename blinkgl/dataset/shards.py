@@ -40,16 +40,16 @@ from blinkgl.sequence_files.sequence_dir import read_manifest, verify_sequence
 from blinkgl.types.events import TOLD, Events
 
 _FLOW = LABELS["flow_forward"]
-"""What makes a sample: without it there is none."""
+"""The label that makes a sample; without it there is none."""
 
 
 def export_shards(
     root: str | Path, out: str | Path, *, shard_bytes: int = 512_000_000, seed: int = 0
 ) -> dict[str, list[int]]:
-    """Writes ``<out>/<split>-000000.tar`` …, each whole or not at all; returns the samples per shard of each split.
+    """Write ``<out>/<split>-000000.tar`` …, each completely or not at all; return the samples per shard of each split.
 
-    Labels are put in a random order (``seed``) over all sequences of a split, since shards are read in one go.
-    Raises AssetError (no labels, a damaged sequence), OutputError (shards are there already, disk full)."""
+    Labels are in a random order (``seed``) over all sequences of a split, since shards are read sequentially. Raises
+    AssetError (no labels, a damaged sequence), OutputError (existing shards, disk full)."""
     root, out = Path(root), Path(out)
     if out.is_dir() and any(out.glob("*-*.tar")):
         raise OutputError("holds shards", where=str(out), accepted="a new folder name")
@@ -84,7 +84,7 @@ def _write(out: Path, split: str, entries: Iterator[tuple[Path, int]], shard_byt
             with tarfile.open(path, "w", format=tarfile.USTAR_FORMAT) as shard:
                 while pending is not None and (counts[-1] == 0 or shard.offset < shard_bytes):
                     for name, data in sample(*pending):
-                        # Owner, mode and time stay at their defaults: the same bytes on every day.
+                        # Owner, mode and time keep their defaults: the bytes do not depend on the date.
                         member = tarfile.TarInfo(name)
                         member.size = len(data)
                         shard.addfile(member, io.BytesIO(data))
@@ -94,7 +94,7 @@ def _write(out: Path, split: str, entries: Iterator[tuple[Path, int]], shard_byt
 
 
 def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
-    """(member name, bytes) of the ``k``-th label of a sequence."""
+    """Yield (member name, bytes) of the ``k``-th label of a sequence."""
     manifest = read_manifest(folder)
     called = folder.name if "sensor" not in manifest else f"{folder.parent.name}-{folder.name}"
     key = f"{called}_{k:06d}"
@@ -135,7 +135,7 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
 
 
 def _camera(folder: Path, manifest: dict[str, Any], t_us: int) -> dict[str, Any]:
-    """Intrinsics, and the camera's pose at a label's time; nothing where a sequence has no poses."""
+    """Return intrinsics, and the camera's pose at a label's time; nothing where a sequence has no poses."""
     path = folder / "poses.npz"
     if "poses.npz" not in manifest["files"]:
         return {}
@@ -146,7 +146,7 @@ def _camera(folder: Path, manifest: dict[str, Any], t_us: int) -> dict[str, Any]
 
 
 def _last_image(folder: Path, manifest: dict[str, Any], t_us: int) -> tuple[int, ExposureLine] | None:
-    """Number and exposure of the frame camera's last image that was there at ``t_us``; None: there was none."""
+    """Return number and exposure of the frame camera's last image complete at ``t_us``; None: there was none."""
     if EXPOSURES not in manifest["files"]:
         return None
     there = [(k, line) for k, line in enumerate(read_exposures(folder)) if line.end_us <= t_us]

@@ -1,8 +1,8 @@
-"""Is a data set whole and right? Files against manifests, names and manifests against configurations, and a sample
-against itself made anew, bit by bit.
+"""Verification of a data set: files against manifests, names and manifests against configurations, and a sample of
+sequences generated again, bit by bit.
 
-A sequence's problems are lines of text; none means none found. What could not be looked at is counted and said: nothing
-is passed over in silence. Whatever stands in a record, looking at it ends, and ends with a line.
+A sequence's problems are lines of text; no lines mean no problem. What could not be checked is counted and reported.
+Any content of a record, valid or not, leads to a line.
 """
 
 from __future__ import annotations
@@ -46,23 +46,24 @@ from blinkgl.sequence_files.rig_dir import FILES as LENS_FILES
 from blinkgl.sequence_files.sequence_dir import MANIFEST, RIG, manifest_problems, read_manifest, verify_sequence
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What a configuration asks of a sequence's folder: its name, its manifest, its files.
+# What a configuration requires of a sequence's folder: its name, its manifest, its files.
 
 
 def said_of(config: SequenceConfig) -> list[tuple[str, Any]]:
-    """(key, value) that the manifest of any folder has."""
+    """Return (key, value) pairs of every folder's manifest."""
     return [("split", config.output.split), ("seed", config.seed), ("sequence", config.output.first_index)]
 
 
 def times_of(config: SequenceConfig) -> list[tuple[str, Any]]:
-    """(key, value) of its time."""
+    """Return (key, value) pairs of its time."""
     t0, t1 = config.time.t0_ns // 1000, config.time.t1_ns // 1000
     return [("t_offset_us", t0), ("duration_us", t1 - t0)]
 
 
 def bound(name: str, manifest: dict[str, Any], config: SequenceConfig, events: bool = True) -> list[str]:
-    """Do the folder's name, the manifest and the sequence's own configuration speak of the same
-    sequence, and is there what it asks for?   events : whether there are some."""
+    """Return where the folder's name, the manifest and the sequence's own configuration disagree, and missing or extra
+    files.
+    events : whether there are some."""
     said = [*said_of(config), ("emulator", config.events.emulator if events else None)]
     if config.frames is None:
         said += [
@@ -81,7 +82,7 @@ def bound(name: str, manifest: dict[str, Any], config: SequenceConfig, events: b
 
 
 def unlike(manifest: dict[str, Any], said: list[tuple[str, Any]]) -> list[str]:
-    """Where the manifest says another value than ``said``."""
+    """Return where the manifest differs from ``said``."""
     return [
         f"{MANIFEST}: {key} is {shown(manifest.get(key))}, config.yaml says {value}"
         for key, value in said
@@ -90,21 +91,21 @@ def unlike(manifest: dict[str, Any], said: list[tuple[str, Any]]) -> list[str]:
 
 
 def misnamed(name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
-    """Whether a folder is called otherwise than what it holds, with its split or without. "." may have any name."""
+    """Return whether a folder's name differs from its content, with its split or without. "." may have any name."""
     path = sequence_name(config.output, manifest["sequence"])
     wrong = name != "." and name != (path if "/" in name else path.split("/")[1])
     return [f"the folder is called {shown(name)}, but holds {path}"] if wrong else []
 
 
 def not_asked_for(wanted: set[str], manifest: dict[str, Any]) -> list[str]:
-    """Files that are missing or too many, five each."""
+    """Return missing and extra files, at most five each."""
     there = set(manifest["files"])
     missing = [f"{file}: missing, config.yaml asks for it" for file in sorted(wanted - there)[:5]]
     return missing + [f"{shown(file)}: config.yaml does not ask for it" for file in sorted(there - wanted)[:5]]
 
 
 def files_of_rig(config: SequenceConfig) -> Iterator[str]:
-    """Names of the files of a rig's sequence, its manifest left out."""
+    """Yield the names of the files of a rig's sequence, without its manifest."""
     yield from ("config.yaml", RIG)
     for _, name, own, gives_events in config.cameras():
         yield f"{name}/{MANIFEST}"
@@ -117,7 +118,7 @@ def files_of_rig(config: SequenceConfig) -> Iterator[str]:
 
 
 def _files_of(config: SequenceConfig, events: bool = True) -> Iterator[str]:
-    """Names of the files of a generated sequence, the manifest left out.   events : whether there are some."""
+    """Yield the names of the files of a generated sequence, without the manifest.   events : whether there are some."""
     yield from ("poses.npz", "config.yaml")
     if events:
         yield "events.h5"
@@ -142,24 +143,25 @@ def _files_of(config: SequenceConfig, events: bool = True) -> Iterator[str]:
 
 
 def distorts(config: SequenceConfig) -> bool:
-    """Whether a lens bends straight lines, so that its files are there."""
+    """Return whether a lens has distortion, so that its files exist."""
     return config.frames is None and config.camera.lens != "pinhole"
 
 
 def exposures_of(config: SequenceConfig) -> list[int]:
-    """When the frame camera's exposures begin, ns; of a configuration with ``images``."""
+    """Return the starts of the frame camera's exposures, ns; for a configuration with ``images``."""
     assert config.images is not None
     return exposure_starts(config.images, config.time.t0_ns, config.time.t1_ns, config.camera.height)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# One sequence's folder, or one rig's, by itself.
+# Checks of one sequence's folder, or one rig's.
 
 _REQUIRED = {"duration_us": int, "seed": int, "sequence": int, "split": str, "labels": int}
 
 
 def look(folder: Path, name: str) -> tuple[list[str], Known | None]:
-    """``name``: path below the data set, "." where the sequence is looked at alone and may be called anything."""
+    """Return the problems of a folder. ``name``: path below the data set, "." where the sequence is checked alone and
+    may have any name."""
     found: list[Known] = []
 
     def check() -> list[str]:
@@ -183,7 +185,7 @@ def look(folder: Path, name: str) -> tuple[list[str], Known | None]:
             problems = look_at_sensor(manifest, config)
         else:
             problems = bound(name, manifest, config)
-        # Last: what else is found says more than that something was edited.
+        # Last: other findings say more than that something was edited.
         problems = problems or manifest_problems(folder)
         if not problems:
             found.append(Known(folder, manifest, config))
@@ -193,7 +195,7 @@ def look(folder: Path, name: str) -> tuple[list[str], Known | None]:
 
 
 def look_at_rig(folder: Path, name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
-    """Problems of a rig's folder whose files are whole: of itself, and of each camera's in it."""
+    """Return the problems of a rig's folder whose files are complete: its own, and those of each camera's folder."""
     if config.sensors is None:
         return ["config.yaml: a single camera's, but the manifest is a rig's"]
     said = [("sensors", [one.name for one in config.sensors]), *said_of(config), *times_of(config)]
@@ -210,7 +212,7 @@ def look_at_rig(folder: Path, name: str, manifest: dict[str, Any], config: Seque
 
 
 def look_at_sensor(manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
-    """Problems of the folder of one camera of a rig, whose configuration is the rig's."""
+    """Return the problems of the folder of one camera of a rig, whose configuration is the rig's."""
     for _, name, own, gives_events in config.cameras():
         if name == manifest.get("sensor"):
             return bound(".", manifest, own, gives_events)
@@ -218,7 +220,7 @@ def look_at_sensor(manifest: dict[str, Any], config: SequenceConfig) -> list[str
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A sequence against itself made anew.
+# Comparison of a sequence with itself generated again.
 
 _SAME_ANYWHERE = (
     "split",
@@ -233,7 +235,7 @@ _SAME_ANYWHERE = (
     "objects",
     "source",
 )
-"""Of a manifest: what no renderer and no library has a say in."""
+"""Entries of a manifest that do not depend on the renderer and libraries."""
 
 
 def made_again(
@@ -243,7 +245,7 @@ def made_again(
     base: str | Path | None,
     progress: Callable[[int, str], None] | None,
 ) -> None:
-    """``chosen`` generated again, in one OpenGL context. What differs goes to ``result``.   base : folder that relative
+    """Generate ``chosen`` again, in one OpenGL context; differences go to ``result``.   base : folder that relative
     paths start from; None: the run's.   progress : called with a count and a name, or None."""
     gl: GLContext | None = None
     if base is None:
@@ -275,9 +277,10 @@ def made_again(
 
 
 def _compared(name: str, one: Known, made: Path, result: Verification) -> list[str]:
-    """The sequence against itself made again: bit by bit, or as far as two machines can agree."""
+    """Return the differences of the sequence from itself generated again: bit by bit, or as far as two machines can
+    agree."""
     lines = differences(one.folder, made)
-    if one.manifest["format_version"] == 1:  # theirs have no hash of themselves, which ours have
+    if one.manifest["format_version"] == 1:  # those have no hash of themselves
         lines = [line for line in lines if not line.endswith(f"{MANIFEST}: differs")]
     if not lines:
         return []
@@ -294,7 +297,7 @@ def _compared(name: str, one: Known, made: Path, result: Verification) -> list[s
 
 
 def _apart(one: dict[str, Any], other: dict[str, Any]) -> str:
-    """What may make the bytes of two machines differ; "" where nothing does."""
+    """Return what may make the bytes of two machines differ; "" where nothing does."""
     mine, here = ({"BlinkGL": manifest.get("blinkgl"), **made_with(manifest)} for manifest in (one, other))
     different = [k for k in mine.keys() | here.keys() if mine.get(k) != here.get(k)]
     return "; ".join(
@@ -303,7 +306,7 @@ def _apart(one: dict[str, Any], other: dict[str, Any]) -> str:
 
 
 def differences(a: Path, b: Path) -> list[str]:
-    """Files in which two folders differ, one line each."""
+    """Return files in which two folders differ, one line each."""
     names = [{p.relative_to(f).as_posix() for p in f.rglob("*") if p.is_file()} for f in (a, b)]
     lines = [f"{shown(name)}: only in one of them" for name in sorted(names[0] ^ names[1])]
     return lines + [
@@ -324,11 +327,11 @@ def verify_dataset(
     base: str | Path | None = None,
     progress: Callable[[int, str], None] | None = None,
 ) -> Verification:
-    """Every sequence below ``root``, and what lies between them.
+    """Check every sequence below ``root``, and the relations between them.
 
-    deep : so many sequences, drawn with ``seed``, are generated again and compared bit by bit.
-    base : folder that the recipe's relative paths start from; default: as the run's record says.
-    Raises AssetError when ``root`` holds no sequence at all."""
+    deep : this many sequences, drawn with ``seed``, are generated again and compared bit by bit.
+    base : folder that the recipe's relative paths start from; default: as recorded by the run.
+    Raises AssetError when ``root`` holds no sequence."""
     root = Path(root)
     if not root.is_dir():
         raise AssetError("no such data set", where=str(root), accepted="a folder of sequences")

@@ -43,8 +43,8 @@ from blinkgl.machine.posix import peak_kib
 
 Message = dict[str, Any]
 RUN_FOLDER = ".run"
-"""Below the data set: recipe, logs, costs. Readers of the data set skip hidden folders, and
-nothing in it is compared."""
+"""Below the data set: recipe, logs, costs. Readers of the data set skip hidden folders, and its content is not
+compared."""
 _NEWS_EVERY_S = 0.25
 
 
@@ -57,7 +57,7 @@ class Job:
     recipe: str
     num: int | None = None
     maker: ClassVar[str] = "blinkgl.dataset.work:Maker"
-    """Who makes its tasks, as "module:class": :func:`maker_of` finds it in a worker process."""
+    """The class that makes its tasks, as "module:class": :func:`maker_of` finds it in a worker process."""
 
     def plan(self) -> Plan:
         return Plan.of(RunTemplate(parse_yaml(self.recipe, "recipe"), Path(self.base)), self.num)
@@ -67,7 +67,7 @@ class Job:
 
 
 class Work(Protocol):
-    """What executors want of a job: where its logs go, its sequences, who makes them, itself as plain data."""
+    """The interface of jobs for executors: folder of logs, sequences, maker, plain data."""
 
     maker: ClassVar[str]
 
@@ -78,15 +78,16 @@ class Work(Protocol):
 
 
 def maker_of(name: str, job: Mapping[str, Any], device: int | None) -> Maker:
-    """The maker called ``name`` ("module:class", of a job's ``maker``) of a job in plain data."""
+    """Return the maker called ``name`` ("module:class", of a job's ``maker``) for a job in plain data."""
     module, _, kind = name.partition(":")
     return getattr(importlib.import_module(module), kind).of(job, device)
 
 
 def thread_environment(workers: int, cores: int, given: Mapping[str, str] = os.environ) -> dict[str, str]:
-    """Variables of each of ``workers`` processes on ``cores`` cores: cores are divided, not oversubscribed. What the
-    user has set stays. Software OpenGL draws in the calling thread (LP_NUM_THREADS=0) as soon as there are two workers
-    (two processes then draw 1.2-1.35 times as fast as one with two threads), or one on a single core."""
+    """Return variables of each of ``workers`` processes on ``cores`` cores: cores are divided, not oversubscribed.
+    Variables set by the user are kept. Software OpenGL draws in the calling thread (LP_NUM_THREADS=0) if there are two
+    workers or more (two processes then draw 1.2-1.35 times as fast as one with two threads), or one on a single
+    core."""
     share = max(1, cores // max(1, workers))
     wanted = {"NUMBA_NUM_THREADS": str(share), "OMP_NUM_THREADS": str(share), "OPENBLAS_NUM_THREADS": str(share)}
     if workers > 1 or cores == 1:
@@ -104,11 +105,11 @@ class Maker:
 
     @classmethod
     def of(cls, job: Mapping[str, Any], device: int | None) -> Maker:
-        """Of a job in plain data."""
+        """Return the maker of a job in plain data."""
         return cls(Job(**job), device)
 
     def open(self) -> Message:
-        """Looks at the assets, makes the OpenGL context, and says hello. Raises BlinkGLError."""
+        """Check the assets, make the OpenGL context, and return the hello. Raises BlinkGLError."""
         assets = self.plan.check_assets()
         rendered = [group.template.check() for group in self.plan.used]
         rendered = [config.gl for config in rendered if config.frames is None]
@@ -116,7 +117,9 @@ class Maker:
             # A process has one context, which sequences of all groups share.
             if any(gl != rendered[0] for gl in rendered):
                 raise ConfigError(
-                    "the groups ask for different OpenGL", where="gl", accepted="one gl section at the top level"
+                    "the groups need different OpenGL implementations",
+                    where="gl",
+                    accepted="one gl section at the top level",
                 )
             device = rendered[0].device if self.device is None else self.device
             self._context = partial(create_context, rendered[0].backend, device)
@@ -129,14 +132,14 @@ class Maker:
         }
 
     def renew(self) -> None:
-        """A new context in place of one that was lost. Raises GLError: the card gives none."""
+        """Replace a lost context by a new one. Raises GLError: the GPU gives none."""
         if self.gl is not None and self.gl.lost:
             self.gl.release()
             self.gl = self._context()
 
     def make(self, number: int, attempt: int, tell: Callable[[Message], None]) -> Message:
-        """The ``number``-th task of the plan. Returns "done" or "failed"; only
-        KeyboardInterrupt and SystemExit get out."""
+        """Make the ``number``-th task of the plan. Returns "done" or "failed"; only KeyboardInterrupt and SystemExit
+        are raised."""
         task = self.plan.tasks[number]
         log = SequenceLog(self.job.out, task.name)
         log.write(f"attempt {attempt}, pid {os.getpid()} on {platform.node()}")
@@ -144,7 +147,7 @@ class Maker:
 
         def progress(report: SequenceReport, fraction: float) -> None:
             nonlocal last
-            # Frames come by the hundred a second, and each message is a line of JSON through a pipe.
+            # There are hundreds of frames per second, and each message is a line of JSON through a pipe.
             if (now := time.monotonic()) - last > _NEWS_EVERY_S:
                 last = now
                 tell(
@@ -160,7 +163,7 @@ class Maker:
                 )
 
         try:
-            # A lost context fails the sequence that it was lost in; the next attempt begins with a new one.
+            # A lost context fails its sequence; the next attempt begins with a new one.
             self.renew()
             config = self.plan.config(task)
             with announced_compiling(lambda text: tell({"kind": "said", "task": number, "text": text})):
@@ -204,7 +207,7 @@ class Maker:
 
 
 def failed(number: int, error: Exception) -> Message:
-    """The "failed" of a task that ``error`` ended."""
+    """Return the "failed" of a task that ``error`` ended."""
     expected = isinstance(error, BlinkGLError)
     return {
         "kind": "failed",
@@ -217,12 +220,12 @@ def failed(number: int, error: Exception) -> Message:
 
 
 def report_of(message: Message) -> SequenceReport:
-    """The report in a "done" message."""
+    """Return the report in a "done" message."""
     return SequenceReport(**{**message["report"], "path": Path(message["report"]["path"])})
 
 
 def environment(gl: GLContext | None, libraries: Mapping[str, str] = MappingProxyType({})) -> dict[str, str]:
-    """Everything that has a say in the bytes: two machines that agree in it make the same sequences.
+    """Return everything that affects the bytes: two machines with the same values make the same sequences.
     libraries : versions of those that not every run uses."""
     import numba
     import numpy
@@ -241,19 +244,18 @@ def environment(gl: GLContext | None, libraries: Mapping[str, str] = MappingProx
 
 
 def environment_differences(one: dict[str, str], other: dict[str, str]) -> str:
-    """ "numpy 2.4 and 2.3; …", empty when they agree."""
+    """Return "numpy 2.4 and 2.3; …", empty when they are equal."""
     return "; ".join(f"{key} {one.get(key)} and {value}" for key, value in other.items() if one.get(key) != value)
 
 
 @lru_cache(maxsize=1)
 def _source_hash() -> str:
-    """12 hex digits of the code and shaders that are running: a version number says little about a checkout.
-    BLINKGL_BUILD says it instead where somebody else answers for that (the tag of a container image;
-    tests while the code is being worked on)."""
+    """Return 12 hex digits of the running code and shaders: a version number does not identify a checkout.
+    BLINKGL_BUILD replaces it (the tag of a container image; tests while the code is edited)."""
     if build := os.environ.get("BLINKGL_BUILD"):
         return build
-    # Rooms that no byte of a sequence depends on are left out, so that editing them does not end a run.
-    found, apart = hashlib.sha256(), {"configs", "tools", "report", "shader_debugger"}  # what makes no sequence
+    # Rooms that do not affect a sequence's bytes are left out, so that editing them does not end a run.
+    found, apart = hashlib.sha256(), {"configs", "tools", "report", "shader_debugger"}  # code that makes no sequence
     for package in ("blinkgl", "blinkgl.shaders"):
         root = resources.files(package)
         for path in sorted(Path(str(root)).rglob("*")):
@@ -263,7 +265,7 @@ def _source_hash() -> str:
 
 
 def _disk_is_full(error: BaseException) -> bool:
-    """Whether the next sequence would meet the same end: no space, no permission, a file system that went read-only."""
+    """Return whether the next sequence would fail in the same way: no space, no permission, a read-only file system."""
     while error is not None:
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES):
             return True
@@ -274,7 +276,7 @@ def _disk_is_full(error: BaseException) -> bool:
 
 
 class SequenceLog:
-    """``.run/logs/<split>/<sequence>.log``, appended to. A log that cannot be written stops nothing."""
+    """Appends to ``.run/logs/<split>/<sequence>.log``. A log that cannot be written stops nothing."""
 
     def __init__(self, out: str | Path, name: str):
         self.path = Path(out) / RUN_FOLDER / "logs" / f"{name}.log"

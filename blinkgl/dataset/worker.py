@@ -1,7 +1,7 @@
 """A worker process of the local executor: ``python -m blinkgl.dataset.worker FD``.
 
-The job, then task numbers, come as lines of JSON on standard input; messages (:mod:`blinkgl.dataset.work`) leave on FD
-the same way. When standard input ends, the driver is dead: whatever is being made is thrown away.
+The job, then task numbers, come as lines of JSON on standard input; messages (:mod:`blinkgl.dataset.work`) are sent on
+FD in the same form. When standard input ends, the driver is dead: the sequence in progress is discarded.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _GRACE_S = 20.0
 
 
 def main() -> int:
-    """Makes tasks until the driver's end of standard input closes; the exit status."""
+    """Make tasks until the driver closes standard input; return the exit status."""
     faulthandler.enable()
     try:
         with interruptible(signal.SIGTERM):
@@ -40,9 +40,9 @@ def _work() -> int:
         data = json.dumps(message).encode() + b"\n"
         try:
             with one_at_a_time:
-                while data:  # not a buffered file: a thread in the middle of one at exit is a fatal error of Python's
+                while data:  # not a buffered file: a thread that reads one at exit is a fatal error in Python
                     data = data[os.write(channel, data) :]
-        except OSError:  # nobody listens any more
+        except OSError:  # nobody reads any more
             raise KeyboardInterrupt from None
 
     from blinkgl.dataset.work import maker_of
@@ -66,8 +66,7 @@ def _listen(tasks: queue.Queue) -> None:
     for line in sys.stdin:
         tasks.put(json.loads(line))
     tasks.put(None)
-    # Idle workers leave by the None. One that is at work gets the signal; one that hangs must not outlive the driver
-    # either.
+    # Idle workers end at the None. A busy one gets the signal; one that hangs must not outlive the driver either.
     os.kill(os.getpid(), signal.SIGTERM)
     threading.Event().wait(_GRACE_S)
     os._exit(1)

@@ -1,8 +1,8 @@
-"""Event emulators. They know nothing of scenes or OpenGL.
+"""Event emulators, independent of scenes and OpenGL.
 
 In:    frames (linear luminance, float32) and times (int64 ns).
 Out:   :class:`~blinkgl.types.events.Events`, columnar, in order of time.
-Start: esim.py, the simplest; emulator.py is the contract, table.py names them all.
+Start: esim.py, the simplest; emulator.py is the interface, table.py lists all emulators.
 """
 
 from __future__ import annotations

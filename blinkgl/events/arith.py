@@ -1,10 +1,10 @@
 """Logarithm, exponential, sine and cosine from IEEE additions, multiplications and bit fields only.
 
-The library's own rather than NumPy's or libm's for two reasons. They vectorise inside fused numba loops (numba
-without SVML calls a scalar ``log`` per pixel), and they give the same bits on every machine, in numba and in
-NumPy alike, so that a seed means the same events everywhere. The same source serves both: scalars when compiled
-into a kernel, arrays when called from Python (:func:`numba.extending.register_jitable`). fastmath stays off in
-every caller, because contraction or re-association would change the last bit.
+They replace NumPy's or libm's for two reasons. They vectorise inside fused numba loops (numba without SVML calls a
+scalar ``log`` per pixel), and they give the same bits on every machine, in numba and in NumPy, so that a seed gives the
+same events everywhere. The same source serves both: scalars when compiled into a kernel, arrays when called from Python
+(:func:`numba.extending.register_jitable`). fastmath is off in every caller, because contraction or re-association would
+change the last bit.
 
 Coefficients are Chebyshev fits made with mpmath on the reduced intervals; the tests compare with mpmath/NumPy.
 """
@@ -18,7 +18,7 @@ _F, _I, _D, _L = np.float32, np.int32, np.float64, np.int64
 
 
 def select(condition: bool, a: float, b: float) -> float:
-    """``a`` where the condition holds, else ``b``; a conditional move inside a kernel."""
+    """Return ``a`` where the condition holds, else ``b``; a conditional move inside a kernel."""
     return np.where(condition, a, b)
 
 
@@ -32,7 +32,7 @@ Q = 25
 """Fraction bits of fixed-point log intensity: resolution 2^-25 = 3.0e-8, range +-64."""
 Q_ONE = 1 << Q
 LOG_MAX_INPUT = float(2.0**30)
-"""Largest intensity :func:`log_q25` takes (and 2^-30 the smallest): a log, a threshold and their difference fit."""
+"""Largest intensity of :func:`log_q25` (and 2^-30 the smallest): a log, a threshold and their difference fit."""
 # ln 2 and 1 in units of 2^-25.
 _Q_LN2 = _I(round(np.log(2.0) * Q_ONE))
 _Q_SCALE = _F(Q_ONE)
@@ -57,7 +57,7 @@ _A0, _A1, _A2, _A3, _A4, _A5, _A6, _A7, _A8 = (
 
 @register_jitable
 def _log1p_reduced(f):
-    """log(1 + f) for f in [sqrt(1/2) - 1, sqrt(2) - 1], float32, absolute error < 5e-8."""
+    """Return log(1 + f) for f in [sqrt(1/2) - 1, sqrt(2) - 1], float32, absolute error < 5e-8."""
     # Horner: log(1 + f) = f + f^2 p(f), so that small f keep all their digits.
     p = f * _A8 + _A7
     p = p * f + _A6
@@ -72,14 +72,14 @@ def _log1p_reduced(f):
 
 @register_jitable
 def log_q25(v: float) -> float:
-    """ln(v) as int32 in units of 2^-25; v float32 in [2^-30, 2^30]. Absolute error < 1.3e-7.
+    """Return ln(v) as int32 in units of 2^-25; v float32 in [2^-30, 2^30]. Absolute error < 1.3e-7.
 
-    Fixed point because sums of thresholds are then exact: a brightness that returns to its old value returns
-    to its old level, a reference never drifts, and ties are decided by numbers rather than by rounding. In
-    float32 the same four bytes would resolve 5e-7 at ln v = -6.
+    Fixed point makes sums of thresholds exact: a brightness that returns to its old value returns to its old level, a
+    reference never drifts, and ties do not depend on rounding. In float32 the same four bytes would resolve 5e-7 at ln
+    v = -6.
     """
-    # sqrt(1/2) taken off the bits, the exponent field changes at sqrt(1/2) 2^n instead of at 2^n: the reduced interval
-    # lies round 1.
+    # sqrt(1/2) is subtracted from the bits, so that the exponent field changes at sqrt(1/2) 2^n instead of at 2^n: the
+    # reduced interval is around 1.
     bits = _F(v).view(np.int32)
     # v = m 2^exponent with m in [sqrt(1/2), sqrt(2)).
     exponent = _I(_I(bits - _SQRT_HALF_BITS) >> _EXP23)
@@ -92,7 +92,7 @@ _LN2_32 = _F(np.log(2.0))
 
 @register_jitable
 def log_f32(v: float) -> float:
-    """ln(v), float32 to float32, v normal and positive. Error < 1.3e-7 + 1.5 ulp of the result."""
+    """Return ln(v), float32 to float32, v normal and positive. Error < 1.3e-7 + 1.5 ulp of the result."""
     # The same split as in log_q25: v = m 2^exponent, f = m - 1.
     bits = _F(v).view(np.int32)
     exponent = _I(_I(bits - _SQRT_HALF_BITS) >> _EXP23)
@@ -124,7 +124,7 @@ _EXP_MIN_32, _BIAS_32 = _F(-87.0), _I(127)
 
 @register_jitable
 def exp_f32(v: float) -> float:
-    """exp(v) for float32 v <= 80, relative error < 2e-7; below -87 it stays at exp(-87) = 1.6e-38."""
+    """Return exp(v) for float32 v <= 80, relative error < 2e-7; below -87 it is exp(-87) = 1.6e-38."""
     v = np.maximum(v, _EXP_MIN_32)
     # e^v = 2^n e^r with |r| <= ln(2)/2. n ln 2 in two parts (Cody and Waite): the first has so few bits that n times it
     # is exact.
@@ -161,7 +161,7 @@ _B0, _B1, _B2, _B3, _B4, _B5, _B6 = (
 
 @register_jitable
 def log_f64(v: float) -> float:
-    """ln(v), float64, v normal and positive; error < 4e-16 (1 + |ln v|)."""
+    """Return ln(v), float64, v normal and positive; error < 4e-16 (1 + |ln v|)."""
     bits = _D(v).view(np.int64)
     exponent = _L(_L(bits - _SQRT_HALF_BITS_64) >> _EXP52)
     m = _L(bits - _L(exponent << _EXP52)).view(np.float64)
@@ -208,7 +208,7 @@ _X0, _X1, _X2, _X3, _X4, _X5, _X6, _X7, _X8, _X9, _X10, _X11, _X12 = (
 
 @register_jitable
 def _exp_reduced(r):
-    """exp(r) for |r| <= 1/2, float64."""
+    """Return exp(r) for |r| <= 1/2, float64."""
     # Estrin's scheme: a chain of four multiplications instead of twelve.
     r2 = r * r
     r4 = r2 * r2
@@ -220,7 +220,7 @@ def _exp_reduced(r):
 
 @register_jitable
 def exp_f64(v: float) -> float:
-    """exp(v) for float64 v <= 700, relative error < 5e-16; below -700 it stays at exp(-700) ~ 1e-304."""
+    """Return exp(v) for float64 v <= 700, relative error < 5e-16; below -700 it is exp(-700) ~ 1e-304."""
     v = np.maximum(v, _EXP_MIN_64)
     n = (v * _LOG2E_64 + _ROUND_64) - _ROUND_64
     r = (v - n * _LN2_HI_64) - n * _LN2_LO_64
@@ -233,10 +233,10 @@ _FALL_MIN_64 = _D(-600.0)
 
 @register_jitable
 def fall_f64(x: float) -> float:
-    """e^-x for float64 x >= 0; without the range reduction where x <= 1/2, and without a branch. Beyond 600 it stays at
-    e^-600 = 1e-261, so that what is multiplied with it does not become subnormal, which not every card computes."""
+    """Return e^-x for float64 x >= 0; without the range reduction where x <= 1/2, and without a branch. Beyond 600 it
+    is e^-600 = 1e-261, so that products do not become subnormal, which not every GPU supports."""
     v = np.maximum(-x, _FALL_MIN_64)
-    # The sum's low bits are the exponent: the constant's own leave with the shift.
+    # The low bits of the sum are the exponent; the shift removes those of the constant.
     t = select(x <= _HALF, _ROUND_64, v * _LOG2E_64 + _ROUND_64)
     n = t - _ROUND_64
     p = _exp_reduced((v - n * _LN2_HI_64) - n * _LN2_LO_64)
@@ -275,7 +275,7 @@ _D4, _L1, _L2, _L3 = _D(4.0), _L(1), _L(2), _L(3)
 
 @register_jitable
 def cos_sin_turn(u: float) -> tuple[float, float]:
-    """(cos 2 pi u, sin 2 pi u) for u in [0, 1], float64, absolute error < 4e-16."""
+    """Return (cos 2 pi u, sin 2 pi u) for u in [0, 1], float64, absolute error < 4e-16."""
     turns = u * _D4
     nearest = (turns + _ROUND_64) - _ROUND_64
     # f: quarter turns from the nearest one, in [-1/2, 1/2].
@@ -295,7 +295,7 @@ def cos_sin_turn(u: float) -> tuple[float, float]:
     c = c * z + _C2
     c = c * z + _C1
     c = c * z + _C0
-    # In odd quadrants sine and cosine of the rest change places.
+    # In odd quadrants sine and cosine of the rest are exchanged.
     odd = _D(quadrant & _L1)  # blends rather than branches: exact, since odd is 0 or 1
     # The cosine is negative in quadrants 1 and 2, the sine in 2 and 3.
     cos_sign = _D1 - _D2 * _D(((quadrant + _L1) & _L2) >> _L1)

@@ -1,7 +1,7 @@
-"""An event camera, emulator and what is behind it together, and the one loop that frames go through it in.
+"""An event camera: an emulator with its read-out, and the one loop that passes frames through it.
 
-Whoever turns frames into events does it here: a generated sequence, converted frames, a video, a reference, a
-benchmark. So what stands between an emulator and the outside, the read-out, is never left out by one of them.
+Generated sequences, converted frames, videos, references and benchmarks all use this loop, so none of them can leave
+out the read-out.
 """
 
 from __future__ import annotations
@@ -25,28 +25,28 @@ from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import OPTIONAL, Events
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The read-out bus: what becomes of events when a sensor makes more than it can send.
+# The read-out bus: what happens to events when a sensor makes more than it can send.
 #
-# One bus, first come first served. An event that finds ``queue_events`` others waiting is lost; the others are
-# stamped when they leave the bus, ``1 / events_per_second`` (and ``row_ns`` more where the row changes or the bus
-# was idle) after the one before. Below the limit events are late by less than a microsecond; above it time stamps
-# lag by up to ``queue_events / events_per_second`` and the output rate is the bus's. Events of one microsecond are
-# served in raster order, as a row arbiter would, so in overload the upper rows of that microsecond come first.
+# One bus, first come first served. An event that finds ``queue_events`` others waiting is lost. The others are stamped
+# when they leave the bus, ``1 / events_per_second`` after the one before (plus ``row_ns`` where the row changes or the
+# bus was idle). Below the limit events are late by less than a microsecond; above it time stamps lag by up to
+# ``queue_events / events_per_second`` and the output rate is the bus's. Events of one microsecond are served in raster
+# order, as by a row arbiter, so in overload the upper rows of that microsecond come first.
 #
-# Behind it stands the clock: a time stamp is the last tick of ``clock_us`` that has passed.
+# After the bus comes the clock: a time stamp is the last tick of ``clock_us`` that has passed.
 #
-# An event exists for the outside when it has left the bus. A recording that ends at time T therefore ends with the
-# last event that left by T; those still on the bus then are no part of it, and are counted (``late``).
+# An event is output when it leaves the bus. A recording that ends at time T therefore ends with the last event that
+# left by T; events still on the bus are not part of it and are counted (``late``).
 
-# Time on the bus is counted in ps, so that the rounding of 1 / events_per_second does not add up; from the first event
-# on, because a clock that counts from 1970 leaves no room for them in 64 bits.
+# Time on the bus is counted in ps, so that the rounding of 1 / events_per_second does not accumulate. It starts at the
+# first event, because ps since 1970 do not fit 64 bits.
 _PS_PER_US = 1_000_000
 _NO_EVENT_YET = -(2**62)
 
 
 @kernel(error_model="numpy")
 def _serve(t_us, y, event_ps, row_ps, waiting, state, keep, out_us):
-    """``waiting``: ring of the times (ps) at which the last accepted events left.
+    """Serve events. ``waiting``: ring of the times (ps) at which the last accepted events left.
     ``state``: accepted, bus free (ps), row."""
     kept, size = 0, waiting.size
     accepted, free_ps, row = state[0], state[1], state[2]
@@ -74,8 +74,8 @@ def _serve(t_us, y, event_ps, row_ps, waiting, state, keep, out_us):
 class Readout:
     """Events of an emulator, in order, chunk by chunk -> the events the sensor sends.
 
-    ``dropped`` counts the events that found the queue full; ``late`` those that had not left
-    the bus by the end of the last step.
+    ``dropped`` counts the events that found the queue full; ``late`` those that had not left the bus by the end of the
+    last step.
     """
 
     def __init__(self, config: ReadoutConfig):
@@ -85,18 +85,18 @@ class Readout:
         self._event_ps = 0 if rate is None else max(1, round(1e12 / rate))
         self._row_ps = round(config.row_ns * 1000)
         self._waiting = np.zeros(config.queue_events, np.int64)
-        # Events accepted; time from which the bus is free (always has been); its row (none); µs of the first event.
+        # Events accepted; time from which the bus is free (always); its row (none); µs of the first event.
         self._state = np.array([0, -(2**62), -1, _NO_EVENT_YET], np.int64)
         self._on_bus = Events.empty()
 
     @property
     def late(self) -> int:
-        """Accepted events that no step has given out yet."""
+        """Return the number of accepted events that no step has returned yet."""
         return len(self._on_bus)
 
     def step(self, events: Events, until_us: int | None = None) -> Events:
-        """The events that leave the bus until ``until_us`` (that microsecond included), stamped when they do and in
-        order from step to step; later ones wait for the next step. None: all of them, however late.
+        """Return the events that leave the bus until ``until_us`` (that microsecond included), stamped when they leave
+        and in order from step to step; later ones wait for the next step. None: all of them, however late.
 
         ``until_us`` : the time up to which the emulator has given its events, int µs.
         Raises EventDataError 100 days after the first event, which picoseconds in int64 cannot hold."""
@@ -121,7 +121,7 @@ class Readout:
         # 2^43 us are 8.8e18 ps, just below 2^63.
         if int(events.t[-1]) - origin_us > 2**43:
             raise EventDataError(
-                "the read-out counts from the first event",
+                "the time since the first event is too long",
                 value=f"{(int(events.t[-1]) - origin_us) / 8.64e10:.4g} days",
                 accepted="at most 100 days",
             )
@@ -145,7 +145,7 @@ class Readout:
         known = {"waiting", "state", "dropped", *(f"on_bus_{k}" for k in columns)}
         mine = {"waiting": self._waiting, "state": self._state}
         if set(state) != known or any(state[name].shape != array.shape for name, array in mine.items()):
-            raise EventDataError("saved state is of another read-out", value=sorted(state))
+            raise EventDataError("the saved state belongs to another read-out", value=sorted(state))
         self._waiting[...], self._state[...], self.dropped = state["waiting"], state["state"], int(state["dropped"][0])
         self._on_bus = Events(**{k: state[f"on_bus_{k}"].copy() for k in columns})
 
@@ -154,13 +154,11 @@ _NOTHING = nullcontext()
 
 
 class EventFrame(NamedTuple):
-    """What an emulator is given of one moment; valid until the next one is asked for, so
-    that a source may reuse its arrays.
+    """Input of an emulator at one time; valid until the next one is requested, so that a source may reuse its arrays.
 
-    luminance : (H, W) float32, linear, or uint8 codes; or a tensor on the camera's
-    :attr:`~EventCamera.tensor_device`.
-    rows : (y0, y1): outside these rows the frame is the one before; None: it may differ anywhere.
-    As of ``Emulator.step``. surfaces : what the pixels show, of a camera that says what made its events."""
+    luminance : (H, W) float32, linear, or uint8 codes; or a tensor on the camera's :attr:`~EventCamera.tensor_device`.
+    rows : (y0, y1): outside these rows the frame equals the one before; None: it may differ anywhere. See
+    ``Emulator.step``. surfaces : the surfaces seen by the pixels, for a camera that records the truth of its events."""
 
     t_ns: int
     luminance: Any
@@ -169,14 +167,15 @@ class EventFrame(NamedTuple):
 
 
 class EventCamera:
-    """``events:`` and ``readout:`` of a configuration: frames in, the events that leave the sensor out.
+    """The ``events:`` and ``readout:`` sections of a configuration: takes frames, returns the events that leave the
+    sensor.
 
-    Light goes through the jumps that a frame camera's resets make into the emulator, its events through the pixels'
-    defects and the bus with its clock, as far as the configuration has them.
-    readout : None: none of it.   seed : of the draws.
+    The light, changed by the jumps of a frame camera's resets, goes into the emulator; its events go through the
+    pixels' defects, the bus and its clock, as far as the configuration has them.
+    readout : None: none of these.   seed : of the draws.
     emulator : the :class:`Emulator` itself.
-    truth : says what made each event, of frames that come with their ``surfaces``; None: nobody asks.
-    make : of the emulator: that on the processor, or on the device that is asked for (``tensors/choice.py``).
+    truth : finds the surface of each event, for frames with ``surfaces``; None: not requested.
+    make : makes the emulator, on the CPU or on the requested device (``tensors/choice.py``).
     Raises EventDataError: a size out of range."""
 
     def __init__(
@@ -192,7 +191,7 @@ class EventCamera:
         self._truth = truth
         self.emulator = make(config, height, width, seed)
         self.frames = 0
-        """Taken so far."""
+        """Frames taken so far."""
         self._pixels, self._readout, self._resets = None, None, None
         if readout is not None:
             if readout.frame_resets is not None:
@@ -204,32 +203,32 @@ class EventCamera:
 
     @property
     def tells(self) -> bool:
-        """Whether events say what made them, so that frames have to come with their ``surfaces``."""
+        """Return whether the surface of each event is recorded, so that frames must have ``surfaces``."""
         return self._truth is not None
 
     @property
     def tensor_device(self) -> Any:
-        """The torch device of which it takes frames as tensors; None: arrays alone, because the emulator does or
-        because something else of the camera looks at them."""
+        """Return the torch device of which it takes frames as tensors; None: only arrays, because the emulator or
+        another part of the camera needs them."""
         return self.emulator.tensor_device if self._truth is None and self._resets is None else None
 
     @property
     def saturated(self) -> int:
-        """Events cut by the emulator's ``max_events_per_step`` so far."""
+        """Return the events cut by the emulator's ``max_events_per_step`` so far."""
         return self.emulator.saturated
 
     @property
     def dropped(self) -> int:
-        """Events that found the read-out's queue full, so far."""
+        """Return the events that found the read-out's queue full so far."""
         return 0 if self._readout is None else self._readout.dropped
 
     @property
     def late(self) -> int:
-        """Events under way to the outside, on the bus."""
+        """Return the number of events that wait on the bus."""
         return 0 if self._readout is None else self._readout.late
 
     def step(self, frame: EventFrame) -> Events:
-        """The events that are out by the frame's time and were not before. Raises EventDataError as ``Emulator.step``;
+        """Return the new events that leave by the frame's time. Raises EventDataError as ``Emulator.step``; its
         ``t_ns`` is then the frame's."""
         self.frames += 1
         try:
@@ -243,12 +242,12 @@ class EventCamera:
         until_us = frame.t_ns // 1000
         if self._pixels is not None:
             events = self._pixels.step(events, until_us)
-        if self._truth is not None:  # what is behind the pixels carries it along, whenever it lets an event go
+        if self._truth is not None:  # the later stages keep the truth with its event
             events = replace(events, truth=self._truth.of(events, frame.t_ns))
         return events if self._readout is None else self._readout.step(events, until_us)
 
     def _emulated(self, frame: EventFrame) -> Events:
-        """The emulator's events, of what else its pixels are shown before the frame, too."""
+        """Return the emulator's events, also those of frames inserted before this one."""
         if self._resets is None:
             return self.emulator.step(frame.luminance, frame.t_ns, frame.rows)
         shown = self._resets.shown(frame.t_ns, self.emulator.decoded(frame.luminance))
@@ -261,9 +260,9 @@ def emulate(
     camera: EventCamera,
     clock: Callable[[str], AbstractContextManager] = lambda _: _NOTHING,
 ) -> Iterator[tuple[int, Events]]:
-    """(t_ns, events) frame by frame: all events before t_ns's microsecond that have not been given before.
+    """Yield (t_ns, events) frame by frame: all new events before t_ns's microsecond.
 
-    The loop asks for a frame, takes its events and gives them away before it asks for the next.
+    The loop requests a frame and yields its events before it requests the next.
     clock : ``clock("events")`` is entered around the camera's work."""
     for frame in frames:
         with clock("events"):

@@ -1,4 +1,4 @@
-"""What every emulator shares: checking frames and times, threads, scratch memory, saving and restoring."""
+"""Shared code of all emulators: checking frames and times, threads, scratch memory, saving and restoring."""
 
 from __future__ import annotations
 
@@ -17,55 +17,55 @@ from blinkgl.events.threads import run, thread_count
 from blinkgl.types.events import Events
 
 BLOCK = 1024
-"""Pixels a kernel takes in one go: everything about them stays in the first cache levels. Threads get whole blocks."""
+"""Pixels that a kernel processes at once: their data fits the first cache levels. Threads get whole blocks."""
 SHARE_BLOCKS = 64
-"""A thread's least share: 65,536 pixels, 100 µs and more. Waking a thread takes 20 to 50 µs."""
+"""Smallest share of a thread: 65,536 pixels, 100 µs and more. Waking a thread takes 20 to 50 µs."""
 BANDS_PER_THREAD = 4
-"""A thread that wakes late, or is held up by another program, leaves bands to the others."""
+"""A thread that wakes late, or is delayed by another program, leaves bands to the others."""
 INTENSITY_LIMIT_BITS = np.uint32(np.float32(LOG_MAX_INPUT).view(np.uint32))
 """Bit pattern of the largest accepted intensity. Read as unsigned integers, negative numbers, infinities and NaN
 are all larger, so one running maximum per frame checks everything at once."""
 MAX_SIDE = 2**16
 NEVER_NS = -(2**62)
 NO_FRAME, NO_CODES = np.empty(0, np.float32), np.empty(0, np.uint8)
-"""Stand for the kind of frame that was not given."""
+"""Used for the kind of frame that was not given."""
 
 
 def _flat(array: np.ndarray) -> np.ndarray:
-    """(H*W,) in C order. Kernels write into no frame, but numba compiles another one for arrays that must not be
-    written, such as a renderer's views: those whose memory may be are handed on as such."""
+    """Return (H*W,) in C order. Kernels do not write to frames, but numba compiles a separate kernel for read-only
+    arrays, such as a renderer's views; so arrays whose memory is writable are passed on as writable."""
     flat = np.ascontiguousarray(array).reshape(-1)
     if not flat.flags.writeable:
-        with contextlib.suppress(ValueError):  # memory that really is read-only
+        with contextlib.suppress(ValueError):  # the memory is really read-only
             flat.flags.writeable = True
     return flat
 
 
 class Emulator(ABC):
-    """Frames in, events out.
+    """Base of the emulators: takes frames, returns events.
 
     ``step(luminance, t_ns)`` takes one frame: float32 (H, W), linear, finite, >= 0, at most 2^30; or uint8 (H, W),
     looked up in the table of :meth:`set_decode`. The first call sets the reference and returns no events; call k
     returns the events of the interval (t_{k-1}, t_k]. Times are int64 ns, strictly increasing, at most 17 minutes
-    apart. Event times are floored to the microsecond and never decrease, within a step or from step to step; an
-    event at the very end of an interval belongs to it and is stamped with its end, so in half-open windows
-    [t0, t1) it is the first of the next window.
+    apart. Event times are floored to the microsecond and never decrease, within a step or from step to step; an event
+    at the very end of an interval belongs to it and is stamped with its end, so in half-open windows [t0, t1) it is the
+    first of the next window.
 
-    The events depend on the configuration, the seed and the frames, and on nothing else: not on the number of
-    threads (``numba.set_num_threads``), not on saving and restoring between steps.
+    The events depend only on the configuration, the seed and the frames: not on the number of threads
+    (``numba.set_num_threads``), not on saving and restoring between steps.
 
-    Raises :class:`EventDataError` for a frame that is none of the above, naming its number and value; the state is
-    then untouched and the next good frame goes on.
+    Raises :class:`EventDataError` for any other frame, naming its number and value; the state is then unchanged, and
+    the next valid frame continues.
     """
 
     config: Any
-    """The configuration it was made with, of its own ``Config``."""
+    """The configuration, of its class's ``Config``."""
     Config: ClassVar[type[EmulatorConfig]]
-    """Its configuration: name, keys, and what a sensor sets."""
+    """The configuration class: name, keys, and values from a sensor."""
     device: ClassVar[str] = "cpu"
-    """Where events are made: "cpu" or "cuda"."""
+    """Where events are computed: "cpu" or "cuda"."""
     tensor_device: Any = None
-    """The torch device of which ``step`` takes frames as tensors, too; None: it takes arrays alone."""
+    """The torch device of which ``step`` takes frames as tensors, too; None: only arrays."""
     _still_pixels_sleep = False
     """Whether a pixel whose luminance does not change has no events and no changing state."""
     _state: tuple[str, ...] = ()
@@ -74,13 +74,13 @@ class Emulator(ABC):
     @classmethod
     @abstractmethod
     def response(cls, config: EmulatorConfig) -> Response:
-        """How luminance becomes the signal that timelines watch, and how far that moves from event to event."""
+        """Return how luminance becomes the signal that timelines watch, and the signal's change per event."""
 
     @classmethod
     @abstractmethod
     def noiseless(cls, config: EmulatorConfig) -> EmulatorConfig:
-        """What is left of it when noise and bandwidth are taken away: of this or another
-        emulator, whose events `trade` judges by."""
+        """Return the configuration without noise and bandwidth limit, of this or another emulator; `trade` compares its
+        events."""
 
     def __init__(self, height: int, width: int, seed: int):
         if not (1 <= height < MAX_SIDE and 1 <= width < MAX_SIDE and height * width < 2**31):
@@ -101,8 +101,8 @@ class Emulator(ABC):
 
     # -- input ----------------------------------------------------------------------------------------------
     def set_decode(self, table: np.ndarray) -> None:
-        """Linear luminance of each uint8 value, (256,) float32; the default is k / 255. An sRGB video wants the
-        sRGB curve here: 8-bit input then costs a table look-up and no conversion."""
+        """Set the linear luminance of each uint8 value, (256,) float32; the default is k / 255. For sRGB video pass the
+        sRGB curve: 8-bit input then costs a table lookup and no conversion."""
         table = np.ascontiguousarray(table, np.float32)
         if table.shape != (256,) or not (
             np.isfinite(table).all() and table.min() >= 0 and table.max() <= LOG_MAX_INPUT
@@ -112,39 +112,39 @@ class Emulator(ABC):
         self._tables_changed()
 
     def decoded(self, frame: np.ndarray) -> np.ndarray:
-        """(H, W) float32 linear luminance of a frame as ``step`` takes it."""
+        """Return the (H, W) float32 linear luminance of a frame as ``step`` takes it."""
         return self._decode[frame] if frame.dtype == np.uint8 else frame
 
     def _tables_changed(self) -> None:  # noqa: B027 - most emulators keep nothing that depends on the tables
         pass
 
     def memory_s(self, luminance: np.ndarray) -> np.ndarray | None:
-        """(H, W) how long a pixel's signal goes on following a change of light that is over, s, of linear luminance
-        (H, W); None: not at all. Whoever says what made an event asks."""
+        """Return (H, W), how long a pixel's signal follows a change of light after it is over, s, for linear luminance
+        (H, W); None: not at all. Used to find the surface of an event."""
         return None
 
     def push(self, luminance: np.ndarray, jump: float, rise_s: float) -> np.ndarray | None:
-        """(H, W) float32 by what ln I has to be higher for ``rise_s`` so that the signal ends higher by ``jump``, of
-        linear luminance (H, W); None: the signal follows at once. Whoever makes a jump behind the photoreceptor asks
+        """Return (H, W) float32, by how much ln I must be higher for ``rise_s`` so that the signal ends higher by
+        ``jump``, for linear luminance (H, W); None: the signal follows at once. Used for jumps behind the photoreceptor
         (:mod:`~blinkgl.events.resets`)."""
         return None
 
     @property
     def causes(self) -> bool:
-        """Whether events say what caused them, ``config.causes``."""
+        """Return whether events record their causes, ``config.causes``."""
         return bool(getattr(self.config, "causes", False))
 
     def step(self, luminance: np.ndarray, t_ns: int, rows: tuple[int, int] | None = None) -> Events:
-        """Events since the last frame; see the class.
+        """Return the events since the last frame; see the class.
 
-        rows : the caller's word that rows outside [y0, y1) are the same as in the frame before (None: any may differ).
-        Emulators whose still pixels do nothing skip those rows and do not look at them, neither for events nor for
-        values that cannot be used; the events are the same."""
+        rows : the caller's promise that rows outside [y0, y1) equal those of the frame before (None: any may differ).
+        Emulators whose still pixels do nothing skip those rows, without checking their values; the events are the
+        same."""
         frame = self._checked_frame(luminance)
         t_ns = self._checked_time(t_ns)
         if self.t_ns is None and self.causes and self.height > MAX_CAUSE_ROWS:
             raise EventDataError(
-                "causes are for sensors of fewer rows",
+                "the sensor has too many rows for causes",
                 where="events.causes",
                 value=self.height,
                 accepted=f"at most {MAX_CAUSE_ROWS} rows, or events without causes",
@@ -199,15 +199,16 @@ class Emulator(ABC):
         return t_ns
 
     def _check_intensity(self, frame: np.ndarray) -> None:
-        """Before anything changes. One pass over bit patterns; the slow look only where that finds something."""
+        """Check a frame before anything changes: one pass over bit patterns, and a slow search only where that finds
+        something."""
         first, stop = self._changed
         if frame.dtype == np.uint8 or first >= stop or frame[first:stop].view(np.uint32).max() <= INTENSITY_LIMIT_BITS:
             return
         self._refuse_intensity(frame)
 
     def _refuse_intensity(self, frame: np.ndarray) -> None:
-        """Raises EventDataError that names the first pixel that cannot be used, if there is one."""
-        bad = np.flatnonzero(~((frame >= 0) & (frame <= LOG_MAX_INPUT)))  # -0.0 is not bad
+        """Raise EventDataError that names the first invalid pixel, if there is one."""
+        bad = np.flatnonzero(~((frame >= 0) & (frame <= LOG_MAX_INPUT)))  # -0.0 is valid
         if bad.size:
             y, x = divmod(int(bad[0]), self.width)
             error = EventDataError(
@@ -227,14 +228,14 @@ class Emulator(ABC):
 
     # -- running the kernels --------------------------------------------------------------------------------
     def _run(self, kernel, arguments: tuple, base_us: int, span_us: int) -> Events:
-        """Run a band kernel over all blocks, on up to
-        :func:`~blinkgl.events.threads.thread_count` threads, and sort what it emits.
+        """Run a band kernel over all blocks, on up to :func:`~blinkgl.events.threads.thread_count` threads, and sort
+        its events.
 
         ``kernel(taken, start, edges, progress, share, packed, *arguments)`` takes bands of whole blocks, [edges[b],
-        edges[b + 1]), by :func:`~blinkgl.events.threads.take_part` until there are none. In band b it goes on from
-        block ``progress[b, 0]`` with ``progress[b, 1]`` events in ``packed[b]`` and stops early when that might not
-        hold the next block; it then goes on from there in a larger buffer. ``share`` is the
-        number of events a block may emit.
+        edges[b + 1]), by :func:`~blinkgl.events.threads.take_part` until there are none. In band b it continues from
+        block ``progress[b, 0]`` with ``progress[b, 1]`` events in ``packed[b]``, and stops early when that might not
+        hold the next block; it then continues from there in a larger buffer. ``share`` is the number of events a block
+        may emit.
         """
         first, stop = self._changed if self._still_pixels_sleep else (0, self.height * self.width)
         first_block, stop_block = first // BLOCK, -(-stop // BLOCK)
@@ -252,20 +253,20 @@ class Emulator(ABC):
             run(kernel, bands, (edges, progress, share, packed, *arguments), threads)
             if (progress[:, 0] >= edges[1:]).all():
                 break
-            # No block emits more than its share or, at one event each, its pixels; so this ends, and is bounded.
+            # A block emits at most its share, or one event per pixel; so this loop ends, and memory is bounded.
             self._buffer.grow(bands, 2 * packed.shape[1] + 8 * BLOCK, progress[:, 1])
         self.saturated += int(progress[:, 2].sum())
         return self._buffer.to_events(progress[:, 1].copy(), base_us, span_us, threads, self.causes)
 
     # -- state ----------------------------------------------------------------------------------------------
     def state_dict(self) -> dict[str, np.ndarray]:
-        """Everything the future depends on besides configuration and seed, as plain arrays (copies)."""
+        """Return all state besides configuration and seed, as plain arrays (copies)."""
         state = {name: np.array(getattr(self, name)) for name in self._state if getattr(self, name) is not None}
         clock = [self.t_ns is not None, self.t_ns or 0, self.frames, self.saturated]
         return {"clock": np.array(clock, np.int64), "shape": np.array([self.height, self.width]), **state}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore :meth:`state_dict`'s result into an emulator built with the same size, config and seed."""
+        """Restore the result of :meth:`state_dict` in an emulator with the same size, config and seed."""
         wanted = {name for name in self._state if getattr(self, name) is not None} | {"clock", "shape"}
         if set(state) != wanted or tuple(state["shape"]) != (self.height, self.width):
             raise EventDataError(

@@ -1,18 +1,18 @@
 """ESIM: events where log intensity passes levels one contrast threshold apart.
 
-Rebecq, Gehrig, Scaramuzza, "ESIM: an Open Event Camera Simulator", CoRL 2018, section 3. With L = ln(I + eps) and
-the last level passed L_ref, a pixel fires ON at every L_ref + j C+ and OFF at every L_ref - j C- that L reaches in
-the interval (t_prev, t], at the time where the straight line from L_prev to L meets the level, floored to the
-microsecond. A level passed in the refractory period is lost (L_ref moves all the same).
+Rebecq, Gehrig, Scaramuzza, "ESIM: an Open Event Camera Simulator", CoRL 2018, section 3. With L = ln(I + eps) and the
+last level passed L_ref, a pixel fires ON at every L_ref + j C+ and OFF at every L_ref - j C- that L reaches in the
+interval (t_prev, t], at the time where the straight line from L_prev to L meets the level, floored to the microsecond.
+A level passed in the refractory period is lost (L_ref moves all the same).
 
 C+ and C- belong to the pixel and are drawn once; with jitter each *event* draws the next ones, once. (Thresholds
-redrawn at every frame lose events, the more the higher the frame rate.) Everything is integer arithmetic: logs in
-2^-25 steps, times in ns, so references neither drift nor stick, however slow the ramp, and a brightness that
+redrawn at every frame would lose events, more of them at a higher frame rate.) Everything is integer arithmetic: logs
+in units of 2^-25, times in ns. So references neither drift nor stick, however slow the ramp, and a brightness that
 returns exactly passes exactly the same levels.
 
-How it is fast: the logarithm and the comparison with both levels are branch-free loops over blocks that stay in
-the first-level cache; the pixels that fire are then picked out of the block's flags, eight at a time, without branches
-on the data. ``blinkgl.tensors`` makes the same events with other means.
+For speed, the logarithm and the comparison with both levels are branch-free loops over blocks that fit the first-level
+cache; the pixels that fire are then extracted from the block's flags, eight at a time, without branches on the data.
+``blinkgl.tensors`` makes the same events by another implementation.
 """
 
 from __future__ import annotations
@@ -50,14 +50,14 @@ class Levels(NamedTuple):
     log: np.ndarray  # int32, 2^-25 ln units: log intensity of the frame before
     upper: np.ndarray  # int32: the next ON level
     lower: np.ndarray  # int32: the next OFF level
-    on: np.ndarray  # int32 thresholds, constant; [] when all are alike
+    on: np.ndarray  # int32 thresholds, constant; [] when all are equal
     off: np.ndarray
     fired: np.ndarray  # int32 number of levels passed, for the jitter's draws
     last_ns: np.ndarray  # int64 time of the last event, for the refractory period
 
 
 class Interval(NamedTuple):
-    """What is the same for all pixels of a step; thresholds in 2^-25 ln units."""
+    """Values of a step that are the same for all pixels; thresholds in 2^-25 ln units."""
 
     t0_ns: int
     dt_ns: int
@@ -77,7 +77,7 @@ class Interval(NamedTuple):
 
 @kernel(error_model="numpy")
 def log_block(intensity: np.ndarray, eps: float, out: np.ndarray) -> None:
-    """ln(intensity + eps) into ``out``, int32, 2^-25."""
+    """Write ln(intensity + eps) to ``out``, int32, 2^-25."""
     # No branch and no call of libm in the loop, so that LLVM vectorises it.
     for i in range(intensity.size):
         out[i] = log_q25(np.float32(intensity[i] + eps))
@@ -97,7 +97,7 @@ def _flag_block(level, upper, lower, flags):
 
 @register_jitable
 def crossing_ns(part: float, whole: float, dt_ns: int) -> int:
-    """floor(part / whole * dt_ns) for 0 <= part <= whole < 2^31, exactly, for any dt_ns < 2^52."""
+    """Return floor(part / whole * dt_ns) for 0 <= part <= whole < 2^31, exactly, for any dt_ns < 2^52."""
     # Both factors are below 2^31, so the product fits int64.
     if dt_ns < _LONG_NS:
         return np.int64(np.uint64(part * dt_ns) // np.uint64(whole))
@@ -159,8 +159,8 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin):
                 else:
                     cut += 1
             if p.fired.size:
-                # The next thresholds, drawn once per level and numbered by the levels passed: how the path was cut into
-                # frames has no part in it.
+                # The next thresholds, drawn once per level and numbered by the levels passed, so that they do not
+                # depend on the frame times.
                 p.fired[i] += 1
                 a, b = normal2(v.seed, np.uint64(i), _JITTER, np.uint64(p.fired[i]))
                 up = max(v.floor_on, step_on + np.int64(np.floor(v.jitter * a + 0.5)))
@@ -202,8 +202,7 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
             cap = min(np.int64(farthest * v.inverse_threshold) + 2, v.bound_per_pixel)
             if count * cap > share:
                 cap = max(1, share // count)
-            # No room for the worst case; nothing of this block has been touched: the caller makes room and comes
-            # back to it.
+            # No room for the worst case; nothing of this block has been changed: the caller makes room and repeats it.
             if filled + count * cap > packed.size:
                 return block, filled, cut
             filled, cut_here = _emit_block(active, count, s, now, p, v, cap, packed, filled)
@@ -228,19 +227,18 @@ def _bands(taken, start, edges, progress, share, packed, frame, codes, table, p,
 
 
 def to_q25(value: float | np.ndarray) -> np.ndarray:
-    """Log intensity in ln units as fixed point (int64)."""
+    """Return log intensity in ln units as fixed point (int64)."""
     return np.floor(np.asarray(value, np.float64) * Q_ONE + 0.5).astype(np.int64)
 
 
 def draw_thresholds(
     height: int, width: int, on: float, off: float, sigma: float, seed: np.uint64
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Per-pixel (C+, C-), float64 (H*W,): normal around the nominal values, kept >= 0.01 and <= 10.
+    """Draw per-pixel (C+, C-), float64 (H*W,): normal around the nominal values, kept >= 0.01 and <= 10.
 
     For nominal thresholds under 0.02 the floor is half the nominal one.
     """
-    # Draw 0 of the stream, one pair of normals per pixel: thresholds are fixed for the life of the
-    # sensor.
+    # Draw 0 of the stream, one pair of normals per pixel: thresholds never change.
     spread = lambda pixels: normal2(seed, pixels, np.uint64(Stream.THRESHOLD), np.uint64(0))
     a, b = in_blocks(spread, pixel_counters(height, width))
     clip = lambda c, n: np.clip(c + sigma * n, min(MIN_THRESHOLD, c / 2), 10.0)
@@ -249,8 +247,8 @@ def draw_thresholds(
 
 @register
 class Esim(Emulator):
-    """See the module and :class:`~blinkgl.events.emulator.Emulator`. State: 12 bytes per pixel; spread thresholds
-    (constant) and the refractory period add 8 each, jitter 4."""
+    """The ESIM emulator, see the module and :class:`~blinkgl.events.emulator.Emulator`. State: 12 bytes per pixel;
+    spread thresholds (constant) and the refractory period add 8 each, jitter 4."""
 
     Config = EsimConfig
     _still_pixels_sleep = True
@@ -273,8 +271,7 @@ class Esim(Emulator):
         self.config = config = config or EsimConfig()
         pixels = self.height * self.width
         on, off = config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold
-        # Thresholds become fixed point here. One pair of integers serves all pixels unless they are
-        # spread.
+        # Thresholds become fixed point here. Without spread one pair of integers serves all pixels.
         self._on_all, self._off_all = int(to_q25(on)), int(to_q25(off))
         self._on = self._off = np.empty(0, np.int32)
         smallest = min(self._on_all, self._off_all)
@@ -285,8 +282,7 @@ class Esim(Emulator):
             )
             smallest = int(min(self._on.min(), self._off.min()))
         self._floor_on, self._floor_off = (int(to_q25(min(MIN_THRESHOLD, c / 2))) for c in (on, off))
-        # With jitter every event may draw the floor, so the worst case of events per unit of change is
-        # that of the floor.
+        # With jitter every event may draw the smallest threshold, which gives the largest number of events.
         if config.threshold_jitter:
             smallest = min(self._floor_on, self._floor_off)
         self._inverse_threshold = 1.0 / smallest
@@ -309,8 +305,7 @@ class Esim(Emulator):
         up, down = (self._on, self._off) if self._on.size else (self._on_all, self._off_all)
         if self._fired.size:
             jitter = self.config.threshold_jitter * Q_ONE
-            # Draw 0 is the pair of thresholds in force at the first frame. _emit_block counts on from
-            # 1.
+            # Draw 0 is the pair of thresholds at the first frame. _emit_block counts from 1.
             spread = lambda pixels: normal2(self.seed, pixels, _JITTER, np.uint64(0))
             a, b = in_blocks(spread, pixel_counters(self.height, self.width))
             up = np.maximum(self._floor_on, up + np.floor(jitter * a + 0.5).astype(np.int64))

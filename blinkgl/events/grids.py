@@ -1,4 +1,4 @@
-"""Events as a signed voxel grid, and those of some pixels: what streams of one sensor are compared by."""
+"""Signed voxel grids of events, and events of selected pixels, to compare streams of one sensor."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from blinkgl.types.events import Events
 
 
 def voxel_grid(events: Events, t0_us: int, t1_us: int, height: int, width: int, bins: int) -> np.ndarray:
-    """(bins, H, W) float32: polarities (+1, -1), each shared between the two bins beside
-    (bins - 1) (t - t0) / (t1 - t0); events outside [t0, t1] count as nothing."""
+    """Return (bins, H, W) float32: polarities (+1, -1), each divided between the two bins next to
+    (bins - 1) (t - t0) / (t1 - t0); events outside [t0, t1] are ignored."""
     grid = np.zeros((bins, height, width), np.float32)
     _vote(events.x, events.y, events.t, events.p, np.int64(t0_us), np.int64(t1_us), grid)
     return grid
@@ -34,6 +34,6 @@ def _vote(x, y, t, p, t0, t1, grid):
 
 
 def masked(events: Events, mask: np.ndarray) -> Events:
-    """The events of the pixels where ``mask`` (H, W) is True."""
+    """Return the events of the pixels where ``mask`` (H, W) is True."""
     keep = mask[events.y, events.x]
     return events.part(keep)

@@ -1,21 +1,21 @@
-"""How large photoreceptor noise has to be for a wanted rate of noise events, at any frame spacing.
+"""The size of photoreceptor noise that gives a wanted rate of noise events at any frame spacing.
 
-The noise before the comparator is white noise through the photoreceptor's low-pass: seen at the frames, a first-order
+The noise before the comparator is white noise through the photoreceptor's low-pass. At the frames it is a first-order
 autoregression with coefficient e^-k, k time constants per frame. Sampling hides crossings, so with a fixed size the
-event rate would fall with the frame rate; instead the size is chosen per k.
+event rate would fall with the frame rate; therefore the size is chosen per k.
 
 The table holds ln(events per time constant) for sizes s (standard deviation in thresholds) and k. Levels are one
-threshold apart and an event puts the reference on the level that was passed, so a pixel is on a ladder of levels, and a
-ladder with a rung at the noise's mean is the quietest. Thresholds for ON and OFF that differ, as they do in every pixel
-once they are spread, move the ladder a little with every pair of events: a pixel is on a ladder for the longer, the
-quieter it is, and its rate in the end is the harmonic mean over where the ladder may stand. That is the rate of the
-table, and pixels start on ladders as they are found then (:func:`start_places`). It was solved for as the stationary
-state of Markov chains, without throwing dice (by ``tools/noise_rates.py`` of 348eebef).
+threshold apart and an event sets the reference to the level that was passed, so a pixel is on a ladder of levels. A
+ladder with a rung at the noise's mean has the lowest rate. Thresholds that differ for ON and OFF, as in every pixel
+with spread, move the ladder a little with every pair of events. A pixel stays longer on a ladder with a lower rate, so
+its long-term rate is the harmonic mean over the positions of the ladder. That is the rate of the table, and pixels
+start on ladders with the same distribution (:func:`start_places`). The table was computed as the stationary state of
+Markov chains, without random numbers (by ``tools/noise_rates.py`` of 348eebef).
 
-With a dead time the reference is taken anew wherever the noise is at its end, and pixels leave their ladder. A dead
-time shorter than a frame lets them find the loud ones, where noise goes to and fro over one level (three times the
-events, and more where they are rare); one of several frames puts the reference near the noise's mean and hides what
-follows an event (a third). A second table has the factor.
+With a dead time the reference is taken again at the noise's value at its end, and pixels leave their ladder. A dead
+time shorter than a frame moves them to ladders with a high rate, where noise crosses one level in both directions
+(three times the events, and more where they are rare). One of several frames puts the reference near the noise's mean
+and hides the events after an event (a third). A second table has the factor.
 """
 
 from __future__ import annotations
@@ -144,23 +144,23 @@ _DEAD = np.array(
 # fmt: on
 """ln of the factor by which a dead time of so many frames changes the rate: [dead time][k][size]."""
 IN_SECONDS = 0.5
-"""Part of a factor above 1 (of its logarithm) that a clip of seconds sees: pixels leave the ladders that they begin on
-by events, and those of the quiet ones are rare. Chosen on clips of 2 s at 5 Hz; the best of 0, 1/4, 1/2 and 1 on other
-clips, too, where thresholds are spread, not where they are equal."""
+"""Part of a factor above 1 (of its logarithm) that appears in a clip of seconds: pixels leave their first ladder by
+events, which are rare on quiet ladders. Chosen on clips of 2 s at 5 Hz; it is the best of 0, 1/4, 1/2 and 1 on other
+clips, too, with spread thresholds, not with equal ones."""
 
 
-# ln rate is nearly linear in 1/s^2: that is what sizes are interpolated in.
+# ln rate is nearly linear in 1/s^2, so sizes are interpolated in that.
 _DEAD_Q = 1 / DEAD_SIZES**2
-# A matrix that takes a row over DEAD_SIZES to one over RATE_SIZES.
+# A matrix from a row over DEAD_SIZES to one over RATE_SIZES.
 _TO_SIZES = np.array([np.interp(1 / RATE_SIZES**2, _DEAD_Q[::-1], row[::-1]) for row in np.eye(len(DEAD_SIZES))])
-# Below the smallest size on in a straight line, of 1 / s^2.
+# Below the smallest size: a straight line in 1 / s^2.
 _BEYOND = np.maximum(1 / RATE_SIZES**2 - _DEAD_Q[0], 0.0) / (_DEAD_Q[0] - _DEAD_Q[1])
 _TO_SIZES[0] += _BEYOND
 _TO_SIZES[1] -= _BEYOND
 
 
-# Sampling pushes the levels away by a length in proportion to the root of k (Chernoff 1965), so that the rate is smooth
-# in that root: down to k = 0 its last two rows go on in a straight line.
+# Sampling shifts the levels by a length proportional to the root of k (Chernoff 1965), so the rate is smooth in that
+# root: down to k = 0 the last two rows continue as a straight line.
 _ROOTS = np.sqrt(RATE_K)
 _SLOPE = (_LOG_RATE[1] - _LOG_RATE[0]) / (_ROOTS[1] - _ROOTS[0])
 _OVER_K = PchipInterpolator(
@@ -169,16 +169,16 @@ _OVER_K = PchipInterpolator(
 
 
 def noise_rate(size: float, k: float) -> float:
-    """Events per time constant, without a dead time: the table between its entries. size : in thresholds."""
+    """Return events per time constant, without a dead time, interpolated from the table. size : in thresholds."""
     # Beyond the last k samples are independent, and the rate per time constant falls as 1/k.
     row, q = _OVER_K(np.sqrt(min(k, RATE_K[-1]))), 1 / RATE_SIZES**2
     return float(np.exp(np.interp(1 / size**2, q[::-1], row[::-1]))) / max(k / RATE_K[-1], 1.0)
 
 
 def noise_size(k: np.ndarray | float, events_per_time_constant: np.ndarray, dead_frames: float = 0.0) -> np.ndarray:
-    """Standard deviation of the noise, in thresholds, elementwise; at most 2.5.
+    """Return the standard deviation of the noise, in thresholds, elementwise; at most 2.5.
 
-    k : time constants per frame. Beyond 10 the samples are independent and the rate per *frame* is what counts.
+    k : time constants per frame. Beyond 10 the samples are independent and the rate per *frame* counts.
     dead_frames : the dead time after an event.
     """
     k, rate = np.broadcast_arrays(np.asarray(k, float), np.asarray(events_per_time_constant, float))
@@ -200,12 +200,12 @@ def noise_size(k: np.ndarray | float, events_per_time_constant: np.ndarray, dead
 def _dead_time_factors(k: np.ndarray, dead_frames: float) -> np.ndarray:
     """Return ln of the factor by which a dead time changes the rate of each of RATE_SIZES, k.shape + (15,)."""
     by_k = np.empty((len(DEAD_K), len(DEAD_SIZES)))
-    # Factors above 1 only act in part within seconds, see IN_SECONDS.
+    # Factors above 1 apply only partly within seconds, see IN_SECONDS.
     table = np.where(_DEAD > 0, IN_SECONDS * _DEAD, _DEAD)
     # Without a dead time the logarithm of the factor is 0.
     for i, j in np.ndindex(by_k.shape):
         by_k[i, j] = np.interp(np.log1p(dead_frames), np.log1p([0, *DEAD_FRAMES]), [0, *table[:, i, j]])
-    # Linear in ln k between the rows, and held at the ends.
+    # Linear in ln k between the rows, constant beyond the ends.
     places = np.interp(np.log(np.maximum(k, 1e-300)), np.log(DEAD_K), np.arange(len(DEAD_K)))
     below = np.minimum(places.astype(int), len(DEAD_K) - 2)
     part = (places - below)[..., None]
@@ -213,13 +213,13 @@ def _dead_time_factors(k: np.ndarray, dead_frames: float) -> np.ndarray:
 
 
 def noise_table(rate_hz: float, dt_s: float, threshold: float, dead_s: float = 0.0) -> np.ndarray:
-    """(TABLE_SIZE,) float32 noise sizes in ln units over ln k, for frames ``dt_s`` apart and a dead time."""
+    """Return (TABLE_SIZE,) float32 noise sizes in ln units over ln k, for frames ``dt_s`` apart and a dead time."""
     k = np.exp(TABLE_LOW + TABLE_STEP * np.arange(TABLE_SIZE))
     return (threshold * noise_size(k, rate_hz * dt_s / k, dead_s / dt_s)).astype(np.float32)
 
 
 def start_sizes(rate_hz: float, corner_hz: np.ndarray, threshold: float) -> np.ndarray:
-    """Noise sizes in ln units for pixels with these corner frequencies, whatever the frame spacing will be."""
+    """Return noise sizes in ln units for pixels with these corner frequencies, independent of the frame spacing."""
     corners = _some_corners(corner_hz)
     # k = 0: frames so dense that only the corner frequency counts.
     sizes = noise_size(0.0, rate_hz / (2 * np.pi * corners))
@@ -227,9 +227,10 @@ def start_sizes(rate_hz: float, corner_hz: np.ndarray, threshold: float) -> np.n
 
 
 def start_places(rate_hz: float, corner_hz: np.ndarray, uniform: np.ndarray) -> np.ndarray:
-    """The rung next to the noise's mean, in thresholds from it, -1/2 to 1/2, of pixels after a long time.
+    """Return the distance of the noise's mean to the next rung, in thresholds, -1/2 to 1/2, of pixels after a long
+    time.
 
-    The time on a ladder is in inverse proportion to its rate, which grows from 0 to 1/2 as e^{span h}, h nearly the
+    The time on a ladder is inversely proportional to its rate, which grows from 0 to 1/2 as e^{span h}, h nearly the
     same for all sizes: that of the way back to a rung, 1 - (1 - place)^2. uniform : (N,) in (0, 1)."""
     corners = _some_corners(corner_hz)
     # Each pixel takes the nearest of the corner frequencies, in the logarithm.

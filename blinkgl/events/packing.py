@@ -1,11 +1,11 @@
 """Packed events: one int64 each, sorted by time, unpacked into columns.
 
-Layout: ``(t_us - base_us) << 33 | y << 17 | x << 1 | p``. Kernels emit pixel by pixel in raster order, and the
-sort is a stable radix sort on the time alone, so events of one microsecond come out in raster order, those of one
-pixel in the order they fired: no tie depends on how the frame was cut into bands for the threads. Moving one
-8-byte word per event is several times cheaper than moving four columns.
+Layout: ``(t_us - base_us) << 33 | y << 17 | x << 1 | p``. Kernels emit pixel by pixel in raster order, and the sort is
+a stable radix sort by time only, so events of one microsecond are in raster order and those of one pixel in firing
+order: the order does not depend on how the frame was divided among threads. Moving one 8-byte word per event is several
+times cheaper than moving four columns.
 
-Causes, where they are asked for, take the two uppermost bits of y: a sensor then has at most 2^14 rows.
+Causes, if requested, use the two upper bits of y: a sensor then has at most 2^14 rows.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ MAX_INTERVAL_NS = (2**30 - 1) * 1000
 # Times of up to 14 bits (16 ms) take one pass with 16384 counters.
 _SINGLE_PASS_BITS, _DIGIT_BITS = 14, 11
 _EVENTS_PER_THREAD, _PARTS_PER_THREAD = 2**15, 2
-"""Fewer events than that are sorted in the time another thread takes to wake up."""
+"""Smaller numbers of events are sorted in the time that another thread needs to wake up."""
 
 
 @register_jitable
 def cause_of(light: float, leak: float, noise: float) -> int:
-    """The :class:`~blinkgl.types.events.Cause` of a crossing: the largest part, all in its direction."""
+    """Return the :class:`~blinkgl.types.events.Cause` of a crossing: that of the largest part."""
     # Parts are of the change in the event's own direction, so the largest one caused it.
     if light >= leak and light >= noise:
         return _SIGNAL
@@ -90,7 +90,7 @@ def _unpack_causes(packed, start, stop, y, cause):
         causes[i] = np.uint8((word[i] >> CAUSE_SHIFT) & 3)
 
 
-# The three below work through parts of the events, each taken by the next thread that is free.
+# The three kernels below process parts of the events; each part is taken by the next free thread.
 
 
 @kernel(error_model="numpy")
@@ -126,7 +126,7 @@ def _unpack_parts(taken, start, packed, edges, base_us, x, y, t, p, cause):
 
 
 class PackedBuffer:
-    """Scratch memory for one emulator's packed events; grows to the largest step seen, never with the clip."""
+    """Scratch memory for one emulator's packed events; it grows to the largest step, not with the clip."""
 
     def __init__(self) -> None:
         self._rows = np.empty((0, 0), np.int64)
@@ -134,13 +134,13 @@ class PackedBuffer:
         self._histogram = np.empty(0, np.int64)
 
     def rows(self, bands: int, capacity: int) -> np.ndarray:
-        """(bands, >= capacity) int64, one row per band to emit into; keeps its size between steps."""
+        """Return (bands, >= capacity) int64, one row per band to emit into; its size is kept between steps."""
         if self._rows.shape[0] != bands or self._rows.shape[1] < capacity:
             self._rows = np.empty((bands, max(capacity, self._rows.size // bands, 1)), np.int64)
         return self._rows
 
     def grow(self, bands: int, capacity: int, filled: np.ndarray) -> None:
-        """More room per row, keeping the first ``filled[b]`` events of each."""
+        """Enlarge the rows, keeping the first ``filled[b]`` events of each."""
         old, self._rows = self._rows, np.empty((bands, capacity), np.int64)
         for band in range(bands):
             self._rows[band, : filled[band]] = old[band, : filled[band]]
@@ -148,11 +148,11 @@ class PackedBuffer:
     def to_events(
         self, counts: np.ndarray, base_us: int, span_us: int, threads: int = 1, causes: bool = False
     ) -> Events:
-        """The events of ``rows[b, : counts[b]]``, sorted.
+        """Return the events of ``rows[b, : counts[b]]``, sorted.
 
         counts : (B,) int64, events per row, rows in raster order.
-        base_us, span_us : time of offset 0, and the largest offset that can occur.
-        threads : at most so many; few events are sorted by the calling one alone.
+        base_us, span_us : time of offset 0, and the largest possible offset.
+        threads : largest number; a few events are sorted by the calling one alone.
         causes : whether the words hold them.
         """
         total = int(counts.sum())
@@ -165,8 +165,7 @@ class PackedBuffer:
         # the first-level cache.
         bits = max(1, int(span_us).bit_length())
         digit_bits = bits if bits <= _SINGLE_PASS_BITS else _DIGIT_BITS
-        # A pass reads one buffer and writes the other; one pass needs one. A quarter more, so that the
-        # next step fits.
+        # A pass reads one buffer and writes the other. A quarter more, so that the next step fits.
         if self._sorted.shape[1] < total:
             self._sorted = np.empty((2 if bits > digit_bits else 1, total + total // 4), np.int64)
         if len(self._sorted) < 2 and bits > digit_bits:
@@ -193,9 +192,9 @@ class PackedBuffer:
 def unpacked(
     packed: np.ndarray, base_us: int, causes: bool = False, edges: np.ndarray | None = None, threads: int = 1
 ) -> Events:
-    """The events of (N,) int64 words that are in their order.
+    """Return the events of (N,) sorted int64 words.
 
-    edges : (parts + 1,) int64, what each thread takes; None: one takes all.   causes : whether the words hold them."""
+    edges : (parts + 1,) int64, the part of each thread; None: one takes all.   causes : whether the words hold them."""
     total = len(packed)
     edges = np.array([0, total]) if edges is None else edges
     x, y = np.empty(total, np.uint16), np.empty(total, np.uint16)
@@ -222,21 +221,21 @@ def _even_split(counts: np.ndarray, parts: int) -> np.ndarray:
 
 @kernel(error_model="numpy")
 def copy_block(source: np.ndarray, target: np.ndarray) -> None:
-    """``target[:] = source``."""
+    """Set ``target[:] = source``."""
     for i in range(source.size):
         target[i] = source[i]
 
 
 @kernel(error_model="numpy")
 def scale_block(frame: np.ndarray, scale: float, out: np.ndarray) -> None:
-    """``out[:] = frame * scale``."""
+    """Set ``out[:] = frame * scale``."""
     for i in range(frame.size):
         out[i] = frame[i] * scale
 
 
 @kernel(error_model="numpy")
 def lookup_block(codes: np.ndarray, table: np.ndarray, out: np.ndarray) -> None:
-    """``out[:] = table[codes]``."""
+    """Set ``out[:] = table[codes]``."""
     for i in range(codes.size):
         out[i] = table[codes[i]]
 
@@ -253,10 +252,10 @@ _BIT_COUNTS = np.array([_mask.bit_count() for _mask in range(256)], np.int64)
 
 @kernel(error_model="numpy")
 def compact_flags(flags: np.ndarray, scratch: np.ndarray, first_pixel: int, out: np.ndarray) -> int:
-    """Numbers ``first_pixel + i`` of the set flags into ``out``; returns how many.
+    """Write the numbers ``first_pixel + i`` of the set flags to ``out``; return how many.
 
     flags : (n,) uint8 of 0 and 1, n a multiple of 8. scratch : (n / 8,) int64. out : int32 with room for 8 more than
-    are set. Eight flags are one word, squeezed to a byte by a multiplication and looked up: which pixels fire is
+    are set. Eight flags are one word, reduced to a byte by a multiplication and looked up: firing pixels are
     unpredictable, so a branch per pixel would cost several times more.
     """
     words = flags.view(np.uint64)

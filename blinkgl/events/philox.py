@@ -1,12 +1,11 @@
 """Counter-based random numbers: every draw is a pure function of (seed, pixel, stream, index).
 
-Philox4x32-10 (Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011). There is no
-state to share, so results do not depend on the number of threads, the chunk length, or which pixels were busy.
-The counter is (pixel, stream, index low, index high), the key the 64-bit seed. One block is 128 bits: two
-uniforms, or two normals.
+Philox4x32-10 (Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011). There is no shared
+state, so results do not depend on the number of threads, the chunk length, or which pixels were busy. The counter is
+(pixel, stream, index low, index high), the key the 64-bit seed. One block is 128 bits: two uniforms, or two normals.
 
-Called from Python with arrays (uint64) the functions are the NumPy twin; compiled into a kernel they work on
-scalars (see :mod:`blinkgl.events.arith`).
+Called from Python with arrays (uint64) the functions run in NumPy; compiled into a kernel they work on scalars (see
+:mod:`blinkgl.events.arith`).
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ _HALF, _ULP53, _MINUS2 = _D(0.5), _D(2.0**-53), _D(-2.0)
 
 
 class Stream(IntEnum):
-    """What a draw is for. Append only: the numbers are part of every published data set."""
+    """The purposes of draws. Append only: the numbers are part of every published data set."""
 
     THRESHOLD = 0  # (ON, OFF) spread of the thresholds, frozen per pixel
     JITTER = 1  # (ON, OFF) threshold jitter, index = the pixel's event count
@@ -56,7 +55,7 @@ def _round(c0, c1, c2, c3, k0, k1):
 
 @register_jitable(inline="always")
 def philox4x32(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> tuple[int, int, int, int]:
-    """Four 32-bit words (held in uint64) of the block at counter (c0, c1, c2, c3) under key (k0, k1)."""
+    """Return four 32-bit words (held in uint64) of the block at counter (c0, c1, c2, c3) under key (k0, k1)."""
     # Ten rounds, the key bumped between them by the golden ratio and sqrt(3) - 1.
     for _ in range(9):
         c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
@@ -66,15 +65,16 @@ def philox4x32(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> tuple[in
 
 @register_jitable(inline="always")
 def uniform2(seed: int, pixel: int, stream: int, index: int) -> tuple[float, float]:
-    """Two independent uniforms in the open interval (0, 1), 53 bits each. All arguments uint64 (or arrays of it)."""
+    """Return two independent uniforms in the open interval (0, 1), 53 bits each. All arguments uint64 (or arrays of
+    it)."""
     w0, w1, w2, w3 = philox4x32(pixel & _MASK32, stream, index & _MASK32, index >> _S32, seed & _MASK32, seed >> _S32)
-    # The upper 53 of 64 bits, and a half: neither 0 nor 1 comes out.
+    # The upper 53 of 64 bits, and a half: 0 and 1 cannot occur.
     return (_D(((w1 << _S32) | w0) >> _S11) + _HALF) * _ULP53, (_D(((w3 << _S32) | w2) >> _S11) + _HALF) * _ULP53
 
 
 @register_jitable
 def normal2(seed: int, pixel: int, stream: int, index: int) -> tuple[float, float]:
-    """Two independent standard normals (Box-Muller), float64."""
+    """Return two independent standard normals (Box-Muller), float64."""
     u, v = uniform2(seed, pixel, stream, index)
     # Box and Muller: radius sqrt(-2 ln u), angle 2 pi v. u is never 0.
     radius = np.sqrt(_MINUS2 * log_f64(u))
@@ -88,16 +88,17 @@ _THREE_ROOT, _TWO, _ULP32 = _D(np.sqrt(3.0)), _D(2.0), _D(2.0**-32)
 
 @register_jitable(inline="always")
 def rough_normal(seed: int, pixel: int, stream: int, index: int) -> float:
-    """Mean 0, variance 1, near normal (sum of four uniforms, within +-3.5): a third of the cost of a normal, for
-    jitters whose exact law nobody has measured."""
+    """Return a nearly normal value of mean 0 and variance 1 (sum of four uniforms, within +-3.5) at a third of the cost
+    of a normal, for jitters whose exact law has not been measured."""
     w0, w1, w2, w3 = philox4x32(pixel & _MASK32, stream, index & _MASK32, index >> _S32, seed & _MASK32, seed >> _S32)
-    # Four uniforms of variance 1/12; their mean, 2 - 2^-31, is taken off, and sqrt(3) makes the variance 1.
+    # Four uniforms of variance 1/12; their mean, 2 - 2^-31, is subtracted, and sqrt(3) makes the variance 1.
     return (_D(w0 + w1 + w2 + w3) * _ULP32 + (_TWO * _ULP32 - _TWO)) * _THREE_ROOT
 
 
 @register_jitable
 def normal2_and_uniform(seed: int, pixel: int, stream: int, index: int) -> tuple[float, float, float]:
-    """Two independent standard normals (angle of 32 bits) and an independent uniform (32 bits) from one block."""
+    """Return two independent standard normals (angle of 32 bits) and an independent uniform (32 bits) from one
+    block."""
     w0, w1, w2, w3 = philox4x32(pixel & _MASK32, stream, index & _MASK32, index >> _S32, seed & _MASK32, seed >> _S32)
     # Words 0 and 1 give the 53 bits of the radius, word 2 the angle, word 3 the spare uniform.
     u = (_D(((w1 << _S32) | w0) >> _S11) + _HALF) * _ULP53
@@ -107,17 +108,17 @@ def normal2_and_uniform(seed: int, pixel: int, stream: int, index: int) -> tuple
 
 
 def pixel_counters(height: int, width: int) -> np.ndarray:
-    """(H*W,) uint64 pixel numbers in raster order, the ``pixel`` argument of the draws."""
+    """Return (H*W,) uint64 pixel numbers in raster order, the ``pixel`` argument of the draws."""
     return np.arange(height * width, dtype=np.uint64)
 
 
 _BLOCK = 2**16
-"""Pixels whose draws fit the cache: the dozens of arrays on the way of a 1080p sensor do not."""
+"""Pixels whose draws fit the cache: the temporary arrays of a whole 1080p sensor do not."""
 
 
 def in_blocks(draw: Callable[..., tuple[np.ndarray, ...]], *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
     """Return what ``draw`` returns for ``arrays`` of one length (or [], which stay so), called for a block of pixels at
-    a time: the same numbers sooner."""
+    a time: the same numbers, faster."""
     count = len(arrays[0])
     parts = [
         draw(*(array[first : first + _BLOCK] if len(array) else array for array in arrays))

@@ -1,7 +1,7 @@
-"""What single pixels do by themselves, whatever the emulator: dead ones, and noise of their own.
+"""Defects of single pixels, independent of the emulator: dead pixels and noise events.
 
-A stage between the emulator and the bus, as :mod:`blinkgl.config.readout` describes it. Noise is a process in
-continuous time that the steps only look at: its events are numbered, and number n is drawn from the seed and n alone.
+A stage between the emulator and the bus, described in :mod:`blinkgl.config.readout`. Noise is a process in continuous
+time, independent of the steps: its events are numbered, and number n is drawn only from the seed and n.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ _DEFECT, _OWN = np.uint64(Stream.DEFECT), np.uint64(Stream.OWN_NOISE)
 
 @kernel(error_model="numpy")
 def _awake(pixel, t_us, dead_us, last):
-    """Return (n,) bool: which events come at least ``dead_us`` after the last such event of their pixel. ``last`` is
-    updated."""
+    """Return (n,) bool: which events come at least ``dead_us`` after the last accepted event of their pixel; updates
+    ``last``."""
     out = np.empty(t_us.size, np.bool_)
     for i in range(t_us.size):
         out[i] = t_us[i] - last[pixel[i]] >= dead_us
@@ -36,16 +36,16 @@ def _awake(pixel, t_us, dead_us, last):
 
 
 class PixelNoise:
-    """Events of an emulator -> those of pixels of which some are dead and some fire by themselves.
+    """Removes the events of dead pixels from an emulator's events and adds noise events.
 
-    ``rates`` : (H*W,) float64, events per second of each pixel's own.   ``dead``, ``hot`` : (H*W,) bool.
-    ``on_shares`` : (H*W,) float64, of the events that answer no other."""
+    ``rates`` : (H*W,) float64, noise events per second of each pixel.   ``dead``, ``hot`` : (H*W,) bool. ``on_shares``
+    : (H*W,) float64, of the events that do not follow another."""
 
     def __init__(self, config: PixelsConfig, height: int, width: int, seed: int, causes: bool = False):
         self.config, self._width, self._causes = config, width, causes
         self._seed = np.uint64(int(seed) & (2**64 - 1))
         pixels = pixel_counters(height, width)
-        # Draws 0 and 1 of the stream: uniforms for what a pixel is, normals for how much.
+        # Draws 0 and 1 of the stream: uniforms for the kind of pixel, normals for its values.
         which, other = uniform2(self._seed, pixels, _DEFECT, np.uint64(0))
         spread, prefers = normal2(self._seed, pixels, _DEFECT, np.uint64(1))
         self.hot = which < config.hot_fraction
@@ -55,28 +55,28 @@ class PixelNoise:
         decades = np.where(self.hot, config.hot_spread_decades, config.spread_decades)
         rates = np.minimum(median * exp_f64(np.log(10.0) * decades * spread), _MOST_HZ)
         self.rates = np.where(self.dead, 0.0, rates)
-        # Running sums, in which a uniform finds its pixel. Answers come on top of the drawn events,
-        # which are therefore as many fewer.
+        # Running sums, in which a uniform finds its pixel. Answers are added to the drawn events, which are reduced
+        # accordingly.
         self._sums = np.cumsum(self.rates / (1.0 + np.where(self.hot, 0.0, config.answered)))
         # The odds of ON against OFF are log-normal over the hot pixels.
         off = (1.0 - config.hot_on_share) * exp_f64(-config.hot_on_spread * prefers)
         self.on_shares = np.where(self.hot, config.hot_on_share / (config.hot_on_share + off), config.on_share)
         self._decades = np.log(10.0) * config.answer_spread_decades
-        # Answers that are on their way when the recording begins are those of noise before it.
+        # Answers of noise before the recording begins may fall into it.
         before_s = min(1e-3 * config.answer_ms * np.exp(3.0 * self._decades), _LONGEST_BEFORE_S)
         self._before_ns = round(1e9 * before_s) if config.answered else 0
         self._from_us = 0
         self._last = np.full(height * width, -(2**62), np.int64) if config.refractory_us else None
         self._batch = 0  # next to be drawn
-        self._t_ns: int | None = None  # where the last batch ended
-        self._drawn = Events.empty()  # and not given yet
+        self._t_ns: int | None = None  # end of the last batch
+        self._drawn = Events.empty()  # not returned yet
 
     def step(self, events: Events, until_us: int) -> Events:
-        """``events`` without those of dead pixels, with the noise up to ``until_us`` (that microsecond included); of
-        one microsecond the noise comes last. The first step says when the noise begins."""
+        """Return ``events`` without those of dead pixels, with the noise up to ``until_us`` (that microsecond
+        included); within a microsecond the noise comes last. Noise begins with the first step."""
         if self.dead.any() and len(events):
             events = events.part(~self.dead[events.y.astype(np.int64) * self._width + events.x])
-        # No pixel fires by itself.
+        # No pixel has noise.
         if not (self._sums.size and self._sums[-1] > 0):
             return events
         if self._t_ns is None:
@@ -109,7 +109,7 @@ class PixelNoise:
         wait, pick = uniform2(self._seed, index, _OWN, np.uint64(0))
         polarity, answers = uniform2(self._seed, index, _OWN, np.uint64(1))
         total = self._sums[-1]
-        # Exponential waiting times, ns. None needs to be longer than 13 days: a batch of the longest still fits int64.
+        # Exponential waiting times, ns, at most 13 days, so that the longest batch fits int64.
         gaps = np.minimum(-log_f64(wait) * (1e9 / total), 2.0**50).astype(np.int64)
         t_ns = self._t_ns + np.cumsum(gaps)
         self._t_ns = int(t_ns[-1])
@@ -131,7 +131,7 @@ class PixelNoise:
         answer = own.part(chosen)
         at_us = (t_ns[chosen] + np.minimum(wait_ns[chosen], 2.0**55).astype(np.int64)) // 1000
         both = Events.concatenate([own, replace(answer, t=at_us, p=1 - answer.p)])
-        # What lies before the recording was only drawn for its answers.
+        # Events before the recording were drawn only for their answers.
         return both.part(both.t > self._from_us)
 
     def state_dict(self) -> dict[str, np.ndarray]:

@@ -1,10 +1,10 @@
-"""What a camera that takes frames does to its own event pixels: where the frame's pixels are reset, the signal of every
-event pixel jumps and comes back.
+"""Effect of a frame camera's resets on its event pixels: at each reset of the frame's pixels the signal of every event
+pixel jumps and returns.
 
-Seen in recordings of DAVIS240 cameras: once a frame, 3 to 9 % of the pixels on which something moves, and hardly any
-other, fire ON within half a millisecond; for the next millisecond there are hardly any ON events and more OFF events
-than usual. So a jump carries over their threshold those pixels that stand near it. No noise that is added to events can
-do that; the jump is made before the emulator, in the light that it is shown.
+Observed in recordings of DAVIS240 cameras: once per frame, 3 to 9 % of the pixels with motion, and hardly any other,
+fire ON within half a millisecond; during the next millisecond there are hardly any ON events and more OFF events than
+usual. So the jump carries pixels near their threshold over it. Noise added to the events cannot reproduce this; the
+jump is added to the light before the emulator.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from blinkgl.config.readout import FrameResetsConfig
 from blinkgl.events.emulator import Emulator
 
 RISE_NS = 300_000
-"""Time of the jump: the ON events of a reset lie within half a millisecond."""
+"""Duration of the jump: the ON events of a reset lie within half a millisecond."""
 
 
 class _Seen(NamedTuple):
@@ -28,14 +28,14 @@ class _Seen(NamedTuple):
 
 
 class FrameResets:
-    """The light that pixels see between and at the frames that an emulator is given, with the jumps in it.
+    """The light that pixels see at and between the frames of an emulator, with the jumps added.
 
-    The signal is higher by ``kick`` thresholds ``RISE_NS`` after a reset. Of an emulator that follows light at once it
-    goes there and, in ``length_ms``, back in straight lines; one with a low-pass is pushed there by brighter light
-    and comes back as slowly as its pixels do. Resets follow one another at ``interval_ms``; the first comes
-    ``first_ms`` after the first frame.
+    The signal is higher by ``kick`` thresholds ``RISE_NS`` after a reset. In an emulator that follows light at once it
+    rises and, in ``length_ms``, returns linearly; an emulator with a low-pass gets brighter light, and its pixels
+    return at their own speed. Resets have the interval ``interval_ms``; the first comes ``first_ms`` after the first
+    frame.
 
-    emulator : of which the pixels are.   threshold : its smallest nominal one, ln units: in three recordings whose
+    emulator : that of the pixels.   threshold : its smallest nominal one, ln units: in three recordings whose
     thresholds differ by a factor of four the jump is 0.31 to 0.39 of it."""
 
     def __init__(self, config: FrameResetsConfig, emulator: Emulator, threshold: float):
@@ -49,10 +49,10 @@ class FrameResets:
         self._last: _Seen | None = None
 
     def shown(self, t_ns: int, luminance: np.ndarray) -> Iterator[tuple[int, np.ndarray, bool]]:
-        """(t_ns, luminance, changed) of what an emulator is shown up to a frame, that frame last; changed: the jump is
-        in it, or was in the one before.
+        """Yield (t_ns, luminance, changed) for an emulator up to a frame, that frame last; changed: the jump is in it,
+        or was in the one before.
 
-        luminance : (H, W) float32, linear; it stays as it is, and a copy of it is kept."""
+        luminance : (H, W) float32, linear; it is not changed, and a copy of it is kept."""
         last, kicked = self._last, False
         if last is None:
             self._began = t_ns
@@ -67,20 +67,20 @@ class FrameResets:
         self._last = _Seen(t_ns, np.array(luminance, np.float32))
 
     def _lit(self, luminance: np.ndarray, share: float) -> np.ndarray:
-        """The light with a share of the jump in it."""
+        """Return the light with this share of the jump."""
         if share == 0:
             return luminance
         push = self._emulator.push(luminance, self._jump, 1e-9 * RISE_NS)
         return luminance * np.exp(np.float32(share) * (np.float32(self._jump) if push is None else push))
 
     def _at(self, t_ns: int) -> float:
-        """The share of the jump at a time."""
+        """Return the share of the jump at a time."""
         assert self._began is not None
         since = (t_ns - self._began - self._first) % self._every if t_ns >= self._began + self._first else -1
         return float(np.interp(since, self._corners, self._share, left=0.0, right=0.0))
 
     def _knots(self, after_ns: int, before_ns: int) -> Iterator[int]:
-        """Times strictly between two frames at which the jump begins, is highest and is over."""
+        """Yield the times strictly between two frames at which the jump begins, is highest and ends."""
         assert self._began is not None
         first = max((after_ns - self._began - self._first - self._corners[-1]) // self._every, 0)
         for number in itertools.count(first):

@@ -1,4 +1,4 @@
-"""How far an emulator's signal moves for a change of luminance: what the time sampling has to know about the sensor."""
+"""How an emulator's signal depends on luminance: what time sampling needs to know about the sensor."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ import numpy as np
 
 
 class Thresholds(Protocol):
-    """Whatever has a contrast threshold and, where OFF differs, another."""
+    """A configuration with a contrast threshold and, if OFF differs, another one."""
 
     contrast_threshold: float
     contrast_threshold_off: float | None
 
 
 def smallest_threshold(config: Thresholds) -> float:
-    """Of a configuration with ``contrast_threshold`` and ``contrast_threshold_off``."""
+    """Return the smallest of ``contrast_threshold`` and ``contrast_threshold_off``."""
     return min(config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold)
 
 
 class Response(NamedTuple):
-    """The signal gain * ln(I + offset), below the luminance ``joint`` a straight line, which fires every ``threshold``
-    (the smallest nominal one)."""
+    """The signal gain * ln(I + offset), below the luminance ``joint`` a straight line. An event is fired every
+    ``threshold`` (the smallest nominal one)."""
 
     threshold: float
     gain: float
@@ -30,14 +30,13 @@ class Response(NamedTuple):
     low_slope: float = 0.0
 
     def signal(self, luminance: np.ndarray) -> np.ndarray:
-        """float32."""
-        # The logarithm above the joint; below it the logarithm stays, and the straight line adds what
-        # is missing.
+        """Return the signal, float32."""
+        # Above the joint the logarithm; below it the logarithm at the joint plus the straight line.
         joint = np.float32(self.joint)
         log = np.float32(self.gain) * np.log(np.maximum(luminance, joint) + np.float32(self.offset))
         return log + np.float32(self.low_slope) * np.minimum(luminance - joint, 0) if self.low_slope else log
 
     def change(self, luminance: np.ndarray, rate: np.ndarray) -> np.ndarray:
-        """d(signal)/dt of luminances and their rates of change, in the rates' unit of time."""
+        """Return d(signal)/dt of luminances and their rates of change, in the rates' unit of time."""
         slope = np.float32(self.gain) / (np.maximum(luminance, np.float32(self.joint)) + np.float32(self.offset))
         return rate * (np.where(luminance > self.joint, slope, np.float32(self.low_slope)) if self.low_slope else slope)

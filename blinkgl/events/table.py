@@ -1,4 +1,4 @@
-"""Which emulators there are: one table of classes, and nothing else that asks which kind an emulator is.
+"""The table of emulator classes, the only place that selects by an emulator's kind.
 
     @register
     class Mine(Emulator):
@@ -8,8 +8,8 @@
         def _start(self, frame, t_ns): ...
         def _advance(self, frame, t_ns): ...
 
-docs/extending.md has the whole of one. What configuration needs is in ``Config``, which a class hands to
-:class:`~blinkgl.config.events.EmulatorConfig` when it is registered, so that configuration never looks up the stream.
+docs/extending.md has a complete example. ``Config`` holds what configuration needs; registration passes it to
+:class:`~blinkgl.config.events.EmulatorConfig`, so that the configuration room does not import this one.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     pass
 
 EMULATORS: dict[str, type[Emulator]] = {}
-"""By ``Config``'s key ``emulator``."""
+"""Emulators by ``Config``'s key ``emulator``."""
 _SOME_SENSORS = (
     SensorConfig(name="unknown", width=4, height=3),
     SensorConfig(
@@ -48,10 +48,10 @@ _SOME_SENSORS = (
 
 
 def register(emulator: type[Emulator]) -> type[Emulator]:
-    """Puts a class into the table after a look at every part of it; returns it, so that it may stand above the class.
+    """Check every part of a class and add it to the table; return it, for use as a decorator.
 
-    Raises TypeError naming the emulator and the part that is missing or of the wrong kind, or that another has its
-    name; nothing is then registered."""
+    Raises TypeError naming the emulator and the part that is missing or of the wrong kind, or a name that is in use;
+    nothing is then registered."""
     kind = _checked(emulator)
     if EMULATORS.get(kind, emulator) is not emulator:
         raise TypeError(f"emulator '{kind}': there is one already, {EMULATORS[kind].__name__}")
@@ -61,13 +61,13 @@ def register(emulator: type[Emulator]) -> type[Emulator]:
 
 
 def unregister(kind: str) -> None:
-    """Takes the emulator of this name out again. Raises KeyError where there is none."""
+    """Remove the emulator of this name. Raises KeyError where there is none."""
     del EMULATORS[kind]
     EmulatorConfig.members.remove(kind)
 
 
 def emulator_of(config: EmulatorConfig) -> type[Emulator]:
-    """The class that a configuration is of. Raises TypeError for one that is not in the table."""
+    """Return the class of a configuration. Raises TypeError for one that is not in the table."""
     for emulator in EMULATORS.values():
         if type(config) is emulator.Config:
             return emulator
@@ -75,12 +75,12 @@ def emulator_of(config: EmulatorConfig) -> type[Emulator]:
 
 
 def make_emulator(config: EmulatorConfig, height: int, width: int, seed: int = 0) -> Emulator:
-    """The emulator a config asks for, on the processor. Raises EventDataError: a size out of range."""
+    """Return the emulator of a configuration, on the CPU. Raises EventDataError: a size out of range."""
     return emulator_of(config)(height, width, config, seed)
 
 
 def _checked(emulator: Any) -> str:
-    """The class's name in the table. Raises TypeError as :func:`register`."""
+    """Return the class's name in the table. Raises TypeError as :func:`register`."""
     if not (isinstance(emulator, type) and issubclass(emulator, Emulator)):
         raise TypeError(f"{emulator!r} is not a subclass of Emulator")
     name = emulator.__name__

@@ -1,12 +1,11 @@
-"""Kernels on several threads that sleep when they have nothing to do.
+"""Kernels on several threads that sleep when they have no work.
 
-numba's own parallel loops run on OpenMP, whose threads spin for milliseconds after every loop, and at its end wait
-spinning for the last one. On a machine with nothing else to do that is as fast as can be; where something else runs,
-the thread that is waited for stands in the queue behind the ones that wait (two threads then took four to five times as
-long as one, and twelve times the processor time). Here a thread that has no work holds no core, and nobody waits for a
-thread that has not begun: work is cut in more parts than there are threads, every thread takes the next part that
-nobody has (:func:`take_part`), and the caller, who takes parts like everybody else, has done them all
-by itself where no helper got a core in time.
+numba's parallel loops run on OpenMP, whose threads spin for milliseconds after every loop and while they wait for the
+last thread. On an idle machine that is the fastest way. On a busy one the last thread waits for a core behind the
+spinning ones (two threads then took four to five times as long as one, and twelve times the CPU time). Here a thread
+without work uses no core, and nobody waits for a thread that has not begun: work is cut into more parts than there are
+threads, every thread takes the next free part (:func:`take_part`), and the caller also takes parts, so it does all of
+them if no helper gets a core in time.
 """
 
 from __future__ import annotations
@@ -25,8 +24,7 @@ from numba.extending import intrinsic, register_jitable
 
 @intrinsic
 def _exchange(typingctx, array, index, value):
-    """Puts ``value`` into int64 ``array[index]`` and returns what was there, in one step
-    that no other thread can get between."""
+    """Put ``value`` into int64 ``array[index]`` and return the old value, as one atomic operation."""
     if not (isinstance(array, types.Array) and array.dtype == types.int64 and array.ndim == 1):
         raise TypingError("expected a 1-D int64 array")
 
@@ -39,10 +37,10 @@ def _exchange(typingctx, array, index, value):
 
 @register_jitable
 def take_part(taken: np.ndarray, start: int) -> int:
-    """In a kernel: the number of a part that no thread has taken before, the next from ``start``
-    on, around the end; -1 when none is left.
+    """Return, in a kernel, the number of a part that no thread has taken: the next from ``start`` on, wrapping at the
+    end; -1 when none is left.
 
-    A thread that starts at the same place every time finds what it left in its core's cache."""
+    A thread that starts at the same place every time finds its last data in its core's cache."""
     for k in range(taken.size):
         part = (start + k) % taken.size
         if taken[part] == 0 and _exchange(taken, part, 1) == 0:
@@ -51,7 +49,7 @@ def take_part(taken: np.ndarray, start: int) -> int:
 
 
 class _Job:
-    """One kernel, run by whoever comes before it is closed."""
+    """One kernel, run by every thread that joins before it is closed."""
 
     def __init__(self, kernel: Callable, parts: int, arguments: tuple, threads: int):
         self._kernel, self._arguments, self._threads = kernel, arguments, threads
@@ -61,7 +59,7 @@ class _Job:
         self._all_out.acquire()
 
     def help(self) -> None:
-        """The part of a helper; nothing when the work is over."""
+        """Run a helper's share; nothing when the work is over."""
         with self._lock:
             if self._closed:
                 return
@@ -80,8 +78,7 @@ class _Job:
                 self._all_out.release()
 
     def lead(self) -> None:
-        """The part of the caller: when its own run is over no part is left to take, so
-        only those at work are waited for."""
+        """Run the caller's share. After it no part is left, so it waits only for the threads at work."""
         try:
             self._kernel(self._taken, 0, *self._arguments)
         finally:
@@ -105,11 +102,11 @@ def _help_for_ever(jobs: SimpleQueue[_Job]) -> None:
 
 
 def run(kernel: Callable, parts: int, arguments: tuple, threads: int) -> None:
-    """``kernel(taken, start, *arguments)`` on up to ``threads`` threads at once, the calling one
-    among them; over when all parts are done.
+    """Run ``kernel(taken, start, *arguments)`` on up to ``threads`` threads including the caller; return when all parts
+    are done.
 
-    kernel : a compiled function that releases the GIL and works on the parts that
-    ``take_part(taken, start)`` gives it, until that is -1.
+    kernel : a compiled function that releases the GIL and works on the parts that ``take_part(taken, start)`` returns,
+    until that is -1.
     Raises what the kernel raised in any thread."""
     if threads <= 1:
         kernel(np.zeros(parts, np.int64), 0, *arguments)
@@ -125,7 +122,7 @@ def run(kernel: Callable, parts: int, arguments: tuple, threads: int) -> None:
 
 
 def _forget() -> None:
-    """After fork(): the child has the list of the threads and none of them."""
+    """Reset the list of threads after fork(): the child has none of them."""
     global _jobs, _growing
     _jobs, _growing = SimpleQueue(), threading.Lock()
     _helpers.clear()
@@ -135,6 +132,6 @@ os.register_at_fork(after_in_child=_forget)
 
 
 def thread_count() -> int:
-    """How many threads a kernel may use: ``numba.set_num_threads`` in this thread, else
-    NUMBA_NUM_THREADS, else the cores."""
+    """Return how many threads a kernel may use: ``numba.set_num_threads`` in this thread, else NUMBA_NUM_THREADS, else
+    the number of cores."""
     return numba.get_num_threads()

@@ -1,18 +1,17 @@
-"""What made an event: which surface, where it was and how it moved, by looking at the two frames that the event lies
-between.
+"""The truth of an event: its surface, the surface's position and motion, from the two frames around the event.
 
-An emulator sees a pixel at the times of its frames and nothing in between, so what made its events is in one of them:
+An emulator sees a pixel only at the times of its frames, so the surface that made an event is in one of them:
 
-- shows the pixel the same surface in both, that surface, as it is in the nearer frame in time;
-- does it not (an edge has passed), the one that is nearer to the camera: it is its edge that moved. So what an object
-  leaves behind itself is made by the object and not by what it uncovers.
+- if the pixel shows the same surface in both, it is that surface, at the nearer frame in time;
+- if not (an edge has passed), it is the one nearer to the camera: its edge moved. So the object makes the events behind
+  itself, not the surface that it uncovers.
 
 "The same surface" is the same instance at about the same depth (``_JUMP``): an arm in front of its own body passes,
-too. Where event frames are anti-aliased, what covers a part of a pixel changes it as well; then the four pixels around
-it are looked at besides (``reach``).
+too. In anti-aliased event frames a surface that covers a part of a pixel changes it as well; then the four pixels
+around it are also considered (``reach``).
 
-A pixel may go on following a change that is over (V2E's low-pass; :meth:`Emulator.memory_s`): for so long its events
-are still those of the surface that left. Noise events get what their pixel shows.
+A pixel may follow a change after it is over (V2E's low-pass; :meth:`Emulator.memory_s`): for that time its events are
+still those of the surface that left. Noise events get the surface that their pixel shows.
 """
 
 from __future__ import annotations
@@ -24,13 +23,13 @@ import numpy as np
 from blinkgl.types.events import TRUTH, Events
 
 _JUMP = 0.05
-"""Relative change of depth from frame to frame beyond which one instance shows another surface of itself."""
+"""Relative change of depth between frames beyond which one instance shows another of its surfaces."""
 _AROUND = ((0, 0), (0, -1), (0, 1), (-1, 0), (1, 0))
 
 
 class Surfaces(NamedTuple):
-    """What every pixel shows at one time. ids : (H, W) whole numbers, 0: nothing.   depth : (H, W) float32 along the
-    optical axis, inf: nothing.   velocity : (H, W, 2) float32 px/s."""
+    """The surface at every pixel at one time. ids : (H, W) whole numbers, 0: nothing.   depth : (H, W) float32 along
+    the optical axis, inf: nothing.   velocity : (H, W, 2) float32 px/s."""
 
     ids: np.ndarray
     depth: np.ndarray
@@ -38,7 +37,7 @@ class Surfaces(NamedTuple):
 
 
 class SurfaceTruth:
-    """Gives events the surfaces that made them. It is shown the surfaces at the time of every frame.
+    """Assigns events to the surfaces that made them, from the surfaces at the time of every frame.
 
     reach : 1 where a frame's pixels see more than their centres, 0 where they do not."""
 
@@ -49,9 +48,9 @@ class SurfaceTruth:
         self._until_ns = np.empty(0, np.int64)
 
     def see(self, t_ns: int, surfaces: Surfaces, memory_s: np.ndarray | None = None) -> None:
-        """At the time of a frame, in order. The arrays are kept until the frame after the next.
+        """Add the surfaces at the time of a frame, in order. The arrays are kept until the frame after the next.
 
-        memory_s : (H, W) how long a pixel goes on following what it has seen, s; None: not at all."""
+        memory_s : (H, W) how long a pixel follows a past change, s; None: not at all."""
         if memory_s is not None and self._seen:
             before = self._seen[-1][1]
             gone = (before.depth < surfaces.depth) & (before.ids != surfaces.ids)
@@ -64,7 +63,8 @@ class SurfaceTruth:
         self._seen = [*self._seen[-2:], (t_ns, surfaces)]
 
     def of(self, events: Events, done_ns: int) -> np.ndarray:
-        """(N,) of :data:`~blinkgl.types.events.TRUTH` of events of the interval that ends at the frame of done_ns."""
+        """Return (N,) of :data:`~blinkgl.types.events.TRUTH` of events of the interval that ends at the frame of
+        done_ns."""
         truth = np.empty(len(events), TRUTH)
         at = next(k for k, (t_ns, _) in enumerate(self._seen) if t_ns == done_ns)
         (before_ns, before), (after_ns, after) = self._seen[max(at - 1, 0)], self._seen[at]
@@ -78,7 +78,7 @@ class SurfaceTruth:
             for dy, dx in self._offsets:
                 place = np.clip(y + dy, 0, height - 1) * width + np.clip(x + dx, 0, width - 1)
                 other = _looked_up(surfaces, place)
-                # of the same instance only where it is another part of it, and only at the pixel itself
+                # another part of the same instance counts only at the pixel itself
                 jump = other[1] < best * (1 - _JUMP) if dy == dx == 0 else False
                 passes = (other[1] < best) & ((other[0] != found[0]) | jump)
                 found, best = _where(passes, other, found), np.where(passes, other[1], best)

@@ -1,15 +1,15 @@
 """V2E: lin-log photoreceptor of finite bandwidth, threshold mismatch, leak, shot noise, refractory period.
 
-Hu, Liu, Delbruck, "v2e: From Video Frames to Realistic DVS Events", CVPRW 2021, section 3, as a process in
-continuous time, so that nothing but the accuracy of the interpolation depends on the frame rate:
+Hu, Liu, Delbruck, "v2e: From Video Frames to Realistic DVS Events", CVPRW 2021, section 3, as a process in continuous
+time, so that the frame rate affects only the accuracy of the interpolation:
 
 * The photoreceptor follows the lin-log intensity x, linear in time between frames, through a first-order low-pass
   with k = 2 pi f_c dt (I + 20)/275 time constants per interval. With the lag D = y - x the exact solution over an
   interval is D' = D e^-k - dx (1 - e^-k)/k: stable for every k, second order in the frame spacing.
 * The comparator sees z = y + leak (t - epoch) and fires where z, on its exact curve, meets the level (Newton's
-  method), not on frame times.
-* After any event the reference is z at the end of the dead time: with no refractory period the level just passed,
-  with one whatever the signal has become, so that change during the dead time never comes out as a backlog.
+  method), not at frame times.
+* After any event the reference is z at the end of the dead time: without a refractory period the level just passed,
+  with one the signal at that time, so that a change during the dead time causes no events later.
 * Leak is a drift of the reference; with jitter each event draws the length of the pixel's next leak interval
   (keyed by the event's time). Hot pixels are pixels with a large leak.
 * Shot noise is a Poisson process per block of 1024 pixels at its rate in the dark, thinned to each pixel's own rate
@@ -67,9 +67,10 @@ _FARTHEST = _F(1e6)
 
 
 class Pixels(NamedTuple):
-    """Per-pixel arrays, flat; size 0 when the feature is off. What the photoreceptor holds is of the frame before."""
+    """Per-pixel arrays, flat; size 0 when the feature is off. The photoreceptor's state is that of the previous
+    frame."""
 
-    intensity: np.ndarray  # float32 DN; [] when neither low-pass nor shot noise asks for it
+    intensity: np.ndarray  # float32 DN; [] unless the low-pass or shot noise needs it
     x: np.ndarray  # float32 lin-log
     lag: np.ndarray  # float32 y - x; [] without low-pass
     noise: np.ndarray  # float32 photoreceptor noise, ln units; []
@@ -82,13 +83,13 @@ class Pixels(NamedTuple):
     clock_ns: np.ndarray  # (blocks,) int64 time of the next shot-noise candidate; []
     clock_index: np.ndarray  # (blocks,) int64 its number
     shot_table: np.ndarray  # (blocks, 2048) float32, see shot_tables
-    since_ns: np.ndarray  # int64: when the reference was taken; [] unless causes are asked for
-    noise_then: np.ndarray  # float32: the photoreceptor noise in it; []
-    hot: np.ndarray  # uint8: whether leak is that of a hot pixel; []
+    since_ns: np.ndarray  # int64: time of the reference; [] without causes
+    noise_then: np.ndarray  # float32: the photoreceptor noise in the reference; []
+    hot: np.ndarray  # uint8: whether the leak is a hot pixel's; []
 
 
 class Interval(NamedTuple):
-    """What is the same for all pixels of a step."""
+    """Values of a step that are the same for all pixels."""
 
     t0_ns: int
     dt_ns: int
@@ -162,14 +163,14 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
             )
             if count * cap > share:
                 cap = max(1, share // count)
-            # No room for the worst case; nothing of this block has been touched.
+            # No room for the worst case; nothing of this block has been changed.
             if filled + count * cap > packed.size:
                 return block, filled, cut
             filled, cut_here = emit(
                 active[:count], s, (intensity, x, lag, noise), keys[:shots], p, v, cap, packed, filled
             )
             cut += cut_here
-        # Last: until here these are of the frame before.
+        # Last, because these arrays hold the previous frame until here.
         if p.intensity.size:
             copy_block(intensity, p.intensity[s:e])
         copy_block(x, p.x[s:e])
@@ -197,18 +198,18 @@ def _bands(taken, start, edges, progress, share, packed, frame, codes, table, x_
 
 
 _TAIL = 4.0
-"""Time constants of the low-pass after which a step, e^4 times the threshold at most, is over."""
+"""Time constants of the low-pass after which a step of at most e^4 times the threshold is over."""
 _PUSHES, _MOST_PUSH = 8, 3.0
-"""Steps to the light that makes a jump, and its largest ln: what is darker follows more slowly than that."""
+"""Iterations for the light that makes a jump, and its largest ln: darker pixels follow more slowly."""
 
 
 @register
 class V2e(Emulator):
-    """See the module and :class:`~blinkgl.events.emulator.Emulator`. Luminance 1.0 is ``config.full_scale`` DN.
+    """The V2E emulator, see the module and :class:`~blinkgl.events.emulator.Emulator`. Luminance 1.0 is
+    ``config.full_scale`` DN.
 
-    State: 12 bytes per pixel; 4 more each with the low-pass, leak, photoreceptor noise, and intensity where the first
-    or shot noise asks for it, 8 with the dead time, 12 with causes. Constants: 16
-    bytes per pixel, 8 more with shot noise."""
+    State: 12 bytes per pixel; 4 more each with the low-pass, leak, photoreceptor noise, and intensity (for low-pass or
+    shot noise), 8 with the dead time, 12 with causes. Constants: 16 bytes per pixel, 8 more with shot noise."""
 
     Config = V2eConfig
     _state: ClassVar[tuple[str, ...]] = (
@@ -229,7 +230,7 @@ class V2e(Emulator):
 
     @classmethod
     def response(cls, config: V2eConfig) -> Response:
-        """lin-log: linear up to 20 digital numbers."""
+        """Return the lin-log response: linear up to 20 digital numbers."""
         return Response(
             smallest_threshold(config), 1.0, 0.0, 20.0 / config.full_scale, np.log(20.0) / 20.0 * config.full_scale
         )
@@ -259,16 +260,16 @@ class V2e(Emulator):
         self._noise_sizes, self._sizes_dt_ns = np.empty(0, np.float32), -1
 
         self._leak = draw_leaks(height, width, config, self._on, self.seed)
-        # Four floats per pixel: whatever a pixel that fires needs of them is in one line of the cache.
+        # Four floats per pixel in one cache line: everything that a firing pixel needs.
         self._constants = np.zeros((pixels, 4), np.float32)
         self._constants[:, 0], self._constants[:, 1] = self._on, self._off
         if self._leak.size:
             self._constants[:, 2] = self._leak
         self._leak_jitter = config.leak_jitter if self._leak.size else 0.0
-        # Never, unless some pixel leaks.
+        # Never, unless a pixel leaks.
         self._rebase_ns = 2**61
         if self._leak.size and self._leak.max() > 0:
-            # The leak clock starts anew when the median pixel has leaked REBASE.
+            # The leak clock restarts when the median pixel has leaked REBASE.
             self._rebase_ns = int(REBASE / float(np.median(self._leak[self._leak > 0])) * 1e9)
         self._epoch_ns = np.zeros(1, np.int64)
 
@@ -304,8 +305,8 @@ class V2e(Emulator):
         memory = self.memory_s(luminance)
         if memory is None:
             return None
-        # m (1 - e^{-k g}) = jump: what a low-pass takes up of m in k of its time constants, which brighter light
-        # shortens, by g. The geometric mean of two steps converges where the steps by themselves run away.
+        # m (1 - e^{-k g}) = jump: the response of a low-pass to m in k of its time constants, which brighter light
+        # shortens by the factor g. The geometric mean of two steps converges where the plain iteration diverges.
         k = rise_s * _TAIL / memory
         intensity, most = luminance.astype(np.float64) * self.config.full_scale, _MOST_PUSH
         m = np.minimum(jump / -np.expm1(-k), most)
@@ -328,7 +329,7 @@ class V2e(Emulator):
         self._upper[...], self._lower[...] = reference + self._on, reference - self._off
         self._leak[...] = start.leak
         dead = np.flatnonzero(start.dead_ns)
-        # Levels that every signal has passed mark the dead time, so that the kernel looks at the pixel.
+        # Levels that every signal has passed mark the dead time, so that the kernel processes the pixel.
         self._upper[dead], self._lower[dead] = -np.inf, np.inf
         self._release[dead] = t_ns + start.dead_ns[dead]
         if self.causes:
@@ -336,7 +337,7 @@ class V2e(Emulator):
             if self._noise.size:
                 self._noise_then[...] = self._noise + start.by_noise
         for block in range(len(self._clock_ns)):
-            # Number 2^62 is beyond all that the running clock draws.
+            # Number 2^62 is beyond all draws of the running clock.
             rate = self._shot_unit * float(self._shot_table[block, -1])
             gap, _ = shot_draw(self.seed, np.uint64(block), np.uint64(2**62), rate)
             self._clock_ns[block] = t_ns + gap
@@ -376,7 +377,7 @@ class V2e(Emulator):
         return events
 
     def _refuse_shots(self, dt_ns: int) -> None:
-        """Raises EventDataError: more shot noise in an interval than a step may emit."""
+        """Raise EventDataError for more shot noise in an interval than a step may emit."""
         if self._shots_per_ns * dt_ns > self.config.max_events_per_step:
             raise EventDataError(
                 "more shot noise than max_events_per_step in one interval",

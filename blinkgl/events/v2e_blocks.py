@@ -33,15 +33,15 @@ _F = np.float32
 _ZERO, _HALF, _JOINT = _F(0), _F(0.5), _F(20.0)
 _SHOT, _NOISE = np.uint64(Stream.SHOT), np.uint64(Stream.NOISE)
 _U2, _U1 = np.uint64(2), np.uint64(1)
-# Up to so many events of shot noise are kept in order one by one. _FAR_BELOW is the least int32.
+# Up to this many shot noise events are sorted by insertion. _FAR_BELOW is the smallest int32.
 _INSERTION_LIMIT, _FAR_BELOW = 32, np.int32(-(2**31))
 DRAWS = 16
-"""Candidates of shot noise that are drawn in one go, at most."""
+"""Largest number of shot noise candidates drawn at once."""
 
 
 @kernel(error_model="numpy")
 def lin_log_block(intensity: np.ndarray, out: np.ndarray) -> None:
-    """``out[:]`` = lin-log of ``intensity`` (DN)."""
+    """Set ``out[:]`` to the lin-log of ``intensity`` (DN)."""
     for i in range(intensity.size):
         out[i] = lin_log(intensity[i])
 
@@ -57,7 +57,7 @@ def relax_block(
     out: np.ndarray,
     z: np.ndarray,
 ) -> None:
-    """The low-pass: its lag at the end into ``out``, and with what it follows into ``z``."""
+    """Write the low-pass's lag at the interval's end to ``out``, and its output to ``z``."""
     # z = x + (y - x) is the low-pass's output y.
     for i in range(now.size):
         lag_now = relax(lag[i], before[i], now[i], intensity_before[i], intensity_now[i], kappa)
@@ -67,7 +67,7 @@ def relax_block(
 
 @kernel(error_model="numpy")
 def add_scaled_block(a: np.ndarray, scale: float, out: np.ndarray) -> None:
-    """``out[:] += a * scale``."""
+    """Set ``out[:] += a * scale``."""
     for i in range(a.size):
         out[i] += a[i] * scale
 
@@ -86,7 +86,8 @@ def noise_block(
     out: np.ndarray,
     z: np.ndarray,
 ) -> None:
-    """The photoreceptor's noise at the end into ``out``, and added to ``z``.   normals : scratch, at least as long."""
+    """Write the photoreceptor's noise at the interval's end to ``out``, and add it to ``z``.   normals : scratch, at
+    least as long."""
     # Blocks begin at even pixels, so pairs do not straddle them.
     for j in range((out.size + 1) // 2):  # pixels 2j and 2j + 1 share a draw
         a, b = normal2(seed, np.uint64(first // 2 + j), _NOISE, np.uint64(step))
@@ -103,7 +104,8 @@ def noise_block(
 
 @kernel(error_model="numpy")
 def flag_block(z: np.ndarray, upper: np.ndarray, lower: np.ndarray, flags: np.ndarray) -> float:
-    """Flags (uint8) of the pixels at or beyond a level; returns how far the farthest is beyond (negative: none is)."""
+    """Set flags (uint8) of the pixels at or beyond a level; return how far the farthest is beyond (negative: none
+    is)."""
     farthest = _FAR_BELOW
     for i in range(z.size):
         # Levels of a pixel in its dead time are infinite: it is then always beyond.
@@ -135,17 +137,17 @@ def shot_block(
     keys: np.ndarray,
     draws: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> tuple[int, int, int]:
-    """Shot noise of one block in the interval: accepted events into ``keys`` (pixel in block << 42 | ns from the
-    interval's start << 1 | polarity), sorted. Returns (events, time and number of the next candidate); -1
-    events when ``keys`` is too small."""
+    """Write the shot noise of one block in the interval to ``keys`` (pixel in block << 42 | ns from the interval's
+    start << 1 | polarity), sorted. Return (events, time and number of the next candidate); -1 events when ``keys`` is
+    too small."""
     # The clock stands at the next candidate, whose number is ``index``.
     count, first, end_ns = 0, block * BLOCK, v.t0_ns + v.dt_ns
     table = p.shot_table[block]
     whole = np.float64(table[table.size - 1])
     t_ns, index = p.clock_ns[block], p.clock_index[block]
-    # A Poisson process of candidates for the block as a whole, as fast as if all its pixels were dark, thinned below to
-    # what their intensities allow (Lewis and Shedler, Naval Research Logistics 26, 1979). One clock a block instead of
-    # one a pixel.
+    # A Poisson process of candidates for the whole block, at the rate of dark pixels, thinned below to the rate at
+    # their intensities (Lewis and Shedler, Naval Research Logistics 26, 1979). One clock per block instead of one per
+    # pixel.
     rate = v.shot_unit_per_ns * whole
     gaps, picks, accepts = draws
     # The expected number of candidates and two standard deviations more.
@@ -159,7 +161,7 @@ def shot_block(
             drawn = 0
         gap, pick, accept = gaps[drawn], picks[drawn], accepts[drawn]
         drawn += 1
-        # How many entries are <= weight. Weights are much alike, so the proportional guess is a cache line away.
+        # How many entries are <= weight. Weights are similar, so the proportional guess is a cache line away.
         weight, place = np.float32(pick * whole), np.int64(pick * table.size)
         while place > 0 and table[place - 1] > weight:
             place -= 1
@@ -176,8 +178,7 @@ def shot_block(
             # Thinning: the candidate's rate is that of the dark, DARKEST.
             if accept * DARKEST < shot_factor(intensity):
                 if count == keys.size:
-                    # The caller doubles ``keys`` and repeats the block; draws have no state, so they
-                    # come out the same.
+                    # The caller doubles ``keys`` and repeats the block; draws have no state, so they are the same.
                     return -1, t_ns, index
                 key = (offset << 42) | (after << 1) | np.int64(on)
                 slot = count
@@ -196,7 +197,7 @@ def shot_block(
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# V2E's events of the pixels whose signal may meet a level in an interval, one pixel after the other.
+# V2E's events of the pixels whose signal may meet a level in an interval, pixel by pixel.
 
 _U = np.uint64
 _U1000 = _U(1000)
@@ -219,14 +220,14 @@ def emit(
     packed: np.ndarray,
     begin: int,
 ) -> tuple[int, int]:
-    """Write the events of the listed pixels into ``packed[begin:]``, pixel by pixel, and move their levels.
+    """Write the events of the listed pixels to ``packed[begin:]``, pixel by pixel, and move their levels.
 
     active : int32, in raster order.   first : the pixel that ``now`` and the keys count from.
-    now : (intensity, x, lag, noise) at the interval's end.   keys : int64, shot noise in order, see ``shot_block``.
-    p, v : Pixels and Interval of v2e.py.   cap : most events of a pixel; there is room for so many of each.
-    Returns (end of the events, number of events beyond the cap)."""
+    now : (intensity, x, lag, noise) at the interval's end.   keys : int64, sorted shot noise, see ``shot_block``.
+    p, v : Pixels and Interval of v2e.py.   cap : most events of a pixel; there is room for as many of each. Returns
+    (end of the events, number of events beyond the cap)."""
     dt_ns, dt = v.dt_ns, v.dt_ns * 1e-9
-    # Local names: every ``p.x`` inside the loop would count references to the array, a microsecond a pixel in all.
+    # Local names: every ``p.x`` inside the loop would count references to the array, a microsecond per pixel in all.
     x_before, lag_before, intensity_before, noise_before = p.x, p.lag, p.intensity, p.noise
     upper, lower, constants, leaks, release = p.upper, p.lower, p.constants, p.leak, p.release
     since, noise_at_reference, hot = p.since_ns, p.noise_then, p.hot
@@ -272,7 +273,7 @@ def emit(
         noise_then, since_ns = 0.0, np.int64(0)
         if told:
             noise_then, since_ns = np.float64(noise_at_reference[i]), since[i] - v.t0_ns
-        # Where the comparator looks from: as a fraction of the interval, and in ns from its start.
+        # Start of the comparison: as a fraction of the interval, and in ns from its start.
         s, now_ns = 0.0, np.int64(0)
         if waiting:
             # The signal at the end of the dead time is the new reference.
@@ -313,12 +314,11 @@ def emit(
             else:
                 cut += 1
             if v.leak_jitter > 0.0:
-                # The number of the draw is the event's time in ns, so that it does not depend on how time was cut into
-                # frames. The length of the next leak interval is normal around 1, at least a tenth; float32 as it is
-                # stored.
+                # The number of the draw is the event's time in ns, so that it does not depend on the frame times. The
+                # length of the next leak interval is normal around 1, at least a tenth; float32 as it is stored.
                 spread = 1.0 + v.leak_jitter * rough_normal(v.seed, _U(i), _LEAK_JITTER, _U(v.t0_ns + at_ns))
                 drawn = np.float64(np.float32(np.float64(constants[i, 2]) / max(spread, 0.1)))
-                # The reference stays where it is; its value relative to the new drift changes.
+                # The reference stays; its value relative to the new drift changes.
                 change = drawn - leak
                 leak += change
                 reference += change * (v.since_epoch_0 + s * dt)
@@ -336,7 +336,7 @@ def emit(
             up, down = reference + on, reference - off
             if not dead:
                 since_ns, noise_then = now_ns, noise + noise_change * s
-        # In a dead time both levels are passed, whatever comes: the pixel is looked at until it is released.
+        # In a dead time both levels count as passed, so that the pixel is processed until its release.
         upper[i] = -_INF if dead else np.float32(up)
         lower[i] = _INF if dead else np.float32(down)
         if dead:
@@ -350,7 +350,8 @@ def emit(
 
 @register_jitable
 def _time_of(keys, key, o):
-    """Return when shot noise ``key`` is, ns from the interval's start; _NEVER_NS if it is not of the pixel at ``o``."""
+    """Return the time of shot noise ``key``, ns from the interval's start; _NEVER_NS if it is not of the pixel at
+    ``o``."""
     if key < keys.size and keys[key] >> 42 == o:
         return (keys[key] >> 1) & _NANOSECONDS
     return _NEVER_NS
@@ -358,8 +359,8 @@ def _time_of(keys, key, o):
 
 @register_jitable
 def _cause(by_shot, hot, change, by_leak, by_noise):
-    """Return the cause of an event. change : how far the signal has moved since the reference was taken, by_leak and
-    by_noise of it by these; light is the rest."""
+    """Return the cause of an event. change : of the signal since the reference was taken; by_leak and by_noise : parts
+    of it; light is the rest."""
     if by_shot:
         return _CAUSE_SHOT
     sign = 1.0 if change > 0 else -1.0

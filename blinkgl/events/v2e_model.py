@@ -25,16 +25,16 @@ _SHOT, _U2, _SMALLEST_K = np.uint64(Stream.SHOT), np.uint64(2), _F(1e-6)
 # entry.
 _TABLE_LOW, _TABLE_PER, _TABLE_LAST = _F(TABLE_LOW), _F(1 / TABLE_STEP), _F(TABLE_SIZE - 2)
 DARK, SETTLED = _F(2.0**-60), _F(2.0**-90)
-"""DN below which there is no light, and ln units below which a lag is over: nothing subnormal comes up, which takes a
-processor a hundred times as long and which a card takes for zero."""
+"""DN below which there is no light, and ln units below which a lag is over. They avoid subnormal numbers, which take a
+CPU a hundred times as long and which a GPU may treat as zero."""
 REBASE = 0.02
-"""Leak (ln units) after which the leak clock starts anew: small beside a threshold, so that float32 does."""
+"""Leak (ln units) after which the leak clock restarts: small compared with a threshold, so that float32 suffices."""
 
 
 # --- photoreceptor -----------------------------------------------------------------------------------------
 @register_jitable
 def lin_log(intensity: float) -> float:
-    """ln(I) above 20 DN, the chord from the origin below (v2e, ``lin_log``); float32."""
+    """Return ln(I) above 20 DN, the chord from the origin below (v2e, ``lin_log``); float32."""
     dim = select(intensity < DARK, _ZERO, intensity * _SLOPE)
     # select computes both sides, so the logarithm's argument is clamped to its range.
     return select(intensity <= _JOINT, dim, log_f32(np.maximum(intensity, _JOINT)))
@@ -42,7 +42,7 @@ def lin_log(intensity: float) -> float:
 
 @register_jitable
 def settled(lag: float) -> float:
-    """A lag, 0 where it is over. float32."""
+    """Return a lag, 0 where it is over. float32."""
     return select(np.abs(lag) < SETTLED, _ZERO, lag)
 
 
@@ -52,8 +52,8 @@ _P0, _P1, _P2, _P3, _P4, _P5, _P6 = (_F(c) for c in (1, -1 / 2, 1 / 6, -1 / 24, 
 
 @register_jitable
 def decay(k: float) -> tuple[float, float]:
-    """(e^-k, (1 - e^-k)/k) for float32 k >= 0 without cancellation at small k."""
-    # ``select`` computes both sides: each is held to the range in which it is right.
+    """Return (e^-k, (1 - e^-k)/k) for float32 k >= 0 without cancellation at small k."""
+    # ``select`` computes both sides, so each is limited to its valid range.
     small = np.minimum(k, _HALF)
     p = _gentle_growth(small)
     large = np.maximum(k, _HALF)
@@ -74,7 +74,7 @@ def _gentle_growth(k):
 
 @register_jitable
 def relax(lag: float, before: float, now: float, intensity_before: float, intensity_now: float, kappa: float) -> float:
-    """Lag y - x at the interval's end; kappa = 2 pi f_c dt / 275. float32."""
+    """Return the lag y - x at the interval's end; kappa = 2 pi f_c dt / 275. float32."""
     # The low-pass y' = (x - y) / tau with x on a straight line: lag(1) = lag(0) e^-k - (x1 - x0) (1 - e^-k) / k. Its
     # corner frequency is f_c (I + 20) / 275 (v2e, ``low_pass_filter``), at the interval's mean intensity.
     a, g = decay(kappa * (_HALF * (intensity_before + intensity_now) + _JOINT))
@@ -84,10 +84,10 @@ def relax(lag: float, before: float, now: float, intensity_before: float, intens
 # --- where the signal meets a level ------------------------------------------------------------------------
 @register_jitable
 def curve_of(base: float, drift: float, dx: float, lag: float, k: float) -> tuple[float, float, float]:
-    """(c, rise, fall) of z(s) = c + rise s + fall e^{-k s} over an interval, s in [0, 1], float64.
+    """Return (c, rise, fall) of z(s) = c + rise s + fall e^{-k s} over an interval, s in [0, 1], float64.
 
-    base: lin-log intensity and leak at the start; drift: change by leak and noise; dx: change of the lin-log
-    intensity; lag: y - x at the start; k: time constants in the interval, negative for no low-pass.
+    base: lin-log intensity and leak at the start; drift: change by leak and noise; dx: change of the lin-log intensity;
+    lag: y - x at the start; k: time constants in the interval, negative without a low-pass.
     """
     if k < 0:
         return base, drift + dx, 0.0
@@ -98,7 +98,7 @@ def curve_of(base: float, drift: float, dx: float, lag: float, k: float) -> tupl
 
 @register_jitable
 def signal_at(s: float, c: float, rise: float, fall: float, k: float) -> float:
-    """z at fraction s of the interval."""
+    """Return z at fraction s of the interval."""
     if k < 0:
         return c + rise * s
     return c + rise * s + fall * fall_f64(k * s)
@@ -108,10 +108,10 @@ def signal_at(s: float, c: float, rise: float, fall: float, k: float) -> float:
 def crossing_fraction(
     start: float, target: float, polarity: int, c: float, rise: float, fall: float, k: float, end: float
 ) -> float:
-    """Where in [start, 1] z(s) = target, given that z(1) = ``end`` has reached it.
+    """Return the fraction in [start, 1] where z(s) = target, given that z(1) = ``end`` has reached it.
 
-    The inverse cubic Hermite interpolant of z, then Newton's method inside a shrinking bracket; the error is below
-    1e-6 of the interval unless the curve is flat there."""
+    The inverse cubic Hermite interpolant of z, then Newton's method inside a shrinking bracket; the error is below 1e-6
+    of the interval unless the curve is flat there."""
     # 0 / 0 is NaN where the signal stands on the level; max and min then give ``start``.
     if k < 0:
         return min(max(start, (target - c) / rise), 1.0)
@@ -163,28 +163,30 @@ DARKEST = 1.0 - 0.75 * 20.0 / 275.0
 
 @register_jitable
 def shot_factor(intensity: float) -> float:
-    """Noise falls to a quarter from dark to full scale (v2e, SHOT_NOISE_INTEN_FACTOR 0.25)."""
+    """Return the shot noise factor, which falls to a quarter from dark to full scale (v2e, SHOT_NOISE_INTEN_FACTOR
+    0.25)."""
     return 1.0 - 0.75 * min(max((intensity + 20.0) / 275.0, 0.0), 1.0)
 
 
 @register_jitable(inline="always")
 def shot_draw(seed: int, block: int, index: int, rate_per_ns: float) -> tuple[int, float]:
-    """Draw number ``index`` of a block: (ns to the event after it, uniform that picks pixel and polarity)."""
+    """Return draw number ``index`` of a block: (ns to the event after it, uniform that selects pixel and polarity)."""
     u, v = uniform2(seed, block, _SHOT, index * _U2)
-    # Exponential waiting time, at least 1 ns so that the clock goes on; 1e18 ns are 30 years.
+    # Exponential waiting time, at least 1 ns so that the clock advances; 1e18 ns are 30 years.
     return np.int64(min(-log_f64(u) / rate_per_ns, 1e18)) + np.int64(1), v
 
 
 def shot_tables(on: np.ndarray, off: np.ndarray, theta_on: float, theta_off: float) -> np.ndarray:
-    """Cumulative noise of the pixels of each block of 1024, ON pixels then OFF pixels, (blocks, 2048) float32.
+    """Return the cumulative noise of the pixels of each block of 1024, ON pixels then OFF pixels, (blocks, 2048)
+    float32.
 
-    One unit is a pixel with nominal threshold and one polarity; the last entry of a block is its whole noise.
+    One unit is a pixel with nominal threshold and one polarity; the last entry of a block is its total noise.
     """
     blocks = -(-len(on) // BLOCK)
     weights = np.zeros((blocks, 2, BLOCK))
     for polarity, (nominal, theta) in enumerate(((theta_on, on), (theta_off, off))):
         padded = np.zeros(blocks * BLOCK)
-        # Shot noise is in inverse proportion to the threshold; 0 beyond the last pixel.
+        # Shot noise is inversely proportional to the threshold; 0 beyond the last pixel.
         padded[: len(on)] = nominal / theta.astype(np.float64)
         weights[:, polarity] = padded.reshape(blocks, BLOCK)
     return np.cumsum(weights.reshape(blocks, 2 * BLOCK), axis=1).astype(np.float32)
@@ -193,7 +195,7 @@ def shot_tables(on: np.ndarray, off: np.ndarray, theta_on: float, theta_off: flo
 # --- photoreceptor noise -----------------------------------------------------------------------------------
 @register_jitable
 def next_noise(noise: float, k: float, size: float, normal: float) -> float:
-    """Photoreceptor noise k time constants later: the exact step of its stationary process. float32."""
+    """Return the photoreceptor noise k time constants later: the exact step of its stationary process. float32."""
     # Ornstein-Uhlenbeck: n(k) = n e^-k + size sqrt(1 - e^-2k) N(0, 1), of any step.
     a, _ = decay(k)
     return noise * a + size * np.sqrt(_ONE - a * a) * normal
@@ -201,7 +203,7 @@ def next_noise(noise: float, k: float, size: float, normal: float) -> float:
 
 @register_jitable
 def noise_place(k: float) -> tuple[int, float]:
-    """Place in the table of sizes: (entry below, fraction)."""
+    """Return the place in the table of sizes: (entry below, fraction)."""
     # The place is clamped to the table.
     place = (log_f32(np.maximum(k, _SMALLEST_K)) - _TABLE_LOW) * _TABLE_PER
     below = np.int32(np.minimum(np.maximum(place, _ZERO), _TABLE_LAST))
@@ -209,14 +211,14 @@ def noise_place(k: float) -> tuple[int, float]:
 
 
 def noise_threshold(config: V2eConfig) -> float:
-    """The threshold that the size of the noise is made for: the mean of ON and OFF, as v2e does."""
+    """Return the threshold to which the size of the noise refers: the mean of ON and OFF, as in v2e."""
     return 0.5 * (config.contrast_threshold + (config.contrast_threshold_off or config.contrast_threshold))
 
 
 # --- what is drawn once ------------------------------------------------------------------------------------
 def draw_start_noise(intensity: np.ndarray, config: V2eConfig, seed: np.uint64) -> np.ndarray:
     # The low-pass's corner f_c (I + 20)/275 Hz.
-    """Photoreceptor noise at the first frame, already stationary, (H*W,) float32 ln units."""
+    """Draw stationary photoreceptor noise at the first frame, (H*W,) float32 ln units."""
     corner = config.cutoff_hz * (intensity.astype(np.float64) + 20.0) / 275.0
     pixels = np.arange(len(intensity), dtype=np.uint64)
     _, normal = in_blocks(lambda part: normal2(seed, part, np.uint64(Stream.START), np.uint64(1)), pixels)
@@ -224,13 +226,13 @@ def draw_start_noise(intensity: np.ndarray, config: V2eConfig, seed: np.uint64) 
 
 
 class Start(NamedTuple):
-    """Where the comparators stand at the first frame, flat."""
+    """State of the comparators at the first frame, flat."""
 
     offset: np.ndarray  # float32: reference less signal, ln units
-    leak: np.ndarray  # float32, of the interval that is under way; [] without leak
-    dead_ns: np.ndarray  # int64: what is left of the dead time; [] without one, 0 for most
-    age_ns: np.ndarray  # int64: how long leak has been moving the pixel
-    by_noise: np.ndarray  # float32: what of the offset is the photoreceptor noise's doing
+    leak: np.ndarray  # float32, of the current interval; [] without leak
+    dead_ns: np.ndarray  # int64: the rest of the dead time; [] without one, 0 for most
+    age_ns: np.ndarray  # int64: duration of the leak so far
+    by_noise: np.ndarray  # float32: part of the offset caused by the photoreceptor noise
 
 
 _JITTER_TURN, _TURNS, _MOST_ROUGH = 1000, 200, 3.5
@@ -245,14 +247,14 @@ def draw_start(
     noise: np.ndarray,
     seed: np.uint64,
 ) -> Start:
-    """The state of pixels at the first frame, see ``V2eConfig.start``.
+    """Draw the state of pixels at the first frame, see ``V2eConfig.start``.
 
     intensity : (H*W,) DN.   on, off : thresholds.   leak : mean drift, ln units per second; [].
     noise : the photoreceptor noise; [].
 
-    ``stationary``: a still scene, watched for long. Leak takes a time T from one event to the next, and shot noise of
-    rate R begins it anew: the T under way has the weight (1 - e^-RT)/R (of a long one more is seen), its age a the
-    density e^-Ra up to T."""
+    ``stationary``: after a long time in a still scene. Leak takes a time T from one event to the next, and shot noise
+    of rate R restarts it. The current T has the weight (1 - e^-RT)/R (a long one is seen more often), and its age a has
+    the density e^-Ra up to T."""
     pixels = np.arange(len(on), dtype=np.uint64)
     return Start(*in_blocks(lambda *part: _start_of(config, seed, *part), pixels, intensity, on, off, leak, noise))
 
@@ -267,13 +269,13 @@ def _start_of(
     leak: np.ndarray,
     noise: np.ndarray,
 ) -> Start:
-    """:func:`draw_start` of the pixels of these numbers."""
+    """Return :func:`draw_start` of the pixels of these numbers."""
     offset, dead_ns = np.zeros(len(on), np.float32), np.zeros(len(on) if config.refractory_us else 0, np.int64)
     age_ns, by_noise = np.zeros(len(on), np.int64), np.zeros(len(on), np.float32)
-    # One pair of uniforms per pixel: the first is the age of the interval or the place on the ladder.
+    # One pair of uniforms per pixel: the first is the age of the interval or the place on the ladder of levels.
     first, second = uniform2(seed, pixels, np.uint64(Stream.START), np.uint64(0))
     if config.start == "balanced":
-        # Triangular: where a Brownian motion that is put back to 0 at -1 and 1 is found.
+        # Triangular: the stationary position of a Brownian motion that returns to 0 at -1 and 1.
         place = first - second
         offset = (-place * np.where(place > 0, on, off)).astype(np.float32)
     if config.start != "stationary" or not (leak.size or config.shot_noise_rate_hz):
@@ -304,7 +306,7 @@ def _start_of(
         leak[moving] = (on[moving] / time).astype(np.float32)
         age_ns[moving] = np.minimum(age * 1e9, 2.0**61).astype(np.int64)
     if dead_ns.size:
-        # The chance to be in the dead time is its share of the whole cycle.
+        # The probability of the dead time is its share of the whole cycle.
         u, v = uniform2(seed, pixels, np.uint64(Stream.START), np.uint64(_TURNS))
         dead_s = config.refractory_us * 1e-6
         dead_ns = np.where(u * (dead_s + between) < dead_s, np.ceil(v * dead_s * 1e9), 0.0).astype(np.int64)
@@ -338,8 +340,7 @@ def _age(uniform: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def _length_of_interval(jitter: float, q: np.ndarray, pixels: np.ndarray, seed: np.uint64) -> np.ndarray:
-    """Draw the lengths of the leak intervals under way at one moment, in mean intervals. q : shot noise events per
-    mean interval."""
+    """Draw the lengths of the current leak intervals, in mean intervals. q : shot noise events per mean interval."""
     length = np.ones(len(q))
     if jitter == 0:
         return length
@@ -367,13 +368,13 @@ MAX_LEAK_HZ = 1e6
 
 
 def draw_hot(height: int, width: int, config: V2eConfig, seed: np.uint64) -> np.ndarray:
-    """Which pixels are hot, (H*W,) uint8."""
+    """Draw which pixels are hot, (H*W,) uint8."""
     which = lambda pixels: uniform2(seed, pixels, np.uint64(Stream.HOT), np.uint64(0))
     return (in_blocks(which, pixel_counters(height, width))[0] < config.hot_pixel_fraction).astype(np.uint8)
 
 
 def draw_leaks(height: int, width: int, config: V2eConfig, on: np.ndarray, seed: np.uint64) -> np.ndarray:
-    """Drift of the comparator by leak, ln units per second, (H*W,) float32; empty when there is none.
+    """Draw the drift of the comparator by leak, ln units per second, (H*W,) float32; empty when there is none.
 
     Log-normal over the pixels (v2e: 10^(cov N)); hot pixels: exponential around their mean rate.
     """
@@ -384,10 +385,10 @@ def draw_leaks(height: int, width: int, config: V2eConfig, on: np.ndarray, seed:
 
 
 def _leaks_of(config: V2eConfig, pixels: np.ndarray, on: np.ndarray, seed: np.uint64) -> np.ndarray:
-    """:func:`draw_leaks` of the pixels of these numbers."""
+    """Return :func:`draw_leaks` of the pixels of these numbers."""
     spread, _ = normal2(seed, pixels, np.uint64(Stream.LEAK), np.uint64(0))
-    # Log-normal tails of several decades ask for more events than there are microseconds: that is noise without end.
-    # 10^(cov N) as a power of e.
+    # Log-normal tails of several decades exceed the resolution of event times, so the rate is limited. 10^(cov N) is
+    # computed as a power of e.
     rate = np.minimum(config.leak_rate_hz * exp_f64(np.log(10.0) * config.leak_cov_decades * spread), MAX_LEAK_HZ)
     if config.hot_pixel_fraction:
         u, v = uniform2(seed, pixels, np.uint64(Stream.HOT), np.uint64(0))

@@ -6,24 +6,24 @@ sections 3 and 4. In an interval with intensities L0 -> L1 (digital numbers) and
     mu    = k1 (L1 - L0)/dt / (L + k2) + k4 + k5 L        drift: signal, temperature, parasitic photocurrent
     sigma = k3 sqrt(L) / (L + k2) + k6                    photon shot noise, circuit
 
-dV = mu dt + sigma dW from V in (-1, 1); at +1 an ON event, at -1 an OFF event, V back to 0.
+dV = mu dt + sigma dW from V in (-1, 1); at +1 an ON event, at -1 an OFF event, then V = 0.
 
-That equation is followed exactly, so that noise is the same at any frame rate:
+The equation is solved exactly, so that noise is the same at any frame rate:
 
-* A pixel far from both thresholds is not drawn. What it keeps is the mean of V and the *unspent variance*, the sum of
-  sigma^2 dt since V was last known. Where the mean path comes within 6.5 standard deviations of a threshold the pixel
-  is looked at: V is drawn at the interval's start, and the variance is spent. A path is missed that has crossed and
-  come back while nobody looked: with probability below 1.6e-10 an interval (4 Q(6.5), both sides).
-* A pixel that is looked at draws the time at which it meets the threshold that is in reach: inverse Gaussian with mean
-  a/|mu| and shape a^2/sigma^2 for a distance a (the law against the drift, met with probability exp(-2 |mu| a/sigma^2),
-  is the same; without drift it is Levy's). Where that is beyond the interval's end V at the end is drawn, given that it
-  was not met: normal, kept with the probability 1 - exp(-2 a b/sigma^2 dt) that a Brownian bridge to the distance b has
-  not met it. Where both thresholds can be reached the interval is taken in parts, short enough that one of them
-  cannot (again to 1.6e-10).
+* A pixel far from both thresholds draws nothing. It keeps the mean of V and the *unspent variance*, the sum of
+  sigma^2 dt since V was last known. Where the mean path comes within 6.5 standard deviations of a threshold, the
+  pixel is processed: V is drawn at the interval's start, and the variance is spent. A path that crosses and returns
+  before that is missed, with probability below 1.6e-10 per interval (4 Q(6.5), both sides).
+* A processed pixel draws the time at which it meets the reachable threshold: inverse Gaussian with mean a/|mu| and
+  shape a^2/sigma^2 for a distance a (the law against the drift, met with probability exp(-2 |mu| a/sigma^2), is the
+  same; without drift it is Levy's). If that time is after the interval's end, V at the end is drawn under the
+  condition that the threshold was not met: normal, accepted with the probability 1 - exp(-2 a b/sigma^2 dt) that a
+  Brownian bridge to the distance b has not met it. Where both thresholds are reachable the interval is divided into
+  parts so short that one of them is not (again to 1.6e-10).
 * V starts at the stationary law of a still scene (:func:`start_voltage`), not at 0 everywhere, where all pixels of a
-  flat image would have their first leak event together.
+  flat image would have their first leak event at the same time.
 
-V is kept in 2^-29, fine enough for a leak of one event an hour at any frame rate.
+V is stored in units of 2^-29, fine enough for a leak of one event an hour at any frame rate.
 """
 
 from __future__ import annotations
@@ -71,10 +71,11 @@ _DIFFUSION = np.uint64(Stream.DIFFUSION)
 # Draw numbers are step * 2^20 + draw within the step.
 _U1000, _U20, _U1, _U2, _MAX_BOUND = np.uint64(1000), np.uint64(20), np.uint64(1), np.uint64(2), np.float32(1e7)
 IN_DEAD_TIME = np.int32(2 * V_ONE - 1)
-"""Voltage of a pixel in its dead time: never far from a threshold, so that the pixel is looked at."""
+"""Voltage of a pixel in its dead time: always near a threshold, so that the pixel is processed."""
 MAX_DRAWS = 2**19
 TRIES = 500
-"""At an end that is drawn until it fits: it does at once, or the time before it was a rounding error's."""
+"""Largest number of draws of an end value: the first one nearly always fits, unless the time before was a rounding
+error."""
 _MAX_DRAWS, _TRIES = np.uint64(MAX_DRAWS), np.uint64(TRIES)
 
 
@@ -85,12 +86,12 @@ class Pixels(NamedTuple):
     v: np.ndarray  # int32 mean voltage, 2^-29 thresholds
     unspent: np.ndarray  # float32 variance of the voltage around it, thresholds^2; 0 where V is known
     release: np.ndarray  # int64 ns, end of the dead time or NEVER; [] without dead time
-    by_light: np.ndarray  # float32: what light and leak have moved V by since it was 0; [] unless causes are asked for
+    by_light: np.ndarray  # float32: part of V caused by light and leak since it was 0; [] without causes
     by_leak: np.ndarray
 
 
 class Interval(NamedTuple):
-    """What is the same for all pixels of a step; k1 to k6 are the model's parameters, times in µs."""
+    """Values of a step that are the same for all pixels; k1 to k6 are the model's parameters, times in µs."""
 
     t0_ns: int
     dt_ns: int
@@ -111,8 +112,8 @@ class Interval(NamedTuple):
 
 @kernel(error_model="numpy")
 def _sense_block(before, now, v, unspent, interval, v_end, unspent_end, flags):
-    """Write mean and variance of V at the end to ``v_end`` and ``unspent_end``, and flag the pixels to look at.
-    Return the largest mean number of events."""
+    """Write mean and variance of V at the end to ``v_end`` and ``unspent_end``, and flag the pixels to process. Return
+    the largest mean number of events."""
     dt_us = interval.dt_ns * 1e-3
     # Once per block and in float32; dt_us multiplies what is a rate.
     k1, k2, k3, k6 = _F(interval.k1), _F(interval.k2), _F(interval.k3), _F(interval.k6)
@@ -147,7 +148,7 @@ def _share_block(before, now, by_light, by_leak, interval, light_end, leak_end):
 
 @register_jitable
 def rates(before: float, after: float, dt_us: float, v: Interval) -> tuple[float, float, float]:
-    """(mu, what of it is leak, sigma) per us: :func:`drift_and_noise` in double precision, since a pixel may fire at
+    """Return (mu, its leak part, sigma) per us: :func:`drift_and_noise` in double precision, since a pixel may fire at
     any time."""
     mean = 0.5 * (before + after)
     leak = v.k4 + v.k5 * mean
@@ -156,9 +157,10 @@ def rates(before: float, after: float, dt_us: float, v: Interval) -> tuple[float
 
 @register_jitable
 def cause_at(side: int, since_us: float, light: float, leak: float, mu: float, leak_rate: float) -> int:
-    """Of an event at the threshold ``side`` (1, -1), ``since_us`` after V's parts were ``light`` and ``leak``."""
+    """Return the cause of an event at the threshold ``side`` (1, -1), ``since_us`` after V's parts were ``light`` and
+    ``leak``."""
     by_light, by_leak = light + (mu - leak_rate) * since_us, leak + leak_rate * since_us
-    # Light, leak, and as noise the rest of the way to the threshold.
+    # Light, leak, and noise as the rest of the distance to the threshold.
     return cause_of(side * by_light, side * by_leak, 1.0 - side * (by_light + by_leak))
 
 
@@ -186,7 +188,7 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
         voltage, variance = p.v[i] / V_ONE, np.float64(p.unspent[i])
         t_us = 0.0
         if p.release.size and p.release[i] != NEVER_NS:
-            # Dead to the interval's end: nothing fires, and V stays the mark.
+            # Dead until the interval's end: nothing fires, and V keeps the mark.
             if p.release[i] > v.t0_ns + v.dt_ns:
                 v_end[i - first], unspent_end[i - first] = IN_DEAD_TIME, _ZERO
                 if p.by_light.size:
@@ -195,7 +197,7 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
             # Released within the interval: V is known to be 0 at that time.
             t_us, voltage, variance = max(p.release[i] - v.t0_ns, 0) * 1e-3, 0.0, 0.0
             p.release[i] = NEVER_NS
-        # What light and leak have moved V by when it was last known, and when that was.
+        # V's parts by light and leak when it was last known, and that time.
         since_us, light, leak = t_us, 0.0, 0.0
         if p.by_light.size:
             light, leak = np.float64(p.by_light[i]), np.float64(p.by_leak[i])
@@ -214,8 +216,7 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
         while t_us < dt_us:
             left_us = dt_us - t_us
             part_us, side = reach_of_part(voltage, mu, sigma, left_us)
-            # Neither threshold is in reach of what is left: nothing is drawn, the variance stays
-            # unspent.
+            # No threshold is reachable in the rest: nothing is drawn, the variance stays unspent.
             if side == 0 and part_us == left_us:
                 voltage += mu * left_us
                 variance = sigma * sigma * left_us
@@ -236,8 +237,8 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
                 t_us += after_us
                 event_ns = min(np.int64(t_us * 1e3), v.dt_ns)
                 voltage = 0.0
-                # An event moves V back to 0, and what is left of the interval goes on from there.
-                if emitted == cap or draw >= last:  # too many to draw them all: count what is to be expected
+                # An event resets V to 0, and the rest of the interval continues from there.
+                if emitted == cap or draw >= last:  # too many to draw them all: count the expected number
                     cut += 1 + np.int64((dt_us - t_us) * max(abs(mu), sigma * sigma))
                     break
                 word = pixel | np.int64(side > 0)
@@ -247,7 +248,7 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
                 out += 1
                 emitted += 1
                 if p.release.size:
-                    # Dead beyond the interval's end, or V starts anew from 0 within it.
+                    # Dead beyond the interval's end, or V restarts from 0 within it.
                     release_ns = event_ns + v.refractory_ns
                     if release_ns > v.dt_ns:
                         p.release[i] = v.t0_ns + release_ns
@@ -256,8 +257,7 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
                     t_us = release_ns * 1e-3
                 since_us, light, leak = t_us, 0.0, 0.0
             else:
-                # Not met in this part: V at its end, drawn until it fits that. A Brownian bridge says
-                # how likely it was not met.
+                # Not met in this part: draw V at its end until it is accepted. A Brownian bridge gives the probability.
                 noise, stop = sigma * np.sqrt(part_us), draw + _TRIES
                 while True:
                     draw += _U1
@@ -303,13 +303,12 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
         most = np.float64(min(most, _MAX_BOUND))
         count = compact_flags(flags, scratch, s, active)
         if count:
-            # The cap is far above what chance adds to the mean.
+            # The cap is far above the mean plus random fluctuations.
             cap = min(np.int64(2 * most + 8 * np.sqrt(most)) + 8, v.bound_per_pixel)
             # Every block has its share of max_events_per_step.
             if count * cap > share:
                 cap = max(1, share // count)
-            # No room for the worst case; nothing of this block has been touched: the caller makes room
-            # and comes back to it.
+            # No room for the worst case; nothing of this block has been changed: the caller makes room and repeats it.
             if filled + count * cap > packed.size:
                 return block, filled, cut
             filled, cut_here = _emit_block(
@@ -342,7 +341,8 @@ def _bands(taken, start, edges, progress, share, packed, frame, codes, table, p,
 
 @register
 class DvsVoltmeter(Emulator):
-    """See the module and :class:`~blinkgl.events.emulator.Emulator`. Luminance 1.0 is ``config.full_scale`` DN.
+    """The DVS-Voltmeter emulator, see the module and :class:`~blinkgl.events.emulator.Emulator`. Luminance 1.0 is
+    ``config.full_scale`` DN.
 
     State: 12 bytes per pixel, 8 more with a dead time, 8 more with causes. ``saturated`` counts the expected number of
     the events that were not drawn."""

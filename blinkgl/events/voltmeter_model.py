@@ -1,6 +1,6 @@
-"""DVS-Voltmeter's voltage of one pixel: its drift and noise, when it meets a threshold, where it is in a still scene.
+"""DVS-Voltmeter's voltage of one pixel: drift, noise, hitting times, and the stationary state of a still scene.
 
-What the loops of :mod:`blinkgl.events.voltmeter` are made of; that module has the model and its source.
+The loops of :mod:`blinkgl.events.voltmeter` use these functions; that module describes the model and its source.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ V_ONE = 2**29
 # V_ONE is one threshold; a drift beyond 2.25 thresholds is cut.
 _V_SCALE, _V_UNIT, _DRIFT_LIMIT = _F(V_ONE), _F(1.0 / V_ONE), _F(2.25)
 _START = np.uint64(Stream.START)
-# Standard deviations up to which a threshold counts as in reach, see the module.
+# Standard deviations within which a threshold counts as reachable, see the module voltmeter.
 _FAR_64 = 6.5
 _FAR_SQUARED = np.float32(6.5**2)
 MOST_STEPS = np.float32(2.0**16)
-"""So many intervals' variance is summed before it is spent: beyond, float32 would round away what is added."""
+"""Number of intervals after which the summed variance is used: beyond it, float32 would lose the increments."""
 NEAREST = 1.0 - 1e-6
-"""|V| carried over never exceeds this: a threshold that the drift has passed is then reached at once."""
+"""Largest |V| carried over: a threshold that the drift has passed is then reached at once."""
 
 
 @register_jitable
 def drift_and_noise(
     before: float, now: float, k1: float, k2: float, k3: float, k4_dt: float, k5_dt: float, k6: float, root_dt: float
 ) -> tuple[float, float]:
-    """(mu dt, sigma sqrt(dt)) of an interval, elementwise; k4_dt = k4 dt, root_dt = sqrt(dt), dt in us."""
+    """Return (mu dt, sigma sqrt(dt)) of an interval, elementwise; k4_dt = k4 dt, root_dt = sqrt(dt), dt in us."""
     mean = _HALF * (before + now)
     # gain: slope of the logarithm.
     gain = _ONE / (mean + k2)
@@ -41,17 +41,17 @@ def drift_and_noise(
 
 @register_jitable
 def move(v: float, drift: float) -> float:
-    """V (int32, 2^-29) at the interval's end if nothing fires; a drift beyond 2.25 thresholds is cut to that."""
+    """Return V (int32, 2^-29) at the interval's end if nothing fires; the drift is limited to 2.25 thresholds."""
     cut = select(drift > _DRIFT_LIMIT, _DRIFT_LIMIT, select(drift < -_DRIFT_LIMIT, -_DRIFT_LIMIT, drift))
     return np.int32(v + np.int32(cut * _V_SCALE))
 
 
 @register_jitable
 def near_threshold(v: float, v_end: float, variance: float, here: float) -> bool:
-    """Whether a pixel has to be looked at: 6.5 standard deviations around the mean path's extremes reach a threshold.
+    """Return whether a pixel must be processed: a threshold is within 6.5 standard deviations of the mean path.
 
-    v, v_end : mean voltage at both ends, int32, 2^-29.   variance : unspent at the end, float32.   here : of it, this
-    interval's."""
+    v, v_end : mean voltage at both ends, int32, 2^-29.   variance : unspent at the end, float32.   here : this
+    interval's part of it."""
     # The mean path is straight, so its extremes are at its ends.
     high, low = select(v > v_end, v, v_end), select(v > v_end, v_end, v)
     above, below = _ONE - _F(high) * _V_UNIT, _ONE + _F(low) * _V_UNIT
@@ -64,18 +64,18 @@ def near_threshold(v: float, v_end: float, variance: float, here: float) -> bool
 
 @register_jitable
 def one_minus_exp(x: float) -> float:
-    """1 - e^-x for x >= 0, to 1e-11 relative."""
+    """Return 1 - e^-x for x >= 0, to 1e-11 relative."""
     return select(x < 1e-4, x * (1.0 - x * (0.5 - x * (1.0 / 6.0))), 1.0 - exp_f64(-x))
 
 
 @register_jitable
 def hitting_time(distance: float, mu: float, sigma: float, normal: float, uniform: float) -> float:
-    """Time to a threshold at ``distance`` > 0 that is reached: inverse Gaussian, mean distance/|mu|, shape
+    """Return the time to a threshold at ``distance`` > 0 that is reached: inverse Gaussian, mean distance/|mu|, shape
     distance^2/sigma^2; Levy's law without drift.
 
-    Michael, Schucany, Haas (1976): the smaller root of a quadratic in the squared normal, or its conjugate. The
-    root is written with a sum in the denominator, so that it keeps its digits for small drifts and tends to
-    distance^2/(sigma normal)^2, which is Levy's law.
+    Michael, Schucany, Haas (1976): the smaller root of a quadratic in the squared normal, or its conjugate. The root is
+    written with a sum in the denominator, so that it stays accurate for small drifts and tends to distance^2/(sigma
+    normal)^2, which is Levy's law.
     """
     speed = abs(mu)
     g = normal * normal * sigma * sigma / (2.0 * distance)
@@ -94,9 +94,10 @@ def hitting_time(distance: float, mu: float, sigma: float, normal: float, unifor
 
 @register_jitable
 def reach_of_part(v: float, mu: float, sigma: float, left: float) -> tuple[float, int]:
-    """(us of the next part, the threshold that it may reach: 1, -1, or 0 where neither can be and the part is all).
+    """Return (us of the next part, the threshold that it may reach: 1, -1, or 0 where neither is reachable in the whole
+    rest).
 
-    ``left`` is halved until at most one threshold is in reach of 6.5 sigma sqrt(part)."""
+    ``left`` is halved until at most one threshold is within 6.5 sigma sqrt(part)."""
     part, rate = left, _FAR_64 * _FAR_64 * sigma * sigma
     while True:
         drift, squared = mu * part, rate * part
@@ -110,17 +111,17 @@ def reach_of_part(v: float, mu: float, sigma: float, left: float) -> tuple[float
 
 @register_jitable
 def reached(distance: float, toward: float, sigma: float) -> float:
-    """Probability that a threshold is ever met; ``toward`` is the drift towards it."""
+    """Return the probability that a threshold is ever reached; ``toward`` is the drift towards it."""
     if toward >= 0.0:
         return 1.0
-    # Of a motion that drifts away the chance to ever arrive is exp(-2 |mu| a / sigma^2).
+    # If the motion drifts away, the probability to ever arrive is exp(-2 |mu| a / sigma^2).
     return exp_f64(2.0 * toward * distance / (sigma * sigma)) if sigma > 0.0 else 0.0
 
 
 @register_jitable
 def crosses(before: float, after: float, noise: float) -> float:
-    """Probability that a Brownian motion between two known ends meets a threshold: ``before`` > 0 and ``after`` are the
-    distances there, ``noise`` is sigma sqrt(dt)."""
+    """Return the probability that a Brownian motion between two known ends meets a threshold: ``before`` > 0 and
+    ``after`` are the distances there, ``noise`` is sigma sqrt(dt)."""
     if after <= 0.0:
         return 1.0
     # Reflection principle: exp(-2 a b / (sigma^2 dt)).
@@ -129,12 +130,13 @@ def crosses(before: float, after: float, noise: float) -> float:
 
 
 def start_voltage(intensity: np.ndarray, config: VoltmeterConfig, seed: np.uint64) -> tuple[np.ndarray, np.ndarray]:
-    """V of a scene that has stood still for long, int32 (2^-29), and µs left of the dead time, 0 for most.
+    """Draw V of a scene that has been still for long, int32 (2^-29), and the rest of the dead time, µs, 0 for most.
 
-    intensity : (H*W,) DN.   Where there is neither drift nor noise nothing moves, and V is 0.
+    intensity : (H*W,) DN.   Without drift and noise V is 0.
 
     Between events V has the density 1 - e^{-r(1-v)} above 0 and e^{rv} - e^{-r} below, r = 2 mu/sigma^2 >= 0 (the
-    Fokker-Planck equation with a source at 0; for r < 0 its mirror image); drawn by rejection, half are kept at any r.
+    Fokker-Planck equation with a source at 0; for r < 0 its mirror image). It is drawn by rejection, which keeps half
+    of the candidates at any r.
     """
     pixels = np.arange(len(intensity), dtype=np.uint64)
     v, left_us = in_blocks(lambda *part: _voltage_of(config, seed, *part), pixels, intensity)
@@ -144,7 +146,7 @@ def start_voltage(intensity: np.ndarray, config: VoltmeterConfig, seed: np.uint6
 def _voltage_of(
     config: VoltmeterConfig, seed: np.uint64, pixels: np.ndarray, intensity: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """:func:`start_voltage` of the pixels of these numbers."""
+    """Return :func:`start_voltage` of the pixels of these numbers."""
     c = config
     level = intensity.astype(np.float64)
     # Drift and noise of a scene that does not change.

@@ -35,7 +35,9 @@ class Renderer:
         self.config = configured(source, quality=quality).sequence(check.whole(index, "index", 0, MAX_INDEX))
         if self.config.frames is not None:
             raise ConfigError(
-                "nothing to draw: it converts recorded frames", where="source", accepted="use generate() or record()"
+                "the source has nothing to draw: it converts recorded frames",
+                where="source",
+                accepted="use generate() or record()",
             )
         self.scene = scene_of(source, self.config, index)
         self.start_s, self.end_s = self.config.time.t0_ns * 1e-9, self.config.time.t1_ns * 1e-9
@@ -76,7 +78,7 @@ class Renderer:
         to, back_to : s, where forward and backward lead; default: one label interval on and back."""
         if of_events := [name for name in OF_EVENTS if name in label_names(labels)]:
             raise ConfigError(
-                "belongs to events, not to a time", where="labels", value=of_events[0], accepted="record()"
+                "a label of events has no value at a time", where="labels", value=of_events[0], accepted="record()"
             )
         asked = validate(LabelsConfig, labels_tree(labels), where="labels")
         request = asked_for(asked)

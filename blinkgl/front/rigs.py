@@ -106,7 +106,7 @@ def _camera_tree(camera: Camera | Mapping[str, Any]) -> dict[str, Any]:
     check.one_of(camera, "RigSensor.camera", Camera, "a Camera, or a table such as {'fov': 80}")
     if camera.motion != Camera(1, 1).motion:
         raise ConfigError(
-            "a sensor moves with its rig and has no pose of its own",
+            "a sensor moves with its rig and cannot have its own pose",
             where="RigSensor.camera",
             value=camera,
             accepted="position, euler, quaternion or matrix of the RigSensor",

@@ -113,7 +113,7 @@ def generate(
     template = configured(source, rig, **settings)
     if isinstance(source, Scene) and not source.on_disk:
         raise ConfigError(
-            "the scene holds arrays, from which the data set could not be made again",
+            "the scene contains arrays, so the data set would not be reproducible",
             where="source",
             value=source,
             accepted="meshes and images in files, or record()",

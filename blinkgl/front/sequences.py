@@ -208,7 +208,7 @@ def simulate_rig(
     config = template.sequence(check.whole(index, "index", 0, MAX_INDEX))
     if config.sensors is None:
         raise ConfigError(
-            "the source is of a single camera", where="rig", value=rig, accepted="a Rig, or a preset's name; or record"
+            "the source has a single camera", where="rig", value=rig, accepted="a Rig, or a preset's name; or record"
         )
     return simulate_rig_of(requested(source, config, index))
 

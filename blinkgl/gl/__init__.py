@@ -1,4 +1,4 @@
-"""OpenGL without a window. The only package that talks to drivers.
+"""OpenGL without a window. The only package that calls drivers.
 
 In:    a backend and a device, GLSL text, names of formats.
 Out:   a context, compiled programs, render targets.

@@ -1,8 +1,8 @@
 """Headless OpenGL: EGL on a chosen device, OSMesa as the software fallback, one error when there is neither.
 
-Every context made here has ``glClipControl(GL_LOWER_LEFT, GL_ZERO_TO_ONE)`` set, because reversed-Z keeps the
-precision of a 32F depth buffer only when clip-space depth runs from 0 to 1 (with -1 to 1 the hardware's
-``0.5 * z + 0.5`` rounds it away).
+Every context made here has ``glClipControl(GL_LOWER_LEFT, GL_ZERO_TO_ONE)`` set, because reversed-Z keeps the precision
+of a 32F depth buffer only when clip-space depth runs from 0 to 1 (with -1 to 1 the hardware's ``0.5 * z + 0.5`` rounds
+it away).
 """
 
 from __future__ import annotations
@@ -110,8 +110,8 @@ def _load_library() -> ctypes.CDLL:
 _thread = threading.local()
 """``current``: weak reference to the context last made current in the thread."""
 _opened_by: int | None = None
-"""The process that opened OpenGL first. One that is forked off it afterwards has the drivers' locks, and not their
-threads: it would wait for them for ever with its first triangle, also in a context of its own."""
+"""The process that opened OpenGL first. A process forked from it has the drivers' locks but not their threads: it would
+hang at its first triangle, even in its own context."""
 REQUIRED_VERSION = 430
 APT_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri libosmesa6"
 REMEDY = (
@@ -140,11 +140,11 @@ class GLContext:
     ctx        : the ``moderngl.Context``.
     backend    : "egl" or "osmesa".   device: EGL device number (0 for OSMesa).
     vendor, renderer, version : GL's own strings; is_software : drawn by the CPU.
-    notes      : what was tried before and failed, one line each (empty when the first choice worked).
+    notes      : earlier attempts that failed, one line each (empty when the first choice worked).
     shaders    : the :class:`~blinkgl.gl.shader.ShaderLoader` behind :meth:`program`.
 
-    Not thread-safe, and not to be carried over ``fork()``: GLError in a process that was
-    forked after the first context was made.
+    Not thread-safe, and not usable after ``fork()``: GLError in a process that was forked after the first context was
+    made.
     """
 
     def __init__(self, raw: Any, backend: str, device: int, notes: tuple[str, ...] = ()):
@@ -164,7 +164,7 @@ class GLContext:
         self.shaders = ShaderLoader(self.ctx)
         self.idle = self.ctx.framebuffer(self.ctx.renderbuffer((1, 1)))  # bound when a target in use is released
         self.lost = False
-        """Whether :meth:`check` has found that it draws no more."""
+        """Whether :meth:`check` has found that it no longer draws."""
         self._checks = 0
         self._set_clip_control()
 
@@ -182,45 +182,41 @@ class GLContext:
             raise _EGLUnavailable(f"{self.renderer}: glClipControl has no effect")
 
     def function(self, name: str, restype: Any, *argtypes: Any) -> Any:
-        """ctypes function for the GL entry point ``name``; for the calls moderngl does not wrap."""
+        """Return a ctypes function for the GL entry point ``name``; for calls that moderngl does not wrap."""
         address = self._raw.load_opengl_function(name)
         if not address:
             raise GLError(f"the driver has no {name}", where=self.renderer)
         return ctypes.CFUNCTYPE(restype, *argtypes)(address)
 
     def program(self, name: str, defines: Mapping[str, Any] | None = None) -> moderngl.Program:
-        """The program of ``shaders/<name>``; compiled once per (name, defines). See :class:`ShaderLoader`."""
+        """Return the program of ``shaders/<name>``; compiled once per (name, defines). See :class:`ShaderLoader`."""
         _refuse_after_fork()
         return self.shaders.program(name, defines)
 
     def framebuffer(
         self, width: int, height: int, colour: tuple[str, ...] = ("RGBA8",), depth: bool | str = True
     ) -> Target:
-        """A new render target; see :class:`~blinkgl.gl.framebuffer.Target`."""
+        """Return a new render target; see :class:`~blinkgl.gl.framebuffer.Target`."""
         return Target(self, width, height, colour, depth)
 
     def make_current(self) -> None:
         """Make this context the current one again, after another context was used in the same thread.
 
-        Raises GLError where it is current in another thread: going on would draw into, and free, what belongs to the
-        context that is current here, and in a forked process."""
+        Raises GLError where it is current in another thread: drawing would then use and free objects of the context
+        that is current here; and in a forked process."""
         _refuse_after_fork()
         egl = None
         if self.backend == "egl":
-            # EGL does not see what OSMesa does behind its back: it takes a context it bound for still bound, and does
-            # nothing.
+            # EGL is not aware of OSMesa: it assumes that a context it bound is still bound, and does nothing.
             egl = _unbind_egl()
-        self._raw.__enter__()  # glcontext does not look at what eglMakeCurrent answers
+        self._raw.__enter__()  # glcontext ignores the result of eglMakeCurrent
         if egl is not None and not egl.eglGetCurrentContext():
-            raise GLError(
-                "this context is in use by another thread", where=self.renderer, accepted="a context per thread"
-            )
+            raise GLError("another thread uses this context", where=self.renderer, accepted="a context per thread")
         _thread.current = weakref.ref(self)
 
     def check(self) -> None:
-        """Draws one pixel and reads it back. A driver that resets its card throws contexts away, and what is read from
-        such a one is nothing that was drawn; most say nothing of it. Raises GLError, after which the work has to be
-        done again, in another context."""
+        """Draw one pixel and read it back. A driver that resets its GPU discards contexts, mostly without an error;
+        reads then return invalid data. Raises GLError; the work must then be repeated in another context."""
         self.resume()
         self._checks = self._checks % 250 + 1
         red, green = self._checks, 255 - self._checks
@@ -230,22 +226,22 @@ class GLContext:
         if answer != asked:
             self.lost = True
             raise GLError(
-                "the card has lost its context: what it drew last is gone",
+                "the GPU has lost its context; its last frame is lost",
                 where=self.renderer,
                 accepted="another try, in a new context",
             )
 
     def resume(self) -> None:
-        """:meth:`make_current` where another context has been made so in this thread since. For
-        whoever goes on after somebody else's turn."""
+        """Call :meth:`make_current` where another context has been made current in this thread since."""
         if getattr(_thread, "current", lambda: None)() is not self:
             self.make_current()
 
     @contextlib.contextmanager
     def borrowed(self) -> Iterator[None]:
-        """Current inside the block; afterwards the one that was current in this thread before is so again. Releasing
-        needs it: OpenGL's names are per context, so what is freed while another context is current is that other one's,
-        and the garbage collector may finish an abandoned generator, and with it a renderer, at any moment."""
+        """Make it current inside the block; afterwards the context that was current in this thread before is restored.
+        Needed to release objects: OpenGL's names are per context, so freeing while another context is current frees
+        that one's objects, and the garbage collector may finish an abandoned generator, and with it a renderer, at any
+        moment."""
         before = getattr(_thread, "current", lambda: None)()
         try:
             self.make_current()
@@ -259,8 +255,8 @@ class GLContext:
         return self._raw is None
 
     def release(self) -> None:
-        """Free the context and everything in it. Harmless when repeated."""
-        if self._raw is not None and _forked():  # the parent's, who goes on with it
+        """Free the context and everything in it. May be called repeatedly."""
+        if self._raw is not None and _forked():  # the parent process still uses it
             self._raw = None
         if self._raw is not None:
             with self.borrowed():
@@ -283,11 +279,11 @@ def create_context(backend: str = "auto", device: int = 0) -> GLContext:
     """Make a headless context and make it current.
 
     backend : "egl"; "osmesa"; or "auto": EGL's ``device``, then (only for device 0) EGL's other devices, then OSMesa.
-    device  : index in the order of ``eglQueryDevicesEXT``; CUDA_VISIBLE_DEVICES has no say
-    in it. The environment variable
-              GLCONTEXT_DEVICE_INDEX overrides it (glcontext's own rule, kept because job schedulers set it).
+    device  : index in the order of ``eglQueryDevicesEXT``; CUDA_VISIBLE_DEVICES does not affect it. The environment
+              variable GLCONTEXT_DEVICE_INDEX overrides it (glcontext's own rule, kept because job schedulers set it).
 
-    Raises GLError naming every attempt and the remedy, and in a process that was forked after another context was made.
+    Raises GLError naming every attempt and the remedy, and in a process that was forked after another context was
+    made.
     """
     _refuse_after_fork()
     if backend not in ("auto", "egl", "osmesa"):
@@ -323,9 +319,9 @@ def _forked() -> bool:
 def _refuse_after_fork() -> None:
     if _forked():
         raise GLError(
-            "this process was forked from one that had opened OpenGL, and would hang",
+            "this process was forked from one that uses OpenGL, and would hang",
             where=f"process {os.getpid()}",
-            accepted="use multiprocessing.get_context('spawn'), or fork before anything is drawn",
+            accepted="use multiprocessing.get_context('spawn'), or fork before drawing",
         )
 
 
@@ -344,13 +340,13 @@ def _overridden(device: int) -> int:
 
 
 def _egl(device: int) -> Any:
-    """glcontext's EGL object, current in this thread."""
+    """Return glcontext's EGL object, current in this thread."""
     from glcontext import egl  # type: ignore[missing-module-attribute]  # an extension module
 
     libegl = os.environ.get("GLCONTEXT_LINUX_LIBEGL") or _loadable(_EGL_LIBRARIES)
     if libegl is None:
         raise _EGLUnavailable("libEGL.so.1 not found")
-    # glcontext opens libGL beside libEGL, although EGL hands out every function: machines without X11 have no libGL.
+    # glcontext also opens libGL, although EGL provides every function: machines without X11 have no libGL.
     libgl = os.environ.get("GLCONTEXT_LINUX_LIBGL") or _loadable(_GL_LIBRARIES) or libegl
     try:
         return egl.create_context(
@@ -368,7 +364,7 @@ def _egl(device: int) -> Any:
 
 
 def _unbind_egl() -> ctypes.CDLL:
-    """libEGL, after which no context is current in this thread as far as EGL knows."""
+    """Return libEGL, after unbinding the current context of this thread from EGL."""
     name = os.environ.get("GLCONTEXT_LINUX_LIBEGL") or _loadable(_EGL_LIBRARIES)
     lib = ctypes.CDLL(name)
     lib.eglGetCurrentDisplay.restype = ctypes.c_void_p
@@ -395,8 +391,8 @@ def _one_line(error: Exception) -> str:
 
 
 def egl_devices() -> list[str]:
-    """One description per EGL device, in ``gl.device`` order; empty without EGL or its
-    device extension. Makes no context."""
+    """Return one description per EGL device, in ``gl.device`` order; empty without EGL or its device extension. Makes
+    no context."""
     name = _loadable(_EGL_LIBRARIES)
     if name is None:
         return []

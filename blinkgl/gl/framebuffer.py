@@ -1,7 +1,7 @@
 """Off-screen render targets with float colour and a 32-bit float depth, and their read-back.
 
-Row 0 of every array is GL's row 0. BlinkGL's projection turns y round, so that this is the image's top row; nothing is
-flipped here or anywhere else.
+Row 0 of every array is GL's row 0. BlinkGL's projection inverts y, so this is the image's top row; nothing is flipped
+here or anywhere else.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ FORMATS = {
 
 
 def checked_array(out: np.ndarray | None, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """``out``, or a new array where there is none. ValueError when it is not C-contiguous
-    or of another shape or dtype."""
+    """Return ``out``, or a new array where there is none. Raises ValueError when it is not C-contiguous or has another
+    shape or dtype."""
     if out is None:
         return np.empty(shape, dtype)
     if out.shape != shape or out.dtype != dtype or not out.flags.c_contiguous:
@@ -77,7 +77,7 @@ class Target:
         limit = gl.ctx.info["GL_MAX_TEXTURE_SIZE"]
         if not (1 <= width <= limit and 1 <= height <= limit):
             raise GLError(
-                "render size is beyond this OpenGL's limit",
+                "the render size exceeds this OpenGL's limit",
                 value=f"{width}x{height}",
                 accepted=f"1 to {limit} px a side",
             )
@@ -102,7 +102,7 @@ class Target:
         self._clear_float = gl.function("glClearBufferfv", None, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
         self._clear_uint = gl.function("glClearBufferuiv", None, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
         self._clear_int = gl.function("glClearBufferiv", None, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
-        self._cleared: tuple[tuple, list[Callable[[], object]]] = (), []  # to what values, and the calls that do it
+        self._cleared: tuple[tuple, list[Callable[[], object]]] = (), []  # clear values, and the calls that set them
 
     def _texture(self, pixel: PixelFormat) -> moderngl.Texture:
         texture = self.gl.ctx.texture((self.width, self.height), pixel.components, dtype=pixel.gl)
@@ -140,7 +140,7 @@ class Target:
         raise GLError("unknown kind of depth", value=kind, accepted="True, False, 'texture' or 'texture of 16 bits'")
 
     def use(self) -> None:
-        """Draw into this target from now on (sets the viewport, and the scissor of ``fbo.scissor``)."""
+        """Make this the target of drawing (sets the viewport, and the scissor of ``fbo.scissor``)."""
         self.fbo.use()
 
     def clear(self, *colour: float | int | Sequence[float], depth: float = 0.0) -> None:
@@ -152,7 +152,7 @@ class Target:
         """
         self.fbo.use()
         values = (*(c if isinstance(c, (int, float)) else tuple(c) for c in colour), depth)
-        if values != self._cleared[0]:  # mostly they are those of the frame before
+        if values != self._cleared[0]:  # usually equal to the previous frame's
             self._cleared = values, [*self._clear_calls(colour, depth)]
         for call in self._cleared[1]:
             call()
@@ -171,10 +171,10 @@ class Target:
             yield partial(self._clear_float, _DEPTH, 0, ctypes.byref(ctypes.c_float(depth)))
 
     def copy_into(self, other: Target) -> None:
-        """Copies the first attachment into that of ``other``, a target of the same size and formats; honours the
+        """Copy the first attachment into that of ``other``, a target of the same size and formats; honours the
         scissor."""
         self._bind(_READ_FRAMEBUFFER, self.fbo.glo)
-        self._read_buffer(_COLOR_ATTACHMENT0)  # which reading anything else, the depth say, has changed
+        self._read_buffer(_COLOR_ATTACHMENT0)  # reading another attachment, such as the depth, has changed it
         self._bind(_DRAW_FRAMEBUFFER, other.fbo.glo)
         edges = (0, 0, self.width, self.height)
         self._blit(*edges, *edges, _COLOR_BIT, _NEAREST)
@@ -183,10 +183,10 @@ class Target:
     def read(
         self, i: int = 0, out: np.ndarray | None = None, region: tuple[int, int, int, int] | None = None
     ) -> np.ndarray:
-        """Attachment ``i``: (H, W) for one component, else (H, W, C); dtype of its format; row 0 is the top row.
+        """Return attachment ``i``: (H, W) for one component, else (H, W, C); dtype of its format; row 0 is the top row.
 
-        out    : written in place and returned when given (C-contiguous, that shape and
-               dtype). No allocation: the fast way.
+        out    : written in place and returned when given (C-contiguous, that shape and dtype); the fast way, without
+        allocation.
         region : (x, y, w, h) px; H, W are then h, w.
         """
         pixel = self.formats[i]
@@ -197,8 +197,8 @@ class Target:
         return out
 
     def read_depth(self, out: np.ndarray | None = None) -> np.ndarray:
-        """(H, W) float32 window-space depth: near/z_camera for BlinkGL's reversed-Z infinite
-        projection, 0 where cleared."""
+        """Return window-space depth, (H, W) float32: near/z_camera for BlinkGL's reversed-Z infinite projection, 0
+        where cleared."""
         if self.depth is None:
             raise GLError("this target has no depth")
         out = checked_array(out, (self.height, self.width), np.dtype(np.float32))
@@ -206,7 +206,7 @@ class Target:
         return out
 
     def release(self) -> None:
-        """Free the framebuffer and its textures. Harmless when repeated."""
+        """Free the framebuffer and its textures. May be called repeatedly."""
         if self.gl.ctx.fbo is self.fbo:
             self.gl.idle.use()  # moderngl binds its current framebuffer again later, an error once that is deleted
         for resource in (self.fbo, *self.colour, self.depth):

@@ -1,10 +1,10 @@
 """GLSL programs from files: one file per program, ``#include``, ``#define`` variants, errors that name the user's line.
 
-A file in ``shaders/`` holds all stages of one program, told apart by ``#ifdef VERTEX_SHADER`` /
-``#ifdef FRAGMENT_SHADER``; it is compiled once per stage. ``#include "camera.glsl"`` takes
-``shaders/include/camera.glsl`` and has an include guard built in, so that two includes may share a third. What the
-compiler sees is one text with a table saying which file and line each of its lines came from: drivers disagree about
-``#line`` with a file number, but all of them count lines.
+A file in ``shaders/`` holds all stages of one program, separated by ``#ifdef VERTEX_SHADER`` / ``#ifdef
+FRAGMENT_SHADER``; it is compiled once per stage. ``#include "camera.glsl"`` reads ``shaders/include/camera.glsl``, with
+an automatic include guard, so that two includes may share a third. The compiler gets one text, with a table of the file
+and line that each of its lines came from: drivers disagree about ``#line`` with a file number, but all of them count
+lines.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
     from importlib.resources.abc import Traversable  # from 3.11 on; annotations only
 
 STAGES = ("vertex", "fragment")
-"""Of a program that draws."""
+"""Stages of a program that draws."""
 GEOMETRY = "geometry"
-"""The stage between them, of variants that define ``GEOMETRY_STAGE``."""
+"""The stage between them, in variants that define ``GEOMETRY_STAGE``."""
 DEFAULT_VERSION = "#version 430 core"
 
 MADE: list[Callable[[], Mapping[str, str]]] = []
-"""Includes that are no files: each gives texts by the name that they are included by. Whoever makes some adds itself
-here; a file of the shader folder wins."""
+"""Generated includes: each function returns texts by their include name. Rooms add theirs here; a file of the shader
+folder has priority."""
 
 _VERSION = re.compile(r"\s*#\s*version\b")
 _INCLUDE = re.compile(r"\s*#\s*include\b\s*(?P<argument>.*?)\s*(//.*)?$")
@@ -50,17 +50,16 @@ _STAGE_HEADER = re.compile(r"(vertex|geometry|fragment)_shader$")
 
 
 def stages_of(defines: Mapping[str, Any] | None) -> tuple[str, ...]:
-    """Of a variant of a program that draws, in the order in which they run."""
+    """Return the stages of a variant of a program that draws, in the order in which they run."""
     return (STAGES[0], GEOMETRY, STAGES[1]) if (defines or {}).get("GEOMETRY_STAGE") else STAGES
 
 
 @dataclass(frozen=True)
 class ShaderSource:
-    """text : GLSL as the compiler sees it, one stage.
-    origin : (file, line) of each of its lines, 1-based, the file relative to the shader
-    folder; ("", 0) for generated lines.
-    files : text of every file in it, by the same names.   made : names of those that are no files
-    (:data:`MADE`), as they are included."""
+    """The source of one stage. text : GLSL for the compiler.
+    origin : (file, line) of each of its lines, 1-based, the file relative to the shader folder; ("", 0) for generated
+    lines.
+    files : text of every file in it, by the same names.   made : names of generated includes (:data:`MADE`)."""
 
     name: str
     stage: str
@@ -70,13 +69,13 @@ class ShaderSource:
     made: tuple[str, ...] = ()
 
     def locate(self, line: int) -> tuple[str, int]:
-        """File and line that line ``line`` (1-based) of ``text`` came from."""
+        """Return the file and line that line ``line`` (1-based) of ``text`` came from."""
         return self.origin[line - 1] if 1 <= line <= len(self.origin) else ("", 0)
 
 
 class ShaderError(GLError):
-    """A shader that does not load, compile or link. ``str``: one line; ``detail``: every
-    message with the source around it."""
+    """A shader that does not load, compile or link. ``str``: one line; ``detail``: every message with the source around
+    it."""
 
     def __init__(self, problem: str, *, where: str | None = None, detail: str = "", log: str = "", **more: Any):
         super().__init__(problem, where=where, **more)
@@ -84,20 +83,20 @@ class ShaderError(GLError):
 
 
 def shader_folder() -> Traversable:
-    """The shaders that ship with BlinkGL."""
+    """Return the folder of the shipped shaders."""
     return resources.files("blinkgl.shaders")
 
 
 def expand(
     name: str, stage: str, defines: Mapping[str, Any] | None = None, folder: Traversable | None = None
 ) -> ShaderSource:
-    """Source of one stage with includes and defines written out.
+    """Return the source of one stage with includes and defines expanded.
 
     name    : file in ``folder`` (default: the shipped shaders), or an absolute path; includes are always the folder's.
-            stage: "vertex", "geometry" or "fragment".
-    defines : NAME -> number, True (1), text as it stands, or False/None (left undefined).
+    stage   : "vertex", "geometry" or "fragment".
+    defines : NAME -> number, True (1), text, or False/None (left undefined).
 
-    Raises ShaderError for a missing file, an include cycle, or a define that is no GLSL identifier.
+    Raises ShaderError for a missing file, an include cycle, or a define that is not a GLSL identifier.
     """
     if stage not in (*STAGES, GEOMETRY):
         raise ValueError(f"stage must be one of {(*STAGES, GEOMETRY)}, not {stage!r}")
@@ -117,17 +116,17 @@ def expand(
 
 
 def made_includes() -> dict[str, str]:
-    """All texts of :data:`MADE` as they are now."""
+    """Return all present texts of :data:`MADE`."""
     return {name: text for make in MADE for name, text in make().items()}
 
 
 def normalised(defines: Mapping[str, Any] | None) -> tuple[tuple[str, str], ...]:
-    """Sorted (name, GLSL text) pairs: the key under which a variant is cached."""
+    """Return sorted (name, GLSL text) pairs: the key under which a variant is cached."""
     pairs = []
     for key, value in sorted((defines or {}).items()):
         if not _NAME.match(key):
             raise ShaderError(
-                "not a name GLSL can #define", value=key, accepted="letters, digits, single _; not starting with gl_"
+                "not a valid GLSL name", value=key, accepted="letters, digits, single _; not starting with gl_"
             )
         if value is None or value is False:
             continue
@@ -139,7 +138,7 @@ def normalised(defines: Mapping[str, Any] | None) -> tuple[tuple[str, str], ...]
 
 
 class _Expansion:
-    """Collects the lines of a file and what it includes, and their origins."""
+    """Collects the lines of a file and its includes, and their origins."""
 
     def __init__(self, folder: Traversable):
         self.folder = folder
@@ -170,7 +169,7 @@ class _Expansion:
             if argument is None:
                 if chain:
                     raise ShaderError(
-                        "#version belongs into the program's own file, not into an include", where=f"{shown}:{end}"
+                        "#version must be in the program's file, not in an include", where=f"{shown}:{end}"
                     )
                 self.version = text.splitlines()[end - 1].strip()
             elif end:
@@ -185,7 +184,7 @@ class _Expansion:
             raise ShaderError(
                 "include outside the shader folder", where=at, value=name, accepted="a file in shaders/include"
             )
-        # A guard of the preprocessor, not of this loader: only it knows which #ifdef branches are alive.
+        # A preprocessor guard, not one of this loader: only the preprocessor knows which #ifdef branches are active.
         guard = _guard(name)
         self.lines += (f"#ifndef {guard}", f"#define {guard}")
         self.origin += (("", 0), ("", 0))
@@ -209,8 +208,9 @@ def _guard(name: str) -> str:
 
 @lru_cache(maxsize=256)
 def _parts(shown: str, text: str) -> tuple[tuple[tuple[str, ...], tuple[tuple[str, int], ...], int, str | None], ...]:
-    """A file in pieces: (lines, their origins, number of the line that ends them, what that line includes; None where
-    it is a #version). The last one ends at 0. Kept, since every program of a scene includes the same dozen files."""
+    """Return a file in pieces: (lines, their origins, number of the line that ends them, what that line includes; None
+    where it is a #version). The last one ends at 0. Cached, since all programs of a scene include the same dozen
+    files."""
     parts, lines, origin = [], [], []
     in_comment = False
     for number, line in enumerate(text.splitlines(), 1):
@@ -230,7 +230,7 @@ def _parts(shown: str, text: str) -> tuple[tuple[tuple[str, ...], tuple[tuple[st
 
 
 def _ends_in_comment(line: str, inside: bool) -> bool:
-    """Whether a /* comment is open after ``line``."""
+    """Return whether a /* comment is open after ``line``."""
     position = 0
     while True:
         if inside:
@@ -245,7 +245,7 @@ def _ends_in_comment(line: str, inside: bool) -> bool:
 
 
 def link(ctx: moderngl.Context, sources: Mapping[str, ShaderSource]) -> moderngl.Program:
-    """The program of its stages. Raises ShaderError."""
+    """Return the program of its stages. Raises ShaderError."""
     try:
         return ctx.program(
             vertex_shader=sources["vertex"].text,
@@ -257,14 +257,12 @@ def link(ctx: moderngl.Context, sources: Mapping[str, ShaderSource]) -> moderngl
 
 
 def unused(program: moderngl.Program, name: str) -> ShaderError:
-    """The error for an attribute or a uniform that a program declares but that its compiler removed."""
-    return ShaderError(
-        f"the shader does not use '{name}' any more", where=program.extra, accepted="a program that uses it"
-    )
+    """Return the error for an attribute or a uniform that a program declares but that its compiler removed."""
+    return ShaderError(f"the shader no longer uses '{name}'", where=program.extra, accepted="a program that uses it")
 
 
 class Uniforms(dict[str, Any]):
-    """The uniforms of one program by name; "" is the program itself. One that it does not have raises ShaderError."""
+    """The uniforms of one program by name; "" is the program itself. A missing one raises ShaderError."""
 
     def __init__(self, program: moderngl.Program):
         super().__init__({name: program[name] for name in program if isinstance(program[name], moderngl.Uniform)})
@@ -277,7 +275,7 @@ class Uniforms(dict[str, Any]):
 class ShaderLoader:
     """Compiles and caches the programs of one context.
 
-    A cached program is shared by all who ask for it with the same defines, its uniforms included.
+    All requests with the same defines share a cached program, including its uniforms.
     """
 
     def __init__(self, ctx: moderngl.Context, folder: Traversable | None = None):
@@ -286,11 +284,11 @@ class ShaderLoader:
         self._programs: dict[tuple[str, tuple[tuple[str, str], ...]], moderngl.Program] = {}
         self._made: dict[
             tuple[str, tuple[tuple[str, str], ...]], dict[str, str]
-        ] = {}  # includes of a program that are no files
+        ] = {}  # generated includes of a program
 
     def program(self, name: str, defines: Mapping[str, Any] | None = None) -> moderngl.Program:
-        """The program of file ``name`` with ``defines``; compiled when first asked for, and again when an include that
-        is no file has changed. Raises ShaderError."""
+        """Return the program of file ``name`` with ``defines``; it is compiled when first requested, and again when a
+        generated include has changed. Raises ShaderError."""
         key = (name, normalised(defines))
         if key not in self._programs or not self._made.get(key, {}).items() <= made_includes().items():
             self._programs[key] = self._compile(name, defines)
@@ -298,7 +296,7 @@ class ShaderLoader:
 
     @property
     def compiled(self) -> tuple[tuple[str, tuple[tuple[str, str], ...]], ...]:
-        """(file, sorted defines) of every program that has been asked for so far."""
+        """Return (file, sorted defines) of every program requested so far."""
         return tuple(self._programs)
 
     def _compile(self, name: str, defines: Mapping[str, Any] | None) -> moderngl.Program:
@@ -318,7 +316,7 @@ class ShaderLoader:
 
 
 def translate(log: str, sources: Mapping[str, ShaderSource]) -> ShaderError:
-    """moderngl's error text as a ShaderError that speaks of the files the user wrote."""
+    """Return moderngl's error text as a ShaderError that names the user's files."""
     stage = next((m[1] for m in map(_STAGE_HEADER.match, log.splitlines()) if m), None)
     name = next(iter(sources.values())).name
     first: ShaderError | None = None
@@ -341,9 +339,11 @@ def translate(log: str, sources: Mapping[str, ShaderSource]) -> ShaderError:
 
 
 def messages(log: str) -> Iterator[tuple[str, int, int, str, str]]:
-    """(stage, line, column, kind, text) of each message of a compiler, line and column of what it compiled, from 1.
+    """Yield (stage, line, column, kind, text) of each message of a compiler, line and column of the compiled text, from
+    1.
 
-    stage : "" where the log does not say.   column : 0 where the driver does not say.   kind : error or warning."""
+    stage : "" where the log does not give it.   column : 0 where the driver does not give it.   kind : error or
+    warning."""
     stage = ""
     for line in map(str.strip, log.splitlines()):
         if header := _STAGE_HEADER.match(line):

@@ -1,8 +1,8 @@
-"""When pixels are exposed, and which instants an image is the mean of.
+"""Exposure times of pixels, and the instants that an image averages.
 
 Row r collects light over [start + r * row, start + r * row + exposure). The time from the first row's start to the last
-row's end is cut into n cells of one length; each is drawn once, at its middle, and a row weighs it by how much of the
-cell lies inside its own exposure: the midpoint rule, the same for a global and a rolling shutter.
+row's end is divided into n equal cells; each is drawn once, at its middle, and a row weights it by the part of the cell
+inside its own exposure: the midpoint rule, the same for a global and a rolling shutter.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from blinkgl.machine.kernels import kernel
 
 @dataclass(frozen=True)
 class Exposure:
-    """start_ns : of the first row's.   exposure_ns : how long every row's lasts.   row_ns : by how much each
-    begins after the one above (0: global shutter).   rows : of the image."""
+    """The exposure of an image. start_ns : of the first row.   exposure_ns : of every row.   row_ns : delay of each row
+    after the one above (0: global shutter).   rows : of the image."""
 
     start_ns: int
     exposure_ns: int
@@ -28,16 +28,16 @@ class Exposure:
 
     @property
     def end_ns(self) -> int:
-        """Of the last row's."""
+        """Return the end of the last row's exposure."""
         return self.start_ns + self.exposure_ns + round((self.rows - 1) * self.row_ns)
 
     @property
     def middle_ns(self) -> int:
-        """Of the image: the middle of the middle row's."""
+        """Return the middle of the image's exposure: that of the middle row."""
         return (self.start_ns + self.end_ns) // 2
 
     def cells(self, count: int) -> tuple[list[int], np.ndarray]:
-        """Times, ns, of ``count`` instants, and (count, rows) float64 weights: each row's sum to 1."""
+        """Return the times, ns, of ``count`` instants, and (count, rows) float64 weights: each row's sum to 1."""
         span = float(self.end_ns - self.start_ns)
         edges = np.linspace(0.0, span, count + 1)
         times = [self.start_ns + math.floor(middle) for middle in (edges[1:] + edges[:-1]) / 2]
@@ -48,8 +48,8 @@ class Exposure:
 
 
 def instants(exposure: Exposure, speed: float, max_px: float, lens: int, most: int) -> int:
-    """How many instants an image takes: while nothing moves farther than ``max_px`` from one to the next at ``speed``
-    px/s, and with ``lens`` of them in every row's exposure; ``most`` at most, 1 at least."""
+    """Return the number of instants of an image: enough that nothing moves farther than ``max_px`` between two at
+    ``speed`` px/s, and that every row's exposure has ``lens`` of them; at most ``most``, at least 1."""
     span_ns = exposure.end_ns - exposure.start_ns
     moving = speed * span_ns * 1e-9 / max_px
     focusing = lens * span_ns / exposure.exposure_ns if lens > 1 else 1.0
@@ -58,7 +58,7 @@ def instants(exposure: Exposure, speed: float, max_px: float, lens: int, most: i
 
 @kernel
 def accumulate(total: np.ndarray, image: np.ndarray, weights: np.ndarray) -> None:
-    """Adds weights[row] * image to total, (H, W, 3) float64 each, image float32 (H, W, 3 or more)."""
+    """Add weights[row] * image to total, (H, W, 3) float64 each, image float32 (H, W, 3 or more)."""
     height, width, channels = total.shape
     for y in range(height):
         weight = weights[y]
@@ -71,15 +71,15 @@ def accumulate(total: np.ndarray, image: np.ndarray, weights: np.ndarray) -> Non
 # ---------------------------------------------------------------------------------------------------------------------
 # Automatic exposure: a first-order lag in the logarithm of exposure times gain.
 #
-# With m the mean of an image taken with the product P, 1 being the largest code, P* = P target / m is what would
-# have met the target, and after dt seconds
+# With m the mean of an image taken with the product P, 1 being the largest code, P* = P target / m would have met the
+# target, and after dt seconds
 #
-#     ln P' = ln P + (1 - exp(-dt / lag)) (ln P* - ln P)
+# ln P' = ln P + (1 - exp(-dt / lag)) (ln P* - ln P)
 #
-# so that under constant light that clips nowhere ln P approaches its end as exp(-t / lag) whatever the image rate.
+# so that under constant light without clipping ln P approaches its end as exp(-t / lag), independent of the image rate.
 
 _DARKEST = 1e-6
-"""Mean below which an image says no more than that it is too dark."""
+"""Mean below which an image only shows that it is too dark."""
 
 
 @dataclass(frozen=True)
@@ -91,23 +91,23 @@ class Setting:
 
     @property
     def product(self) -> float:
-        """ns, at gain 1."""
+        """Return exposure times gain, ns."""
         return self.exposure_ns * self.gain
 
 
 def decibels(gain: float) -> float:
-    """Of a factor of voltage."""
+    """Return the dB of a voltage factor."""
     return 20.0 * math.log10(gain)
 
 
 def factor(gain_db: float) -> float:
-    """Of so many dB, of voltage."""
+    """Return the voltage factor of a gain in dB."""
     return 10.0 ** (gain_db / 20.0)
 
 
 def next_setting(config: AutoExposureConfig, setting: Setting, mean: float, dt_s: float) -> Setting:
-    """What the image ``dt_s`` after one with ``setting``, whose mean is ``mean`` (linear, 1 is the largest code), is
-    taken with."""
+    """Return the setting of the image ``dt_s`` after one with ``setting`` whose mean is ``mean`` (linear, 1 is the
+    largest code)."""
     share = 1.0 - math.exp(-dt_s / config.lag) if config.lag > 0 else 1.0
     wanted = setting.product * (config.target / max(mean, _DARKEST)) ** share
     shortest, longest = NS_PER_US * config.shortest_us, NS_PER_US * config.longest_us

@@ -1,10 +1,10 @@
-"""A frame camera: draws the instants of each exposure, adds up their light, and reads it out.
+"""A frame camera: draws the instants of each exposure, adds their light, and reads it out.
 
     camera = FrameCamera(renderer, config.images, seed, (t0_ns, t1_ns))
     while camera.due_ns is not None:
         image = camera.take()                  # a CameraImage
 
-It knows the renderer through which it looks and nothing of sequences or files; several may look at one scene.
+It depends on a renderer but not on sequences or files; several may use one scene.
 """
 
 from __future__ import annotations
@@ -28,23 +28,24 @@ if TYPE_CHECKING:
     from blinkgl.render.renderer import Renderer
 
 SPEED_EVERY, SPEED_TIMES = 4, 3
-"""The speeds that decide how many instants there are: of every n-th pixel, at so many times of the exposure."""
+"""Sampling of the speeds that determine the number of instants: every n-th pixel, and this many times of the
+exposure."""
 
 
 LENS_SPACING = 2.0
-"""What is out of focus is sampled so many ``max_px`` apart: a pixel by default, of which each sample is the mean."""
+"""Spacing of lens samples of out-of-focus points, in ``max_px``: one pixel by default, because each sample is a pixel's
+mean."""
 
 
 @dataclass(frozen=True, eq=False)
 class CameraImage:
-    """What a frame camera has taken.
+    """An image of a frame camera.
 
     k : number, from 0.   start_ns, end_ns : from the first row's exposure to the end of the last one's.
     exposure_ns : of each row.   row_ns : between the starts of two rows.   gain : a factor.
-    instants : of which it is the mean.   step_px : at most so far things move from one to the next, by the speeds at a
-    few times.
-    pictures : name -> codes, (H, W, 3) RGB or (H, W) of one colour per pixel, uint8 of 8 bits, else uint16: "images",
-    as the camera gives it, and those of ``images.also``."""
+    instants : number of instants averaged.   step_px : largest motion between two, from the speeds at a few times.
+    pictures : name -> codes, (H, W, 3) RGB or (H, W) of one colour per pixel, uint8 for 8 bits, else uint16: "images",
+    the camera's output, and those of ``images.also``."""
 
     k: int
     start_ns: int
@@ -58,26 +59,26 @@ class CameraImage:
 
     @property
     def t_ns(self) -> int:
-        """When it is there: the end of the last row's exposure."""
+        """Return its time: the end of the last row's exposure."""
         return self.end_ns
 
     @property
     def middle_ns(self) -> int:
-        """The middle of the exposure, of the middle row where they differ."""
+        """Return the middle of the exposure, of the middle row where they differ."""
         return (self.start_ns + self.end_ns) // 2
 
     @property
     def image(self) -> np.ndarray:
-        """As the camera gives it."""
+        """Return the camera's output."""
         return self.pictures["images"]
 
 
 class FrameCamera:
-    """Takes images with a renderer that somebody else holds.
+    """Takes images with a given renderer.
 
     config : ``images:``.   seed : 64-bit, of its noise.   span_ns : first and last time of the sequence.
-    due_ns : when the next image is there; None: there are no more.   taken : images so far.   drawn : instants so far.
-    largest_step_px : of all images, as of :class:`CameraImage`.   seconds : wall time beside the drawing."""
+    due_ns : time of the next image; None: there are no more.   taken : images so far.   drawn : instants so far.
+    largest_step_px : of all images, see :class:`CameraImage`.   seconds : wall time besides the drawing."""
 
     def __init__(self, renderer: Renderer, config: ImagesConfig, seed: int, span_ns: tuple[int, int]):
         camera = renderer.scene.camera
@@ -88,12 +89,12 @@ class FrameCamera:
         self.rewind()
 
     def rewind(self) -> None:
-        """Back to before the first image."""
+        """Return to before the first image."""
         self._setting = self._first
         self.taken, self.drawn, self.largest_step_px, self.seconds = 0, 0, 0.0, 0.0
 
     def __len__(self) -> int:
-        """Images in all."""
+        """Return the total number of images."""
         return len(self._starts)
 
     @property
@@ -101,7 +102,7 @@ class FrameCamera:
         return None if self.taken == len(self._starts) else self._exposure().end_ns
 
     def take(self) -> CameraImage:
-        """The next image. Raises GLError."""
+        """Return the next image. Raises GLError."""
         started, drawing = working_clock(), self._drawing_s
         image = self._take()
         self.seconds += working_clock() - started - (self._drawing_s - drawing)
@@ -139,7 +140,7 @@ class FrameCamera:
         )
 
     def facts(self) -> dict[str, Any]:
-        """Plain values for a manifest."""
+        """Return plain values for a manifest."""
         return {
             "images": self.taken,
             "pictures": list(self.config.pictures),
@@ -159,8 +160,8 @@ class FrameCamera:
         )
 
     def _light(self, exposure: Exposure) -> tuple[np.ndarray, int, float]:
-        """Mean over the exposure, (H, W, 3) float64, 1 being white; of how many instants; how far things move between
-        two of them, px."""
+        """Return the mean over the exposure, (H, W, 3) float64, 1 being white; the number of instants; the largest
+        motion between two of them, px."""
         config, draw = self.config, self.renderer
         times = np.linspace(exposure.start_ns, exposure.end_ns, SPEED_TIMES)
         speed = max(largest_speed(draw.velocity(int(t), SPEED_EVERY).view()) for t in times)
@@ -179,7 +180,7 @@ class FrameCamera:
         return self._at(total), count, speed * (exposure.end_ns - exposure.start_ns) * 1e-9 / count
 
     def _points_needed(self, t_ns: int) -> int:
-        """Of the lens, for the discs that the depths in view become; 1 where nothing is spread over a pixel."""
+        """Return the number of lens points for the discs of the depths in view; 1 where no disc exceeds a pixel."""
         lens = self.config.lens
         if lens is None:
             return 1
@@ -189,26 +190,26 @@ class FrameCamera:
         return thin_lens.samples(largest, LENS_SPACING * self.config.max_px)
 
     def _at(self, radiance: np.ndarray) -> np.ndarray:
-        """The light that arrives at the pixels, 1 being white."""
+        """Return the light at the pixels, 1 being white."""
         light = np.asarray(radiance, np.float64) / self.config.white
         return light if self._vignette is None else light * self._vignette
 
     # ---- read-out ------------------------------------------------------------------------------------------------
 
     def _seen(self, light: np.ndarray, setting: Setting) -> tuple[np.ndarray, float, float]:
-        """The light that the filters let through, the electrons that light 1 gives, and the gain of an electron."""
+        """Return the light that passes the filters, the electrons of light 1, and the gain per electron."""
         light = light if self.config.bayer is None else mosaic(light, self.config.bayer)
-        # of white, with the setting that the configuration gives, full_well / gain
+        # of white, with the configured setting, full_well / gain
         electrons = self.config.full_well * setting.exposure_ns / self._first.product
         return light, electrons, setting.gain / self.config.full_well
 
     def _reading(self, light: np.ndarray, setting: Setting) -> np.ndarray:
-        """What the converter is given, 1 being the largest code, without noise."""
+        """Return the converter's input, 1 being the largest code, without noise."""
         light, electrons, gain = self._seen(light, setting)
         return np.minimum(light * electrons, self.config.full_well) * gain
 
     def _noisy(self, light: np.ndarray, setting: Setting, k: int) -> np.ndarray:
-        """The same with the noise of image ``k``."""
+        """Return the converter's input with the noise of image ``k``."""
         config, (light, electrons, gain) = self.config, self._seen(light, setting)
         out, light = np.empty(light.shape), np.ascontiguousarray(light)
         readings(
@@ -230,6 +231,6 @@ class FrameCamera:
 
 
 def _mean(reading: np.ndarray) -> float:
-    """Of an image as it comes out, linear; of a colour image its luminance's."""
+    """Return the mean of an output image, linear; for a colour image of its luminance."""
     seen = np.clip(reading, 0.0, 1.0)
     return float((seen @ LUMA).mean() if seen.ndim == 3 else seen.mean())

@@ -1,11 +1,11 @@
-"""From light to what the converter reads: photons, full well, read noise, gain, black level, colour filters.
+"""Conversion of light to the converter's input: photons, full well, read noise, gain, black level, colour filters.
 
-The electrons of a pixel are Poisson distributed around its light, cut at the full well; the read-out adds normal noise;
-gain brings full_well / gain electrons to 1. So with light far from both ends the variance of a reading is mean * gain /
+The electrons of a pixel are Poisson distributed around its light, limited to the full well; the read-out adds normal
+noise; the gain maps full_well / gain electrons to 1. So far from both ends the variance of a value is mean * gain /
 full_well plus that of the read noise: in codes mean / (electrons per code).
 
-Noise is a function of (seed, image, pixel, channel) by the counter-based generator of :mod:`blinkgl.events.philox`,
-so that it is the same whoever draws it, in whatever order.
+Noise is a function of (seed, image, pixel, channel) by the counter-based generator of :mod:`blinkgl.events.philox`, so
+it does not depend on the order of drawing.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ PATTERNS = {
 
 
 class Stream(IntEnum):
-    """What a draw is for. Append only: the numbers are part of every published data set."""
+    """The purposes of draws. Append only: the numbers are part of every published data set."""
 
     PHOTONS = 0  # index = image * 2^16 + try
     READ_OUT = 1
@@ -39,13 +39,13 @@ class Stream(IntEnum):
 _U = np.uint64
 _PHOTONS, _READ_OUT = _U(Stream.PHOTONS), _U(Stream.READ_OUT)
 _TRIES = _U(1 << 16)
-_FEW = 10.0  # electrons up to which they are counted one by one
+_FEW = 10.0  # electrons up to which the distribution is summed
 _LN_ROOT_2PI = 0.5 * np.log(2.0 * np.pi)
 
 
 @register_jitable
 def _log_factorial(k):
-    """ln k! of k >= 9, float64: Stirling's series, error < 1e-12 there."""
+    """Return ln k! of k >= 9, float64: Stirling's series, error < 1e-12 there."""
     x = k + 1.0
     inverse = 1.0 / x
     z = inverse * inverse
@@ -55,10 +55,10 @@ def _log_factorial(k):
 
 @register_jitable
 def poisson(mean: float, seed: int, pixel: int, index: int) -> float:
-    """Whole number >= 0, float64, Poisson distributed with mean >= 0; of (seed, pixel, index) alone.
+    """Return a Poisson distributed number with mean >= 0, as float64; it depends only on (seed, pixel, index).
 
-    Counted along the distribution where the mean is small, and otherwise by transformed rejection with squeeze
-    (Hoermann, "The transformed rejection method for generating Poisson random variables", 1993, algorithm PTRS)."""
+    For a small mean the distribution is summed, otherwise transformed rejection with squeeze (Hoermann, "The
+    transformed rejection method for generating Poisson random variables", 1993, algorithm PTRS)."""
     if mean <= 0.0:
         return 0.0
     first = index * _TRIES
@@ -107,11 +107,12 @@ def readings(
     image: np.uint64,
     out: np.ndarray,
 ) -> None:
-    """What the converter is given: out (N,), 1 being the largest code, not yet cut there, of (N,) light, float64 both.
+    """Write the converter's input to out (N,), 1 being the largest code, not yet limited, from (N,) light, float64
+    both.
 
-    electrons_of_light : that light 1 gives with this exposure.   gain : of an electron.   full_well, read_noise :
-    electrons.   image : number of the image."""
-    flood = 4.0 * full_well + 1000.0  # fills the well whatever is drawn
+    electrons_of_light : of light 1 with this exposure.   gain : per electron.   full_well, read_noise : electrons.
+    image : number of the image."""
+    flood = 4.0 * full_well + 1000.0  # fills the well for any draw
     for i in range(light.size):
         electrons = min(light[i] * electrons_of_light, flood)
         if photon_noise:
@@ -124,7 +125,7 @@ def readings(
 
 
 def mosaic(image: np.ndarray, pattern: str) -> np.ndarray:
-    """(H, W) of (H, W, 3): of each pixel the channel that its filter lets through."""
+    """Return (H, W) of (H, W, 3): for each pixel the channel of its filter."""
     out = np.empty(image.shape[:2], image.dtype)
     for y, row in enumerate(PATTERNS[pattern]):
         for x, channel in enumerate(row):
@@ -133,11 +134,11 @@ def mosaic(image: np.ndarray, pattern: str) -> np.ndarray:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# How linear light becomes codes, and back.
+# Conversion of linear light to codes, and back.
 
 
 def encode(linear: np.ndarray, response: str, gamma: float, bits: int) -> np.ndarray:
-    """Codes of linear light in [0, 1], rounded to nearest: uint8 of 8 bits, else uint16. Any shape.
+    """Return codes of linear light in [0, 1], rounded to nearest: uint8 for 8 bits, else uint16. Any shape.
 
     response : "srgb", "linear", or "gamma": light ^ (1 / gamma)."""
     x = np.clip(np.asarray(linear, np.float64), 0.0, 1.0)
@@ -149,7 +150,7 @@ def encode(linear: np.ndarray, response: str, gamma: float, bits: int) -> np.nda
 
 
 def decode(codes: np.ndarray, response: str, gamma: float, bits: int) -> np.ndarray:
-    """Linear light, float64 in [0, 1], of the middle of each code: what :func:`encode` turns into it again."""
+    """Return linear light, float64 in [0, 1], at the middle of each code: :func:`encode` gives the code again."""
     x = np.asarray(codes, np.float64) / largest_code(bits)
     if response == "srgb":
         return linear_from_srgb(x)
@@ -157,5 +158,5 @@ def decode(codes: np.ndarray, response: str, gamma: float, bits: int) -> np.ndar
 
 
 def largest_code(bits: int) -> int:
-    """Of so many bits."""
+    """Return the largest code of this many bits."""
     return (1 << bits) - 1

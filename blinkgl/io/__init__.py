@@ -1,7 +1,7 @@
-"""Files in and out: one module per format, the reader beside the writer. Nothing here knows
-about scenes, GL or emulators.
+"""Input and output of files: one module per format, the reader beside the writer, independent of scenes, GL and
+emulators.
 
-In:    events, pictures and labels as arrays, or files of strangers.
-Out:   files that appear whole or not at all, or arrays, or one line that names the file.
+In:    events, pictures and labels as arrays, or files from untrusted users.
+Out:   files that appear completely or not at all, or arrays, or a one-line error that names the file.
 Start: formats.py (``open_events``, ``write_events``).
 """

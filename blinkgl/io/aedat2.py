@@ -32,8 +32,8 @@ SIZES = {
     "DAVIS346": (260, 346),
     "DAVIS640": (480, 640),
 }
-"""(height, width) of chips; their names go on with letters that do not matter here."""
-# A header beyond these sizes, in bytes, is damage.
+"""(height, width) of chips; further letters of their names do not matter here."""
+# A larger header, in bytes, is damaged.
 _MAX_LINE, _MAX_HEADER = 1 << 16, 1 << 26
 # Big-endian records of 8 bytes, see the module.
 _RECORD = np.dtype([("address", ">u4"), ("t", ">u4")])
@@ -41,7 +41,7 @@ _RECORD = np.dtype([("address", ">u4"), ("t", ">u4")])
 _VALUES = 7
 _FULL_SCALE = 1 << 15
 _DEFAULT_RATE, _DEFAULT_ACCELERATION = 1000.0, 8.0
-"""Full scales, degrees/s and g, that jAER sets a camera to where its header does not say."""
+"""Full scales, degrees/s and g, that jAER uses where the header gives none."""
 # Kinds of records. Kind k has its last time in state[1 + k] of _unwrap.
 _DVS, _PIN, _APS, _IMU = range(4)
 
@@ -50,8 +50,8 @@ class Aedat2Reader:
     """A recording of a DAVIS camera; times are the file's own µs, unwrapped. height, width : px, by the chip's name.
     frames_cut : frames without all of their samples (at the file's ends), known after :meth:`frames`.
 
-    Raises AssetError: another magic or version, a chip that is not known, a header without an end; while reading,
-    naming the byte: stray bytes at the end (truncated), an address outside the sensor, times that run backwards."""
+    Raises AssetError: another magic or version, an unknown chip, a header without an end; while reading, naming the
+    byte: stray bytes at the end (truncated), an address outside the sensor, decreasing times."""
 
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)
@@ -61,7 +61,7 @@ class Aedat2Reader:
         size = next((size for known, size in SIZES.items() if name and name.upper().startswith(known)), None)
         if size is None:
             raise AssetError(
-                "a camera whose addresses are not known" if chip else "no camera named in the header ('# AEChip: …')",
+                "a camera with unknown addresses" if chip else "no camera named in the header ('# AEChip: …')",
                 where=str(path),
                 value=name,
                 accepted=", ".join(SIZES),
@@ -70,7 +70,7 @@ class Aedat2Reader:
         self.frames_cut = 0
 
     def chunks(self, records: int = 1 << 17) -> Iterator[Events]:
-        """All events, as decoded from ``records`` records at a time."""
+        """Yield all events, decoded from ``records`` records at a time."""
         for _, address, t in self._kind(_DVS, records):
             # The file counts x of events from the right and y from the bottom.
             x = self.width - 1 - (address >> 12 & 0x3FF)
@@ -78,7 +78,8 @@ class Aedat2Reader:
             yield Events(x.astype(np.uint16), y.astype(np.uint16), t, (address >> 11 & 1).astype(np.uint8))
 
     def frames(self, records: int = 1 << 17) -> Iterator[CameraFrame]:
-        """Frames in their order: reset minus signal sample, (H, W) uint16 of 0 … 1023, 0 where it would be negative.
+        """Yield frames in their order: reset minus signal sample, (H, W) uint16 of 0 … 1023, 0 where it would be
+        negative.
 
         Frames of a part of the sensor (a region of interest) are 0 elsewhere. The exposure of a global shutter is from
         the last reset read to the first signal read; of a rolling one, that of the row read first."""
@@ -89,7 +90,8 @@ class Aedat2Reader:
         self.frames_cut = assembler.cut
 
     def imu(self) -> ImuSamples:
-        """All whole samples. Scales are the header's (``ImuGyroScale``, ``ImuAccelScale``), or jAER's usual ones."""
+        """Return all complete samples. Scales are the header's (``ImuGyroScale``, ``ImuAccelScale``), or jAER's usual
+        ones."""
         parts = [(address, t) for _, address, t in self._kind(_IMU)]
         address = np.concatenate([a for a, _ in parts]) if parts else np.empty(0, np.int64)
         t = np.concatenate([t for _, t in parts]) if parts else np.empty(0, np.int64)
@@ -112,8 +114,8 @@ class Aedat2Reader:
         )
 
     def _kind(self, kind: int, records: int = 1 << 17) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-        """(index of the first record looked at, addresses, times) of one kind of records; the others are checked, too,
-        that what a file holds is refused whatever is asked of it."""
+        """Yield (index of the first record, addresses, times) of one kind of records; the others are checked, too, so
+        that a damaged file is always refused."""
         # state: the last time, then the last time of each kind.
         state = np.full(5, -1, np.int64)
         for first, raw in self._raw(records):
@@ -159,7 +161,7 @@ class Aedat2Reader:
                 accepted=f"x < {self.width}, y < {self.height}",
             )
         raise AssetError(
-            f"times run backwards: {at}",
+            f"times decrease: {at}",
             where=str(self.path),
             value=stamp,
             accepted=f"at least {int(state[0]) & 0xFFFFFFFF} µs, or a wrap of 32 bits",
@@ -167,8 +169,8 @@ class Aedat2Reader:
 
 
 def _read_header(path: Path) -> tuple[str, int]:
-    """The lines that begin with '#', and where they end. A record, too, may begin with that byte (y of 140 … 143); no
-    line holds the control characters that its low bytes are, and newer files say where they end."""
+    """Return the lines that begin with '#', and where they end. A record may also begin with that byte (y of 140 …
+    143); but a line has no control characters, which its low bytes are, and newer files mark the end."""
     lines, size = [], 0
     try:
         with open(path, "rb") as file:
@@ -211,8 +213,7 @@ def _scale(header: str, key: str, prefix: str, usual: float) -> float:
 
 def _kinds(address: np.ndarray) -> np.ndarray:
     # Bits 11 and 10 tell the kinds of records with and without bit 31 apart.
-    """Return _DVS, _PIN, _APS or _IMU for every address (int64); frame samples of the sub-type that nobody has are
-    _PIN."""
+    """Return _DVS, _PIN, _APS or _IMU for every address (int64); frame samples of the unused sub-type are _PIN."""
     low = address >> 10 & 3
     return np.where(
         address >> 31 == 0, np.where(low & 1, _PIN, _DVS), np.where(low == 3, _IMU, np.where(low == 2, _PIN, _APS))
@@ -223,8 +224,8 @@ def _kinds(address: np.ndarray) -> np.ndarray:
 def _unwrap(address, kinds, stamp, state, height, width, t):
     """Fill times, int64 µs, and return (index of the first bad record, or -1; 1: outside the sensor, 2: backwards).
 
-    Records of one kind keep the order of time; of different kinds they may be out of order by less than half of what 32
-    bits count."""
+    Records of one kind are in order of time; of different kinds they may be out of order by less than half of the range
+    of 32 bits."""
     for i in range(len(address)):
         kind = kinds[i]
         # Only events and frame samples have coordinates.
@@ -248,7 +249,7 @@ def _unwrap(address, kinds, stamp, state, height, width, t):
 
 
 class _Frames:
-    """Frame samples, in their order, put together. cut : frames without all of their samples."""
+    """Assembles frames from frame samples, in their order. cut : frames without all of their samples."""
 
     def __init__(self, height: int, width: int):
         self._shape, self.cut = (height, width), 0
@@ -267,7 +268,7 @@ class _Frames:
                 yield from self.end()
 
     def end(self) -> Iterator[CameraFrame]:
-        """The frame so far, where it is one."""
+        """Yield the frame so far, if it is one."""
         # A frame is complete where each pixel that was reset has also been read, in a rectangle.
         read, there = self._signal >= 0, self._reset >= 0
         if read.any() or there.any():

@@ -20,7 +20,8 @@ _ABSENT = {"events": "no events", "frame": "no frames", "imus": "no samples of a
 class Aedat4Reader:
     """The streams of a recording; times are the file's own int64 µs (usually since 1970).
 
-    height, width : px of the events' sensor. Raises AssetError: no AEDAT4, damaged, no stream of what is asked for."""
+    height, width : px of the events' sensor. Raises AssetError: not AEDAT4, damaged, the requested stream is
+    missing."""
 
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)
@@ -31,7 +32,7 @@ class Aedat4Reader:
         check_size(self.height, self.width, str(path))
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
-        """All events, packet by packet, joined to about ``size``."""
+        """Yield all events, packet by packet, joined to about ``size``."""
         first, pending, count = 0, [], 0
         for a in self._packets("events"):
             pending.append(events_of(a["x"], a["y"], a["t"], a["on"], str(self.path), first + count))
@@ -43,7 +44,7 @@ class Aedat4Reader:
             yield Events.concatenate(pending)
 
     def frames(self) -> Iterator[CameraFrame]:
-        """Frames in their order, uint8, RGB where they have colours; one in memory at a time."""
+        """Yield frames in their order, uint8, RGB where they have colours; one in memory at a time."""
         last = None
         for number, frame in enumerate(self._packets("frame")):
             begin, end = int(frame["exposure_begin_t"]), int(frame["exposure_end_t"])
@@ -56,17 +57,17 @@ class Aedat4Reader:
             yield CameraFrame(image[..., :3] if image.ndim == 3 else image, begin, end)
 
     def imu(self) -> ImuSamples:
-        """All samples of the inertial unit."""
+        """Return all samples of the inertial unit."""
         rows = np.concatenate(list(self._packets("imus")))
         t = rows["t"].astype(np.int64)
         if (back := np.diff(t) < 0).any():
             i = int(np.argmax(back))
             raise EventDataError(
-                f"times run backwards at sample {i + 1} of the inertial unit",
+                f"times decrease at sample {i + 1} of the inertial unit",
                 where=str(self.path),
                 value=(int(t[i]), int(t[i + 1])),
             )
-        # The file counts in g and degrees per second.
+        # The file's units are g and degrees per second.
         pull, rate = (
             np.stack([rows[f"{name}_{axis}"] for axis in "xyz"], axis=1).astype(np.float64)
             for name in ("accelerometer", "gyroscope")
@@ -89,7 +90,7 @@ class Aedat4Reader:
 
 
 def _decoder(path: Path) -> Any:
-    # Here: few programs read such files.
+    # Imported here: few programs read such files.
     import aedat
 
     return aedat.Decoder(os.fspath(path))
@@ -97,7 +98,7 @@ def _decoder(path: Path) -> Any:
 
 @contextlib.contextmanager
 def _damage(path: Path) -> Iterator[None]:
-    """Turn what the decoder raises on damaged bytes, a panic of its Rust code included, into AssetError."""
+    """Convert what the decoder raises on damaged bytes, including a panic of its Rust code, to AssetError."""
     try:
         yield
     except (AssetError, ImportError):

@@ -1,5 +1,5 @@
-"""Events as NumPy files: .npz with x, y, t, p (and cause, where known), or .npy with a structured array; read also
-MATLAB's .mat with such variables. Whole recordings in memory, unlike the others."""
+"""Events as NumPy files: .npz with x, y, t, p (and cause, where known), or .npy with a structured array; also reads
+MATLAB's .mat with such variables. Unlike the other formats, whole recordings are in memory."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _DAMAGE = (ValueError, LookupError, RuntimeError, StopIteration, struct.error, z
 
 
 def read_mat(path: str | os.PathLike) -> dict[str, Any]:
-    """Arrays (N,) by the names of their variables, a struct as a table of arrays; None for what is neither. Raises
+    """Return arrays (N,) by the names of their variables, a struct as a table of arrays; None for anything else. Raises
     AssetError: version 7.3, which is HDF5; damaged."""
     data = memoryview(Path(path).read_bytes())
     if data[124:128] in (b"\0\2IM", b"\2\0MI") or data[:8] == b"\x89HDF\r\n\x1a\n":
@@ -44,7 +44,8 @@ def read_mat(path: str | os.PathLike) -> dict[str, Any]:
 
 
 def _elements(data: memoryview) -> Iterator[tuple[int, memoryview]]:
-    """Type and content of each element. One of up to four bytes has its size in the upper half of the first word."""
+    """Yield type and content of each element. One of up to four bytes has its size in the upper half of the first
+    word."""
     at = 0
     while at < len(data):
         kind, size = struct.unpack_from("<II", data, at)
@@ -66,7 +67,7 @@ def _unpacked(data: memoryview) -> Iterator[tuple[int, memoryview]]:
 
 
 def _matrix(body: memoryview) -> tuple[str, Any]:
-    """Name and value. A struct's fields follow each other as matrices without names."""
+    """Return name and value. A struct's fields follow each other as matrices without names."""
     parts = _elements(body)
     flags, _, called = next(parts)[1], next(parts), next(parts)[1]
     name = bytes(called).decode("latin-1")
@@ -90,10 +91,10 @@ _NAMES = {
 
 
 class ArrayReader:
-    """``.npz`` with four columns or ``.npy`` structured. Integer times are µs, float
-    times seconds; p is 0/1, -1/1 or bool.
+    """Reads ``.npz`` with four columns or structured ``.npy``. Integer times are µs, float times seconds; p is 0/1,
+    -1/1 or bool.
 
-    A plain (N, 4) array is refused: files in the wild disagree about the order of its columns."""
+    A plain (N, 4) array is refused: existing files disagree about the order of its columns."""
 
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)
@@ -107,7 +108,7 @@ class ArrayReader:
         self.causes = self._events.cause is not None
 
     def _columns(self, path: str | os.PathLike) -> tuple[dict[str, np.ndarray], bool]:
-        """The columns of the file, and whether times that are floats are seconds."""
+        """Return the columns of the file, and whether float times are seconds."""
         with numpy_errors(path):
             if self.path.suffix.lower() == ".npy":
                 table = read_npy(path)
@@ -127,8 +128,8 @@ class ArrayReader:
 
 
 class MatReader(ArrayReader):
-    """``.mat`` of version 7 or older with variables, or one struct, of such names. MATLAB's numbers are floats unless
-    somebody said otherwise: times are seconds where one of them has a fraction, else µs. y is as the file has it."""
+    """Reads ``.mat`` of version 7 or older with variables, or one struct, of such names. MATLAB's numbers are floats by
+    default: times are seconds where one of them has a fraction, else µs. y is as in the file."""
 
     def _columns(self, path: str | os.PathLike) -> tuple[dict[str, np.ndarray], bool]:
         found = read_mat(path)
@@ -142,7 +143,7 @@ class MatReader(ArrayReader):
 
 
 class ArrayWriter:
-    """Collects events, writes on close."""
+    """Collects events and writes on close."""
 
     def __init__(self, path: str | os.PathLike, height: int, width: int):
         self.path, self._size, self._chunks = Path(path), (height, width), []
@@ -172,7 +173,7 @@ class ArrayWriter:
 
 
 def _named(names: Iterable[str], path) -> dict[str, str]:
-    """Column -> its name in the file; AssetError when one is missing."""
+    """Return column -> its name in the file. Raises AssetError when one is missing."""
     found = {k: next((n for n in options if n in names), None) for k, options in _NAMES.items()}
     if "cause" in names:
         found["cause"] = "cause"

@@ -1,8 +1,8 @@
-"""Output appears whole or not at all: written under a hidden name beside the final one, synced, then renamed.
+"""Output that appears completely or not at all: written under a hidden name beside the final one, synced, then renamed.
 
 A temporary's name holds a hash of this machine's boot, its PID namespace, and the writer's pid, so that a later run can
-recognise leftovers of its own dead predecessors (kill -9, power loss) without ever touching those of a live
-process, another container, or another machine on a shared disk.
+recognise leftovers of dead writers (kill -9, power loss) without touching those of a live process, another container,
+or another machine on a shared disk.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _PATTERN = re.compile(r"^\..+\.blinkgl-tmp-([0-9a-f]{12})-(\d+)-\d+(\..*)?$")
 
 @contextlib.contextmanager
 def output_errors(where: str | os.PathLike) -> Iterator[None]:
-    """Turns an ``OSError`` of writing ``where`` (also HDF5's, which hide the errno in their text) into an
+    """Convert an ``OSError`` of writing ``where`` (also HDF5's, whose errno is only in its text) to an
     :class:`OutputError` of one line."""
     try:
         yield
@@ -45,7 +45,7 @@ def _reason(error: OSError) -> str:
 
 
 def machine_token() -> str:
-    """12 hex digits naming this boot of this machine and this PID namespace: where a pid is meaningful."""
+    """Return 12 hex digits for this boot of this machine and this PID namespace: where a pid is meaningful."""
     parts = [socket.gethostname()]
     for read in (lambda: Path("/proc/sys/kernel/random/boot_id").read_text(), lambda: os.readlink("/proc/self/ns/pid")):
         with contextlib.suppress(OSError):
@@ -54,14 +54,14 @@ def machine_token() -> str:
 
 
 def temporary_beside(final: Path) -> Path:
-    """A fresh hidden name in ``final``'s folder (hence on its file system) with its suffix, because writers
-    such as ffmpeg go by the ending."""
+    """Return a new hidden name in ``final``'s folder (hence on its file system) with its suffix, because writers such
+    as ffmpeg depend on the ending."""
     return final.with_name(f".{final.name}.blinkgl-tmp-{machine_token()}-{os.getpid()}-{next(_serial)}{final.suffix}")
 
 
 def remove_stale(folder: Path) -> list[Path]:
-    """Deletes temporaries in ``folder`` whose writer ran on this boot of this machine and is dead. Anything
-    else, even when it looks like ours, is left alone."""
+    """Delete temporaries in ``folder`` whose writer ran on this boot of this machine and is dead. Everything else, even
+    if it looks similar, is kept."""
     removed = []
     token = machine_token()
     for path in folder.iterdir() if folder.is_dir() else ():
@@ -84,8 +84,8 @@ def _alive(pid: int) -> bool:
 
 
 def fsync(path: Path) -> None:
-    """Flushes a file or a directory entry to the disk."""
-    if os.name == "nt":  # which opens no folders, and flushes what can be written alone
+    """Flush a file or a directory entry to the disk."""
+    if os.name == "nt":  # Windows cannot open folders; it flushes what it can
         return
     fd = os.open(path, os.O_RDONLY)
     try:
@@ -100,7 +100,7 @@ def fsync(path: Path) -> None:
 
 @contextlib.contextmanager
 def atomic_file(final: str | os.PathLike, *, overwrite: bool = True) -> Iterator[Path]:
-    """``with atomic_file("out.h5") as path:`` write to ``path``; renamed to ``out.h5`` on success, deleted on
+    """``with atomic_file("out.h5") as path:`` write to ``path``; it is renamed to ``out.h5`` on success and deleted on
     any exception. The parent folder is made.
 
     Raises
@@ -117,7 +117,7 @@ def atomic_file(final: str | os.PathLike, *, overwrite: bool = True) -> Iterator
         remove_stale(final.parent)
     temporary = temporary_beside(final)
     try:
-        yield temporary  # the format's own writer translates its errors; what the body reads is not our business
+        yield temporary  # the format's own writer converts its errors; reading errors of the body are not handled here
         with output_errors(final):
             fsync(temporary)
             os.replace(temporary, final)
@@ -131,12 +131,12 @@ def atomic_file(final: str | os.PathLike, *, overwrite: bool = True) -> Iterator
 
 @contextlib.contextmanager
 def atomic_folder(final: str | os.PathLike) -> Iterator[Path]:
-    """``with atomic_folder("out") as folder:`` write below ``folder``; renamed to ``out`` on success, deleted on any
-    exception. The parent folder is made.
+    """``with atomic_folder("out") as folder:`` write below ``folder``; it is renamed to ``out`` on success and deleted
+    on any exception. The parent folder is made.
 
     Raises
     ------
-    OutputError : ``final`` is there (and no empty folder), or cannot be written.
+    OutputError : ``final`` exists (and is not an empty folder), or cannot be written.
     """
     final = Path(final)
     refuse_existing(final)
@@ -163,7 +163,7 @@ def atomic_folder(final: str | os.PathLike) -> Iterator[Path]:
 
 
 def refuse_existing(final: str | os.PathLike) -> None:
-    """OutputError unless ``final`` is free (absent, or an empty folder)."""
+    """Raise OutputError unless ``final`` is free (absent, or an empty folder)."""
     final = Path(final)
     if final.is_dir() and not any(final.iterdir()):
         return

@@ -27,14 +27,14 @@ _PARTLY, _LARGELY = 0.05, 0.5
 
 
 def encode_boxes(value: Boxes) -> bytes:
-    """The bytes of the .npz; they do not depend on the clock."""
+    """Return the bytes of the .npz; they do not depend on the clock."""
     buffer = io.BytesIO()
     np.savez(buffer, **{name: getattr(value, name) for name in (*SHAPES, "resolution")})
     return buffer.getvalue()
 
 
 def read_boxes(path: str | os.PathLike) -> Boxes:
-    """Raises AssetError: missing, damaged, arrays of another shape or kind of number."""
+    """Return the boxes of a file. Raises AssetError: missing, damaged, arrays of another shape or number type."""
     with numpy_errors(path), NpzReader(path) as file:
         arrays, resolution = {name: file[name] for name in SHAPES}, file["resolution"]
     if resolution.shape != (2,) or resolution.dtype.kind != "i":
@@ -52,7 +52,7 @@ def read_boxes(path: str | os.PathLike) -> Boxes:
 
 
 def kitti_text(value: Boxes) -> str:
-    """A line per object that is seen."""
+    """Return a line per visible object."""
     lines = []
     for k in np.flatnonzero(value.visible_pixels > 0):
         T, (length, width, height) = value.T_cam_box[k], value.size[k]

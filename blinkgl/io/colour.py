@@ -1,4 +1,4 @@
-"""Flow and events as colours."""
+"""Colours of flow and events."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ for Optical Flow", IJCV 2011, colour coding after Ware); unequal, because equal 
 
 @functools.cache
 def flow_wheel() -> np.ndarray:
-    """(511, 511, 3) uint8: the colour of unit-disc flow (u, v) at [255 + 255 v, 255 + 255 u]; white at rest."""
+    """Return the colour of unit-disc flow (u, v) at [255 + 255 v, 255 + 255 u], (511, 511, 3) uint8; white at rest."""
     ring = np.concatenate([np.linspace(a, b, n, endpoint=False) for n, a, b in _BANDS])
     v, u = np.mgrid[-_RADIUS : _RADIUS + 1, -_RADIUS : _RADIUS + 1] / _RADIUS
     position = (np.arctan2(-v, -u) / np.pi + 1) / 2 * len(ring)  # closed: no seam at pure +x
@@ -37,11 +37,11 @@ def flow_wheel() -> np.ndarray:
 
 
 def flow_colour(flow: np.ndarray, maximum: float | None = None, valid: np.ndarray | None = None) -> np.ndarray:
-    """RGB of a flow field by the Middlebury wheel: direction is hue, speed is saturation.
+    """Return the RGB of a flow field by the Middlebury wheel: direction is hue, speed is saturation.
 
     flow : (H, W, 2) px, +x right, +y down. maximum : px of full saturation (default: the largest valid speed); faster
-    pixels keep their hue at full saturation. valid : (H, W) bool; invalid or non-finite pixels are dark grey.
-    Returns (H, W, 3) uint8.
+    pixels keep their hue at full saturation. valid : (H, W) bool; invalid or non-finite pixels are dark grey. Returns
+    (H, W, 3) uint8.
     """
     flow = np.ascontiguousarray(flow, np.float32)
     valid = np.ones(flow.shape[:2], np.bool_) if valid is None else np.ascontiguousarray(valid, np.bool_)
@@ -82,7 +82,7 @@ def _look_up(flow, valid, maximum, wheel, invalid, rgb):
 
 @kernel
 def count_events(x: np.ndarray, y: np.ndarray, p: np.ndarray, counts: np.ndarray) -> None:
-    """Adds events to ``counts`` (2, H, W) uint16 by polarity, saturating."""
+    """Add events to ``counts`` (2, H, W) uint16 by polarity, saturating."""
     for i in range(len(x)):
         n = counts[p[i], y[i], x[i]]
         if n < 65535:
@@ -90,8 +90,8 @@ def count_events(x: np.ndarray, y: np.ndarray, p: np.ndarray, counts: np.ndarray
 
 
 def event_colour(counts: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8 of (2, H, W) counts: ON blue, OFF red on white, both violet; one event
-    already shows, more are darker."""
+    """Return (H, W, 3) uint8 of (2, H, W) counts: ON blue, OFF red on white, both violet; one event is visible, more
+    are darker."""
     rgb = np.empty((*counts.shape[1:], 3), np.uint8)
     _shade(counts, _SHADE, rgb)
     return rgb

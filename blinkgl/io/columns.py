@@ -1,8 +1,8 @@
-"""Events as a file claims them: nothing wraps round, nothing lies outside the sensor, nothing runs backwards.
+"""Checks of a file's events: no overflow, no event outside the sensor, no decreasing times.
 
-Every reader hands the columns it finds to :func:`events_of`; :class:`blinkgl.io.formats.EventFile`, the slicing readers
-and every writer ask :func:`check_events` for the rest. Positions in messages are indices of
-events, counted from the file's first.
+Every reader passes its columns to :func:`events_of`; :class:`blinkgl.io.formats.EventFile`, the slicing readers and
+every writer call :func:`check_events` for the rest. Positions in messages are indices of events, counted from the
+file's first.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ def events_of(
     offset: int = 0,
     signed: bool = False,
 ) -> Events:
-    """Columns of any integer, boolean or float type as :class:`Events`; ``offset`` (µs) is added to the times.
+    """Return columns of any integer, boolean or float type as :class:`Events`; ``offset`` (µs) is added to the times.
 
     t : µs. p : 0 or 1, with ``signed`` also -1, which becomes 0. cause : 0 to 3, see
-    :class:`~blinkgl.types.events.Cause`, where the file has them. first : index of the
-    first of these events in the file.
+    :class:`~blinkgl.types.events.Cause`, where the file has them. first : index of the first of these events in the
+    file.
     Raises EventDataError, naming event and value, for what Events cannot hold: coordinates outside uint16 or between
-    pixels, NaN, times beyond int64, another polarity. AssetError: a column that is no 1-D array of
-    numbers, or columns of different lengths."""
+    pixels, NaN, times beyond int64, another polarity. AssetError: a column that is not a 1-D array of numbers, or
+    columns of different lengths."""
     columns = {"x": np.asarray(x), "y": np.asarray(y), "t": np.asarray(t), "p": np.asarray(p)}
     if cause is not None:
         columns["cause"] = np.asarray(cause)
@@ -54,8 +54,8 @@ def events_of(
 
 
 def microseconds(seconds: np.ndarray, where: str, first: int = 0) -> np.ndarray:
-    """int64 µs, rounded, of float seconds. Raises EventDataError, naming the event, for NaN,
-    infinity and what int64 cannot hold."""
+    """Return int64 µs, rounded, of float seconds. Raises EventDataError, naming the event, for NaN, infinity and what
+    int64 cannot hold."""
     t = np.rint(np.asarray(seconds, np.float64) * 1e6)
     if len(t) and not (np.abs(t) < _MAX_TIME).all():  # NaN compares False
         i = int(np.argmin(np.abs(t) < _MAX_TIME))
@@ -74,18 +74,18 @@ def check_events(
     width: int | None = None,
     after: int | None = None,
 ) -> int | None:
-    """Refuses, naming event and value, what lies outside a sensor of that size (None: not known), a polarity other than
-    0 and 1, and times that run backwards, also against ``after``, the last time before these events. Returns the last
-    time (``after`` when there are no events). Raises EventDataError."""
+    """Refuse, naming event and value, events outside a sensor of that size (None: not known), a polarity other than 0
+    and 1, and decreasing times, also against ``after``, the last time before these events. Return the last time
+    (``after`` when there are no events). Raises EventDataError."""
     t = events.t
     if not len(t):
         return after
     if after is not None and t[0] < after:
-        raise EventDataError(f"event times run backwards at event {first}", where=where, value=(after, int(t[0])))
+        raise EventDataError(f"event times decrease at event {first}", where=where, value=(after, int(t[0])))
     if (back := t[1:] < t[:-1]).any():
         i = int(np.argmax(back))
         raise EventDataError(
-            f"event times run backwards at event {first + i + 1}", where=where, value=(int(t[i]), int(t[i + 1]))
+            f"event times decrease at event {first + i + 1}", where=where, value=(int(t[i]), int(t[i + 1]))
         )
     for name, side in (("x", width), ("y", height)):
         column = getattr(events, name)
@@ -109,7 +109,7 @@ def check_events(
 
 
 def refuse_causes(events: Events, kind: str, where: str) -> None:
-    """OutputError for events with causes, for a format that has no place for them."""
+    """Raise OutputError for events with causes, for a format that cannot store them."""
     if events.cause is not None:
         raise OutputError(
             f"{kind} cannot hold the causes of events",
@@ -119,7 +119,7 @@ def refuse_causes(events: Events, kind: str, where: str) -> None:
 
 
 def check_size(height: int | None, width: int | None, where: str) -> None:
-    """AssetError when a sensor's declared size (None: not declared) is impossible."""
+    """Raise AssetError when a sensor's declared size (None: not declared) is impossible."""
     if not all(n is None or 0 < n <= MAX_SIDE for n in (height, width)):
         raise AssetError(
             "impossible sensor size", where=where, value=f"{width}x{height}", accepted=f"1 to {MAX_SIDE} px a side"
@@ -127,7 +127,7 @@ def check_size(height: int | None, width: int | None, where: str) -> None:
 
 
 def _whole(column: np.ndarray, name: str, dtype, low: int, high: int, where: str, first: int) -> np.ndarray:
-    """``column`` as ``dtype``, every value unchanged."""
+    """Return ``column`` as ``dtype``, every value unchanged."""
     if column.dtype.kind not in "iufb":
         raise AssetError(
             f"event column '{name}' holds no numbers",
@@ -152,10 +152,10 @@ def _refuse(column: np.ndarray, good: np.ndarray, name: str, accepted: str, wher
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What a camera records beside its events: frames of its own and the samples of an inertial measurement unit.
+# Recordings of a camera beside its events: its frames and the samples of an inertial measurement unit.
 
 G = 9.80665
-"""m/s²; what recordings count in."""
+"""m/s²; the unit of recordings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +169,7 @@ class CameraFrame:
 
     @property
     def t_us(self) -> int:
-        """The middle of the exposure."""
+        """Return the middle of the exposure."""
         return (self.begin_us + self.end_us) // 2
 
 

@@ -125,8 +125,8 @@ class DsecEventWriter:
         self._raise_pending()
 
     def close(self, t_end_us: int | None = None) -> None:
-        """Finishes the file. ``t_end_us`` (image clock, exclusive) is the recording's end where it is later than the
-        last event's, so that ``ms_to_idx`` covers windows up to it."""
+        """Finish the file. ``t_end_us`` (image clock, exclusive) is the recording's end where it is later than the last
+        event's, so that ``ms_to_idx`` covers windows up to it."""
         if self._closed:
             return
         # The table covers the whole recording, events or not.
@@ -155,7 +155,7 @@ class DsecEventWriter:
             raise
 
     def abort(self) -> None:
-        """Stops without finishing; never raises."""
+        """Stop without finishing; never raises."""
         if self._closed:
             return
         self._closed = True
@@ -193,7 +193,7 @@ class DsecEventWriter:
         self._last_t = check_events(events, where, self.count, height=self.height, width=self.width, after=self._last_t)
 
     def _check_causes(self, events: Events) -> None:
-        """The first events say whether there are causes."""
+        """Check that all events have causes, or none: the first ones decide."""
         if self.count == 0 and events.cause is not None:
             with output_errors(self.path):
                 self._columns["cause"] = growing_dataset(
@@ -242,10 +242,10 @@ def _new_block(names: Iterable[str]) -> dict[str, np.ndarray]:
 
 
 class DsecEventReader:
-    """Events of a DSEC file by time; times come out as int64 µs on the image clock (t + t_offset).
+    """Reads events of a DSEC file by time; times are returned as int64 µs on the image clock (t + t_offset).
 
-    Also reads BlinkFlow's files, which lack ``t_offset`` (taken as 0), hold t as u8 and whose ``ms_to_idx`` stops
-    short of the last millisecond.
+    Also reads BlinkFlow's files, which lack ``t_offset`` (taken as 0), store t as u8, and whose ``ms_to_idx`` ends
+    before the last millisecond.
 
     Raises
     ------
@@ -286,18 +286,18 @@ class DsecEventReader:
             check_size(self.height, self.width, str(path))
 
     def _declared(self, name: str) -> int | None:
-        """A root attribute that says the sensor's size; None without."""
+        """Return a root attribute with the sensor's size; None without."""
         value = attribute(self._file, name, self.path)
         if value is not None and (np.ndim(value) or np.asarray(value).dtype.kind not in "iu"):
             raise AssetError(f"attribute '{name}' is no integer", where=str(self.path), value=value)
         return None if value is None else int(value)
 
     def slice(self, t0_us: int, t1_us: int) -> Events:
-        """Events of [t0_us, t1_us), image clock, by DSEC's rule: ``ms_to_idx`` gives the conservative range
-        floor(t0)…ceil(t1) in ms, the exact bounds are searched inside it.
+        """Return events of [t0_us, t1_us), image clock, by DSEC's rule: ``ms_to_idx`` gives the conservative range
+        floor(t0)…ceil(t1) in ms, inside which the exact bounds are searched.
 
-        Raises EventDataError as :func:`~blinkgl.io.columns.check_events`; AssetError: damaged,
-        or a table that leaves events out."""
+        Raises EventDataError as :func:`~blinkgl.io.columns.check_events`; AssetError: damaged, or a table that leaves
+        events out."""
         # Times on the file's own clock; the table is asked for whole milliseconds around them.
         r0, r1 = int(t0_us) - self.t_offset_us, int(t1_us) - self.t_offset_us
         start, stop = self._index(r0 // 1000, 0), self._index(-(-r1 // 1000), self.count)
@@ -312,7 +312,7 @@ class DsecEventReader:
         return events.window(t0_us, t1_us)
 
     def number(self, t_us: int) -> int:
-        """How many events lie before t_us, image clock: the number of the first that does not. Raises as
+        """Return how many events are before t_us, image clock: the number of the first that is not. Raises as
         :meth:`slice`."""
         # The event lies within one millisecond, between two entries of the table.
         ms = (int(t_us) - self.t_offset_us) // 1000
@@ -342,7 +342,7 @@ class DsecEventReader:
             return self.count if otherwise else (int(table[-1]) if len(table) else 0)
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
-        """All events in pieces of ``size``."""
+        """Yield all events in pieces of ``size``."""
         for start in range(0, self.count, size):
             yield self._read(start, min(self.count, start + size))
 
@@ -362,9 +362,9 @@ class DsecEventReader:
 
 
 def write_rectify_map(path: str | os.PathLike, rectify_map: np.ndarray, codec: str = "zstd") -> None:
-    """``rectify_map``: (H, W, 2) float32, ``map[y, x] = (x_rect, y_rect)``. A simulated pin-hole camera's is the
-    identity; loaders such as E-RAFT's insist on the file. codec : "gzip", which h5py
-    alone reads, or another, which is Blosc's zstd."""
+    """Write ``rectify_map``: (H, W, 2) float32, ``map[y, x] = (x_rect, y_rect)``. A pinhole camera's is the identity;
+    loaders such as E-RAFT's require the file. codec : "gzip", which h5py alone reads, or another, which is Blosc's
+    zstd."""
     if codec == "gzip":
         packed: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
     else:
@@ -379,6 +379,6 @@ def write_rectify_map(path: str | os.PathLike, rectify_map: np.ndarray, codec: s
 
 
 def identity_rectify_map(height: int, width: int) -> np.ndarray:
-    """(H, W, 2) float32 identity for :func:`write_rectify_map`."""
+    """Return the identity, (H, W, 2) float32, for :func:`write_rectify_map`."""
     y, x = np.mgrid[:height, :width].astype(np.float32)
     return np.stack([x, y], axis=-1)

@@ -1,9 +1,9 @@
-"""What made each event of a sequence: ``event_labels.h5`` beside ``events.h5``, a row per event, in the same order.
+"""The truth of each event of a sequence: ``event_labels.h5`` beside ``events.h5``, a row per event, in the same order.
 
 instance  (N,)   u2   instance id of the surface, 0: nothing
 depth     (N,)   f4   along the optical axis, world units; inf: nothing
 velocity  (N, 2) f4   px/s, +x right, +y down
-cause     (N,)   u1   blinkgl.types.events.Cause, where the emulator says it
+cause     (N,)   u1   blinkgl.types.events.Cause, where the emulator records it
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ BLOCK = 1 << 17
 
 
 class EventLabelsWriter:
-    """Takes the events that ``events.h5`` is given and writes what made them. The same events give the same bytes
-    however they were chunked. Raises OutputError: the disk refuses; what is written is then of no use."""
+    """Writes the truth of the events in ``events.h5``. The same events give the same bytes for any chunks. Raises
+    OutputError: the disk refuses; the file is then unusable."""
 
     def __init__(self, path: str | os.PathLike, *, codec: str = "zstd"):
         self.path, self._codec = Path(path), codec
@@ -41,8 +41,8 @@ class EventLabelsWriter:
             }
 
     def append(self, events: Events) -> None:
-        """The next events, which are kept until there is a block of them and not to be changed. Raises TypeError where
-        they do not say what made them."""
+        """Append events, which are kept until a block is full and must not be changed. Raises TypeError where they have
+        no truth."""
         if not len(events):
             return
         if events.truth is None:
@@ -67,7 +67,7 @@ class EventLabelsWriter:
             self._file.close()
 
     def abort(self) -> None:
-        """Stops without finishing; never raises."""
+        """Stop without finishing; never raises."""
         try:
             self._file.close()
         except Exception:  # noqa: BLE001 - a full disk refuses the flush; the file is deleted anyway
@@ -89,10 +89,10 @@ def _parts(kind: np.dtype) -> tuple[np.dtype, tuple[int, ...]]:
 
 
 class EventLabelsReader:
-    """What made the events of a sequence, by their number in ``events.h5``: ``reader.read(i, j)``. Use as a context
+    """The truth of a sequence's events, by their number in ``events.h5``: ``reader.read(i, j)``. Use as a context
     manager.
 
-    path : the file, or the folder of its sequence.   count : rows.   causes : whether it holds them.
+    path : the file, or the folder of its sequence.   count : rows.   causes : whether it has them.
     Raises AssetError: missing, damaged, or no such file."""
 
     def __init__(self, path: str | os.PathLike):
@@ -119,7 +119,7 @@ class EventLabelsReader:
         return dataset(self._file, name, self.path, shape=(None, *shape), kinds="f" if kind.kind == "f" else "iu")
 
     def read(self, start: int = 0, stop: int | None = None) -> tuple[np.ndarray, np.ndarray | None]:
-        """Of the events number ``start`` to ``stop`` (None: the last): (N,) of :data:`~blinkgl.types.events.TRUTH`, and
+        """Return, for events ``start`` to ``stop`` (None: the last), (N,) of :data:`~blinkgl.types.events.TRUTH`, and
         their causes (N,) uint8, None where the file has none. Raises AssetError: damaged."""
         rows = slice(*slice(start, stop).indices(self.count)[:2])
         with hdf5_errors(self.path):
@@ -130,8 +130,9 @@ class EventLabelsReader:
 
 
 def with_truth(events: Events, first: int, path: str | os.PathLike) -> Events:
-    """Events of ``events.h5`` from number ``first`` on, with what made them, from the ``event_labels.h5`` at ``path``
-    (the file, or the folder of its sequence). Raises AssetError: missing, damaged, or of another number of events."""
+    """Return events of ``events.h5`` from number ``first`` on with their truth, from the ``event_labels.h5`` at
+    ``path`` (the file, or the folder of its sequence). Raises AssetError: missing, damaged, or of another number of
+    events."""
     with EventLabelsReader(path) as reader:
         truth, cause = reader.read(first, first + len(events))
         if len(truth) < len(events):

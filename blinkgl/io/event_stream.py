@@ -21,7 +21,7 @@ _DVS = 1
 
 
 class EventStreamReader:
-    """Size and events of an .es file. Raises AssetError: not of version 2, not of a DVS, truncated."""
+    """Size and events of an .es file. Raises AssetError: not version 2, not of a DVS, truncated."""
 
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)
@@ -40,8 +40,8 @@ class EventStreamReader:
         check_size(self.height, self.width, str(path))
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
-        """All events, as decoded from ``size`` bytes at a time."""
-        # Time, bytes of the event at hand so far, its polarity, x and y.
+        """Yield all events, decoded from ``size`` bytes at a time."""
+        # Time, bytes of the current event so far, its polarity, x and y.
         state = np.zeros(5, np.int64)
         with open(self.path, "rb") as file:
             file.seek(_HEADER)
@@ -56,7 +56,7 @@ class EventStreamReader:
 
 @kernel
 def _decode(data, state, x, y, t, p):
-    """Returns how many events became whole."""
+    """Decode bytes; return how many events are complete."""
     n = 0
     time, got, polarity, column, row = state
     for byte in data:

@@ -29,7 +29,7 @@ _WORD = {"evt2": np.dtype("<u4"), "evt21": np.dtype("<u8"), "evt3": np.dtype("<u
 _MAX_SIDE = 2048
 _LONGEST_LINE = 4096
 _MAX_TIME = 1 << 34
-"""µs, 4.8 hours: the limit of what is filled with TIME_HIGH words."""
+"""µs, 4.8 hours: the longest time that is filled with TIME_HIGH words."""
 
 
 class EvtWriter:
@@ -48,7 +48,7 @@ class EvtWriter:
                 accepted="at most 2048 px a side",
             )
         self.path, self.height, self.width = Path(path), height, width
-        # time written so far, the row; -1: none yet
+        # time written so far, and the row; -1: none yet
         self._state = np.array([0, -1], np.int64)
         self._count = 0
         header = (
@@ -93,12 +93,13 @@ class EvtWriter:
 
 
 class EvtReader:
-    """Header and events of an EVT2/EVT2.1/EVT3 file. ``height`` and ``width`` are None when the header does not say.
+    """Header and events of an EVT2/EVT2.1/EVT3 file. ``height`` and ``width`` are None when the header does not give
+    them.
 
-    As the format asks for, events before the first TIME_HIGH have no time and are left out, and
-    triggers and vendors' words are passed over.
+    As the format requires, events before the first TIME_HIGH have no time and are left out, and triggers and vendors'
+    words are skipped.
     Raises AssetError: no ``% evt`` header, another version, an impossible size, stray bytes at the end (truncated), a
-    word that the format does not have (with its byte), events but no TIME_HIGH at all."""
+    word that the format does not have (with its byte), events but no TIME_HIGH."""
 
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)
@@ -118,7 +119,7 @@ class EvtReader:
         check_size(self.height, self.width, str(path))
 
     def chunks(self, words: int = 1 << 17) -> Iterator[Events]:
-        """All events, as decoded from ``words`` words at a time."""
+        """Yield all events, decoded from ``words`` words at a time."""
         dtype = _WORD[self.version]
         # EVT2: time high, wraps.  EVT3: time high, y, low, vector base x, polarity, wraps.  -1: no time yet.  Last:
         # events without a time.
@@ -141,8 +142,7 @@ class EvtReader:
                 n, bad = self._decode(raw, state, x, y, t, p)
                 if bad >= 0:
                     raise AssetError(
-                        f"damaged at byte {position + bad * dtype.itemsize}: no {self.version.upper()} word can "
-                        "stand here",
+                        f"damaged at byte {position + bad * dtype.itemsize}: no valid {self.version.upper()} word",
                         where=str(self.path),
                         value=f"0x{int(raw[bad]):0{2 * dtype.itemsize}x}",
                     )
@@ -193,7 +193,8 @@ def _read_header(path: Path) -> tuple[str, int]:
 
 @kernel
 def _decode_evt2(words, masks, state, x, y, t, p):
-    """Returns (events, index of the first word of an unknown type, or whose mask leaves the 11 bits of x; -1: none).
+    """Decode words; return (events, index of the first word of an unknown type, or whose mask exceeds the 11 bits of x;
+    -1: none).
 
     masks : bit k is an event at the word's x + k; of EVT2 that is 1."""
     n, bad = 0, -1
@@ -265,8 +266,8 @@ def _encode_evt3(x, y, t, p, state, first, words):
 
 @kernel
 def _decode_evt3(words, state, x, y, t, p):
-    """Returns (events, index of the first word of an unknown type, or whose vector leaves
-    the 11 bits of x; -1: none)."""
+    """Decode words; return (events, index of the first word of an unknown type, or whose vector exceeds the 11 bits of
+    x; -1: none)."""
     n, bad = 0, -1
     high, row, low, base, polarity, wraps, untimed = state
     for i in range(len(words)):

@@ -1,4 +1,4 @@
-"""A flow field by its file's ending: .png (DSEC's 16 bit), .flo (Middlebury), .npy (u, v[, valid], as BlinkFlow's)."""
+"""Flow fields by file ending: .png (DSEC's 16 bit), .flo (Middlebury), .npy (u, v[, valid], as BlinkFlow's)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _ZERO = 1 << 15
 
 
 def encode_flow_png(flow: np.ndarray, valid: np.ndarray, *, scale: float = DSEC_SCALE) -> tuple[bytes, int]:
-    """PNG bytes of a flow field.
+    """Return the PNG bytes of a flow field.
 
     flow : (H, W, 2) float px, +x right, +y down. valid : (H, W) bool.
     Returns (png, lost): ``lost`` counts valid pixels that the format cannot hold (beyond -256 … 255.99 px for DSEC, or
@@ -35,7 +35,7 @@ def encode_flow_png(flow: np.ndarray, valid: np.ndarray, *, scale: float = DSEC_
         code = np.asarray(flow, np.float32) * np.float32(scale)
         np.rint(code, out=code)
         code += np.float32(_ZERO)
-        if code.size and code.min() >= 0 and code.max() <= 65535:  # as nearly always; NaN is neither
+        if code.size and code.min() >= 0 and code.max() <= 65535:  # the usual case; NaN is neither
             holds = np.ones(valid.shape, bool)
         else:
             holds = ((code >= 0) & (code <= 65535)).all(axis=-1)
@@ -48,7 +48,7 @@ def encode_flow_png(flow: np.ndarray, valid: np.ndarray, *, scale: float = DSEC_
 
 
 def write_flow_png(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray, *, scale: float = DSEC_SCALE) -> int:
-    """Writes :func:`encode_flow_png`; returns the count of valid pixels the format could not hold."""
+    """Write :func:`encode_flow_png`; return the number of valid pixels that the format could not hold."""
     png, lost = encode_flow_png(flow, valid, scale=scale)
     with output_errors(path):
         Path(path).write_bytes(png)
@@ -56,7 +56,7 @@ def write_flow_png(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray,
 
 
 def read_flow_png(path: str | os.PathLike, *, scale: float = DSEC_SCALE) -> tuple[np.ndarray, np.ndarray]:
-    """flow (H, W, 2) float32 px (0 where invalid), valid (H, W) bool.
+    """Return flow (H, W, 2) float32 px (0 where invalid), valid (H, W) bool.
 
     Raises AssetError when the file is not a 16-bit RGB PNG."""
     raw = read_png(path)
@@ -72,11 +72,12 @@ def read_flow_png(path: str | os.PathLike, *, scale: float = DSEC_SCALE) -> tupl
 
 _TAG = 202021.25
 _UNKNOWN = 1e9
-_MAX_SIDE = 99999  # Middlebury's own reader refuses beyond
+_MAX_SIDE = 99999  # limit of Middlebury's own reader
 
 
 def encode_flo(flow: np.ndarray, valid: np.ndarray | None = None) -> bytes:
-    """flow: (H, W, 2) px; where ``valid`` (H, W) is False, the format's "unknown" (1e10) is stored."""
+    """Return the bytes of flow, (H, W, 2) px; where ``valid`` (H, W) is False, the format's "unknown" (1e10) is
+    stored."""
     data = np.array(flow, "<f4", order="C")
     if valid is not None:
         data[~np.asarray(valid, bool)] = 1e10
@@ -84,13 +85,14 @@ def encode_flo(flow: np.ndarray, valid: np.ndarray | None = None) -> bytes:
 
 
 def write_flo(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray | None = None) -> None:
-    """See :func:`encode_flo`. Raises OutputError."""
+    """Write :func:`encode_flo`. Raises OutputError."""
     with output_errors(path):
         Path(path).write_bytes(encode_flo(flow, valid))
 
 
 def read_flo(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
-    """flow (H, W, 2) float32 px (0 where unknown), valid (H, W) bool. AssetError: wrong tag, size or length."""
+    """Return flow (H, W, 2) float32 px (0 where unknown), valid (H, W) bool. Raises AssetError: wrong tag, size or
+    length."""
     try:
         data = Path(path).read_bytes()
     except OSError as error:
@@ -116,9 +118,9 @@ ENDINGS = (".png", ".flo", ".npy")
 
 
 def read_flow(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
-    """flow (H, W, 2) float32 px, +x right, +y down (0 where invalid), and valid (H, W) bool.
+    """Return flow (H, W, 2) float32 px, +x right, +y down (0 where invalid), and valid (H, W) bool.
 
-    Raises AssetError: missing, damaged, or no flow."""
+    Raises AssetError: missing, damaged, or not flow."""
     path = Path(path)
     if path.suffix == ".flo":
         return read_flo(path)
@@ -132,10 +134,10 @@ def read_flow(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
 
 
 def read_flow_npy(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
-    """flow (H, W, 2) float32 px as it stands in a .npy of (H, W, 2) or, with the validity, (H, W, 3), NaN included; and
-    (H, W) bool what the file says is valid, all of it where it says nothing.
+    """Return flow (H, W, 2) float32 px as in a .npy of (H, W, 2) or, with validity, (H, W, 3), NaN included; and the
+    file's validity, (H, W) bool, all True where it has none.
 
-    Raises AssetError: missing, damaged, or no flow."""
+    Raises AssetError: missing, damaged, or not flow."""
     data = read_npy(path)
     if data.ndim != 3 or data.shape[2] not in (2, 3) or data.dtype.kind != "f":
         raise AssetError(
@@ -149,13 +151,13 @@ def read_flow_npy(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
 
 
 def encode_flow_npy(flow: np.ndarray, valid: np.ndarray) -> bytes:
-    """(H, W, 3) float32 of u, v (0 where invalid) and 1 or 0."""
+    """Return (H, W, 3) float32 of u, v (0 where invalid) and 1 or 0."""
     return encode_npy(np.dstack([np.where(valid[..., None], flow, 0), valid]).astype(np.float32))
 
 
 def write_flow(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray) -> int:
-    """Writes flow (H, W, 2) px and valid (H, W) bool; the file appears whole or not at all. Returns how many valid
-    pixels the format could not hold (.png: beyond -256 ... 255.99 px), which are stored as invalid.
+    """Write flow (H, W, 2) px and valid (H, W) bool; the file appears completely or not at all. Return the number of
+    valid pixels that the format could not hold (.png: beyond -256 ... 255.99 px), which are stored as invalid.
 
     Raises OutputError: unknown ending, or it cannot be written."""
     ending, lost = Path(path).suffix, 0

@@ -1,6 +1,6 @@
-"""Every event format by one door: :func:`open_events`, :func:`event_writer`, :func:`write_events`, :func:`convert`.
+"""The interface to all event formats: :func:`open_events`, :func:`event_writer`, :func:`write_events`, :func:`convert`.
 
-:data:`FORMATS` says what there is; docs/formats.md what each file holds.
+:data:`FORMATS` lists the formats; docs/formats.md describes their content.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ class EventFormat:
     """One event format.
 
     endings : of its files.   module : of ``blinkgl.io``, imported when a file of it is opened or written.
-    reader : class that is made of a path.   writer : class that is made of (path, height, width) and ``fixed``; "": the
-    format is only read.   dataset : of an HDF5 file, by which files with one ending are told apart; "":
-    the format of those that have no other's.   takes : options of :func:`event_writer` that the writer has.
-    causes : it has a place for what caused each event."""
+    reader : class made from a path.   writer : class made from (path, height, width) and ``fixed``; "": the format is
+    only read.   dataset : of an HDF5 file, which distinguishes files with one ending; "": the format of files without
+    the others'.
+    takes : options of :func:`event_writer` that the writer has.   causes : it can store the causes of events."""
 
     name: str
     endings: tuple[str, ...]
@@ -74,20 +74,20 @@ FORMATS = {
         EventFormat("npy", (".npy",), "arrays", "ArrayReader", "ArrayWriter", causes=True),
     )
 }
-"""By name. Of formats that share an ending the first is written."""
+"""Formats by name. Of formats that share an ending the first is written."""
 ENDINGS: dict[str, str] = {}
-"""Ending -> the format that is written by it."""
+"""Ending -> the format that is written for it."""
 for _one in FORMATS.values():
     for _ending in _one.endings:
         ENDINGS.setdefault(_ending, _one.name)
 WITH_CAUSES = tuple(name for name, one in FORMATS.items() if one.causes)
-"""Formats with a place for what caused each event; the others refuse events that have causes."""
+"""Formats that can store the causes of events; the others refuse events with causes."""
 SENSORS = ((180, 240), (240, 304), (260, 346), (320, 320), (480, 640), (720, 1280), (1080, 1920))
-"""(height, width) of event cameras, smallest first: the guess for files that do not say."""
+"""(height, width) of event cameras, smallest first: the guess for files without a size."""
 
 
 class EventWriter(Protocol):
-    """What every format's writer offers; ``abort`` never raises. ``t_end_us`` may be set before the end: the
+    """Interface of every format's writer; ``abort`` never raises. ``t_end_us`` may be set before the end: the
     recording's, where it is later than the last event's (used by DSEC's table)."""
 
     t_end_us: int | None
@@ -101,7 +101,8 @@ class EventWriter(Protocol):
 class EventFile:
     """An event file opened for reading, in any format.
 
-    height, width : px, None when the file does not say. t_offset_us : DSEC's, else 0 (already added to the times)."""
+    height, width : px, None when the file does not give them. t_offset_us : DSEC's, else 0 (already added to the
+    times)."""
 
     path: Path
     format: str
@@ -112,15 +113,14 @@ class EventFile:
 
     @property
     def causes(self) -> bool:
-        """Whether its events have causes."""
+        """Return whether its events have causes."""
         return getattr(self._reader, "causes", False)
 
     def chunks(self) -> Iterator[Events]:
-        """All events from the beginning, in pieces, memory flat (npz, npy: held whole).
+        """Yield all events from the beginning, in pieces, in constant memory (npz, npy: all in memory).
 
-        Raises, naming event and value, EventDataError: times that run backwards, an event outside height and width
-        where those are known, or that :class:`~blinkgl.types.events.Events` cannot hold;
-        AssetError when the file is damaged."""
+        Raises, naming event and value, EventDataError: decreasing times, an event outside height and width where those
+        are known, or that :class:`~blinkgl.types.events.Events` cannot hold; AssetError when the file is damaged."""
         last, count = None, 0
         for events in self._reader.chunks():
             last = check_events(events, str(self.path), count, height=self.height, width=self.width, after=last)
@@ -129,12 +129,13 @@ class EventFile:
                 yield events
 
     def frames(self) -> Iterator[CameraFrame]:
-        """What the camera's own frames show, one in memory at a time. AssetError: the format, or the recording, has
-        none; damaged. EventDataError: times that do not increase."""
+        """Yield the camera's own frames, one in memory at a time. Raises AssetError: the format, or the recording, has
+        none; damaged.
+        EventDataError: times that do not increase."""
         return self._stream("frames")()
 
     def imu(self) -> ImuSamples:
-        """The samples of the camera's inertial unit. Raises as :meth:`frames`."""
+        """Return the samples of the camera's inertial unit. Raises as :meth:`frames`."""
         return self._stream("imu")()
 
     def _stream(self, name: str) -> Callable[[], Any]:
@@ -148,7 +149,7 @@ class EventFile:
         return stream
 
     def close(self) -> None:
-        """Lets go of the file (only HDF5's stay open between reads)."""
+        """Close the file (only HDF5 files stay open between reads)."""
         getattr(self._reader, "close", lambda: None)()
 
     def __enter__(self) -> EventFile:
@@ -158,12 +159,12 @@ class EventFile:
         self.close()
 
     def read(self) -> Events:
-        """All events at once."""
+        """Return all events at once."""
         return Events.concatenate(list(self.chunks()))
 
     def sized(self) -> EventFile:
-        """Self with height and width known: where the file does not say, the smallest known sensor that holds all its
-        events (one pass over the file)."""
+        """Return self with height and width known: where the file has none, the smallest known sensor that contains all
+        its events (one pass over the file)."""
         if self.height is not None and self.width is not None:
             return self
         largest = np.zeros(2, int)
@@ -175,9 +176,9 @@ class EventFile:
 
 
 def open_events(path: str | os.PathLike) -> EventFile:
-    """Opens an event file; the content decides where the ending leaves a choice.
+    """Open an event file; the content decides where the ending is ambiguous.
 
-    Raises AssetError: missing, unknown ending, or not what the ending says."""
+    Raises AssetError: missing, unknown ending, or content that does not match the ending."""
     path = Path(path)
     kind = ENDINGS.get(path.suffix.lower())
     if kind is None:
@@ -187,12 +188,12 @@ def open_events(path: str | os.PathLike) -> EventFile:
     if path.suffix.lower() in HDF5:
         kind = _held(path)
     reader = FORMATS[kind].open(path)
-    kind = getattr(reader, "version", kind)  # of a .raw file, which says whether it is EVT2, EVT2.1 or EVT3
+    kind = getattr(reader, "version", kind)  # a .raw file says whether it is EVT2, EVT2.1 or EVT3
     return EventFile(path, kind, reader.height, reader.width, getattr(reader, "t_offset_us", 0), reader)
 
 
 def output_format(path: str | os.PathLike) -> str:
-    """The format to write ``path`` in. Raises OutputError: its ending names none that is written."""
+    """Return the format for writing ``path``. Raises OutputError: no written format has its ending."""
     kind = ENDINGS.get(Path(path).suffix.lower())
     if kind is None or not FORMATS[kind].writer:
         raise OutputError(
@@ -216,7 +217,7 @@ def _writer(path: Path, kind: str, height: int, width: int, t_offset_us: int, ti
     check_size(height, width, str(path))
     if time_unit != "s" and "time_unit" not in FORMATS[kind].takes:
         raise OutputError(
-            f"{kind} has a unit of time of its own",
+            f"{kind} has a fixed unit of time",
             where=str(path),
             value=time_unit,
             accepted="a unit with .txt and .csv only",
@@ -237,8 +238,8 @@ def event_writer(
     """``with event_writer("out.h5", 480, 640) as out: out.append(events)``. The file appears under its name when the
     block ends without an exception, and not at all otherwise.
 
-    t_offset_us : DSEC only, the time of the recording's start. time_unit : text and CSV only, "s" or "us".
-    Raises OutputError, EventDataError.
+    t_offset_us : DSEC only, the time of the recording's start. time_unit : text and CSV only, "s" or "us". Raises
+    OutputError, EventDataError.
     """
     kind = output_format(path)
     with atomic_file(path, overwrite=overwrite) as temporary:
@@ -254,13 +255,13 @@ def event_writer(
 def write_events(
     path: str | os.PathLike, chunks: Events | Iterable[Events], height: int, width: int, **options: Any
 ) -> int:
-    """Writes events or an iterable of chunks; options as :func:`event_writer`. Returns the number of events."""
+    """Write events or an iterable of chunks; options as :func:`event_writer`. Return the number of events."""
     count = 0
     with event_writer(path, height, width, **options) as writer:
         for events in [chunks] if isinstance(chunks, Events) else chunks:
             if events.truth is not None:
                 raise OutputError(
-                    "event files do not hold what made the events",
+                    "event files cannot store what caused the events",
                     where=str(path),
                     accepted="dataclasses.replace(events, truth=None), or `generate`, which writes event_labels.h5",
                 )
@@ -278,12 +279,12 @@ def convert(
     time_unit: str = "s",
     overwrite: bool = True,
 ) -> tuple[EventFile, int]:
-    """Copies events from one format to another, streaming.
+    """Copy events from one format to another, streaming.
 
-    size : (height, width) for sources that do not say (default: guessed, see :meth:`EventFile.sized`).
+    size : (height, width) for sources without a size (default: guessed, see :meth:`EventFile.sized`).
     time_unit : of text and CSV, "s" or "us". zero_time : shift times so that the first event is at 0, for EVT3, which
     counts from the start.
-    Causes of events are left out where the format cannot hold them.
+    Causes of events are left out where the format cannot store them.
     Returns the source with its size, and the number of events written.
     """
     kind = output_format(target)

@@ -43,34 +43,34 @@ class ExposureLine:
 
     @property
     def middle_us(self) -> int:
-        """The middle of the exposure, of the middle row where they differ."""
+        """Return the middle of the exposure, of the middle row where they differ."""
         return round((self.start_us + self.end_us) / 2)
 
 
 def picture_file(picture: str, k: int) -> str:
-    """Name of the k-th "images", "sharp" or "clean" below the sequence."""
+    """Return the name of the k-th "images", "sharp" or "clean" below the sequence."""
     return f"{FOLDER}/{picture}/{k:06d}.png"
 
 
 def files_of(images: ImagesConfig, count: int) -> Iterator[str]:
-    """Names of all files of ``count`` images."""
+    """Yield the names of all files of ``count`` images."""
     yield from (STAMPS, EXPOSURES)
     for picture in images.pictures:
         yield from (picture_file(picture, k) for k in range(count))
 
 
 def encode_codes(codes: np.ndarray) -> bytes:
-    """PNG of (H, W, 3) RGB or (H, W), uint8 or uint16, as they are."""
+    """Return a PNG of (H, W, 3) RGB or (H, W), uint8 or uint16, unchanged."""
     return encode_png(codes[..., ::-1] if codes.ndim == 3 else codes)
 
 
 def read_codes(path: str | os.PathLike) -> np.ndarray:
-    """What :func:`encode_codes` wrote. Raises AssetError."""
+    """Return the codes of :func:`encode_codes`. Raises AssetError."""
     return read_image(path)
 
 
 def exposures_csv(lines: Iterable[ExposureLine]) -> str:
-    """The text of ``exposures.csv``: a heading, then a line per image. Times to the nanosecond."""
+    """Return the text of ``exposures.csv``: a heading, then a line per image. Times to the nanosecond."""
     rows = [",".join(f.name for f in fields(ExposureLine))]
     rows += [
         f"{e.start_us:.3f},{e.end_us:.3f},{e.exposure_us:.3f},{e.row_us:.6g},{e.gain_db:.6g},{e.instants}"
@@ -80,12 +80,12 @@ def exposures_csv(lines: Iterable[ExposureLine]) -> str:
 
 
 def stamps_txt(lines: Iterable[ExposureLine]) -> str:
-    """The text of ``images/timestamps.txt``."""
+    """Return the text of ``images/timestamps.txt``."""
     return "".join(f"{e.middle_us}\n" for e in lines)
 
 
 def read_exposures(sequence: str | os.PathLike) -> list[ExposureLine]:
-    """Of a sequence's frame camera. Raises AssetError: there is none, or its list is damaged."""
+    """Return the exposures of a sequence's frame camera. Raises AssetError: there is none, or its list is damaged."""
     path = Path(sequence) / EXPOSURES
     heading = [f.name for f in fields(ExposureLine)]
     try:
@@ -101,6 +101,8 @@ def read_exposures(sequence: str | os.PathLike) -> list[ExposureLine]:
             lines.append(ExposureLine(start, end, exposure, row_us, gain_db, int(row[5])))
         return lines
     except FileNotFoundError:
-        raise AssetError("no frame camera here", where=str(path), accepted="a sequence made with images:") from None
+        raise AssetError(
+            "the sequence has no frame camera", where=str(path), accepted="a sequence made with images:"
+        ) from None
     except (OSError, ValueError, csv.Error) as error:
         raise AssetError(f"damaged list of exposures: {' '.join(str(error).split())[:120]}", where=str(path)) from None

@@ -1,5 +1,5 @@
-"""Frame sequences as input: a video, a folder of images, or an array file; one frame in
-memory at a time (.npz: all)."""
+"""Frame sequences as input: a video, a folder of images, or an array file; one frame in memory at a time (.npz:
+all)."""
 
 from __future__ import annotations
 
@@ -70,12 +70,12 @@ class FrameSource:
 def open_frames(
     path: str | os.PathLike, *, fps: float | None = None, timestamps: str | os.PathLike | None = None
 ) -> FrameSource:
-    """A video (by ending), a folder of images, .npy/.npz with frames (N, H, W) or (N, H, W, 3), or the frames that a
-    camera recorded beside its events (.aedat, .aedat4), at the middle of their exposures.
+    """Open a video (by ending), a folder of images, .npy/.npz with frames (N, H, W) or (N, H, W, 3), or the frames that
+    a camera recorded beside its events (.aedat, .aedat4), at the middle of their exposures.
 
     fps : frame rate; overrides the video's own and any time stamps. timestamps : file with one time per frame, or "time
     name" lines as the Event Camera Dataset's images.txt (integers are µs, numbers with a point seconds). A folder's own
-    timestamps.txt, or an images.txt in it or its parent, is found by itself.
+    timestamps.txt, or an images.txt in it or its parent, is used automatically.
 
     Raises AssetError or EventDataError, one line naming file, frame and value.
     """
@@ -105,7 +105,7 @@ def open_frames(
 
 
 def read_any_image(path: Path) -> np.ndarray:
-    """(H, W) or (H, W, 3) RGB; uint8, uint16 or float32 as the file holds. AssetError when undecodable."""
+    """Return (H, W) or (H, W, 3) RGB; uint8, uint16 or float32 as in the file. Raises AssetError when undecodable."""
     if path.suffix.lower() == ".pfm":
         from blinkgl.io.images import read_pfm
 
@@ -219,7 +219,7 @@ def _array(path: Path, fps: float | None, timestamps) -> FrameSource:
         for i in range(len(frames)):
             frame = np.ascontiguousarray(frames[i])
             if frame.dtype.kind == "f":
-                with np.errstate(over="ignore"):  # becomes inf, which is refused by name later
+                with np.errstate(over="ignore"):  # becomes inf, which a later check refuses by name
                     frame = frame.astype(np.float32)
             yield (
                 frame[..., 0] if frame.ndim == 3 and frame.shape[2] == 1 else frame,
@@ -251,13 +251,13 @@ def _recording(path: Path, fps: float | None, timestamps) -> FrameSource:
 
 
 def _stamps(name: str, values: np.ndarray) -> list[int]:
-    """ns of an array of times: by its name's unit, else floats are seconds and integers µs."""
+    """Return ns of an array of times: by its name's unit, else floats are seconds and integers µs."""
     unit = 1 if name.endswith("_ns") else 1000 if name.endswith("_us") or values.dtype.kind != "f" else 10**9
     return [round(float(t) * unit) if values.dtype.kind == "f" else int(t) * unit for t in values]
 
 
 def read_timestamps(path: Path) -> list[tuple[int, str | None]]:
-    """(t_ns, name or None) per line of "time" or "time name"; integers are µs, numbers with a point or exponent
+    """Return (t_ns, name or None) per line of "time" or "time name"; integers are µs, numbers with a point or exponent
     seconds; ``#`` comments and one header line are skipped. Raises EventDataError naming the line."""
     try:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
@@ -287,5 +287,5 @@ def read_timestamps(path: Path) -> list[tuple[int, str | None]]:
 
 
 def _natural(path: Path) -> list:
-    """frame2 before frame10."""
+    """Return a sort key with frame2 before frame10."""
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", path.name)]

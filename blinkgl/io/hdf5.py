@@ -1,9 +1,8 @@
-"""HDF5 files that are not trusted: opened without being led out of the file, data sets
-checked before they are believed.
+"""Untrusted HDF5 files: opened without following references to other files, data sets checked before use.
 
-An HDF5 file may say that its data lie in other files (external storage, virtual data sets, external links): read as
-root, such a file copies whatever it names into a column. :func:`open_hdf5` is the one way to open a
-file for reading and refuses them by name.
+An HDF5 file may say that its data are in other files (external storage, virtual data sets, external links): read as
+root, such a file copies any file into a column. Every file is opened for reading by :func:`open_hdf5`, which refuses
+them by name.
 """
 
 from __future__ import annotations
@@ -25,18 +24,18 @@ from numpy.typing import DTypeLike
 from blinkgl.errors import AssetError
 
 _MAX_CHUNK_BYTES = 1 << 28
-"""HDF5 unpacks a chunk whole, however little of it is asked for."""
+"""HDF5 unpacks a whole chunk, even for a small part of it."""
 
 _LEVEL, _BIT_SHUFFLE = 1, hdf5plugin.Blosc.BITSHUFFLE
 CODECS = {"zstd": 5, "lz4": 1}
-"""What Blosc packs with -> its number in the filter's parameters."""
+"""Blosc's codecs -> their numbers in the filter's parameters."""
 _NAMES = {number: name.encode() for name, number in CODECS.items()}
 _BLOSC_VALUES = 4
-"""Parameters that Blosc's filter reads without asking how many there are; with fewer it crashes."""
+"""Parameters that Blosc's filter reads without checking their number; with fewer it crashes."""
 
 
 def open_hdf5(path: Path) -> h5py.File:
-    """Opens for reading. AssetError with the likely cause when that fails, and for a file that leads to other files."""
+    """Open a file for reading. Raises AssetError with the likely cause, also for a file that refers to other files."""
     path = Path(path)
     if not path.is_file():
         raise AssetError("no such file", where=str(path))
@@ -59,7 +58,7 @@ def open_hdf5(path: Path) -> h5py.File:
         for name, kind in links:
             if (what := _leads_out(file.id, name, kind)) is not None:
                 raise AssetError(
-                    f"'{name.decode(errors='replace')}' is {what}, which leads to other files; refused",
+                    f"'{name.decode(errors='replace')}' is {what}, which refers to other files; refused",
                     where=str(path),
                     accepted="a file that holds its own data",
                 )
@@ -67,8 +66,8 @@ def open_hdf5(path: Path) -> h5py.File:
 
 
 def _leads_out(root: h5py.h5f.FileID, name: bytes, kind: int) -> str | None:
-    """What stands under ``name``, when it is stored elsewhere. Soft links stay inside the file: what they lead to has a
-    link of its own here, which is looked at."""
+    """Return what is under ``name``, when it is stored elsewhere. Soft links stay inside the file: their targets have
+    their own links, which are checked."""
     if kind == h5py.h5l.TYPE_SOFT:
         return None
     if kind != h5py.h5l.TYPE_HARD:
@@ -85,7 +84,7 @@ def _leads_out(root: h5py.h5f.FileID, name: bytes, kind: int) -> str | None:
 
 @contextlib.contextmanager
 def hdf5_errors(path: Path, file: h5py.File | None = None) -> Iterator[None]:
-    """h5py's ways of saying that bytes make no sense, as AssetError; ``file`` is closed on any exception."""
+    """Convert h5py's errors for invalid bytes to AssetError; ``file`` is closed on any exception."""
     try:
         yield
     except BaseException as error:
@@ -107,11 +106,11 @@ def hdf5_errors(path: Path, file: h5py.File | None = None) -> Iterator[None]:
 def dataset(
     file: h5py.File, name: str, path: Path, *, shape: tuple[int | None, ...], kinds: str = "iu"
 ) -> h5py.Dataset:
-    """The data set ``name``, with its shape (None: any length) and NumPy kinds ("iu" integers, "f" floats, "b" bools)
-    as asked for, and as many values stored as it claims.
+    """Return the data set ``name``, with its shape (None: any length) and NumPy kinds ("iu" integers, "f" floats, "b"
+    bools) as requested, and as many values stored as declared.
 
-    Raises AssetError: none of that name (or a group), another shape or type, values that
-    were never written, huge chunks."""
+    Raises AssetError: none of that name (or a group), another shape or type, values that were never written, huge
+    chunks."""
     found = file.get(name)
     if not isinstance(found, h5py.Dataset):
         raise AssetError(f"no dataset '{name}'", where=str(path))
@@ -131,29 +130,27 @@ def dataset(
     layout = found.id.get_create_plist()
     for code, _, values, _ in (layout.get_filter(k) for k in range(layout.get_nfilters())):
         if code == hdf5plugin.Blosc.filter_id and len(values) < _BLOSC_VALUES:
-            raise AssetError(
-                f"damaged HDF5 file: dataset '{name}' lacks what Blosc needs to unpack it", where=str(path)
-            )
+            raise AssetError(f"damaged HDF5 file: dataset '{name}' lacks data that Blosc needs", where=str(path))
     if found.chunks is None:
         whole = layout.get_layout() == h5py.h5d.COMPACT or found.id.get_storage_size() >= found.nbytes
     else:
         if math.prod(found.chunks) * found.dtype.itemsize > _MAX_CHUNK_BYTES:
             raise AssetError(
-                f"dataset '{name}' has chunks too large to unpack",
+                f"dataset '{name}' has chunks that are too large",
                 where=str(path),
                 value=found.chunks,
                 accepted=f"at most {_MAX_CHUNK_BYTES >> 20} MB each",
             )
         whole = found.id.get_num_chunks() >= math.prod(-(-n // c) for n, c in zip(found.shape, found.chunks))
     if not whole:
-        raise AssetError(f"dataset '{name}' claims {found.size} values, but fewer are stored", where=str(path))
+        raise AssetError(f"dataset '{name}' declares {found.size} values, but stores fewer", where=str(path))
     return found
 
 
 def attribute(file: h5py.File, name: str, path: Path) -> Any:
-    """The file's attribute ``name``, numbers or text; None where there is none.
+    """Return the file's attribute ``name``, numbers or text; None where there is none.
 
-    Raises AssetError: of another type. h5py reads lists of any length without a look at the file, and a damaged type
+    Raises AssetError: of another type. h5py reads lists of any length without checking the file, and a damaged type
     that is taken for one ends the process."""
     if name not in file.attrs:
         return None
@@ -171,8 +168,9 @@ def growing_dataset(
     chunks: tuple[int, ...],
     codec: str = "zstd",
 ) -> h5py.Dataset:
-    """A new data set that grows along its first axis. codec : of :data:`CODECS`, packed by Blosc, level 1 with bit
-    shuffle (filter 32001), zstd as in DSEC's files; or "gzip", level 1 with byte shuffle, which every HDF5 unpacks."""
+    """Return a new data set that grows along its first axis. codec : of :data:`CODECS`, packed by Blosc, level 1 with
+    bit shuffle (filter 32001), zstd as in DSEC's files; or "gzip", level 1 with byte shuffle, which every HDF5
+    unpacks."""
     if codec == "gzip":
         packed: dict[str, Any] = {"compression": "gzip", "compression_opts": _LEVEL, "shuffle": True}
     else:
@@ -183,11 +181,11 @@ def growing_dataset(
 
 
 def write_rows(data: h5py.Dataset, start: int, rows: np.ndarray) -> None:
-    """``data[start:] = rows`` for a data set of :func:`growing_dataset`, which grows to hold them.
+    """Set ``data[start:] = rows`` for a data set of :func:`growing_dataset`, which grows to hold them.
 
-    Blosc's chunks are compressed here, each by one thread, instead of inside HDF5. There Blosc would take the user's
-    ``BLOSC_NTHREADS``, and with more than one thread stores its blocks in the order they finish:
-    bytes would differ from run to run."""
+    Blosc's chunks are compressed here, each by one thread, instead of inside HDF5. There Blosc would use the user's
+    ``BLOSC_NTHREADS``, and with more than one thread it stores its blocks in the order they finish: bytes would differ
+    from run to run."""
     if data.compression == "gzip":
         data.resize(start + len(rows), axis=0)
         data[start:] = rows
@@ -203,7 +201,7 @@ def write_rows(data: h5py.Dataset, start: int, rows: np.ndarray) -> None:
         if len(piece) < step:  # HDF5 stores the last chunk whole, filled with zeros
             piece = joined([piece, np.zeros((step - len(piece), *piece.shape[1:]), piece.dtype)])
         packed = _compressed(piece, _NAMES[codec])
-        # As HDF5's filter does: what does not become smaller is stored as it is, and the chunk says so.
+        # As in HDF5's filter: what does not become smaller is stored unchanged, and the chunk says so.
         skipped = 1 if packed is None else 0
         data.id.write_direct_chunk(
             (begin + i, *(0,) * (data.ndim - 1)), piece.tobytes() if skipped else packed, skipped
@@ -211,8 +209,8 @@ def write_rows(data: h5py.Dataset, start: int, rows: np.ndarray) -> None:
 
 
 def joined(pieces: list[np.ndarray]) -> np.ndarray:
-    """One after another, in the dtype of the first: NumPy's own concatenation closes the gaps between a record's
-    fields, and a file's records keep theirs."""
+    """Return the arrays one after another, in the dtype of the first: NumPy's own concatenation removes the gaps
+    between a record's fields, which a file's records keep."""
     out = np.zeros((sum(map(len, pieces)), *pieces[0].shape[1:]), pieces[0].dtype)
     at = 0
     for piece in pieces:
@@ -222,7 +220,7 @@ def joined(pieces: list[np.ndarray]) -> np.ndarray:
 
 
 def _compressed(array: np.ndarray, codec: bytes) -> bytes | None:
-    """One Blosc buffer; None when it is not smaller than the array."""
+    """Return one Blosc buffer; None when it is not smaller than the array."""
     out, size = ctypes.create_string_buffer(array.nbytes), ctypes.c_size_t
     n = _blosc().blosc_compress_ctx(
         _LEVEL,
@@ -243,5 +241,5 @@ def _compressed(array: np.ndarray, codec: bytes) -> bytes | None:
 
 @functools.cache
 def _blosc() -> ctypes.CDLL:
-    """The C-Blosc that HDF5's own filter uses."""
+    """Return the C-Blosc that HDF5's own filter uses."""
     return ctypes.CDLL(str(Path(hdf5plugin.PLUGIN_PATH) / "libh5blosc.so"))

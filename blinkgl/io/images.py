@@ -1,5 +1,4 @@
-"""Images, masks, ids, depth and normals of a sequence; NumPy files, whose headers are checked
-before they are believed."""
+"""Images, masks, ids, depth and normals of a sequence; NumPy files, whose headers are checked before use."""
 
 from __future__ import annotations
 
@@ -29,7 +28,7 @@ _MAX_PIXELS = 1 << 28
 
 
 def encode_image(image: np.ndarray) -> bytes:
-    """sRGB PNG. (H, W) or (H, W, 3) RGB; float is linear light, uint8 and uint16 are stored as they are."""
+    """Return an sRGB PNG of (H, W) or (H, W, 3) RGB; float is linear light, uint8 and uint16 are stored unchanged."""
     image = np.asarray(image)
     if image.dtype.kind == "f":
         image = to_srgb8(image)
@@ -37,18 +36,18 @@ def encode_image(image: np.ndarray) -> bytes:
 
 
 def read_image(path: str | os.PathLike) -> np.ndarray:
-    """(H, W) or (H, W, 3) RGB as stored (uint8, uint16)."""
+    """Return (H, W) or (H, W, 3) RGB as stored (uint8, uint16)."""
     image = read_png(path)
     return np.ascontiguousarray(image[..., 2::-1]) if image.ndim == 3 else image
 
 
 def encode_mask(mask: np.ndarray) -> bytes:
-    """8-bit PNG, 0 or 255, of a (H, W) bool."""
+    """Return an 8-bit PNG, 0 or 255, of a (H, W) bool."""
     return encode_png(np.asarray(mask, bool).astype(np.uint8) * np.uint8(255))
 
 
 def read_mask(path: str | os.PathLike) -> np.ndarray:
-    """(H, W) bool."""
+    """Return a mask, (H, W) bool."""
     image = read_png(path)
     if image.ndim != 2:
         raise AssetError("not a mask", where=str(path), value=image.shape, accepted="one channel")
@@ -56,7 +55,7 @@ def read_mask(path: str | os.PathLike) -> np.ndarray:
 
 
 def encode_ids(ids: np.ndarray) -> bytes:
-    """16-bit PNG of (H, W) instance ids; ValueError when one does not fit."""
+    """Return a 16-bit PNG of (H, W) instance ids. Raises ValueError when one does not fit."""
     ids = np.asarray(ids)
     if ids.size and (ids.min() < 0 or ids.max() > 65535):
         raise ValueError(f"instance ids must fit uint16, got {ids.min()}..{ids.max()}")
@@ -64,7 +63,7 @@ def encode_ids(ids: np.ndarray) -> bytes:
 
 
 def read_ids(path: str | os.PathLike) -> np.ndarray:
-    """(H, W) integers as stored. Raises AssetError."""
+    """Return (H, W) integers as stored. Raises AssetError."""
     image = read_png(path)
     if image.ndim != 2:
         raise AssetError("not a picture of ids", where=str(path), value=image.shape, accepted="one channel")
@@ -72,45 +71,45 @@ def read_ids(path: str | os.PathLike) -> np.ndarray:
 
 
 def encode_npy(array: np.ndarray) -> bytes:
-    """.npy bytes; object arrays are refused (they would be pickled)."""
+    """Return .npy bytes; object arrays are refused (they would be pickled)."""
     buffer = io.BytesIO()
     np.save(buffer, np.ascontiguousarray(array), allow_pickle=False)
     return buffer.getvalue()
 
 
 def read_npy(path: str | os.PathLike) -> np.ndarray:
-    """An array; AssetError when missing, no .npy, truncated, of objects, or of a shape that the
-    file is too short or too long for."""
+    """Return an array. Raises AssetError when missing, not a .npy, truncated, of objects, or when its length does not
+    match its shape."""
     with numpy_errors(path):
         check_npy(path)
         return np.load(path, allow_pickle=False)
 
 
 def check_npy(path: str | os.PathLike) -> None:
-    """Raises what :func:`npy_header` does for the .npy file, and OSError."""
+    """Check a .npy file. Raises the errors of :func:`npy_header`, and OSError."""
     with open(path, "rb") as file:
         npy_header(file, os.fstat(file.fileno()).st_size, str(path))
 
 
 def npy_header(file: BinaryIO, size: int, where: str) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """(shape, Fortran order?, dtype) at the beginning of ``file``, ``size`` bytes long; it
-    is left where the data begin.
+    """Return (shape, Fortran order?, dtype) at the beginning of ``file``, ``size`` bytes long, and leave it where the
+    data begin.
 
-    Raises AssetError: objects (they would be unpickled), or a shape that is not what the
-    bytes hold; and what NumPy raises."""
+    Raises AssetError: objects (they would be unpickled), or a shape that does not match the bytes; and what NumPy
+    raises."""
     version = np.lib.format.read_magic(file)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, fortran, dtype = read(file)
     if dtype.hasobject:
         raise AssetError(
-            "array of Python objects, which could run any code when loaded; refused",
+            "array of Python objects, which can run any code when loaded; refused",
             where=where,
             accepted="an array of numbers",
         )
     expected = file.tell() + math.prod(shape) * dtype.itemsize
     if size != expected or min(shape, default=0) < 0:
         raise AssetError(
-            "truncated or malformed array: its header does not agree with its length",
+            "truncated or malformed array: its header does not match its length",
             where=where,
             value=f"{dtype} {shape} in {size} bytes",
             accepted=f"{expected} bytes",
@@ -119,10 +118,10 @@ def npy_header(file: BinaryIO, size: int, where: str) -> tuple[tuple[int, ...], 
 
 
 class NpzReader:
-    """The arrays of an .npz by name; one is read when it is asked for. Never unpickles. Use as a context manager.
+    """The arrays of an .npz by name; each is read when requested. Never unpickles. Use as a context manager.
 
-    Raises (inside :func:`numpy_errors`) AssetError: an entry that is no plain array of numbers, or that would not fit
-    into half of this machine's memory: a small archive can unpack to any size."""
+    Raises (inside :func:`numpy_errors`) AssetError: an entry that is not a plain array of numbers, or that would not
+    fit into half of this machine's memory: a small archive can unpack to any size."""
 
     def __init__(self, path: str | os.PathLike):
         self.path, self._archive = path, zipfile.ZipFile(path)
@@ -156,14 +155,14 @@ class NpzReader:
 
 
 def memory_limit() -> int:
-    """Bytes that one file may make us hold: half of the machine's memory."""
+    """Return the bytes that one file may use: half of the machine's memory."""
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
 
 
 @contextlib.contextmanager
 def numpy_errors(path: str | os.PathLike) -> Iterator[None]:
-    """Any failure to load ``path`` with NumPy as an AssetError: on damaged bytes it raises what its header parser,
-    zipfile and zlib happen to (TokenError, BadZipFile, zlib.error, NotImplementedError, MemoryError …)."""
+    """Convert any failure to load ``path`` with NumPy to an AssetError: on damaged bytes it raises exceptions of its
+    header parser, zipfile and zlib (TokenError, BadZipFile, zlib.error, NotImplementedError, MemoryError …)."""
     try:
         yield
     except AssetError:
@@ -183,7 +182,7 @@ _HEADER = re.compile(
 
 
 def encode_pfm(image: np.ndarray) -> bytes:
-    """(H, W) or (H, W, 3) float32, row 0 = top."""
+    """Return the bytes of (H, W) or (H, W, 3) float32, row 0 = top."""
     image = np.asarray(image)
     if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
         raise ValueError(f"PFM holds (H, W) or (H, W, 3), got {image.shape}")
@@ -192,13 +191,13 @@ def encode_pfm(image: np.ndarray) -> bytes:
 
 
 def write_pfm(path: str | os.PathLike, image: np.ndarray) -> None:
-    """See :func:`encode_pfm`. Raises OutputError."""
+    """Write :func:`encode_pfm`. Raises OutputError."""
     with output_errors(path):
         Path(path).write_bytes(encode_pfm(image))
 
 
 def read_pfm(path: str | os.PathLike) -> np.ndarray:
-    """(H, W) or (H, W, 3) float32, row 0 = top. AssetError: wrong header or length."""
+    """Return (H, W) or (H, W, 3) float32, row 0 = top. Raises AssetError: wrong header or length."""
     try:
         data = Path(path).read_bytes()
     except OSError as error:
@@ -207,7 +206,7 @@ def read_pfm(path: str | os.PathLike) -> np.ndarray:
 
 
 def decode_pfm(data: bytes, path: str | os.PathLike) -> np.ndarray:
-    """:func:`read_pfm` of bytes; ``path`` is for messages."""
+    """Return :func:`read_pfm` of bytes; ``path`` is for messages."""
     header = _HEADER.match(data)
     if not header:
         raise AssetError("not a PFM file: wrong header", where=str(path))
@@ -224,7 +223,7 @@ def decode_pfm(data: bytes, path: str | os.PathLike) -> np.ndarray:
 
 
 def encode_png(image: np.ndarray, strategy: int = cv2.IMWRITE_PNG_STRATEGY_RLE) -> bytes:
-    """PNG at the fast end (level 1). (H, W) or (H, W, 3) in BGR order, uint8 or uint16."""
+    """Return a fast PNG (level 1) of (H, W) or (H, W, 3) in BGR order, uint8 or uint16."""
     ok, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, strategy])
     if not ok:
         raise OutputError("PNG encoding failed", value=f"{image.dtype} {image.shape}")
@@ -232,8 +231,8 @@ def encode_png(image: np.ndarray, strategy: int = cv2.IMWRITE_PNG_STRATEGY_RLE) 
 
 
 def read_png(path: str | os.PathLike) -> np.ndarray:
-    """Pixels as stored, channels in OpenCV's BGR order, of a PNG or another image that OpenCV decodes; AssetError when
-    missing, truncated, undecodable, or of more than 2^28 px (what it would unpack to is known before that happens)."""
+    """Return pixels as stored, channels in OpenCV's BGR order, of a PNG or another image that OpenCV decodes. Raises
+    AssetError when missing, truncated, undecodable, or of more than 2^28 px (checked before unpacking)."""
     try:
         data = Path(path).read_bytes()
     except OSError as error:
@@ -250,7 +249,7 @@ def read_png(path: str | os.PathLike) -> np.ndarray:
 
 
 def _image_problem(data: bytes) -> str | None:
-    """What is wrong with an image file that OpenCV would pass over: it fills up what is missing with grey."""
+    """Return a problem of an image file that OpenCV would ignore: it fills missing parts with grey."""
     if data[:8] == _PNG_MAGIC:
         return _png_problem(data)
     if data[:2] == b"\xff\xd8" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
@@ -262,7 +261,7 @@ def _image_problem(data: bytes) -> str | None:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                with Image.open(io.BytesIO(data)) as opened:  # reads the header only
+                with Image.open(io.BytesIO(data)) as opened:  # reads only the header
                     size = opened.size
         except Exception:  # noqa: BLE001 - unknown to Pillow, or damaged: its plug-ins raise anything; OpenCV decides
             return "cannot decode image (corrupt or truncated)" if not len(data) else None
@@ -270,7 +269,7 @@ def _image_problem(data: bytes) -> str | None:
 
 
 def _png_problem(data: bytes) -> str | None:
-    """Chunks (length, type, content, CRC) up to IEND, all there and undamaged? (PNG specification, section 5)"""
+    """Return a problem of the chunks (length, type, content, CRC) up to IEND. (PNG specification, section 5)"""
     if data[12:16] != b"IHDR" or len(data) < 33:
         return "cannot decode image (corrupt or truncated)"
     at = 8

@@ -33,7 +33,7 @@ ROWS = ("rate", "acceleration", "ideal_rate", "ideal_acceleration", "rate_bias",
 
 
 def imu_csv(t_ns: np.ndarray, rate: np.ndarray, acceleration: np.ndarray) -> str:
-    """EuRoC's text of N measurements: (N,) int64 ns, (N, 3) rad/s, (N, 3) m/s²; exact to 16 digits."""
+    """Return EuRoC's text of N measurements: (N,) int64 ns, (N, 3) rad/s, (N, 3) m/s²; exact to 16 digits."""
     lines = [HEADING]
     for t, w, a in zip(t_ns.tolist(), rate.tolist(), acceleration.tolist()):
         lines.append(f"{t}," + ",".join(repr(v) for v in (*w, *a)))
@@ -41,7 +41,7 @@ def imu_csv(t_ns: np.ndarray, rate: np.ndarray, acceleration: np.ndarray) -> str
 
 
 def imu_h5(arrays: Mapping[str, np.ndarray]) -> bytes:
-    """The bytes of ``imu.h5``."""
+    """Return the bytes of ``imu.h5``."""
     buffer = io.BytesIO()
     with h5py.File(buffer, "w") as file:
         for name in ("t_ns", *ROWS, "T_cam_imu"):
@@ -50,7 +50,7 @@ def imu_h5(arrays: Mapping[str, np.ndarray]) -> bytes:
 
 
 def kalibr_yaml(config: ImuConfig, T_cam_imu: np.ndarray) -> str:
-    """The text of ``imu.yaml``."""
+    """Return the text of ``imu.yaml``."""
     keys = (
         "accelerometer_noise_density",
         "accelerometer_random_walk",
@@ -62,7 +62,7 @@ def kalibr_yaml(config: ImuConfig, T_cam_imu: np.ndarray) -> str:
 
 
 def read_imu(sequence: str | os.PathLike) -> dict[str, np.ndarray]:
-    """What ``imu.h5`` of a sequence holds, by name. Raises AssetError: there is none, or it is damaged."""
+    """Return the arrays in ``imu.h5`` of a sequence, by name. Raises AssetError: there is none, or it is damaged."""
     path = Path(sequence) / H5
     with open_hdf5(path) as file, hdf5_errors(path):
         arrays = {"t_ns": dataset(file, "t_ns", path, shape=(None,))[()]}

@@ -27,11 +27,11 @@ SHAPES: dict[str, tuple[tuple[int | None, ...], str]] = {
     "valid": ((None, None, None), "iub"),
     "occluded": ((None, None, None), "iub"),
 }
-"""Of the arrays: shape, None any length, and NumPy kinds."""
+"""Shape of each array (None any length), and NumPy kinds."""
 
 
 def encode_intervals(t_ns: int, interval_ns: np.ndarray, arrays: Mapping[str, np.ndarray]) -> bytes:
-    """The bytes of a file. arrays : of :data:`SHAPES`, by name; bools are written as uint8."""
+    """Return the bytes of a file. arrays : of :data:`SHAPES`, by name; bools are written as uint8."""
     buffer = io.BytesIO()
     with h5py.File(buffer, "w") as file:
         ends = {"interval_ns": interval_ns, "to_us": (int(t_ns) + interval_ns) // 1000}
@@ -47,14 +47,14 @@ def encode_intervals(t_ns: int, interval_ns: np.ndarray, arrays: Mapping[str, np
 
 
 def intervals_in(path: str | os.PathLike) -> np.ndarray:
-    """(K,) int64 ns: how far the labels in a file lead. Raises AssetError."""
+    """Return the intervals of the labels in a file, (K,) int64 ns. Raises AssetError."""
     path = Path(path)
     with open_hdf5(path) as file, hdf5_errors(path):
         return dataset(file, "interval_ns", path, shape=(None,))[()].astype(np.int64)
 
 
 def read_intervals(path: str | os.PathLike, names: tuple[str, ...]) -> tuple[int, np.ndarray, dict[str, np.ndarray]]:
-    """from_us, interval_ns (K,) int64, and the arrays of these names; "valid" and "occluded" as bool. Raises
+    """Return from_us, interval_ns (K,) int64, and the arrays of these names; "valid" and "occluded" as bool. Raises
     AssetError: missing, damaged, arrays of different sizes, or intervals that do not increase."""
     path = Path(path)
     with open_hdf5(path) as file, hdf5_errors(path):
@@ -65,5 +65,5 @@ def read_intervals(path: str | os.PathLike, names: tuple[str, ...]) -> tuple[int
     if len(sizes) != 1 or next(iter(sizes))[0] != len(interval_ns):
         raise AssetError("arrays of different sizes", where=str(path), value=sorted(sizes))
     if (np.diff(interval_ns) <= 0).any() or (interval_ns == 0).any():
-        raise AssetError("not intervals that increase", where=str(path), value=interval_ns.tolist()[:8])
+        raise AssetError("the intervals do not increase", where=str(path), value=interval_ns.tolist()[:8])
     return from_us, interval_ns, {k: a.astype(np.float32 if k == "flow" else bool) for k, a in arrays.items()}

@@ -36,12 +36,12 @@ class MvsecReader:
 
 
 def event_table(file: h5py.File, path: Path, name: str = DATASET) -> h5py.Dataset:
-    """The (N, 4) float64 data set of events. Raises AssetError."""
+    """Return the (N, 4) float64 data set of events. Raises AssetError."""
     return dataset(file, name, path, shape=(None, 4), kinds="f")
 
 
 def events_of_rows(rows: np.ndarray, where: str, first: int, t0_s: float = 0.0) -> Events:
-    """Rows x, y, t[s], ±1 as events; ``t0_s`` is subtracted from the times. first : index of the first row in the file.
-    Raises EventDataError, naming event and value."""
-    x, y, t, p = np.ascontiguousarray(rows.T)  # several passes over each column: not through all four
+    """Return rows x, y, t[s], ±1 as events; ``t0_s`` is subtracted from the times. first : index of the first row in
+    the file. Raises EventDataError, naming event and value."""
+    x, y, t, p = np.ascontiguousarray(rows.T)  # contiguous columns, because each is read several times
     return events_of(x, y, microseconds(t - t0_s, where, first), p, where, first, signed=True)

@@ -1,4 +1,4 @@
-"""What is drawn over pictures for people: boxes, and tracks with tails."""
+"""Overlays on pictures: boxes, and tracks with tails."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from blinkgl.io.pictures import id_colours
 from blinkgl.types.boxes import Boxes
 
 _FROM_PX = 160
-"""Pictures less wide than this have no room for words."""
+"""Narrower pictures have no space for text."""
 TAIL_US = 150_000
-"""How long a point's tail is."""
+"""Duration of a point's tail."""
 
 
 def with_boxes(picture: np.ndarray, boxes: Boxes) -> np.ndarray:
-    """(h, w, 3) uint8: a copy of a picture of any size with the objects' boxes, in the colours of their ids: of what is
-    seen in full lines, of the whole, cut at the picture's edges, in pale ones, and what they are called. Sky and
-    ground, which are everywhere, have none."""
+    """Return a copy of a picture of any size, (h, w, 3) uint8, with the objects' boxes in the colours of their ids and
+    their names: visible boxes in full lines, whole ones, clipped at the picture's edges, in pale ones. Sky and ground
+    have none."""
     out = np.ascontiguousarray(picture).copy()
     scale = np.tile([out.shape[1], out.shape[0]] / boxes.resolution, 2)
     for k in range(len(boxes)):
@@ -39,9 +39,9 @@ def with_boxes(picture: np.ndarray, boxes: Boxes) -> np.ndarray:
 
 
 def with_tracks(picture: np.ndarray, tracks: TrackLines, t_us: int) -> np.ndarray:
-    """(h, w, 3) uint8: a copy of a picture of any size with the points that are seen at t_us as dots, in the colours of
-    their objects, and where they were before as tails that thin out. Between two of the tracks' times they are
-    interpolated."""
+    """Return a copy of a picture of any size, (h, w, 3) uint8, with the points visible at t_us as dots in the colours
+    of their objects, and their earlier positions as fading tails. Positions are interpolated between the tracks'
+    times."""
     out = np.ascontiguousarray(picture).copy()
     scale = np.array([out.shape[1], out.shape[0]]) / tracks.resolution
     if not tracks.t_us[0] <= t_us <= tracks.t_us[-1]:
@@ -68,8 +68,8 @@ def with_tracks(picture: np.ndarray, tracks: TrackLines, t_us: int) -> np.ndarra
 
 @dataclass(frozen=True, eq=False)
 class TrackLines:
-    """Of point tracks what is drawn: t_us (T,), px (N, T, 2), occluded (N, T), instance (N,), resolution (2,) width and
-    height of the picture that px are of."""
+    """The drawn data of point tracks: t_us (T,), px (N, T, 2), occluded (N, T), instance (N,), resolution (2,) width
+    and height of the picture that px refer to."""
 
     t_us: np.ndarray
     px: np.ndarray
@@ -79,7 +79,7 @@ class TrackLines:
 
 
 def _between(times: np.ndarray, t_us: int) -> tuple[int, float]:
-    """The number of the last time that is not after t_us, and how far it is from there to the next."""
+    """Return the index of the last time that is not after t_us, and the fraction to the next."""
     now = max(int(np.searchsorted(times, t_us, side="right")) - 1, 0)
     step = times[now + 1] - times[now] if now + 1 < len(times) else 1
     return now, float((t_us - times[now]) / step)
@@ -90,7 +90,7 @@ def _colour(instance: int) -> list[int]:
 
 
 def _rectangle(picture: np.ndarray, edges: np.ndarray, colour: list[int]) -> None:
-    """The outermost pixels inside of edges, px from the picture's corner."""
+    """Draw the outermost pixels inside of edges, px from the picture's corner."""
     left, top, right, bottom = (int(v) for v in (*np.floor(edges[:2]), *(np.ceil(edges[2:]) - 1)))
     cv2.rectangle(picture, (left, top), (max(right, left), max(bottom, top)), colour, 1)
 
@@ -106,7 +106,7 @@ def _written(
     colour: tuple[int, ...],
     back: tuple[int, int, int] | None = None,
 ) -> np.ndarray:
-    """A copy with words at their upper left corner. back : of the ground that they stand on; None: none."""
+    """Return a copy with text at its upper left corner. back : background of the text; None: none."""
     made = Image.fromarray(picture)
     draw, font = ImageDraw.Draw(made), ImageFont.load_default(10)
     if back is not None:

@@ -1,4 +1,4 @@
-"""Arrays as pictures, by their kind: what a label or a buffer of the shader debugger looks like."""
+"""Pictures of arrays, by kind of label or of a shader debugger's buffer."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ EMPTY = np.array([40, 40, 40], np.uint8)  # nothing hit, or not a number
 
 
 def finite_range(values: np.ndarray, signed: bool = False, share: float = 0.005) -> tuple[float, float]:
-    """A range for display: the finite values without the outermost ``share`` on either side; symmetric when signed."""
+    """Return a range for display: the finite values without the outermost ``share`` at each end; symmetric when
+    signed."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return 0.0, 1.0
@@ -26,11 +27,11 @@ def finite_range(values: np.ndarray, signed: bool = False, share: float = 0.005)
 
 
 def map_scalar(values: np.ndarray, name: str, low: float, high: float, log: bool = False) -> np.ndarray:
-    """(H, W, 3) uint8; not finite: dark grey. log : equal ratios get equal steps of colour."""
+    """Return (H, W, 3) uint8; dark grey where not finite. log : equal ratios get equal steps of colour."""
     if log and low > 0:
         with np.errstate(invalid="ignore", divide="ignore"):
             return map_scalar(np.log(values), name, float(np.log(low)), float(np.log(high)))
-    import matplotlib  # here: it takes long to import, and whoever makes no pictures does without
+    import matplotlib  # imported here: it is slow to import, and only pictures need it
 
     if name not in MAPS:
         raise ConfigError("unknown colour map", where="map", value=name, accepted="one of " + ", ".join(MAPS))
@@ -42,8 +43,8 @@ def map_scalar(values: np.ndarray, name: str, low: float, high: float, log: bool
 
 
 def id_colours(ids: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8: distinct hues by the golden ratio, dark grey for 0; the same number
-    always has the same colour."""
+    """Return distinct hues by the golden ratio, (H, W, 3) uint8, dark grey for 0; a number always has the same
+    colour."""
     from matplotlib.colors import hsv_to_rgb
 
     numbers = ids.astype(np.int64)
@@ -56,7 +57,7 @@ def id_colours(ids: np.ndarray) -> np.ndarray:
 
 
 def component(array: np.ndarray, which: str) -> np.ndarray:
-    """(H, W) of (H, W[, C]): a component, or the length of the vector."""
+    """Return (H, W) of (H, W[, C]): a component, or the length of the vector."""
     if array.ndim == 2:
         return array
     if which in ("auto", "length"):
@@ -82,12 +83,11 @@ def picture(
     high: float | None = None,
     hit: np.ndarray | None = None,
 ) -> tuple[np.ndarray, dict]:
-    """(H, W, 3) uint8 and a legend: {"kind": "bar", "map", "low", "high", "log"}, {"kind":
-    "wheel", "high"} or {"kind": kind}.
+    """Return (H, W, 3) uint8 and a legend: {"kind": "bar", "map", "low", "high", "log"}, {"kind": "wheel", "high"} or
+    {"kind": kind}.
 
-    kind : as of a :class:`~blinkgl.labels.Label`, or "uv".   which : component of a
-    vector; "auto" takes the kind's own way.
-    hit : (H, W) bool, where scalars mean something (they set the range, the rest is dark grey)."""
+    kind : as of a :class:`~blinkgl.labels.Label`, or "uv".   which : component of a vector; "auto": the kind's default.
+    hit : (H, W) bool, where scalars are valid (they set the range, the rest is dark grey)."""
     if array.dtype == bool or kind == "mask":
         return np.where(array[..., None], np.uint8(245), np.uint8(25)).repeat(3, axis=-1), {"kind": "mask"}
     if which == "auto" and colours is None:
@@ -108,7 +108,7 @@ def picture(
         if kind == "motion":
             speed = component(array, "length")
             top = high if high is not None else finite_range(speed if hit is None or not hit.any() else speed[hit])[1]
-            from blinkgl.io.colour import flow_colour  # files know labels, so labels ask for them late
+            from blinkgl.io.colour import flow_colour  # imported late, because labels use this module
 
             return flow_colour(array, top, hit), {"kind": "wheel", "high": float(top)}
     values = component(np.asarray(array), which).astype(np.float64)

@@ -1,7 +1,7 @@
-"""Records on disk that somebody else may have written or damaged: read with limits, and from regular files alone.
+"""Records on disk that somebody else may have written or damaged: read with limits, and only from regular files.
 
-A manifest, an index, a run's record: whatever stands in them, reading ends, and ends with data of the shape that its
-model asks for or with one line that says what is wrong.
+For any content of a manifest, an index or a run's record, reading returns data in the form of its model, or one line
+that says what is wrong.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ MAX_NAME_BYTES = 1024
 
 
 def open_regular(path: str | os.PathLike) -> int:
-    """A file descriptor for reading. OSError; AssetError for what is no regular file: a pipe would wait for a writer
-    for ever, a device has no end. A link at the end of the path is followed only to such a file."""
+    """Return a file descriptor for reading. Raises OSError; AssetError for anything but a regular file: a pipe could
+    block forever, a device has no end. A link at the end of the path is followed only to such a file."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
@@ -33,7 +33,8 @@ def open_regular(path: str | os.PathLike) -> int:
 
 
 def read_text(path: str | os.PathLike, limit: int = MAX_RECORD_BYTES) -> str:
-    """UTF-8 text of a regular file. FileNotFoundError; AssetError: unreadable, no text, more than ``limit`` bytes."""
+    """Return UTF-8 text of a regular file. Raises FileNotFoundError; AssetError: unreadable, not text, more than
+    ``limit`` bytes."""
     try:
         with open(open_regular(path), "rb") as file:
             data = file.read(limit + 1)
@@ -42,15 +43,15 @@ def read_text(path: str | os.PathLike, limit: int = MAX_RECORD_BYTES) -> str:
         return data.decode("utf-8")
     except FileNotFoundError:
         raise
-    except ValueError:  # bytes that are no UTF-8; a path that holds NUL
+    except ValueError:  # bytes that are not UTF-8; a path that contains NUL
         raise AssetError("not a text file in UTF-8", where=str(path)) from None
     except OSError as error:
         raise AssetError(f"cannot be read: {error.strerror}", where=str(path)) from error
 
 
 def parse(text: str, model: TypeAdapter | None = None) -> Any:
-    """Plain data from JSON text, as written, once ``model`` has accepted it. ValueError says in one line what is wrong:
-    no JSON, nested too deeply, a key twice, or not of the model's shape."""
+    """Return plain data from JSON text, as written, once ``model`` has accepted it. Raises ValueError with one line:
+    not JSON, nested too deeply, a key twice, or not in the model's form."""
     try:
         data = json.loads(text, object_pairs_hook=_unique)
         if model is not None:
@@ -73,14 +74,14 @@ _OPEN = "0" * 64
 
 
 def sealed(record: Mapping[str, Any], default: Callable[[Any], Any] | None = None) -> str:
-    """The JSON text of a record with a hash of itself: SHA-256 of the text with zeros in the hash's place."""
+    """Return the JSON text of a record with a hash of itself: SHA-256 of the text with zeros in the hash's place."""
     text = json.dumps({**record, SEAL: _OPEN}, indent=1, sort_keys=True, default=default) + "\n"
     digest = hashlib.sha256(text.encode()).hexdigest()
     return text.replace(f'"{SEAL}": "{_OPEN}"', f'"{SEAL}": "{digest}"')
 
 
 def seal_problem(text: str) -> str | None:
-    """What is wrong with the hash that a sealed record has of itself; None where it is right."""
+    """Return the problem of a sealed record's hash; None where it is right."""
     found = re.search(rf'"{SEAL}": "([0-9a-f]{{64}})"', text)
     if found is None:
         return f"'{SEAL}' is missing"
@@ -96,14 +97,14 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def shown(name: Any, most: int = 160) -> str:
-    """A name from disk as it may be printed on a terminal: one line, no control characters, not too long."""
+    """Return a name from disk for printing on a terminal: one line, no control characters, not too long."""
     text = str(name)
     text = text if text.isprintable() else ascii(text)[1:-1]
     return text if len(text) <= most else text[: most - 1] + "…"
 
 
 def _inside(name: str) -> str:
-    """ValueError unless ``name`` is a plain relative POSIX path that stays where it starts."""
+    """Return ``name``. Raises ValueError unless it is a plain relative POSIX path inside its folder."""
     parts = name.split("/")
     try:
         sizes = [len(part.encode("utf-8")) for part in parts]
@@ -119,13 +120,12 @@ def _inside(name: str) -> str:
 InsidePath = Annotated[str, AfterValidator(_inside)]
 """A relative path that neither leaves its folder nor names the folder itself."""
 HereOrInside = Annotated[str, AfterValidator(lambda name: name if name == "." else _inside(name))]
-"""The same, or "." for the folder itself."""
+"""As InsidePath, or "." for the folder itself."""
 
 
 def entries_below(folder: str | os.PathLike) -> Iterator[tuple[str, str, int]]:
-    """(POSIX path relative to ``folder``, kind, bytes) of everything below it; kind is "file", "empty folder",
-    "symbolic link" or "special file". Links are not followed. Folders that hold something
-    are not listed themselves. OSError."""
+    """Yield (POSIX path relative to ``folder``, kind, bytes) of everything below it; kind is "file", "empty folder",
+    "symbolic link" or "special file". Links are not followed. Non-empty folders are not listed. Raises OSError."""
     pending = [""]
     while pending:
         prefix = pending.pop()

@@ -30,14 +30,14 @@ _COLUMN_NAMES = ({"t", "ts", "time", "times", "timestamp", "timestamps"}, {"x"},
 
 
 class TextReader:
-    """``height`` and ``width`` are None when the file does not say. Raises AssetError with the line's
-    number for anything that is no event."""
+    """Reads events from text. ``height`` and ``width`` are None when the file does not give them. Raises AssetError
+    with the number of a line that is not an event."""
 
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)
         self.height = self.width = None
         self._start = self._lines = 0  # bytes and lines before the first event
-        self._unit = -1  # of integer and of decimal times: not known yet
+        self._unit = -1  # unit of integer and of decimal times: not known yet
         named = False
         try:
             with open(path, "rb") as file:
@@ -65,13 +65,13 @@ class TextReader:
         check_size(self.height, self.width, str(path))
 
     def _name_columns(self, text: str) -> None:
-        """Takes sizes and the unit of time from a line that names the columns; AssetError when
-        it names others, or in another order."""
+        """Read sizes and the unit of time from a line with column names. Raises AssetError when it names others, or in
+        another order."""
         names = re.split(r"[,\t]|\s+(?![\[(])", text.lower().replace('"', ""))
         found = [_COLUMN.fullmatch(name.strip()) for name in names if name.strip()]
         if len(found) != 4 or not all(m and m["name"] in known for m, known in zip(found, _COLUMN_NAMES)):
             raise AssetError(
-                f"line {self._lines + 1} is not an event, and does not name the columns of one",
+                f"line {self._lines + 1} is not an event, and not a heading with column names",
                 where=str(self.path),
                 value=text,
                 accepted=f"{_ACCEPTED}, in this order",
@@ -82,7 +82,7 @@ class TextReader:
             self.width, self.height = int(found[1]["size"]), int(found[2]["size"])
 
     def chunks(self, size: int = 1 << 22) -> Iterator[Events]:
-        """All events, from about ``size`` bytes of text at a time."""
+        """Yield all events, from about ``size`` bytes of text at a time."""
         unit = np.array([self._unit])
         with open(self.path, "rb") as file:
             file.seek(self._start)
@@ -108,7 +108,7 @@ class TextReader:
                     content = text.split(b"\n", bad + 1)[bad].decode("latin-1")
                     if mixed:
                         raise AssetError(
-                            f"line {line + bad + 1} has its time in another unit",
+                            f"line {line + bad + 1} has a time in another unit",
                             where=str(self.path),
                             value=content,
                             accepted="either integers (µs) or numbers with a point (s) in the whole file",
@@ -127,9 +127,9 @@ class TextReader:
 
 
 class TextWriter:
-    """``t x y p``. ``separator`` "," makes a CSV: it begins with a line that names the columns. time_unit : "s" writes
-    seconds with six decimals, "us" integer µs; the CSV is then what faery writes and reads, with
-    the sensor's size in its first line."""
+    """Writes ``t x y p``. ``separator`` "," makes a CSV that begins with a line of column names. time_unit : "s" writes
+    seconds with six decimals, "us" integer µs; the CSV is then what faery writes and reads, with the sensor's size in
+    its first line."""
 
     def __init__(self, path: str | os.PathLike, height: int, width: int, separator: str = " ", *, time_unit: str = "s"):
         if time_unit not in ("s", "us"):
@@ -227,7 +227,7 @@ def _scaled(mantissa, exponent):
 
 @kernel
 def _parse(buffer, x, y, t, p, unit):
-    """Parse the events in whole lines of text. Return (count, index of the first bad line or -1, bad for its unit of
+    """Parse the events in complete lines of text. Return (count, index of the first bad line or -1, bad for its unit of
     time?).
 
     unit[0] : of the times so far, -1 not known, 0 integers (µs), 1 decimals (s); kept up to date."""

@@ -1,4 +1,4 @@
-"""``tracks.npz`` of a sequence: points on surfaces, followed (:class:`blinkgl.render.tracks.Tracks` names the
+"""``tracks.npz`` of a sequence: points on surfaces over time (:class:`blinkgl.render.tracks.Tracks` names the
 arrays)."""
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _SHAPES: dict[str, tuple[str, str]] = {
 
 
 def read_tracks(path: str | os.PathLike) -> dict[str, np.ndarray]:
-    """The arrays of ``tracks.npz``, by name. path : the file, or the folder of its sequence.
+    """Return the arrays of ``tracks.npz``, by name. path : the file, or the folder of its sequence.
 
-    Raises AssetError: missing, damaged, another shape or kind of number."""
+    Raises AssetError: missing, damaged, another shape or number type."""
     path = Path(path)
     path = path / TRACKS if path.is_dir() else path
     try:

@@ -20,15 +20,15 @@ from blinkgl.io.atomic import atomic_file, output_errors
 FORMATS = ("tum", "euroc")
 _MOST_LINES = 5_000_000
 _GAP = 20
-"""A step so many times the usual one is a gap."""
+"""A step this many times the usual one is a gap."""
 
 
 def read_trajectory(path: str | os.PathLike, form: str | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Times (N,) int64 ns and poses (N, 4, 4) float64 T_world_body, N >= 2, of a file of ``form`` "tum" or "euroc";
-    None: EuRoC's where the lines have commas.
+    """Return times (N,) int64 ns and poses (N, 4, 4) float64 T_world_body, N >= 2, of a file of ``form`` "tum" or
+    "euroc"; None: EuRoC where the lines have commas.
 
-    Raises AssetError, naming the line: not so many numbers, not finite, times that do not increase, a quaternion of
-    length other than 1, a gap of 20 usual steps; a heading that says w first of a TUM file."""
+    Raises AssetError, naming the line: a wrong count of numbers, not finite, times that do not increase, a quaternion
+    of length other than 1, a gap of 20 usual steps; a heading with w first in a TUM file."""
     path = Path(path)
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -61,7 +61,7 @@ def read_trajectory(path: str | os.PathLike, form: str | None = None) -> tuple[n
             raise AssetError(f"line {k} is no pose", where=str(path), value=line[:80], accepted=accepted) from None
     if max(map(abs, times)) >= 2**62:
         raise AssetError(
-            "times are too large: of another unit?",
+            "times are too large: another unit?",
             where=str(path),
             value=rows[-1][1][:40],
             accepted="seconds in TUM's files, nanoseconds in EuRoC's",
@@ -84,7 +84,7 @@ def read_trajectory(path: str | os.PathLike, form: str | None = None) -> tuple[n
 
 
 def _nanoseconds(word: str, form: str) -> int:
-    """Of a number of s or ns, all its digits."""
+    """Return ns of a number of s or ns, with all its digits."""
     if form == "euroc":
         return int(float(word)) if "." in word or "e" in word.lower() else int(word)
     whole, _, part = word.partition(".")
@@ -103,7 +103,7 @@ def _check_times(t_ns: np.ndarray, line: list[int], path: Path) -> None:
     usual = float(np.median(steps))
     if usual > 100e9:
         raise AssetError(
-            "poses are minutes apart: times of another unit?",
+            "poses are minutes apart: another unit of time?",
             where=str(path),
             value=f"{usual * 1e-9:.6g} s from pose to pose",
             accepted="seconds in TUM's files, nanoseconds in EuRoC's",
@@ -119,7 +119,7 @@ def _check_times(t_ns: np.ndarray, line: list[int], path: Path) -> None:
 
 
 def write_trajectory(path: str | os.PathLike, t_ns: np.ndarray, poses: np.ndarray) -> None:
-    """Writes (N,) int64 ns and (N, 4, 4) poses as TUM's text, whole or not at all. Raises OutputError."""
+    """Write (N,) int64 ns and (N, 4, 4) poses as TUM's text, completely or not at all. Raises OutputError."""
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     lines = ["# timestamp tx ty tz qx qy qz qw"]
     for t, p, q in zip(np.asarray(t_ns).tolist(), poses[:, :3, 3].tolist(), quaternions.tolist()):

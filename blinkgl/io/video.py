@@ -69,7 +69,7 @@ class VideoWriter:
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=self._log)
 
     def write(self, frame: np.ndarray) -> None:
-        """(height, width, 3) uint8 RGB."""
+        """Write (height, width, 3) uint8 RGB."""
         if frame.shape != self._shape or frame.dtype != np.uint8:
             raise ValueError(f"expected uint8 {self._shape}, got {frame.dtype} {frame.shape}")
         try:
@@ -89,7 +89,7 @@ class VideoWriter:
         self._release()
 
     def abort(self) -> None:
-        """Stops the encoder; never raises."""
+        """Stop the encoder; never raises."""
         if self._process is not None:
             self._process.kill()
             with contextlib.suppress(OSError):
@@ -121,12 +121,12 @@ _CONTAINERS = (
     "yuv4mpegpipe,h264,hevc,vvc,av1,obu,m4v,mjpeg,rm,wtv,cine"
 )
 _ALONE = ["-protocol_whitelist", "file", "-format_whitelist", _CONTAINERS]
-"""A video is the file itself: play lists and manifests (DASH, HLS, concat), which lead ffmpeg to other files and to the
-network whatever a file is called, are no containers here."""
+"""Only the file itself is read: play lists and manifests (DASH, HLS, concat), which make ffmpeg open other files and
+the network for any file name, are not accepted."""
 
 
 def _input(path: str | os.PathLike) -> str:
-    """The file for ffmpeg, to which a name with a colon would be a protocol."""
+    """Return the file for ffmpeg, which would take a name with a colon as a protocol."""
     return f"file:{os.fspath(path)}"
 
 
@@ -207,15 +207,15 @@ class VideoReader:
 
 
 def read_exr(path: str | os.PathLike) -> np.ndarray:
-    """(H, W, 3) or (H, W) float32 linear of an OpenEXR image. OpenCV's wheel has no OpenEXR; ffmpeg does. AssetError:
-    undecodable."""
+    """Return (H, W, 3) or (H, W) float32 linear of an OpenEXR image. OpenCV's wheel has no OpenEXR; ffmpeg does. Raises
+    AssetError: undecodable."""
     if not os.path.isfile(path):
         raise AssetError("no such file", where=str(path))
     return decode_exr(Path(path).read_bytes(), str(path))
 
 
 def decode_exr(data: bytes, where: str) -> np.ndarray:
-    """:func:`read_exr` of what has been read already."""
+    """Return :func:`read_exr` of bytes already read."""
     # Through a pipe, and as OpenEXR whatever it looks like: a name such as f%d.exr would be a pattern of names. ffmpeg
     # finds no end of an image in a pipe by itself.
     whole = ["-f", "exr_pipe", "-c:v", "exr", "-frame_size", str(len(data))]
@@ -244,7 +244,7 @@ def _last_line(log) -> str:
 
 
 def _gist(text: str) -> str:
-    """ffmpeg's most telling line, without addresses."""
+    """Return ffmpeg's most informative line, without addresses."""
     lines = [re.sub(r"^\[[^\]]*\]\s*", "", line).strip() for line in text.splitlines()]
     lines = [re.sub(r" @ 0x[0-9a-f]+", "", line) for line in lines if line]
     telling = [

@@ -1,10 +1,9 @@
-"""Ground truth, one row per label: what :mod:`blinkgl.config` reads of it, what is drawn,
-what lies on disk, how it is judged.
+"""Ground truth, one row per label: its configuration, drawing, files and grading.
 
 In:    rows (:func:`register`).
 Out:   :data:`LABELS`, which configuration, renderer, writer, verification, reports and the shader debugger read.
-Start: label.py, which says what a row holds, and surface.py, the plainest of them. Neither OpenGL nor a compiler is
-imported here: a YAML is read by it.
+Start: label.py, which defines a row, and surface.py, the simplest rows. Neither OpenGL nor a compiler is imported here,
+because reading a YAML imports this room.
 """
 
 from blinkgl.labels.boxes import ObjectBoxes

@@ -1,4 +1,4 @@
-"""Where objects are: boxes in the picture and in space."""
+"""Bounding boxes of objects, in the image and in 3-D."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from blinkgl.types.boxes import SHAPES, Boxes
 
 
 class ObjectBoxes(Label):
-    """:class:`Boxes` of the objects that are in the picture or behind something in it."""
+    """:class:`Boxes` of the objects that are visible in the image or hidden in it."""
 
     name = "boxes"
     kind, needs = "mask", ("ids",)

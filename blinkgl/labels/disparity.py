@@ -1,4 +1,4 @@
-"""How far apart the two eyes of a rectified pair see a point."""
+"""Disparity of a rectified stereo pair."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 
 class Disparity(Label):
-    """(H, W) float32 px, f b / Z >= 0: x in the left eye less x in the right, whichever eye's picture it is of; 0 where
-    nothing is hit, and everywhere where a sensor has no other eye. Hidden points have theirs, too."""
+    """(H, W) float32 px, f b / Z >= 0: x in the left image minus x in the right, for both images; 0 where nothing is
+    hit, and everywhere for a sensor without a pair. Hidden points are included."""
 
     name = "disparity"
     unit, kind = "px", "scalar"
@@ -35,7 +35,7 @@ class Disparity(Label):
 
 
 def _of(scene: Scene, depth: np.ndarray) -> np.ndarray:
-    """(H, W) float64; depth is 0 where nothing is hit."""
+    """Return the disparity, (H, W) float64; depth is 0 where nothing is hit."""
     baseline = scene.sensors[0].baseline or 0.0
     there = depth > 0
     return np.where(there, scene.camera.disparity(np.where(there, depth, 1.0), abs(baseline)), 0.0)

@@ -1,4 +1,4 @@
-"""The forms in which labels lie on disk."""
+"""File formats of labels."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Form:
-    """``FOLDER/000000.ENDING``, one file a label.
+    """A format ``FOLDER/000000.ENDING``, one file per label.
 
-    encode : a value as the bytes of a file, or as (bytes, number of its pixels that the form cannot hold).
-    read : the value in a file; raises AssetError."""
+    encode : converts a value to the bytes of a file, or to (bytes, number of pixels that the format cannot hold).
+    read : returns the value in a file; raises AssetError."""
 
     folder: str
     ending: str
@@ -21,15 +21,15 @@ class Form:
     read: Callable[[str | os.PathLike], Any] | None = None
 
     def file(self, index: int) -> str:
-        """Name of the ``index``-th label's file below the sequence."""
+        """Return the name of the ``index``-th label's file below the sequence."""
         return f"{self.folder}/{index:06d}.{self.ending}"
 
     def files(self, count: int) -> Iterator[str]:
-        """Names of the files of so many labels."""
+        """Return the names of the files of ``count`` labels."""
         yield from (self.file(k) for k in range(count))
 
     def holds(self, name: str) -> bool:
-        """Whether ``name`` is one of its files."""
+        """Return whether ``name`` is one of its files."""
         return (
             name.startswith(self.folder + "/")
             and name.endswith("." + self.ending)
@@ -38,28 +38,28 @@ class Form:
 
 
 def npy(folder: str) -> Form:
-    """Any array of numbers as .npy."""
+    """Return the format of any array of numbers as .npy."""
     return Form(folder, "npy", _images("encode_npy"), _images("read_npy"))
 
 
 def mask_png(folder: str) -> Form:
-    """(H, W) bool as 8-bit PNG, 255 and 0."""
+    """Return the format of (H, W) bool as 8-bit PNG, 255 and 0."""
     return Form(folder, "png", _images("encode_mask"), _images("read_mask"))
 
 
 def ids_png(folder: str) -> Form:
-    """(H, W) numbers from 0 to 65535 as 16-bit PNG."""
+    """Return the format of (H, W) numbers from 0 to 65535 as 16-bit PNG."""
     return Form(folder, "png", _images("encode_ids"), _images("read_ids"))
 
 
 def image_png(folder: str) -> Form:
-    """(H, W[, 3]) linear light or sRGB codes as sRGB PNG; read as codes."""
+    """Return the format of (H, W[, C]) linear light or sRGB codes as sRGB PNG; read as codes."""
     return Form(folder, "png", _images("encode_image"), _images("read_image"))
 
 
 def _images(name: str) -> Callable[[Any], Any]:
-    """A function of :mod:`blinkgl.io.images`, which is imported when it is first used:
-    configuration reads this module."""
+    """Return a function of :mod:`blinkgl.io.images` that is imported when first used, because configuration imports
+    this module."""
 
     def call(value: Any) -> Any:
         from blinkgl.io import images

@@ -1,4 +1,4 @@
-"""Where the surface is at another label's time."""
+"""Optical flow to another label's time."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 
 def seconds_of(labels: LabelsConfig) -> tuple[float, ...]:
-    """The intervals among ``labels.flow``, s."""
+    """Return the intervals in ``labels.flow``, s."""
     return tuple(one for one in labels.flow if isinstance(one, float))
 
 
 class FlowTo(Label):
-    """:class:`Flow` to the next label's time or to the one before; valid pixels beyond DSEC's ±256 px become invalid in
-    the PNG, not in the float forms."""
+    """:class:`Flow` to the next label's time or to the previous one; valid pixels beyond DSEC's ±256 px become invalid
+    in the PNG, but not in the float files."""
 
     unit, kind = "px", "motion"
     buffer = "RGBA32F"
@@ -61,7 +61,7 @@ class FlowTo(Label):
     @property
     def forms(self) -> tuple[Form, ...]:
         folder = f"flow/{self.towards}"
-        # Float forms have folders of their own: DSEC loaders take every file of flow/forward for a PNG.
+        # Float files have their own folders: DSEC loaders read every file of flow/forward as a PNG.
         return (
             Form(folder, "png", _png, _read),
             Form(folder + "_npy", "npy", _npy, _read),

@@ -1,4 +1,4 @@
-"""What the renderer is asked for, and what it returns."""
+"""Requests for labels, and the frames that the renderer returns."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from blinkgl.labels.table import LABELS, label_of
 
 
 class LabelRequest:
-    """Which labels :meth:`Renderer.labels` returns, by name:
-    ``LabelRequest("depth", "flow_forward")``; what is not asked for is not computed.
+    """The labels that :meth:`Renderer.labels` returns, by name: ``LabelRequest("depth", "flow_forward")``; others are
+    not computed.
 
-    intervals_ns : how far those lead that lead to several times, "flow_intervals".
-    categories : pattern of names and number of the category, for those that tell objects apart by them.
+    intervals_ns : intervals of the labels that lead to several times, "flow_intervals".
+    categories : pattern of names and number of the category, for labels of object categories.
     Iterating gives the names in the order of the table. Raises KeyError: no such label."""
 
     def __init__(self, *names: str, intervals_ns: Iterable[int] = (), categories: tuple[tuple[str, int], ...] = ()):
@@ -26,30 +26,30 @@ class LabelRequest:
 
     @property
     def buffers(self) -> tuple[str, ...]:
-        """Labels whose shader outputs have to be drawn for it, in the order of the table."""
+        """Return the labels whose shader outputs must be drawn, in the order of the table."""
         drawn = {other for name in self.names for other in (name, *LABELS[name].needs)}
         return tuple(name for name, label in LABELS.items() if name in drawn and label.buffer)
 
     @property
     def there(self) -> tuple[str, ...]:
-        """Labels whose shader outputs have to be drawn at the other times."""
+        """Return the labels whose shader outputs must be drawn at the other times."""
         drawn = {other for name in self.names for other in LABELS[name].there}
         return tuple(name for name in LABELS if name in drawn)
 
     @property
     def each(self) -> LabelRequest:
-        """Labels that are drawn once per interval."""
+        """Return the request for labels that are drawn once per interval."""
         return LabelRequest(*(other for name in self.names for other in LABELS[name].each))
 
     def only(self, names: Iterable[str]) -> LabelRequest:
-        """Of these names alone."""
+        """Return the request for these names only."""
         return LabelRequest(*names, intervals_ns=self.intervals_ns, categories=self.categories)
 
     def without(self, *names: str) -> LabelRequest:
         return self.only(name for name in self.names if name not in names)
 
     def within(self, before_ns: int, after_ns: int) -> LabelRequest:
-        """With those intervals alone that end in [before_ns, after_ns], as :func:`ending_within` has it."""
+        """Return the request with only the intervals that end in [before_ns, after_ns], as in :func:`ending_within`."""
         there = ending_within(self.intervals_ns, before_ns, after_ns)
         return LabelRequest(*self.names, intervals_ns=there, categories=self.categories)
 
@@ -78,8 +78,8 @@ class LabelRequest:
 
 
 def ending_within(intervals_ns: Iterable[int], before_ns: int, after_ns: int) -> list[int]:
-    """Those intervals that end in [before_ns, after_ns]. One that ends less than 1 µs outside ends there: label times
-    are rounded to ns, and a multiple of 1/30 s is not that of the label interval."""
+    """Return the intervals that end in [before_ns, after_ns], with a tolerance of 1 µs: label times are rounded to ns,
+    and a multiple of 1/30 s differs from that of the label interval."""
     there = {min(max(ns, before_ns), after_ns) for ns in intervals_ns if before_ns - 1000 < ns < after_ns + 1000}
     return sorted(there - {0})
 
@@ -96,14 +96,14 @@ class Flow:
 
 
 class LabelFrame:
-    """Ground truth at t_ns. Every label that was asked for is an attribute of its name; those that were not are None.
+    """Ground truth at t_ns. Every requested label is an attribute of its name; the others are None.
 
     colour : (H, W, 3) float32 linear radiance (label "images").
     depth : (H, W) float32 Z along the optical axis; inf: nothing hit.   ids : (H, W) uint32; 0: nothing hit.
     normals : (H, W, 3) float32 unit, camera axes (OpenCV), facing the camera.
     velocity : (H, W, 2) float32 px/s at t.
-    flow_intervals : :class:`~blinkgl.labels.intervals.Flows` over intervals of one's own.
-    forward, backward : :class:`Flow`, with the occlusion mask where that was asked for.
+    flow_intervals : :class:`~blinkgl.labels.intervals.Flows` over the configured intervals.
+    forward, backward : :class:`Flow`, with the occlusion mask if requested.
     values : all of them by the name of the label."""
 
     def __init__(self, t_ns: int, values: dict[str, Any]):

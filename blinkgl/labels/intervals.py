@@ -1,5 +1,5 @@
-"""Flow to any other times: from each label's time on over intervals of one's own, hundredths of a second beside tenths,
-or many that follow one another (continuous flow). What is drawn is forward flow, once per interval."""
+"""Flow from each label's time over chosen intervals, for example hundredths of a second beside tenths, or many
+consecutive ones (continuous flow). It is drawn as forward flow, once per interval."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Flows:
     valid: np.ndarray
 
     def over(self, seconds: float) -> Flow:
-        """The flow over this interval, to the nearest microsecond. Raises KeyError: it is not among them."""
+        """Return the flow over this interval, to the nearest microsecond. Raises KeyError: it is not among them."""
         k = int(np.argmin(np.abs(self.interval_ns - seconds * 1e9))) if len(self.interval_ns) else -1
         if k < 0 or abs(self.interval_ns[k] - seconds * 1e9) > 500:
             there = ", ".join(f"{ns * 1e-9:.9g}" for ns in self.interval_ns)
@@ -39,7 +39,7 @@ class Flows:
 
 @dataclass(frozen=True, eq=False)
 class Occlusions:
-    """What is hidden at the ends of :class:`Flows`: t_ns, interval_ns as there; occluded (K, H, W) bool."""
+    """Occlusion at the ends of :class:`Flows`: t_ns, interval_ns as there; occluded (K, H, W) bool."""
 
     t_ns: int
     interval_ns: np.ndarray
@@ -47,7 +47,7 @@ class Occlusions:
 
 
 class _OverIntervals(Label):
-    """A value with an array per interval. ``arrays``: name -> (shape behind (K, H, W), dtype); ``made``: its class."""
+    """A value with one array per interval. ``arrays``: name -> (shape after (K, H, W), dtype); ``made``: its class."""
 
     kind, off = "motion", "no interval in labels.flow"
     arrays: dict[str, tuple[tuple[int, ...], Any]]
@@ -90,11 +90,11 @@ class _OverIntervals(Label):
         from_us, interval_ns, arrays = read_intervals(path, tuple(self.arrays))
         return self.made(from_us * 1000, interval_ns, **arrays)
 
-    views = property(lambda self: ())  # the flow label at other times, which the debugger shows
+    views = property(lambda self: ())  # the debugger shows it as the flow label at other times
 
 
 class FlowIntervals(_OverIntervals):
-    """:class:`Flows`: what ``flow_forward`` would be, did it lead from the label's time to each of the others."""
+    """:class:`Flows`: ``flow_forward`` from the label's time over each of the intervals."""
 
     name, title, unit = "flow_intervals", "flow over intervals", "px"
     each = ("flow_forward",)
@@ -114,7 +114,7 @@ class FlowIntervals(_OverIntervals):
 
 
 class OcclusionIntervals(_OverIntervals):
-    """:class:`Occlusions`: what ``occlusion_forward`` would be at the end of each interval."""
+    """:class:`Occlusions`: ``occlusion_forward`` at the end of each interval."""
 
     name, title, unit = "occlusion_intervals", "occlusion over intervals", ""
     off = "labels.occlusion: false, or no interval in labels.flow"

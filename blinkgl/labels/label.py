@@ -1,8 +1,8 @@
-"""What a label is: everything that is known of one kind of ground truth, in one class.
+"""Base class of labels: one class holds everything about one kind of ground truth.
 
-A row of the table is an instance. What it has to say is listed in :class:`Label`, in the order of its way:
-configuration, shader, the CPU, files, the reference. docs/extending.md has the whole of one;
-:func:`blinkgl.labels.register` names what is missing.
+A row of the table is an instance. :class:`Label` lists its attributes in the order of processing: configuration,
+shader, CPU, files, reference. docs/extending.md has a complete example; :func:`blinkgl.labels.register` names what is
+missing.
 """
 
 from __future__ import annotations
@@ -52,14 +52,14 @@ KINDS = ("scalar", "depth", "signed", "ids", "mask", "light", "unit", "motion")
 
 @dataclass(frozen=True)
 class View:
-    """One array of a label that is shown and judged by itself; of most labels the only one.
+    """One array of a label that is shown and graded separately; most labels have only one.
 
-    name, title, unit, kind : as of :class:`Label`.   of : the array (H, W[, C]) in a value.   reference : what it
-    should be, of a scene and a :class:`~blinkgl.render.reference.ReferenceFrame`.   judged_in, tolerance : unit of its
-    error, and the most that is let pass.
-    error : (drawn, true, label interval in s) -> (H, W) >= 0.   statistic : "max" of the
-    pixels' errors, or their "mean".
-    same_triangle : judged only where both sides see the same triangle.   note : said beside the figure."""
+    name, title, unit, kind : as of :class:`Label`.   of : the array (H, W[, C]) in a value.   reference : its correct
+    value, from a scene and a :class:`~blinkgl.render.reference.ReferenceFrame`.   judged_in, tolerance : unit of its
+    error, and the largest error that passes.
+    error : (drawn, true, label interval in s) -> (H, W) >= 0.   statistic : "max" of the pixels' errors, or their
+    "mean".
+    same_triangle : compare only where both see the same triangle.   note : remark beside the result."""
 
     name: str
     title: str
@@ -76,13 +76,13 @@ class View:
 
 
 class Drawn(Protocol):
-    """What :meth:`Label.finish` is given: the buffers of one time as the shader wrote them.
+    """Input of :meth:`Label.finish`: the buffers of one time as the shader wrote them.
 
     scene : as it is drawn.   end_ns : the time that this label leads to; None: it is of one time.
     categories : pattern of names and number of the category, in order.
-    t_ns : the time.   leading : of a label that says ``each``, interval in ns -> frame of those labels, leading so far.
-    raw(name) : (H, W[, C]) buffer of a label, its own or one of ``needs``.   value(name) : what that label made of its.
-    there(name) : buffer of a label among its ``there``, at the time that this label leads to.
+    t_ns : the time.   leading : for a label with ``each``, interval in ns -> frame of those labels over it. raw(name) :
+    (H, W[, C]) buffer of a label, its own or one of ``needs``.   value(name) : that label's value. there(name) : buffer
+    of a label in ``there``, at the time that this label leads to.
     flow(name) : the flow in a label's buffer.   occlusion(flow) : (H, W) bool, where the points of that flow's label
     are hidden at its end; needs "ids", and "depth" and "ids" there.   boxes() : of the objects; needs "ids"."""
 
@@ -182,52 +182,52 @@ class Label:
     # ---- configuration -------------------------------------------------------------------------------------------
 
     def asked(self, labels: LabelsConfig) -> bool:
-        """Whether ``labels:`` asks for it."""
+        """Return whether ``labels:`` requests it."""
         return bool(getattr(labels, self.name))
 
     @property
     def said(self) -> str:
-        """Its name in Python calls, ``labels=["depth", …]``: the word that asks for it in a YAML."""
+        """Return its name in Python calls, ``labels=["depth", …]``, which is the word that requests it in a YAML."""
         return self.name
 
     def intervals(self, labels: LabelsConfig) -> tuple[int, ...]:
-        """Of a label that says ``each``: how far each leads from the label's time, ns, increasing."""
+        """Return, for a label with ``each``, its intervals from the label's time, ns, increasing."""
         return ()
 
     def categories(self, labels: LabelsConfig) -> tuple[tuple[str, int], ...]:
-        """Of a label that tells kinds of objects apart: pattern of names and number, in order."""
+        """Return, for a label of object categories, pattern of names and number, in order."""
         return ()
 
     def check(self, scene: Scene, labels: LabelsConfig) -> None:
-        """Raises ConfigError for what ``labels:`` asks for and a scene cannot give."""
+        """Raise ConfigError for requests in ``labels:`` that the scene cannot give."""
 
     def facts(self, scene: Scene, labels: LabelsConfig) -> dict[str, Any]:
-        """What the manifest says of it besides, by key: plain values."""
+        """Return further entries of the manifest, by key: plain values."""
         return {}
 
     def ask(self, tree: dict[str, Any]) -> None:
-        """Asks for it in a tree of ``labels:``."""
+        """Request it in a tree of ``labels:``."""
         tree[self.name] = True
 
     def can_be_of(self, scene: Scene) -> bool:
-        """Whether it says anything of a scene: where it does not the shader debugger leaves it out."""
+        """Return whether it is defined for a scene; otherwise the shader debugger leaves it out."""
         return True
 
     # ---- the shader and the CPU ----------------------------------------------------------------------------------
 
     def uniforms(self, shot: Shot) -> Mapping[str, np.ndarray]:
-        """Values of the uniforms in ``glsl``, once a frame: name -> array whose first axis counts the scene's objects,
-        (n,), (n, k) for a vector, (n, rows, columns) for a matrix. ``shot.moment`` has the poses and matrices,
+        """Return values of the uniforms in ``glsl``, once per frame: name -> array whose first axis counts the scene's
+        objects, (n,), (n, k) for a vector, (n, rows, columns) for a matrix. ``shot.moment`` has the poses and matrices,
         ``shot.ends[towards]`` those of the other time."""
         return {}
 
     def finish(self, drawn: Drawn) -> Any:
-        """The label's value, of ``channels`` and ``dtype``, from the buffers."""
+        """Return the label's value, of ``channels`` and ``dtype``, from the buffers."""
         raw = drawn.raw(self.name)
         return np.ascontiguousarray(raw[..., : self.channels]) if self.channels else raw
 
     def wrong(self, value: Any, height: int, width: int) -> str | None:
-        """What is wrong with the shape or the kind of number of a value, in words; None: nothing."""
+        """Return what is wrong with the shape or number type of a value, in words; None: nothing."""
         array = np.asarray(value)
         if array.shape[:2] != (height, width):
             return f"not {width}x{height} px: {array.shape}"
@@ -243,7 +243,7 @@ class Label:
         return None
 
     def own(self, value: Any) -> Any:
-        """A copy of a value, as it is written."""
+        """Return a copy of a value, as it is written."""
         array = np.array(value)
         return array.astype(self.dtype, copy=False) if array.dtype.kind == "f" and self.dtype is not None else array
 
@@ -254,23 +254,24 @@ class Label:
         return (files.npy(self.name),)
 
     def written(self, labels: LabelsConfig) -> tuple[Form, ...]:
-        """Those of ``forms`` that ``labels:`` asks for; the label itself is asked for."""
+        """Return those of ``forms`` that ``labels:`` requests; the label itself is requested."""
         return self.forms
 
     def drawn_on(self, picture: np.ndarray, value: Any) -> np.ndarray | None:
-        """(H, W, 3) uint8: the value drawn over a picture, of a label that is no picture itself; else None."""
+        """Return (H, W, 3) uint8: the value drawn over a picture, for a label that is not a picture itself; else
+        None."""
         return None
 
     # ---- the reference -------------------------------------------------------------------------------------------
 
     def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
-        """(H, W[, C]) float64: what it should be, of the float64 reference's hits; 0 or inf where
-        nothing is hit, as ``finish`` has it."""
+        """Return its correct value, (H, W[, C]) float64, from the float64 reference's hits; 0 or inf where nothing is
+        hit, as in ``finish``."""
         raise NotImplementedError
 
     @property
     def views(self) -> tuple[View, ...]:
-        """What the shader debugger shows and judges."""
+        """Return what the shader debugger shows and grades."""
         return (
             View(
                 self.name,

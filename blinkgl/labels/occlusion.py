@@ -1,4 +1,4 @@
-"""Which points of the flow are hidden at its other end."""
+"""Occlusion of the flow's points at its other end."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from blinkgl.labels.label import Drawn, Label, Towards, View
 
 
 class OcclusionAt(Label):
-    """(H, W) bool: a valid pixel's point is not visible where its flow ends, behind another
-    surface or outside the image."""
+    """(H, W) bool: a valid pixel's point is not visible at its flow's end: behind another surface or outside the
+    image."""
 
     title, kind, off = "occlusion masks", "mask", "labels.occlusion: false, or no flow"
     dtype = bool

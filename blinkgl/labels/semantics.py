@@ -1,4 +1,4 @@
-"""What kind of thing is seen: categories of objects by their names, as numbers."""
+"""Categories of visible objects, by their names, as numbers."""
 
 from __future__ import annotations
 
@@ -25,37 +25,37 @@ _CATEGORIES = {"sky": 1, "ground": 2, "wall": 3} | {
     name: kind.category for name, kind in PRIMITIVES.items() if kind.category is not None
 }
 BY_NAME: Categories = (*sorted(_CATEGORIES.items(), key=lambda row: row[1]), ("*", 255))
-"""``semantics: true``: sky 1, ground 2, wall 3, shapes from 4 on, 255 for other names. Data sets hold these numbers:
-new kinds come at the end."""
+"""``semantics: true``: sky 1, ground 2, wall 3, shapes from 4, 255 for other names. Data sets store these numbers: new
+kinds must come at the end."""
 
 
 def categories_of(labels: LabelsConfig) -> Categories:
-    """The table that ``labels:`` asks for; that by kinds where it says none."""
+    """Return the table of ``labels:``; that by kinds where it has none."""
     asked = labels.semantics
     return tuple(asked.items()) if isinstance(asked, dict) and asked else BY_NAME
 
 
 def class_of(thing: SceneObject) -> str:
-    """What kind of thing an object is, by its name: "cuboid" of "cuboid-3#12", "Chair" of "Chair.001"; "ground", "wall"
-    and "sky" by their category."""
+    """Return an object's kind, from its name: "cuboid" of "cuboid-3#12", "Chair" of "Chair.001"; "ground", "wall" and
+    "sky" by their category."""
     if thing.category != "object":
         return thing.category
     return re.sub(r"([#.\-_ ]\d+)+$", "", thing.name) or thing.name
 
 
 def names_of(thing: SceneObject) -> list[str]:
-    """What patterns are compared with."""
+    """Return the names that patterns are compared with."""
     return [thing.name, class_of(thing), *(part.mesh.name for part in thing.parts)]
 
 
 def category_of(thing: SceneObject, categories: Categories) -> int:
-    """Number of an object's category; 0: no pattern fits."""
+    """Return the number of an object's category; 0: no pattern matches."""
     names = names_of(thing)
     return next((number for pattern, number in categories if any(fnmatchcase(n, pattern) for n in names)), 0)
 
 
 class Semantics(Label):
-    """(H, W) uint16 category of the object that is seen; 0: nothing hit, or no pattern fits its name."""
+    """(H, W) uint16 category of the visible object; 0: nothing hit, or no pattern matches its name."""
 
     name = "semantics"
     unit, kind = "0: nothing, or no category", "ids"
@@ -74,7 +74,7 @@ class Semantics(Label):
             for pattern, _ in categories
         ):
             raise ConfigError(
-                "no object has a name that one of the patterns fits",
+                "no object's name matches a pattern",
                 where="labels.semantics",
                 value=[pattern for pattern, _ in categories],
                 accepted="patterns of "

@@ -1,4 +1,4 @@
-"""Labels that are read off the surface at a pixel's centre: depth, normals, ids, velocity, motion in space, images."""
+"""Labels of the surface at a pixel's centre: depth, normals, ids, velocity, scene flow, images."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Depth(Label):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Which way the surface faces.
+# Direction of the surface.
 
 
 class Normals(Label):
@@ -55,7 +55,7 @@ class Normals(Label):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Which object is seen.
+# Visible object.
 
 
 class Ids(Label):
@@ -95,7 +95,7 @@ class Ids(Label):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# How fast the surface moves in the image.
+# Motion of the surface in the image.
 
 
 class Velocity(Label):
@@ -115,14 +115,14 @@ class Velocity(Label):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# How far the surface moves in space.
+# Motion of the surface in space.
 
 
 class SceneFlow(Label):
-    """(H, W, 3) float32 world units: how far the point that a pixel shows moves in the world until the next label's
-    time, in the camera's axes at its own time; 0 where nothing is hit. What stands still has 0, however the camera
-    moves: of a point at X in the camera's axes it leads to X + s, which at the other time is at
-    T_cam'_cam (X + s) in that camera's axes."""
+    """(H, W, 3) float32 world units: the motion of the pixel's point in the world until the next label's time, in the
+    camera's axes at its own time; 0 where nothing is hit. It is 0 for static surfaces, however the camera moves: a
+    point at X in the camera's axes moves to X + s, which at the other time is at T_cam'_cam (X + s) in that camera's
+    axes."""
 
     name, title = "scene_flow", "scene flow"
     unit, kind = "world units", "scalar"
@@ -135,9 +135,9 @@ class SceneFlow(Label):
     def uniforms(self, shot: Shot) -> dict[str, np.ndarray]:
         now, then = shot.moment, shot.ends["forward"]
         to_camera = now.T_world_cam[:3, :3].T
-        # Differences of poses, so that what stands still has exactly nothing.
+        # Differences of poses, so that static objects have exactly 0.
         change = to_camera @ (then.T_world_obj - now.T_world_obj)[:, :3]
-        # A sky at infinity stands still: its box is only drawn where the camera is.
+        # A sky at infinity is static: its box only follows the camera.
         change[[thing.at_infinity for thing in shot.scene.objects]] = 0.0
         of_clip = to_camera @ then.T_world_cam[:3, :3] @ np.linalg.inv(then.view.projection[[0, 1, 3], :3])
         return {"change_in_space": change, "space_from_clip": np.tile(of_clip, (len(change), 1, 1))}
@@ -151,11 +151,11 @@ class SceneFlow(Label):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What the scene looks like.
+# Appearance of the scene.
 
 
 class Images(Label):
-    """(H, W, 3) float32 linear radiance, anti-aliased as ``render.image_antialiasing`` says."""
+    """(H, W, 3) float32 linear radiance, anti-aliased by ``render.image_antialiasing``."""
 
     name, title, unit, kind = "images", "images", "linear radiance", "light"
     anti_aliased, at_last = True, True
@@ -168,4 +168,4 @@ class Images(Label):
 
     @property
     def views(self) -> tuple[View, ...]:
-        return ()  # the debugger follows the colour pass step by step, beginning with what it looks up
+        return ()  # the debugger shows the steps of the colour pass, beginning with its lookups

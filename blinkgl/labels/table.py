@@ -1,6 +1,6 @@
-"""Which labels there are: one table of rows, and nothing else that lists them.
+"""The table of labels, the only list of them.
 
-register(Position())        # a Label: docs/extending.md has the whole of one
+register(Position())        # a Label: docs/extending.md has a complete example
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 
 
 LABELS: dict[str, Label] = {}
-"""By ``name``, in the order in which they were registered, which is that of everything that lists labels."""
+"""Labels by ``name``, in the order of registration, which all lists of labels use."""
 _KEYS: set[str] = set()
 """Keys of ``labels:`` that were added for a label."""
 
 
 def register(label: Label) -> Label:
-    """Puts a row into the table after a look at every part of it, and its keys into ``labels:``; returns it.
+    """Check every part of a row, add it to the table and its keys to ``labels:``; return it.
 
-    Raises TypeError naming the label and the part that is missing or of the wrong kind, or that another has its name;
+    Raises TypeError naming the label and the part that is missing or of the wrong kind, or a name that is in use;
     nothing is then registered."""
     _checked(label)
     if _has_own_key(label) and label.name not in LabelsConfig.model_fields:
@@ -42,7 +42,7 @@ def register(label: Label) -> Label:
 
 
 def unregister(name: str) -> None:
-    """Takes the label of this name out again, and the keys that no other has. Raises KeyError where there is none."""
+    """Remove the label of this name, and the keys that no other uses. Raises KeyError where there is none."""
     del LABELS[name]
     if name in _KEYS:
         LabelsConfig.remove_key(name)
@@ -54,14 +54,14 @@ def _has_own_key(label: Label) -> bool:
 
 
 def label_of(name: str) -> Label:
-    """The row of this name. Raises KeyError naming those there are."""
+    """Return the row of this name. Raises KeyError naming the existing ones."""
     if name not in LABELS:
         raise KeyError(f"no label '{name}'; there are {', '.join(LABELS)}")
     return LABELS[name]
 
 
 def asked_for(labels: LabelsConfig) -> LabelRequest:
-    """What ``labels:`` asks for."""
+    """Return the request of ``labels:``."""
     from blinkgl.labels.frames import LabelRequest
 
     asked = [name for name, label in LABELS.items() if label.asked(labels)]
@@ -71,7 +71,7 @@ def asked_for(labels: LabelsConfig) -> LabelRequest:
 
 
 def _checked(label: Any) -> None:
-    """Raises TypeError as :func:`register`."""
+    """Check a row. Raises TypeError as :func:`register`."""
     name = getattr(label, "name", None)
 
     def unless(right: Any, part: str, problem: str) -> None:
@@ -100,7 +100,7 @@ def _checked(label: Any) -> None:
 
 
 def _check_drawing(label: Label, unless: Callable[[Any, str, str], None]) -> None:
-    """What the label shader needs to know, and which other labels."""
+    """Check what the label shader needs, and the other labels that it uses."""
     buffers = (None, *BUFFERS)
     unless(label.buffer in buffers, "buffer", f"is {label.buffer!r} and none of {', '.join(BUFFERS)}")
     made = type(label).finish is not Label.finish or label.anti_aliased
@@ -117,18 +117,18 @@ def _check_drawing(label: Label, unless: Callable[[Any, str, str], None]) -> Non
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What the label shader (``shaders/label.glsl``) includes that is no file: the table of labels in GLSL, and the
-# snippets that stand in rows.
+# Generated includes of the label shader (``shaders/label.glsl``): the table of labels in GLSL, and the snippets of
+# rows.
 
 
 def define_of(name: str) -> str:
-    """The macro that says to which attachment a label goes."""
+    """Return the macro with a label's attachment number."""
     return f"OUT_{name.upper()}"
 
 
 def includes() -> dict[str, str]:
-    """Texts by the name that they are included by: labels_need.glsl, labels.glsl, and
-    labels/NAME.glsl of those labels whose source is their own."""
+    """Return texts by their include name: labels_need.glsl, labels.glsl, and labels/NAME.glsl of those labels with
+    their own source."""
     drawn = [label for label in LABELS.values() if label.buffer]
     own = {f"labels/{label.name}.glsl": label.glsl.lstrip("\n") for label in drawn if label.glsl is not None}
     return {"labels_need.glsl": _needs(drawn), "labels.glsl": _written(drawn), **own}

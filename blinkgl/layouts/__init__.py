@@ -1,4 +1,4 @@
-"""A data set as the loaders of other people's data sets expect it: their files, names, shapes, scales and clocks.
+"""Data sets in the layouts of published data sets: their files, names, shapes, scales and clocks.
 
 In:    sequence directories
 Out:   folders that DSEC's, E-RAFT's, BlinkFlow's, MVSEC's, TAP-Vid's, MultiFlow's and EventKubric's loaders open

@@ -43,7 +43,7 @@ def _events_before(source: Source) -> Missing | None:
 
 
 class BlinkFlow(Layout):
-    """Its clock is in whole ms from the beginning of a sequence."""
+    """BlinkFlow's layout. Its clock is in whole ms from the beginning of a sequence."""
 
     name = "blinkflow"
     about = "BlinkFlow's PyTorch loader, E-FlowFormer's training, eflow"
@@ -61,7 +61,7 @@ class BlinkFlow(Layout):
         checked = source.count("occlusion_forward") == len(times)
         for k in range(len(times)):
             flow, valid = source.flow("forward", k)
-            if checked:  # their third channel is what passed a check forwards and backwards; flow is everywhere
+            if checked:  # their third channel is a forward-backward check; flow is valid everywhere
                 valid = valid & ~source.value("occlusion_forward", k)
             write_bytes(
                 folder / f"forward_flow/{k + 1:06d}.npy", encode_npy(np.dstack([flow, valid]).astype(np.float32))

@@ -29,13 +29,13 @@ from blinkgl.layouts.source import Source
 
 DISPARITY_SCALE = 256.0
 _PARALLEL = 1e-6
-"""By how much two cameras' axes and rows may differ for a disparity to be f b / Z."""
+"""Largest difference of two cameras' axes and rows for which a disparity is f b / Z."""
 _INTERVAL_US = 100_000
-"""E-RAFT's windows, written into its loader."""
+"""Windows of E-RAFT, fixed in its loader."""
 
 
 def _rectified(source: Source) -> Missing | None:
-    """DSEC's truth lies in the rectified picture; its loaders rectify the events alone."""
+    """Return what is missing: DSEC's labels are in the rectified image; its loaders rectify only the events."""
     if source.camera is None or source.rectified:
         return None
     return Missing("labels in rectified pixels", "labels: {pixels: rectified}")
@@ -56,7 +56,7 @@ def _three_labels(source: Source) -> Missing | None:
 
 
 class Dsec(Layout):
-    """Training sequences with flow, and of a stereo rig with disparity."""
+    """Training sequences with flow, and for a stereo rig with disparity."""
 
     name = "dsec"
     about = "DSEC's event slicer, bflow's loader of DSEC, eflow"
@@ -65,7 +65,8 @@ class Dsec(Layout):
     splits = ("train", "test")
 
     def opened_by(self, out: Path) -> str:
-        """DSEC's own provider asserts a folder of disparities and both eyes' events in every training sequence."""
+        """Return the loaders: DSEC's own provider requires a folder of disparities and both cameras' events in every
+        sequence."""
         folders = [*out.glob("train/*")]
         if folders and all((f / "disparity/event").is_dir() and (f / "events/right").is_dir() for f in folders):
             return f"DSEC's provider, {self.about}"
@@ -93,8 +94,8 @@ class Dsec(Layout):
 
 
 class ERaft(Layout):
-    """Its loader reads a folder ``test`` alone, takes every second line of ``image_timestamps.txt`` but the first and
-    the last, and 100 ms of events on both sides of each."""
+    """E-RAFT's layout. Its loader reads only a folder ``test``, uses every second line of ``image_timestamps.txt``
+    except the first and the last, and 100 ms of events on both sides of each."""
 
     name = "eraft"
     about = "E-RAFT's DSEC loader (test sequences, standard and warm start)"
@@ -111,29 +112,30 @@ class ERaft(Layout):
         header = "# from_timestamp_us, to_timestamp_us, file_index"
         write_lines(
             folder / "test_forward_flow_timestamps.csv", [header, *rows[1:]]
-        )  # of label 0 its loader makes no sample
+        )  # its loader makes no sample of label 0
         write_flow(source, "forward", folder / "flow")
         return []
 
 
 def image_times(source: Source) -> list[int]:
-    """Times of DSEC's images, µs: those of the flow labels, the end of the last, and the middle between any two."""
+    """Return times of DSEC's images, µs: those of the flow labels, the end of the last, and the middle between any
+    two."""
     times = source.flow_times("forward")
     return [t for a, b in times for t in (a, (a + b) // 2)] + [times[-1][1]]
 
 
 def write_events(source: Source, folder: Path) -> None:
-    """``events.h5``, which is in DSEC's layout as it is, and ``rectify_map.h5``."""
+    """Write ``events.h5``, which already has DSEC's layout, and ``rectify_map.h5``."""
     copy(source.folder / "events.h5", folder / "events.h5")
     camera = source.camera
     flat = camera is None or isinstance(camera, PinHole)
     table = identity_rectify_map(source.height, source.width) if flat else rectify_map(camera)
-    # Beside events that h5py alone reads, the map must not ask for a plugin either.
+    # Beside events that h5py alone reads, the map must not need a plugin either.
     write_rectify_map(folder / "rectify_map.h5", table, codec=source.codec)
 
 
 def write_flow(source: Source, towards: str, folder: Path) -> None:
-    """``forward`` or ``backward``: PNGs by number, and their times."""
+    """Write ``forward`` or ``backward``: PNGs by number, and their times."""
     times = source.flow_times(towards)
     if not times:
         return
@@ -146,8 +148,8 @@ def write_flow(source: Source, towards: str, folder: Path) -> None:
 
 
 def encode_disparity(disparity: np.ndarray) -> bytes:
-    """(H, W) px, not finite or <= 0: none. 16-bit PNG of round(256 d); what rounds to 0, or is 256 px and more, has no
-    code and becomes 0, "none"."""
+    """Return a 16-bit PNG of round(256 d) of (H, W) px; not finite or <= 0: none. Values that round to 0, or of 256 px
+    and more, have no code and become 0, "none"."""
     with np.errstate(invalid="ignore", over="ignore"):
         code = np.rint(np.asarray(disparity, np.float64) * DISPARITY_SCALE)
         holds = np.isfinite(code) & (code >= 1) & (code <= 65535)
@@ -170,7 +172,7 @@ def _write_disparity(left: Source, right: Source, folder: Path) -> list[str]:
 
 
 def _baseline(left: Source, right: Source) -> float | None:
-    """World units; None where a disparity is no f b / Z."""
+    """Return the baseline, world units; None where a disparity is not f b / Z."""
     eyes = left.camera, right.camera
     if eyes[0] is None or eyes[1] is None or not np.allclose(eyes[0].K, eyes[1].K, rtol=0, atol=1e-9):
         return None
@@ -183,8 +185,8 @@ def _baseline(left: Source, right: Source) -> float | None:
 
 
 def cam_to_cam(source: Source, camera: CameraModel) -> str:
-    """DSEC's calibration: cam0 and, of a stereo rig, cam3 are event cameras; ``camRectX`` is the one without
-    distortion; ``T_XY`` takes points from Y to X."""
+    """Return DSEC's calibration: cam0 and, for a stereo rig, cam3 are event cameras; ``camRectX`` is the one without
+    distortion; ``T_XY`` transforms points from Y to X."""
     right = source.right
     if right is None or right.camera is None:
         return cam_to_cam_yaml([Calibrated(camera)])

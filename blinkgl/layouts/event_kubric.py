@@ -26,7 +26,7 @@ _TIME = "time: {duration: 2, label_rate: 47.5}"
 
 
 def _times(source: Source) -> Missing | None:
-    """96 images and tracks at their times, 2 s from the first to the last."""
+    """Require 96 images and tracks at their times, 2 s from the first to the last."""
     times = source.image_times
     if not times:
         return None

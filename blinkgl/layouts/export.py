@@ -1,4 +1,4 @@
-"""Which layouts there are, and a whole data set in one of them: it is there in full or not at all."""
+"""The table of layouts, and the export of a whole data set, which appears completely or not at all."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from blinkgl.layouts.source import Source, sources_of
 from blinkgl.layouts.tapvid import TapVid
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The layouts there are.
+# The available layouts.
 
 _ROWS = (Dsec(), ERaft(), BlinkFlow(), Mvsec(), TapVid(), MultiFlow(), EventKubric())
 LAYOUTS: dict[str, Layout] = {row.name: row for row in _ROWS}
 
 
 def layout_of(name: str) -> Layout:
-    """Raises ConfigError: there is none of that name."""
+    """Return the layout of this name. Raises ConfigError: there is none."""
     if name not in LAYOUTS:
         raise ConfigError("no such layout", where="--layout", value=name, accepted=", ".join(["webdataset", *LAYOUTS]))
     return LAYOUTS[name]
@@ -32,7 +32,8 @@ def layout_of(name: str) -> Layout:
 
 @dataclass(frozen=True)
 class Exported:
-    """sequences : how many.   said : what a person should know of, a line each.   opened_by : which loaders open it."""
+    """The result of an export. sequences : their number.   said : notes for the user, a line each.   opened_by : the
+    loaders that open it."""
 
     sequences: int
     said: tuple[str, ...]
@@ -40,10 +41,10 @@ class Exported:
 
 
 def export_layout(root: str | Path, out: str | Path, layout: str) -> Exported:
-    """Writes the data set (or the one sequence) ``root`` as the folder ``out``, in a layout of the table.
+    """Write the data set (or the one sequence) ``root`` as the folder ``out``, in a layout of the table.
 
-    Raises, before anything is written, ConfigError: no such layout; AssetError: no sequences, a damaged one, or what
-    one lacks, with the YAML that makes it; OutputError: ``out`` exists or cannot be written, two sequences in one
+    Raises, before anything is written, ConfigError: no such layout; AssetError: no sequences, a damaged one, or a
+    missing part, with the YAML that makes it; OutputError: ``out`` exists or cannot be written, two sequences in one
     place."""
     row, root, out = layout_of(layout), Path(root), Path(out)
     if not root.is_dir():
@@ -76,7 +77,9 @@ def _refuse_what_lacks(row: Layout, source: Source) -> None:
 def _places(row: Layout, sources: list[Source]) -> list[str]:
     places = [f"{row.folder(source)}/{source.name}" for source in sources]
     if twice := [place for place in places if places.count(place) > 1]:
-        raise OutputError("two sequences would be written to one place", where=f"layout '{row.name}'", value=twice[0])
+        raise OutputError(
+            "two sequences would be written to the same place", where=f"layout '{row.name}'", value=twice[0]
+        )
     return [row.folder(source) for source in sources]
 
 

@@ -1,4 +1,4 @@
-"""What a layout is: the files of one published data set, made from a sequence directory."""
+"""Base class of layouts: the files of one published data set, made from a sequence directory."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from blinkgl.layouts.source import Source
 
 
 class Missing(NamedTuple):
-    """What a sequence lacks, in words, and the YAML line that makes it."""
+    """A missing part of a sequence, in words, and the YAML line that makes it."""
 
     what: str
     yaml: str
 
 
 Need = Callable[[Source], "Missing | None"]
-"""What loaders cannot do without, asked of a sequence: None where it is there, or where another need speaks of it."""
+"""A check of a sequence for what loaders require: None where it is there, or where another check reports it."""
 
 
 class Layout:
     """One layout; a row of the table is an instance.
 
-    name : as ``--layout`` has it.   about : what opens it, for tables.   size : (height, width) that its loaders have
-    written into their code, None: any; other sizes are exported and said.   needs : what its loaders ask for.
-    splits : folders that its loaders want to be there, empty or not."""
+    name : as in ``--layout``.   about : what opens it, for tables.   size : (height, width) fixed in its loaders, None:
+    any; other sizes are exported with a note.   needs : what its loaders require.
+    splits : folders that its loaders require, empty or not."""
 
     name: str
     about: str
@@ -40,30 +40,30 @@ class Layout:
     splits: tuple[str, ...] = ()
 
     def opened_by(self, out: Path) -> str:
-        """What opens the export in the folder ``out``: some loaders ask for more than the layout does."""
+        """Return what opens the export in the folder ``out``: some loaders need more than the layout does."""
         return self.about
 
     def missing(self, source: Source) -> list[Missing]:
-        """What ``source`` lacks and its loaders cannot do without."""
+        """Return the missing parts of ``source`` that its loaders require."""
         return [missing for need in self.needs if (missing := need(source)) is not None]
 
     def folder(self, source: Source) -> str:
-        """Where its files go, below the export."""
+        """Return the folder of its files, below the export."""
         return f"{source.split}/{source.name}"
 
     def write(self, source: Source, folder: Path) -> list[str]:
-        """Makes the files of ``source`` in ``folder``, which is there. Returns what a person should know of, a line
-        each. Raises AssetError: a file of the sequence is damaged; OutputError."""
+        """Write the files of ``source`` into ``folder``, which exists. Return notes for the user, a line each. Raises
+        AssetError: a file of the sequence is damaged; OutputError."""
         raise NotImplementedError
 
 
 def forward_flow(source: Source) -> Missing | None:
-    """What nearly every layout asks for."""
+    """Require forward flow, as nearly every layout does."""
     return None if source.flow_times("forward") else Missing("forward flow", "labels: {flow: [forward]}")
 
 
 def images(source: Source) -> Missing | None:
-    """Of the camera that makes the events."""
+    """Require images of the event camera."""
     return None if source.image_times else Missing("images", "labels: {images: true}")
 
 
@@ -74,28 +74,29 @@ _ROWS = 1 << 16
 
 
 def copy(source: Path, target: Path) -> None:
-    """``source``, byte for byte. Raises OutputError."""
+    """Copy ``source``, byte for byte. Raises OutputError."""
     with output_errors(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(source, target)
 
 
 def write_bytes(target: Path, data: bytes) -> None:
-    """Raises OutputError."""
+    """Write bytes. Raises OutputError."""
     with output_errors(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(data)
 
 
 def write_lines(target: Path, lines: Sequence[Any]) -> None:
-    """One value a line, UTF-8. Raises OutputError."""
+    """Write one value per line, UTF-8. Raises OutputError."""
     write_bytes(target, ("\n".join(map(str, lines)) + "\n").encode())
 
 
 def growing(
     file: h5py.File, name: str, dtype: DTypeLike, shape: tuple[int, ...] = (), rows: int = _ROWS
 ) -> h5py.Dataset:
-    """An empty data set of rows of ``shape``, for :func:`append`: gzip, which every HDF5 reads without a plugin."""
+    """Return an empty data set of rows of ``shape``, for :func:`append`: gzip, which every HDF5 reads without a
+    plugin."""
     return file.create_dataset(
         name,
         (0, *shape),
@@ -110,7 +111,7 @@ def growing(
 
 
 def append(data: h5py.Dataset, rows: np.ndarray) -> None:
-    """``rows`` at its end."""
+    """Append ``rows``."""
     start = len(data)
     data.resize(start + len(rows), axis=0)
     data[start:] = rows

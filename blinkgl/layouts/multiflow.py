@@ -41,14 +41,14 @@ def _samples(source: Source) -> Missing | None:
 
 
 def _sensor_pixels(source: Source) -> Missing | None:
-    """Its events are not rectified."""
+    """Require events in the sensor's pixels, which MultiFlow does not rectify."""
     if source.camera is None or isinstance(source.camera, PinHole) or not source.rectified:
         return None
     return Missing("labels in the sensor's pixels", "labels: {pixels: sensor}")
 
 
 class MultiFlow(Layout):
-    """Flow to many times, of samples of a second."""
+    """Flow to many times, in samples of a second."""
 
     name = "multiflow"
     about = "bflow's MultiFlow loader (flow at many times after one; folders train and val)"
@@ -77,7 +77,7 @@ class MultiFlow(Layout):
 
 
 def labels_of(source: Source) -> list[int]:
-    """Numbers of the labels that samples are made of."""
+    """Return the numbers of the labels that samples are made of."""
     there = set(source.image_times)
     return [
         k
@@ -90,12 +90,12 @@ def labels_of(source: Source) -> list[int]:
 
 
 def _leads(source: Source, k: int) -> bool:
-    """Whether label ``k`` leads to the end of a sample."""
+    """Return whether label ``k`` leads to the end of a sample."""
     return TARGET_US in _clock_us(intervals_in(source.file("flow_intervals", k)))
 
 
 def _clock_us(interval_ns: np.ndarray) -> list[int | None]:
-    """When they end on a sample's clock; None: not in a sample, or at no multiple of its step."""
+    """Return their ends on a sample's clock; None: not in a sample, or not at a multiple of its step."""
     ends = [(int(ns) / 1000, round(int(ns) / 1000 / STEP_US) * STEP_US) for ns in interval_ns]
     fits = [abs(us - step) <= 1 and 0 < step <= TARGET_US - LABEL_US for us, step in ends]
     return [LABEL_US + step if fit else None for (_, step), fit in zip(ends, fits)]

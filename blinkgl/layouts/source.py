@@ -1,4 +1,4 @@
-"""A sequence directory as layouts look at it."""
+"""A sequence directory as input of layouts."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from blinkgl.types.events import Events
 
 @dataclass(frozen=True)
 class Source:
-    """One sequence. Times are µs on its own clock; the events of :meth:`events` are on it, too.
+    """One sequence. Times are µs on its own clock, also those of :meth:`events`.
 
-    folder : its directory.   manifest : what stands in there.   name : the directory's, or that of the rig it is on.
-    beside : the directory of the right eye, where this is the left one of a stereo pair.   unit : that of the inertial
-    unit, its own or another of its rig; None: there is none."""
+    folder : its directory.   manifest : its content.   name : the directory's, or that of its rig.
+    beside : the directory of the right camera, where this is the left one of a stereo pair.   unit : that of the
+    inertial unit, its own or another of its rig; None: there is none."""
 
     folder: Path
     manifest: dict[str, Any]
@@ -45,7 +45,7 @@ class Source:
     def open(
         cls, folder: Path, name: str | None = None, beside: Path | None = None, unit: Path | None = None
     ) -> Source:
-        """Raises AssetError: no sequence, or files are missing or cut."""
+        """Open a sequence. Raises AssetError: no sequence, or files are missing or cut."""
         if problems := verify_sequence(folder, checksums=False):
             raise AssetError(
                 f"damaged sequence: {problems[0]}",
@@ -69,45 +69,45 @@ class Source:
 
     @property
     def start_us(self) -> int:
-        """When the recording begins: an interval before the first label."""
+        """Return the start of the recording: an interval before the first label."""
         return self.manifest["t_offset_us"]
 
     @property
     def end_us(self) -> int:
-        """When it ends."""
+        """Return the end of the recording."""
         return self.start_us + int(self.manifest.get("duration_us") or 0)
 
     def has(self, name: str) -> bool:
-        """Whether the file ``name`` belongs to it."""
+        """Return whether the file ``name`` belongs to it."""
         return name in self.manifest["files"]
 
     def count(self, label: str) -> int:
-        """How many files of a label's first form there are."""
+        """Return the number of files of a label's first format."""
         return sum(map(LABELS[label].forms[0].holds, self.manifest["files"]))
 
     def flow_times(self, towards: str) -> list[tuple[int, int]]:
-        """(from, to) of every flow label; empty: there is none."""
+        """Return (from, to) of every flow label; empty: there is none."""
         stamps = _stamps(f"flow_{towards}")
         return self._pairs(stamps) if self.has(stamps) else []
 
     @functools.cached_property
     def interval_times(self) -> list[int]:
-        """Of the labels that lead to several times (``flow_intervals``); empty: there are none."""
+        """Return the times of the labels that lead to several times (``flow_intervals``); empty: there are none."""
         stamps = _stamps("flow_intervals")
         return [int(line) for line in self._lines(stamps)] if self.has(stamps) else []
 
     @functools.cached_property
     def image_times(self) -> list[int]:
-        """Of the sRGB images; empty: there are none."""
+        """Return the times of the sRGB images; empty: there are none."""
         stamps = _stamps("images")
         return [int(line) for line in self._lines(stamps)] if self.has(stamps) else []
 
     def file(self, label: str, k: int) -> Path:
-        """The ``k``-th file of a label, in its first form."""
+        """Return the ``k``-th file of a label, in its first format."""
         return self.folder / LABELS[label].forms[0].file(k)
 
     def flow(self, towards: str, k: int) -> tuple[np.ndarray, np.ndarray]:
-        """(H, W, 2) float32 px and (H, W) bool, from the most exact form that there is. Raises AssetError."""
+        """Return (H, W, 2) float32 px and (H, W) bool, from the most exact format available. Raises AssetError."""
         forms = {form.ending: form for form in LABELS[f"flow_{towards}"].forms}
         for form in (forms["npy"], forms["flo"], forms["png"]):
             if self.has(form.file(k)):
@@ -116,30 +116,31 @@ class Source:
         raise AssetError("no flow of this number", where=str(self.folder), value=k)
 
     def image(self, k: int) -> np.ndarray:
-        """(H, W, 3) uint8 sRGB."""
+        """Return an image, (H, W, 3) uint8 sRGB."""
         image = read_image(self.file("images", k))
         return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
 
     def grey(self, k: int) -> np.ndarray:
-        """(H, W) uint8."""
+        """Return a grey image, (H, W) uint8."""
         return cv2.cvtColor(self.image(k), cv2.COLOR_RGB2GRAY)
 
     def value(self, label: str, k: int) -> np.ndarray:
-        """The ``k``-th value of a label that is one array, (H, W[, C]); depth is inf where nothing is. AssetError."""
+        """Return the ``k``-th value of a label that is one array, (H, W[, C]); depth is inf where nothing is hit.
+        Raises AssetError."""
         return _read(LABELS[label].forms[0], self.file(label, k))
 
     def flows(self, k: int) -> Flows:
-        """Flow from label ``k`` to several times. AssetError."""
+        """Return the flow from label ``k`` to several times. Raises AssetError."""
         return _read(LABELS["flow_intervals"].forms[0], self.file("flow_intervals", k))
 
     def events(self, chunk: int = 1 << 20) -> Iterator[Events]:
-        """All events, in order, in pieces."""
+        """Yield all events, in order, in pieces."""
         with DsecEventReader(self.folder / "events.h5") as reader:
             yield from reader.chunks(chunk)
 
     @functools.cached_property
     def poses(self) -> dict[str, np.ndarray]:
-        """The arrays of ``poses.npz``; none where a recording has no poses."""
+        """Return the arrays of ``poses.npz``; none where a recording has no poses."""
         path = self.folder / "poses.npz"
         if not self.has("poses.npz"):
             return {}
@@ -148,8 +149,8 @@ class Source:
 
     @functools.cached_property
     def camera(self) -> CameraModel | None:
-        """Its model; None where a recording says nothing of it."""
-        if self.has(CAM_TO_CAM):  # of a lens that distorts
+        """Return its camera model; None where a recording does not give it."""
+        if self.has(CAM_TO_CAM):  # a lens with distortion
             return next(iter(read_camchain(self.folder / CAM_TO_CAM).values())).camera
         if "K" not in self.poses:
             return None
@@ -158,17 +159,17 @@ class Source:
 
     @functools.cached_property
     def right(self) -> Source | None:
-        """The right eye's sequence, of a stereo pair. Raises as :meth:`open`."""
+        """Return the right camera's sequence, of a stereo pair. Raises as :meth:`open`."""
         return None if self.beside is None else Source.open(self.beside, self.name)
 
     @property
     def rectified(self) -> bool:
-        """Whether labels are in the pixels of the rectified picture: of a lens that distorts, on request."""
+        """Return whether labels are in the pixels of the rectified image: of a lens with distortion, on request."""
         return isinstance(self.camera, PinHole) or self._configured("labels", "pixels") == "rectified"
 
     @property
     def codec(self) -> str:
-        """What its events are packed with."""
+        """Return the codec of its events."""
         return str(self._configured("output", "compression") or "zstd")
 
     def _configured(self, section: str, key: str) -> Any:
@@ -197,8 +198,8 @@ def _read(form: Form, path: Path) -> Any:
 
 
 def sources_of(root: Path) -> list[Source]:
-    """The sequences of a data set, or ``root`` itself; of a rig its first event camera's, of a pair the left one's.
-    Raises as :meth:`Source.open`, and AssetError: a rig without an event camera."""
+    """Return the sequences of a data set, or ``root`` itself; of a rig its first event camera's, of a pair the left
+    one's. Raises as :meth:`Source.open`, and AssetError: a rig without an event camera."""
     return [_of_rig(f) if is_rig_folder(f) else Source.open(f) for f in made_folders(root)]
 
 

@@ -30,7 +30,7 @@ def _at_images(source: Source) -> Missing | None:
 
 
 class TapVid(Layout):
-    """Videos with the tracks of points."""
+    """Videos with point tracks."""
 
     name = "tapvid"
     about = "TAP-Vid's DAVIS reader (TAPIR, CoTracker, BootsTAP: a pickle of NumPy arrays)"
@@ -43,7 +43,7 @@ class TapVid(Layout):
         tracks = read_tracks(source.folder)
         at, shown = _common(source, tracks["t_us"])
         hidden = tracks["occluded"][:, at]
-        ever = ~hidden.all(axis=1)  # what no frame shows cannot be asked for
+        ever = ~hidden.all(axis=1)  # points that no frame shows cannot be queried
         share = (tracks["target_points"][:, at] + 0.5) / [source.width, source.height]
         table = {
             "video": np.stack([source.image(k) for k in shown]),
@@ -56,6 +56,6 @@ class TapVid(Layout):
 
 
 def _common(source: Source, t_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of the tracks' times at which there is an image, and of those images."""
+    """Return the indices of the tracks' times at which there is an image, and of those images."""
     _, at, shown = np.intersect1d(t_us, source.image_times, return_indices=True)
     return at, shown

@@ -1,7 +1,7 @@
-"""What every room may ask of the machine that BlinkGL runs on.
+"""Information about the machine, for every room.
 
 In:    nothing.
-Out:   processor, optional parts, how long kernels have compiled, interrupts, how a command line ends.
-Start: command_line.py (``run_app``); cpu.py, extras.py, compiling.py, kernels.py, bench.py, interrupts.py, terminal.py
-answer one question each.
+Out:   CPU, optional parts, compilation times of kernels, interrupts, the exit of a command line.
+Start: command_line.py (``run_app``); cpu.py, extras.py, compiling.py, kernels.py, bench.py, interrupts.py and
+terminal.py each have one purpose.
 """

@@ -1,4 +1,4 @@
-"""What every benchmark shares: which machine it ran on, and how long something takes."""
+"""Shared code of the benchmarks: a description of the machine, and timing."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 
 
 def machine_line(opengl: str | None = None) -> str:
-    """One line for a report: processor, cores, memory, versions, OpenGL renderer, date."""
+    """Return one line for a report: CPU, cores, memory, versions, OpenGL renderer, date."""
     import numba
 
     parts = [
@@ -30,7 +30,8 @@ def machine_line(opengl: str | None = None) -> str:
 
 
 def seconds(run: Callable[[], object], repeat: int = 10, warm_up: int = 2) -> dict[str, float]:
-    """Wall seconds of ``run()``: median, minimum and maximum of ``repeat`` after ``warm_up`` runs that do not count."""
+    """Return the wall seconds of ``run()``: median, minimum and maximum of ``repeat`` after ``warm_up`` runs that do
+    not count."""
     for _ in range(warm_up):
         run()
     times = []

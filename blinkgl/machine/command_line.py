@@ -1,4 +1,4 @@
-"""Run a command line so that a user sees one line per error, whatever went wrong."""
+"""Runs a command line so that every error is one line for the user."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from blinkgl.machine.terminal import never_fail_to_print
 def run_app(
     app: typer.Typer, arguments: list[str], program: str, project: str, gone: Mapping[str, str] | None = None
 ) -> int:
-    """Run ``app`` with ``arguments`` and return the exit status: 2 and one line for an error of the user's or the
-    machine's, 130 when interrupted, 1 and a traceback for a bug.
+    """Run ``app`` with ``arguments`` and return the exit status: 2 and one line for an error of the user or the
+    machine, 130 when interrupted, 1 and a traceback for a bug.
 
-    program : name of the command.   project : whose bug an unforeseen error is.   gone : "command" or "command
-    --option" of earlier versions, and what to say to whoever still types it."""
+    program : name of the command.   project : for reports of unforeseen errors.   gone : "command" or "command
+    --option" of earlier versions, and what to use instead."""
     never_fail_to_print()
     debug = "--debug" in arguments
     arguments = [a for a in arguments if a != "--debug"] or ["--help"]
     try:
-        # Not standalone: typer then hands errors up instead of printing its own boxes.
+        # Not standalone: typer then raises errors instead of printing its own boxes.
         with interruptible(), announced_compiling(lambda text: print(text, file=sys.stderr)):
             status = app(arguments, prog_name=program, standalone_mode=False)
         return status if isinstance(status, int) else 0
     except (KeyboardInterrupt, typer.Abort):
         print("interrupted", file=sys.stderr)
         return 130
-    except BrokenPipeError:  # `blinkgl … | head`: the reader has gone, which is no error of ours
+    except BrokenPipeError:  # `blinkgl … | head`: the reader has gone, which is not an error
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except Exception as error:  # noqa: BLE001 - every error leaves as a line for the user
@@ -50,7 +50,7 @@ def _is_usage_error(error: Exception) -> bool:
 
 
 def _said_of_gone(arguments: list[str], gone: Mapping[str, str]) -> ConfigError | None:
-    """The error for a command or an option of earlier versions among the arguments; None: there is none."""
+    """Return the error for a command or an option of earlier versions among the arguments; None: there is none."""
     given = {argument.partition("=")[0] for argument in arguments}
     for words, said in gone.items():
         command, _, option = words.partition(" --")

@@ -1,7 +1,7 @@
-"""How long this process has spent compiling kernels, a clock that stands still meanwhile, and the lines that say so.
+"""Time this process has spent compiling kernels, a clock that excludes it, and lines that report it.
 
-A machine compiles each kernel once (:mod:`~blinkgl.machine.kernels`), so the time is no part of what anything costs and
-must not be in anybody's seconds. numba is not imported here: commands that need no kernel start without it.
+A machine compiles each kernel once (:mod:`~blinkgl.machine.kernels`), so the time does not belong to any measured cost.
+numba is not imported here: commands that need no kernel start without it.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ import warnings
 from collections.abc import Callable, Iterator
 
 SAY_EVERY_S = 10.0
-"""Seconds of compiling between two lines: a program that prints nothing for a minute looks as if it hung."""
+"""Seconds of compiling between two lines, so that a program does not seem to hang."""
 
 
 class Watch:
-    """Wall seconds between the start of the outermost compilation and its end. numba compiles under
-    one lock, so they nest and never overlap."""
+    """Wall seconds between the start of the outermost compilation and its end. numba compiles under one lock, so
+    compilations nest and never overlap."""
 
     def __init__(self) -> None:
         self.seconds, self.kernels, self._depth, self._began = 0.0, 0, 0, 0.0
@@ -43,18 +43,18 @@ class Watch:
 
 
 watch = Watch()
-"""Of this process; :mod:`~blinkgl.machine.kernels` tells it when numba compiles."""
+"""The watch of this process; :mod:`~blinkgl.machine.kernels` starts and stops it."""
 
 
 def compiled_s() -> float:
-    """Wall seconds spent compiling kernels in this process so far; loading them from disk does not count."""
+    """Return the wall seconds spent compiling kernels in this process so far; loading them from disk does not count."""
     return watch.seconds
 
 
 @contextlib.contextmanager
 def announced_compiling(say: Callable[[str], None]) -> Iterator[None]:
-    """Calls ``say`` with a sentence when the first kernel is compiled inside, and with another every
-    :data:`SAY_EVERY_S` seconds of compiling. The innermost of several listeners is told."""
+    """Call ``say`` with a sentence when the first kernel is compiled inside, and with another every :data:`SAY_EVERY_S`
+    seconds of compiling. Only the innermost of several listeners is called."""
     outer, watch.say = watch.say, say
     try:
         yield
@@ -63,7 +63,7 @@ def announced_compiling(say: Callable[[str], None]) -> Iterator[None]:
 
 
 def kernel_cache_failed(what: str) -> None:
-    """Says ``what`` is wrong with the kernels on disk, to whoever is told of compiling, else as a warning."""
+    """Report the problem ``what`` of the kernels on disk to the listener of compiling, else as a warning."""
     if watch.say is not None:
         watch.say(f"warning: {what}")
     else:
@@ -71,10 +71,10 @@ def kernel_cache_failed(what: str) -> None:
 
 
 def working_clock() -> float:
-    """``time.perf_counter()`` without the compilation."""
+    """Return ``time.perf_counter()`` without the compilation."""
     return time.perf_counter() - watch.seconds
 
 
 def compiling_line(seconds: float) -> str:
-    """ "compiling kernels, once per machine: 14 s"; "" where there was next to nothing to compile."""
+    """Return "compiling kernels, once per machine: 14 s"; "" where almost nothing was compiled."""
     return f"compiling kernels, once per machine: {seconds:.0f} s" if seconds >= 0.5 else ""

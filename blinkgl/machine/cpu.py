@@ -1,4 +1,4 @@
-"""What this processor's instruction set offers."""
+"""Instruction set of this CPU."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _BF16 = {"avx512_bf16": "AVX-512 BF16", "amx_bf16": "AMX", "bf16": "Arm BF16"}
 
 
 def cpu_field(*names: str, path: str = "/proc/cpuinfo") -> str:
-    """Return what the kernel says of the first core under the first of ``names`` that it has, e.g. ``vendor_id``; an
+    """Return the kernel's value for the first core under the first of ``names`` that exists, e.g. ``vendor_id``; an
     empty string where there is no such file."""
     try:
         for line in Path(path).read_text(encoding="utf-8", errors="replace").splitlines():
@@ -23,12 +23,12 @@ def cpu_field(*names: str, path: str = "/proc/cpuinfo") -> str:
 
 def cpu_flags(path: str = "/proc/cpuinfo") -> frozenset[str]:
     """Return the kernel's names of the first core's features (x86: flags; Arm: Features), without those that a virtual
-    machine hides, which the mathematics libraries do not see either."""
+    machine hides, which mathematics libraries do not see either."""
     return frozenset(cpu_field("flags", "Features", path=path).split())
 
 
 def bf16_instructions() -> str:
-    """What multiplies bfloat16 here, e.g. "AVX-512 BF16, AMX"; "" where nothing does: it is then
-    emulated, 45 to 80 times slower than fp32."""
+    """Return the instructions that multiply bfloat16 here, e.g. "AVX-512 BF16, AMX"; "" where there are none: it is
+    then emulated, 45 to 80 times slower than fp32."""
     flags = cpu_flags()
     return ", ".join(text for flag, text in _BF16.items() if flag in flags)

@@ -1,5 +1,5 @@
-"""Optional parts: what they are for, and the command that installs them. BlinkGL itself is on no package index, so a
-remedy names the packages, never ``blinkgl[extra]``."""
+"""Optional parts: their purpose, and the command that installs them. BlinkGL itself is on no package index, so a remedy
+names the packages, never ``blinkgl[extra]``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import shlex
 import sys
 
-EXTRAS = {  # extra of setup.cfg -> (distributions, what they are for)
+EXTRAS = {  # extra of setup.cfg -> (distributions, purpose)
     "cycles": (
         ("bpy",),
         "Blender: blinkgl import; better in an environment of its own, see docs/install.md",
@@ -25,11 +25,11 @@ _PINNED = {"torch": "torch>=2.6", "bpy": "bpy>=4.5,<4.6", "mujoco": "mujoco>=3.1
 
 
 def python() -> str:
-    """This interpreter, as one would type it here."""
+    """Return this interpreter, as typed on the command line here."""
     relative = os.path.relpath(sys.executable)
     return shlex.quote(relative if len(relative) < len(sys.executable) else sys.executable)
 
 
 def install(*distributions: str) -> str:
-    """The command that installs them for this interpreter, in the versions that fit."""
+    """Return the command that installs them for this interpreter, in compatible versions."""
     return f"{python()} -m pip install {' '.join(shlex.quote(_PINNED.get(name, name)) for name in distributions)}"

@@ -1,8 +1,8 @@
-"""Ctrl-C and SIGTERM that are not lost.
+"""Ctrl-C and SIGTERM that are never lost.
 
-Python runs a signal's handler between any two byte codes of the main thread, also those of a weak reference's callback,
-of ``__del__`` and of what a C library calls back. What is raised there goes to ``sys.unraisablehook``, is printed as
-"Exception ignored in" and is gone: a run that was told to end goes on. Here it is sent again.
+Python runs a signal's handler between any two byte codes of the main thread, also in a weak reference's callback, in
+``__del__`` and in callbacks of C libraries. An exception raised there goes to ``sys.unraisablehook``, is printed as
+"Exception ignored in" and lost: a run that was told to end continues. Here the signal is sent again.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _AGAIN_AFTER_S = 0.05
 @contextlib.contextmanager
 def interruptible(*numbers: int) -> Iterator[None]:
     """Inside, signals ``numbers`` raise KeyboardInterrupt as SIGINT does, and one that was raised where Python drops
-    exceptions is sent again 50 ms later, until it gets through. Only a main thread can see to that: in another nothing
+    exceptions is sent again 50 ms later, until it takes effect. This works only in a main thread; in another nothing
     changes."""
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -35,8 +35,8 @@ def interruptible(*numbers: int) -> Iterator[None]:
 
     def again() -> None:
         time.sleep(_AGAIN_AFTER_S)
-        if inside:  # else the signal has had its effect, or its default action is back, which would kill the process
-            signal.pthread_kill(main, last)  # a real signal: it also ends a system call that waits
+        if inside:  # else the signal has taken effect, or its default action is restored, which would kill the process
+            signal.pthread_kill(main, last)  # a real signal also ends a blocking system call
 
     def unraisable(unraisable: sys.UnraisableHookArgs) -> None:
         if issubclass(unraisable.exc_type, KeyboardInterrupt):

@@ -1,9 +1,9 @@
 """The decorator of every compiled function.
 
-numba compiles a kernel the first time it is called with arguments of some types and keeps the result on disk: beside
-the source, in the user's cache folder where that is not writable, or in NUMBA_CACHE_DIR. What it keeps has no check
-sum, so a damaged file raises whatever unpickling raises, or runs as it is. Here an entry is read only if its check sum
-is right; any other is compiled again.
+numba compiles a kernel the first time it is called with arguments of some types and stores the result on disk: beside
+the source, in the user's cache folder where that is not writable, or in NUMBA_CACHE_DIR. Its files have no checksum, so
+a damaged one raises unpickling errors, or runs wrong code. Here an entry is read only if its checksum is right; any
+other is compiled again.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 from blinkgl.machine.compiling import kernel_cache_failed, watch
 
 _said: set[str] = set()
-"""Folders that a line was said about."""
+"""Folders that have been reported."""
 
 
 class _Listener(event.Listener):
@@ -40,7 +40,7 @@ event.register("numba:compile", _Listener())
 
 
 class _CheckedFile(IndexDataCacheFile):
-    """numba's files of one kernel. Each entry ends with a check sum and names its key, so that a damaged index cannot
+    """numba's files of one kernel. Each entry ends with a checksum and names its key, so that a damaged index cannot
     lead to the code of other types."""
 
     def save(self, key: Any, data: Any) -> None:
@@ -71,7 +71,7 @@ def _checksum(content: bytes) -> bytes:
 
 
 class _Cache(FunctionCache):
-    """numba's cache of one kernel. A file that cannot be read or written costs a compilation and a line."""
+    """numba's cache of one kernel. A file that cannot be read or written costs a compilation and is reported."""
 
     def __init__(self, function: Callable):
         super().__init__(function)
@@ -101,9 +101,9 @@ class _Cache(FunctionCache):
 
 @cache
 def _stamps_of_imports(module: str) -> tuple[tuple[str, float, int], ...]:
-    """(module, time of change, size) of all modules of ours whose functions ``module`` has imported, directly or by
-    others. numba looks at the kernel's own file alone and would go on with the old code of a function that it calls.
-    No kernel calls a function of the configuration."""
+    """Return (module, time of change, size) of all our modules whose functions ``module`` imports, directly or
+    indirectly. numba checks only the kernel's own file and would use old code of a called function. No kernel calls a
+    function of the configuration."""
     seen, waiting = {module}, [module]
     while waiting:
         for value in vars(sys.modules[waiting.pop()]).values():
@@ -117,7 +117,7 @@ def _stamps_of_imports(module: str) -> tuple[tuple[str, float, int], ...]:
 
 
 def kernel(function: Callable | None = None, *, error_model: Literal["python", "numpy"] = "python") -> Any:
-    """Decorates a function that numba compiles, without the interpreter's lock, and keeps on disk.
+    """Decorate a function that numba compiles, without the interpreter's lock, and stores on disk.
 
     error_model : "numpy" divides by zero as NumPy does, without a branch; "python" raises ZeroDivisionError."""
     if function is None:
@@ -125,6 +125,6 @@ def kernel(function: Callable | None = None, *, error_model: Literal["python", "
     dispatcher: Any = numba.njit(nogil=True, error_model=error_model)(function)
     try:
         dispatcher._cache = _Cache(function)  # noqa: SLF001 - what njit(cache=True) does, with a class of its own
-    except RuntimeError as error:  # numba found no folder that can be written
+    except RuntimeError as error:  # numba found no writable folder
         kernel_cache_failed(f"{error}; kernels are compiled in every process")
     return dispatcher

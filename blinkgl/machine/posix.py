@@ -1,4 +1,4 @@
-"""What POSIX systems alone have; None elsewhere, where one process makes data sets and locks nothing."""
+"""Modules of POSIX systems; None elsewhere, where one process makes data sets without locks."""
 
 from __future__ import annotations
 
@@ -12,5 +12,5 @@ __all__ = ["fcntl", "peak_kib", "resource"]
 
 
 def peak_kib() -> int:
-    """The most memory that this process has had, KiB; 0 where the system does not say."""
+    """Return the largest memory use of this process, KiB; 0 where the system does not report it."""
     return 0 if resource is None else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -1,8 +1,7 @@
-"""What is printed for people. Rich reads words in square brackets as its markup and drops them: "(extra [cluster])"
-becomes "(extra )", a path "run[x]" loses its end. Every console and progress column of the project
-is made here, and takes text as it stands.
+"""Consoles and progress columns for text as it is. Rich interprets words in square brackets as markup and drops them:
+"(extra [cluster])" becomes "(extra )". Every console and progress column of the project is made here.
 
-And what is printed where not every character can be: :func:`never_fail_to_print`."""
+Also printing where not every character can be encoded: :func:`never_fail_to_print`."""
 
 from __future__ import annotations
 
@@ -19,9 +18,9 @@ _NO_END = 10_000
 
 
 def plain_console(**options: Any) -> Console:
-    """``rich.console.Console`` whose strings, in tables too, are no markup and no names of emoji (``a:bug:b`` is a
-    folder). For style pass a ``rich.text.Text`` or ``style=``. Where nobody looks, in a pipe or a file, a line is as
-    long as it is: whoever searches it shall find words whole."""
+    """Return a ``rich.console.Console`` that interprets no markup and no names of emoji (``a:bug:b`` is a folder), in
+    tables too. For style pass a ``rich.text.Text`` or ``style=``. In a pipe or a file, lines are not wrapped, so that
+    words can be searched."""
     console = Console(markup=False, emoji=False, **options)
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = _NO_END
@@ -29,12 +28,12 @@ def plain_console(**options: Any) -> Console:
 
 
 def say(console: Console, text: str) -> None:
-    """One line as it stands: no colours for numbers, no line breaks of Rich's."""
+    """Print one line unchanged: no colours for numbers, no line breaks of Rich's."""
     console.print(text, highlight=False, soft_wrap=True, markup=False)
 
 
 def plain_column(text: str) -> TextColumn:
-    """``rich.progress.TextColumn`` whose fields are no markup."""
+    """Return a ``rich.progress.TextColumn`` whose fields are not markup."""
     return TextColumn(text, markup=False)
 
 
@@ -69,9 +68,8 @@ def _plainly(error: UnicodeError) -> tuple[str, int]:
 
 
 def never_fail_to_print() -> None:
-    """From here on, a character that stdout or stderr cannot encode (LC_ALL=C, PYTHONIOENCODING=ascii) is printed as
-    the nearest plain one, or '?'. A command calls it before it prints anything; a number
-    nobody can read is better than none."""
+    """Print a character that stdout or stderr cannot encode (LC_ALL=C, PYTHONIOENCODING=ascii) as the nearest plain
+    one, or '?', from here on. A command calls it before it prints anything."""
     codecs.register_error("blinkgl-plainly", _plainly)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # not what tests and notebooks put there
@@ -79,7 +77,7 @@ def never_fail_to_print() -> None:
 
 
 def causes_line(causes: dict[str, int], seconds: float) -> str:
-    """Events by cause, in words: how many a second, and the share of all."""
+    """Return events by cause, in words: events per second, and the share of all."""
     whole = max(sum(causes.values()), 1)
     parts = (f"{name} {n / max(seconds, 1e-9):,.4g}/s ({100 * n / whole:.1f} %)" for name, n in causes.items())
     return "by cause: " + ", ".join(parts)

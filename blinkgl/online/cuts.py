@@ -1,4 +1,4 @@
-"""What is cut out of a sequence: samples that have something to say."""
+"""Cutting useful samples out of a sequence."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from blinkgl.online.samples import StreamSample, WindowSample
 from blinkgl.sequence import Simulation
 from blinkgl.types.events import Events
 
-_LEAST_PX = 0.3  # shorter flow counts as so long where density is asked for
-_CANDIDATES = 6  # places drawn for each sample that is wanted
+_LEAST_PX = 0.3  # shorter flow counts as this long for the density
+_CANDIDATES = 6  # candidate positions for each requested sample
 
 Sample = WindowSample | StreamSample
 Cut = Callable[[Simulation, StreamJob, str, int, np.random.Generator], Iterator[Sample]]
-"""(sequence, job, name of the sequence, how many are wanted at most, dice) -> samples."""
+"""(sequence, job, name of the sequence, largest number of samples, random generator) -> samples."""
 
 
 def windows(
     sequence: Simulation, job: StreamJob, name: str, wanted: int, dice: np.random.Generator
 ) -> Iterator[WindowSample]:
-    """Pairs of windows at times and of lengths of their own."""
+    """Yield pairs of windows at random times and of random lengths."""
     events = sequence.gather()
     for start, span in _places(sequence, job, 2, wanted, dice):
         t = start + span
@@ -56,7 +56,7 @@ def windows(
 def streams(
     sequence: Simulation, job: StreamJob, name: str, wanted: int, dice: np.random.Generator
 ) -> Iterator[StreamSample]:
-    """Stretches of ``job.steps`` windows that follow each other."""
+    """Yield runs of ``job.steps`` consecutive windows."""
     events = sequence.gather()
     for start, span in _places(sequence, job, job.steps, wanted, dice):
         edges = start + span * np.arange(job.steps + 1, dtype=np.int64)
@@ -77,7 +77,7 @@ CUTS: dict[str, Cut] = {"windows": windows, "streams": streams}
 
 
 def _moves_as_asked(job: StreamJob, flow: np.ndarray, pixels: int, parts: list[Events]) -> bool:
-    """Whether flow is there, not too long, and every px of it has its share of events."""
+    """Return whether there is flow, not too long, and with enough events per px."""
     lengths = np.hypot(*flow[::7].T)
     if not len(lengths) or np.median(lengths) > job.max_flow:
         return False
@@ -96,14 +96,14 @@ def _places(
         job.window_us or (sequence.config.time.interval_ns // 1000,) * 2,
         steps,
     )
-    return list(dict.fromkeys(drawn))  # a short sequence has few places, and none is a sample twice
+    return list(dict.fromkeys(drawn))  # a short sequence has few positions, and no sample may occur twice
 
 
 def drawn_spans(
     rng: np.random.Generator, t0_us: int, t1_us: int, count: int, window_us: tuple[int, int], steps: int = 2
 ) -> list[tuple[int, int]]:
-    """``count`` beginnings and lengths (t, span), µs, with [t, t + steps · span) inside [t0, t1]: lengths log-uniform
-    in ``window_us``, as far as the sequence is long enough, places uniform.
+    """Return ``count`` starts and lengths (t, span), µs, with [t, t + steps · span) inside [t0, t1]: lengths
+    log-uniform in ``window_us``, as far as the sequence is long enough, positions uniform.
 
     Raises ConfigError: a sequence that is shorter than ``steps`` of the shortest."""
     longest = min(window_us[1], (t1_us - t0_us) // steps)

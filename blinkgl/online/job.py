@@ -1,4 +1,4 @@
-"""What a stream is made of, in plain data, so that worker processes can be told."""
+"""The definition of a stream, in plain data, for worker processes."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from blinkgl.dataset.plan import Plan
 from blinkgl.errors import ConfigError
 
 MIX = 8
-"""Slots of a block, whose samples are mixed: a batch then has samples of different sequences."""
+"""Slots of a block, whose samples are mixed, so that a batch has samples of different sequences."""
 
 
 @dataclass(frozen=True)
 class StreamJob:
-    """What is rendered.
+    """What a stream renders.
 
     recipe : YAML text, its seed already the stream's (:func:`stream_seed`).   base : folder that its paths start from.
-    kind : what a sample is, a key of :data:`blinkgl.online.cuts.CUTS`.   samples : of a slot.
+    kind : kind of sample, a key of :data:`blinkgl.online.cuts.CUTS`.   samples : per slot.
     window_us : shortest and longest window, µs, drawn log-uniformly for each sample; None: the recipe's label interval.
     steps : windows of a sample of kind "streams".   min_events : fewest events in each window.
     max_flow : longest median of the flow in a sample, px.   min_density : fewest events per pixel of a window and px of
@@ -46,15 +46,15 @@ class StreamJob:
     maker: ClassVar[str] = "blinkgl.online.maker:SlotMaker"
 
     def plan(self) -> Plan:
-        """Raises ConfigError: a bad recipe, or one without groups of the split."""
+        """Return the plan. Raises ConfigError: a bad recipe, or one without groups of the split."""
         return _plan(self.recipe, self.base, self.split)
 
     def block_of_all(self, block: int) -> int:
-        """Number in the whole stream of a block of this process."""
+        """Return the number in the whole stream of a block of this process."""
         return block * self.world + self.rank
 
     def slot_of_all(self, slot: int) -> int:
-        """Number in the whole stream of a slot of this process."""
+        """Return the number in the whole stream of a slot of this process."""
         block, place = divmod(slot, MIX)
         return self.block_of_all(block) * MIX + place
 
@@ -67,7 +67,7 @@ def _plan(recipe: str, base: str, split: str) -> Plan:
     tree = parse_yaml(recipe, "recipe")
     of_split = [g for g in RunTemplate(tree, Path(base)).groups if g.enabled and _split_of(g) == split]
     if not of_split:
-        raise ConfigError(f"the recipe has nothing of split '{split}'", where="output.split")
+        raise ConfigError(f"the recipe has no sequences of split '{split}'", where="output.split")
     if "groups" in tree:
         names = {group.name for group in of_split}
         for name, group in tree["groups"].items():
@@ -77,12 +77,12 @@ def _plan(recipe: str, base: str, split: str) -> Plan:
         if group.template.check().frames is not None:
             raise ConfigError("recorded frames are not rendered", where="frames", accepted="blinkgl generate, and path")
         if "forward" not in (flow := flow_labels(group)):
-            raise ConfigError("no flow to learn from", where="labels.flow", value=flow)
+            raise ConfigError("no flow labels to learn from", where="labels.flow", value=flow)
     return plan
 
 
 def flow_labels(group: Group) -> list[str]:
-    """``labels.flow`` of a group."""
+    """Return ``labels.flow`` of a group."""
     return list(group.template.check().labels.model_dump()["flow"])
 
 
@@ -91,6 +91,6 @@ def _split_of(group: Group) -> str:
 
 
 def stream_seed(recipe_seed: int, seed: int) -> int:
-    """The recipe's seed in a stream of seed ``seed``: other sequences than ``blinkgl generate`` makes of the recipe,
-    unless it is told ``--seed`` of this."""
+    """Return the recipe's seed in a stream of seed ``seed``: other sequences than those of ``blinkgl generate``, unless
+    it gets this ``--seed``."""
     return derived_seed(recipe_seed, f"online/{seed}")

@@ -12,8 +12,8 @@ from blinkgl.online.stream import SampleStream
 
 
 class Batches(IterableDataset):
-    """Batch k is ``collate`` of the samples from first + k · size on; ``count`` of them, None: without an end. A
-    DataLoader takes from its processes in turn, so that they deal the batches out between them and the order is that
+    """Batches of a stream. Batch k is ``collate`` of the samples from first + k · size on; ``count`` of them, None:
+    endless. A DataLoader takes from its processes in turn, so they divide the batches among them and the order is that
     of one."""
 
     def __init__(

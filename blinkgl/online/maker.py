@@ -1,4 +1,4 @@
-"""Slots, rendered: what a worker process does for a stream."""
+"""Rendering of slots: the work of a stream's worker process."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from blinkgl.online.job import StreamJob
 from blinkgl.sequence import SequenceRequest, simulate_sequence
 
 TRIES = 8
-"""Sequences of a slot that may give nothing, before it is given up."""
+"""Largest number of unusable sequences of a slot."""
 _APART = 1_000_000  # between numbers of a slot's sequences
 
 
 class SlotMaker(Maker):
-    """Makes slots: ``samples`` files each in the spool folder. The "done" says how many sequences that took
-    ("sequences"), how many of them failed ("failures"), and with what ("last")."""
+    """Makes slots: ``samples`` files each in the spool folder. The "done" reports the number of sequences
+    ("sequences"), how many failed ("failures"), and the last error ("last")."""
 
     job: StreamJob
 
@@ -41,11 +41,11 @@ class SlotMaker(Maker):
 
     def __exit__(self, *_: object) -> None:
         super().__exit__()
-        if os.getppid() != self._driver:  # it was killed, and nobody else tidies up
+        if os.getppid() != self._driver:  # it was killed, and nobody else removes the files
             shutil.rmtree(self.job.out, ignore_errors=True)
 
     def make(self, number: int, attempt: int, tell: Any) -> Message:
-        """The slot of this number, of those of this process. Only KeyboardInterrupt and SystemExit get out."""
+        """Make this process's slot of this number. Only KeyboardInterrupt and SystemExit are raised."""
         job, began, made, failures, barren, last, tried = self.job, time.process_time(), 0, 0, 0, "", 0
         slot = job.slot_of_all(number)
         while made < job.samples and barren < TRIES:
@@ -64,7 +64,7 @@ class SlotMaker(Maker):
             except Exception as error:  # noqa: BLE001 - whatever it is, the next sequence goes on
                 message = failed(number, error)
                 if may_pass(error) or message["stop"]:
-                    return message  # the machine's trouble: somebody else tries the same again
+                    return message  # an error of the machine: another worker tries the same again
                 failures, last = failures + 1, f"{_name_of(group, index)}: {message['error']}"
             if made == before:
                 barren += 1
@@ -82,7 +82,8 @@ class SlotMaker(Maker):
         return {"kind": "failed", "error": error, "expected": True, "final": True, "stop": False, **report}
 
     def _group(self, slot: int, tried: int) -> Group:
-        """By the groups' numbers of sequences. (By dice, not in turn: what ``shares`` deals out goes in turn.)"""
+        """Return a group, drawn by the groups' numbers of sequences. (Random, not in turn, because ``shares`` assigns
+        values in turn.)"""
         used = self.plan.used
         counts = np.array([self.plan.counts[group.name] for group in used], float)
         return used[int(self._dice(slot, tried, 0).choice(len(used), p=counts / counts.sum()))]
@@ -92,10 +93,10 @@ class SlotMaker(Maker):
 
 
 def sample_file(spool: Path, slot: int, item: int) -> Path:
-    """Where a sample lies in the spool folder."""
+    """Return the path of a sample in the spool folder."""
     return spool / f"{slot:09d}_{item:03d}.npz"
 
 
 def _name_of(group: Group, index: int) -> str:
-    """ "davis240_000017"."""
+    """Return "davis240_000017"."""
     return f"{group.name or 'sequence'}_{index:06d}"

@@ -1,4 +1,4 @@
-"""What a stream gives, and how it lies in the spool folder for a moment."""
+"""Samples of a stream, and their files in the spool folder."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _COLUMNS = ("x", "y", "t", "p")
 
 @dataclass(frozen=True, eq=False)
 class WindowSample:
-    """Two windows of events that meet, and the flow over each.
+    """Two adjacent windows of events, and the flow over each.
 
     old, new : events of [t - Δ, t) and [t, t + Δ), µs of the sequence's clock.   t_us, span_us : t and Δ.
     flow : (H, W, 2) float32 px, t -> t + Δ at reference t, +x right, +y down.   valid : (H, W) bool.
@@ -42,7 +42,7 @@ class WindowSample:
         return self.valid.shape[1]
 
     def write(self, path: Path) -> None:
-        """``path`` (.npz), whole or not at all: who waits for the name finds all of it."""
+        """Write ``path`` (.npz), completely or not at all, so that a reader never sees a part of it."""
         arrays = _columns(old=self.old, new=self.new) | {"flow": self.flow, "valid": self.valid}
         if self.backward is not None:
             arrays |= {"backward": self.backward, "backward_valid": self.backward_valid}
@@ -51,7 +51,7 @@ class WindowSample:
 
 @dataclass(frozen=True, eq=False)
 class StreamSample:
-    """Windows of one sequence that follow each other, for networks with a memory.
+    """Consecutive windows of one sequence, for networks with a memory.
 
     windows : K times the events of [t_k, t_k+1).   t_us : (K + 1,) int64 µs of the sequence's clock, evenly spaced.
     flow : (K, H, W, 2) float32 px, t_k -> t_k+1 at reference t_k.   valid : (K, H, W) bool.
@@ -72,7 +72,7 @@ class StreamSample:
         return self.valid.shape[2]
 
     def write(self, path: Path) -> None:
-        """As :meth:`WindowSample.write`."""
+        """Write the sample as :meth:`WindowSample.write`."""
         arrays = _columns(all=Events.concatenate(self.windows))
         counts = np.array([len(window) for window in self.windows])
         _save(
@@ -81,7 +81,7 @@ class StreamSample:
 
 
 def read_sample(path: Path) -> WindowSample | StreamSample:
-    """What either ``write`` wrote. Raises FileNotFoundError; ValueError, KeyError: another file."""
+    """Return a written sample of either kind. Raises FileNotFoundError; ValueError, KeyError: another file."""
     with np.load(path, allow_pickle=False) as z:
         arrays = {key: z[key] for key in z.files}
     name = str(arrays["name"])

@@ -1,13 +1,13 @@
-"""Samples that are rendered while they are used, in their order.
+"""Samples that are rendered while they are used, in order.
 
-Worker processes (:class:`~blinkgl.dataset.executor.Local`'s, each with an OpenGL context of its own and one thread)
-render sequences and cut several samples out of each. What comes of it lies for a moment in a spool folder in memory,
-from where the process that asked, or loader processes that it started, take it.
+Worker processes (:class:`~blinkgl.dataset.executor.Local`'s, each with its own OpenGL context and one thread) render
+sequences and cut several samples out of each. The samples are kept briefly in a spool folder in memory, from which this
+process, or loader processes that it started, take them.
 
 *Reproducible*: sample n is item ``n % samples`` of slot ``n // samples``, after the slots' samples have been mixed
-block by block; a slot is a pure function of (recipe, seed, number of the slot), whoever makes it, and always has as
-many samples. Where a sequence fails, or gives too few, others of the same slot fill it up, in a fixed order. No sample
-comes twice. *Back-pressure*: slots are ordered up to a block ahead of what has been taken, and no further.
+block by block; a slot is a pure function of (recipe, seed, number of the slot) and always has the same number of
+samples. Where a sequence fails, or gives too few, others of the same slot complete it, in a fixed order. No sample is
+repeated. *Back-pressure*: slots are requested up to a block ahead of what has been taken, and no further.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ from blinkgl.online.job import MIX, StreamJob, flow_labels
 from blinkgl.online.maker import sample_file
 from blinkgl.online.samples import read_sample
 
-_ATTEMPTS = 3  # at a slot whose worker died
-_SLOT_S = 900.0  # longest for a slot
+_ATTEMPTS = 3  # attempts at a slot whose worker died
+_SLOT_S = 900.0  # time limit of a slot
 _FREE_FAILURES, _FAILURE_SHARE = 10, 0.5
 _SPOOL_FREE = 2**30
 _ERROR = "error"
 _GONE = ".gone"  # instead of .npz: this sample was taken
-_BASE = "base"  # first slot that is still wanted, for takers in other processes
+_BASE = "base"  # first slot that is still needed, for takers in other processes
 
 
 @dataclass
 class StreamStats:
-    """slots, samples, sequences, failures : made so far.   cpu_s : processor seconds of the workers for them.
+    """Statistics. slots, samples, sequences, failures : made so far.   cpu_s : CPU seconds of the workers for them.
     replaced : workers that died.   waited_s : wall seconds that :meth:`SampleStream.take` has waited in this process,
     of ``open_s`` wall seconds since the stream was opened."""
 
@@ -67,15 +67,16 @@ class StreamStats:
 
 
 class SampleStream:
-    """Samples without an end. Sample n is the same whoever asks; :meth:`take` gives it once.
+    """Endless samples. Sample n does not depend on who requests it; :meth:`take` returns it once.
 
-    workers : rendering processes; 0 renders in this process, when a sample is asked for. (A copy in a loader process
+    workers : rendering processes; 0 renders in this process, when a sample is requested. (A copy in a loader process
     takes what the owner's workers make.)   first : sample that is taken first, when a run is resumed.
-    ahead : blocks that are rendered before they are asked for.   card : of several graphics cards the one that all
-    workers render on, counted round; None: each on another.   block : samples that are mixed with each other.
-    stats : :class:`StreamStats`.   spool : folder where samples lie for a moment.
+    ahead : blocks that are rendered in advance.   card : index (modulo their number) of the graphics card of all
+    workers; None: each on another.   block : samples that are mixed with each other.
+    stats : :class:`StreamStats`.   spool : folder where samples are kept briefly.
     Raises BlinkGLError: a recipe that cannot be rendered here. :meth:`take` raises ConfigError: one that gives no
-    samples; EventDataError: a sample that was taken, and after :meth:`close`."""
+    samples;
+    EventDataError: a sample that was taken, and after :meth:`close`."""
 
     def __init__(self, job: StreamJob, workers: int = 1, first: int = 0, ahead: int = 1, card: int | None = None):
         plan = job.plan()
@@ -86,7 +87,7 @@ class SampleStream:
         self.spool = Path(_spool_folder())
         self.job = replace(job, out=str(self.spool))
         self._owner, self._ahead, self._workers = os.getpid(), ahead, workers
-        self._base = first // self.block * MIX  # first slot that is still wanted
+        self._base = first // self.block * MIX  # first slot that is still needed
         self._next, self._stop, self._thread = self._base, False, None
         self._executor: Executor | None = None
         try:
@@ -109,26 +110,26 @@ class SampleStream:
 
     @classmethod
     def of(cls, template: RunTemplate, job: StreamJob, **how: Any) -> SampleStream:
-        """The stream of a recipe: ``job`` with ``template`` filled in. Raises as the class."""
+        """Return the stream of a recipe: ``job`` with ``template`` filled in. Raises as the class."""
         text = to_yaml(template.tree)
         return cls(replace(job, base=str(template.base.resolve()), recipe=text), **how)
 
     def __getstate__(self) -> dict[str, Any]:
-        """A taker from the spool, without the workers."""
+        """Return a taker from the spool, without the workers."""
         return {**self.__dict__, "_executor": None, "_thread": None}
 
     def take(self, n: int) -> Sample:
-        """Sample n, waited for; nobody else gets it."""
+        """Wait for sample n and return it; it is removed."""
         sample = self.peek(n)
         self._mark(*self._place(n))
         return sample
 
     def peek(self, n: int) -> Sample:
-        """Sample n, waited for; it stays."""
+        """Wait for sample n and return it; it stays."""
         return read_sample(self._wait(n))
 
     def move(self, n: int, to: Path) -> None:
-        """Sample n as the file ``to``, which must not exist; as :meth:`take`. Raises OSError."""
+        """Move sample n to the file ``to``, which must not exist; as :meth:`take`. Raises OSError."""
         shutil.copyfile(self._wait(n), to)
         self._mark(*self._place(n))
 
@@ -150,7 +151,7 @@ class SampleStream:
         return path
 
     def _place(self, n: int) -> tuple[int, int]:
-        """Slot and item of sample n: the samples of a block, shuffled."""
+        """Return slot and item of sample n: the samples of a block, shuffled."""
         block, place = divmod(n, self.block)
         mixed = int(_order(self.job.seed, self.job.block_of_all(block), self.block)[place])
         return block * MIX + mixed // self.job.samples, mixed % self.job.samples
@@ -163,7 +164,7 @@ class SampleStream:
             self._advance()
 
     def _refused(self, slot: int, path: Path) -> bool:
-        """Raises what keeps the sample from ever coming; else False."""
+        """Raise the error that prevents the sample; else return False."""
         mine = os.getpid() == self._owner
         if path.with_suffix(_GONE).exists() or slot < (self._base if mine else self._told_base()):
             raise EventDataError("this sample was taken", where=f"slot {slot}")
@@ -173,7 +174,7 @@ class SampleStream:
             if not self.spool.is_dir():
                 raise EventDataError("the online source is closed", where=f"slot {slot}") from None
             return False
-        if path.is_file():  # what was there before is good
+        if path.is_file():  # earlier samples are valid
             return False
         where, _, said = said.partition("\n")
         raise ConfigError(said, where=where)
@@ -184,7 +185,7 @@ class SampleStream:
         return 0
 
     def close(self) -> None:
-        """Ends the workers and leaves nothing behind. Harmless when repeated, and in a taker."""
+        """End the workers and remove the spool. May be called repeatedly, and in a taker."""
         if os.getpid() != self._owner:
             return
         self._stop = True
@@ -205,24 +206,26 @@ class SampleStream:
     # -- the owner's side --
 
     def _advance(self) -> None:
-        """Forgets the blocks all of whose samples were taken; more may be rendered then."""
+        """Drop the blocks of which all samples were taken; more may be rendered then."""
         while True:
             if not all(mark.exists() for mark in self._marks()):
                 return
             marks = list(self._marks())
             self._base += MIX
-            (self.spool / _BASE).write_text(str(self._base))  # before the marks go: who asks again has to be told
+            (self.spool / _BASE).write_text(
+                str(self._base)
+            )  # before the marks are removed: later requests must be refused
             for mark in marks:
                 mark.unlink()
 
     def _marks(self) -> Iterator[Path]:
-        """Where the block that is wanted first has its marks, when all was taken."""
+        """Yield the marks of the first needed block, when all was taken."""
         for slot in range(self._base, self._base + MIX):
             for item in range(self.job.samples):
                 yield sample_file(self.spool, slot, item).with_suffix(_GONE)
 
     def _drive(self) -> None:
-        """Keeps the workers at slots up to a block ahead; the only thread that talks to them."""
+        """Keep the workers busy with slots up to a block ahead; the only thread that communicates with them."""
         executor, again = cast(Executor, self._executor), []
         running: dict[int, tuple[int, float]] = {}  # slot -> attempt, since when
         try:
@@ -261,7 +264,7 @@ class SampleStream:
                 return
 
     def _counted(self, message: Message, attempt: int) -> bool:
-        """Takes note of a slot's end; whether it has to be tried again."""
+        """Record a slot's end; return whether it must be tried again."""
         stats = self.stats
         stats.sequences += message.get("sequences", 0)
         stats.failures += message.get("failures", 0)
@@ -279,7 +282,7 @@ class SampleStream:
         return False
 
     def _give_up(self, said: str, where: str = "recipe") -> None:
-        """Leaves the reason for all takers: what is at fault, in a line by itself, and why."""
+        """Leave the reason for all takers: the cause, and a line on it."""
         self._stop = True
         temporary = self.spool / (_ERROR + ".tmp")
         with suppress(OSError):
@@ -288,7 +291,7 @@ class SampleStream:
 
 
 def _why(error: StartError) -> str:
-    """The problem, and the last line that the workers wrote: their log goes with the stream."""
+    """Return the problem, and the last line that the workers wrote: their log is deleted with the stream."""
     try:
         lines = error.log.read_text(encoding="utf-8", errors="replace").split("\n")
     except OSError:
@@ -303,7 +306,7 @@ def _order(seed: int, block: int, size: int) -> np.ndarray:
 
 
 def _spool_folder() -> str:
-    """In memory where there is room, else where temporary files go."""
+    """Return a folder in memory where there is room, else for temporary files."""
     shared = Path("/dev/shm")
     with suppress(OSError):
         if os.access(shared, os.W_OK) and shutil.disk_usage(shared).free > _SPOOL_FREE:
@@ -312,12 +315,12 @@ def _spool_folder() -> str:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# This process among those of a distributed training: what `torchrun` and Ray Train say of it.
+# This process among those of a distributed training, from `torchrun` or Ray Train.
 
 
 class Share(NamedTuple):
-    """rank, world : number of this process, and how many there are.   local : its number on this machine; None: nobody
-    says."""
+    """Share of a process. rank, world : its number, and the number of processes.   local : its number on this machine;
+    None: unknown."""
 
     rank: int = 0
     world: int = 1
@@ -325,10 +328,10 @@ class Share(NamedTuple):
 
 
 def share_of_process(environment: Mapping[str, str] = os.environ) -> Share:
-    """From Ray Train's context, where that has been imported and this is one of its workers, else from ``RANK``,
-    ``WORLD_SIZE`` and ``LOCAL_RANK``, else alone. Nothing is imported.
+    """Return the share from Ray Train's context, where that has been imported and this is one of its workers, else from
+    ``RANK``, ``WORLD_SIZE`` and ``LOCAL_RANK``, else a single process. Nothing is imported.
 
-    Raises ConfigError: variables that are no numbers, or do not fit together."""
+    Raises ConfigError: variables that are not numbers, or inconsistent."""
     return _of_ray() or _of_environment(environment)
 
 
@@ -337,7 +340,7 @@ def _of_ray() -> Share | None:
     try:
         context = cast(Any, train).get_context()
         said = context.get_world_rank(), context.get_world_size(), context.get_local_rank()
-    except (AttributeError, RuntimeError):  # not imported; not one of its workers, as some versions say it
+    except (AttributeError, RuntimeError):  # not imported; not one of its workers, in some versions
         return None
     return None if said[0] is None or said[1] is None else Share(*said)
 

@@ -298,18 +298,18 @@ def judge_half(recorded: Sums, simulated: Sums, told: float = float("nan")) -> J
 
 def _keys(base: EmulatorConfig, fixed: Iterable[str]) -> list[str]:
     if not base.fitted:
-        raise ConfigError("this emulator says nothing of what may be fitted", where="emulator", value=base.emulator)
+        raise ConfigError("this emulator has no parameters to fit", where="emulator", value=base.emulator)
     fixed = set(fixed)
     if "threshold_ratio" in fixed:
         raise ConfigError(
-            "the two thresholds are fitted one by one, and not their ratio",
+            "the two thresholds are fitted separately, not by their ratio",
             where="--set",
             value="threshold_ratio",
             accepted="contrast_threshold or contrast_threshold_off",
         )
     keys = [key for key in base.fitted if key not in fixed]
     if not keys:
-        raise ConfigError("nothing is left to be fitted", where="--set", value=sorted(fixed))
+        raise ConfigError("no parameter is left to fit", where="--set", value=sorted(fixed))
     return keys
 
 
@@ -324,9 +324,9 @@ def _own_frames(recording: str | os.PathLike) -> str | os.PathLike:
         if "needs the package aedat" in error.problem or "damaged" in error.problem:
             raise
     raise EventDataError(
-        "the recording has no frames, and without them nobody knows what the camera saw",
+        "the recording has no frames, and the scene cannot be estimated without them",
         where=os.fspath(recording),
-        accepted="--frames, or --still for a scene that stands still",
+        accepted="--frames, or --still for a static scene",
     )
 
 

@@ -198,7 +198,7 @@ def _greys(
     for frame, t_ns, name in frames:
         if frame.shape[:2] != size:
             raise EventDataError(
-                "frames are of another size than the recording",
+                "frames and recording have different sizes",
                 where=reading.name,
                 value=f"{frame.shape[1]}x{frame.shape[0]}",
                 accepted=f"{size[1]}x{size[0]}, as its events",
@@ -212,7 +212,7 @@ def _greys(
         times.append(t_ns)
     if full.mean() > MOST_SATURATED:
         raise EventDataError(
-            "too many pixels of the frames are saturated to say what the light did there",
+            "too many pixels of the frames are saturated",
             where=reading.name,
             value=f"{100 * full.mean():.0f} %",
             accepted=f"at most {100 * MOST_SATURATED:.0f} % (a shorter exposure)",
@@ -428,7 +428,7 @@ def read_recording(path: str | os.PathLike, *, least: int = 0) -> tuple[Events, 
         events = file.read()
     if len(events) < least:
         raise EventDataError(
-            "too few events to tell an emulator's parameters",
+            "too few events to estimate an emulator's parameters",
             where=str(path),
             value=len(events),
             accepted=f"{least:,} or more",

@@ -103,7 +103,9 @@ def _judged(x: np.ndarray, label: np.ndarray, window: np.ndarray, window_us: flo
             found.append(area(score, label[test]))
             gains += gained
     if not found:
-        raise EventDataError("events at one time alone cannot be judged by another", where="compare --judge")
+        raise EventDataError(
+            "all events have the same time, so a judge cannot be trained and tested", where="compare --judge"
+        )
     return Judgement(
         float(np.mean(found)), float(np.std(found)), len(x), float(window_us), telling=tuple(_telling(gains))
     )

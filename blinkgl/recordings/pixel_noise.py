@@ -199,7 +199,7 @@ def _distance(a: np.ndarray, b: np.ndarray) -> float:
 
 def _too_few(name: str, count: int) -> EventDataError:
     return EventDataError(
-        "too few events to tell the noise of single pixels",
+        "too few events to estimate the noise of single pixels",
         where=name,
         value=count,
         accepted=f"{LEAST_EVENTS:,} or more in each half of its time",

@@ -61,7 +61,7 @@ class Search:
         self.target = Targets([one(*part) for part in parts])
         if not len(self.target.values):
             pixels = sum(int(clip.used.sum()) for clip, _ in parts)
-            raise EventDataError("too few pixels to tell an emulator's parameters", value=pixels)
+            raise EventDataError("too few pixels to estimate an emulator's parameters", value=pixels)
         self.evaluations = 0
         self.untold: dict[str, str] = {}
         self.cost = float("nan")

@@ -1,6 +1,7 @@
-"""A scene at a moment becomes pixels; and, in float64 without OpenGL, what they should be.
+"""Rendering of a scene at one time; and a float64 reference without OpenGL.
 
 In:    a :class:`~blinkgl.scene.types.Scene`, a context, a time.
 Out:   luminance, colour and labels of that moment.
-Start: renderer.py (``Renderer``); reference.py is its slow, obvious twin (rays: casting.py; light: appearance.py).
+Start: renderer.py (``Renderer``); reference.py is its slow, simple reference (rays: casting.py; light:
+appearance.py).
 """

@@ -10,14 +10,13 @@ from blinkgl.errors import GLError
 class Samples(NamedTuple):
     """How one pixel is sampled.
 
-    grid  : the image is drawn grid x grid times finer and averaged (super-sampling:
-    everything is evaluated grid² times).
-    taps  : 1, or 4: texture lookups of a drawn pixel, spread over the pixel, each one mip level finer. The texture is
-            super-sampled, the light and the silhouettes are not. Event frames only: colour
-            is not worth a shader variant.
-    edges : whether silhouettes and creases, and no other pixels, are given the means over the areas of their surfaces
-            (:class:`~blinkgl.render.passes.edged.Edged`), of a finer grid before it is averaged. The taps, where there
-            are four, then lie along the way in which a surface is foreshortened."""
+    grid  : the image is drawn grid x grid times finer and averaged (super-sampling).
+    taps  : 1, or 4: texture lookups of a drawn pixel, spread over the pixel, each one mip level finer. This
+            super-samples the texture but not the light and the silhouettes. Only for event frames: colour is not worth
+            a shader variant.
+    edges : whether pixels at silhouettes and creases get the mean by area of their surfaces
+            (:class:`~blinkgl.render.passes.edged.Edged`), on the finer grid before it is averaged. The four taps, if
+            any, then lie along the direction in which a surface is foreshortened."""
 
     grid: int = 1
     taps: int = 1
@@ -25,12 +24,12 @@ class Samples(NamedTuple):
 
     @property
     def stored(self) -> int:
-        """Samples kept in memory per pixel of the image."""
+        """Return the samples in memory per pixel of the image."""
         return self.grid**2
 
     @property
     def shared(self) -> bool:
-        """Whether a pixel at a silhouette shows both surfaces by their shares, and not only that of its centre."""
+        """Return whether a pixel at a silhouette shows both surfaces by area, and not only that of its centre."""
         return self.stored > 1 or self.edges
 
 
@@ -45,7 +44,7 @@ ANTIALIASING = {
 
 
 def samples_of(name: str, where: str = "render.antialiasing") -> Samples:
-    """GLError for a name that is none of :data:`ANTIALIASING`'s."""
+    """Return the samples of an anti-aliasing mode. Raises GLError for a name that is not in :data:`ANTIALIASING`."""
     if name not in ANTIALIASING:
         raise GLError("unknown anti-aliasing", where=where, value=name, accepted="one of " + ", ".join(ANTIALIASING))
     return ANTIALIASING[name]

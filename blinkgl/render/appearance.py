@@ -1,7 +1,7 @@
-"""What the surface points that rays hit look like, in float64: normals, textures, light, shadows, gloss, fog.
+"""Appearance of the surface points hit by rays, in float64: normals, textures, light, shadows, gloss, fog.
 
-A surface that is seen from behind has its shading normal turned round. Textures are sampled bilinearly at their full
-resolution, without mip maps: mip maps are the GPU's way to anti-alias, not a property of the scene.
+The shading normal of a surface seen from behind is reversed. Textures are sampled bilinearly at their full resolution,
+without mip maps: those are the GPU's anti-aliasing, not a property of the scene.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ LUMA = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709, of linear R, G, B
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """What the surface looks like at some :class:`Hits`.
+    """Appearance of the surface at some :class:`Hits`.
 
     normal : (..., 3) unit shading normal in world coordinates, on the camera's side.   uv : (..., 2) before uv_scale.
     albedo, colour : (..., 3) linear light.   luminance : (...) Rec. 709 luma of colour.
@@ -40,7 +40,7 @@ class Surface:
 
 
 def surface(scene: Scene, hits: Hits) -> Surface:
-    """Normals, texture coordinates, albedo and radiance at every hit."""
+    """Return normals, texture coordinates, albedo and radiance at every hit."""
     n = len(hits.hit)
     normal, uv = np.full((n, 3), np.nan), np.full((n, 2), np.nan)
     albedo, colour = np.zeros((n, 3)), np.full((n, 3), float(scene.backdrop))
@@ -69,7 +69,7 @@ def surface(scene: Scene, hits: Hits) -> Surface:
 
 
 def seen_through_fog(scene: Scene, hits: Hits, colour: np.ndarray) -> np.ndarray:
-    """(N, 3) radiance at the hits as it arrives at the camera; where nothing is hit as it is."""
+    """Return the radiance of the hits as it arrives at the camera, (N, 3); unchanged where nothing is hit."""
     if scene.fog is None:
         return colour
     rays = rays_of(scene.camera, hits.xy)
@@ -81,10 +81,10 @@ def seen_through_fog(scene: Scene, hits: Hits, colour: np.ndarray) -> np.ndarray
 
 @dataclass(frozen=True, eq=False)
 class Radiated:
-    """What N points of one part send to the camera, (N, 3) each: albedo * matt + mirrored + emission.
+    """Radiance that N points of one part send to the camera, (N, 3) each: albedo * matt + mirrored + emission.
 
-    light : what it receives.   matt : radiance that a white surface of this kind scatters of it.   mirrored : of the
-    lamps and of all around."""
+    light : the received light.   matt : radiance scattered by a white surface of this kind.   mirrored : reflection of
+    the lamps and the surroundings."""
 
     light: Received
     matt: np.ndarray
@@ -93,15 +93,15 @@ class Radiated:
 
     @property
     def added(self) -> np.ndarray:
-        """What does not go through the albedo."""
+        """Return the radiance that is not multiplied by the albedo."""
         return self.mirrored + self.emission
 
 
 def radiated(
     scene: Scene, hits: Hits, rows: np.ndarray, albedo: np.ndarray, normal: np.ndarray, uv: np.ndarray
 ) -> Radiated:
-    """Of the hits ``rows``, all of one part, which is lit. albedo, normal : (N, 3), (N, 3) unit, world axes, without a
-    normal map.   uv : (N, 2)."""
+    """Return the radiance of the hits ``rows``, all of one lit part. albedo, normal : (N, 3), (N, 3) unit, world axes,
+    without a normal map.   uv : (N, 2)."""
     thing, part = scene_parts(scene)[int(hits.part[rows[0]])]
     material, pose = part.material, thing.path.pose(hits.t_ns)
     # Maps are looked up at the base colour's coordinates.
@@ -129,24 +129,24 @@ def radiated(
 def bumped(
     hits: Hits, rows: np.ndarray, part: Part, pose: np.ndarray, normal: np.ndarray, at: np.ndarray
 ) -> np.ndarray:
-    """(N, 3) unit normals, world axes, as the part's normal map has them. normal : without it, on the camera's side."""
+    """Return unit normals of the part's normal map, (N, 3), world axes. normal : without it, on the camera's side."""
     mesh, bumps = part.mesh, part.material.bumps
     assert bumps is not None
     corners, bary = mesh.faces[hits.triangle[rows]], hits.bary[rows]
     given = tangents(mesh).astype(np.float64)
-    # The way along the texture turns as a normal does.
+    # The tangent of the texture is transformed like a normal.
     if mesh.deformer is not None:
         turned = mesh.deformer.normals(replace(mesh, normals=given[:, :3].astype(np.float32)), hits.t_ns)
         given = np.column_stack([turned, given[:, 3]])
     side = np.where(hits.front[rows], 1.0, -1.0)[:, None]
-    # Everything below is of the front; the result is turned back to the side that is seen.
+    # Everything below is for the front; the result is turned back to the visible side.
     n = normal * side
     along = np.einsum("nc,nck->nk", bary, given[:, :3][corners]) @ pose[:3, :3].T
-    # Gram and Schmidt: the tangent without its part along the normal.
+    # Gram-Schmidt: the tangent without its part along the normal.
     along = along - n * (along * n).sum(axis=1, keepdims=True)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-15)
     hand = np.sign(np.einsum("nc,nc->n", bary, given[:, 3][corners]))[:, None]
-    # Stored 0 to 1, meant -1 to 1.
+    # Stored as 0 to 1, used as -1 to 1.
     bump = 2.0 * sample_map(bumps, at) - 1.0
     x, y, z = (bump[:, k : k + 1] for k in range(3))
     scale = part.material.bump_scale
@@ -165,13 +165,13 @@ def shone(
     metallic: np.ndarray,
     roughness: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """((N, 1) share of the light that goes through the albedo, (N, 3) radiance that is mirrored) of a surface with a
-    gloss (:mod:`blinkgl.scene.surfaces.gloss`). light : what a matt one receives there.   eye : (N, 3) unit vectors."""
+    """Return ((N, 1) share of the light that is multiplied by the albedo, (N, 3) mirrored radiance) of a glossy surface
+    (:mod:`blinkgl.scene.surfaces.gloss`). light : received by a matt one.   eye : (N, 3) unit vectors."""
     # The same limits as in surface.glsl; the lobe of a perfect mirror would divide by 0.
     roughness = np.maximum(roughness, gloss.SMOOTHEST)
     nv = np.clip((normal * eye).sum(axis=1), 1e-3, 1.0)
     part = gloss.energy_at(nv, roughness)
-    # What single reflection loses of even light, which several reflections return.
+    # Energy of uniform light that single reflection loses and multiple reflections return.
     lost = (1.0 / part.sum(axis=1) - 1.0)[:, None]
     mix = metallic[:, None]
     clear = 1.0 + gloss.several(np.full((1, 1), gloss.DIELECTRIC), roughness) * lost
@@ -196,7 +196,7 @@ def shone(
         lobe = gloss.lobe(np.maximum(nl, 1e-12), nv, (half * normal).sum(axis=1), roughness)
         of_clear = clear * (gloss.DIELECTRIC + (1 - gloss.DIELECTRIC) * edge)
         of_metal = metal * (albedo + (1 - albedo) * edge)
-        # ``direct`` has the cosine, the strength and the shadow in it
+        # ``direct`` includes the cosine, the strength and the shadow
         out += np.where(lit, lobe, 0.0)[:, None] * light.direct[k] * (of_clear * (1 - mix) + of_metal * mix)
     return (1 - mix) * (1 - even_clear), out
 
@@ -206,10 +206,10 @@ _surroundings: dict[int, tuple] = {}
 
 @dataclass(frozen=True, eq=False)
 class Received:
-    """The light that N points of a scene receive, as the radiance of a white Lambert surface there, (N, 3) each.
+    """Light that N points of a scene receive, as the radiance of a white Lambert surface there, (N, 3) each.
 
-    direct : (lamps, N, 3) of each of :func:`blinkgl.scene.lights.lamps_of`, in the others' shadows.   open : the same
-    without shadows.   around : from all around."""
+    direct : (lamps, N, 3) of each of :func:`blinkgl.scene.lights.lamps_of`, with shadows.   open : without shadows.
+    around : from the surroundings."""
 
     direct: np.ndarray
     open: np.ndarray
@@ -217,16 +217,16 @@ class Received:
 
     @property
     def total(self) -> np.ndarray:
-        """All of it."""
+        """Return the sum of all light."""
         return self.direct.sum(axis=0) + self.around
 
 
 def received(
     scene: Scene, t_ns: int, points: np.ndarray, normal: np.ndarray, own: np.ndarray | None = None
 ) -> Received:
-    """What the scene's lights send at t_ns to (N, 3) points with (N, 3) unit normals, world axes.
+    """Return the light of the scene at t_ns at (N, 3) points with (N, 3) unit normals, world axes.
 
-    own : (N, 2) part and triangle that each point is on, which do not hide it from a lamp; None: no shadows."""
+    own : (N, 2) part and triangle of each point, which do not shade it; None: no shadows."""
     lamps = lamps_of(scene.light)
     direct, open_ = np.zeros((2, len(lamps), *points.shape))
     casting = shadowing(scene.light)
@@ -240,31 +240,31 @@ def received(
 
 
 SOFT_SAMPLES = 64
-"""Points of a lamp that are looked for, of a soft shadow."""
+"""Points on a lamp that are tested for a soft shadow."""
 _FAR_AWAY = 1e5
-"""From where a sun's rays come, times the scene's size: parallel to 1e-5."""
+"""Distance of a sun's ray origins, times the scene's size: parallel to 1e-5."""
 
 
 def seen_share(scene: Scene, t_ns: int, lamp: Lamp, points: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """(N,) how much of a lamp is seen from (N, 3) points, world axes, past what casts shadows: 0 or 1, of a soft shadow
-    a mean over the lamp. own : as for :func:`received`."""
+    """Return the fraction of a lamp that is visible from (N, 3) points, world axes, past all casters, (N,): 0 or 1, for
+    soft shadows a mean over the lamp. own : as for :func:`received`."""
     casters, number = _casters(scene)
     if not casters.objects or not len(points):
         return np.ones(len(points))
     # Part numbers among the casters.
     skip = np.ascontiguousarray(np.column_stack([number[own[:, 0]], own[:, 1]]).astype(np.int32))
-    # A lamp shines along -z, a camera looks along +z: y and z are turned round.
+    # A lamp shines along -z, a camera looks along +z: y and z are negated.
     pose = lamp.path.pose(t_ns) @ np.diag([1.0, -1.0, -1.0, 1.0])
     middle = points.mean(axis=0)
     size = 1.0 + float(np.linalg.norm(points - middle, axis=1).max())
     count = SOFT_SAMPLES if scene.light.shadows == "soft" and lamp.size > 0 else 1
     total = np.zeros(len(points))
-    # Sunflower seeds over the lamp's disc: 2.39996323 rad is the golden angle.
+    # Sunflower pattern over the lamp's disc: 2.39996323 rad is the golden angle.
     for i in range(count):
         radius, angle = math.sqrt((i + 0.5) / count), i * 2.39996323
         aside = (0.5 * lamp.size * radius if count > 1 else 0.0) * np.array([math.cos(angle), math.sin(angle)])
         eye = pose.copy()
-        # A sun: the direction is turned by the angle, and the eye is far away along it.
+        # A sun: the direction is turned by the angle, and the eye is far away in it.
         if lamp.kind == "sun":
             ahead = eye[:3, 2] + eye[:3, :2] @ np.tan(aside)
             eye[:3, 3] = middle - ahead * (_FAR_AWAY * size)
@@ -287,8 +287,9 @@ _shadowers: WeakKeyDictionary = WeakKeyDictionary()
 def seen_by_lamp(
     scene: Scene, t_ns: int, eye: np.ndarray, rays: np.ndarray, near: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What a shadow map should hold: (N,) depth along the axis of a lamp that looks from the (4, 4) pose ``eye`` along
-    (N, 3) rays of length 1 there, inf where nothing casts, and (N,) number of the part among all that cast, -1."""
+    """Return the content of a shadow map: (N,) depth along the axis of a lamp that looks from the (4, 4) pose ``eye``
+    along (N, 3) rays of length 1 there, inf where nothing casts, and (N,) number of the part among all that cast,
+    -1."""
     casters, _ = _casters(scene)
     if not casters.objects:
         return np.full(len(rays), np.inf), np.full(len(rays), -1, np.int32)
@@ -297,7 +298,7 @@ def seen_by_lamp(
 
 
 def casts(scene: Scene) -> bool:
-    """Whether anything in it casts shadows."""
+    """Return whether anything in the scene casts shadows."""
     return bool(_casters(scene)[0].objects)
 
 
@@ -318,7 +319,7 @@ def _casters(scene: Scene) -> tuple[Scene, np.ndarray]:
 
 
 def sample_albedo(material: Material, uv: np.ndarray) -> np.ndarray:
-    """(N, 3) linear albedo at (N, 2) texture coordinates."""
+    """Return linear albedo at (N, 2) texture coordinates, (N, 3)."""
     base = np.asarray(material.base_color, np.float64)
     if material.texture is None:
         return np.broadcast_to(base, (len(uv), 3)).copy()
@@ -326,7 +327,8 @@ def sample_albedo(material: Material, uv: np.ndarray) -> np.ndarray:
 
 
 def sample_map(given: Map, at: np.ndarray, colour: bool = False) -> np.ndarray:
-    """(N, 3) of a map at (N, 2) coordinates of the base colour: numbers as they are stored, 0 to 1, or linear light."""
+    """Return a map's values at (N, 2) coordinates of the base colour, (N, 3): numbers as stored, 0 to 1, or linear
+    light."""
     a, b, c, d, e, f = given.at
     # The map's own affine transform of the coordinates.
     there = at @ np.array([[a, b], [d, e]]).T + [c, f]
@@ -353,7 +355,7 @@ def _wrapped(index: np.ndarray, size: int, wrap: str) -> np.ndarray:
 
 
 def sample_bilinear(texture: Texture, uv: np.ndarray, wrap: tuple[str, str] = REPEAT) -> np.ndarray:
-    """(N, 3) linear light, bilinear over the four nearest texels; texel centres at (i + 0.5) / size."""
+    """Return linear light, bilinear over the four nearest texels, (N, 3); texel centres at (i + 0.5) / size."""
     image = texture.image
     size = np.array([image.shape[1], image.shape[0]])
     at = uv * size - 0.5

@@ -1,8 +1,8 @@
 """Boxes of objects (:class:`blinkgl.types.boxes.Boxes`) from their vertices in float64 and a picture of ids.
 
-What of an object is before the near plane is cut there, and its corners are projected: of a pin-hole camera the box of
-those is that of the whole, since a triangle's picture is a triangle. Through a lens its edges bend, by less than the
-triangles are fine.
+Objects are clipped at the near plane, and their corners are projected. For a pinhole camera the box of the corners is
+that of the object, since a projected triangle is a triangle. Through a lens its edges bend, by less than the size of
+the triangles.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from blinkgl.types.boxes import Boxes, no_boxes
 
 
 def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -> Boxes:
-    """Of the objects that are before the camera at t_ns. ids : (H, W) uint32 instances that are seen."""
+    """Return the boxes of the objects in front of the camera at t_ns. ids : (H, W) uint32 visible instances."""
     camera, T_world_cam = scene.camera, scene.camera_path.pose(t_ns)
     shown = extents(ids, 1 + max((thing.instance_id for thing in scene.objects), default=0))
     whole = np.array([-0.5, -0.5, camera.width - 0.5, camera.height - 0.5])
@@ -48,10 +48,10 @@ def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -
         if not pixels:
             continue
         low, high = vertices.min(axis=0), vertices.max(axis=0)
-        # The box's own axes are the object's; its origin is the box's middle.
+        # The box has the object's axes; its origin is the box's middle.
         middle = np.eye(4)
         middle[:3, 3] = 0.5 * (low + high)
-        # What of the box is in the picture, and its area against the whole.
+        # The part of the box in the picture, and its area relative to the whole.
         inside = np.clip(amodal.reshape(2, 2), whole[:2], whole[2:])
         area = np.prod(amodal[2:] - amodal[:2])
         rows.append(
@@ -81,12 +81,12 @@ def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -
 
 
 def _aside(camera: CameraModel, thing: SceneObject, T_cam_obj: np.ndarray) -> bool:
-    """Whether the ball round an object's origin is out of the picture."""
+    """Return whether the ball around an object is outside the picture."""
     return bool((camera.frustum_planes() @ T_cam_obj[:3, 3] < -thing.radius).any())
 
 
 def _solid(thing: SceneObject, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
-    """(V, 3) float64 vertices of all parts at t_ns, object axes, and (F, 3) faces."""
+    """Return the vertices of all parts at t_ns, (V, 3) float64, object axes, and the faces, (F, 3)."""
     vertices, faces, begin = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
     for part in thing.parts:
         vertices.append(vertices_at(part.mesh, t_ns))
@@ -96,8 +96,8 @@ def _solid(thing: SceneObject, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _projected(camera: CameraModel, points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(M, 2) px and (F', 3) of the triangles of (V, 3) points, camera axes, cut at the near plane, without those that
-    the camera has no place for."""
+    """Return (M, 2) px and (F', 3) of the triangles of (V, 3) points, camera axes, clipped at the near plane, without
+    those that the camera cannot project."""
     points, faces = before(points, faces, camera.near)
     px = np.full((len(points), 2), np.nan)
     used = np.unique(faces)
@@ -106,9 +106,9 @@ def _projected(camera: CameraModel, points: np.ndarray, faces: np.ndarray) -> tu
 
 
 def before(points: np.ndarray, faces: np.ndarray, near: float) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles of (V, 3) points cut at Z = near: points with those of the cuts behind them, and faces of what is
-    farther."""
-    # Corners that are far enough away, and how many of each triangle.
+    """Return triangles of (V, 3) points clipped at Z = near: points followed by those of the cuts, and the faces beyond
+    it."""
+    # Corners beyond the plane, and their number per triangle.
     there = points[:, 2] >= near
     count = there[faces].sum(axis=1)
     kept, extra = [faces[count == 3]], [points]
@@ -117,12 +117,12 @@ def before(points: np.ndarray, faces: np.ndarray, near: float) -> tuple[np.ndarr
         some = faces[count == inside]
         if not len(some):
             continue
-        # Turned so that the corner that stands alone comes first.
+        # Rotated so that the corner on its own side comes first.
         alone = np.argmax(there[some] == (inside == 1), axis=1)
         a, b, c = (some[np.arange(len(some)), (alone + k) % 3] for k in range(3))
         cuts = []
         for other in (b, c):
-            # Where the two sides that cross the plane meet it; exactly at near, whatever the rounding.
+            # Intersections of the two sides with the plane; exactly at near, despite rounding.
             share = (near - points[a, 2]) / (points[other, 2] - points[a, 2])
             cut = points[a] + share[:, None] * (points[other] - points[a])
             cut[:, 2] = near
@@ -136,19 +136,19 @@ def before(points: np.ndarray, faces: np.ndarray, near: float) -> tuple[np.ndarr
 
 
 _EDGE = 1e-9
-"""px: so near to an edge a pixel's centre is in the triangles on both sides of it."""
+"""px: a pixel centre this near to an edge is in the triangles on both sides."""
 
 
 @kernel(error_model="numpy")
 def cover(px: np.ndarray, faces: np.ndarray, mask: np.ndarray) -> None:
-    """Sets ``mask`` (H, W) where a pixel's centre is in one of the triangles (F, 3) of (V, 2) float64 px, their edges
+    """Set ``mask`` (H, W) where a pixel centre is in one of the triangles (F, 3) of (V, 2) float64 px, edges
     included."""
     height, width = mask.shape
     for f in range(len(faces)):
         ax, ay = px[faces[f, 0]]
         bx, by = px[faces[f, 1]]
         cx, cy = px[faces[f, 2]]
-        # Twice the signed area; clockwise triangles are turned round.
+        # Twice the signed area; clockwise triangles are reversed.
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         if area == 0.0:
             continue
@@ -160,7 +160,7 @@ def cover(px: np.ndarray, faces: np.ndarray, mask: np.ndarray) -> None:
         if not max(ax, bx, cx) >= -_EDGE or not min(ax, bx, cx) <= width - 1.0 + _EDGE:
             continue
         for y in range(first, last + 1):
-            # What of the row is on the inner side of each edge: a x + b >= 0.
+            # The part of the row on the inner side of each edge: a x + b >= 0.
             left, right = 0.0, width - 1.0
             for px0, py0, px1, py1 in ((ax, ay, bx, by), (bx, by, cx, cy), (cx, cy, ax, ay)):
                 slope = py0 - py1
@@ -179,8 +179,8 @@ def cover(px: np.ndarray, faces: np.ndarray, mask: np.ndarray) -> None:
 
 @kernel
 def extents(ids: np.ndarray, count: int) -> np.ndarray:
-    """(count, 5) int64: of every id below ``count`` the first and last column and row of its pixels, as x0, y0, x1, y1,
-    and how many there are."""
+    """Return (count, 5) int64: for every id below ``count`` the first and last column and row of its pixels, as x0, y0,
+    x1, y1, and their number."""
     out = np.zeros((count, 5), np.int64)
     out[:, 0], out[:, 1] = ids.shape[1], ids.shape[0]
     for y in range(ids.shape[0]):

@@ -1,7 +1,7 @@
-"""What a pass draws on, and the handle of what it drew: a frame stays on the card until somebody reads it.
+"""The target of a pass, and the handle of a drawn frame: a frame stays on the GPU until it is read.
 
-A :class:`Canvas` owns one pass's target and, where frames are viewed, the memory that they are viewed in. It is drawn
-over by the pass's next frame; whoever reads a frame after that is told so.
+A :class:`Canvas` owns one pass's target and, where frames are viewed, the memory of the views. The pass's next frame
+overwrites it; reading an older frame raises an error.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Rectangle(NamedTuple):
         return Rectangle(min(self.x0, other.x0), min(self.y0, other.y0), max(self.x1, other.x1), max(self.y1, other.y1))
 
     def grown(self, margin: int, width: int, height: int) -> Rectangle:
-        """With ``margin`` px more on every side, as far as a picture of this size reaches."""
+        """Return it with ``margin`` px more on every side, within a picture of this size."""
         return Rectangle(
             max(0, self.x0 - margin),
             max(0, self.y0 - margin),
@@ -59,7 +59,7 @@ class Rectangle(NamedTuple):
 
 
 def merged(rectangles: list[Rectangle]) -> list[Rectangle]:
-    """Rectangles that do not meet and cover the given ones, in a fixed order."""
+    """Return disjoint rectangles that cover the given ones, in a fixed order."""
     result: list[Rectangle] = []
     for rectangle in rectangles:
         while (other := next((r for r in result if r.meets(rectangle)), None)) is not None:
@@ -70,17 +70,16 @@ def merged(rectangles: list[Rectangle]) -> list[Rectangle]:
 
 
 DEPTH_BUFFER = "depth buffer"
-"""What an input says for its ``output`` to read the depth buffer of a pass that keeps it as a texture."""
+"""An input's ``output`` that selects the depth texture of a pass."""
 
 
 class Frame:
-    """What a pass drew of a moment, on the card, until the same pass draws its next frame;
-    GLError for whoever asks afterwards.
+    """A pass's picture of a moment, on the GPU, until the same pass draws its next frame; later use raises GLError.
 
-    moment : as the pass saw it.   t_ns : its time.   names : of its pictures; where none is said the first is meant.
+    moment : as the pass saw it.   t_ns : its time.   names : of its outputs; the first is the default.
     width, height : px.
-    changed : rectangles in which it may differ from the same pass's frame before it; None:
-    anywhere. See :meth:`changed_since`."""
+    changed : rectangles in which it may differ from the same pass's previous frame; None: anywhere. See
+    :meth:`changed_since`."""
 
     def __init__(self, canvas: Canvas, number: int, moment: Moment, changed: list[Rectangle] | None):
         self._canvas, self._number, self.moment, self.changed = canvas, number, moment, changed
@@ -103,17 +102,17 @@ class Frame:
 
     @property
     def target(self) -> Target:
-        """What it was drawn into, for a pass that resolves or copies it."""
+        """Return the target that it was drawn into, for a pass that resolves or copies it."""
         self._check()
         return self._canvas.target
 
     def texture(self, output: str = "") -> moderngl.Texture:
-        """Of an output of the pass (default: its first), or :data:`DEPTH_BUFFER`, for another pass.
-        As the program wrote it: all components of its format."""
+        """Return the texture of an output (default: the first), or of :data:`DEPTH_BUFFER`, for another pass: as the
+        program wrote it, with all components of its format."""
         if output == DEPTH_BUFFER:
             if not isinstance(self._canvas.pass_.depth, str):
                 raise GLError(
-                    "the pass keeps no depth buffer that can be read",
+                    "the pass has no readable depth buffer",
                     where=type(self._canvas.pass_).__name__,
                     value=output,
                     accepted='one with `depth = "texture"`',
@@ -122,44 +121,45 @@ class Frame:
         return self.target.colour[self._canvas.attachment(output)]
 
     def read(self, name: str = "", out: np.ndarray | None = None) -> np.ndarray:
-        """A picture as an array of the caller's own, (H, W) or (H, W, C), dtype of its format; row 0 is the top row.
+        """Return a copy of an output, (H, W) or (H, W, C), dtype of its format; row 0 is the top row.
 
         out : written and returned when given (C-contiguous, that shape and dtype)."""
         self._check()
         return self._canvas.read(name, out)
 
     def view(self, name: str = "") -> np.ndarray:
-        """The same as a read-only array in memory that the renderer owns and writes the next frame into: no allocation,
-        and only what has changed is transferred. To be copied by whoever wants to keep it."""
+        """Return an output as a read-only array in memory of the renderer that the next frame overwrites: no
+        allocation, and only changed parts are transferred. Copy it to keep it."""
         self._check()
         return self._canvas.view(name, self)
 
     def tensor(self, device: Any = "cuda", name: str = "") -> Any:
-        """A picture as a torch tensor of the caller's own, (H, W) or (H, W, C), dtype of its format.
+        """Return an output as a new torch tensor, (H, W) or (H, W, C), dtype of its format.
 
-        device : torch's. On the card that draws it, the picture does not leave it where CUDA can share it; see
-        :mod:`blinkgl.render.tensors`, and :meth:`transfer` for the way it takes.
+        device : torch's. On the GPU that draws it, the picture stays there if CUDA can share it; see
+        :mod:`blinkgl.render.tensors`, and :meth:`transfer` for the way used.
         Raises GLError: no torch, no such device, no such output."""
         self._check()
         return self._canvas.tensor(device, name)
 
     def transfer(self, device: Any = "cuda", name: str = "") -> str:
-        """How :meth:`tensor` gets there: "interop", "pinned" or "plain", with why no shorter way where there is one."""
+        """Return the way of :meth:`tensor`: "interop", "pinned" or "plain", with the reason why no faster way is
+        used."""
         self._check()
         reader = self._canvas.reader(device, name)
         return f"{reader.way}: {reader.why}" if reader.why else reader.way
 
     def changed_since(self, before: Frame | None) -> list[Rectangle] | None:
-        """Rectangles outside of which this frame equals ``before``; None: it may differ anywhere, since nothing is
-        known of two frames that are not of the same pass, one right after the other."""
+        """Return rectangles outside which this frame equals ``before``; None: it may differ anywhere, because only
+        consecutive frames of one pass are compared."""
         if before is None:
             return None
-        # Another of its own kind: its members are no secret.
+        # Another of its own class: private members may be used.
         follows = before._canvas is self._canvas and before._number == self._number - 1  # noqa: SLF001
         return self.changed if follows else None
 
     def rows_changed_since(self, before: Frame | None) -> tuple[int, int] | None:
-        """(y0, y1): outside these rows it equals ``before``; None: it may differ anywhere."""
+        """Return (y0, y1): outside these rows it equals ``before``; None: it may differ anywhere."""
         changed = self.changed_since(before)
         if changed is None:
             return None
@@ -168,21 +168,21 @@ class Frame:
     def _check(self) -> None:
         if self._canvas.number != self._number:
             raise GLError(
-                "this frame is no longer on the card: its pass has drawn another one",
+                "this frame is no longer on the GPU: its pass has drawn another one",
                 where=f"frame at {self.t_ns * 1e-9:.9g} s",
                 accepted="read() before the next frame is drawn",
             )
 
 
 class Canvas:
-    """Of one pass of one renderer. width, height : of the image.   number : of the last
-    frame; -1 when it has been released."""
+    """The target of one pass of one renderer. width, height : of the image.   number : of the last frame; -1 after
+    release."""
 
     def __init__(self, pass_: Pass, painter: Painter, width: int, height: int):
         self.pass_, self.painter, self.number = pass_, painter, 0
         self.outputs = pass_.outputs
         self.target = self.make_target(width, height)
-        self._held: dict[int, tuple[int, np.ndarray]] = {}  # attachment -> number of the frame held, and its picture
+        self._held: dict[int, tuple[int, np.ndarray]] = {}  # attachment -> number of the stored frame, and its picture
         self._readers: dict[tuple[int, str], TextureReader] = {}  # by attachment and device
         self._used: dict[str, Frame] = {}  # inputs of the last frame
 
@@ -195,8 +195,8 @@ class Canvas:
         )
 
     def draw(self, shot: Shot) -> Frame:
-        """What the pass draws of a moment into :attr:`target`."""
-        # Of a pass that looks at its inputs pixel by pixel only what changed in them can have changed.
+        """Draw a moment into :attr:`target` and return the frame."""
+        # A pass that reads its inputs pixel by pixel changes only where they change.
         changed = self._changed(shot)
         self._used = dict(shot.inputs) if self.pass_.pointwise else {}
         if changed is None or changed:
@@ -205,7 +205,7 @@ class Canvas:
         return self.frame(shot, changed)
 
     def frame(self, shot: Shot, changed: list[Rectangle] | None) -> Frame:
-        """The handle of what has been drawn just now."""
+        """Return the handle of the frame that has just been drawn."""
         self.number += 1
         return Frame(self, self.number, shot.moment, changed)
 
@@ -221,7 +221,7 @@ class Canvas:
     # ---- read-back -----------------------------------------------------------------------------------------------
 
     def attachment(self, output: str) -> int:
-        """Number of an output (default: the first). Raises GLError."""
+        """Return the number of an output (default: the first). Raises GLError."""
         names = [o.name for o in self.outputs]
         if not names or (output and output not in names):
             raise GLError(
@@ -252,7 +252,7 @@ class Canvas:
         self.painter.gl.resume()
         number, picture = self._held.get(i, (0, None))
         if picture is None or number != self.number:
-            # Only a picture of the frame right before this one is right outside of what changed.
+            # Only a picture of the previous frame is valid outside the changed rectangles.
             stale = frame.changed if number == self.number - 1 and number > 0 else None
             picture = self._update(i, picture, stale)
             self._held[i] = self.number, picture
@@ -261,7 +261,7 @@ class Canvas:
         return seen
 
     def reader(self, device: Any, name: str) -> TextureReader:
-        """What reads a picture's attachment into tensors of a device; made when it is first asked for."""
+        """Return the reader of an attachment into tensors of a device; made when first needed."""
         i = self.attachment(name)
         if (i, str(device)) not in self._readers:
             self.painter.gl.resume()
@@ -270,7 +270,7 @@ class Canvas:
         return self._readers[i, str(device)]
 
     def tensor(self, device: Any, name: str) -> Any:
-        """A tensor of the caller's own."""
+        """Return a new tensor."""
         components = self.outputs[self.attachment(name)].components
         reader = self.reader(device, name)
         self.painter.finish()
@@ -282,7 +282,7 @@ class Canvas:
         return picture
 
     def _update(self, i: int, picture: np.ndarray | None, stale: list[Rectangle] | None) -> np.ndarray:
-        """The picture of attachment ``i`` as it is now, where it was right but for ``stale``."""
+        """Return the current picture of attachment ``i``; ``picture`` is valid outside ``stale``."""
         self.painter.finish()
         started = working_clock()
         if picture is None or stale is None:
@@ -310,11 +310,11 @@ class Canvas:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A camera that stands still: draw what does not move once, and after that only where something moves.
+# A camera that stands still: draw the static part once, and afterwards only where something moves.
 #
-# The still part of the scene is kept as a picture with its depth. For each frame the rectangles that moving objects
-# cover, now or in the frame before, are restored from it, the moving objects are drawn over them under a scissor,
-# and only those rectangles are read back. Every pixel gets the value that a full redraw would give it.
+# The static part of the scene is kept as a picture with its depth. For each frame the rectangles that moving objects
+# cover, now or in the previous frame, are restored from it, the moving objects are drawn over them under a scissor, and
+# only those rectangles are read back. Every pixel gets the value of a full redraw.
 
 # OpenGL's enums: GL_READ_FRAMEBUFFER, GL_DRAW_FRAMEBUFFER; depth and colour bits; GL_NEAREST.
 _READ_FRAMEBUFFER, _DRAW_FRAMEBUFFER = 0x8CA8, 0x8CA9
@@ -322,18 +322,17 @@ _DEPTH, _COLOUR_AND_DEPTH, _NEAREST = 0x0100, 0x4000 | 0x0100, 0x2600
 
 
 def screen_rectangle(item: DrawItem, T_cam_obj: np.ndarray, camera: CameraModel) -> Rectangle | None:
-    """Pixels that the item can touch, by its bounding box; None when it is out of the image."""
+    """Return the pixels that the item can touch, from its bounding box; None when it is outside the image."""
     bounds = camera.bounds(item.corners @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3])
     return None if bounds is None else Rectangle(*bounds)
 
 
 class StillCanvas(Canvas):
-    """Of a pass that draws the scene with a camera, or for a lamp, that stands still. The target always holds the
-    whole last frame; what is kept beside it, the still objects' picture and the places of those that move, is nobody
-    else's."""
+    """The canvas of a pass that draws the scene for a camera or a lamp that stands still. The target always holds the
+    whole last frame. It also keeps the picture of the static objects and the rectangles of moving ones."""
 
     _picture: Target | None = None
-    _covered: tuple[Rectangle, ...] = ()  # by what moves, in the last frame
+    _covered: tuple[Rectangle, ...] = ()  # by moving objects, in the last frame
 
     def draw(self, shot: Shot) -> Frame:
         pass_, painter, moment = self.pass_, self.painter, shot.moment
@@ -345,7 +344,7 @@ class StillCanvas(Canvas):
                 if rectangle is not None:
                     movers.append((item, rectangle))
         covered = [rectangle for _, rectangle in movers]
-        # The first frame draws what stands still, once.
+        # The first frame draws the static part, once.
         if self._picture is None:
             self._picture = self.make_target(camera.width, camera.height)
             still = replace(shot, target=self._picture)
@@ -353,7 +352,7 @@ class StillCanvas(Canvas):
             pass_.paint(painter, still, [item for item in visible if not item.moves])
             stale = [Rectangle(0, 0, camera.width, camera.height)]
         else:
-            # Where movers are now and where they were: both have to be restored.
+            # Present and previous rectangles of moving objects both have to be restored.
             stale = merged([*self._covered, *covered])
         self._covered = tuple(covered)
         painter.prepare(self.target)
@@ -369,14 +368,14 @@ class StillCanvas(Canvas):
         return self.frame(shot, stale)
 
     def _restore(self, rectangle: Rectangle) -> None:
-        """Copies the still picture's colour and depth into the target, inside the rectangle (px of the targets)."""
+        """Copy the static picture's colour and depth into the target, inside the rectangle (px of the targets)."""
         gl = self.painter.gl
         if not hasattr(self, "_bind"):
             self._bind = gl.function("glBindFramebuffer", None, ctypes.c_uint, ctypes.c_uint)
             self._blit = gl.function("glBlitFramebuffer", None, *[ctypes.c_int] * 8, ctypes.c_uint, ctypes.c_uint)
         self._bind(_READ_FRAMEBUFFER, self._picture.fbo.glo)
         self._bind(_DRAW_FRAMEBUFFER, self.target.fbo.glo)
-        # A pass without colour outputs has a depth buffer alone.
+        # A pass without colour outputs has only a depth buffer.
         edges = (rectangle.x0, rectangle.y0, rectangle.x1, rectangle.y1)
         self._blit(*edges, *edges, _COLOUR_AND_DEPTH if self.outputs else _DEPTH, _NEAREST)
         self.target.fbo.use()

@@ -1,21 +1,20 @@
-"""Rays that are cast at a scene in float64, the surface points that they hit, and how those move.
+"""Casting rays into a scene in float64: the surface points that they hit, and the motion of those points.
 
-One ray goes through each pixel centre (or any other image point); it hits the nearest triangle, and everything else
-follows from the object-local point of the hit. A mesh that deforms is a mesh of its own at each time: its vertices are
+One ray goes through each pixel centre (or any other image point) and hits the nearest triangle; everything else is
+computed from the object-local point of the hit. A deforming mesh is a separate mesh at each time: its vertices are
 moved in float64, and rays are cast at them there.
 
 Flow and its rounding
 ---------------------
-With ``M(t) = inv(T_world_cam(t)) @ T_world_obj(t)``, the point p is at ``M p`` in camera coordinates, and
-``X1 = X0 + (M1 - M0) p``. For a pin-hole camera ``X0 = Z0 (rx, ry, 1)`` with ``rx = (x - cx) / fx`` exact, so
+With ``M(t) = inv(T_world_cam(t)) @ T_world_obj(t)``, the point p is at ``M p`` in camera coordinates, and ``X1 = X0 +
+(M1 - M0) p``. For a pinhole camera ``X0 = Z0 (rx, ry, 1)`` with ``rx = (x - cx) / fx`` exact, so
 
     flow_x = fx (dX - rx dZ) / Z1,    (dX, dY, dZ) = (M1 - M0) p,    Z1 = Z0 + dZ,
 
-without subtracting two projections (:meth:`blinkgl.camera.CameraModel.displacement`). ``M1 - M0`` is formed from the
-differences of the poses, so a pose that does not change contributes exactly nothing. The point q of a
-shape that changes moves by ``M1 (q1 - q0) + (M1 - M0) q0``. What is left is about 1e-15 of the
-flow, plus the resolution of the poses themselves: a translation of size 1e6 units is stored
-to 1e-10 units, i.e. fx * 1e-10 / Z px.
+without subtracting two projections (:meth:`blinkgl.camera.CameraModel.displacement`). ``M1 - M0`` is computed from the
+differences of the poses, so a constant pose contributes exactly nothing. The point q of a deforming shape moves by ``M1
+(q1 - q0) + (M1 - M0) q0``. The remaining error is about 1e-15 of the flow, plus the resolution of the poses themselves:
+a translation of 1e6 units is stored to 1e-10 units, i.e. fx * 1e-10 / Z px.
 
 Back faces: a closed mesh whose material is not double-sided is not hit from behind; any other is.
 """
@@ -32,12 +31,12 @@ from blinkgl.camera import CameraModel
 from blinkgl.render.raycast import Forest, Holes, build_tree, join_trees, nearest_tree
 from blinkgl.scene.types import Mesh, Part, Scene, SceneObject
 
-# A visibility ray ends this much (relative) before the point it aims at, so that the point does not hide itself:
-# far above the rounding of a hit (1e-15), far below any separation of two surfaces that a picture could show.
+# A visibility ray ends this much (relative) before its target point, so that the point does not hide itself: far above
+# the rounding of a hit (1e-15), far below any visible separation of two surfaces.
 VISIBILITY_SLACK = 1e-9
 
 KEPT = 4
-"""Times whose shapes are kept, of a scene that deforms."""
+"""Number of times whose shapes are kept, for a deforming scene."""
 _trees: WeakKeyDictionary = WeakKeyDictionary()
 _shapes: WeakKeyDictionary = WeakKeyDictionary()
 _forests: WeakKeyDictionary = WeakKeyDictionary()
@@ -45,7 +44,7 @@ _forests: WeakKeyDictionary = WeakKeyDictionary()
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """The surface points seen at N image points at one time.
+    """The visible surface points at N image points at one time.
 
     xy : (N, 2) px.   t_ns : the time.   hit : (N,) bool.
     depth : (N,) Z along the optical axis in world units, inf where nothing is hit.
@@ -69,13 +68,13 @@ class Hits:
 
 @dataclass(frozen=True, eq=False)
 class Flow:
-    """Where the points of some :class:`Hits` are at t_ns (t').
+    """Positions of the points of some :class:`Hits` at another time t_ns (t').
 
     flow : (..., 2) px, +x right, +y down, t -> t'; nan where not valid.
     valid : hit, and in front of the camera at t' (Z' > 0), where its model sees it.
     occluded : valid, but not visible at t': hidden by a surface, seen from its own culled side, outside the image or in
     front of the near plane.   outside : valid, and not inside the image at t'.
-    depth : (...) Z' at t'.   hidden_by : (..., 2) int32 (part, triangle) of the nearest thing in the way, or -1.
+    depth : (...) Z' at t'.   hidden_by : (..., 2) int32 (part, triangle) of the nearest occluder, or -1.
     """
 
     t_ns: int
@@ -88,20 +87,20 @@ class Flow:
 
 
 def scene_parts(scene: Scene) -> list[tuple[SceneObject, Part]]:
-    """Every part with its object, in the order that part indices count."""
+    """Return every part with its object, in the order of part indices."""
     return [(thing, part) for thing in scene.objects for part in thing.parts]
 
 
 def pixel_grid(camera: CameraModel) -> np.ndarray:
-    """(H * W, 2) float64 pixel centres, row by row."""
+    """Return pixel centres row by row, (H * W, 2) float64."""
     y, x = np.mgrid[0 : camera.height, 0 : camera.width]
     return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
 
 
 def cast(scene: Scene, t_ns: int, xy: np.ndarray | None = None) -> Hits:
-    """The nearest hit behind each image point.
+    """Return the nearest hit of each image point's ray.
 
-    xy : (N, 2) image points in px, not necessarily inside the image; every pixel centre when left out."""
+    xy : (N, 2) image points in px, not necessarily inside the image; None: every pixel centre."""
     xy = pixel_grid(scene.camera) if xy is None else np.atleast_2d(np.asarray(xy, np.float64))
     hit, bary, depth = nearest(scene, t_ns, rays_of(scene.camera, xy)[:, :2])
     parts = scene_parts(scene)
@@ -124,7 +123,7 @@ def rays_of(camera: CameraModel, xy: np.ndarray) -> np.ndarray:
 
 
 def vertices_at(mesh: Mesh, t_ns: int) -> np.ndarray:
-    """(V, 3) float64 object-local positions at a time; those of the last few are kept. Not to be written to."""
+    """Return object-local positions at a time, (V, 3) float64; the last few are kept. Read only."""
     if mesh.deformer is None:
         return np.asarray(mesh.vertices, np.float64)
     kept = _shapes.setdefault(mesh, {})
@@ -138,7 +137,7 @@ def vertices_at(mesh: Mesh, t_ns: int) -> np.ndarray:
 
 def _forest(scene: Scene, t_ns: int) -> Forest:
     kept = _forests.setdefault(scene, {})
-    # One forest for all times, unless some shape changes.
+    # One forest for all times, unless a shape deforms.
     key = t_ns if any(thing.deforms for thing in scene.objects) else None
     if key not in kept:
         parts = scene_parts(scene)
@@ -157,7 +156,7 @@ def _forest(scene: Scene, t_ns: int) -> Forest:
 
 
 def _holes_of(part: Part) -> Holes | None:
-    """Return a part's holes as the ray caster takes them."""
+    """Return a part's holes in the ray caster's form."""
     mask, mesh = part.material.mask, part.mesh
     if mask is None:
         return None
@@ -176,9 +175,8 @@ def nearest(
     near: float | None = None,
     any_will_do: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (hit (N, 3) int32, bary (N, 3), depth (N,)) as described at :func:`raycast.nearest_tree`. eye, near :
-    of other rays than the camera's: (4, 4) pose where they come from, Z at which they begin.   any_will_do : as
-    there."""
+    """Return (hit (N, 3) int32, bary (N, 3), depth (N,)) as described at :func:`raycast.nearest_tree`. eye, near : for
+    rays from elsewhere: their (4, 4) pose, and the Z at which they begin.   any_will_do : as there."""
     forest = _forest(scene, int(t_ns))
     camera_pose = scene.camera_path.pose(t_ns) if eye is None else eye
     # relative to the camera by differences of positions, so that a common offset from the origin cancels first
@@ -232,7 +230,7 @@ def _relative_change(scene: Scene, thing: SceneObject, t0_ns: int, t1_ns: int) -
 
 
 def _relative_rate(scene: Scene, thing: SceneObject, t_ns: int) -> np.ndarray:
-    """Return (3, 4) dM/dt in 1/s: the analytic twist of the body as the moving camera sees it."""
+    """Return (3, 4) dM/dt in 1/s: the analytic twist of the body relative to the moving camera."""
     c, dc = scene.camera_path.pose(t_ns), scene.camera_path.derivative(t_ns)
     b, db = thing.path.pose(t_ns), thing.path.derivative(t_ns)
     rate = np.empty((3, 4))
@@ -243,7 +241,7 @@ def _relative_rate(scene: Scene, thing: SceneObject, t_ns: int) -> np.ndarray:
 
 
 def applied(scene: Scene, hits: Hits, matrix_of: Callable[[SceneObject], np.ndarray]) -> np.ndarray:
-    """(N, 3) matrix_of(object) (3, 4) applied to every object-local point; nan where nothing is hit."""
+    """Return matrix_of(object) (3, 4) applied to every object-local point, (N, 3); nan where nothing is hit."""
     parts, out = scene_parts(scene), np.full((len(hits.hit), 3), np.nan)
     for p, rows in by_part(hits.part):
         m = matrix_of(parts[p][0])
@@ -252,8 +250,8 @@ def applied(scene: Scene, hits: Hits, matrix_of: Callable[[SceneObject], np.ndar
 
 
 def _add_of_shapes(scene: Scene, hits: Hits, out: np.ndarray, t_ns: int, vectors_of) -> None:
-    """Adds to ``out`` (N, 3) what the shape itself does, on parts that deform: vectors_of(mesh) (V, 3) at the hit
-    point, from the object's axes to the camera's at t_ns."""
+    """Add the motion of deforming shapes to ``out`` (N, 3): vectors_of(mesh) (V, 3) at the hit point, from the object's
+    axes to the camera's at t_ns."""
     for p, rows in by_part(hits.part):
         thing, part = scene_parts(scene)[p]
         if part.mesh.deformer is not None:
@@ -263,7 +261,7 @@ def _add_of_shapes(scene: Scene, hits: Hits, out: np.ndarray, t_ns: int, vectors
 
 
 def local_at(scene: Scene, hits: Hits, t_ns: int) -> np.ndarray:
-    """(N, 3) object-local positions of the hit points at another time."""
+    """Return object-local positions of the hit points at another time, (N, 3)."""
     out = hits.local
     for p, rows in by_part(hits.part):
         mesh = scene_parts(scene)[p][1].mesh
@@ -276,7 +274,7 @@ def local_at(scene: Scene, hits: Hits, t_ns: int) -> np.ndarray:
 
 
 def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
-    """Displacement of every hit point from ``hits.t_ns`` to t_ns, and whether it is seen there."""
+    """Return the displacement of every hit point from ``hits.t_ns`` to t_ns, and its visibility there."""
     camera = scene.camera
     change = applied(scene, hits, lambda thing: _relative_change(scene, thing, hits.t_ns, t_ns))
     _add_of_shapes(scene, hits, change, t_ns, lambda mesh: vertices_at(mesh, t_ns) - vertices_at(mesh, hits.t_ns))
@@ -290,7 +288,7 @@ def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
         there = hits.xy + flow
         inside = valid & ((there >= -0.5) & (there < [camera.width - 0.5, camera.height - 0.5])).all(axis=1)
 
-    # the ray aims at the moved point itself: through there = xy + flow it would carry that sum's rounding
+    # the ray aims at the moved point itself: through xy + flow it would have that sum's rounding
     there_hits = replace(hits, local=local_at(scene, hits, t_ns))
     moved = applied(scene, there_hits, lambda thing: relative_pose_at(scene, thing, t_ns))
     seen, hidden_by = is_seen(scene, hits, t_ns, moved, inside & (depth >= camera.near))
@@ -299,9 +297,9 @@ def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
 
 
 def moved_in_space(scene: Scene, hits: Hits, t_ns: int) -> np.ndarray:
-    """(N, 3) how far every hit point moves in the world from ``hits.t_ns`` to t_ns, in the camera's axes at
+    """Return how far every hit point moves in the world from ``hits.t_ns`` to t_ns, (N, 3), in the camera's axes at
     ``hits.t_ns``; nan where nothing is hit."""
-    # The shape's own change, and the pose's.
+    # The motion of the shape plus that of the pose.
     own = replace(hits, local=local_at(scene, hits, t_ns) - hits.local)
     carried = applied(scene, hits, lambda thing: _pose_change(thing, hits.t_ns, t_ns))
     changed = applied(scene, own, lambda thing: np.c_[thing.path.pose(t_ns)[:3, :3], np.zeros(3)])
@@ -309,7 +307,7 @@ def moved_in_space(scene: Scene, hits: Hits, t_ns: int) -> np.ndarray:
 
 
 def _pose_change(thing: SceneObject, t0_ns: int, t1_ns: int) -> np.ndarray:
-    """(3, 4) difference of two poses; zero of a sky at infinity, whose box is only drawn where the camera is."""
+    """Return the difference of two poses, (3, 4); zero for a sky at infinity, whose box only follows the camera."""
     if thing.at_infinity:
         return np.zeros((3, 4))
     return (thing.path.pose(t1_ns) - thing.path.pose(t0_ns))[:3]
@@ -318,11 +316,11 @@ def _pose_change(thing: SceneObject, t0_ns: int, t1_ns: int) -> np.ndarray:
 def is_seen(
     scene: Scene, hits: Hits, t_ns: int, moved: np.ndarray, candidate: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) bool: which of the points of ``hits`` are seen at t_ns, and (N, 2) int32 (part, triangle) of the nearest
-    thing in the way, or -1.
+    """Return (N,) bool: which points of ``hits`` are visible at t_ns, and (N, 2) int32 (part, triangle) of the nearest
+    occluder, or -1.
 
-    moved : (N, 3) where they are then, camera axes.   candidate : (N,) bool, those in the image and behind the near
-    plane; the others are not seen."""
+    moved : (N, 3) their positions then, camera axes.   candidate : (N,) bool, those in the image and behind the near
+    plane; the others are not visible."""
     candidate = candidate & _faces_camera(scene, hits, t_ns, candidate)
     hidden_by = np.full((len(hits.hit), 2), -1, np.int32)
     rows = np.flatnonzero(candidate)
@@ -335,16 +333,16 @@ def is_seen(
 
 
 def is_hidden(scene: Scene, t_ns: int, xy: np.ndarray, depth: np.ndarray, slack: float) -> np.ndarray:
-    """(N,) bool: something is in front of points that are at (N, 2) ``xy`` px and (N,) ``depth`` at t_ns.
+    """Return (N,) bool: whether something is in front of points at (N, 2) ``xy`` px and (N,) ``depth`` at t_ns.
 
-    slack : what is nearer by less than this part of the depth counts as the point's own surface."""
+    slack : a surface nearer by less than this fraction of the depth counts as the point's own."""
     far = depth * (1.0 - slack)
     hit, _, _ = nearest(scene, t_ns, rays_of(scene.camera, xy)[:, :2], far=far, any_will_do=True)
     return hit[:, 0] >= 0
 
 
 def velocity(scene: Scene, hits: Hits) -> np.ndarray:
-    """(N, 2) px/s image velocity of every hit point at ``hits.t_ns``, from the analytic twists."""
+    """Return the image velocity of every hit point at ``hits.t_ns``, (N, 2) px/s, from the analytic twists."""
     rate = applied(scene, hits, lambda thing: _relative_rate(scene, thing, hits.t_ns))
     _add_of_shapes(scene, hits, rate, hits.t_ns, lambda mesh: mesh.deformer.velocity(mesh, hits.t_ns))
     with np.errstate(invalid="ignore"):
@@ -353,12 +351,12 @@ def velocity(scene: Scene, hits: Hits) -> np.ndarray:
 
 
 def relative_pose_at(scene: Scene, thing: SceneObject, t_ns: int) -> np.ndarray:
-    """(4, 4) T_cam_obj at t_ns."""
+    """Return T_cam_obj at t_ns, (4, 4)."""
     return _relative_pose(scene.camera_path.pose(t_ns), thing.path.pose(t_ns))
 
 
 def _faces_camera(scene: Scene, hits: Hits, t_ns: int, rows: np.ndarray) -> np.ndarray:
-    """Return (N,) bool: the triangle of each hit is drawn from where the camera is at t_ns (False only for culled
+    """Return (N,) bool: the triangle of each hit is drawn from the camera's position at t_ns (False only for culled
     ones)."""
     shown = np.ones(len(rows), bool)
     for p, (thing, part) in enumerate(scene_parts(scene)):

@@ -1,16 +1,14 @@
-"""Where one surface ends in front of another: the edges of meshes that a picture shows as steps, as lines in it.
+"""Lines of a picture where one surface ends in front of another: the mesh edges that are visible as steps.
 
     lines = Lines()
     pixels, crossings = lines.in_pixels(moment, items, width, height)      # what passes/edged.py draws
 
-An edge of a mesh is seen when the surface turns away from the camera there (a silhouette), when it ends there (a
-border), when two of its faces meet at an angle (a crease), or when they show different places of their texture (a
-seam). Which ones that are is decided in float64, in the mesh's own axes: the camera comes to the mesh, as in
-raycast.py.
+A mesh edge is visible when the surface turns away from the camera there (a silhouette), when it ends there (a border),
+when two of its faces meet at an angle (a crease), or when they show different parts of their texture (a seam). This is
+decided in float64, in the mesh's own axes: the camera is transformed to the mesh, as in raycast.py.
 
-Where triangles are small an outline runs to and fro. A silhouette's edge at which the surface is hollow lies behind the
-surface itself, and its line runs back along others that are seen: it is one of those that cancel each other
-(edges.glsl).
+Where triangles are small an outline zigzags. A silhouette's edge at which the surface is hollow lies behind the surface
+itself, and its line runs back along visible ones: these lines cancel each other (edges.glsl).
 """
 
 from __future__ import annotations
@@ -29,14 +27,14 @@ if TYPE_CHECKING:
 
 LINE = 7
 """Numbers of a line (:meth:`Lines.of`): both of its ends, px and depth (near / Z); its kind. The surface lies to the
-left of the way from the one to the other, x to the right and y down."""
+left of the direction from the first to the second end, x to the right and y down."""
 CROSSING = 8
-"""Numbers of what a line is in one pixel (:meth:`Lines.in_pixels`): its share, and the turn that is in it, in eighths
-of a turn along the pixel's boundary; of the centre, px to the left of the line; depth in the middle of the part; the
-way to the left, a unit vector; what depth gains along the line in a px of the longer axis; the line's kind."""
+"""Numbers of a line's part in one pixel (:meth:`Lines.in_pixels`): its share, and its turn, in eighths of a turn along
+the pixel's boundary; px from the line to the centre, to the left; depth in the middle of the part; the direction to the
+left, a unit vector; the change of depth along the line per px of the longer axis; the line's kind."""
 SILHOUETTE, BACK_AGAIN = 0, -1
-"""Kinds of lines, beside creases and seams (mesh_edges.py): silhouettes and borders; silhouettes where a closed
-surface is hollow."""
+"""Kinds of lines besides creases and seams (mesh_edges.py): silhouettes and borders; silhouettes where a closed surface
+is hollow."""
 
 
 class _Arrays(NamedTuple):
@@ -52,7 +50,7 @@ class _Arrays(NamedTuple):
 
 
 class _Pool:
-    """Contours one behind the other: places, faces, planes, edges, sharp, culled as theirs, with numbers that count on.
+    """Contours one after the other: places, faces, planes, edges, sharp, culled as in each, with continued numbers.
 
     starts : (N + 1, 3) int64: where each one's places, faces and edges begin, and the last one's end."""
 
@@ -79,12 +77,14 @@ class _Pool:
 
 
 class Lines:
-    """The contours of a scene's objects; each is made when it is first drawn, and kept, all one behind the other.
-    Objects of the same meshes share one."""
+    """The contours of a scene's objects; each is made when it is first drawn, and kept. Objects of the same meshes
+    share one."""
 
     def __init__(self) -> None:
         self._contours: list[Contour] = []
-        self._numbers: dict[tuple[tuple[int, bool], ...], int] = {}  # of a contour, by its meshes' ids and sides
+        self._numbers: dict[
+            tuple[tuple[int, bool], ...], int
+        ] = {}  # numbers of contours, by their meshes' ids and sides
         self._of_object: dict[int, int] = {}
         self._pool = _Pool([])
         self._lines = np.empty((1024, LINE))
@@ -95,8 +95,8 @@ class Lines:
         self._counts = np.zeros(0, np.int32)
 
     def of(self, moment: Moment, items: Iterable[DrawItem], width: int, height: int) -> np.ndarray:
-        """(lines, LINE) float64: the lines of the objects that these items are of, in a picture of ``width`` x
-        ``height`` px, those that something hides included; valid until the next call."""
+        """Return (lines, LINE) float64: the lines of these items' objects in a picture of ``width`` x ``height`` px,
+        hidden ones included; valid until the next call."""
         bodies = np.array(list(dict.fromkeys(item.object_index for item in items)), np.int64)
         numbers = np.array([self._number(moment, body) for body in bodies.tolist()], np.int64)
         if len(self._pool.starts) <= len(self._contours):
@@ -104,7 +104,7 @@ class Lines:
         pool = self._pool
         for number in dict.fromkeys(numbers.tolist()):
             contour, (place, face, _) = self._contours[number], pool.starts[number]
-            # The shape of this moment: its planes, too, are those of now.
+            # A deforming shape needs the places and planes of this moment.
             if contour.deforms:
                 there = slice(face, face + len(contour.faces))
                 pool.places[place : place + len(contour.corners)] = contour.positions(moment.t_ns)
@@ -132,9 +132,9 @@ class Lines:
     def in_pixels(
         self, moment: Moment, items: Iterable[DrawItem], width: int, height: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """What those lines are in each pixel that they cross. (pixels, 4) int32: x, y, the first of the pixel's
-        crossings, the one after its last; no pixel is there twice.  (crossings, CROSSING) float32, those of a pixel in
-        the order of :meth:`of`. Valid until the next call."""
+        """Return the parts of those lines in each pixel that they cross. (pixels, 4) int32: x, y, the first of the
+        pixel's crossings, the one after its last; no pixel occurs twice.  (crossings, CROSSING) float32, those of a
+        pixel in the order of :meth:`of`. Valid until the next call."""
         lines = self.of(moment, items, width, height)
         if len(self._counts) != width * height:
             self._counts = np.zeros(width * height, np.int32)
@@ -150,7 +150,7 @@ class Lines:
 
 @kernel
 def _emit(numbers, bodies, T_cam_obj, mvps, pool, width, height, out):
-    """Write the lines of all objects and return their number. numbers, bodies : of each object, its contour's place in
+    """Write the lines of all objects and return their number. numbers, bodies : of each object, its contour's index in
     the pool and its own in the scene."""
     starts, planes = pool.starts, pool.planes
     front = np.empty(len(planes), np.bool_)
@@ -178,7 +178,7 @@ def _emit_one(mvp, pool, mine, front, width, height, out, count):
     edges, sharp = pool.edges[mine[0] : mine[1]], pool.sharp[mine[0] : mine[1]]
     ends = np.empty((2, 4))
     for e in range(len(edges)):
-        # Kinds and directions from which faces are seen.
+        # Kinds, and directions from which faces are visible.
         v0, v1, towards, kind = edges[e, 0], edges[e, 1], front[edges[e, 2]], SILHOUETTE
         culled = pool.culled[edges[e, 2]] and (edges[e, 3] < 0 or pool.culled[edges[e, 3]])
         if edges[e, 3] >= 0:
@@ -188,10 +188,10 @@ def _emit_one(mvp, pool, mine, front, width, height, out, count):
                     continue
                 kind = sharp[e]
             elif culled:
-                # The edge follows the order of the face that is seen.
+                # The edge follows the order of the visible face.
                 if not towards:
                     v0, v1, towards = v1, v0, True
-                # Hollow: the one face's third corner is before the other.
+                # Hollow: one face's third corner is in front of the other.
                 for k in range(3):
                     p = places[faces[edges[e, 3], k]]
                     if faces[edges[e, 3], k] != v0 and faces[edges[e, 3], k] != v1:
@@ -226,8 +226,8 @@ def _emit_one(mvp, pool, mine, front, width, height, out, count):
         bx = (ends[1, 0] / ends[1, 3] + 1) * 0.5 * width
         by = (ends[1, 1] / ends[1, 3] + 1) * 0.5 * height
         ad, bd = ends[0, 2] / ends[0, 3], ends[1, 2] / ends[1, 3]
-        # Inside of the picture and a pixel more: float32 places lines well there.
-        # Liang and Barsky: [low, high] is what of the line is in the rectangle.
+        # The part inside the picture plus one pixel, where float32 is accurate. Liang-Barsky: [low, high] is the part
+        # of the line in the rectangle.
         low, high, dx, dy = 0.0, 1.0, bx - ax, by - ay
         for k in range(4):
             d = -dx if k == 0 else dx if k == 1 else -dy if k == 2 else dy
@@ -258,7 +258,7 @@ def _most(lines):
     """Return an upper bound of the number of pixels crossed."""
     count = 0
     for n in range(len(lines)):
-        # A line enters a new pixel at most once for each column and row that it passes.
+        # A line enters a new pixel at most once for each column and row that it crosses.
         count += 4 + int(abs(lines[n, 3] - lines[n, 0]) + abs(lines[n, 4] - lines[n, 1]))
     return count
 
@@ -279,8 +279,7 @@ def _cross(lines, width, height, out, places):
     """Write the crossings of each line, in order along it, and each one's pixel, y * width + x. Return their number.
 
     A line is cut where it passes from pixel to pixel. The share is the area between the part and the square's boundary
-    as seen from the centre: the triangle that it makes with the centre, less the square's sector between the same
-    rays."""
+    as seen from the centre: the part's triangle with the centre, minus the square's sector between the same rays."""
     count = 0
     for n in range(len(lines)):
         ax, ay, dx, dy = lines[n, 0], lines[n, 1], lines[n, 3] - lines[n, 0], lines[n, 4] - lines[n, 1]
@@ -295,7 +294,7 @@ def _cross(lines, width, height, out, places):
             y -= 1
         step_x, step_y = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
         by_x, by_y = (1 / abs(dx) if dx != 0 else np.inf), (1 / abs(dy) if dy != 0 else np.inf)
-        # Amanatides and Woo: walk from pixel to pixel by whichever border comes first.
+        # Amanatides and Woo: walk from pixel to pixel across the nearer border.
         next_x = ((x + 1 - ax) if dx > 0 else (ax - x)) * by_x if dx != 0 else np.inf
         next_y = ((y + 1 - ay) if dy > 0 else (ay - y)) * by_y if dy != 0 else np.inf
         low = 0.0
@@ -306,12 +305,12 @@ def _cross(lines, width, height, out, places):
                 fx, fy = ax - (x + 0.5), ay - (y + 0.5)
                 px, py, qx, qy = fx + low * dx, fy + low * dy, fx + high * dx, fy + high * dy
                 room = -(lx * fx + ly * fy)
-                # The short way round, unless the centre lies on the other side of the line.
+                # The shorter way round, unless the centre lies on the other side of the line.
                 turn = _around(qx, qy) - _around(px, py)
                 turn -= 8.0 * np.rint(turn / 8.0)
                 if (room > 0.0) != (turn > 0.0) and abs(turn) > 2.0:
                     turn += 8.0 if room > 0.0 else -8.0
-                # Triangle with the centre, less the sector: 8 half sides are an area of 1.
+                # Triangle with the centre, minus the sector: 8 half sides are an area of 1.
                 out[count, 0] = 0.5 * (px * qy - py * qx) - 0.125 * turn
                 out[count, 1] = turn
                 out[count, 2], out[count, 3] = room, lines[n, 2] + 0.5 * (low + high) * gain
@@ -331,10 +330,8 @@ def _cross(lines, width, height, out, places):
 
 @kernel
 def _by_pixel(crossings, places, width, counts, pixels, out):
-    """Write the crossings to ``out``, those of a pixel together, and return the number of pixels. counts : zeros,
-    left so."""
-    # A counting sort. ``counts`` first holds numbers, then write positions, and is zero again at the
-    # end.
+    """Write the crossings to ``out``, grouped by pixel, and return the number of pixels. counts : zeros, left so."""
+    # A counting sort. ``counts`` first holds numbers, then write positions, and is zero again at the end.
     found = 0
     for n in range(len(crossings)):
         place = places[n]

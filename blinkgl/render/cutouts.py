@@ -1,5 +1,5 @@
-"""Some rectangles of a scene's picture, drawn as finely as one likes: a whole picture at 32 x 32 samples a pixel is out
-of reach, and a few thousand pixels in many places say as much about errors as all of them."""
+"""Rectangles of a scene's picture at any sampling density. A whole picture at 32 x 32 samples per pixel is too
+expensive, and a few thousand pixels in many places represent its errors."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ Self = TypeVar("Self", bound="Cutouts")
 def lattice(
     width: int, height: int, columns: int, rows: int, tile_width: int, tile_height: int
 ) -> tuple[Rectangle, ...]:
-    """``columns`` x ``rows`` rectangles spread evenly over an image; one of the whole image when they would touch."""
+    """Return ``columns`` x ``rows`` rectangles distributed evenly over an image; one of the whole image if they would
+    touch."""
     if columns * tile_width >= width or rows * tile_height >= height:
         return (Rectangle(0, 0, width, height),)
     xs = [round((i + 0.5) * width / columns - tile_width / 2) for i in range(columns)]
@@ -33,7 +34,7 @@ def lattice(
 
 
 def mask_of(tiles: tuple[Rectangle, ...], height: int, width: int) -> np.ndarray:
-    """(H, W) bool."""
+    """Return the pixels of the rectangles, (H, W) bool."""
     mask = np.zeros((height, width), bool)
     for r in tiles:
         mask[r.y0 : r.y1, r.x0 : r.x1] = True
@@ -41,8 +42,8 @@ def mask_of(tiles: tuple[Rectangle, ...], height: int, width: int) -> np.ndarray
 
 
 class Cutouts:
-    """Luminance of rectangles of a scene's picture, each pixel the mean of ``scale`` x ``scale`` samples on a regular
-    grid. A context manager; called with times it draws.   samples : how each sample is drawn."""
+    """Luminance of rectangles of a scene's picture; each pixel is the mean of ``scale`` x ``scale`` samples on a
+    regular grid. A context manager; it is called with times.   samples : settings of each sample."""
 
     def __init__(self, gl: GLContext, scene: Scene, tiles: tuple[Rectangle, ...], scale: int, samples: RenderConfig):
         self._tiles, self._scale = tiles, scale
@@ -58,7 +59,7 @@ class Cutouts:
         self._renderer.release()
 
     def __call__(self, times: Iterable[int]) -> Iterator[np.ndarray]:
-        """(H, W) float32 of every time, ns, linear light, zero outside the rectangles; the same array each time."""
+        """Yield (H, W) float32 linear light at each time, ns, zero outside the rectangles; the same array each time."""
         frame = np.zeros(self._shape, np.float32)
         for t_ns in times:
             for r, camera in zip(self._tiles, self._cameras):

@@ -1,4 +1,4 @@
-"""What of a scene is drawn: its parts in the order of their layers, and what of each makes another program."""
+"""The drawn parts of a scene in the order of their layers, and the properties that select their programs."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from blinkgl.scene.types import Light, Material, Mesh, Part, Scene, SceneObject
 
 
 class Kind(NamedTuple):
-    """What of a material, and of a shape that changes with time, makes another program. shape : macros of the
-    latter.   hued : whether its luminance takes three channels: where its colour and that of the light, or two colours
-    of its own, vary independently.   masked : it has holes.   more : of MORE, what it is to passes that are lit.
-    faceted : the corners of each of its faces have one normal; said where the light is not the plain one alone."""
+    """Properties of a material, and of a deforming shape, that select a program. shape : macros of the latter.   hued :
+    whether its luminance needs three channels: where its colour and that of the light, or two of its colours, vary
+    independently.
+    masked : it has holes.   more : of MORE, for lit passes.   faceted : the corners of each face have one normal; set
+    only where the light is not plain."""
 
     textured: bool
     lit: bool
@@ -32,13 +33,13 @@ class Kind(NamedTuple):
     faceted: bool = False
 
     def defines(self, lit: bool) -> dict[str, int]:
-        """Of its variants. lit : of a pass that is."""
+        """Return the defines of its variants. lit : for a lit pass."""
         plain = ("TEXTURED", self.textured), ("LIT", self.lit), ("TWO_SIDED", self.two_sided), ("MASKED", self.masked)
         return {name: 1 for name, on in plain if on} | dict(self.shape) | (dict.fromkeys(self.more, 1) if lit else {})
 
     @property
     def whole(self) -> bool:
-        """Whether light is not a factor on its albedo, or one that its own normal does not tell: it takes the general
+        """Return whether light is not just a factor on the albedo that the normal determines: it then uses the general
         light's programs."""
         return self.lit and (self.hued or "GLOSSY" in self.more or "BUMPED" in self.more)
 
@@ -47,7 +48,7 @@ MORE = ("TINTED", "EMISSIVE", "EMISSION_MAP", "GLOSSY", "GLOSS_MAP", "BUMPED")
 
 
 def more_of(material: Material, mesh: Mesh) -> tuple[str, ...]:
-    """Those of MORE that a part asks for."""
+    """Return those of MORE that a part needs."""
     lit = not material.unlit
     gloss, emissive = material.gloss if lit else None, lit and any(material.emission)
     on = (
@@ -62,7 +63,7 @@ def more_of(material: Material, mesh: Mesh) -> tuple[str, ...]:
 
 
 def shape_of(deformer: Deformer | None) -> tuple[tuple[str, int], ...]:
-    """The macros of a deformer's variants."""
+    """Return the macros of a deformer's variants."""
     if deformer is None:
         return ()
     return (
@@ -74,14 +75,14 @@ def shape_of(deformer: Deformer | None) -> tuple[tuple[str, int], ...]:
 
 
 def padded_rows(deformer: Deformer) -> int:
-    """Rows of numbers that its programs have room for: the next power of two, so that one program serves many
+    """Return the rows of parameters in its programs: the next power of two, so that one program serves many
     skeletons."""
     # At least 4 rows.
     return 1 << max(deformer.rows - 1, 3).bit_length()
 
 
 def box_corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """(8, 3) of the box between two of its corners, (3,) each."""
+    """Return the corners, (8, 3), of the box between two of its corners, (3,) each."""
     return np.array(list(itertools.product(*zip(low, high))))
 
 
@@ -89,15 +90,16 @@ def box_corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
 class DrawItem:
     """One part of one object, ready to draw.
 
-    object_index : row of a moment's matrices.   part : number of the part among those of the scene, object by object.
+    object_index : row of a moment's matrices.   part : number of the part in the scene, object by object.
     number : of this item among all, in the order of the layers.   moves : whether the object does.
-    centre, radius; low, high : bounding sphere and box, object frame; of a shape that changes those of all that it
-    sweeps.   corners : (8, 3) of the box.
+    centre, radius; low, high : bounding sphere and box, object frame; for a deforming shape they contain it at all
+    times.
+    corners : (8, 3) of the box.
     layer : 0 objects, 1 ground and walls, 2 sky; drawn in this order so that depth rejects hidden fragments early.
-    two_sided : no culling, and the normal is turned towards the camera.   hued, faceted : as of :class:`Kind`.
-    casts : whether it throws shadows: objects and walls do, unless they are unlit (screens, skies of files).
+    two_sided : no culling, and the normal is turned towards the camera.   hued, faceted : as in :class:`Kind`.
+    casts : whether it casts shadows: objects and walls do, unless they are unlit (screens, skies of files).
     facet_slope : tangent of the angle between its facets and the normals that smooth them.
-    extended : whether its material has more than a base colour: maps and numbers of its own to hand to programs.
+    extended : whether its material has more than a base colour: maps and numbers to pass to programs.
     """
 
     object_index: int
@@ -129,12 +131,12 @@ class DrawItem:
 
 
 MAX_RADIUS = 1e18
-"""Times the largest focal length, 1e9 px, still far below float32's 3e38."""
+"""Largest radius: times the largest focal length, 1e9 px, it is far below float32's 3e38."""
 _LAYER = {"object": 0, "ground": 1, "wall": 1, "sky": 2}
 
 
 class _Greys:
-    """Which materials take three channels of luminance; pictures are looked at where it matters, once each."""
+    """Finds the materials that need three channels of luminance; each picture is examined at most once."""
 
     def __init__(self, coloured_light: bool):
         self._coloured_light = coloured_light
@@ -160,13 +162,13 @@ class _Greys:
         coloured = pictured or tinted
         if gloss is None:
             return self._coloured_light and coloured
-        # What is mirrored has another colour than what is scattered.
+        # A reflection has another colour than scattered light.
         return (self._coloured_light or metal) and (coloured or len(set(material.base_color)) > 1)
 
 
 class _Facets:
-    """Which meshes have flat facets alone, and how far normals are from those of the facets that they smooth; each is
-    looked at once, and none where the light is plain."""
+    """Finds the meshes with only flat facets, and the angles between normals and the facets that they smooth; each is
+    examined once, and none where the light is plain."""
 
     def __init__(self, light: Light):
         self._asked, self._shadows = not light.plain, light.shadows != "off"
@@ -189,7 +191,7 @@ class _Facets:
     def flat(self, mesh: Mesh) -> bool:
         if not self._asked or mesh.deformer is not None:
             return False
-        # Normals of each face's corners against its first one's.
+        # Compares the normals of each face's corners with its first one's.
         if id(mesh) not in self._known:
             corners = mesh.normals[mesh.faces]
             self._known[id(mesh)] = bool((np.abs(corners[:, 1:] - corners[:, :1]) <= 1e-6).all())
@@ -203,10 +205,10 @@ def _draw_item(index: int, thing: SceneObject, part: Part, scene: Scene, grey: _
         centre = (low + high) / 2
         radius = float(np.sqrt(((mesh.vertices - centre) ** 2).sum(axis=1).max()))
     else:
-        # Of a shape that changes the box of all that it sweeps.
+        # The box of a deforming shape at all times.
         low, high = mesh.deformer.bounds(mesh, scene.t0_ns, scene.t1_ns)
         centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
-    # NaN too.
+    # Also refuses NaN.
     if not radius <= MAX_RADIUS:
         raise AssetError(
             "mesh is too large to be drawn in float32",
@@ -234,8 +236,7 @@ def _draw_item(index: int, thing: SceneObject, part: Part, scene: Scene, grey: _
 
 
 def draw_items(scene: Scene) -> list[DrawItem]:
-    """All parts of a scene. Parts are numbered object by object; items in the order of their layers, in which they are
-    drawn."""
+    """Return all drawn parts of a scene in the order of their layers. Parts are numbered object by object."""
     grey, facets = _Greys(is_coloured(scene.light)), _Facets(scene.light)
     items = [
         _draw_item(index, obj, part, scene, grey, facets)

@@ -1,4 +1,4 @@
-"""What the renderer counts."""
+"""Counters of the renderer."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass
 class RenderStats:
-    """Wall seconds since the renderer was made; triangles counts what was submitted after culling."""
+    """Wall seconds since the renderer was made; triangles submitted after culling."""
 
     frames: int = 0
     triangles: int = 0

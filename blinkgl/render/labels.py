@@ -1,5 +1,5 @@
-"""Ground truth of one time: what the label pass draws, finished by the rows of the labels, which may
-look at the buffers of other times."""
+"""Ground truth at one time: the buffers of the label pass, finished by the rows of the labels, which may read the
+buffers of other times."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from blinkgl.render.renderer import Renderer
 
 KEPT = 3
-"""Times whose buffers are kept for others: neighbouring labels look at the same moments."""
+"""Number of times whose buffers are kept: neighbouring labels use the same moments."""
 
 
 class Labels:
-    """Makes the label frames of one renderer. camera : of another picture at the same place; None: of the scene's."""
+    """Makes the label frames of one renderer. camera : of another picture at the same place; None: the scene's."""
 
     def __init__(self, renderer: Renderer, camera: PinHole | None = None):
         self._renderer, self._view = renderer, None if camera is None else View.of(camera)
@@ -36,7 +36,7 @@ class Labels:
         self._kept: dict[tuple[int, tuple[str, ...]], dict[str, np.ndarray]] = {}
 
     def frame(self, t_ns: int, request: LabelRequest, forward_ns: int | None, backward_ns: int | None) -> LabelFrame:
-        """See :meth:`Renderer.labels`."""
+        """Return the label frame; see :meth:`Renderer.labels`."""
         draw = self._renderer
         ends: dict[str, int] = {}
         for towards, end_ns in (("forward", forward_ns), ("backward", backward_ns)):
@@ -77,7 +77,7 @@ class Labels:
         return values[name]
 
     def shown_at(self, x: int, y: int, t_ns: int) -> str:
-        """See :meth:`Renderer.shown_at`."""
+        """Return the text of :meth:`Renderer.shown_at`."""
         number = int(self._buffers(t_ns, LabelRequest("ids").buffers)["ids"][y, x])
         names = [
             f"object '{o.name}' (id {number})"
@@ -96,12 +96,12 @@ class Labels:
         return draw.draw(pass_, self._moment(t_ns), {name: self._moment(t) for name, t in ends.items()})
 
     def _buffers(self, t_ns: int, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-        """Buffers of these labels at a time, as the shader wrote them."""
+        """Return buffers of these labels at a time, as the shader wrote them."""
         key = (t_ns, names)
         if key not in self._kept:
             frame = self._drawn(names, t_ns, {})
             self._kept[key] = {name: frame.read(name) for name in names}
-            # Neighbouring labels look at the same moments; the oldest goes first.
+            # Neighbouring labels use the same moments; the oldest is dropped first.
             while len(self._kept) > KEPT:
                 self._kept.pop(next(iter(self._kept)))
         return self._kept[key]
@@ -109,8 +109,8 @@ class Labels:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """All that was drawn of one time. drawn : buffers.   ends : where labels lead, ns, by ``towards``.
-    there : buffers at those times.   leading : frames of labels that lead over intervals, by those."""
+    """Everything drawn of one time. drawn : buffers.   ends : the other times of labels, ns, by ``towards``.
+    there : buffers at those times.   leading : frames of labels over intervals, by interval."""
 
     t_ns: int
     drawn: dict[str, np.ndarray]
@@ -121,7 +121,7 @@ class _Seen:
 
 
 class _Drawn:
-    """:class:`blinkgl.labels.label.Drawn`: what one label may look at."""
+    """The :class:`blinkgl.labels.label.Drawn` of one label: what it may read."""
 
     def __init__(self, label: Label, scene: Scene, seen: _Seen, value_of: Callable[[str], Any]):
         towards = label.towards or ""

@@ -1,14 +1,14 @@
-"""A lens's picture out of a flat one.
+"""The picture of a lens, made from a pinhole picture.
 
-A rasteriser draws what a pin-hole camera sees. For a lens that distorts the flat picture that holds all of its own
-(:func:`blinkgl.camera.drawing.seen_through`) is drawn, at 1.42 px a pixel or more, and each pixel of the lens's picture
-looks where its ray meets that:
+A rasteriser draws what a pinhole camera sees. For a lens with distortion, the pinhole picture that contains its whole
+view (:func:`blinkgl.camera.drawing.seen_through`) is drawn at a density of 1.42 or more, and each pixel of the lens's
+picture reads it where its ray meets it:
 
-- light is the mean over the pixel, by area, of the flat picture's pixels;
-- labels are not interpolated. Each pixel claims the one of the flat picture whose centre is nearest to its ray; no two
-  claim the same one. That fragment is evaluated where the ray passes it, not at its centre (``along_ray.glsl``), so a
-  label is of the surface that is seen at the flat pixel's centre, at most half a pixel of the lens's beside the
-  ray, and there exact.
+- light is the mean of the pinhole picture's pixels over the pixel, by area;
+- labels are not interpolated. Each pixel claims the pinhole pixel whose centre is nearest to its ray; no two claim the
+  same one. That fragment is evaluated where the ray passes, not at its centre (``along_ray.glsl``). So a label is of
+  the
+  surface at the pinhole pixel's centre, at most half a pixel of the lens's beside the ray, and exact there.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ if TYPE_CHECKING:
 
 
 class Places(NamedTuple):
-    """Where the pixels of a picture, of every n-th pixel of a lens's, are in the flat one.
+    """Positions of a lens's pixels (or every n-th) in the pinhole picture.
 
-    places : (h, w, 2) float32 px from the flat picture's corner (its first pixel is [0, 1)).
-    slopes : (h, w, 4) float32 d(place) / d(px), of a pixel to the right and of one downwards."""
+    places : (h, w, 2) float32 px from the pinhole picture's corner (its first pixel is [0, 1)).
+    slopes : (h, w, 4) float32 d(place) / d(px), for a pixel to the right and for one downwards."""
 
     places: np.ndarray
     slopes: np.ndarray
@@ -41,7 +41,7 @@ class Places(NamedTuple):
 
 @lru_cache(maxsize=16)
 def places_of(camera: CameraModel, flat: PinHole, width: int, height: int) -> Places:
-    """Of a picture of the whole of ``camera``'s, width x height px."""
+    """Return the places of a picture of ``camera``'s whole view, width x height px."""
     fine = camera if (width, height) == (camera.width, camera.height) else camera.resized(width, height)
     x, y = np.meshgrid(np.arange(float(width)), np.arange(float(height)))
     xy = np.stack([x, y], axis=-1)
@@ -53,25 +53,25 @@ def places_of(camera: CameraModel, flat: PinHole, width: int, height: int) -> Pl
 
 @lru_cache(maxsize=8)
 def claims_of(camera: CameraModel, flat: PinHole) -> np.ndarray:
-    """(h, w, 2) float32 of the flat picture: px from each pixel's centre to the ray of the pixel that claims it; 9
-    where none does."""
+    """Return (h, w, 2) float32 of the pinhole picture: px from each pixel's centre to the ray of the pixel that claims
+    it; 9 where none does."""
     places = places_of(camera, flat, camera.width, camera.height).places
     claims = np.full((flat.height, flat.width, 2), 9, np.float32)
-    # The one pixel of the lens that looks through this one of the flat picture claims it; 9 is nobody's.
+    # Only the lens's pixel nearest to this pinhole pixel claims it; 9 means none.
     nearest = np.floor(places).astype(np.intp)
     claims[nearest[..., 1], nearest[..., 0]] = places - (nearest + np.float32(0.5))
     return claims
 
 
 _SPARED = 0.4
-"""px of the flat picture: places are at most 1 + this over their number apart."""
+"""px of the pinhole picture: places are at most 1 + this divided by their number apart."""
 _MOST = 16
 
 
 @lru_cache(maxsize=32)
 def steps_of(camera: CameraModel, finer: int) -> tuple[int, int]:
-    """Places in a pixel, along x and y, between which a flat picture that is so many times finer has one pixel or a
-    little more, wherever in the picture."""
+    """Return the number of places per pixel, along x and y, so that between two of them lies about one pixel of a
+    pinhole picture ``finer`` times as fine, everywhere in the picture."""
     seen, size = seen_through(camera), (camera.width, camera.height)
     slopes = places_of(camera, seen, *size).slopes  # type: ignore[bad-argument-type]
     lengths = np.hypot(slopes[..., ::2], slopes[..., 1::2]).max(axis=(0, 1)) * finer
@@ -80,9 +80,9 @@ def steps_of(camera: CameraModel, finer: int) -> tuple[int, int]:
 
 
 class Lens:
-    """Of one renderer: the textures that its passes look at.
+    """The textures of one renderer's lens passes.
 
-    camera : the lens's.   flat : the pin-hole camera that is drawn."""
+    camera : the lens's.   flat : the pinhole camera that is drawn."""
 
     def __init__(self, gl: GLContext, camera: CameraModel, flat: PinHole):
         self.camera, self.flat, self._gl = camera, flat, gl
@@ -90,12 +90,12 @@ class Lens:
 
     @classmethod
     def of(cls, gl: GLContext, camera: CameraModel) -> Lens | None:
-        """None for a pin-hole camera."""
+        """Return the lens of a camera; None for a pinhole camera."""
         flat = seen_through(camera)
         return None if flat is camera else cls(gl, camera, flat)
 
     def places(self, width: int, height: int) -> moderngl.Texture:
-        """Of a picture of this size."""
+        """Return the texture of places for a picture of this size."""
         return self._texture(("places", width, height), lambda: places_of(self.camera, self.flat, width, height).places)
 
     def slopes(self, width: int, height: int) -> moderngl.Texture:
@@ -119,7 +119,7 @@ class Lens:
         return (*self.camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
 
     def set(self, uniforms: Uniforms, shot: Shot, unit: int) -> None:
-        """What lens.glsl and along_ray.glsl take. unit : a free texture unit."""
+        """Set the uniforms of lens.glsl and along_ray.glsl. unit : a free texture unit."""
         if "lens_claims" in uniforms:
             self.claims.use(unit)
             uniforms["lens_claims"].value = unit

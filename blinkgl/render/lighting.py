@@ -1,7 +1,7 @@
-"""The light of a scene as the programs have it: which variants they are compiled in, and the numbers of each object.
+"""The light of a scene for the programs: their variants, and the numbers of each object.
 
-A scene whose light is the plain white sun and sky needs none of this, with shadows or without: its programs are those
-of shaders/include/light.glsl without LIGHTS, and :meth:`Painter.place` sets their three uniforms.
+A scene with only the plain white sun and sky, with or without shadows, needs none of this: its programs use
+shaders/include/light.glsl without LIGHTS, and :meth:`Painter.place` sets their three uniforms.
 """
 
 from __future__ import annotations
@@ -32,9 +32,8 @@ EXAMPLES: tuple[dict[str, Any], ...] = (
         "SHADOWS": 2, "SHADOW_SUNS": 1, "SHADOW_SPOTS": 1, "SOFT": 1,
     },
 )  # fmt: skip
-"""Variants for which a program of a pass that is lit has to compile, besides the plain light's; HUED comes on top."""
-# By uniform, whether it has a value per channel: one of HUED's three, or the one that stands for them;
-# of arrays how many.
+"""Variants in which the program of a lit pass must compile, besides the plain light's; each also with HUED."""
+# By uniform, whether it has a value per channel: HUED's three, or one that represents them; for arrays, how many.
 _FIXED = {"sun_strength": True, "lamp_strength": True, "lamp_fading": False, "spot_cone": False}
 _PLACED = {
     **dict.fromkeys(("sun_towards", "lamp_place", "spot_axis"), 0),
@@ -45,8 +44,8 @@ _NAMES = frozenset((*_FIXED, *_PLACED, *(f"{name}_rate" for name in _PLACED)))
 
 
 class Lighting:
-    """Of one scene. lamps : in the order of the shaders' arrays.   coloured : whether any of it is not white.
-    plain : whether a white sun and sky are all of it, but for shadows."""
+    """The light of one scene. lamps : in the order of the shaders' arrays.   coloured : whether any is not white.
+    plain : whether it is only a white sun and sky, apart from shadows."""
 
     def __init__(self, light: Light):
         self.plain, self.coloured, self.lamps = replace(light, shadows="off").plain, is_coloured(light), lamps_of(light)
@@ -54,7 +53,7 @@ class Lighting:
         self._spots = sum(lamp.kind == "spot" for lamp in self.lamps)
         self._quadric, self._quartic = quadric_of(light), quartic_of(light)
         if self._quartic is not None:
-            # n is a unit vector: what is quadratic in it is quartic, too, and the shader has one form.
+            # n is a unit vector, so a quadratic form in it is also quartic, and the shader has one form.
             second, one = self._quadric[:, :3, :3].reshape(3, 9, 1), np.eye(3).reshape(1, 9)
             self._quartic = self._quartic + 0.5 * (second @ one + (second @ one).swapaxes(1, 2))
         near = self.lamps[self._suns :]
@@ -62,16 +61,16 @@ class Lighting:
         self._fixed = {
             "sun_strength": strength[: self._suns].T,  # channels first
             "lamp_strength": strength[self._suns :].T,
-            "lamp_fading": np.array([lamp.reach**-4.0 for lamp in near]),  # of inf: 0
+            "lamp_fading": np.array([lamp.reach**-4.0 for lamp in near]),  # 0 for an infinite reach
             "spot_cone": np.array([lamp.cone for lamp in near if lamp.kind == "spot"]),
         }
         self._weights: dict[tuple[float, ...], np.ndarray] = {}
-        self._bytes: dict[tuple, bytes] = {}  # of what is fixed, by uniform and by what its one channel stands for
+        self._bytes: dict[tuple, bytes] = {}  # constant values, by uniform and by the channel that one value represents
         self._last: tuple[Moment | None, bool, dict[str, np.ndarray]] = None, False, {}
 
     def defines(self, pass_: Pass, kind: Kind) -> dict[str, Any]:
-        """Of the variant that a pass is drawn in. HUED: light of three channels, where one does not do: for pictures in
-        colour, and for the luminance of what is of several colours itself."""
+        """Return the defines of a pass's variant. HUED: light of three channels, where one is not enough: for colour
+        pictures, and for the luminance of surfaces with several colours."""
         hued = {"HUED": 1} if kind.hued and pass_.one_channel else {}
         if not (kind.lit and pass_.lit):
             return hued if pass_.lit else {}
@@ -96,7 +95,7 @@ class Lighting:
         return {name: n for name, n in counts.items() if n} | ({"SOFT": 1} if any(one.soft for one in maps) else {})
 
     def place(self, uniforms: Uniforms, item: DrawItem, moment: Moment) -> None:
-        """Sets what lights.glsl asks for, of whichever variant the program is."""
+        """Set the uniforms of lights.glsl that the program has."""
         if "sun_direction" in uniforms or _NAMES.isdisjoint(uniforms):
             return
         index, channel = item.object_index, item.material.base_color
@@ -120,7 +119,7 @@ class Lighting:
                     uniform.write(values.tobytes())
 
     def channel(self, base: tuple[float, ...]) -> np.ndarray:
-        """(3,) what one channel stands for: the shares of r, g, b in the luminance of what is of this base colour."""
+        """Return (3,) the shares of r, g, b in the luminance of this base colour, which one channel represents."""
         if base not in self._weights:
             shares = LUMA * np.asarray(base, np.float64)
             total = shares.sum()
@@ -128,7 +127,7 @@ class Lighting:
         return self._weights[base]
 
     def _placed(self, moment: Moment, rates: bool) -> dict[str, np.ndarray]:
-        """By uniform, (objects, ...) float32 in the objects' axes; those of the last moment are kept."""
+        """Return, by uniform, (objects, ...) float32 in the objects' axes; those of the last moment are kept."""
         if self._last[0] is moment and self._last[1] >= rates:
             return self._last[2]
         R, t = moment.T_world_obj[:, :3, :3], moment.T_world_obj[:, :3, 3]
@@ -164,8 +163,8 @@ class Lighting:
 
 
 def _seen_turned(form: np.ndarray, turn: np.ndarray, rate: np.ndarray | None = None) -> np.ndarray:
-    """(N, 3, n, n): symmetric forms (3, n, n) of what (N, n, n) makes of another's arguments; or how they change, where
-    that changes by ``rate`` per second."""
+    """Return (N, 3, n, n): symmetric forms (3, n, n) with their arguments transformed by (N, n, n); or their rate of
+    change, where the transform changes by ``rate`` per second."""
     if rate is None:
         return turn[:, None].swapaxes(2, 3) @ form @ turn[:, None]
     half = turn[:, None].swapaxes(2, 3) @ form @ rate[:, None]
@@ -173,27 +172,28 @@ def _seen_turned(form: np.ndarray, turn: np.ndarray, rate: np.ndarray | None = N
 
 
 def _kron(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(N, 9, 9) of (N, 3, 3) each: what turns the nine products of two coordinates."""
+    """Return (N, 9, 9), the Kronecker products of (N, 3, 3) each: they transform the nine products of two
+    coordinates."""
     return np.einsum("nij,nkl->nikjl", a, b).reshape(-1, 9, 9)
 
 
-# Of lights.glsl: x^4 x²y² x³y xy³ x²yz, each with what follows when x, y, z become y, z, x.
+# Monomials of lights.glsl: x^4 x²y² x³y xy³ x²yz, each followed by its cyclic permutations of x, y, z.
 _MONOMIALS = tuple(
     tuple(sorted((axis + k) % 3 for axis in one))
     for one in ((0, 0, 0, 0), (0, 0, 1, 1), (0, 0, 0, 1), (0, 1, 1, 1), (0, 0, 1, 2))
     for k in range(3)
 )
-_MONOMIAL_OF = np.zeros((81, len(_MONOMIALS)))  # of each of a quartic's numbers
+_MONOMIAL_OF = np.zeros((81, len(_MONOMIALS)))  # index of the monomial of each of a quartic's numbers
 _MONOMIAL_OF[np.arange(81), [_MONOMIALS.index(tuple(sorted(one))) for one in np.ndindex(3, 3, 3, 3)]] = 1.0
 
 
 def _fourth(quartic: np.ndarray) -> np.ndarray:
-    """(..., 3, 9, 9) quartics as the shader has them, (..., 3, 15)."""
+    """Return (..., 3, 9, 9) quartics in the shader's form, (..., 3, 15)."""
     return quartic.reshape(*quartic.shape[:-2], 81) @ _MONOMIAL_OF
 
 
 def _forms(quadric: np.ndarray) -> dict[str, np.ndarray]:
-    """(..., 3, 4, 4) quadrics as the shader has them, (..., 3, 4 or 3)."""
+    """Return (..., 3, 4, 4) quadrics in the shader's form, (..., 3, 4 or 3)."""
     Q = quadric
     even = np.concatenate([2 * Q[..., :3, 3], Q[..., 3, 3:]], axis=-1)
     mixed = 2 * np.stack([Q[..., 0, 1], Q[..., 1, 2], Q[..., 2, 0]], axis=-1)  # of xy, yz, zx

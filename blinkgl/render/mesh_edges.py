@@ -1,4 +1,4 @@
-"""The edges of an object's meshes, made once: which faces meet at each, and whether light is expected to jump there."""
+"""The edges of an object's meshes, made once: the faces that meet at each, and whether the light may jump there."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ if TYPE_CHECKING:
     from blinkgl.scene.types import Mesh
 
 CREASE = np.cos(np.radians(20.0))
-"""Of the angle between the normals of two faces where they meet, above which light is expected to jump."""
+"""Cosine of the angle between the normals of two faces above which the light may jump."""
 WELD = 2e-3
-"""Of an object's size: up to this far apart borders of two of its parts are one. Files that were compressed part by
-part (Draco) have such cracks."""
+"""As a fraction of an object's size: up to this distance the borders of two of its parts are joined. Files whose parts
+were compressed separately (Draco) have such cracks."""
 NEIGHBOURS = 8
-"""Border places that are looked at round one: more parts do not meet in a corner."""
+"""Number of border places examined around one: at most this many parts meet in a corner."""
 BENT, TORN = 1, 2
-"""Kinds of edges between two faces that are both seen: creases; seams."""
+"""Kinds of edges between two faces that are both visible: creases; seams."""
 
 
 class Contour:
-    """The edges of one object. Vertices at the same place are one, those of two parts, too: where parts meet is no
-    border.
+    """The edges of one object. Vertices at the same place are joined, also those of two parts, so there is no border
+    where parts meet.
 
-    corners : (V,) int64 where in the parts' vertices, one part behind the other, each place is.
-    rest : (V, 3) float64 of the shape that does not deform.   faces : (F, 3) int32 places.
+    corners : (V,) int64 index of each place in the parts' vertices, one part after the other.
+    rest : (V, 3) float64 of the undeformed shape.   faces : (F, 3) int32 places.
     edges : (E, 4) int32: two places in the order of the first face, the first face, the second or -1.
     sharp : (E,) int8: :data:`BENT` where its faces meet at an angle or are of two parts, else :data:`TORN` where they
-    meet in space and not in the texture, else 0.   culled : (F,) bool: faces that are drawn from one side alone.
+    meet in space and not in the texture, else 0.   culled : (F,) bool: faces that are drawn only from one side.
     planes : (F, 4) float64 of the rest shape: normal, any length, and its product with a point of the face."""
 
     def __init__(self, parts: Sequence[tuple[Mesh, bool]]):
-        """parts : meshes, and whether both sides of their faces are drawn."""
+        """Find the edges. parts : meshes, and whether both sides of their faces are drawn."""
         self.meshes = [mesh for mesh, _ in parts]
         self.deforms = any(mesh.deformer is not None for mesh in self.meshes)
         vertices = np.concatenate([np.asarray(mesh.vertices, np.float64) for mesh in self.meshes])
@@ -60,16 +60,17 @@ class Contour:
         self.sharp = self._sharp(np.concatenate(corner_of), np.repeat(np.arange(len(places)), np.diff(counts)))
 
     def positions(self, t_ns: int) -> np.ndarray:
-        """(V, 3) float64 places at a time."""
+        """Return the places at a time, (V, 3) float64."""
         moved = [
             mesh.vertices if mesh.deformer is None else mesh.deformer.positions(mesh, t_ns) for mesh in self.meshes
         ]
         return np.concatenate(moved)[self.corners]
 
     def _sharp(self, corner_of: np.ndarray, part: np.ndarray) -> np.ndarray:
-        """(E,) int8. Bent: its two faces have other normals at both of its ends; a surface that is bent there and lit
-        as if it were round shows no step. Torn: other texture coordinates, and not only by whole turns of the
-        texture. corner_of : (F, 3) vertices of the faces; part : (F,) their parts."""
+        """Return the kind of each edge, (E,) int8. Bent: its two faces have different normals at both of its ends; a
+        bent surface with smoothed normals shows no step. Torn: different texture coordinates, other than by whole
+        repeats of the texture.
+        corner_of : (F, 3) vertices of the faces; part : (F,) their parts."""
         normals, uvs = (np.concatenate([getattr(m, name) for m in self.meshes]) for name in ("normals", "uvs"))
         first, second = self.edges[:, 2], self.edges[:, 3]
         bent, torn = second >= 0, second >= 0
@@ -81,10 +82,10 @@ class Contour:
                 for face in (first, second)
             )
             bent &= (normals[one] * normals[other]).sum(axis=1) < CREASE
-            # Whole turns of the texture are no seam.
+            # Whole repeats of the texture are no seam.
             apart = uvs[one] - uvs[other]
             torn &= np.abs(apart - np.round(apart)).max(axis=1) > 1e-5
-        bent |= (second >= 0) & (part[first] != part[second])  # parts have materials of their own
+        bent |= (second >= 0) & (part[first] != part[second])  # parts have different materials
         return np.where(bent, BENT, np.where(torn, TORN, 0)).astype(np.int8)
 
 
@@ -103,7 +104,7 @@ def _edges(faces: np.ndarray, places: int) -> np.ndarray:
     order = np.argsort(key, kind="stable")
     key, ends, face = key[order], ends[order], face[order]
     first = np.flatnonzero(np.r_[True, key[1:] != key[:-1]]) if len(key) else np.zeros(0, np.int64)
-    # Which one it is of its edge's sides: 0 the first, 1 the second.
+    # Index among its edge's sides: 0 the first, 1 the second.
     rank = np.arange(len(key)) - np.repeat(first, np.diff(np.r_[first, len(key)]))
     lead = np.flatnonzero(rank != 1)
     second = np.full(len(lead), -1)
@@ -114,16 +115,16 @@ def _edges(faces: np.ndarray, places: int) -> np.ndarray:
 
 
 def _welded(places: np.ndarray, borders: Sequence[np.ndarray]) -> np.ndarray:
-    """Return (V,) int32: for each place the one that stands for it. Places on the borders of two parts are one where
+    """Return (V,) int32: for each place the one that replaces it. Places on the borders of two parts are joined where
     each is the other's nearest, up to :data:`WELD`. borders : places on each part's borders."""
-    from scipy.spatial import KDTree  # objects of one part need no SciPy here
+    from scipy.spatial import KDTree  # objects of one part do not need SciPy
 
     result = np.arange(len(places), dtype=np.int32)
     at, part = np.concatenate(borders), np.repeat(np.arange(len(borders)), [len(border) for border in borders])
     if not len(at):
         return result
     reach = WELD * float(np.ptp(places, axis=0).max())
-    # One search for all parts; of the few that are so near, the nearest of each other part.
+    # One search for all parts; among the few nearest, the nearest of each other part.
     off, near = KDTree(places[at]).query(places[at], k=min(NEIGHBOURS, len(at)), distance_upper_bound=reach)
     off, near = off.reshape(len(at), -1), near.reshape(len(at), -1)
     mine, column = np.nonzero(np.isfinite(off))
@@ -147,7 +148,7 @@ def _joined(edges: np.ndarray, places: int) -> np.ndarray:
     key = ends.min(axis=1) * places + ends.max(axis=1)
     order = np.argsort(key, kind="stable")
     border, ends, key = border[order], ends[order], key[order]
-    # Of exactly two; more are surfaces that lie on each other.
+    # Only for exactly two; more are surfaces that lie on each other.
     begins = np.r_[True, key[1:] != key[:-1]] if len(key) else np.zeros(0, np.bool_)
     alone = np.diff(np.r_[np.flatnonzero(begins), len(key)]) == 2
     first = np.flatnonzero(begins)[alone]

@@ -1,5 +1,5 @@
-"""One instant of a scene as a camera sees it: poses, matrices, rates, what is in view.
-Computed once, shared by all passes.
+"""One instant of a scene as a camera sees it: poses, matrices, rates, visible items. Computed once, shared by all
+passes.
 
     moments = Moments(scene, resources.items)
     moment = moments.at(t_ns)
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
 # ---------------------------------------------------------------------------------------------------------------------
 # The only place where poses become clip-space matrices: float64, camera-relative, cast to float32 once.
 #
-# Clip space: x right, y DOWN, w = Z along the optical axis, reversed-Z with the far plane at infinity (depth = near
-# / Z in [0, 1], 1 at the near plane). Because y points down in clip space already, row 0 of every image is the top
-# row and ``gl_FragCoord.xy - 0.5`` is the user's pixel: no image is ever flipped. The matrix from camera axes to it
-# is the camera model's (:meth:`blinkgl.camera.CameraModel.clip_from_cam`).
+# Clip space: x right, y DOWN, w = Z along the optical axis, reversed-Z with the far plane at infinity (depth = near / Z
+# in [0, 1], 1 at the near plane). Because y points down in clip space, row 0 of every image is the top row and
+# ``gl_FragCoord.xy - 0.5`` is the user's pixel: no image is ever flipped. The camera model gives the matrix from camera
+# axes (:meth:`blinkgl.camera.CameraModel.clip_from_cam`).
 
 
 def cam_from_obj(T_world_cam: np.ndarray, T_world_obj: np.ndarray) -> np.ndarray:
-    """(..., 4, 4) float64 T_cam_obj. The translations are subtracted before they are rotated, so that a scene
-    far from the origin loses no more than the rounding of its own coordinates."""
+    """Return T_cam_obj, (..., 4, 4) float64. The translations are subtracted before they are rotated, so that a scene
+    far from the origin loses only the rounding of its own coordinates."""
     R_t = np.swapaxes(T_world_cam[..., :3, :3], -1, -2)
     rotation = R_t @ T_world_obj[..., :3, :3]
     out = np.zeros((*rotation.shape[:-2], 4, 4))
@@ -46,7 +46,7 @@ def cam_from_obj(T_world_cam: np.ndarray, T_world_obj: np.ndarray) -> np.ndarray
 def cam_from_obj_rate(
     T_world_cam: np.ndarray, dT_world_cam: np.ndarray, T_world_obj: np.ndarray, dT_world_obj: np.ndarray
 ) -> np.ndarray:
-    """(..., 4, 4) float64 d(T_cam_obj)/dt, 1/s, by the product rule on :func:`cam_from_obj`."""
+    """Return d(T_cam_obj)/dt, (..., 4, 4) float64, 1/s, by the product rule on :func:`cam_from_obj`."""
     R_t = np.swapaxes(T_world_cam[..., :3, :3], -1, -2)
     dR_t = np.swapaxes(dT_world_cam[..., :3, :3], -1, -2)
     offset = T_world_obj[..., :3, 3:] - T_world_cam[..., :3, 3:]
@@ -58,28 +58,29 @@ def cam_from_obj_rate(
 
 
 def mat4_bytes(matrices: np.ndarray) -> bytes:
-    """GLSL mat4 (column-major float32) of one (4, 4) float64 matrix."""
+    """Return the GLSL mat4 (column-major float32) of one (4, 4) float64 matrix."""
     return np.ascontiguousarray(matrices.T, dtype=np.float32).tobytes()
 
 
 def rows_xyw_bytes(matrix: np.ndarray) -> bytes:
-    """GLSL mat4x3 (4 columns of 3) with the x, y, w rows of a (4, 4) clip-space matrix."""
+    """Return the GLSL mat4x3 (4 columns of 3) with the x, y, w rows of a (4, 4) clip-space matrix."""
     return np.ascontiguousarray(matrix[[0, 1, 3]].T, dtype=np.float32).tobytes()
 
 
 def linear_xyw_bytes(matrix: np.ndarray) -> bytes:
-    """GLSL mat3 with the x, y, w rows of the linear part of a (4, 4) clip-space matrix: of differences of positions."""
+    """Return the GLSL mat3 with the x, y, w rows of the linear part of a (4, 4) clip-space matrix, for differences of
+    positions."""
     return np.ascontiguousarray(matrix[[0, 1, 3], :3].T, dtype=np.float32).tobytes()
 
 
 DEPTH_ROOM = 2.0
-"""A fragment may lie a fraction of a pixel outside of its triangle, and outside of the
-part's depths by the slope there."""
+"""Margin of depth: a fragment may lie a fraction of a pixel outside its triangle, so outside the part's depths by the
+slope there."""
 
 
 def inverse_depth_bits(centre_z: np.ndarray, radius: np.ndarray, near: float) -> np.ndarray:
-    """(n, 2) uint32 of bounding spheres, ``inverse_depths`` of guard.glsl: the smallest 1/Z that a fragment can have,
-    as the bits of a float32, and the largest's less those. centre_z, radius : (n,) float64."""
+    """Return (n, 2) uint32 for bounding spheres, ``inverse_depths`` of guard.glsl: the smallest 1/Z of a fragment as
+    the bits of a float32, and the largest minus it. centre_z, radius : (n,) float64."""
     farthest, nearest = np.maximum(centre_z + radius, near), np.maximum(centre_z - radius, near)
     inverse = np.empty((len(centre_z), 2), np.float32)
     inverse[:, 0], inverse[:, 1] = 1 / (DEPTH_ROOM * farthest), DEPTH_ROOM / nearest
@@ -90,12 +91,12 @@ def inverse_depth_bits(centre_z: np.ndarray, radius: np.ndarray, near: float) ->
 
 _TEXTURE_FROM_CLIP = np.array([[0.5, 0, 0, 0.5], [0, 0.5, 0, 0.5], [0, 0, 1, 0], [0, 0, 0, 1.0]])
 KEPT = 4
-"""Moments in memory: a label looks at its own time and at those of its neighbours, which look at it."""
+"""Moments in memory: a label uses its own time and those of its neighbours, which use it, too."""
 
 
 class View(NamedTuple):
-    """What drawing needs of a camera. projection : (4, 4) float64 clip_from_cam.   frustum : (5, 3)
-    inward unit normals, camera axes.   camera : a camera model, or what is asked of one here (that of a shadow map)."""
+    """The camera data that drawing needs. projection : (4, 4) float64 clip_from_cam.   frustum : (5, 3) inward unit
+    normals, camera axes.   camera : a camera model, or an object with the methods used here (that of a shadow map)."""
 
     camera: Any
     projection: np.ndarray
@@ -107,15 +108,16 @@ class View(NamedTuple):
 
 
 class Rates(NamedTuple):
-    """(n, 4, 4) float64 per object, 1/s: d(MVP)/dt and d(T_world_obj)/dt, from the analytic
-    derivatives of the paths."""
+    """Rates per object, (n, 4, 4) float64, 1/s: d(MVP)/dt and d(T_world_obj)/dt, from the analytic derivatives of the
+    paths."""
 
     mvp: np.ndarray
     T_world_obj: np.ndarray
 
 
 class _once:
-    """``functools.cached_property`` without the lock that it takes up to Python 3.11, twice the price of a look-up."""
+    """``functools.cached_property`` without the lock that it has up to Python 3.11, which doubles the cost of a
+    lookup."""
 
     def __init__(self, compute: Callable[[Any], Any]):
         self.compute, self.__doc__ = compute, compute.__doc__
@@ -131,10 +133,10 @@ class _once:
 
 
 class Moment:
-    """All objects of a scene at t_ns. What nobody asks for is not computed; what somebody did is not computed again.
+    """All objects of a scene at t_ns. Values are computed when they are first used, and only once.
 
     T_world_cam : (4, 4) float64.   T_world_obj, T_cam_obj : (n, 4, 4) float64, a row per object of the scene.
-    view : :class:`View` of the camera.   Arrays per item have a row per part that is drawn, ``DrawItem.number``."""
+    view : :class:`View` of the camera.   Arrays per item have a row per drawn part, ``DrawItem.number``."""
 
     def __init__(self, t_ns: int, view: View, T_world_cam: np.ndarray, T_world_obj: np.ndarray, stage: Stage):
         self.t_ns, self.view, self.T_world_cam, self.T_world_obj, self._stage = (
@@ -146,21 +148,21 @@ class Moment:
         )
 
     def through(self, view: View) -> Moment:
-        """The same instant through another camera at the same place."""
+        """Return the same instant through another camera at the same place."""
         other = Moment(self.t_ns, view, self.T_world_cam, self.T_world_obj, self._stage)
         other.__dict__.update({name: self.__dict__[name] for name in _OF_THE_PLACE if name in self.__dict__})
         return other
 
     def from_place(self, view: View, T_world_cam: np.ndarray, dT_world_cam: np.ndarray | None = None) -> Moment:
-        """The same instant through a camera elsewhere, such as a lamp that casts shadows;
-        dT_world_cam : (4, 4) 1/s, None: it stands still."""
+        """Return the same instant through a camera elsewhere, such as a lamp that casts shadows; dT_world_cam : (4, 4)
+        1/s, None: it stands still."""
         other = Moment(self.t_ns, view, T_world_cam, self.T_world_obj, self._stage)
         other.__dict__["dT_world_cam"] = np.zeros((4, 4)) if dT_world_cam is None else dT_world_cam
         return other
 
     @_once
     def dT_world_cam(self) -> np.ndarray:
-        """(4, 4) float64 d(T_world_cam)/dt, 1/s."""
+        """Return d(T_world_cam)/dt, (4, 4) float64, 1/s."""
         return self._stage.camera_path.derivative(self.t_ns)
 
     @_once
@@ -169,18 +171,18 @@ class Moment:
 
     @_once
     def mvp(self) -> np.ndarray:
-        """(n, 4, 4) float64 clip_from_obj."""
+        """Return clip_from_obj, (n, 4, 4) float64."""
         return self.view.projection @ self.T_cam_obj
 
     @_once
     def mvp_columns(self) -> np.ndarray:
-        """(n, 4, 4) float32 the same as GLSL has it, column by column."""
+        """Return :attr:`mvp` as GLSL stores it, column by column, (n, 4, 4) float32."""
         return np.ascontiguousarray(self.mvp.swapaxes(1, 2), np.float32)
 
     @_once
     def texture_from_obj(self) -> np.ndarray:
-        """(n, 4, 4) float32, row by row, from the object's axes to coordinates and depth in a picture of this moment
-        that is a texture, [0, 1] each, times w."""
+        """Return (n, 4, 4) float32, row by row: from the object's axes to coordinates and depth, each in [0, 1] times
+        w, of a texture that holds a picture of this moment."""
         return np.ascontiguousarray(_TEXTURE_FROM_CLIP @ self.mvp, np.float32)
 
     @_once
@@ -191,20 +193,21 @@ class Moment:
 
     @_once
     def centres(self) -> np.ndarray:
-        """(m, 3) float64 centres of the items' bounding spheres, camera axes."""
+        """Return the centres of the items' bounding spheres, camera axes, (m, 3) float64."""
         T = self.T_cam_obj[self._stage.item_object]
         return (T[:, :3, :3] @ self._stage.item_centre[..., None])[..., 0] + T[:, :3, 3]
 
     @_once
     def inverse_depths(self) -> np.ndarray:
-        """(m, 2) uint32: ``inverse_depths`` of guard.glsl, a uvec2 per item."""
+        """Return ``inverse_depths`` of guard.glsl, (m, 2) uint32, a uvec2 per item."""
         if self.view.projection[3, 3]:  # parallel rays: w is 1 everywhere
             return np.tile(inverse_depth_bits(np.ones(1), np.zeros(1), 1.0), (len(self._stage.items), 1))
         return inverse_depth_bits(self.centres[:, 2], self._stage.item_radius, self.view.camera.near)
 
     @_once
     def visible(self) -> list[DrawItem]:
-        """Items whose bounding sphere meets the view frustum: objects front to back, then ground, then sky."""
+        """Return the items whose bounding sphere meets the view frustum: objects front to back, then ground, then
+        sky."""
         stage = self._stage
         if not stage.items:
             return []
@@ -214,7 +217,7 @@ class Moment:
         return [stage.items[i] for i in order if inside[i]]
 
     def parts_of(self, object_index: int) -> list[DrawItem]:
-        """Return all items of one object, in view or not."""
+        """Return all items of one object, visible or not."""
         return self._stage.parts[object_index]
 
 
@@ -222,7 +225,7 @@ _OF_THE_PLACE = ("T_cam_obj", "dT_world_cam", "centres")
 
 
 class Stage:
-    """What of a scene is the same at all times, as arrays: paths of its objects, bounding spheres of its items."""
+    """The constant parts of a scene as arrays: paths of its objects, bounding spheres of its items."""
 
     def __init__(self, scene: Scene, items: Sequence[DrawItem], bodies: Bodies):
         self.items, self.bodies = items, bodies
@@ -237,7 +240,7 @@ class Stage:
 
 
 class Bodies:
-    """Where the objects of a scene are, whoever looks; the last few times are kept."""
+    """Poses of a scene's objects, shared by all cameras; the last few times are kept."""
 
     def __init__(self, scene: Scene):
         self.paths: list[PosePath] = [o.path for o in scene.objects]
@@ -247,11 +250,11 @@ class Bodies:
         self._rates: OrderedDict[int, np.ndarray] = OrderedDict()
 
     def poses(self, t_ns: int) -> np.ndarray:
-        """(n, 4, 4) float64 T_world_obj."""
+        """Return T_world_obj, (n, 4, 4) float64."""
         return self._kept(self._poses, t_ns, self._start, lambda path: path.pose(t_ns))
 
     def rates(self, t_ns: int) -> np.ndarray:
-        """(n, 4, 4) float64 d(T_world_obj)/dt, 1/s."""
+        """Return d(T_world_obj)/dt, (n, 4, 4) float64, 1/s."""
         return self._kept(self._rates, t_ns, np.zeros_like(self._start), lambda path: path.derivative(t_ns))
 
     def _kept(
@@ -268,10 +271,10 @@ class Bodies:
 
 
 class Moments:
-    """Gives the moments of a scene; the last few are kept. ``stage``: :class:`Stage`. Of a lens that distorts they are
-    those of the pin-hole camera that is drawn for it.
+    """Returns the moments of a scene and keeps the last few. ``stage``: :class:`Stage`. For a lens with distortion they
+    are those of the pinhole camera that is drawn for it.
 
-    bodies : of the same scene, that another camera looks at; None: its own."""
+    bodies : of the same scene, shared with another camera; None: its own."""
 
     def __init__(self, scene: Scene, items: Sequence[DrawItem], bodies: Bodies | None = None):
         self.bodies = bodies or Bodies(scene)
@@ -288,7 +291,7 @@ class Moments:
         return moment
 
     def look_through(self, camera: CameraModel) -> None:
-        """From now on through another camera on the same path."""
+        """Use another camera on the same path from now on."""
         self.view = View.of(seen_through(camera))
         for t_ns, moment in self._kept.items():
             self._kept[t_ns] = moment.through(self.view)

@@ -1,9 +1,9 @@
-"""Is the surface point seen at (x, y) still visible at the other end of its flow?
+"""Whether the surface point seen at (x, y) is still visible at the other end of its flow.
 
-Nearly everywhere the four pixels around its new place say so. Where they do not agree, beside silhouettes and where a
-surface turns away, a ray decides (:func:`blinkgl.render.casting.is_hidden`): about two pixels in a hundred of a
-crowded picture. What is thinner than a pixel passes between four pixels unseen; so near what is drawn one or two pixels
-wide (:func:`near_thin`) four that agree are not believed, either.
+Nearly everywhere the four pixels around its new position decide. Where they disagree, beside silhouettes and where a
+surface turns away, a ray decides (:func:`blinkgl.render.casting.is_hidden`): for about two pixels in a hundred of a
+crowded picture. Objects thinner than a pixel can pass between four pixels, so near objects drawn one or two pixels wide
+(:func:`near_thin`) four equal pixels do not suffice, either.
 """
 
 from __future__ import annotations
@@ -16,26 +16,26 @@ from blinkgl.scene.types import Scene
 
 SEEN, HIDDEN, UNDECIDED = 0, 1, 2
 
-# Relative differences of 1/Z. Another surface counts as in front when it is nearer by the first one: a pixel next to
-# the point's place shows its surface elsewhere. The point's own surface counts as the one that is seen when it comes
-# this near to the plane through the four samples; what bends more is asked by a ray.
+# Relative differences of 1/Z. Another surface is in front when it is nearer by the first one: a pixel beside the
+# point's position shows another place of its surface. The point's own surface is visible when it is this near to the
+# plane through the four samples; a ray decides where it bends more.
 _IN_FRONT = 1e-3
 _SAME = 3e-4
-# A ray ends this much before the point. Flow is float32: its end lies up to some 1e-3 px off, which on a surface that
-# is seen at a slant is this much of its depth.
+# A ray ends this much before the point. Flow is float32: its end is off by up to some 1e-3 px, which on a slanted
+# surface is this much of its depth.
 SLACK = 1e-4
 
 
 NARROW = 2
-"""Pixels: what is drawn no wider is elsewhere, in the same picture, between pixels' centres."""
+"""Pixels: an object this narrow may lie between pixel centres elsewhere in the same picture."""
 REACH = 4
-"""Pixels about it in which it may go on unseen: a wire of a third of a pixel meets a centre that often."""
+"""Pixels around it in which it may continue invisibly: a wire of a third of a pixel meets a centre that often."""
 
 
 @kernel
 def near_thin(ids: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """(H, W) bool: whether an object is drawn within :data:`REACH` px (in x and y) that is no more than :data:`NARROW`
-    px wide there, across or down, between others that are farther away.
+    """Return (H, W) bool: whether, within :data:`REACH` px (in x and y), an object is drawn that is at most
+    :data:`NARROW` px wide there, across or down, between others that are farther away.
 
     ids : (H, W) uint32.   depth : (H, W), 0 where nothing is."""
     height, width = ids.shape
@@ -48,14 +48,13 @@ def near_thin(ids: np.ndarray, depth: np.ndarray) -> np.ndarray:
             start = 0
             while start < length:
                 y, x = (start, line) if down else (line, start)
-                # A run of one object: its pixels, one beside the other.
+                # A run of one object: adjacent pixels.
                 own = ids[y, x]
                 end = start + 1
                 while end < length and ids[y + (end - start) * dy, x + (end - start) * dx] == own:
                     end += 1
                 width_here = end - start
-                # Narrow, with something on both sides that is farther away: it may be missing in the
-                # next row.
+                # Narrow, with something farther away on both sides: it may be invisible in the next row.
                 if width_here <= NARROW and start > 0 and end < length and depth[y, x] > 0:
                     before = depth[y - dy, x - dx]
                     after = depth[y + width_here * dy, x + width_here * dx]
@@ -79,21 +78,22 @@ def judged_by_samples(
     ids_there: np.ndarray,
     near: float = 0.0,
 ) -> np.ndarray:
-    """What the picture at t' says of each point: (H, W) uint8 of SEEN, HIDDEN, UNDECIDED; SEEN where not valid.
+    """Return the verdict of the picture at t' on each point: (H, W) uint8 of SEEN, HIDDEN, UNDECIDED; SEEN where not
+    valid.
 
     flow : (H, W, 2) float32 px.   z_there : (H, W) float32 depth of the point at t'.   valid : (H, W) bool.
     ids : (H, W) uint32 at t.   depth_there, ids_there : (H, W) depth and ids drawn at t' (depth 0: nothing).
-    near : depth of the near plane; what is before it is not drawn at t'.
+    near : depth of the near plane; nothing before it is drawn at t'.
 
-    HIDDEN: outside the image, before the near plane, or all four pixels around the new place show other objects that
-    are nearer. SEEN: all four show the point's own object, nothing thin is near (:func:`near_thin`), and their depths,
-    interpolated in 1/Z (exact on a plane, in the outermost half pixel, too), are not in front of it. UNDECIDED: the
-    rest.
+    HIDDEN: outside the image, before the near plane, or all four pixels around the new position show other, nearer
+    objects.
+    SEEN: all four show the point's own object, nothing thin is near (:func:`near_thin`), and their depths, interpolated
+    in 1/Z (exact on a plane, in the outermost half pixel, too), are not in front of it. UNDECIDED: the rest.
     """
     height, width = valid.shape
     thin = near_thin(ids_there, depth_there)
     verdict = np.zeros((height, width), np.uint8)
-    # 1/Z once a pixel instead of once a sample: a point has four of these, and divisions are what this loop waits for.
+    # 1/Z once per pixel instead of once per sample: a point has four of these, and divisions dominate this loop.
     nearness = np.empty((height, width))
     for y in range(height):
         for x in range(width):
@@ -110,14 +110,13 @@ def judged_by_samples(
                 verdict[y, x] = HIDDEN
                 continue
             inverse = 1.0 / np.float64(z_there[y, x])
-            # At the border the four pixels are the outermost ones and the weights extrapolate: a surface that is seen
-            # at a slant would otherwise seem to lie nearer than its own point there.
+            # At the border the four pixels are the outermost ones and the weights extrapolate: otherwise a slanted
+            # surface would seem nearer than its own point there.
             x0 = min(max(int(np.floor(xt)), 0), last_x)
             y0 = min(max(int(np.floor(yt)), 0), last_y)
             x1, y1 = min(x0 + 1, width - 1), min(y0 + 1, height - 1)
             ax, ay, own = xt - x0, yt - y0, ids[y, x]
-            # All four show the own object: seen, unless the interpolated surface is in front of the
-            # point.
+            # All four show its own object: visible, unless the interpolated surface is in front of the point.
             if (
                 ids_there[y0, x0] == own
                 and ids_there[y0, x1] == own
@@ -129,7 +128,7 @@ def judged_by_samples(
                 if (1.0 - ay) * above + ay * below > inverse * (1.0 + _SAME) or thin[y0, x0]:
                     verdict[y, x] = UNDECIDED
                 continue
-            # Otherwise hidden, unless some pixel shows the own object or something that is not nearer.
+            # Otherwise hidden, unless some pixel shows its own object or something that is not nearer.
             limit = inverse * (1.0 + _IN_FRONT)
             verdict[y, x] = HIDDEN
             for dy in range(2):
@@ -150,7 +149,7 @@ def occlusion_mask(
     depth_there: np.ndarray,
     ids_there: np.ndarray,
 ) -> np.ndarray:
-    """(H, W) bool: valid pixels whose point is not visible at t_ns, the time that their flow leads to.
+    """Return (H, W) bool: valid pixels whose point is not visible at t_ns, the time at the end of their flow.
 
     scene : what was drawn.   The rest as in :func:`judged_by_samples`.
     """
@@ -164,8 +163,8 @@ def occlusion_mask(
 
 @kernel
 def undecided(verdict: np.ndarray, flow: np.ndarray, z_there: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of the points of which ``verdict`` is UNDECIDED, row by row: (N,) number of the pixel, (N, 2) float64 px where
-    they are then, (N,) float64 how far away."""
+    """Return, for the points whose ``verdict`` is UNDECIDED, row by row: (N,) number of the pixel, (N, 2) float64 px of
+    their position then, (N,) float64 depth."""
     width = verdict.shape[1]
     flat = verdict.reshape(-1)
     # Two passes: the first counts, so that arrays have the right size.
@@ -187,8 +186,8 @@ def undecided(verdict: np.ndarray, flow: np.ndarray, z_there: np.ndarray) -> tup
 
 @kernel
 def flow_and_reach(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W, 2) float32 px, 0 where not valid, and (H, W) bool of the shader's (H, W, 4): u, v, Z at the other time,
-    which is to be above 0, and whether something is hit."""
+    """Return (H, W, 2) float32 px, 0 where not valid, and (H, W) bool of the shader's (H, W, 4): u, v, Z at the other
+    time, which must be above 0, and whether something is hit."""
     height, width = raw.shape[:2]
     flow, valid = np.empty((height, width, 2), np.float32), np.empty((height, width), np.bool_)
     for y in range(height):

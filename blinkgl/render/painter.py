@@ -1,4 +1,4 @@
-"""OpenGL's state while passes are drawn: programs and their uniforms, clearing, culling, one draw call at a time."""
+"""OpenGL state while passes are drawn: programs and their uniforms, clearing, culling, draw calls."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ if TYPE_CHECKING:
     from blinkgl.render.resources import SceneResources
 
 FREE_UNIT = 8
-"""Texture unit from which on a shape may put its own: a pass has a material's and those of its inputs."""
+"""First texture unit that a shape may use; a pass uses those below for a material and its inputs."""
 MATERIAL_UNITS = {
     name: 16 + k
     for k, name in enumerate(
         ("coverage", "emission_map", "bumps", "gloss_map", "energy", "looks", "surroundings", "surrounding_luminance")
     )
 }
-"""Texture units of what a material has beside a base colour."""
+"""Texture units of a material's maps besides the base colour."""
 
 
 class Programs(dict["Kind", Uniforms]):
-    """Of one pass: uniforms of the program for each kind of material, compiled when first asked for."""
+    """The programs of one pass: uniforms per kind of material, compiled when first needed."""
 
     def __init__(self, painter: Painter, pass_: Pass):
         self._painter, self._pass = painter, pass_
@@ -55,11 +55,10 @@ class Programs(dict["Kind", Uniforms]):
 
 
 class Painter:
-    """Draws for the passes of one renderer. A subclass may look on: every method is called
-    by the passes and none by another.
+    """Draws for the passes of one renderer. A subclass may observe: each method is called only by passes.
 
-    gl : GLContext.   resources : SceneResources.   stats : what is counted.   lens : of a camera that distorts.
-    strokes : lines to be drawn."""
+    gl : GLContext.   resources : SceneResources.   stats : counters.   lens : of a camera with distortion.
+    strokes : lines to draw."""
 
     def __init__(self, gl: GLContext, scene: Scene, resources: SceneResources, stats: RenderStats):
         self.gl, self.scene, self.resources, self.stats = gl, scene, resources, stats
@@ -71,14 +70,14 @@ class Painter:
         self.strokes = Strokes(gl, self.uniforms)
 
     def begin(self, target: Target, background: tuple[float, ...] = ()) -> None:
-        """Draw into ``target`` from now on, which is cleared: the first attachment to
-        ``background``, 0 where it ends, the others to 0."""
+        """Set ``target`` for drawing and clear it: the first attachment to ``background`` (0 for missing components),
+        the others to 0."""
         self.prepare(target)
         target.clear(*((*background, 0.0, 0.0, 0.0, 0.0)[: pixel.components] for pixel in target.formats[:1]))
         self.stats.frames += 1
 
     def prepare(self, target: Target) -> None:
-        """Draw into ``target`` from now on, over what it holds."""
+        """Set ``target`` for drawing, over its content."""
         ctx = self.gl.ctx
         target.fbo.use()
         ctx.viewport = (0, 0, target.fbo.width, target.fbo.height)
@@ -96,17 +95,17 @@ class Painter:
         return programs
 
     def uniforms(self, program: moderngl.Program) -> Uniforms:
-        """The table that a pass sets values in."""
+        """Return the table of uniforms that a pass sets."""
         return Uniforms(program)
 
     def place(self, uniforms: Uniforms, item: DrawItem, moment: Moment) -> None:
-        """Sets what every program that draws the scene takes: matrices, depths and, where it has them, the light."""
+        """Set the uniforms of every program that draws the scene: matrices, depths and, if it has them, the light."""
         index = item.object_index
         uniforms["mvp"].write(moment.mvp_columns[index])
         if "inverse_depths" in uniforms:
             uniforms["inverse_depths"].write(moment.inverse_depths[item.number])
         if "sun_direction" in uniforms:
-            # Every time: the context's programs are shared with other renderers, their uniforms included.
+            # Every time: the context's programs, with their uniforms, are shared with other renderers.
             light = self.scene.light
             uniforms["light_strength"].value = (light.sun, light.sky)
             # v @ R is R^T v: a world direction in the object's axes; R[2] is that of world z.
@@ -118,7 +117,7 @@ class Painter:
             self._dress(uniforms, item, moment)
 
     def _dress(self, uniforms: Uniforms, item: DrawItem, moment: Moment) -> None:
-        """Sets what a material has beside a base colour."""
+        """Set a material's uniforms besides the base colour."""
         material, resources = item.material, self.resources
         if "coverage" in uniforms and material.mask is not None:
             self._look_up(uniforms, "coverage", resources.coverage_texture(material))
@@ -142,7 +141,7 @@ class Painter:
                 self._look_up(uniforms, "gloss_map", resources.numbers_texture(gloss.map), gloss.map)
 
     def _shine(self, uniforms: Uniforms, item: DrawItem, moment: Moment) -> None:
-        """Sets what is seen in what shines, and from where."""
+        """Set the uniforms of reflections and the position of the camera."""
         self._look_up(uniforms, "energy", self.resources.energy_texture())
         self._look_up(uniforms, "looks", self.resources.looks_texture())
         coloured = "surroundings" in uniforms
@@ -161,7 +160,7 @@ class Painter:
             uniforms["to_world_rate"].write(np.ascontiguousarray(dR.T, np.float32).tobytes())
 
     def _look_up(self, uniforms: Uniforms, name: str, texture: Any, map_: Map | None = None) -> None:
-        """Hands a program a texture of a material, and where it lies."""
+        """Bind a material's texture, and set the transform of its coordinates."""
         unit = MATERIAL_UNITS[name]
         texture.use(unit)
         uniforms[name].value = unit
@@ -171,8 +170,7 @@ class Painter:
             uniforms[f"{name}_place"].value = (a, d, b, e, c, f)
 
     def deform(self, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
-        """Sets what the vertex stage of a shape that changes with time takes besides; to be called after
-        :meth:`place`."""
+        """Set the further uniforms of a deforming shape's vertex stage; call it after :meth:`place`."""
         moment, index, deformer = shot.moment, item.object_index, item.deformer
         assert deformer is not None
         shape, t_ns = self.resources.shape(deformer), moment.t_ns
@@ -187,7 +185,7 @@ class Painter:
         shape.use(uniforms[""], FREE_UNIT)
 
     def fog(self, uniforms: Uniforms, shot: Shot) -> None:
-        """Sets what fog.glsl takes: the fog, and how a fragment's place in the target becomes its ray (X, Y) / Z."""
+        """Set the uniforms of fog.glsl: the fog, and the transform from a fragment's position to its ray (X, Y) / Z."""
         # NDC x is P00 X/Z + P02; solved for X/Z, with 2 px / width - 1 for NDC.
         fog, P = self.scene.fog, shot.moment.view.projection
         assert fog is not None
@@ -202,7 +200,7 @@ class Painter:
 
     def draw(self, uniforms: Uniforms, item: DrawItem) -> None:
         cull = not item.two_sided
-        # State changes cost: culling is switched only where it differs.
+        # State changes are expensive: culling is switched only where it differs.
         if cull != self._culling:
             (self.gl.ctx.enable if cull else self.gl.ctx.disable)(moderngl.CULL_FACE)
             self._culling = cull
@@ -210,27 +208,28 @@ class Painter:
         self.stats.triangles += len(item.mesh.faces)
 
     def cover(self, pass_: Pass) -> tuple[Uniforms, moderngl.VertexArray]:
-        """Program of a pass over the whole target, and the vertex array of no vertices that draws its one triangle."""
+        """Return the program of a pass over the whole target, and the empty vertex array that draws its one
+        triangle."""
         if pass_ not in self._covers:
             program = self.gl.program(pass_.program, pass_.defines(None))
             self._covers[pass_] = self.uniforms(program), self.gl.ctx.vertex_array(program, [])
         return self._covers[pass_]
 
     def fill(self, array: moderngl.VertexArray, target: Target) -> None:
-        """One triangle over all of ``target``."""
+        """Draw one triangle over all of ``target``."""
         target.fbo.use()
         self.gl.ctx.viewport = (0, 0, target.fbo.width, target.fbo.height)
         self.gl.ctx.disable(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
         array.render(moderngl.TRIANGLES, vertices=3)
 
     def finish(self) -> None:
-        """Waits until all is drawn."""
+        """Wait until everything is drawn."""
         started = working_clock()
         self.gl.ctx.finish()
         self.stats.render_s += working_clock() - started
 
     def forget(self) -> None:
-        """Asks for every program again: to be called when the context's programs are to be replaced."""
+        """Drop all programs, before the context's programs are replaced."""
         for _, array in self._covers.values():
             array.release()
         self._programs, self._covers = {}, {}

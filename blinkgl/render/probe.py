@@ -1,4 +1,4 @@
-"""Everything the float64 reference knows about one pixel: for tests, for doubts, and for the shader debugger."""
+"""Everything that the float64 reference knows about one pixel: for tests and the shader debugger."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from blinkgl.scene.types import Scene
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """Everything about one image point at t_ns (and, when asked, where it is at to_ns). float64, None when not there.
+    """Everything about one image point at t_ns and, if requested, at to_ns. float64, None when not there.
 
     world, camera : (3,) position of the surface point at t;   world_to, camera_to, xy_to : at t'.
-    why : '' when the point is seen at both times, else one line saying why it is invalid or occluded.
+    why : '' when the point is visible at both times, else one line saying why it is invalid or occluded.
     """
 
     xy: tuple[float, float]
@@ -61,7 +61,7 @@ class Probe:
 
 
 def probe(scene: Scene, t_ns: int, x: float, y: float, to_ns: int | None = None) -> Probe:
-    """What is seen at image point (x, y) px at t_ns, and where that surface point is at to_ns."""
+    """Return what is seen at image point (x, y) px at t_ns, and the position of that surface point at to_ns."""
     hits = cast(scene, t_ns, np.array([[x, y]]))
     looks = surface(scene, hits)
     colour, luminance = looks.colour[0], float(looks.luminance[0])

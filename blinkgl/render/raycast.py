@@ -1,12 +1,12 @@
-"""Nearest triangle along a ray, in float64: a bounding-volume hierarchy and its slow twin.
+"""Nearest triangle along a ray, in float64: a bounding-volume hierarchy and its slow reference.
 
-Rays are given in camera coordinates as ``s * (rx, ry, 1)``, so that the ray parameter ``s`` *is* the depth Z along
-the optical axis. Each part (one mesh of one object) is traversed in its own local frame; the camera comes to the mesh,
-never the mesh to the world, and so nothing is lost when both are a million units from the origin.
+Rays are given in camera coordinates as ``s * (rx, ry, 1)``, so that the ray parameter ``s`` *is* the depth Z along the
+optical axis. Each part (one mesh of one object) is traversed in its own local frame; the camera is transformed to the
+mesh, never the mesh to the world, so nothing is lost when both are a million units from the origin.
 
-The triangle test is the watertight one of Woop, Benthin and Wald, "Watertight Ray/Triangle Intersection",
-JCGT 2(1), 2013, sections 3.1-3.3: an edge shared by two triangles is never missed by both. Equal depths are decided by
-the lower (part, triangle), so that the answer does not depend on the order of traversal.
+The triangle test is the watertight one of Woop, Benthin and Wald, "Watertight Ray/Triangle Intersection", JCGT 2(1),
+2013, sections 3.1-3.3: an edge shared by two triangles is never missed by both. Equal depths are decided by the lower
+(part, triangle), so that the answer does not depend on the order of traversal.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ import numpy as np
 from blinkgl.machine.kernels import kernel
 
 LEAF_TRIANGLES = 4
-_STACK = 64  # the tree is balanced: 64 levels are more than any mesh in memory needs
-# Relative slack of the box tests, far above the rounding of the triangle test (a few 1e-16) and far below anything
-# that would make the tree visit noticeably more boxes. With it, the tree finds what the exhaustive loop finds.
+_STACK = 64  # the tree is balanced: 64 levels suffice for any mesh in memory
+# Relative slack of the box tests, far above the rounding of the triangle test (a few 1e-16), and too small to visit
+# noticeably more boxes. With it, the tree finds what the exhaustive loop finds.
 _BALL_SLACK = 1e-9
 _BOX_SLACK = 1e-14
 _DEPTH_SLACK = 1e-9
@@ -45,14 +45,14 @@ class Tree:
 
 
 class Forest(NamedTuple):
-    """The trees of all parts, one after the other, as the kernels take them.
+    """The trees of all parts, one after the other, in the kernels' form.
 
     root, first, size : (P,) int32 root node, first triangle and number of triangles of each part.
     cull : (P,) bool, back faces of this part are not hit.   extent : (P,) largest local coordinate.
-    mask : (P,) int32 row of ``masks`` that says where a part has holes, -1: nowhere.   uvs : (M, 3, 2) float64 texture
-    coordinates of the corners of all faces of parts with holes.
+    mask : (P,) int32 row of ``masks`` with a part's holes, -1: none.   uvs : (M, 3, 2) float64 texture coordinates of
+    the corners of all faces of parts with holes.
     masks : (K, 6) int64 of each: first face in ``uvs``; first texel in ``texels``, height, width; wrap modes along u
-    and v, of :data:`WRAPS`.   cutoffs : (K,) opacity below which there is nothing.   texels : (T,) float32 opacity.
+    and v, of :data:`WRAPS`.   cutoffs : (K,) opacity below which there is a hole.   texels : (T,) float32 opacity.
     """
 
     triangles: np.ndarray
@@ -73,13 +73,13 @@ class Forest(NamedTuple):
     texels: np.ndarray
 
 
-# Their indices are what _texel_index takes as ``wrap``.
+# _texel_index takes their indices as ``wrap``.
 WRAPS = ("repeat", "mirror", "clamp")
 
 
 class Holes(NamedTuple):
-    """Of one part. uvs : (F, 3, 2) float64 of its faces' corners.   opacity : (h, w) float32, 0 to 1.
-    cutoff : what is less is a hole.   wrap : along u and v, of :data:`WRAPS`."""
+    """The holes of one part. uvs : (F, 3, 2) float64 of its faces' corners.   opacity : (h, w) float32, 0 to 1.
+    cutoff : a lower opacity is a hole.   wrap : along u and v, of :data:`WRAPS`."""
 
     uvs: np.ndarray
     opacity: np.ndarray
@@ -87,8 +87,8 @@ class Holes(NamedTuple):
     wrap: tuple[str, str]
 
 
-# Slices that are assigned and argsort would take longer to compile than all the rest here: numba brings a string
-# library along for the message that shapes differ.
+# Slice assignment and argsort would take longer to compile than everything else here: numba compiles a string library
+# for their error message.
 @kernel
 def _sort_stably(order, a, b, centre, axis, spare):
     """Sort order[a:b] by the centroids along an axis; equal ones keep their order. spare : room for b - a."""
@@ -141,7 +141,7 @@ def _build(triangles, lower, upper, child, count):
             continue
         # Stable, so that the tree does not depend on the sort's implementation.
         _sort_stably(order, a, b, centre, axis, spare)
-        # Children are neighbours in memory: one number finds both.
+        # Children are adjacent in memory: one number finds both.
         middle = (a + b) // 2
         child[node], count[node] = nodes, 0
         stack[depth, 0], stack[depth, 1], stack[depth, 2] = nodes, a, middle
@@ -152,7 +152,7 @@ def _build(triangles, lower, upper, child, count):
 
 
 def build_tree(vertices: np.ndarray, faces: np.ndarray) -> Tree:
-    """Hierarchy over (F, 3) faces of (V, 3) float64 vertices; F >= 1."""
+    """Return a hierarchy over (F, 3) faces of (V, 3) float64 vertices; F >= 1."""
     corners = np.ascontiguousarray(np.asarray(vertices, np.float64)[np.asarray(faces)])
     n = len(corners)
     lower, upper = np.empty((2 * n, 3)), np.empty((2 * n, 3))
@@ -163,7 +163,7 @@ def build_tree(vertices: np.ndarray, faces: np.ndarray) -> Tree:
 
 
 def join_trees(trees: list[Tree], cull: list[bool], holes: list[Holes | None] | None = None) -> Forest:
-    """One forest; part p of the forest is ``trees[p]``, with ``holes[p]`` in it."""
+    """Return one forest; its part p is ``trees[p]``, with the holes ``holes[p]``."""
     mask, uvs, masks, cutoffs, texels = _holes(len(trees), holes or [])
 
     def starts(sizes):
@@ -175,7 +175,7 @@ def join_trees(trees: list[Tree], cull: list[bool], holes: list[Holes | None] | 
     size = np.array([len(tree.face) for tree in trees], np.int32)
     first = starts(size)
     root = starts([len(tree.child) for tree in trees])
-    # Children count on over the trees, leaves over the triangles, inner nodes over the nodes.
+    # Child numbers are continued over the trees: of leaves over the triangles, of inner nodes over the nodes.
     child = [tree.child + np.where(tree.count > 0, first[p], root[p]) for p, tree in enumerate(trees)]
     return Forest(
         triangles=joined("triangles", (0, 3, 3)),
@@ -252,7 +252,7 @@ def _shear(d):
         kz = 2
     kx = (kz + 1) % 3
     ky = (kx + 1) % 3
-    # Keep the handedness, and with it the sign that tells front from back.
+    # Keep the handedness, and so the sign that distinguishes front and back.
     if d[kz] < 0.0:
         kx, ky = ky, kx
     return kx, ky, kz, d[kx] / d[kz], d[ky] / d[kz], 1.0 / d[kz]
@@ -288,8 +288,8 @@ def _local_ray(axes, rx, ry, d):
 @kernel(error_model="numpy")
 def _balls(forest, origins, axes):
     """Return balls around the parts, slightly too large, in camera axes: (P, 3) middles, (P,) radii, and (P,) the
-    square of the length of the tangents from the camera's centre, a little too short; <= 0: it is inside. Most
-    rays pass most parts by, and a ball says so before a ray is turned into a part's axes."""
+    squared length of the tangents from the camera's centre, slightly too short; <= 0: it is inside. Most rays miss most
+    parts, and a ball finds that before a ray is transformed into a part's axes."""
     count = forest.root.shape[0]
     centre, radius, outside = np.empty((count, 3)), np.empty(count), np.empty(count)
     for p in range(count):
@@ -302,7 +302,7 @@ def _balls(forest, origins, axes):
             side = 0.5 * (forest.upper[node, k] - forest.lower[node, k]) if forest.size[p] else 0.0
             half += side * side
             away[k] = (forest.lower[node, k] + side if forest.size[p] else 0.0) - origins[p, k]
-        # Into the camera's axes; the radius and the tangent take the rounding of all this.
+        # Into the camera's axes; radius and tangent allow for the rounding of all this.
         for k in range(3):
             centre[p, k] = axes[p, 0, k] * away[0] + axes[p, 1, k] * away[1] + axes[p, 2, k] * away[2]
             square += centre[p, k] * centre[p, k]
@@ -325,12 +325,12 @@ def nearest_tree(
     depth: np.ndarray,
     any_will_do: bool = False,
 ) -> None:
-    """Nearest hit of each ray through the hierarchy.
+    """Find the nearest hit of each ray through the hierarchy.
 
     origins : (P, 3) camera centre and axes : (P, 3, 3) camera axes (columns) in each part's frame.
     rays : (N, 2) (rx, ry).   near : depth below which nothing is hit.   far : (N,) depth from which nothing is hit.
     skip : (N, 2) int32 (part, face) each ray passes through, or (-1, -1).
-    any_will_do : the first hit that is found instead of the nearest: for who asks whether there is one.
+    any_will_do : return the first hit found instead of the nearest, to test whether there is one.
     Output: hit (N, 3) int32 (part, face, 1 when seen from the front) or -1; bary (N, 3); depth (N,), inf when nothing
     is hit.
     """
@@ -350,8 +350,7 @@ def nearest_tree(
             # The ball begins behind the best hit so far.
             if size[p] == 0 or centre[p, 2] - radius[p] > best:
                 continue
-            # Ray and ball: the angle to the middle is wider than the tangent's, or the ball lies
-            # behind.
+            # Ray and ball: the angle to the middle is wider than the tangent's, or the ball is behind the camera.
             along = centre[p, 0] * rays[i, 0] + centre[p, 1] * rays[i, 1] + centre[p, 2]
             if outside[p] > 0.0 and (along < 0.0 or along * along < outside[p] * length):
                 continue
@@ -361,8 +360,7 @@ def nearest_tree(
                 scale = max(scale, abs(o[k]))
             _local_ray(axes[p], rays[i, 0], rays[i, 1], d)
             kx, ky, kz, sx, sy, sz = _shear(d)
-            # inf for an axis that the ray does not move along; origins are moved apart by the slack of
-            # the box test.
+            # inf for an axis along which the ray does not move; origins are moved apart by the slack of the box test.
             for k in range(3):
                 inverse[k] = 1.0 / d[k] if d[k] != 0.0 else np.inf
                 o_lo[k], o_hi[k] = o[k] + _BOX_SLACK * scale, o[k] - _BOX_SLACK * scale
@@ -370,7 +368,7 @@ def nearest_tree(
             n = 1
             while n > 0 and not (any_will_do and hit[i, 0] >= 0):
                 n -= 1
-                # Entered beyond the best hit: its whole subtree is.
+                # Entered beyond the best hit: so is its whole subtree.
                 if entry[n] > best:
                     continue
                 node = stack[n]
@@ -381,8 +379,7 @@ def nearest_tree(
                         s, u, v, w, front = _triangle(triangles[j], o, kx, ky, kz, sx, sy, sz)
                         if not (near <= s <= best and s < far[i]) or (cull[p] and not front):
                             continue
-                        # Equal depths go to the lower (part, triangle), in whatever order they are
-                        # found.
+                        # Equal depths are decided by the lower (part, triangle), independent of the order.
                         if s == best and (hit[i, 0] < p or hit[i, 1] < face[j]):
                             continue
                         k = mask[p]
@@ -392,7 +389,7 @@ def nearest_tree(
                         hit[i, 0], hit[i, 1], hit[i, 2] = p, face[j], front
                         bary[i, 0], bary[i, 1], bary[i, 2] = u, v, w
                     continue
-                # Slabs: the ray is inside of the box between the largest entry and the least exit.
+                # Slabs: the ray is inside the box between the largest entry and the smallest exit.
                 for c in range(child[node], child[node] + 2):
                     enter, leave = 0.0, np.inf
                     for k in range(3):

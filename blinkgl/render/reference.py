@@ -1,9 +1,9 @@
-"""The float64 reference renderer: what every buffer of every pass should hold, by casting rays on the CPU.
+"""The float64 reference renderer: computes every buffer of every pass by casting rays on the CPU.
 
-It shares nothing with the rasteriser but :mod:`blinkgl.scene.types` and the camera models: no GLSL, no clip space, no
-projection matrix. It sees through any camera model whose rays point forward (Z > 0). Tests and the shader debugger
-compare the GPU with it. Rays, hits and flow are :mod:`blinkgl.render.casting`'s, light and textures
-:mod:`blinkgl.render.appearance`'s.
+It shares with the rasteriser only :mod:`blinkgl.scene.types` and the camera models: no GLSL, no clip space, no
+projection matrix. It supports any camera model whose rays point forward (Z > 0). Tests and the shader debugger compare
+the GPU with it. Rays, hits and flow are in :mod:`blinkgl.render.casting`, light and textures in
+:mod:`blinkgl.render.appearance`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from blinkgl.scene.types import Scene
 class ReferenceFrame:
     """All buffers of one image; (H, W, ...) float64 unless said otherwise. See :class:`Hits`, :class:`Flow` and
     :class:`~blinkgl.render.appearance.Surface` for the fields. velocity : (H, W, 2) px/s at t, nan where nothing is
-    hit.   forward, backward : flow to the times that were asked for, else None."""
+    hit.
+    forward, backward : flow to the requested times, else None."""
 
     t_ns: int
     hit: np.ndarray
@@ -44,12 +45,13 @@ class ReferenceFrame:
     xy: np.ndarray
 
     def hits(self) -> Hits:
-        """What was hit at the pixels' centres, row by row."""
+        """Return the hits at the pixel centres, row by row."""
         flat = {name: (a := getattr(self, name)).reshape(self.hit.size, *a.shape[2:]) for name in _HIT_IMAGES}
         return Hits(t_ns=self.t_ns, **flat)
 
     def scene_flow(self, scene: Scene) -> np.ndarray:
-        """(H, W, 3) world units, as :func:`moved_in_space` to the forward flow's time; 0 where nothing is hit."""
+        """Return (H, W, 3) world units, as :func:`moved_in_space` to the forward flow's time; 0 where nothing is
+        hit."""
         assert self.forward is not None
         moved = moved_in_space(scene, self.hits(), self.forward.t_ns).reshape(*self.hit.shape, 3)
         return np.where(self.hit[..., None], moved, 0.0)
@@ -63,9 +65,9 @@ def render(
     backward_ns: int | None = None,
     xy: np.ndarray | None = None,
 ) -> ReferenceFrame:
-    """Every buffer at t_ns, with the flow to forward_ns and to backward_ns where given.
+    """Return every buffer at t_ns, with the flow to forward_ns and to backward_ns where given.
 
-    xy : (H, W, 2) px that are looked at, of a picture of another size than the camera's; None: all pixels' centres."""
+    xy : (H, W, 2) image points, px, of a picture of any size; None: all pixel centres."""
     shape = (scene.camera.height, scene.camera.width) if xy is None else xy.shape[:2]
     hits = cast(scene, t_ns, None if xy is None else xy.reshape(-1, 2))
     looks = surface(scene, hits)
@@ -96,11 +98,11 @@ _FLOW_IMAGES = ("flow", "valid", "occluded", "outside", "depth", "hidden_by")
 
 
 def silhouette_band(ids: np.ndarray, depth: np.ndarray, width: int = 1, jump: float = 0.02) -> np.ndarray:
-    """(H, W) bool: pixels within ``width`` px (8-neighbourhood) of an id change or a jump in depth.
+    """Return (H, W) bool: pixels within ``width`` px (8-neighbourhood) of an id change or a jump in depth.
 
     ids : (H, W) integers.   depth : (H, W), inf or nan where nothing is hit.   A jump is a second difference of 1 / Z
-    along x or y above ``jump`` of its largest value there: 1 / Z is affine in the image of a plane, however steep the
-    plane is seen, so that slanted ground is not taken for an edge.
+    along x or y above ``jump`` of its largest value there: 1 / Z of a plane is affine in the image, however steep the
+    plane, so slanted ground is not taken for an edge.
     """
     # Second differences of 1/Z vanish on a plane; along x and along y in turn.
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -113,7 +115,7 @@ def silhouette_band(ids: np.ndarray, depth: np.ndarray, width: int = 1, jump: fl
         b[:-1] |= change
         bend = np.abs(z[2:] - 2.0 * z[1:-1] + z[:-2]) > jump * np.maximum(np.maximum(z[2:], z[1:-1]), z[:-2])
         b[1:-1] |= bend
-    # Neighbours over a corner.
+    # Diagonal neighbours.
     diagonal = ids[1:, 1:] != ids[:-1, :-1]
     other = ids[1:, :-1] != ids[:-1, 1:]
     band[1:, 1:] |= diagonal

@@ -1,15 +1,14 @@
-"""Frames of a scene by rasterisation: puts passes together and draws them.
+"""Frames of a scene by rasterisation: combines passes and draws them.
 
     with create_context() as gl, Renderer(gl, scene, RenderConfig()) as renderer:
         luminance = renderer.luminance(t_ns).read()            # (H, W) float32, linear light
         labels = renderer.labels(t_ns, LabelRequest("flow_forward", "depth"), t_forward_ns=t1_ns)
-        edges = renderer.draw(MyPass(), t_ns)                  # a Frame: on the card until it is read
+        edges = renderer.draw(MyPass(), t_ns)                  # a Frame: on the GPU until it is read
 
-A pass (``passes/``) says what is drawn; a :class:`~blinkgl.render.moment.Moment` where everything is; a
-:class:`~blinkgl.render.canvas.Canvas` holds what one pass has drawn, :class:`~blinkgl.render.canvas.StillCanvas` draws
-again only what moves. Poses are composed in float64 relative to the camera (``moment.py``); vertices stay
-object-local. Programs and targets are made the first time something asks for them, and only in
-the variants the scene's materials need.
+A pass (``passes/``) defines what is drawn; a :class:`~blinkgl.render.moment.Moment` holds the positions of everything;
+a :class:`~blinkgl.render.canvas.Canvas` holds the picture of one pass, and :class:`~blinkgl.render.canvas.StillCanvas`
+redraws only moving objects. Poses are composed in float64 relative to the camera (``moment.py``); vertices stay
+object-local. Programs and targets are made when first needed, only in the variants that the scene's materials need.
 """
 
 from __future__ import annotations
@@ -53,15 +52,15 @@ if TYPE_CHECKING:
 
 
 class Renderer:
-    """Draws one scene. Holds GL resources: use it as a context manager or call :meth:`release`.
+    """Draws one scene. It holds GL resources: use it as a context manager or call :meth:`release`.
 
-    scene : as it is drawn, frames and ground truth alike: at the level of detail that the configuration asks for,
-    without triangles that are lines in float32.   width, height : of the image, px.   stats : RenderStats.
-    whole : frames are always drawn whole; otherwise a camera that stands still has only what
-    moves drawn again, to the same pixels.
-    beside : of the same scene seen by another sensor: its meshes, textures, poses and shadow maps serve this one, too.
-    It has to be released last.
-    painter : class that issues the draw calls; a subclass may look on."""
+    scene : as it is drawn, for frames and ground truth: at the configured level of detail, without triangles that are
+    lines in float32.   width, height : of the image, px.   stats : RenderStats.
+    whole : frames are always drawn completely; otherwise only moving objects are redrawn for a camera that stands
+    still, to the same pixels.
+    beside : renderer of the same scene for another sensor; this one shares its meshes, textures, poses and shadow maps.
+    It must be released last.
+    painter : class that issues the draw calls; a subclass may observe."""
 
     def __init__(
         self,
@@ -90,21 +89,22 @@ class Renderer:
         )
         self._painter = painter(gl, scene, resources, self.stats)
         self._painter.lens = Lens.of(gl, scene.camera)
-        # A sky at infinity is around each camera, elsewhere for every one.
+        # A sky at infinity is around each camera; everything else is shared.
         shared = beside is not None and not any(o.at_infinity for o in scene.objects)
         self._moments = Moments(scene, self.items, beside._moments.bodies if shared else None)  # noqa: SLF001
         self._canvases: dict[tuple[Pass, int, int], Canvas] = {}
         self._common: dict[tuple[Pass, int, int], Canvas] = {} if beside is None else beside._common  # noqa: SLF001
         self._last: dict[Pass, Frame] = {} if beside is None else beside._last  # noqa: SLF001
         self._labels: dict[PinHole | None, Labels] = {}
-        # Worth it when something stands still besides the camera; a scene of movers alone is drawn whole.
+        # Useful when something besides the camera stands still; a scene of only moving objects is drawn completely.
         some_stand = any(o.is_static for o in scene.objects)
         lamps_stand = all(lamp.path.is_static for lamp in scene.light.lamps)
-        # Those of the rig's first camera, not equal ones: the path of a sun is no value, so that maps are told by it.
+        # The maps of the rig's first camera, not equal ones: a sun's path has no equality, so maps are identified by
+        # it.
         self._shadows: tuple[ShadowMap, ...] = ()
         if scene.light.shadows != "off":
             self._shadows = shadow_maps(scene, self.items) if beside is None else beside._shadows  # noqa: SLF001
-        # What is in the shadow of something that moves changes, too, where it is itself at rest.
+        # The shadow of a moving object also changes surfaces at rest.
         shadows_stand = not (self._shadows and any(item.casts and item.moves for item in self.items))
         self.whole = whole or not (scene.camera_path.is_static and some_stand and lamps_stand and shadows_stand)
 
@@ -115,7 +115,7 @@ class Renderer:
         self.release()
 
     def release(self) -> None:
-        if self.gl.released:  # everything went with the context
+        if self.gl.released:  # everything was released with the context
             return
         with self.gl.borrowed():
             self.forget()
@@ -125,8 +125,7 @@ class Renderer:
                 self._painter.resources.release()
 
     def forget(self) -> None:
-        """Nothing of what was drawn or compiled before is used again: to be called when the
-        context's programs are to be replaced."""
+        """Discard everything drawn or compiled before; called before the context's programs are replaced."""
         for canvas in (*self._canvases.values(), *self._common.values()):
             canvas.release()
         self._canvases = {}
@@ -136,12 +135,12 @@ class Renderer:
         self._painter.forget()
 
     def look_through(self, camera: CameraModel) -> None:
-        """From now on draws with another camera of the same size and path: another part of the picture at the same
-        cost. Nothing of what was drawn before is used again, and frames are drawn whole."""
+        """Draw with another camera of the same size and path from now on: another part of the picture at the same cost.
+        Earlier frames are not reused, and frames are drawn completely."""
         self.scene = self.scene.with_camera(camera)
         self._moments.look_through(camera)
         self._labels = {}
-        self.whole = True  # what stands still in one picture is no backdrop of the other
+        self.whole = True  # the static part of one picture is not valid for the other
         lens, new = self._painter.lens, Lens.of(self.gl, camera)
         if lens is not None:
             lens.release()
@@ -151,26 +150,26 @@ class Renderer:
 
     @property
     def items(self) -> Sequence[DrawItem]:
-        """Everything that can be drawn."""
+        """Return everything that can be drawn."""
         return self._painter.resources.items
 
     @property
     def triangles(self) -> int:
-        """Of the whole scene, before culling."""
+        """Return the number of triangles of the whole scene, before culling."""
         return self._painter.resources.triangles
 
     def moment(self, t_ns: int) -> Moment:
-        """Where everything is at t_ns, as all passes of that time share it."""
+        """Return the moment at t_ns, shared by all passes of that time."""
         return self._moments.at(t_ns)
 
     # ---- drawing -------------------------------------------------------------------------------------------------
 
     def draw(self, pass_: Pass, at: int | Moment, ends_ns: Mapping[str, int | Moment] | None = None) -> Frame:
-        """The frame of any pass at a time, ns, or of a moment as it is seen from elsewhere (``moment.from_place``); the
-        passes that it reads are drawn before it.
+        """Return the frame of any pass at a time, ns, or of a moment seen from elsewhere (``moment.from_place``); the
+        passes that it reads are drawn first.
 
-        ends_ns : other times that it looks at, by name: {"forward": t1_ns}. A pass that draws the scene draws the flat
-        picture of a lens that distorts; :meth:`seen` is what the lens makes of it."""
+        ends_ns : further times that it uses, by name: {"forward": t1_ns}. A pass that draws the scene draws the pinhole
+        picture of a lens with distortion; :meth:`seen` returns the lens's picture."""
         self.gl.resume()
         started = working_clock()
         ends = {name: self._moment(t) for name, t in (ends_ns or {}).items()}
@@ -182,20 +181,20 @@ class Renderer:
         return at if isinstance(at, Moment) else self.moment(at)
 
     def seen(self, pass_: Pass, smooth: bool = False) -> Pass:
-        """A pass that draws the scene as the scene's camera sees it: itself, or what a lens makes of it.
+        """Return a pass that draws the scene as the scene's camera sees it: itself, or its picture through a lens.
 
-        smooth : light, which is averaged over pixels; else each looks at one."""
+        smooth : light, which is averaged over pixels; other values are taken from one pixel."""
         if self.lens == "":
             return filtered(pass_) if smooth else pass_
         return Gather(one_value(pass_) if smooth else pass_, self.scene.camera, smooth)
 
     @property
     def lens(self) -> str:
-        """Macro of the camera's model where it distorts; "" for a pin-hole camera."""
+        """Return the macro of the camera's distortion model; "" for a pinhole camera."""
         return "" if self._painter.lens is None else self.scene.camera.shader
 
     def geometry(self, names: tuple[str, ...]) -> Pass:
-        """What the label shader writes of labels of these names, in the pixels of the scene's camera."""
+        """Return the pass of the labels of these names, in the pixels of the scene's camera."""
         return self.seen(Geometry(names, self.lens))
 
     def _drawn(self, pass_: Pass, moment: Moment, ends: Mapping[str, Moment], done: dict[Pass, Frame]) -> Frame:
@@ -220,33 +219,33 @@ class Renderer:
     # ---- frames --------------------------------------------------------------------------------------------------
 
     def luminance(self, t_ns: int) -> Frame:
-        """Linear luminance at t_ns, (H, W) float32."""
+        """Return linear luminance at t_ns, (H, W) float32."""
         return self.draw(self.seen(Luminance(self._samples, self._shadows), smooth=True), t_ns)
 
     def brightness(self, t_ns: int, every: int = 1) -> Frame:
-        """Luminance and d(luminance)/dt per second, (h, w, 2) float32, on every n-th pixel in x and y, textures
+        """Return luminance and d(luminance)/dt per second, (h, w, 2) float32, on every n-th pixel in x and y, textures
         filtered as for the whole image. h = max(1, H // every), w likewise: the small picture covers the whole image,
-        so that its pixels are H / h and W / w pixels apart, a little more than ``every`` where that is no divisor."""
+        so its pixels are H / h and W / w pixels apart, a little more than ``every`` if that is no divisor."""
         return self.draw(self.seen(Brightness(every, self._shadows)), t_ns)
 
     def velocity(self, t_ns: int, every: int = 1) -> Frame:
-        """Image velocity at t_ns in px/s (of the full-size image), (h, w, 2) float32, 0 where nothing is hit, h and w
-        as for :meth:`brightness`: a few pixels are enough to find the largest motion."""
+        """Return image velocity at t_ns in px/s (of the full-size image), (h, w, 2) float32, 0 where nothing is hit, h
+        and w as for :meth:`brightness`: a few pixels suffice to find the largest motion."""
         return self.draw(self.seen(Velocity(every, lens=self.lens)), t_ns)
 
     def velocity_of_movers(self, t_ns: int, every: int = 1) -> Frame:
-        """:meth:`velocity` of what moves, for the time sampling: with a still camera of the moving objects alone, those
-        behind something included: still a bound."""
+        """Return the :meth:`velocity` of moving objects, for time sampling: with a static camera only of moving
+        objects, hidden ones included, which is still a bound."""
         return self.draw(self.seen(Velocity(every, not self.whole, self.lens)), t_ns)
 
     def colour(self, at: int | Moment, antialiasing: str | None = None) -> Frame:
-        """Linear radiance at a time, ns, or of a moment, (H, W, 3) float32; ``antialiasing`` overrides the
+        """Return linear radiance at a time, ns, or of a moment, (H, W, 3) float32; ``antialiasing`` overrides the
         configuration's."""
         samples = self._image_samples if antialiasing is None else samples_of(antialiasing)
         return self.draw(self.seen(Colour(samples, self._shadows), smooth=True), at)
 
     def flat_colour(self, at: Moment) -> Frame:
-        """:meth:`colour` of a moment that a pin-hole camera sees, whatever the scene's camera is."""
+        """Return the :meth:`colour` of a moment as a pinhole camera sees it, whatever the scene's camera is."""
         return self.draw(filtered(Colour(self._image_samples, self._shadows)), at)
 
     def labels(
@@ -257,9 +256,9 @@ class Renderer:
         t_backward_ns: int | None = None,
         camera: PinHole | None = None,
     ) -> LabelFrame:
-        """Ground truth at t_ns: flow_forward runs from t_ns to t_forward_ns, flow_backward to t_backward_ns.
+        """Return ground truth at t_ns: flow_forward runs from t_ns to t_forward_ns, flow_backward to t_backward_ns.
 
-        camera : in whose pixels, at the place of the scene's camera; None: in that one's own."""
+        camera : whose pixels are used, at the place of the scene's camera; None: the scene's camera."""
         return self._labels_in(camera).frame(t_ns, request, t_forward_ns, t_backward_ns)
 
     def _labels_in(self, camera: PinHole | None) -> Labels:
@@ -268,5 +267,5 @@ class Renderer:
         return self._labels[camera]
 
     def shown_at(self, x: int, y: int, t_ns: int) -> str:
-        """What is seen at the centre of pixel (x, y) at t_ns, in words, for messages."""
+        """Return what is seen at the centre of pixel (x, y) at t_ns, as text for messages."""
         return self._labels_in(None).shown_at(x, y, t_ns)

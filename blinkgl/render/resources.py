@@ -1,5 +1,5 @@
-"""What a scene occupies in OpenGL: buffers, textures and vertex arrays, each made when first needed, shared by
-content, and released together."""
+"""OpenGL resources of a scene: buffers, textures and vertex arrays, each made when first needed, shared by content, and
+released together."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ _ATTRIBUTES = (("in_position", "3f", 12), ("in_normal", "3f", 12), ("in_uv", "2f
 
 
 MAX_RADIANCE = 1e18
-"""Of a texel: times the largest colour and the largest light of a configuration, 1e9 each,
-it is still finite in float32."""
+"""Largest radiance of a texel: times the largest colour and light of a configuration, 1e9 each, it is finite in
+float32."""
 
 
 class Shape:
-    """GL side of one deformer: its numbers at one time and those that lead to others, as the block ``Shape`` of
+    """GL resources of one deformer: its parameters at one time and those of other times, as the block ``Shape`` of
     deform.glsl."""
 
     SETS = ("now", "rate", "forward", "backward")
@@ -51,7 +51,7 @@ class Shape:
         limit = ctx.info["GL_MAX_UNIFORM_BLOCK_SIZE"]
         if size > limit:
             raise AssetError(
-                "a shape needs more numbers than this OpenGL takes",
+                "a shape needs more parameters than this OpenGL supports",
                 where=type(deformer).__name__,
                 value=deformer.rows,
                 accepted=f"at most {limit // 16 // len(self.SETS)} rows of four",
@@ -71,11 +71,11 @@ class Shape:
         return texture
 
     def streams(self, program: moderngl.Program) -> list[tuple]:
-        """Vertex streams of those attributes that the program has."""
+        """Return vertex streams of those attributes that the program has."""
         return [(buffer, f"{n}f", name) for name, (buffer, n) in self._streams.items() if name in program]
 
     def put(self, name: str, key: object, rows: Callable[[], np.ndarray]) -> None:
-        """Numbers of one of SETS, unless those of the same ``key`` are there."""
+        """Upload the parameters of one of SETS, unless those of the same ``key`` are there."""
         if self._held.get(name) != key:
             data = np.zeros((self._rows, 4), np.float32)
             given = rows()
@@ -84,7 +84,7 @@ class Shape:
             self._held[name] = key
 
     def use(self, program: moderngl.Program, unit: int) -> None:
-        """Of the program that is drawn with next. unit : first texture unit that is free."""
+        """Bind the resources to the program that is drawn next. unit : first free texture unit."""
         if "Shape" not in program:
             raise unused(program, "Shape")
         program["Shape"].binding = self.BINDING
@@ -100,24 +100,24 @@ class Shape:
 
 
 HALF_LEAST, HALF_MOST = 2.0**-14, 65504.0
-"""Between these a half float is off by 1/2048 at most; below, by 3e-8."""
+"""Between these limits the error of a half float is at most 1/2048; below, 3e-8."""
 
 
 def half_floats(image: np.ndarray) -> np.ndarray:
-    """(h, w, c) float32 light as float16, a tenth of a frame cheaper to look up, where no texel is off by more than
-    1/2048 of its brightest channel nor any mip level by more than that of the whole picture's mean; else ``image``.
+    """Return (h, w, c) float32 light as float16, where the error of a texel is at most 1/2048 of its brightest channel
+    and that of a mip level at most 1/2048 of the mean; else ``image``. float16 saves a tenth of a frame's time.
 
-    For pictures of 8 bits, whose own steps are 9 to 90 times coarser. A smooth one of floats would get steps that it
-    has not, and rates of them."""
+    For 8-bit images, whose own steps are 9 to 90 times coarser. A smooth float image would get visible steps, also in
+    its rates."""
     brightest = image.max(axis=2)
     lit = brightest[brightest > 0]
-    # A NaN makes the mean NaN, and the picture stays float32.
+    # A NaN makes the mean NaN, so the picture stays float32.
     fits = lit.size > 0 and lit.min() >= HALF_LEAST and lit.max() <= HALF_MOST
     return image.astype(np.float16) if fits and brightest.mean(dtype=np.float64) >= HALF_LEAST else image
 
 
 class SceneResources:
-    """GL side of one Scene. Release it before the context."""
+    """GL resources of one Scene. Release them before the context."""
 
     def __init__(self, gl: GLContext, scene: Scene, anisotropy: float = 1.0, mip_bias: float = 0.0):
         self.ctx, self.scene, self.anisotropy, self.mip_bias = gl.ctx, scene, anisotropy, mip_bias
@@ -134,7 +134,8 @@ class SceneResources:
         return sum(len(item.mesh.faces) for item in self.items)
 
     def vertex_array(self, program: moderngl.Program, item: DrawItem) -> moderngl.VertexArray:
-        """VAO of the attributes ``program`` uses; the rest of the interleaved vertex is skipped."""
+        """Return the vertex array of the attributes that ``program`` uses; the rest of the interleaved vertex is
+        skipped."""
         # The texture coordinates of a buffer depend on both, so they are part of its key.
         whole = _by_whole_repeats(item.material)
         key = (id(program), id(item.mesh), item.material.uv_scale, whole)
@@ -162,14 +163,14 @@ class SceneResources:
         return self._vaos[key]
 
     def shape(self, deformer: Deformer) -> Shape:
-        """What a deformer occupies in OpenGL."""
+        """Return the OpenGL resources of a deformer."""
         if id(deformer) not in self._shapes:
             self._shapes[id(deformer)] = Shape(self.ctx, deformer)
         return self._shapes[id(deformer)]
 
     def luminance_texture(self, material: Material) -> moderngl.Texture:
-        """R16F of 8 bits where :func:`half_floats` fit, else R32F: luminance of texture * base_color (mip-mapped in
-        linear light)."""
+        """Return the luminance of texture * base_color, mip-mapped in linear light: R16F for 8-bit images where
+        :func:`half_floats` applies, else R32F."""
         key = ("luminance", id(material.texture), material.base_color, material.wrap)
         if key not in self._textures:
             image = luminance_image(material.texture.image, material.base_color)[..., None]
@@ -177,8 +178,8 @@ class SceneResources:
         return self._textures[key]
 
     def shares_texture(self, material: Material) -> moderngl.Texture:
-        """RGB16F or RGB32F: what r, g and b of texture * base_color have in its luminance; their sum is
-        :meth:`luminance_texture`, and so is the rest."""
+        """Return the shares of r, g and b of texture * base_color in its luminance, RGB16F or RGB32F; their sum is
+        :meth:`luminance_texture`."""
         key = ("shares", id(material.texture), material.base_color, material.wrap)
         if key not in self._textures:
             # Each channel's share of the luminance, so that r + g + b of the texture is it.
@@ -188,7 +189,7 @@ class SceneResources:
         return self._textures[key]
 
     def colour_texture(self, material: Material) -> moderngl.Texture:
-        """Linear rgb of the texture alone: sRGB8 when the image is 8-bit, else RGB32F."""
+        """Return the linear rgb of the texture alone: sRGB8 when the image is 8-bit, else RGB32F."""
         return self._colour(material.texture, material.wrap)
 
     def _colour(self, texture: Texture, wrap: tuple[Wrap, Wrap]) -> moderngl.Texture:
@@ -205,7 +206,7 @@ class SceneResources:
     # ---- of materials that are more than a base colour
 
     def coverage_texture(self, material: Material) -> moderngl.Texture:
-        """R32F: opacity, of one level."""
+        """Return the opacity, R32F, one level."""
         key = ("coverage", id(material.mask), material.wrap)
         if key not in self._textures:
             image = material.mask.alpha.astype(np.float32)[..., None] / np.float32(255)
@@ -213,8 +214,8 @@ class SceneResources:
         return self._textures[key]
 
     def numbers_texture(self, given: Map) -> moderngl.Texture:
-        """RGB32F: three numbers a pixel, as they are stored. Drivers filter 8 bits to 8 bits again: a smooth surface
-        would shine in steps, and have a rate of noise."""
+        """Return three numbers per pixel as they are stored, RGB32F. Drivers filter 8-bit textures to 8 bits: smooth
+        surfaces would then shine in steps, with noisy rates."""
         key = ("numbers", id(given.texture), given.wrap)
         if key not in self._textures:
             image = given.texture.image.astype(np.float32) / np.float32(255)
@@ -222,8 +223,8 @@ class SceneResources:
         return self._textures[key]
 
     def emission_texture(self, material: Material, colour: bool) -> moderngl.Texture:
-        """Linear rgb, or R16F or R32F, as :meth:`luminance_texture`, of what the material sends of it, which has a
-        luminance of 1 at most."""
+        """Return the material's own emission, linear rgb, or R16F or R32F as :meth:`luminance_texture`, scaled to a
+        luminance of at most 1."""
         given = material.emission_map
         if colour:
             return self._colour(given.texture, given.wrap)
@@ -238,13 +239,15 @@ class SceneResources:
         return float(LUMA @ np.asarray(material.emission, np.float64))
 
     def energy_texture(self) -> moderngl.Texture:
-        """RGBA32F of :func:`~blinkgl.scene.surfaces.gloss.energy`, its mean, and the weight of the first look."""
+        """Return RGBA32F of :func:`~blinkgl.scene.surfaces.gloss.energy`, its mean, and the weight of the first
+        look."""
         once = energy()
         mean = np.broadcast_to(mean_energy()[:, None, None], (*once.shape[:2], 1))
         return self._table("energy", np.concatenate([once, mean, looks()[..., 4:]], axis=2))
 
     def looks_texture(self) -> moderngl.Texture:
-        """RGBA32F of :func:`~blinkgl.scene.surfaces.gloss.looks`: of both how far towards the mirror, and how rough."""
+        """Return RGBA32F of :func:`~blinkgl.scene.surfaces.gloss.looks`: for both looks, the fraction of the way to the
+        mirror direction, and the roughness."""
         return self._table("looks", looks()[..., :4])
 
     def _table(self, name: str, numbers: np.ndarray) -> moderngl.Texture:
@@ -256,8 +259,8 @@ class SceneResources:
         return self._textures[name,]
 
     def surroundings_texture(self, coloured: bool) -> moderngl.Texture3D:
-        """RGBA32F, a: 1, of :func:`~blinkgl.scene.surfaces.gloss.blurred`: longitude, latitude, roughness; or R32F of
-        its luminance."""
+        """Return RGBA32F, a: 1, of :func:`~blinkgl.scene.surfaces.gloss.blurred`: longitude, latitude, roughness; or
+        R32F of its luminance."""
         name = "surroundings" if coloured else "luminance of surroundings"
         if name not in self._volumes:
             levels = self._surroundings
@@ -277,7 +280,7 @@ class SceneResources:
         return surroundings_of(self.scene.light)
 
     def _stream(self, mesh: Mesh, name: str) -> moderngl.Buffer:
-        """Of vertices' tangents or colours."""
+        """Return the buffer of the vertices' tangents or colours."""
         key = (name, id(mesh))
         if key not in self._buffers:
             values = tangents(mesh) if name == "in_tangent" else mesh.colours
@@ -285,11 +288,11 @@ class SceneResources:
         return self._buffers[key][0]
 
     def albedo_luminance(self, material: Material) -> float:
-        """Of a material without texture."""
+        """Return the albedo's luminance of a material without texture."""
         return float(LUMA @ np.asarray(material.base_color, np.float64))
 
     def forget_vertex_arrays(self) -> None:
-        """To be called before the programs they were made for are replaced."""
+        """Drop all vertex arrays, before the programs they were made for are replaced."""
         for vao in self._vaos.values():
             vao.release()
         self._vaos = {}
@@ -328,7 +331,7 @@ class SceneResources:
         return self._buffers[key]
 
     def _light(self, image: np.ndarray, texture: Texture, wrap: tuple[Wrap, Wrap]) -> moderngl.Texture:
-        """``image``, (h, w, c) float32, was made from the texture."""
+        """Return a texture of ``image``, (h, w, c) float32, which was made from ``texture``."""
         return self._upload(image, texture.name, wrap=wrap, half=texture.image.dtype == np.uint8)
 
     def _upload(
@@ -344,7 +347,7 @@ class SceneResources:
         limit = self.ctx.info["GL_MAX_TEXTURE_SIZE"]
         if max(height, width) > limit:
             raise AssetError(
-                "texture is larger than this OpenGL takes",
+                "the texture is larger than this OpenGL supports",
                 where=name,
                 value=(width, height),
                 accepted=f"at most {limit} px on a side",
@@ -369,7 +372,7 @@ class SceneResources:
             dtype=dtype,
             internal_format=internal_format,
         )
-        # moderngl knows repeat and clamp alone; mirroring needs the call itself.
+        # moderngl supports only repeat and clamp; mirroring needs a direct call.
         if wrap != REPEAT:
             texture.use(0)
             for axis, kind in zip(_TEXTURE_WRAP, wrap):
@@ -387,13 +390,13 @@ class SceneResources:
 
 
 def _by_whole_repeats(material: Material) -> bool:
-    """Whether a shift of its texture coordinates by whole numbers shows nothing."""
+    """Return whether a shift of its texture coordinates by whole numbers is invisible."""
     maps = (material.bumps, material.emission_map, material.gloss.map if material.gloss is not None else None)
     return material.wrap == REPEAT and all(m is None or (m.at == IDENTITY and m.wrap == REPEAT) for m in maps)
 
 
 def _near_zero(uvs: np.ndarray) -> np.ndarray:
-    """(V, 2) float64 texture coordinates less whole repeats, so that a mesh with thousands of them has zero in its
-    middle. float32 at 50 000 repeats resolves 0.004 of a repeat: the texture of a wide ground would move in steps."""
+    """Return (V, 2) float64 texture coordinates minus whole repeats, so that 0 is in the middle of the mesh. float32 at
+    50 000 repeats resolves 0.004 of a repeat: the texture of a wide ground would move in steps."""
     low, high = uvs.min(axis=0), uvs.max(axis=0)
     return uvs - np.rint((low + high) / 2) if max(-low.min(), high.max()) > 64 else uvs

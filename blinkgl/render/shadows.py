@@ -1,8 +1,7 @@
-"""Shadow maps: what each lamp sees of the scene, and how a surface finds itself in it.
+"""Shadow maps: what each lamp sees of the scene, and how a surface point is found in them.
 
-A map of a sun is a box of parallel light around all that casts shadows, at any time of the scene; outside of it nothing
-is in the way. It does not depend on the camera, so it stays where it is while the camera moves. That of a spot light is
-a picture of its cone.
+A sun's map is a box of parallel light around everything that casts shadows at any time; outside it nothing is shaded.
+It does not depend on the camera, so it stays while the camera moves. A spot light's map is a picture of its cone.
 """
 
 from __future__ import annotations
@@ -25,14 +24,14 @@ if TYPE_CHECKING:
 
 CV_FROM_LAMP = np.diag([1.0, -1.0, -1.0, 1.0])
 """A lamp shines along its -z axis, a camera looks along its z axis with y down."""
-_TIMES = 129  # at which the places of what moves are looked up; in between its speed bounds them
+_TIMES = 129  # number of times at which moving objects are sampled; their speed bounds them in between
 _SPARE = 4  # texels on every side of a map
 _NEAR = 0.02  # world units in front of a spot light in which nothing casts
 
 
 class Parallel(NamedTuple):
-    """A camera of parallel rays, for :class:`~blinkgl.render.moment.View`: sees |X| <= half_x, |Y| <= half_y, and
-    0 <= Z <= depth, on size x size texels."""
+    """A camera of parallel rays, for :class:`~blinkgl.render.moment.View`: sees |X| <= half_x, |Y| <= half_y, and 0 <=
+    Z <= depth, on size x size texels."""
 
     size: int
     half_x: float
@@ -48,7 +47,7 @@ class Parallel(NamedTuple):
         return self.size
 
     def clip_from_cam(self) -> np.ndarray:
-        """(4, 4) float64; w = 1, depth 1 at Z = 0 and 0 at the far end."""
+        """Return clip_from_cam, (4, 4) float64; w = 1, depth 1 at Z = 0 and 0 at the far end."""
         return np.array(
             [
                 [1 / self.half_x, 0, 0, 0],
@@ -59,7 +58,7 @@ class Parallel(NamedTuple):
         )
 
     def bounds(self, points: np.ndarray) -> tuple[int, int, int, int] | None:
-        """As of a camera model: texels that the convex hull of (n, 3) points can touch."""
+        """Return the texels that the convex hull of (n, 3) points can touch, as a camera model does."""
         x = (points[:, 0] / self.half_x + 1) * self.size / 2
         y = (points[:, 1] / self.half_y + 1) * self.size / 2
         x0, x1 = max(0, math.floor(x.min()) - 1), min(self.size, math.ceil(x.max()) + 2)
@@ -69,15 +68,15 @@ class Parallel(NamedTuple):
 
 @dataclass(frozen=True)
 class Box:
-    """Of a sun's map, in world axes and in the lamp's. centre : (3,).   half : (3,) along the lamp's axes."""
+    """The box of a sun's map. centre : (3,), world axes.   half : (3,) along the lamp's axes."""
 
     centre: tuple[float, float, float]
     half: tuple[float, float, float]
 
 
 def boxes(scene: Scene, items: Sequence[DrawItem]) -> dict[int, Box | None]:
-    """Of each lamp of :func:`shadowing` that is a sun, by its number, around all that casts; None for spot lights.
-    Empty where nothing casts."""
+    """Return, for each sun among the lamps of :func:`shadowing`, by its number, the box around everything that casts;
+    None for spot lights. Empty where nothing casts."""
     spheres = _swept(scene, items)
     if not len(spheres):
         return {}
@@ -94,7 +93,7 @@ def _box(lamp: Lamp, spheres: np.ndarray) -> Box:
         R = (lamp.path.pose(0) @ CV_FROM_LAMP)[:3, :3]
         low, high = (centres @ R - radius).min(axis=0), (centres @ R + radius).max(axis=0)
         middle, half = R @ (low + high) / 2, (high - low) / 2
-    else:  # whatever its direction
+    else:  # for any direction
         low, high = (centres - radius).min(axis=0), (centres + radius).max(axis=0)
         middle = (low + high) / 2
         half = np.full(3, (np.linalg.norm(centres - middle, axis=1) + spheres[:, 3]).max())
@@ -104,7 +103,7 @@ def _box(lamp: Lamp, spheres: np.ndarray) -> Box:
 
 
 def _swept(scene: Scene, items: Sequence[DrawItem]) -> np.ndarray:
-    """(n, 4) centre and radius, world axes, of spheres that hold every item that casts at all times."""
+    """Return (n, 4) centre and radius, world axes, of spheres that contain every casting item at all times."""
     times = np.linspace(scene.t0_ns, scene.t1_ns, _TIMES).astype(np.int64)
     spheres = []
     for item in items:
@@ -123,20 +122,20 @@ def _swept(scene: Scene, items: Sequence[DrawItem]) -> np.ndarray:
 
 
 def view_of(lamp: Lamp, box: Box | None, size: int, pose: np.ndarray) -> tuple[View, np.ndarray]:
-    """What the lamp's map sees, and (4, 4) T_world_cam from where. pose : T_world_lamp."""
+    """Return the view of the lamp's map, and its pose T_world_cam, (4, 4). pose : T_world_lamp."""
     T = pose @ CV_FROM_LAMP
     if box is None:
         return View.of(PinHole.centred(size, size, 1 / _texel_of_cone(lamp, size), near=_NEAR)), T
     x, y, z = (h * size / (size - 2 * _SPARE) for h in box.half)
     camera = Parallel(size, x, y, 2 * z)
     T[:3, 3] = np.asarray(box.centre) - z * T[:3, 2]
-    # By sphere against planes through one point nothing is out of it: each item is drawn that casts.
+    # No sphere is outside these planes, which go through one point: every casting item is drawn.
     return View(camera, camera.clip_from_cam(), np.zeros((1, 3))), T
 
 
 @lru_cache(maxsize=64)
 def scale_of(lamp: Lamp, box: Box | None, size: int) -> tuple[float, float, float, float]:
-    """``shadow_scale`` of shadows.glsl."""
+    """Return ``shadow_scale`` of shadows.glsl."""
     camera = view_of(lamp, box, size, np.eye(4))[0].camera
     if isinstance(camera, Parallel):
         return 2 * max(camera.half_x, camera.half_y) / camera.size, 0.0, 1 / camera.depth, lamp.size
@@ -144,15 +143,15 @@ def scale_of(lamp: Lamp, box: Box | None, size: int) -> tuple[float, float, floa
 
 
 def _texel_of_cone(lamp: Lamp, size: int) -> float:
-    """How wide a texel of a spot's map is at a depth of 1."""
+    """Return the width of a texel of a spot light's map at a depth of 1."""
     return math.tan(min(lamp.outer, 1.5)) / (size / 2 - _SPARE)
 
 
 def planes_of(rows: np.ndarray, scales: np.ndarray) -> np.ndarray:
-    """``shadow_plane`` of shadows.glsl, (maps, 3, 3): the depth of a plane with normal n is affine in the map, and its
-    slopes along x and y are the first two times n, over the third times n (of a spot light it is made in the shader),
-    times the depth of a world unit. rows, scales : (maps, 4, 4), (maps, 4) as the shader has them."""
-    across = rows[:, :2, :3] - 0.5 * rows[:, 3:, :3]  # without what centres a perspective map
+    """Return ``shadow_plane`` of shadows.glsl, (maps, 3, 3). The depth of a plane with normal n is affine in the map;
+    its slopes along x and y are the first two rows times n, divided by the third times n (for a spot light in the
+    shader), times the depth of a world unit. rows, scales : (maps, 4, 4), (maps, 4) as in the shader."""
+    across = rows[:, :2, :3] - 0.5 * rows[:, 3:, :3]  # without the centring of a perspective map
     across = across / (across**2).sum(axis=2, keepdims=True)
     along = rows[:, 2:3, :3] / -np.where(scales[:, 2] > 0, scales[:, 2], 1.0)[:, None, None]
     return np.concatenate([across, along], axis=1)

@@ -1,5 +1,5 @@
-"""Lines in a picture as OpenGL has them: a point for each pixel that some cross, which a program's vertex stage looks
-at all of them for."""
+"""Lines of a picture as OpenGL draws them: one point per crossed pixel; the vertex stage reads all lines of its
+pixel."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from blinkgl.render.moment import Moment
 
 ROW = 512
-"""Crossings in a row of the texture that holds them, each two texels: edges.glsl has the same."""
+"""Crossings per row of their texture, two texels each; the same as in edges.glsl."""
 
 
 class Strokes:
-    """Of one renderer. lines : the contours that it draws.   uniforms : table of a program's, for who draws."""
+    """The lines of one renderer. lines : the contours that it draws.   uniforms : returns a program's table."""
 
     def __init__(self, gl: GLContext, uniforms: Callable[[moderngl.Program], Uniforms] = Uniforms):
         self.gl, self.lines, self._uniforms = gl, Lines(), uniforms
@@ -33,7 +33,7 @@ class Strokes:
         self._programs: dict[tuple, tuple[dict[str, Any], moderngl.VertexArray]] = {}
 
     def upload(self, moment: Moment, items: Iterable[DrawItem], width: int, height: int) -> None:
-        """The lines of these items in a picture of width x height px, to be drawn next."""
+        """Upload the lines of these items in a picture of width x height px, for the next drawing."""
         pixels, crossings = self.lines.in_pixels(moment, items, width, height)
         self._count = len(pixels)
         if not self._count:
@@ -55,7 +55,7 @@ class Strokes:
         self._crossings.write(self._rows[:rows], viewport=(0, 0, 2 * ROW, rows))
 
     def program(self, name: str, defines: dict[str, Any]) -> tuple[dict[str, Any], moderngl.VertexArray | None]:
-        """Uniforms of a program, and the array that it draws; None where no pixel has a line."""
+        """Return the uniforms of a program and the array to draw; None where no pixel has a line."""
         if not self._count:
             return {}, None
         key = name, *sorted(defines.items())
@@ -68,12 +68,12 @@ class Strokes:
         return self._programs[key]
 
     def use(self, unit: int) -> None:
-        """The crossings' texture on a unit."""
+        """Bind the crossings' texture to a unit."""
         if self._crossings is not None:
             self._crossings.use(unit)
 
     def draw(self, array: moderngl.VertexArray, target: Target) -> None:
-        """Each of the pixels, over what ``target`` holds."""
+        """Draw each of the pixels over the content of ``target``."""
         ctx = self.gl.ctx
         target.fbo.use()
         ctx.viewport = (0, 0, target.fbo.width, target.fbo.height)
@@ -82,7 +82,7 @@ class Strokes:
         array.render(moderngl.POINTS, vertices=self._count)
 
     def forget(self) -> None:
-        """Asks for every program again."""
+        """Drop all programs, so that they are requested again."""
         for _, array in self._programs.values():
             array.release()
         self._programs = {}

@@ -1,13 +1,14 @@
-"""A frame that OpenGL has drawn as a torch tensor, by the shortest way that there is.
+"""An OpenGL frame as a torch tensor, by the fastest available way.
 
-``interop``: CUDA copies the texture on the card, and nothing goes over the bus. ``pinned``: OpenGL reads into memory
-that the card reaches by itself. ``plain``: the array that ``Frame.read`` gives. All three hold the same numbers.
+``interop``: CUDA copies the texture on the GPU, without using the bus. ``pinned``: OpenGL reads into memory that the
+GPU accesses directly. ``plain``: the array of ``Frame.read``. All three give the same numbers.
 
-No way but ``plain`` has run on a card: none was there. So ``interop`` compares its first tensor of every texture with
-what OpenGL reads, and whatever is missing, refused or different makes the reader take the next way and say why.
+``interop`` and ``pinned`` have not been tested on a GPU. So ``interop`` compares its first tensor of every texture with
+what OpenGL reads, and whenever something is missing, refused or different, the reader takes the next way and gives the
+reason.
 
-Order of things (CUDA Driver API, Graphics Interoperability): what OpenGL was told before a map is done before what CUDA
-is told after it on the map's stream, and the unmap orders what follows likewise; so nobody waits on the host.
+Order (CUDA Driver API, Graphics Interoperability): OpenGL commands before a map are complete before CUDA commands after
+it on the map's stream, and the unmap orders the other direction; so the host never waits.
 """
 
 from __future__ import annotations
@@ -24,15 +25,15 @@ if TYPE_CHECKING:
     from blinkgl.gl import GLContext, Target
 
 _TEXTURE_2D = 0x0DE1
-_CONTEXTS: dict[int, Any] = {}  # torch's (primary) contexts by card, kept as long as the process
+_CONTEXTS: dict[int, Any] = {}  # torch's (primary) contexts by GPU, kept for the life of the process
 
 
 class NoInteropError(Exception):
-    """One line: why CUDA does not read this texture."""
+    """The reason why CUDA does not read this texture, one line."""
 
 
 def torch_device(name: Any) -> Any:
-    """torch and the device of this name, with its number. Raises GLError: no torch, or no such device here."""
+    """Return torch and the device of this name, with its number. Raises GLError: no torch, or no such device."""
     try:
         torch = importlib.import_module("torch")
     except ImportError:
@@ -49,14 +50,14 @@ def torch_device(name: Any) -> Any:
 class TextureReader:
     """Reads attachment ``i`` of a target into tensors on one device.
 
-    way : "interop", "pinned" or "plain".   why : in a line, why no shorter one; "" for the shortest."""
+    way : "interop", "pinned" or "plain".   why : one line, why no faster way is used; "" for the fastest."""
 
     def __init__(self, gl: GLContext, target: Target, i: int, device: Any, driver: Any = None):
         self._gl, self._target, self._i = gl, target, i
         self._torch, self.device = torch_device(device)
         self._resource: Any = None
         self._pinned: Any = None
-        self._sent: Any = None  # when the card has done with the pinned memory
+        self._sent: Any = None  # event: the GPU has read the pinned memory
         self.way, self.why = "plain", "tensors of the processor are asked for"
         if self.device.type == "cuda":
             self.way, self.why = "pinned", ""
@@ -68,7 +69,7 @@ class TextureReader:
                 self.why = str(error)
 
     def read(self) -> Any:
-        """(H, W) or (H, W, C) tensor of its own, dtype of the attachment's format."""
+        """Return a new (H, W) or (H, W, C) tensor, with the dtype of the attachment's format."""
         self._gl.resume()
         if self.way == "interop":
             try:
@@ -79,7 +80,7 @@ class TextureReader:
         if self.way == "plain":
             return self._torch.from_numpy(self._target.read(self._i)).to(self.device)
         if self._sent is not None:
-            self._sent.synchronize()  # the frame before may still be on its way out of this memory
+            self._sent.synchronize()  # the previous frame may still be in transfer from this memory
         if self._pinned is None:
             like = self._torch.from_numpy(self._target.read(self._i))
             self._pinned = self._torch.empty(like.shape, dtype=like.dtype, pin_memory=True)
@@ -92,7 +93,7 @@ class TextureReader:
 
     # -- CUDA beside OpenGL --------------------------------------------------------------------------------------
     def _call(self, name: str, *arguments: Any) -> Any:
-        """What a call of the driver gives besides its status. Raises NoInteropError."""
+        """Return the results of a driver call without its status. Raises NoInteropError."""
         try:
             status, *values = getattr(self._driver, name)(*arguments)
         except Exception as error:  # noqa: BLE001 - a package without its driver, or of another version
@@ -102,7 +103,7 @@ class TextureReader:
         return values[0] if len(values) == 1 else tuple(values)
 
     def _register(self, driver: Any) -> None:
-        """Hands the texture to CUDA and compares the first copy. Raises NoInteropError."""
+        """Register the texture with CUDA and compare the first copy. Raises NoInteropError."""
         if driver is None and self._gl.is_software:
             raise NoInteropError(f"the processor draws ({self._gl.renderer})")
         try:
@@ -128,7 +129,7 @@ class TextureReader:
             raise NoInteropError("CUDA reads other numbers than OpenGL")
 
     def _here(self, name: str, *arguments: Any) -> Any:
-        """A call with torch's context current."""
+        """Call the driver with torch's context current."""
         self._call("cuCtxPushCurrent", self._context)
         try:
             return self._call(name, *arguments)
@@ -137,7 +138,7 @@ class TextureReader:
                 self._call("cuCtxPopCurrent")
 
     def _copied(self) -> Any:
-        """The texture's numbers, copied on the card. Raises NoInteropError: the driver refuses."""
+        """Return the texture's numbers, copied on the GPU. Raises NoInteropError: the driver refuses."""
         target, pixel, torch = self._target, self._target.formats[self._i], self._torch
         shape = (target.height, target.width) + ((pixel.components,) if pixel.components > 1 else ())
         dtype = torch.from_numpy(np.empty(0, pixel.numpy)).dtype
@@ -159,7 +160,7 @@ class TextureReader:
         return made
 
     def release(self) -> None:
-        """Before the texture goes. Harmless when repeated."""
+        """Release the registration, before the texture is released. May be called repeatedly."""
         resource, self._resource, self._pinned = self._resource, None, None
         if resource is not None:
             with suppress(NoInteropError):

@@ -1,7 +1,7 @@
-"""Points on surfaces, followed in time: in float64, by the algebra and the caster of the reference.
+"""Points on surfaces, followed over time in float64 by the functions of the reference renderer.
 
-A point is a triangle of a part and three weights of its corners, so it goes where its surface goes, whatever moves or
-deforms that. Where it is seen is a projection; whether, is a ray that has to reach it. Nothing is drawn.
+A point is a triangle of a part and three weights of its corners, so it follows its surface through any motion or
+deformation. Its image position is a projection; its visibility is tested by a ray. Nothing is drawn.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from blinkgl.render.casting import Hits
 from blinkgl.scene.types import Scene
 
 _DRAWS = 8
-"""Times that places are drawn anew for those where nothing is seen."""
+"""Number of draws of new positions for points that hit nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,7 @@ class Tracks:
 
     t_us : (T,) int64.   query_points : (N, 3) float64, number of the time, y and x of where each point was chosen.
     target_points : (N, T, 2) float64 px, x and y, (0, 0) the centre of the top-left pixel; 0 behind the camera.
-    occluded : (N, T) bool, not seen: hidden, seen from behind, outside the image or nearer than the near plane.
+    occluded : (N, T) bool, not visible: hidden, seen from behind, outside the image or nearer than the near plane.
     points_world : (N, T, 3) float64.   depth : (N, T) float64 along the optical axis, <= 0 behind the camera.
     instance : (N,) uint16.   surface : (N, 2) int32 part (of the scene, as it is drawn) and triangle.
     weights : (N, 3) float64 of the triangle's corners."""
@@ -43,7 +43,7 @@ class Tracks:
 
 
 def track_points(scene: Scene, config: TracksConfig, times_ns: Sequence[int], rng: np.random.Generator) -> Tracks:
-    """The points that ``config`` asks for, at (T,) times. rng : what draws them, where they are drawn."""
+    """Return the points of ``config`` at (T,) times. rng : draws them, if they are random."""
     times = [int(t) for t in times_ns]
     if config.choose == "surface":
         return _of_surfaces(scene, config.points, times, rng)
@@ -72,7 +72,8 @@ def _followed(scene: Scene, hits: Hits, times: list[int], query: np.ndarray) -> 
 
 
 def places(scene: Scene, hits: Hits, t_ns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Of the points of ``hits`` at a time: (N, 2) px, 0 behind the camera; (N, 3) world; (N,) depth; (N,) bool seen."""
+    """Return for the points of ``hits`` at a time: (N, 2) px, 0 behind the camera; (N, 3) world; (N,) depth; (N,) bool
+    visible."""
     camera = scene.camera
     there = replace(hits, local=_local(scene, hits, t_ns))
     moved = casting.applied(scene, there, lambda thing: casting.relative_pose_at(scene, thing, t_ns))
@@ -87,7 +88,7 @@ def places(scene: Scene, hits: Hits, t_ns: int) -> tuple[np.ndarray, np.ndarray,
 
 
 def _local(scene: Scene, hits: Hits, t_ns: int) -> np.ndarray:
-    """(N, 3) object-local positions at t_ns, of any part."""
+    """Return object-local positions at t_ns, (N, 3), of any part."""
     out, parts = np.full((len(hits.hit), 3), np.nan), casting.scene_parts(scene)
     for p in np.unique(hits.part):
         rows, mesh = hits.part == p, parts[p][1].mesh
@@ -100,7 +101,7 @@ _ARRAYS = ("xy", "hit", "depth", "instance", "part", "triangle", "front", "bary"
 
 
 def _of_a_grid(scene: Scene, points: int, times: list[int]) -> tuple[np.ndarray, Hits]:
-    """(N, 3) queries and the hits of a regular grid of whole pixels at the first time."""
+    """Return (N, 3) queries and the hits of a regular grid of whole pixels at the first time."""
     width, height = scene.camera.width, scene.camera.height
     columns = min(width, max(1, round(np.sqrt(points * width / height))))
     rows = min(height, max(1, points // columns))
@@ -114,8 +115,8 @@ def _of_a_grid(scene: Scene, points: int, times: list[int]) -> tuple[np.ndarray,
 
 
 def _of_surfaces(scene: Scene, points: int, times: list[int], rng: np.random.Generator) -> Tracks:
-    """Places drawn evenly on what is an object (else on all but the sky), as it is at the first time; of those the ones
-    that are ever seen, queried when they are first."""
+    """Return points drawn uniformly on the objects (without objects, on all but the sky) at the first time; only those
+    that are visible at some time, queried when they first are."""
     parts = casting.scene_parts(scene)
     own = [p for p, (thing, _) in enumerate(parts) if thing.category == "object"]
     own = own or [p for p, (thing, _) in enumerate(parts) if thing.category != "sky"]
@@ -131,11 +132,11 @@ def _of_surfaces(scene: Scene, points: int, times: list[int], rng: np.random.Gen
     for _ in range(_DRAWS):
         if not len(ends) or ends[-1] <= 0:
             break
-        # Half of what is drawn evenly on closed bodies faces away.
+        # Half of the points on closed bodies face away.
         draws = 2 * left
         chosen = places_[np.minimum(np.searchsorted(ends, rng.random(draws) * ends[-1], side="right"), len(ends) - 1)]
         u, v = rng.random((2, draws))
-        # The far half of the parallelogram is folded back: even over the triangle.
+        # The far half of the parallelogram is folded back: uniform over the triangle.
         u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
         ids = np.array([thing.instance_id for thing, _ in parts], np.int32)[chosen[:, 0]]
         nothing = np.zeros(draws)

@@ -2,8 +2,8 @@
 
 In:    the folder of a data set.
 Out:   report.html and index.jsonl.
-Start: page.py (``build_report``) and templates/data_set.html; collect.py gathers, charts.py
-counts and fills in any room's templates. calibration.py is the page of a fitted emulator.
+Start: page.py (``build_report``) and templates/data_set.html. collect.py collects the data; charts.py makes histograms
+and renders the templates of any room. calibration.py makes the page of a fitted emulator.
 """
 
 from blinkgl.report.page import build_report, write_report

@@ -1,4 +1,4 @@
-"""What a calibration found, as a page: before and after beside the recording, one self-contained HTML file."""
+"""The page of a calibration: before and after compared with the recording, one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _COLOURS = {"recorded": "#222222", "before": "#e9a13b", "fitted": "#1764ab"}
 
 
 def page(result: Calibration, sensor_text: str) -> str:
-    """The HTML text. sensor_text : of the sensor file."""
+    """Return the HTML text. sensor_text : text of the sensor file."""
     a, b = result.halves
     span = lambda part: (result.clip.edges_us[list(part)] - result.clip.edges_us[0]) / 1e6
     return render(
@@ -37,7 +37,7 @@ def page(result: Calibration, sensor_text: str) -> str:
 
 
 def rows(result: Calibration) -> list[tuple[str, list[str]]]:
-    """(quantity, [recorded, before, fitted] of the fitted half, then of the other) as text."""
+    """Return (quantity, [recorded, before, fitted] of the fitted half, then of the other) as text."""
     found = []
     text = lambda v, form: "–" if np.isnan(v) else form.format(v)
     sides = list(zip(result.judged_before, result.judged))
@@ -62,7 +62,7 @@ def rows(result: Calibration) -> list[tuple[str, list[str]]]:
 
 
 def parameters(result: Calibration) -> list[tuple[str, str, str, str]]:
-    """(key, before, fitted, what is to be said) of everything that might have been fitted."""
+    """Return (key, before, fitted, remark) of every parameter that the fit may change."""
     found = []
     for key in result.config.fitted:
         before, after = getattr(result.before, key), getattr(result.config, key)
@@ -70,13 +70,13 @@ def parameters(result: Calibration) -> list[tuple[str, str, str, str]]:
         if key in result.values:
             found.append((key, before, f"{after:.4g} ± {result.uncertainty[key]:.2g}", ""))
         else:
-            said = result.untold.get(key, "asked to stay as it was")
+            said = result.untold.get(key, "kept fixed by request")
             found.append((key, before, "" if after is None else f"{after:.4g}", said))
     return found
 
 
 def picture(result: Calibration) -> bytes:
-    """PNG: rates over time, intervals, counts, and polarity sums of one interval that was not fitted."""
+    """Return a PNG: rates over time, intervals, counts, and polarity sums of one interval that was not fitted."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -134,9 +134,10 @@ def picture(result: Calibration) -> bytes:
 
 
 def mosaic(image: np.ndarray) -> np.ndarray:
-    """The tiles of a clip in rows, a picture about as wide as high; one of a whole sensor is itself.
+    """Return the tiles of a clip in rows, as a nearly square picture; the one tile of a whole sensor is returned
+    unchanged.
 
-    image : (n TILE_PX, TILE_PX), tiles stacked on one another.   Returns (r TILE_PX, c TILE_PX), 0 where no tile is."""
+    image : (n TILE_PX, TILE_PX), stacked tiles.   Returns (r TILE_PX, c TILE_PX), 0 where there is no tile."""
     count = len(image) // TILE_PX
     if image.shape[1] != TILE_PX or count < 2:
         return image
@@ -148,7 +149,7 @@ def mosaic(image: np.ndarray) -> np.ndarray:
 
 
 def _plain(axes: Any) -> None:
-    """Plots without frames, and numbers without mathematical fonts."""
+    """Draw plots without frames, and numbers without mathematical fonts."""
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
     for ax in axes:

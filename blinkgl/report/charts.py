@@ -1,4 +1,4 @@
-"""What the charts of templates/charts.html draw: numbers in words, and histograms in the units of their picture."""
+"""Data of the charts in templates/charts.html: numbers as text, and histograms in units of their picture."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ WIDTH, HEIGHT, BOTTOM, LEFT = 300, 120, 18, 6
 
 @dataclass(frozen=True)
 class Histogram:
-    """``bars``: (left edge, height) of those that are not empty, on the line y = ``floor``; ``median_x`` is None where
-    the median is off the axis. ``low``, ``high``, ``median``: values to be written below, the
-    last one at ``label_x``."""
+    """A histogram. ``bars``: (left edge, height) of the non-empty bars, on the line y = ``floor``; ``median_x`` is None
+    where the median is off the axis. ``low``, ``high``, ``median``: values to write below, the last one at
+    ``label_x``."""
 
     bars: list[tuple[float, float]]
     bar_width: float
@@ -41,7 +41,8 @@ class Histogram:
 def histogram(
     values: np.ndarray, *, log: bool = False, bins: int = 36, span: tuple[float, float] | None = None
 ) -> Histogram | None:
-    """Bars of ``values`` over ``span`` (default: the 0.1 … 99.9 % range); None without values. log: of the axis."""
+    """Return bars of ``values`` over ``span`` (default: the 0.1 … 99.9 % range); None without values. log: logarithmic
+    axis."""
     values = values[np.isfinite(values)]
     if log:
         values = values[values > 0]
@@ -74,7 +75,7 @@ def histogram(
 
 
 def number(value: float) -> str:
-    """Three significant digits, thousands as k, M, G."""
+    """Return three significant digits, thousands as k, M, G."""
     if not np.isfinite(value):
         return "-"
     for limit, suffix in ((1e9, " G"), (1e6, " M"), (1e4, " k")):
@@ -84,35 +85,34 @@ def number(value: float) -> str:
 
 
 def size(count: float) -> str:
-    """Bytes as "12.3 MB"."""
+    """Return bytes as "12.3 MB"."""
     return f"{count / 1e9:.3g} GB" if count >= 1e9 else f"{count / 1e6:.3g} MB"
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Pages from templates (jinja2). Whatever is put into one is escaped, unless a template itself made it; a name that
-# is missing is an error.
+# Pages from jinja2 templates. Inserted values are escaped, unless a template made them; a missing name is an error.
 
 
 def render(name: str, **values: Any) -> str:
-    """The HTML text of a template ``"ROOM/FILE.html"``, which is blinkgl/ROOM/templates/FILE.html."""
+    """Return the HTML text of a template ``"ROOM/FILE.html"``, which is blinkgl/ROOM/templates/FILE.html."""
     return _environment().get_template(name).render(values)
 
 
 def png(array: np.ndarray) -> str:
-    """(H, W, 3) uint8 RGB as a data URI."""
+    """Return (H, W, 3) uint8 RGB as a data URI."""
     ok, data = cv2.imencode(".png", np.ascontiguousarray(array[..., ::-1]), [cv2.IMWRITE_PNG_COMPRESSION, 9])
     assert ok
     return data_uri(data.tobytes())
 
 
 def data_uri(file: bytes) -> str:
-    """The bytes of a PNG file as a data URI."""
+    """Return the bytes of a PNG file as a data URI."""
     return "data:image/png;base64," + base64.b64encode(file).decode()
 
 
 @lru_cache(1)
 def _environment() -> jinja2.Environment:
-    import jinja2  # a page is the last thing that anybody makes
+    import jinja2  # imported late: pages are written last
 
     environment = jinja2.Environment(
         loader=jinja2.FunctionLoader(_source),

@@ -1,5 +1,5 @@
-"""What the page is made of: a sample of labels for pictures and distributions, every
-configuration for the parameters."""
+"""The data of the page: a sample of labels for pictures and distributions, and every configuration for the
+parameters."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _FLOW = LABELS["flow_forward"]
 
 @dataclass(eq=False)
 class Example:
-    """Pictures of one label, RGB uint8 (H, W, 3), and what stands below them."""
+    """Pictures of one label, RGB uint8 (H, W, 3), and their caption."""
 
     name: str
     image: np.ndarray | None
@@ -49,7 +49,7 @@ class Example:
 
 @dataclass
 class Parameter:
-    """A distribution of the recipe, and the values that the sequences have."""
+    """A distribution of the recipe, and the values of the sequences."""
 
     group: str
     path: str
@@ -60,11 +60,11 @@ class Parameter:
 
 @dataclass(eq=False)
 class Collected:
-    """What the page of a data set is made of."""
+    """The contents of a data set's page."""
 
     root: Path
     sequences: list[dict[str, Any]]
-    """lines of the index: a line a camera, so of a rig's sequence several"""
+    """Lines of the index, one per camera: a rig's sequence has several."""
     plan: Plan | None
     environment: dict[str, str]
     failed: dict[str, str]
@@ -74,11 +74,11 @@ class Collected:
     parameters: list[Parameter] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)
     damaged: set[str] = field(default_factory=set)
-    """paths of sequences that are not what their manifests say: counted, but no file of theirs is opened"""
+    """Paths of sequences that differ from their manifests: they are counted, but none of their files is opened."""
 
     @property
     def simulated_us(self) -> dict[str, int]:
-        """Simulated time of each sequence, µs, by its folder. Cameras of a rig share it: it counts once."""
+        """Return the simulated time of each sequence, µs, by its folder. Cameras of a rig share it: it counts once."""
         spans: dict[str, int] = {}
         for line in self.sequences:
             spans[task_of(line)] = max(spans.get(task_of(line), 0), line["duration_us"] or 0)
@@ -86,13 +86,13 @@ class Collected:
 
 
 def task_of(line: dict[str, Any]) -> str:
-    """Folder that a task has made, of a line of the index: that of the rig where it is of one of its cameras."""
+    """Return the folder of the task that made a line of the index: the rig's folder for one of its cameras."""
     path = PurePosixPath(line["path"])
     return str(path.parent if "sensor" in line else path)
 
 
 def collect(root: str | Path, *, examples: int = 6, seed: int = 0) -> Collected:
-    """Raises AssetError when there is no data set; sequences that cannot be read are listed, not fatal."""
+    """Collect the data of the page. Raises AssetError when there is no data set; unreadable sequences are listed."""
     root = Path(root)
     if not root.is_dir():
         raise AssetError("no such data set", where=str(root), accepted="a folder of sequences")
@@ -131,7 +131,7 @@ def collect(root: str | Path, *, examples: int = 6, seed: int = 0) -> Collected:
 
 
 def _sample(found: Collected, rng: np.random.Generator, examples: int) -> None:
-    """Displacements, speeds, depths, numbers of objects from some labels; rates from every sequence."""
+    """Collect displacements, speeds, depths and numbers of objects from some labels, and rates from every sequence."""
     values: dict[str, list] = {k: [] for k in ("displacement", "speed", "depth", "objects", "share")}
     found.quantities["rate"] = np.array(
         [
@@ -177,14 +177,14 @@ def _sample(found: Collected, rng: np.random.Generator, examples: int) -> None:
 
 
 def _value(folder: Path, name: str, flow: Path) -> Any:
-    """What a label holds beside a file of flow; None where the sequence has no such label. Raises AssetError."""
+    """Return a label's content beside a file of flow; None where the sequence has no such label. Raises AssetError."""
     form = LABELS[name].forms[0]
     path = folder / form.file(int(flow.stem))
     return form.read(path) if form.read is not None and path.is_file() else None
 
 
 def _spread(sequences: list[dict[str, Any]], order: list[int], count: int) -> list[int]:
-    """Of each (split, kind of name, emulator) in turn, so that rare kinds are shown, too."""
+    """Choose from each (split, kind of name, emulator) in turn, so that rare kinds appear, too."""
     kinds: dict[tuple, list[int]] = {}
     for number in order:
         s = sequences[number]
@@ -201,7 +201,7 @@ def _example(folder: Path, line: dict[str, Any], flows: list[Path], pairs, k: in
     flow, valid = read_flow_png(flows[k])
     start, end = pairs[k]
     with DsecEventReader(folder / "events.h5") as reader:
-        # A whole label interval is a blot: the first part of it, about one event in five pixels.
+        # A whole label interval is too dense to see: show the first part of it, about one event in five pixels.
         window = end - start
         events = reader.slice(start, end)
         wanted = line["height"] * line["width"] // 5
@@ -236,7 +236,7 @@ def _example(folder: Path, line: dict[str, Any], flows: list[Path], pairs, k: in
 
 
 def _of_the_camera(folder: Path, line: dict[str, Any], t_us: int) -> list[tuple[str, np.ndarray]]:
-    """Of a frame camera, the image nearest to a time and what is written beside it, as 8-bit pictures."""
+    """Return a frame camera's image nearest to a time and what is written beside it, as 8-bit pictures."""
     if not (folder / EXPOSURES).is_file():
         return []
     about, lines = read_manifest(folder)["frame_camera"], read_exposures(folder)
@@ -251,7 +251,7 @@ def _of_the_camera(folder: Path, line: dict[str, Any], t_us: int) -> list[tuple[
 
 
 def _over_time(folder: Path, line: dict[str, Any], t_us: int, image: np.ndarray | None) -> list[tuple[str, np.ndarray]]:
-    """Point tracks over the image of a time, with tails."""
+    """Return point tracks drawn over the image of a time, with tails."""
     pictures = []
     if (folder / TRACKS).is_file():
         tracks, size = read_tracks(folder), np.array([line["width"], line["height"]])
@@ -263,8 +263,8 @@ def _over_time(folder: Path, line: dict[str, Any], t_us: int, image: np.ndarray 
 
 
 def _others(folder: Path, index: int, image: np.ndarray | None) -> list[tuple[str, np.ndarray]]:
-    """Pictures of the labels besides those that every example shows. image : of the same time, what is no picture is
-    drawn over that."""
+    """Return pictures of the labels that not every example shows. image : of the same time; labels that are not images
+    are drawn over it."""
     pictures = []
     for name, label in LABELS.items():
         form = label.forms[0]
@@ -290,7 +290,7 @@ def _pairs(path: Path) -> list[tuple[int, int]]:
 
 
 def _parameters(found: Collected, rng: np.random.Generator) -> None:
-    """Every distribution of the recipe with the values drawn, as the sequences' own config.yaml say."""
+    """Collect every distribution of the recipe with the drawn values of the sequences' config.yaml."""
     if found.plan is None:
         return
     here = {task_of(s) for s in found.sequences if s["path"] not in found.damaged}
@@ -352,7 +352,8 @@ def _at(config: Any, path: tuple[str, ...]) -> Any:
 
 
 def _fits(value: Any, option: Any) -> bool:
-    """Whether a drawn table may have come of this option: its plain keys agree, what was drawn is inside its range."""
+    """Return whether a drawn table may come from this option: its plain keys are equal, drawn values are inside their
+    range."""
     if is_distribution(option):
         kind, spec = next(iter(option.items()))
         return kind not in ("uniform", "log_uniform", "integer") or (

@@ -1,4 +1,4 @@
-"""The page itself: what :mod:`blinkgl.report.collect` found, in the words and charts of templates/data_set.html."""
+"""The page: the results of :mod:`blinkgl.report.collect` in the text and charts of templates/data_set.html."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _MAX_LISTED = 50
 
 
 def write_report(root: str | Path, out: str | Path | None = None, *, examples: int = 6) -> Path:
-    """Writes the page (default ``<root>/report.html``) and ``index.jsonl``; returns the page's
-    path. Raises BlinkGLError."""
+    """Write the page (default ``<root>/report.html``) and ``index.jsonl``; return the page's path. Raises
+    BlinkGLError."""
     found = collect(root, examples=examples)
     out = Path(out) if out is not None else Path(root) / "report.html"
     write_index(root)
@@ -30,7 +30,7 @@ def write_report(root: str | Path, out: str | Path | None = None, *, examples: i
 
 
 def build_report(found: Collected) -> str:
-    """The HTML text."""
+    """Return the HTML text."""
     sequences, costs = found.sequences, found.costs
     groups = _groups(found)
     kinds = Counter(f"{x['split']}, {x['emulator']}" for x in sequences)
@@ -64,7 +64,7 @@ def build_report(found: Collected) -> str:
 
 
 def _causes(sequences: list[dict[str, Any]]) -> list[tuple[str, str]]:
-    """Tiles: rates per pixel by what caused the events, over the sequences that know."""
+    """Return tiles: rates per pixel by cause, over the sequences that store causes."""
     known = [x for x in sequences if x.get("events_by_cause") and x["duration_us"]]
     pixel_seconds = sum(x["duration_us"] * 1e-6 * x["width"] * x["height"] for x in known)
     counts: Counter[str] = Counter()
@@ -74,7 +74,7 @@ def _causes(sequences: list[dict[str, Any]]) -> list[tuple[str, str]]:
 
 
 def _groups(found: Collected) -> list[tuple[str, int, int]]:
-    """(group, sequences made, asked for)"""
+    """Return (group, sequences made, requested) per group."""
     if found.plan is None:
         return []
     paths = {task_of(x) for x in found.sequences}
@@ -128,7 +128,7 @@ def _parameter(p: Parameter) -> dict[str, Any]:
 
 
 def _coverage(values: np.ndarray, low: float, high: float, kind: str) -> tuple[str, int]:
-    """ "9 of 10 tenths of [0.18, 0.25] hit", and how many values lie outside."""
+    """Return "9 of 10 tenths of [0.18, 0.25] hit", and the number of values outside."""
     said = f"of [{number(low)}, {number(high)}]"
     if not values.size or high <= low:
         return f"range {said}", 0

@@ -1,4 +1,4 @@
-"""The noise of single pixels that a still scene showed, as a page: beside what the fit makes of it."""
+"""The page of single-pixel noise fitted to a static scene, compared with the recording."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def page(result: PixelFit, sensor_text: str) -> str:
-    """The HTML text. sensor_text : of the sensor file."""
+    """Return the HTML text. sensor_text : text of the sensor file."""
     return render(
         "report/pixel_noise.html",
         title=f"noise of single pixels fitted to {result.recording.rsplit('/', 1)[-1]}",
@@ -23,7 +23,7 @@ def page(result: PixelFit, sensor_text: str) -> str:
 
 
 def rows(result: PixelFit) -> list[tuple[str, str, str]]:
-    """(quantity, recorded, fitted) of the half that was not fitted, as text."""
+    """Return (quantity, recorded, fitted) of the half that was not fitted, as text."""
     return [
         ("events", f"{result.recorded:,}", f"{result.simulated:,}"),
         ("pixels that fired", f"{result.fired[0]:,}", f"{result.fired[1]:,}"),
@@ -33,7 +33,7 @@ def rows(result: PixelFit) -> list[tuple[str, str, str]]:
 
 
 def parameters(result: PixelFit) -> list[tuple[str, str, str]]:
-    """(key, fitted, what is to be said)."""
+    """Return (key, fitted, remark)."""
     found = []
     for key, field in type(result.config).model_fields.items():
         value = getattr(result.config, key)

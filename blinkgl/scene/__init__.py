@@ -1,6 +1,6 @@
-"""Scenes as pure data in float64: shapes, surfaces, light, a camera, paths in time. No OpenGL here.
+"""Scenes as plain float64 data: shapes, surfaces, light, a camera, paths in time. No OpenGL here.
 
-In:    a validated scene configuration, a seed, files of strangers.
+In:    a validated scene configuration, a seed, files from untrusted users.
 Out:   :class:`~blinkgl.scene.types.Scene`.
-Start: types.py says what a scene is, build.py makes one; rooms inside: geometry, surfaces, motion, importing, worlds.
+Start: types.py defines a scene, build.py makes one; rooms inside: geometry, surfaces, motion, importing, worlds.
 """

@@ -1,4 +1,4 @@
-"""From a scene's configuration to a :class:`~blinkgl.scene.types.Scene`."""
+"""Build a :class:`~blinkgl.scene.types.Scene` from its configuration."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ def build_scene(
     sequence: int = 0,
     base: Path | str = ".",
 ) -> Scene:
-    """The scene over [t0_ns, t1_ns].
+    """Return the scene over [t0_ns, t1_ns].
 
-    camera : what it is seen by; a file's own may take its place (``scene.intrinsics``).
-    split : 'train' or 'test', which side of the pools random scenes draw from.
-    seed, sequence : random scenes are a function of these and the configuration; the same twice gives identical arrays.
+    camera : the camera; a file's own may replace it (``scene.intrinsics``).
+    split : 'train' or 'test', the part of the pools for random scenes.
+    seed, sequence : random scenes are a function of these and the configuration; repetition gives identical arrays.
     base : folder that the configuration's relative paths start from.
     Raises ConfigError and AssetError.
     """
@@ -56,15 +56,14 @@ def build_scene(
 
 
 def in_fog(scene: Scene, config: SceneConfig) -> Scene:
-    """The scene with the fog that ``scene.fog`` of its configuration asks for."""
+    """Return the scene with the fog of ``scene.fog`` in its configuration."""
     fog = config.fog
     return scene if fog is None else replace(scene, fog=Fog(fog.density, fog.radiance))
 
 
 def sequence_scene(config: SequenceConfig, index: int, base: Path | str = ".") -> Scene:
-    """The scene of sequence ``index`` of a run, with the sensor that records what the configuration asks for.
-
-    Of a rig: with all of its sensors, each recording what its own sections ask for.
+    """Return the scene of sequence ``index`` of a run, with the sensor of the configuration; for a rig, with all of its
+    sensors, each recording what its own sections configure.
 
     base : folder that the configuration's relative paths start from. Raises ConfigError and AssetError."""
     time, seed = config.time, config.seed
@@ -82,14 +81,14 @@ def sequence_scene(config: SequenceConfig, index: int, base: Path | str = ".") -
 
 
 def equipped(scene: Scene, config: SequenceConfig) -> Scene:
-    """The scene with the sensors that the configuration describes, each recording what is asked of it."""
+    """Return the scene with the sensors of the configuration, each recording what is configured."""
     if config.sensors is None:
         return recording(scene, config)
     return replace(scene, rig=Rig(scene.rig.path, tuple(_on_rig(one, config.sensors) for one in config.sensors)))
 
 
 def seen_by(config: SequenceConfig) -> CameraConfig:
-    """The camera that a scene is made for: a rig's first one; where it has none, that of the top."""
+    """Return the camera that a scene is made for: a rig's first one; without one, the top level's."""
     return next((one.camera for one in config.sensors or () if one.sees), config.camera)
 
 
@@ -107,7 +106,7 @@ def _on_rig(one: RigSensorConfig, all_: tuple[RigSensorConfig, ...]) -> Sensor:
 
 
 def _with_room(config: SequenceConfig) -> SceneConfig:
-    """The scene's configuration, in which a random world keeps clear of every camera of the rig, wherever it is."""
+    """Return the scene's configuration in which a random world keeps clear of every camera of the rig."""
     scene = config.scene
     if not isinstance(scene, RandomSceneConfig):
         return scene
@@ -120,13 +119,14 @@ def _with_room(config: SequenceConfig) -> SceneConfig:
 
 
 def recording(scene: Scene, config: SequenceConfig) -> Scene:
-    """The scene whose first sensor records what ``events:``, ``readout:`` and ``labels:`` of the configuration say."""
+    """Return the scene whose first sensor records what ``events:``, ``readout:`` and ``labels:`` of the configuration
+    say."""
     recorded = {"emulator": config.events, "readout": config.readout, "labels": config.labels}
     return replace(scene, rig=scene.rig.with_first(**recorded))
 
 
 def check_assets(config: SceneConfig, base: Path | str = ".", split: str = "train") -> None:
-    """Finds missing folders, empty pools and missing files before any work starts. Raises ConfigError or AssetError."""
+    """Find missing folders, empty pools and missing files before any work starts. Raises ConfigError or AssetError."""
     base = Path(base)
     if isinstance(config, RandomSceneConfig):
         objects, textures = pools(config, base)
@@ -161,7 +161,7 @@ def _check_trajectory(config: TrajectoryConfig, base: Path, where: str) -> None:
 
 
 def panorama_of(light: LightConfig) -> str | None:
-    """File that lights a scene; None: none."""
+    """Return the file of the panorama that lights a scene; None: none."""
     return None if light.environment is None else light.environment.map
 
 

@@ -1,8 +1,8 @@
-"""What light does to a white surface, in float64: the numbers that the renderer hands to its shaders.
+"""Radiance of a white surface under lights, in float64: the numbers that the renderer passes to its shaders.
 
-Every strength is the radiance that a white surface gives back which faces the light: of a sun anywhere, of a point or
-spot light 1 world unit away from it (there it falls with the square of the distance). An irradiance of E (W/m²) is
-therefore a strength of E / pi, an intensity of I (W/sr) one of I / pi.
+Every strength is the radiance of a white surface that faces the light: for a sun at any distance, for a point or spot
+light at 1 world unit (it falls with the square of the distance). An irradiance of E (W/m²) is therefore a strength of E
+/ pi, and an intensity of I (W/sr) is I / pi.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from blinkgl.scene.surfaces.gloss import blurred
 from blinkgl.scene.types import Lamp, Light, Panorama, PosePath
 
 MAX_LAMPS = 32
-"""Of a scene: each is looked at by every lit pixel."""
-_SKY_SIZE = (64, 128)  # of the plain sky, which has an edge at the horizon and is even otherwise
+"""Largest number of lamps of a scene: every lit pixel evaluates each."""
+_SKY_SIZE = (64, 128)  # of the plain sky, which has an edge at the horizon and is uniform otherwise
 NEAREST = 1e-3
-"""World units; what is nearer to a point or spot light than this is lit as if it were this far."""
+"""World units; points nearer to a point or spot light than this are lit as if they were this far."""
 
 
 def lamp_pose(position: ArrayLike = (0.0, 0.0, 0.0), shines: ArrayLike = (0.0, 0.0, -1.0)) -> np.ndarray:
-    """(4, 4) T_world_lamp of a lamp at ``position`` that shines in the direction (3,), of any length."""
+    """Return T_world_lamp, (4, 4), of a lamp at ``position`` that shines in the direction (3,), of any length."""
     z = -np.asarray(shines, np.float64)
     z = z / np.linalg.norm(z)
     x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
@@ -53,8 +53,7 @@ def _scaled(color: Sequence[float] | np.ndarray, factor: float) -> tuple[float, 
 
 
 def lamps_of(light: Light) -> tuple[Lamp, ...]:
-    """The sun, where there is one, and the lamps, in the order in which shaders have them: suns, point lights, spot
-    lights."""
+    """Return the sun, where there is one, and the lamps, in the shaders' order: suns, point lights, spot lights."""
     lamps = light.lamps
     if light.sun:
         strength = _scaled(light.sun_color, light.sun)
@@ -65,11 +64,12 @@ def lamps_of(light: Light) -> tuple[Lamp, ...]:
 
 
 MAX_SHADOWS, MAX_SOFT = 4, 2
-"""Lamps whose shadows are drawn, and of soft ones, whose programs are long: a map, and a texture unit, each."""
+"""Largest number of lamps whose shadows are drawn, and of soft ones, whose programs are long: each needs a map and a
+texture unit."""
 
 
 def shadowing(light: Light) -> tuple[int, ...]:
-    """Which of :func:`lamps_of` cast shadows: suns, then spot lights, the first of each."""
+    """Return which of :func:`lamps_of` cast shadows: suns, then spot lights, the first of each."""
     if light.shadows == "off":
         return ()
     lamps = lamps_of(light)
@@ -80,7 +80,7 @@ def shadowing(light: Light) -> tuple[int, ...]:
 
 
 def quadric_of(light: Light) -> np.ndarray:
-    """(3, 4, 4) what comes from all around, per channel, for :func:`ambient`; world axes."""
+    """Return the light of the surroundings per channel, (3, 4, 4), for :func:`ambient`; world axes."""
     one = np.zeros((4, 4))
     one[3, 3] = 0.5
     one[2, 3] = one[3, 2] = 0.25  # 0.5 + 0.5 n_z
@@ -89,20 +89,21 @@ def quadric_of(light: Light) -> np.ndarray:
 
 
 def is_coloured(light: Light) -> bool:
-    """Whether any of it is not white, so that a surface's luminance is not its albedo's times a number."""
+    """Return whether any light is not white, so that a surface's luminance is not its albedo's times a number."""
     forms = [form for form in (quadric_of(light), quartic_of(light)) if form is not None]
     return any(len(set(lamp.strength)) > 1 for lamp in lamps_of(light)) or any((f != f[:1]).any() for f in forms)
 
 
 def quartic_of(light: Light) -> np.ndarray | None:
-    """(3, 9, 9) of what comes from all around, for :func:`ambient`; world axes. None: :func:`quadric_of` is all."""
+    """Return the order-4 light of the surroundings, (3, 9, 9), for :func:`ambient`; world axes. None: only
+    :func:`quadric_of`."""
     return None if light.finer is None else np.asarray(light.finer, np.float64)
 
 
 def ambient(quadric: np.ndarray, normal: np.ndarray, quartic: np.ndarray | None = None) -> np.ndarray:
-    """(..., 3) radiance of a white surface with (..., 3) unit normals, of light from all around: (n, 1) Q (n, 1) per
-    channel, not below 0. quadric : (3, 4, 4), symmetric, in the axes of the normals.   quartic : (3, 9, 9), a form of
-    the nine products of two coordinates, that comes on top."""
+    """Return the radiance of a white surface with (..., 3) unit normals, (..., 3), from light of the surroundings: (n,
+    1) Q (n, 1) per channel, not below 0. quadric : (3, 4, 4), symmetric, in the axes of the normals.   quartic : (3, 9,
+    9), a form of the nine products of two coordinates, which is added."""
     n = np.concatenate([normal, np.ones((*normal.shape[:-1], 1))], axis=-1)
     sums = np.einsum("...i,cij,...j->...c", n, quadric, n)
     if quartic is not None:
@@ -112,9 +113,9 @@ def ambient(quadric: np.ndarray, normal: np.ndarray, quartic: np.ndarray | None 
 
 
 def seen_around(light: Light) -> np.ndarray:
-    """(h, w, 3) float32 radiance from all around, without lamps, as a panorama whose pixels lie as in
-    :func:`~blinkgl.scene.surfaces.environment.pixel_directions`. Of light that is known by its quadric alone what a
-    white surface gives back takes its place: as smooth as that is."""
+    """Return the radiance of the surroundings, (h, w, 3) float32, without lamps, as a panorama with pixels as in
+    :func:`~blinkgl.scene.surfaces.environment.pixel_directions`. Light known only by its quadric is replaced by the
+    radiance of a white surface under it, which is as smooth."""
     height, width = _SKY_SIZE if light.surroundings is None else light.surroundings.pixels.shape[:2]
     picture = np.zeros((height, width, 3), np.float32)
     if light.surroundings is not None:
@@ -127,22 +128,22 @@ def seen_around(light: Light) -> np.ndarray:
 
 
 def surroundings_of(light: Light) -> np.ndarray:
-    """(levels, h, w, 3) float32: :func:`seen_around` as surfaces of several roughnesses mirror it
+    """Return (levels, h, w, 3) float32: :func:`seen_around` mirrored by surfaces of several roughnesses
     (:func:`~blinkgl.scene.surfaces.gloss.blurred`)."""
-    if light.around is None and light.surroundings is None:  # one column will do
+    if light.around is None and light.surroundings is None:  # one column suffices
         return _half_a_sky() * (np.float32(light.sky) * np.asarray(light.sky_color, np.float32))
     return blurred(seen_around(light))
 
 
 @lru_cache(maxsize=1)
 def _half_a_sky() -> np.ndarray:
-    """(levels, h, 1, 3): the same all round."""
+    """Return (levels, h, 1, 3): the same in all columns."""
     return blurred(seen_around(Light(sun=0.0, sky=1.0)))[:, :, :1]
 
 
 def beam(lamp: Lamp, pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What a lamp sends to (N, 3) points, both in world axes: (N, 3) unit vectors towards it, and (N, 3) strength,
-    the radiance of a white surface that faces it, in nobody's shadow. pose : (4, 4) T_world_lamp."""
+    """Return the light of a lamp at (N, 3) points, both in world axes: (N, 3) unit vectors towards it, and (N, 3)
+    strength, the radiance of a white surface that faces it, without shadows. pose : (4, 4) T_world_lamp."""
     axis, strength = pose[:3, 2], np.asarray(lamp.strength, np.float64)
     if lamp.kind == "sun":
         return np.broadcast_to(axis, points.shape), np.broadcast_to(strength, points.shape)
@@ -151,7 +152,7 @@ def beam(lamp: Lamp, pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, 
     towards = way / distance[:, None]
     fall = distance**-2.0
     if math.isfinite(lamp.reach):
-        # KHR_lights_punctual's window: 0 at the reach, and unchanged nearby.
+        # The window of KHR_lights_punctual: 0 at the reach, and no change nearby.
         fall = fall * np.maximum(0.0, 1.0 - (distance / lamp.reach) ** 4)
     if lamp.kind == "spot":
         scale, offset = lamp.cone
@@ -163,8 +164,9 @@ def beam(lamp: Lamp, pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, 
 
 
 def make_light(config: LightConfig, rng: np.random.Generator | None = None, further: Sequence[Lamp] = ()) -> Light:
-    """The light of a scene. Sun direction drawn where the configuration leaves it open and ``rng`` is given.
-    further : lamps beside those of the configuration."""
+    """Return the light of a scene. The sun's direction is drawn where the configuration leaves it open and ``rng`` is
+    given.
+    further : lamps in addition to the configuration's."""
     drawn = () if rng is None else (float(rng.uniform(25, 80)), float(rng.uniform(-180, 180)))
     return Light(
         config.sun_direction(*drawn),
@@ -193,7 +195,7 @@ def _lamp(config: SunLampConfig | PointLampConfig | SpotLampConfig) -> Lamp:
 
 
 def lit_by(panorama: Environment, factor: float, light: Light) -> Light:
-    """A panorama's light in the place of the light's sun and sky. factor : on its radiance."""
+    """Return the light with a panorama's instead of its sun and sky. factor : on its radiance."""
     suns = [
         Lamp("sun", _scaled(sun.strength, factor), StaticPath(lamp_pose(shines=-sun.towards)), size=sun.size)
         for sun in panorama.suns
@@ -207,11 +209,11 @@ def lit_by(panorama: Environment, factor: float, light: Light) -> Light:
 
 
 LUMENS_PER_WATT = 683.0
-"""What photometric units of files are divided by; Blender's exporter multiplies by it."""
+"""Divisor of photometric units of files; Blender's exporter multiplies by it."""
 
 
 def lamp_of_gltf(light: Mapping[str, Any], path: PosePath, gain: float) -> Lamp:
-    """Of an entry of KHR_lights_punctual: lux of a directional light, candela of others."""
+    """Return the lamp of an entry of KHR_lights_punctual: lux of a directional light, candela of others."""
     strength = _scaled(light["color"], gain * light["intensity"] / (LUMENS_PER_WATT * math.pi))
     if light["type"] == "directional":
         return Lamp("sun", strength, path)
@@ -224,7 +226,7 @@ def lamp_of_gltf(light: Mapping[str, Any], path: PosePath, gain: float) -> Lamp:
 def random_lamps(
     config: RandomLightsConfig, rng: np.random.Generator, half_width: float, floor: float
 ) -> tuple[Lamp, ...]:
-    """Lamps of a random world. half_width : of the region, m.   floor : z of the ground."""
+    """Return the lamps of a random world. half_width : of the region, m.   floor : z of the ground."""
     lamps = []
     for _ in range(int(rng.integers(config.count[0], config.count[1] + 1))):
         kind = config.kinds[int(rng.integers(len(config.kinds)))]

@@ -1,4 +1,4 @@
-"""What goes wrong while a file is read, and what it asks for that is not drawn, as lines that name the file."""
+"""Errors while a file is read, and features of a file that are not drawn, as lines that name the file."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ MAX_BYTES = 2_000_000_000
 
 @contextmanager
 def reading(what: str, where: str) -> Iterator[None]:
-    """Everything that reading a ``what`` (mesh, image, scene) from the file ``where`` raises becomes an AssetError.
+    """Convert every exception raised while reading a ``what`` (mesh, image, scene) from the file ``where`` to an
+    AssetError.
 
-    The readers check what they know to check and say what is wrong. What is left is what nobody thought of, and what
-    the parsers of other packages raise on broken files: ValueError, KeyError, IndexError, struct.error, OSError,
-    SyntaxError, … The cause is kept for ``--debug``.
+    The readers report the errors that they check for. The rest are unforeseen errors, and what the parsers of other
+    packages raise on broken files: ValueError, KeyError, IndexError, struct.error, OSError, SyntaxError, … The cause is
+    kept for ``--debug``.
     """
     try:
         yield
@@ -34,7 +35,8 @@ def reading(what: str, where: str) -> Iterator[None]:
 
 
 def contents(path: Path, what: str, where: str | None = None, max_bytes: int = MAX_BYTES) -> bytes:
-    """The bytes of a file. AssetError naming it (``where``): it cannot be read, or is longer than ``max_bytes``."""
+    """Return the bytes of a file. Raises AssetError naming it (``where``): it cannot be read, or is longer than
+    ``max_bytes``."""
     where = where or str(path)
     try:
         size = path.stat().st_size
@@ -51,23 +53,25 @@ def contents(path: Path, what: str, where: str | None = None, max_bytes: int = M
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What a file asks for and BlinkGL does not draw: a loader collects it, a run says it, in one line per file.
+# Features that a file uses and BlinkGL does not draw: collected by a loader, reported by a run in one line per file.
 
 
 @dataclass
 class Omissions:
-    """Of one file, in the order met.
+    """The undrawn features of one file, in the order met.
 
-    name : the file's name without its folder: the line goes into manifests, which know no machine.
+    name : the file's name without its folder: the line is written to manifests, which must not depend on the
+    machine.
     """
 
     name: str
     found: dict[str, None] = field(default_factory=dict)
 
     def add(self, what: str) -> None:
-        """``what``: a few words from the file's own world, with what is done instead: "alpha BLEND (drawn opaque)"."""
+        """Add a feature. ``what``: a few words in the file's terms, with what is done instead: "alpha BLEND (drawn
+        opaque)"."""
         self.found[what] = None
 
     def lines(self) -> tuple[str, ...]:
-        """The one line, or nothing."""
+        """Return the one line, or nothing."""
         return (f"{self.name} asks for what is not drawn: " + "; ".join(self.found),) if self.found else ()

@@ -1,7 +1,7 @@
-"""What looks at a scene: sensors, each at its place on one rig that moves.
+"""Sensors of a scene, each at a fixed pose on one moving rig.
 
-A :class:`Sensor` is a device on the rig; the data sheet of a camera that one can buy, which ``sensor:`` of a
-configuration names, is :class:`blinkgl.config.sensor.SensorConfig`.
+A :class:`Sensor` is a device on the rig; the data sheet of a commercial camera, which ``sensor:`` of a configuration
+names, is :class:`blinkgl.config.sensor.SensorConfig`.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from blinkgl.scene.types import PosePath
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """One camera of a rig and what is recorded through it.
+    """One camera of a rig and what is recorded with it.
 
-    camera : its model.   T_rig_cam : (4, 4) float64 rigid, its place: from camera axes (OpenCV's) to the rig's.
-    emulator, readout : how frames become events; emulator None: no events are recorded; readout None: no limit.
-    labels : ground truth and pictures that are recorded with it; None: none.
+    camera : its model.   T_rig_cam : (4, 4) float64 rigid, from camera axes (OpenCV's) to the rig's.
+    emulator, readout : event emulator and read-out; emulator None: no events are recorded; readout None: no limit.
+    labels : ground truth and pictures that are recorded; None: none.
     folder : of its files below the sequence's directory; "": that directory itself.
-    baseline : world units along the camera's x axis to the other eye of a rectified pair; None: it has none.
+    baseline : world units along the camera's x axis to the other camera of a rectified pair; None: no pair.
     """
 
     camera: CameraModel
@@ -42,9 +42,9 @@ class Sensor:
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """path : T_world_rig over time.   sensors : one or more, all of which it carries.
+    """A rig. path : T_world_rig over time.   sensors : one or more, all carried by it.
 
-    Raises ConfigError for none, and for two that have one folder."""
+    Raises ConfigError for none, and for two with the same folder."""
 
     path: PosePath
     sensors: tuple[Sensor, ...]
@@ -52,7 +52,7 @@ class Rig:
     def __post_init__(self) -> None:
         folders = [sensor.folder for sensor in self.sensors]
         if not folders:
-            raise ConfigError("a rig without a sensor", where="Rig.sensors", accepted="one or more")
+            raise ConfigError("the rig has no sensor", where="Rig.sensors", accepted="one or more")
         if twice := [folder for folder in folders if folders.count(folder) > 1]:
             raise ConfigError(
                 "two sensors have one folder", where="Rig.sensors", value=twice[0], accepted="a folder each"
@@ -60,26 +60,26 @@ class Rig:
 
     @classmethod
     def alone(cls, camera: CameraModel, path: PosePath) -> Rig:
-        """One camera, whose own motion ``path`` is."""
+        """Return a rig of one camera that moves along ``path``."""
         return cls(path, (Sensor(camera),))
 
     def path_of(self, sensor: Sensor) -> PosePath:
-        """T_world_cam over time. Raises ConfigError where the sensor's place is not rigid."""
+        """Return T_world_cam over time. Raises ConfigError where the sensor's pose is not rigid."""
         if np.array_equal(sensor.T_rig_cam, np.eye(4)):
             return self.path
         return OffsetPath(self.path, sensor.T_rig_cam)
 
     def path_of_sky(self) -> PosePath:
-        """T_world_sky over time, of the sky that the first sensor sees: at infinity all directions are the same
-        wherever the camera is, as in a box that is always around it."""
+        """Return T_world_sky over time, of the first sensor's sky: at infinity directions do not depend on the camera's
+        position, as in a box that is always around it."""
         return SharedOriginPath(self.path_of(self.sensors[0]))
 
     def with_first(self, **changes: Any) -> Rig:
-        """With other values in the first sensor."""
+        """Return the rig with other values in the first sensor."""
         return replace(self, sensors=(replace(self.sensors[0], **changes), *self.sensors[1:]))
 
     def seen_by(self, number: int) -> Rig:
-        """The same with its sensor of this number alone. Raises ConfigError where there is none."""
+        """Return the rig with only its sensor of this number. Raises ConfigError where there is none."""
         if not 0 <= number < len(self.sensors):
             raise ConfigError("no such sensor", where="seen_by", value=number, accepted=f"0 to {len(self.sensors) - 1}")
         return replace(self, sensors=(self.sensors[number],))

@@ -1,4 +1,4 @@
-"""One sequence as it happens; whoever writes, keeps, judges or counts it lives in another room.
+"""Simulation of one sequence, independent of how its items are written, stored, graded or counted.
 
 In: the configuration of one sequence, and OpenGL where a scene is drawn.
 Out: its events, ground truth, the frame camera's images and pictures, in the order of time.

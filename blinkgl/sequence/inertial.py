@@ -1,13 +1,13 @@
-"""What an inertial unit on the camera measures: body rate and specific force, from the path, with noise and biases.
+"""Measurements of an inertial unit on the camera: body rate and specific force from the path, with noise and biases.
 
     rate = w + b_g + n_g          acceleration = R^T (a - g) + b_a + n_a
 
-of the unit's own place, so that its distance from the camera (lever arm) is in a. w is that of the path's analytic
-derivative; a is the central difference of the analytic velocity over 40 µs, which is exact where the velocity is
-quadratic, as a spline's is between its knots.
+at the unit's own position, so that its distance from the camera (lever arm) is included in a. w comes from the path's
+analytic derivative; a is the central difference of the analytic velocity over 40 µs, which is exact where the velocity
+is quadratic, as a spline's is between its knots.
 
-White noise of density s is sampled with standard deviation s sqrt(rate); a bias of random walk density s gains
-s / sqrt(rate) from one measurement to the next (Kalibr's model; Woodman 2007; Crassidis 2006).
+White noise of density s is sampled with standard deviation s sqrt(rate); a bias of random walk density s changes by s /
+sqrt(rate) from one measurement to the next (Kalibr's model; Woodman 2007; Crassidis 2006).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Inertial:
 
     t_ns : (N,) int64.   rate : (N, 3) float64 rad/s.   acceleration : (N, 3) float64 m/s², at rest that of free fall,
     upwards.   ideal_rate, ideal_acceleration : the same without noise and bias.   rate_bias, acceleration_bias : (N, 3)
-    that are in them.   T_cam_imu : (4, 4) float64, from the unit's axes to the camera's."""
+    included biases.   T_cam_imu : (4, 4) float64, from the unit's axes to the camera's."""
 
     t_ns: np.ndarray
     rate: np.ndarray
@@ -46,7 +46,7 @@ class Inertial:
 
 
 def place_of(config: ImuConfig) -> np.ndarray:
-    """(4, 4) T_cam_imu."""
+    """Return T_cam_imu, (4, 4)."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler("xyz", config.rotation, degrees=True).as_matrix()
     T[:3, 3] = config.position
@@ -54,9 +54,9 @@ def place_of(config: ImuConfig) -> np.ndarray:
 
 
 def measured(path: PosePath, config: ImuConfig, t0_ns: int, t1_ns: int, rng: np.random.Generator) -> Inertial:
-    """What the unit measures over [t0, t1] on a camera that moves by ``path``, T_world_cam.
+    """Return the unit's measurements over [t0, t1] on a camera that moves by ``path``, T_world_cam.
 
-    Raises ConfigError where the camera's velocity jumps, which no force can do."""
+    Raises ConfigError where the camera's velocity jumps, which gives infinite acceleration."""
     T_cam_imu = place_of(config)
     body = OffsetPath(path, T_cam_imu)
     times = imu_times(config.rate, t0_ns, t1_ns)
@@ -66,7 +66,7 @@ def measured(path: PosePath, config: ImuConfig, t0_ns: int, t1_ns: int, rng: np.
     n, dt = len(times), 1 / config.rate
     white, walk = rng.normal(size=(2, n, 3)), rng.normal(size=(2, n, 3))
     walk[:, 0] = 0
-    # + 0.0: of no walk no negative zeros, which are other bytes.
+    # + 0.0: without a walk there are no negative zeros, which are other bytes.
     bias_w = config.gyroscope_random_walk * np.sqrt(dt) * np.cumsum(walk[0], 0) + 0.0
     bias_a = config.accelerometer_random_walk * np.sqrt(dt) * np.cumsum(walk[1], 0) + 0.0
     return Inertial(
@@ -82,7 +82,7 @@ def measured(path: PosePath, config: ImuConfig, t0_ns: int, t1_ns: int, rng: np.
 
 
 def _ideal(body: PosePath, times: list[int], gravity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) body rates and (N, 3) specific forces of a body, its own axes."""
+    """Return body rates, (N, 3), and specific forces, (N, 3), of a body, its own axes."""
     R_body_world = body.poses(np.array(times, np.int64))[:, :3, :3].swapaxes(1, 2)
     if body.is_static:
         return np.zeros((len(times), 3)), R_body_world @ -gravity
@@ -94,7 +94,7 @@ def _ideal(body: PosePath, times: list[int], gravity: np.ndarray) -> tuple[np.nd
 
 
 def _second(path: PosePath, t_ns: int) -> np.ndarray:
-    """(4, 4) second derivative, 1/s², at the ends of the path from inside."""
+    """Return the second derivative, (4, 4), 1/s², one-sided at the ends of the path."""
     h, seconds = _HALF_NS, _HALF_NS * 1e-9
     if not path.t0_ns <= t_ns <= path.t1_ns:
         return np.zeros((4, 4))
@@ -108,7 +108,7 @@ def _second(path: PosePath, t_ns: int) -> np.ndarray:
 
 
 def _refuse_jumps(path: PosePath, t0_ns: int, t1_ns: int) -> None:
-    """Raises ConfigError where the velocity changes by more than its rate of change says."""
+    """Raise ConfigError where the velocity changes by more than its rate of change explains."""
     begin, end = max(t0_ns, path.t0_ns), min(t1_ns, path.t1_ns)
     step = max(_LOOK_NS, (end - begin) // _MOST_LOOKS)
     times = range(begin, end + 1, step)
@@ -118,12 +118,12 @@ def _refuse_jumps(path: PosePath, t0_ns: int, t1_ns: int) -> None:
         return
     said = 0.5e-9 * step * (second[1:] + second[:-1])
     left = np.abs(first[1:] - first[:-1] - said).max(axis=(1, 2))
-    # a curve that is smooth leaves a third-order rest; a jump leaves itself
+    # a smooth curve leaves a third-order remainder; a jump does not
     allowed = 2e-3 * np.abs(first).max() + 0.25 * np.abs(said).max(axis=(1, 2))
     if (left > allowed).any():
         at = int(np.argmax(left - allowed))
         raise ConfigError(
-            "the camera's velocity jumps, which an inertial unit cannot measure",
+            "the camera's velocity jumps, so its acceleration is infinite",
             where="imu",
             value=f"at {times[at] * 1e-9:.6g} s",
             accepted="a camera path with `interpolation: spline`, or imu: null",

@@ -1,5 +1,5 @@
-"""A sequence of recorded frames: the E-Tartan way. Frames go through the emulator, the
-frames' own flow becomes the label. :mod:`blinkgl.sequence.recorded` says what a folder has to look like."""
+"""A sequence of recorded frames, as in E-Tartan: frames pass through the emulator, and their own flow becomes the
+label. The first comment describes the expected folders."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ from blinkgl.tensors.choice import make_on_device
 from blinkgl.types.events import Events
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Folders of recorded frames and what is in them: which there are, their images, their flow.
+# Folders of recorded frames: finding them, their images and their flow.
 #
-# A folder is expected to look like a TartanAir trajectory: images in one sub-folder, one flow file per pair of
-# frames in another, and, where there are any, masks of occluded pixels beside the flow (``*_mask.npy``, non-zero:
-# the point is hidden or outside the image in the next frame). All are taken in the order of their names. A third may
-# hold the flow back, one file per pair of frames, too.
+# A folder must look like a TartanAir trajectory: images in one sub-folder, one flow file per pair of frames in another,
+# and, if there are any, masks of occluded pixels beside the flow (``*_mask.npy``, non-zero: the point is hidden or
+# outside the image in the next frame). All are used in the order of their names. A third may hold the backward flow,
+# one file per pair of frames, too.
 
 _FLOW = (".npy", ".flo", ".png")
 
 
 def matching_folders(config: FramesConfig, base: Path) -> list[Path]:
-    """The folders that ``frames.folders`` names, sorted. ConfigError: none named, none
-    found, or no image folder inside."""
+    """Return the folders of ``frames.folders``, sorted. Raises ConfigError: none given, none found, or no image folder
+    inside."""
     found: list[Path] = []
     for number, pattern in enumerate(config.folders):
         matches = sorted(Path(p) for p in glob.glob(str(resolve(pattern, base))) if Path(p).is_dir())
@@ -70,7 +70,7 @@ def matching_folders(config: FramesConfig, base: Path) -> list[Path]:
 
 
 def folder_of(config: FramesConfig, index: int, base: Path) -> Path:
-    """The ``index``-th folder of frames; the only one for every index. Raises ConfigError as
+    """Return the ``index``-th folder of frames; the only one for every index. Raises ConfigError as
     :func:`matching_folders`, or for too few."""
     folders = matching_folders(config, base)
     if len(folders) > 1 and index >= len(folders):
@@ -79,8 +79,8 @@ def folder_of(config: FramesConfig, index: int, base: Path) -> Path:
 
 
 def used_images(config: FramesConfig, folder: Path) -> list[Path]:
-    """The images of ``folder`` that become a sequence, in order. AssetError: too few; ConfigError: they last longer
-    than an event file can hold."""
+    """Return the images of ``folder`` that become a sequence, in order. Raises AssetError: too few; ConfigError: they
+    last longer than an event file can hold."""
     files = _listed(folder / config.images, IMAGE)[config.first :]
     files = files[: config.count]
     if len(files) < 3 or (config.count and len(files) < config.count):
@@ -106,8 +106,9 @@ def _listed(folder: Path, suffixes) -> list[Path]:
 
 
 def flow_files(folder: Path, frames: FramesConfig, images: list[Path]) -> tuple[list[Path], list[Path]]:
-    """(flow, masks) of the frames ``images``, which :func:`used_images` found; the k-th goes from frame k to frame
-    k + 1. AssetError: no folder, too few, or, by the numbers in their names, one that is missing in between."""
+    """Return (flow, masks) of the frames ``images`` of :func:`used_images`; the k-th goes from frame k to frame k + 1.
+    Raises
+    AssetError: no folder, too few, or, by the numbers in their names, one missing in between."""
     if frames.flow is None:
         return [], []
     return _flow_and_masks(folder / frames.flow, frames.first, images)
@@ -124,7 +125,7 @@ def _flow_and_masks(folder: Path, first: int, images: list[Path]) -> tuple[list[
             value=f"{max(len(flows) - first, 0)} flow files, {len(masks)} masks",
             accepted=f"at least {pairs} for {len(images)} frames",
         )
-    # Files are taken in the order of their names; one that is missing would give every later pair its neighbour's.
+    # Files are used in the order of their names; a missing one would shift all later pairs.
     one_each = len(_listed(images[0].parent, IMAGE)) - 1
     for files in (flows, masks):
         _check_in_step(files[first : first + pairs], images, shifted=len(files) == one_each)
@@ -132,8 +133,9 @@ def _flow_and_masks(folder: Path, first: int, images: list[Path]) -> tuple[list[
 
 
 def _check_in_step(files: list[Path], images: list[Path], shifted: bool) -> None:
-    """The first numbers in the names of ``files`` are those of ``images``, or, where they may be ``shifted`` (frames
-    from 0, flow from 1), go up with them. Names without numbers say nothing. Raises AssetError."""
+    """Check that the first numbers in the names of ``files`` equal those of ``images`` or, where they may be
+    ``shifted`` (frames from 0, flow from 1), increase with them. Names without numbers are not checked. Raises
+    AssetError."""
     numbers = [(_number(file), _number(image)) for file, image in zip(files, images)]
     offsets = [of_file - of_image for of_file, of_image in numbers if of_file is not None and of_image is not None]
     if len(offsets) < len(numbers):
@@ -141,7 +143,7 @@ def _check_in_step(files: list[Path], images: list[Path], shifted: bool) -> None
     for file, image, offset in zip(files, images, offsets):
         if offset != (offsets[0] if shifted else 0):
             raise AssetError(
-                "the files do not go with the frames: one is missing before it, or the numbers in their names differ",
+                "the files do not match the frames: one is missing before it, or the numbers in their names differ",
                 where=str(file),
                 value=f"it would go with {image.name}",
                 accepted="the same numbers",
@@ -154,7 +156,8 @@ def _number(path: Path) -> int | None:
 
 
 def read_flow_of(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """flow (H, W, 2) float32 px and valid (H, W) bool of frames of (H, W) px. AssetError: unreadable, another size."""
+    """Return flow (H, W, 2) float32 px and valid (H, W) bool of frames of (H, W) px. Raises AssetError: unreadable,
+    another size."""
     flow, valid = read_flow(path)
     if flow.shape[:2] != size:
         raise AssetError("flow and image differ in size", where=str(path), value=flow.shape[:2], accepted=str(size))
@@ -162,7 +165,7 @@ def read_flow_of(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndar
 
 
 def read_mask_of(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """(H, W) bool of frames of (H, W) px. AssetError: unreadable, another size."""
+    """Return a mask, (H, W) bool, of frames of (H, W) px. Raises AssetError: unreadable, another size."""
     mask = read_npy(path)
     if mask.shape != size:
         raise AssetError("mask and image differ in size", where=str(path), value=mask.shape, accepted=str(size))
@@ -170,21 +173,21 @@ def read_mask_of(path: Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def read_frame(path: Path) -> np.ndarray:
-    """(H, W) or (H, W, 3) RGB of an image file, alpha dropped. Raises AssetError."""
+    """Return (H, W) or (H, W, 3) RGB of an image file, without alpha. Raises AssetError."""
     image = read_any_image(path)
     return image if image.ndim == 2 else np.ascontiguousarray(image[..., :3])
 
 
 RECORDED = ("images", "flow_forward", "occlusion_forward")
-"""Labels that recorded frames may bring."""
+"""Labels that recorded frames may have."""
 
 
 class RecordedSequence(Simulation):
     """A sequence of the ``index``-th folder of frames; see :func:`~blinkgl.sequence.simulate.simulate_sequence`.
 
     Label k is the flow from frame k + 1 to k + 2 (counted in the frames used), so that every label has a full interval
-    of events before it, as in drawn sequences. Its ``config`` names the folder.   files : the
-    images.   flows, masks : files of labels, or none.
+    of events before it, as in rendered sequences. Its ``config`` names the folder.   files : the images.   flows, masks
+    : files of labels, or none.
     Raises BlinkGLError: unreadable or unequal frames, flow that does not fit them, frames too far apart."""
 
     def __init__(self, request: SequenceRequest):
@@ -196,7 +199,7 @@ class RecordedSequence(Simulation):
         self.flows, self.masks = flow_files(self.folder, frames, self.files)
         self._kept: dict[int, np.ndarray] = {
             0: read_frame(self.files[0])
-        }  # read already, and an image of a label to come
+        }  # read already, together with an image of a later label
         size = self._kept[0].shape[:2]
         if frames.max_displacement is not None:
             with clock("scene"):
@@ -272,7 +275,7 @@ class RecordedSequence(Simulation):
         return GroundTruth(k, t_ns, LabelFrame(t_ns, values), forward_ns=self._time_of(number + 1, self._recorded.fps))
 
     def truth(self, t_ns: int, span_ns: int) -> GroundTruth:
-        raise ConfigError("recorded frames have ground truth at their own times alone", where="frames")
+        raise ConfigError("recorded frames have ground truth only at their own times", where="frames")
 
     def _picture(self, t_ns: int) -> Picture:
         return Picture(t_ns, self._step.luminance())
@@ -292,12 +295,12 @@ class RecordedSequence(Simulation):
 
 
 def _refuse_far_apart(first: Path, flow: np.ndarray, valid: np.ndarray, most: float) -> None:
-    """AssetError where things move so far to the next frame that what lies between cannot be interpolated."""
+    """Raise AssetError where the motion to the next frame is too large for interpolation."""
     length = np.hypot(flow[..., 0], flow[..., 1])[valid]
     far = float(np.percentile(length, 99)) if length.size else 0.0
     if far > most:
         raise AssetError(
-            "too far from the next frame to be interpolated",
+            "too far from the next frame for interpolation",
             where=str(first),
             value=f"{far:.3g} px",
             accepted=f"at most {most:g} px (frames.max_displacement), or frames.max_displacement: null",

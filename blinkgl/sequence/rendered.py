@@ -1,5 +1,5 @@
-"""A sequence of a scene: frames are drawn at the times the timeline asks for and go through the
-emulator; ground truth at label times."""
+"""A sequence of a scene: frames are drawn at the times of the timeline and passed through the emulator; ground truth is
+drawn at label times."""
 
 from __future__ import annotations
 
@@ -36,23 +36,24 @@ from blinkgl.timeline import Timeline, make_timeline
 from blinkgl.types.events import Events
 
 SURFACES = LabelRequest("ids", "depth", "velocity")
-"""Labels that say what made an event."""
+"""Labels that give the truth of an event."""
 
 
 def drawn(renderer: Renderer, times: Iterable[int], surfaces: bool = False, device: Any = None) -> Iterator[EventFrame]:
-    """The frames of the event pass at ``times``, ns.
-    surfaces : with what every pixel shows.   device : torch's, on which frames are tensors; None: they are arrays."""
+    """Yield the frames of the event pass at ``times``, ns.
+    surfaces : with the surface at every pixel.   device : torch's, on which frames are tensors; None: they are
+    arrays."""
     frame = None
     for t_ns in times:
         before, frame = frame, renderer.luminance(t_ns)
-        # Rows that are as before are not looked at by the emulator: a still camera costs what moves.
+        # The emulator skips unchanged rows: with a still camera the cost depends on what moves.
         rows = frame.rows_changed_since(before)
         luminance = frame.view() if device is None else frame.tensor(device)
         yield EventFrame(t_ns, luminance, rows, surfaces_at(renderer, t_ns) if surfaces else None)
 
 
 def _truth_of(sensor: Sensor, config: SequenceConfig) -> SurfaceTruth | None:
-    """What says what made a sensor's events; None where its labels do not ask."""
+    """Return what finds the truth of a sensor's events; None where its labels do not request it."""
     if sensor.labels is None or not sensor.labels.events:
         return None
     return SurfaceTruth(reach=int(samples_of(config.render.antialiasing).shared))
@@ -64,27 +65,27 @@ def timeline_of(
     renderer: Renderer,
     span_ns: tuple[int, int],
 ) -> Timeline:
-    """What decides the times of a sensor's frames.   scene : of one sensor, as it was built.   renderer : of it.
+    """Return the timeline of a sensor's frames.   scene : of one sensor, as it was built.   renderer : of it.
     span_ns : first and last time, ns."""
     emulator, dynamics = recording(scene, config).sensors[0].emulator, scene.dynamics
-    # A frame stands at every impact: a velocity jumps there, and no speed measured before it bounds the step.
+    # A frame is drawn at every impact: a velocity jumps there, and no speed measured before it bounds the step.
     stops = dynamics.impacts_ns if dynamics is not None else ()
     response = emulator_of(emulator).response(emulator)
     return make_timeline(config.timeline, *span_ns, renderer, response, stops)
 
 
 def surfaces_at(renderer: Renderer, t_ns: int) -> Surfaces:
-    """What every pixel's centre shows at t_ns."""
+    """Return the surface at every pixel's centre at t_ns."""
     seen = renderer.labels(t_ns, SURFACES)
     return Surfaces(seen.ids, seen.depth, seen.velocity)
 
 
 class RenderedSequence(Simulation):
-    """See :func:`~blinkgl.sequence.simulate.simulate_sequence`.
+    """The simulation of a scene; see :func:`~blinkgl.sequence.simulate.simulate_sequence`.
 
-    scene : as it was built.   renderer : what draws it.
-    sensor : what is recorded, and through which camera. A scene that was made already is
-    recorded as the configuration says.   number : of the sensor on its rig, by which noise differs."""
+    scene : as it was built.   renderer : draws it.
+    sensor : records, with its camera. An existing scene is recorded as configured.   number : of the sensor on its rig,
+    which selects its noise."""
 
     def __init__(self, request: SequenceRequest, gl: GLContext | None):
         self.number = request.number
@@ -106,7 +107,7 @@ class RenderedSequence(Simulation):
             if request.labels and self.sensor.labels is not None:
                 for name in asked_for(self.sensor.labels):
                     LABELS[name].check(scene, self.sensor.labels)
-            # A renderer that was handed in has drawn before: its seconds until now are not this sequence's.
+            # A given renderer may have drawn before: its seconds until now do not belong to this sequence.
             self.triangles, self._before = renderer.triangles, (renderer.stats.render_s, renderer.stats.readback_s)
             camera = None
             if request.events:
@@ -136,16 +137,16 @@ class RenderedSequence(Simulation):
             raise self._explained(error) from error
 
     def _frames(self) -> Iterator[EventFrame]:
-        """Of the event pass."""
+        """Yield the frames of the event pass."""
         return drawn(self.renderer, self.timeline, self.camera.tells, self.camera.tensor_device)
 
     def _in_order(self) -> Iterator[Item]:
         yield from super()._in_order()
         self._resume()
-        self.renderer.gl.check()  # before anybody calls the sequence whole
+        self.renderer.gl.check()  # before the sequence counts as complete
 
     def _explained(self, error: EventDataError) -> EventDataError:
-        """The error with the time and, where a pixel is at fault, what is seen there."""
+        """Return the error with the time and, where a pixel is wrong, the object seen there."""
         if error.pixel is None or error.t_ns is None:
             return error
         seen = self.renderer.shown_at(*error.pixel, error.t_ns)
@@ -165,7 +166,7 @@ class RenderedSequence(Simulation):
         request, interval = asked_for(self.sensor.labels), self.config.time.interval_ns
         last = k == self.config.time.label_count
         if last:
-            # Nothing leads on from the last label time: flow and what goes with it have no other end.
+            # No label begins at the last label time: flow and related labels have no other end.
             request = request.only(name for name in request if LABELS[name].at_last)
         return self._truth_over(k, t_ns, interval, request, last)
 
@@ -194,9 +195,9 @@ class RenderedSequence(Simulation):
         return {**self.clock.seconds, **images, **drawing}
 
     def poses(self) -> dict[str, np.ndarray]:
-        """t_ns (M,) int64, the start and every label's time; T_world_cam (M, 4, 4) float64; T_world_obj (n, M, 4, 4)
-        float64 in the order of object_ids (n,) and object_names (n,); K (3, 3); resolution (width, height); near; of a
-        camera that distorts lens, its kind, and distortion (k,)."""
+        """Return t_ns (M,) int64, the start and every label's time; T_world_cam (M, 4, 4) float64; T_world_obj (n, M,
+        4, 4) float64 in the order of object_ids (n,) and object_names (n,); K (3, 3); resolution (width, height); near;
+        for a camera with distortion lens, its kind, and distortion (k,)."""
         scene, times = self.scene, [self.config.time.t0_ns, *self.config.time.label_times_ns]
         T_world_cam, T_world_obj = poses_at(scene, times)
         return {
@@ -222,7 +223,7 @@ class RenderedSequence(Simulation):
 
     @property
     def _rectified(self) -> PinHole | None:
-        """The camera in whose pixels labels are; None: the sensor's own."""
+        """Return the camera whose pixels labels use; None: the sensor's own."""
         asked = self.sensor.labels is not None and self.sensor.labels.pixels == "rectified"
         return rectified(self.scene.camera) if asked and self.lens is not None else None
 
@@ -273,8 +274,8 @@ class RenderedSequence(Simulation):
 
 
 def _described(one: SceneObject) -> dict[str, Any]:
-    """What a body is, for who has no scene: its box at rest in its own axes, and of each part the mesh that it was
-    made from and the material on it."""
+    """Return the description of a body for users without the scene: its box at rest in its own axes, and for each part
+    the source of its mesh and its material."""
     corners = np.concatenate([part.mesh.vertices for part in one.parts]) if one.parts else np.zeros((1, 3))
     low, high = corners.min(axis=0), corners.max(axis=0)
     return {
@@ -309,7 +310,7 @@ def _facts_of(dynamics: Dynamics) -> dict[str, Any]:
 
 
 def poses_at(scene: Scene, times_ns: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """T_world_cam (M, 4, 4) and T_world_obj (n, M, 4, 4), float64, at M times."""
+    """Return T_world_cam (M, 4, 4) and T_world_obj (n, M, 4, 4), float64, at M times."""
     t = np.asarray(times_ns, np.int64)
     return (
         scene.camera_path.poses(t),

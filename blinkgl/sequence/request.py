@@ -1,4 +1,4 @@
-"""What to make of a run, as one value, and what comes of it in time: events, ground truth, pictures."""
+"""The request of a sequence as one value, and its items in time: events, ground truth, pictures."""
 
 from __future__ import annotations
 
@@ -24,14 +24,13 @@ class SequenceRequest:
     """Sequence ``index`` of a run, or a part of it.
 
     config : every value as drawn.   base : folder that relative paths in it start from.
-    events, labels : False leaves them out, ``labels`` ground truth and the frame camera's images; what ``labels:`` and
-    ``images:`` do not ask for is left out anyway. Nothing is drawn that nobody asked for.
+    events, labels : False leaves them out, ``labels`` ground truth and the frame camera's images; labels and images
+    that the configuration does not request are always left out. Nothing is drawn unless it is used.
     pictures_hz : pictures per second of simulated time, at the frames of the event pass; None: none.
-    scene : made already, instead of the configuration's.   renderer : made already, and not
-    released at the end; its scene is drawn.
-    window_ns : first and last time, ns, instead of all of the sequence. (These three: of
-    what is drawn, not of recorded frames.)
-    number : of the camera on its rig, by which noise differs.
+    scene : an existing one, instead of the configuration's.   renderer : an existing one, which is not released at the
+    end; its scene is drawn.
+    window_ns : first and last time, ns, instead of the whole sequence. (These three: only for rendered sequences.)
+    number : of the camera on its rig, which selects its noise.
     Raises ConfigError for parts that exclude each other."""
 
     config: SequenceConfig
@@ -48,7 +47,7 @@ class SequenceRequest:
     def __post_init__(self) -> None:
         if self.pictures_hz is not None and not self.events:
             raise ConfigError(
-                "pictures are of event frames, and there are none",
+                "pictures need event frames",
                 where="pictures_hz",
                 value=self.pictures_hz,
                 accepted="None, or events=True",
@@ -56,22 +55,22 @@ class SequenceRequest:
         drawn = (self.scene, self.renderer, self.window_ns)
         if self.config.frames is not None and any(given is not None for given in drawn):
             raise ConfigError(
-                "nothing is drawn of recorded frames",
+                "recorded frames are not drawn",
                 where="frames",
                 accepted="no scene, renderer or window_ns",
             )
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What happens in a sequence, in the order in which it does. All arrays are the receiver's to keep.
+# Items of a sequence, in their order. All arrays belong to the receiver.
 
 
 @dataclass(frozen=True, eq=False)
 class EventChunk:
-    """The events that have left the sensor since the chunk before.
+    """The events that have left the sensor since the previous chunk.
 
-    t_ns : with this chunk, every event before this time's microsecond, t_ns // 1000, has been
-    given.   events : t in µs; may be empty."""
+    t_ns : with this chunk, every event before this time's microsecond, t_ns // 1000, has been returned.   events : t in
+    µs; may be empty."""
 
     t_ns: int
     events: Events
@@ -79,15 +78,14 @@ class EventChunk:
 
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """What is true at a label's time. Every event before its microsecond, t_ns // 1000,
-    came before it, and no other did.
+    """Ground truth at a label's time. Exactly the events before its microsecond, t_ns // 1000, came before it.
 
     k : number of the label, from 0.   t_ns : its time, ns.
-    frame : what ``labels:`` asks for, as :class:`LabelFrame` says; images as they were drawn, float32 linear light, or
-    as they were recorded, sRGB codes. At the last time of a sequence, from where nothing leads on, images alone.
-    forward_ns, backward_ns : where it leads, ns; None: nowhere.
+    frame : the labels of ``labels:``, see :class:`LabelFrame`; images as drawn, float32 linear light, or as recorded,
+    sRGB codes. At the last time of a sequence, where no label begins, only images.
+    forward_ns, backward_ns : the other times of flow, ns; None: none.
     T_world_cam : (4, 4) float64, OpenCV axes.   T_world_obj : (n, 4, 4) float64, n objects.
-    Both are None where nobody knows (recorded frames)."""
+    Both are None where they are unknown (recorded frames)."""
 
     k: int
     t_ns: int
@@ -100,10 +98,10 @@ class GroundTruth:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """How it looks at t_ns, for somebody who watches: comes after the events up to then.
+    """A picture at t_ns for display: comes after the events up to then.
 
-    image : (H, W, 3) or (H, W) float32 linear light.   velocity : (H, W, 2) float32 px/s, or None
-    where nobody knows (recorded frames)."""
+    image : (H, W, 3) or (H, W) float32 linear light.   velocity : (H, W, 2) float32 px/s, or None where it is unknown
+    (recorded frames)."""
 
     t_ns: int
     image: np.ndarray
@@ -114,12 +112,12 @@ Item = EventChunk | GroundTruth | CameraImage | Picture
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Where the wall time of a sequence goes.
+# Wall time of a sequence by stage.
 
 
 class StageClock:
-    """Wall seconds per named stage, without the compilation of kernels, which happens once per machine and is told
-    apart (``compile_s``). ``with clock("events"): …`` adds to a stage; stages do not nest."""
+    """Wall seconds per named stage, without the compilation of kernels, which happens once per machine and is counted
+    separately (``compile_s``). ``with clock("events"): …`` adds to a stage; stages do not nest."""
 
     def __init__(self) -> None:
         self.started = working_clock()

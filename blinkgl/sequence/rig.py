@@ -1,11 +1,11 @@
-"""The sensors on one rig: their sequences, merged by time. A single camera is a rig of one.
+"""The sequences of the sensors on one rig, merged by time. A single camera is a rig of one.
 
     with simulate_rig(SequenceRequest(config, index), gl) as rig:
         for member, item in rig:
             member.name, item
 
-Each camera is a :class:`~blinkgl.sequence.simulate.Simulation` of its own, which sees the scene from its place;
-they share the scene, OpenGL, meshes, textures, shadow maps and the times of frames.
+Each camera is its own :class:`~blinkgl.sequence.simulate.Simulation`, which sees the scene from its pose; they share
+the scene, OpenGL, meshes, textures, shadow maps and the times of frames.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from blinkgl.timeline import together
 
 
 def simulate_rig(request: SequenceRequest, gl: GLContext | None = None) -> RigSequence:
-    """A sequence with all cameras of its configuration, be it one or several.
+    """Return a sequence with all cameras of its configuration, one or several.
 
-    gl : context to draw with; None: one of its own, where something is drawn at all. Raises BlinkGLError."""
+    gl : context to draw with; None: a new one, where something is drawn. Raises BlinkGLError."""
     clock, config, index = StageClock(), request.config, request.index
     with ExitStack() as stack:
         if config.sensors is None:
@@ -48,7 +48,7 @@ def simulate_rig(request: SequenceRequest, gl: GLContext | None = None) -> RigSe
 
 
 def _rendered(request: SequenceRequest, scene: Scene, gl: GLContext | None, stack: ExitStack) -> Iterator[Simulation]:
-    """The cameras of a rig, which share what the first one's renderer holds; ``stack`` lets go of it."""
+    """Yield the cameras of a rig, which share the resources of the first one's renderer; ``stack`` releases them."""
     settings, first = request.config.gl, None
     for number, _, config, gives_events in request.config.cameras():
         gl = gl or stack.enter_context(create_context(settings.backend, settings.device))
@@ -58,7 +58,7 @@ def _rendered(request: SequenceRequest, scene: Scene, gl: GLContext | None, stac
             request,
             config=config,
             events=gives_events,
-            # of a camera without events at the frames of nobody: it has none
+            # none for a camera without events, which has no event frames
             pictures_hz=request.pictures_hz if gives_events else None,
             scene=scene.seen_by(number),
             renderer=renderer,
@@ -68,13 +68,13 @@ def _rendered(request: SequenceRequest, scene: Scene, gl: GLContext | None, stac
 
 
 class RigSequence:
-    """Iterate over it once: (member, what happens there), in time order; of what happens at one time that of the first
-    sensor comes first. It holds OpenGL until its end, or that of its ``with`` block.
+    """A sequence of a rig. Iterate over it once: (member, item), in time order; items of one time are in the order of
+    the sensors. It holds OpenGL until its end, or that of its ``with`` block.
 
     config : of the rig, every value as drawn.   members : of its cameras, in their order; ``member.name`` is the
     sensor's, "" of a single camera.   scene : with all sensors; None of a single camera.
-    t0_ns, t1_ns : first and last time, ns.   clock : wall seconds per stage, but those of the members.
-    omissions : what files of the scene ask for and is not drawn, a line per file."""
+    t0_ns, t1_ns : first and last time, ns.   clock : wall seconds per stage, without those of the members.
+    omissions : undrawn features of the scene's files, a line per file."""
 
     def __init__(
         self,
@@ -97,7 +97,7 @@ class RigSequence:
         self.close()
 
     def close(self) -> None:
-        """Lets go of OpenGL. Harmless when repeated."""
+        """Release OpenGL. May be called repeatedly."""
         self._stack.close()
 
     def __iter__(self) -> Iterator[tuple[Simulation, Item]]:
@@ -110,8 +110,8 @@ class RigSequence:
                 heads[k] = next(waiting[k][0], None)
 
     def inertial_units(self) -> Iterator[tuple[str, Any, Inertial]]:
-        """(name, configuration, what it measured) of the sensors that are inertial units and nothing else; those of
-        cameras are ``member.imu()``. Raises ConfigError where the rig's velocity jumps."""
+        """Yield (name, configuration, measurements) of the sensors that are only inertial units; those of cameras are
+        ``member.imu()``. Raises ConfigError where the rig's velocity jumps."""
         for k, one in enumerate(self.config.sensors or ()):
             if one.imu is not None and not one.sees and self.scene is not None:
                 path = self.scene.rig.path_of(self.scene.sensors[k])

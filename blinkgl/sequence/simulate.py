@@ -1,4 +1,4 @@
-"""``simulate_sequence``: what happens in a sequence, in the order of time. Writing it down is one consumer of many.
+"""``simulate_sequence``: the items of a sequence in the order of time. Writing them is one of several uses.
 
     with simulate_sequence(SequenceRequest(config, index), gl) as sequence:
         for item in sequence:
@@ -7,10 +7,9 @@
                 case GroundTruth(): ...
                 case CameraImage(): ...
 
-Events come in chunks, one a frame, cut where the time of a label or of a frame camera's image lies between two frames;
-ground truth comes at its time, between them, and an image when its exposure ends. So whoever trains on a window of
-events and the flow over it holds one window, and nobody holds a sequence. (Files would not mind all events first, as it
-used to be: they are the same, byte for byte. An online consumer would then have to keep every event.)
+Events come in chunks, one per frame, cut where the time of a label or of a frame camera's image lies between two
+frames; ground truth comes at its time, between them, and an image when its exposure ends. So training on a window of
+events and the flow over it needs to store only that window, never the whole sequence.
 """
 
 from __future__ import annotations
@@ -36,11 +35,11 @@ from blinkgl.types.events import Events, count_causes, named_causes
 
 
 def simulate_sequence(request: SequenceRequest, gl: GLContext | None = None) -> Simulation:
-    """The sequence of a single camera, ready to be iterated over: :class:`EventChunk`, :class:`GroundTruth`,
+    """Return the sequence of a single camera, ready for iteration: :class:`EventChunk`, :class:`GroundTruth`,
     :class:`CameraImage` and :class:`Picture` in time order.
 
-    gl : context to draw with; None: one of its own, where something is drawn at all.
-    Raises BlinkGLError for anything the user or the machine caused, here or while iterating."""
+    gl : context to draw with; None: a new one, where something is drawn.
+    Raises BlinkGLError for every error of the user or the machine, here or while iterating."""
     if request.config.sensors is not None:
         raise ConfigError(
             "several sensors are simulated together, not as one camera",
@@ -48,7 +47,7 @@ def simulate_sequence(request: SequenceRequest, gl: GLContext | None = None) -> 
             value=[one.name for one in request.config.sensors],
             accepted="record_rig or simulate_rig, or a configuration of a single camera",
         )
-    # They import this module, for what they share.
+    # imported here, because they import this module
     from blinkgl.sequence.recorded import RecordedSequence
     from blinkgl.sequence.rendered import RenderedSequence
 
@@ -56,7 +55,7 @@ def simulate_sequence(request: SequenceRequest, gl: GLContext | None = None) -> 
 
 
 class _Due:
-    """What comes next besides events: labels at their times, a frame camera's images when they are there."""
+    """The next item besides events: labels at their times, a frame camera's images at the end of their exposure."""
 
     def __init__(self, labels: Iterable[tuple[int, int]], camera: FrameCamera | None):
         self._labels, self._camera = iter(labels), camera
@@ -64,14 +63,14 @@ class _Due:
 
     @property
     def ns(self) -> int | None:
-        """Its time; None: nothing comes any more."""
+        """Return its time; None: there are no more."""
         times = [self._next[1]] if self._next is not None else []
         if self._camera is not None and self._camera.due_ns is not None:
             times.append(self._camera.due_ns)
         return min(times, default=None)
 
     def label(self) -> tuple[int, int] | None:
-        """Number and time of the label that is next, which is then over; None: it is the camera's turn."""
+        """Return number and time of the next label, and mark it as done; None: the camera is next."""
         label = self._next
         if label is None or label[1] != self.ns:
             return None
@@ -80,19 +79,18 @@ class _Due:
 
 
 class Simulation(ABC):
-    """One sequence in time: iterate over it once. It holds OpenGL until its end, however the
-    loop ends, or that of its ``with`` block.
+    """One sequence in time: iterate over it once. It holds OpenGL until its end, however the loop ends, or that of its
+    ``with`` block.
 
     name : of the sensor on a rig; "" of a single camera.
     config : every value as drawn.   index : number of the sequence.   height, width : px.
-    t0_ns, t1_ns : first and last time, ns.   pictures_hz : that it gives, or None.
-    clock : wall seconds per stage.   camera : emulator and read-out, None when no events were asked for.
-    events, labels : given so far.   triangles : of all that is drawn; 0 for recorded frames.
-    frame_camera : :class:`~blinkgl.imaging.FrameCamera` whose images are given; None: there is none.
-    timeline : the :class:`Timeline` that says when event frames are drawn; None for
-    recorded frames, and without events.
-    omissions : what files of the scene ask for and is not drawn, a line per file.
-    libraries : versions of those that have a say in this sequence and not in every one."""
+    t0_ns, t1_ns : first and last time, ns.   pictures_hz : rate of its pictures, or None.
+    clock : wall seconds per stage.   camera : emulator and read-out, None when no events are requested.
+    events, labels : numbers so far.   triangles : of everything drawn; 0 for recorded frames.
+    frame_camera : the :class:`~blinkgl.imaging.FrameCamera` of its images; None: there is none.
+    timeline : the :class:`Timeline` of event frames; None for recorded frames, and without events.
+    omissions : undrawn features of the scene's files, a line per file.
+    libraries : versions of those that affect this sequence but not every one."""
 
     name = ""
     triangles = 0
@@ -124,23 +122,25 @@ class Simulation(ABC):
         self.close()
 
     def close(self) -> None:
-        """Lets go of OpenGL. Harmless when repeated."""
+        """Release OpenGL. May be called repeatedly."""
         self._stack.close()
 
     def __iter__(self) -> Iterator[Item]:
         if self._begun:
-            raise ConfigError("a simulation is iterated over once", where="simulate_sequence", accepted="a new one")
+            raise ConfigError(
+                "a simulation can be iterated over only once", where="simulate_sequence", accepted="a new one"
+            )
         self._begun = True
         return self._items()
 
     def chunks(self) -> Iterator[EventChunk]:
-        """The events alone."""
+        """Yield only the events."""
         return (item for item in self if isinstance(item, EventChunk))
 
     def gather(self) -> Events:
-        """All events at once, for whoever cuts windows out of a short sequence. OpenGL stays until :meth:`close`, so
-        that :meth:`truth` can be asked at any time in it: use it in ``with``."""
-        # The end of the iteration closes ``_stack``: an empty one stands in for it meanwhile.
+        """Return all events at once, for cutting windows out of a short sequence. OpenGL stays until :meth:`close`, so
+        that :meth:`truth` can be called for any time: use it in ``with``."""
+        # The end of the iteration closes ``_stack``: an empty one replaces it meanwhile.
         held, self._stack = self._stack, ExitStack()
         try:
             return Events.concatenate([chunk.events for chunk in self.chunks()])
@@ -149,12 +149,12 @@ class Simulation(ABC):
 
     @abstractmethod
     def truth(self, t_ns: int, span_ns: int) -> GroundTruth:
-        """What is true at any time t_ns, with flow forward to t_ns + span_ns and back to t_ns - span_ns (k is -1).
-        Raises ConfigError for recorded frames, of which nobody knows more than their files say."""
+        """Return the ground truth at any time t_ns, with flow forward to t_ns + span_ns and back to t_ns - span_ns (k
+        is -1). Raises ConfigError for recorded frames, whose truth is known only at their times."""
 
     def _items(self) -> Iterator[Item]:
         with self:
-            # The receiver may use OpenGL between two items, as another sensor of the rig does.
+            # The caller may use OpenGL between two items, as another sensor of the rig does.
             self._resume()
             for item in self._in_order():
                 yield item
@@ -175,7 +175,7 @@ class Simulation(ABC):
             yield EventChunk(t_ns, events)
             if ticks is not None and ticks.passed(t_ns // 1000):
                 yield self._picture(t_ns)
-        # Those at or behind the last frame, and all of them where no events were asked for.
+        # Those at or after the last frame, and all of them without events.
         while due.ns is not None:
             yield self._next(due)
 
@@ -193,65 +193,65 @@ class Simulation(ABC):
 
     @property
     def frames(self) -> int:
-        """That the emulator has seen so far."""
+        """Return the number of frames that the emulator has taken so far."""
         return 0 if self.camera is None else self.camera.frames
 
     @property
     def losses(self) -> tuple[int, int, int]:
-        """Events so far that the emulator's ``max_events_per_step`` cut, that found the read-out's
-        queue full, and that are on its bus still."""
+        """Return numbers of events so far that the emulator's ``max_events_per_step`` cut, that found the read-out's
+        queue full, and that are still on its bus."""
         return (0, 0, 0) if self.camera is None else (self.camera.saturated, self.camera.dropped, self.camera.late)
 
     @property
     def tells(self) -> bool:
-        """Whether its events say what made them (``labels.events``)."""
+        """Return whether its events record their surfaces (``labels.events``)."""
         return self.camera is not None and self.camera.tells
 
     @property
     def causes(self) -> dict[str, int]:
-        """Events so far by what caused them; empty unless ``events.causes`` asks for it."""
+        """Return numbers of events so far by cause; empty unless ``events.causes`` is on."""
         asked = self.camera is not None and self.camera.emulator.causes
         return named_causes(self._by_cause) if asked else {}
 
     @property
     def seconds(self) -> dict[str, float]:
-        """Wall seconds per stage so far."""
+        """Return wall seconds per stage so far."""
         return dict(self.clock.seconds)
 
     @abstractmethod
     def facts(self) -> dict[str, Any]:
-        """Plain values for the manifest about where it came from; complete when the iteration is."""
+        """Return plain values for the manifest about its source; complete when the iteration is."""
 
     @abstractmethod
     def poses(self) -> dict[str, np.ndarray]:
-        """What poses.npz holds; empty where nobody knows."""
+        """Return the content of poses.npz; empty where poses are unknown."""
 
     @property
     def lens(self) -> CameraModel | None:
-        """The camera, where it distorts."""
+        """Return the camera if it has distortion."""
         return None
 
     @property
     def rectifies(self) -> bool:
-        """Whether its labels and tracks are in other pixels than its pictures: those of the rectified camera."""
+        """Return whether its labels and tracks are in other pixels than its pictures: those of the rectified camera."""
         return False
 
     def imu(self) -> Inertial | None:
-        """What the inertial unit of ``imu:`` measures; None: there is none. Raises ConfigError where the camera's
-        velocity jumps."""
+        """Return the measurements of the inertial unit of ``imu:``; None: there is none. Raises ConfigError where the
+        camera's velocity jumps."""
         return None
 
     def tracks(self) -> Tracks | None:
-        """The points of ``tracks:``, followed; None: nobody asks."""
+        """Return the points of ``tracks:``; None: not requested."""
         return None
 
     @abstractmethod
     def _resume(self) -> None:
-        """Called when it is its turn again: the receiver may have used OpenGL meanwhile."""
+        """Called before drawing again: the caller may have used OpenGL meanwhile."""
 
     @abstractmethod
     def _label_times(self) -> Iterable[tuple[int, int]]:
-        """Number and time, ns, of every label."""
+        """Yield number and time, ns, of every label."""
 
     @abstractmethod
     def _event_pass(self) -> Iterator[tuple[int, Events]]: ...

@@ -1,10 +1,10 @@
-"""``index.jsonl``: one line per sequence of a data set, for loaders that do not want to search a file system.
+"""``index.jsonl``: one line per sequence of a data set, for loaders that should not search the file system.
 
     {"path": "train/flying_000000", "split": "train", "name": "flying_000000", "sequence":
     0, "seed": …, "emulator": "v2e",
      "events": …, "labels": …, "frames": …, "height": …, "width": …, "t_offset_us": …, "duration_us": …, "bytes": …}
 
-Made from the manifests alone and sorted by path: the same sequences give the same file.
+It is made only from the manifests and sorted by path: the same sequences give the same file.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ _KEYS = (
 
 
 def sequence_folders(root: str | Path) -> Iterator[Path]:
-    """Folders <root>/<split>/<sequence> with a manifest, or ``root`` itself when it is a
-    sequence; of a rig those of its cameras, <root>/<split>/<sequence>/<sensor>. Hidden ones are not looked at."""
+    """Yield folders <root>/<split>/<sequence> with a manifest, or ``root`` itself when it is a sequence; of a rig those
+    of its cameras, <root>/<split>/<sequence>/<sensor>. Hidden folders are skipped."""
     for folder in made_folders(root):
         yield from _of_cameras(folder)
 
 
 def _of_cameras(folder: Path) -> Iterator[Path]:
-    """The folder itself, or of a rig those of its cameras."""
+    """Yield the folder itself, or for a rig those of its cameras."""
     if is_rig_folder(folder):
         yield from (manifest.parent for manifest in sorted(folder.glob(f"*/{MANIFEST}")))
     else:
@@ -57,7 +57,7 @@ def _of_cameras(folder: Path) -> Iterator[Path]:
 
 
 def made_folders(root: str | Path) -> Iterator[Path]:
-    """The same, but of a rig its own: what a run makes, one a task."""
+    """Yield the same, but for a rig its own folder: what a run makes, one per task."""
     root = Path(root)
     if (root / MANIFEST).is_file():
         yield root
@@ -70,11 +70,11 @@ def made_folders(root: str | Path) -> Iterator[Path]:
 
 
 _SOMETIMES = ("events_by_cause", "sensor")
-"""Keys of manifests that only some have."""
+"""Keys that only some manifests have."""
 
 
 def entry(root: Path, folder: Path) -> dict[str, Any]:
-    """A sequence's line. Raises AssetError for a damaged manifest."""
+    """Return a sequence's line. Raises AssetError for a damaged manifest."""
     manifest = read_manifest(folder)
     return {
         "path": folder.relative_to(root).as_posix(),
@@ -86,8 +86,8 @@ def entry(root: Path, folder: Path) -> dict[str, Any]:
 
 
 def write_index(root: str | Path) -> int:
-    """Writes ``index.jsonl`` of the sequences below ``root`` (damaged ones are left out);
-    returns how many. Raises OutputError."""
+    """Write ``index.jsonl`` of the sequences below ``root`` (without damaged ones); return their number. Raises
+    OutputError."""
     root = Path(root)
     entries = []
     for folder in sequence_folders(root):
@@ -99,7 +99,7 @@ def write_index(root: str | Path) -> int:
 
 
 class _Line(BaseModel):
-    """What a reader relies on; "." is the path of a folder that is a sequence itself."""
+    """The guaranteed keys of a line; "." is the path of a folder that is a sequence itself."""
 
     model_config = ConfigDict(strict=True, extra="allow")
     path: HereOrInside
@@ -109,8 +109,8 @@ _MODEL = TypeAdapter(_Line)
 
 
 def read_index(root: str | Path) -> list[dict[str, Any]]:
-    """The lines of ``index.jsonl``. Raises AssetError: missing, damaged, a path that leaves
-    the data set or is listed twice."""
+    """Return the lines of ``index.jsonl``. Raises AssetError: missing, damaged, a path that leaves the data set or is
+    listed twice."""
     path = Path(root) / INDEX
     try:
         entries = [parse(line, _MODEL) for line in read_text(path).splitlines() if line]
@@ -118,12 +118,12 @@ def read_index(root: str | Path) -> list[dict[str, Any]]:
         raise AssetError("no such file", where=str(path)) from None
     except ValueError as error:
         raise AssetError(
-            f"damaged index: {error}", where=str(path), accepted="run 'blinkgl report' to make it anew"
+            f"damaged index: {error}", where=str(path), accepted="run 'blinkgl report' to rebuild it"
         ) from None
     if twice := [name for name, count in Counter(line["path"] for line in entries).items() if count > 1]:
         raise AssetError(
             f"damaged index: {shown(twice[0])} is listed twice",
             where=str(path),
-            accepted="run 'blinkgl report' to make it anew",
+            accepted="run 'blinkgl report' to rebuild it",
         )
     return entries

@@ -1,5 +1,4 @@
-"""preview.mp4: frames, events and flow colours side by side, with the time; made while the
-sequence is being generated."""
+"""preview.mp4: frames, events and flow colours side by side, with the time; made while the sequence is generated."""
 
 from __future__ import annotations
 
@@ -26,11 +25,11 @@ _LEGEND = 27
 
 
 class Panels:
-    """Of one camera: frame, events and flow side by side. Frames are taken at ``rate_hz`` of simulated time and played
-    at ``fps``, i.e. slowed by ``rate_hz / fps``.
+    """The picture of one camera: frame, events and flow side by side. Frames are taken at ``rate_hz`` of simulated time
+    and played at ``fps``, i.e. slowed by ``rate_hz / fps``.
 
     height, width : sensor size, px.   t0_us : start.   flow : False leaves the flow panel out.   label : of the frame.
-    canvas : (h, w, 3) uint8, all as it is shown."""
+    canvas : (h, w, 3) uint8, the composed picture."""
 
     def __init__(
         self,
@@ -45,7 +44,7 @@ class Panels:
     ):
         self._counts = np.zeros((2, height, width), np.uint16)
         self._pending = 0
-        self._noise: int | None = None  # of the pending; None: nobody knows
+        self._noise: int | None = None  # of the pending events; None: unknown
         factor = min(1.0, _MAX_PANEL_HEIGHT / height)
         if height < 200:
             factor = 2.0
@@ -68,37 +67,37 @@ class Panels:
         return self._canvas
 
     def add_events(self, events: Events) -> None:
-        """Collected until the next frame."""
+        """Add events to those of the next frame."""
         count_events(events.x, events.y, events.p, self._counts)
         self._pending += len(events)
         if events.cause is not None:
             self._noise = (self._noise or 0) + int(np.count_nonzero(events.cause))
 
     def set_flow(self, flow: np.ndarray, valid: np.ndarray | None = None) -> None:
-        """(H, W, 2) px and its valid mask. Full saturation follows the 95th percentile of speed: up at once, down
-        slowly, so that neither a passing object washes out the rest nor the colours flicker."""
+        """Set flow, (H, W, 2) px, and its valid mask. Full saturation follows the 95th percentile of speed: up at once,
+        down slowly, so that a passing object does not fade the rest and colours do not flicker."""
         if not self._has_flow:
             return
         speed = np.hypot(flow[::4, ::4, 0], flow[::4, ::4, 1])
         speed = speed[np.isfinite(speed) & (True if valid is None else valid[::4, ::4])]
         if speed.size:
             self._flow_max = max(0.95 * self._flow_max, float(np.percentile(speed, 95)))
-        nearest = lambda a: cv2.resize(a, self._panel, interpolation=cv2.INTER_NEAREST)  # edges stay true
+        nearest = lambda a: cv2.resize(a, self._panel, interpolation=cv2.INTER_NEAREST)  # keeps edges sharp
         shown = None if valid is None else nearest(np.asarray(valid, np.uint8)) > 0
         self._panel_view(2)[:] = flow_colour(nearest(np.asarray(flow, np.float32)), self._flow_max or None, shown)
         self._legend()
         self._caption(2, f"full colour = {self._flow_max:.3g} px")
 
     def due(self, t_us: int) -> bool:
-        """Whether :meth:`frame` at this time would be shown."""
+        """Return whether :meth:`frame` at this time would be shown."""
         return self._ticks.due(t_us)
 
     def compose(self, t_us: int, image: np.ndarray) -> int:
-        """Draws :attr:`canvas`; for how many periods it is shown: those that have passed, 0 where none has.
+        """Draw :attr:`canvas`; return for how many periods it is shown: those that have passed, 0 for none.
         image : (H, W[, 3]) float linear light, whose highlights are compressed where they exceed 1, or uint8 sRGB."""
         if not self.due(t_us):
             return 0
-        small = self._fit(image)  # first: cheaper, and averages linear light where it is given
+        small = self._fit(image)  # first: cheaper, and averages linear light
         small = self._toned(small) if small.dtype.kind == "f" else small
         shown = np.repeat(small[..., None], 3, axis=2) if small.ndim == 2 else small
         self._panel_view(0)[:] = shown
@@ -111,8 +110,8 @@ class Panels:
         return self._ticks.passed(t_us)
 
     def _toned(self, image: np.ndarray) -> np.ndarray:
-        """uint8 sRGB in which nothing clips. What counts as the brightest follows the picture's at once when it rises
-        and slowly when it falls, so that a passing light does not make the rest flicker."""
+        """Return uint8 sRGB without clipping. The assumed maximum follows a brighter picture at once and a darker one
+        slowly, so that a passing light does not make the rest flicker."""
         self._brightest = max(1.0, 0.95 * self._brightest, float(np.nan_to_num(image, nan=0.0, posinf=0.0).max()))
         return to_srgb8(tone_mapped(image, self._brightest))
 
@@ -135,7 +134,7 @@ class Panels:
         self._canvas[:_BAR, left : left + w] = np.asarray(strip)
 
     def _legend(self) -> None:
-        """The colour wheel in the flow panel's lower right corner."""
+        """Draw the colour wheel in the flow panel's lower right corner."""
         view = self._panel_view(2)
         size = 2 * _LEGEND + 1
         if min(view.shape[:2]) < 3 * size:
@@ -150,7 +149,7 @@ class Panels:
 
 
 class _Streamed:
-    """Context manager around a video that is kept when all went well."""
+    """Context manager around a video that is kept if no error occurs."""
 
     _video: VideoWriter
 
@@ -172,7 +171,7 @@ class PreviewWriter(Panels, _Streamed):
 
         preview.add_events(events)              every chunk
         preview.set_flow(flow, valid)           whenever a label exists; shown until the next
-        if preview.due(t_us):                   ask first: making the picture may cost something
+        if preview.due(t_us):                   ask first: making the picture may be expensive
             preview.frame(t_us, image)
 
     path : ending decides the container, .mp4 usually.   The others are those of :class:`Panels`.
@@ -196,14 +195,14 @@ class PreviewWriter(Panels, _Streamed):
         self._video = VideoWriter(path, *self._canvas.shape[:2], fps, preset="superfast", crf=22)
 
     def frame(self, t_us: int, image: np.ndarray) -> None:
-        """Composes and encodes one picture (several times when more than one period has passed), as of
+        """Compose and encode one picture (several times when more than one period has passed), see
         :meth:`Panels.compose`."""
         for _ in range(self.compose(t_us, image)):
             self._video.write(self._canvas)
 
 
 class RigPreviewWriter(_Streamed):
-    """The same of several cameras, one below the other. panels : of each, of one ``rate_hz`` and ``fps``.
+    """Streams a video of several cameras, one below the other. panels : of each, of one ``rate_hz`` and ``fps``.
 
     Raises OutputError when the video cannot be written."""
 
@@ -217,8 +216,8 @@ class RigPreviewWriter(_Streamed):
         self._video = VideoWriter(path, height, width, fps, preset="superfast", crf=22)
 
     def frame(self, number: int, t_us: int, image: np.ndarray) -> None:
-        """The picture of the camera of this number, as of :meth:`Panels.compose`. When the last one's is there all are
-        encoded."""
+        """Set the picture of the camera of this number, see :meth:`Panels.compose`; the last camera's picture completes
+        the frame, which is then encoded."""
         one, top = self.panels[number], self._tops[number]
         count = one.compose(t_us, image)
         if count:

@@ -1,9 +1,9 @@
-"""A sequence of several sensors on disk: a folder like any sequence's, with one below it for each sensor.
+"""A sequence of several sensors on disk: a folder like any sequence's, with one sub-folder per sensor.
 
     <sequence>/
-      rig.yaml                       sensors, what they record, where they are (T_rig_sensor), pairs
-      left/  right/                  sequences of their own, each with its manifest (sequence_dir.py)
-      imu0/imu/                      a sensor that is an inertial unit and no camera (blinkgl.io.imu)
+      rig.yaml                       sensors, what they record, their poses (T_rig_sensor), pairs
+      left/  right/                  their own sequences, each with its manifest (sequence_dir.py)
+      imu0/imu/                      a sensor that is only an inertial unit (blinkgl.io.imu)
       config.yaml  manifest.json  preview.mp4
 
 The manifest has the format "blinkgl-rig" and lists every file below the folder.
@@ -30,7 +30,8 @@ from blinkgl.sequence_files.sequence_dir import MANIFEST, RIG, SequenceWriter, d
 
 
 class RigWriter(SequenceWriter):
-    """Context manager around the folder of a rig's sequence: appears whole or not at all, as a sequence's does.
+    """Context manager around the folder of a rig's sequence, which appears completely or not at all, as a sequence's
+    does.
 
     sensors : as configured.   The other parameters are those of :class:`SequenceWriter`.
 
@@ -50,11 +51,11 @@ class RigWriter(SequenceWriter):
         """Events of all sensors."""
 
     def folder(self, name: str) -> Path:
-        """Where the sequence of a sensor is to be written."""
+        """Return the folder for the sequence of a sensor."""
         return self.path(name)
 
     def adopt(self, name: str) -> None:
-        """The sequence at :meth:`folder` is whole: its files are listed with their checksums."""
+        """List the files, with their checksums, of the complete sequence at :meth:`folder`."""
         folder = self.folder(name)
         manifest = read_manifest(folder)
         with output_errors(folder):
@@ -76,7 +77,7 @@ class RigWriter(SequenceWriter):
 
 
 def rig_yaml(sensors: Sequence[RigSensorConfig]) -> str:
-    """``rig.yaml``: what is on the rig, by name. Rounded nowhere."""
+    """Return ``rig.yaml``: the rig's sensors, by name, unrounded."""
     tables: dict[str, Any] = {}
     for one in sensors:
         records = [key for key in ("events", "images", "imu") if getattr(one, key) is not None]
@@ -101,7 +102,7 @@ def rig_yaml(sensors: Sequence[RigSensorConfig]) -> str:
 
 
 def read_rig(folder: str | os.PathLike) -> dict[str, dict[str, Any]]:
-    """The sensors of a rig's folder, by name, as ``rig.yaml`` has them, ``T_rig_sensor`` as (4, 4) float64.
+    """Return the sensors of a rig's folder, by name, as in ``rig.yaml``, with ``T_rig_sensor`` as (4, 4) float64.
 
     Raises AssetError, ConfigError: no such file, or damaged."""
     tables = read_table(Path(folder) / RIG)["sensors"]
@@ -109,8 +110,8 @@ def read_rig(folder: str | os.PathLike) -> dict[str, dict[str, Any]]:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What a sequence says of a lens that distorts: ``rectify_map.h5`` and ``cam_to_cam.yaml`` as DSEC has them, and
-# ``camchain.yaml`` as Kalibr has it.
+# Files about a lens with distortion: ``rectify_map.h5`` and ``cam_to_cam.yaml`` in DSEC's form, ``camchain.yaml`` in
+# Kalibr's.
 
 RECTIFY_MAP, CAM_TO_CAM, CAMCHAIN = "rectify_map.h5", "cam_to_cam.yaml", "camchain.yaml"
 FILES = RECTIFY_MAP, CAM_TO_CAM, CAMCHAIN
@@ -118,7 +119,7 @@ _TOLERANCE = 1e-3
 
 
 def write_lens(writer: SequenceWriter, camera: CameraModel) -> None:
-    """All of them, into a sequence that is being written."""
+    """Write all of them into a sequence in progress."""
     one = Calibrated(camera)
     writer.external(RECTIFY_MAP, partial(write_rectify_map, rectify_map=rectify_map(camera), codec=writer.codec))
     writer.text(CAM_TO_CAM, cam_to_cam_yaml([one]))

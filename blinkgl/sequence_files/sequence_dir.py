@@ -68,10 +68,10 @@ from blinkgl.types.events import Events
 Self = TypeVar("Self", bound="SequenceWriter")
 MANIFEST = "manifest.json"
 RIG = "rig.yaml"
-"""In the folder of a sequence of several sensors (:mod:`blinkgl.sequence_files.rig_dir`)."""
+"""File in the folder of a sequence of several sensors (:mod:`blinkgl.sequence_files.rig_dir`)."""
 _LARGEST = 2**62
 _IN_FLIGHT = 8
-"""Labels waiting for the encoder thread: bounds memory at a few tens of MB."""
+"""Labels that wait for the encoder thread: limits memory to a few tens of MB."""
 
 
 class SequenceWriter:
@@ -141,9 +141,9 @@ class SequenceWriter:
             # Beside the final name, on the same file system, so that the last step is one rename.
             self._tmp = temporary_beside(self.final)
             self._tmp.mkdir()
-        # One thread: files are written in the order in which they were given, while the next frame is drawn.
+        # One thread: files are written in the given order, while the next frame is drawn.
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="sequence-writer")
-        # Memory is bounded: whoever draws waits when the disk is this many files behind.
+        # Memory is limited: drawing waits when the disk is this many files behind.
         self._slots = threading.BoundedSemaphore(_IN_FLIGHT)
         self._truth: EventLabelsWriter | None = None
         try:
@@ -177,17 +177,17 @@ class SequenceWriter:
     # ---- what a sequence consists of -------------------------------------------------------------------------
 
     def append_events(self, events: Events) -> None:
-        """The next events, in time order (µs on the sequence's clock)."""
+        """Append the next events, in time order (µs on the sequence's clock)."""
         self._check()
         self._events.append(events)
         if self._truth is not None and len(events):
-            # A copy: the thread gets to them when the caller has gone on.
+            # A copy: the thread writes them after the caller has continued.
             self._submit(partial(self._truth.append, events.copy()))
 
     def label(self, name: str, index: int, value: Any, t_us: int, to_us: int | None = None) -> None:
-        """The ``index``-th value of a label (:mod:`blinkgl.labels`) of ``t_us``; ``to_us``: where it leads, of those
-        that lead to another time. Pixels that a form cannot hold are counted in ``lost`` and the manifest. Raises
-        TypeError: a value of another shape or kind of number."""
+        """Write the ``index``-th value of a label (:mod:`blinkgl.labels`) at ``t_us``; ``to_us``: its other time, if it
+        has one. Pixels that a format cannot hold are counted in ``lost`` and the manifest. Raises TypeError: a value of
+        another shape or number type."""
         label = label_of(name)
         if (wrong := label.wrong(value, self.height, self.width)) is not None:
             raise TypeError(f"label '{name}': {wrong}")
@@ -196,29 +196,32 @@ class SequenceWriter:
             self._stamp(label.stamps, str(int(t_us)))
         elif label.stamps is not None:
             self._stamp(label.stamps, f"{int(t_us)}, {int(to_us)}", "# from_timestamp_us, to_timestamp_us")
-        # Without a configuration (a test, a converter) a label has its first form alone.
+        # Without a configuration (a test, a converter) only a label's first format is written.
         for form in label.forms[:1] if self.labels is None else label.written(self.labels):
             self._write(form.file(index), partial(self._encoded, label, form, value))
 
     def poses(self, **arrays: np.ndarray) -> None:
-        """``poses.npz``: named numeric arrays (camera and object poses, times, intrinsics)."""
+        """Write ``poses.npz``: named numeric arrays (camera and object poses, times, intrinsics)."""
         self.arrays("poses.npz", **arrays)
 
     def arrays(self, name: str, **arrays: np.ndarray) -> None:
-        """Named numeric arrays as ``name``, an .npz file."""
+        """Write named numeric arrays as ``name``, an .npz file."""
         arrays = {k: np.array(v) for k, v in arrays.items()}
         if bad := [k for k, v in arrays.items() if v.dtype.hasobject]:
             raise TypeError(f"{name}: object arrays would be pickled: {bad}")
 
         def save(path: Path) -> None:
-            with open(path, "wb") as file:  # NumPy stamps zip members 1980-01-01: the bytes do not depend on the clock
+            with open(
+                path, "wb"
+            ) as file:  # NumPy stamps zip members 1980-01-01, so the bytes do not depend on the clock
                 np.savez(file, **arrays)
 
         self.external(name, save)
 
     def imu(self, config: ImuConfig, measured: Mapping[str, np.ndarray], folder: str = "") -> None:
-        """``imu/``: what an inertial unit measured, the arrays of :class:`~blinkgl.sequence.inertial.Inertial` by
-        name.   folder : that it stands in, of a rig's unit by itself, with a "/" at its end."""
+        """Write ``imu/``: the measurements of an inertial unit, the arrays of
+        :class:`~blinkgl.sequence.inertial.Inertial` by name.
+        folder : of a rig's separate unit, ending with "/"."""
         noisy, ideal = (
             tuple(measured[name] for name in names)
             for names in (("t_ns", "rate", "acceleration"), ("t_ns", "ideal_rate", "ideal_acceleration"))
@@ -229,24 +232,25 @@ class SequenceWriter:
         self.text(folder + imu_files.KALIBR, imu_files.kalibr_yaml(config, measured["T_cam_imu"]))
 
     def image(self, pictures: Mapping[str, np.ndarray], exposure: ExposureLine) -> None:
-        """The next image of the frame camera: codes of "images" and what is written beside it
-        (:mod:`blinkgl.io.frame_camera`), which are not to be changed any more."""
+        """Write the next image of the frame camera: codes of "images" and what is written beside it
+        (:mod:`blinkgl.io.frame_camera`); the arrays must not be changed afterwards."""
         for picture, codes in pictures.items():
             self._write(picture_file(picture, len(self._exposures)), partial(encode_codes, codes))
         self._exposures.append(exposure)
 
     def text(self, name: str, content: str) -> None:
-        """A UTF-8 text file at ``name`` inside the sequence."""
+        """Write a UTF-8 text file at ``name`` inside the sequence."""
         self._write(name, content.encode)
 
     def path(self, name: str) -> Path:
-        """Where another writer (the preview's) may put ``name`` before exit; it is checksummed on exit."""
+        """Return the path where another writer (the preview's) may put ``name`` before exit; it is checksummed on
+        exit."""
         path = self._tmp / name
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
     def external(self, name: str, save: Callable[[Path], None]) -> None:
-        """Runs ``save(path)`` in the background thread."""
+        """Run ``save(path)`` in the background thread."""
 
         def task() -> None:
             path = self.path(name)
@@ -276,9 +280,9 @@ class SequenceWriter:
             with output_errors(path), open(path, "wb") as file:
                 file.write(data)
                 file.flush()
-                # The rename at the end must not reach the disk before the contents do.
+                # The contents must reach the disk before the rename at the end.
                 os.fsync(file.fileno())
-            # Hashed from memory: reading it back would say what the disk has, not what was meant.
+            # Hashed from memory: reading it back would give the disk's content, not the intended one.
             self._files[name] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
 
         self._submit(task)
@@ -290,7 +294,7 @@ class SequenceWriter:
 
     def _done(self, future: Future) -> None:
         self._slots.release()
-        # Raised by the next call: an exception of another thread has nobody to catch it there.
+        # Raised by the next call, because the other thread cannot report it.
         if not future.cancelled() and (error := future.exception()) is not None:
             self._failure.append(error)
 
@@ -310,7 +314,7 @@ class SequenceWriter:
             self._events.close(self.t_end_us)
         if self._truth is not None:
             self._submit(self._truth.close)
-        # Every file is there from here on, or the check raises what stopped it.
+        # From here on every file exists, or the check raises the error that stopped it.
         self._pool.shutdown(wait=True)
         self._check()
         with output_errors(self.final):
@@ -329,13 +333,13 @@ class SequenceWriter:
             # Deepest first: an entry is durable when its folder is.
             for folder in sorted({p.parent for p in self._tmp.rglob("*")}, reverse=True):
                 fsync(folder)
-            # Again: somebody may have put something there while the sequence was made.
+            # Again: something may have been put there while the sequence was made.
             refuse_existing(self.final)
             os.rename(self._tmp, self.final)
             fsync(self.final.parent)
 
     def _about(self) -> dict[str, Any]:
-        """What a manifest of this kind says of it."""
+        """Return the manifest's entries for this kind."""
         return {
             "height": self.height,
             "width": self.width,
@@ -345,8 +349,7 @@ class SequenceWriter:
         }
 
     def _check_untouched(self) -> None:
-        """OutputError when a file that was written is gone or cut: somebody tidied up under us.
-        Half of it must not pass for the whole."""
+        """Raise OutputError when a written file is missing or truncated because something else changed the folder."""
         sizes = {
             name: path.stat().st_size if (path := self._tmp / name).is_file() else None
             for name in self._promised | self._files.keys()
@@ -354,9 +357,9 @@ class SequenceWriter:
         for name, size in sorted(sizes.items()):
             if size is None or size != self._files.get(name, {"bytes": size})["bytes"]:
                 raise OutputError(
-                    f"{name} was deleted or altered while the sequence was being written",
+                    f"{name} was deleted or changed while the sequence was written",
                     where=str(self.final),
-                    accepted="a folder that nobody else writes to",
+                    accepted="a folder that no other program writes to",
                 )
 
     def _discard(self) -> None:
@@ -369,7 +372,7 @@ class SequenceWriter:
 
 
 def is_rig_folder(folder: str | os.PathLike) -> bool:
-    """Whether a folder is the sequence of a rig, with those of its cameras in it."""
+    """Return whether a folder is the sequence of a rig, with those of its cameras in it."""
     return (Path(folder) / RIG).is_file()
 
 
@@ -382,8 +385,7 @@ class _File(BaseModel):
 
 
 class _Common(BaseModel):
-    """What a manifest must look like, wherever it comes from. Further keys are welcome; a
-    key that its maker left out is None."""
+    """The schema of any manifest. Further keys are allowed; missing keys are None."""
 
     model_config = ConfigDict(strict=True, extra="allow")
     format_version: Literal[1, 2]
@@ -403,7 +405,7 @@ class _Common(BaseModel):
 
 
 class Manifest(_Common):
-    """Of one camera's sequence."""
+    """The manifest of one camera's sequence."""
 
     format: Literal["blinkgl-sequence"]
     height: int = Field(ge=1, le=65536)
@@ -412,7 +414,7 @@ class Manifest(_Common):
 
 
 class RigManifest(_Common):
-    """The same of a rig's sequence (rig_dir.py), whose ``files`` are those of all sensors."""
+    """The manifest of a rig's sequence (rig_dir.py), whose ``files`` are those of all sensors."""
 
     format: Literal["blinkgl-rig"]
     sensors: list[InsidePath]
@@ -423,11 +425,11 @@ _MODEL, _RIG_MODEL = TypeAdapter(Manifest), TypeAdapter(RigManifest)
 
 
 def verify_sequence(folder: str | os.PathLike, *, checksums: bool = True) -> list[str]:
-    """Problems of a sequence directory against its manifest, one line each; empty when whole.
+    """Return the problems of a sequence directory against its manifest, one line each; empty when complete.
 
-    Finds missing, foreign, truncated and altered files, and what is no file: links, pipes, devices, empty folders. An
-    unreadable manifest is one problem. ``checksums=False`` reads no contents, and so misses what
-    was altered without changing its length."""
+    Finds missing, foreign, truncated and altered files, and entries that are not files: links, pipes, devices, empty
+    folders. An unreadable manifest is one problem. ``checksums=False`` reads no contents, so it misses files altered
+    without a change of length."""
     folder = Path(folder)
     try:
         files = read_manifest(folder)["files"]
@@ -458,8 +460,8 @@ def verify_sequence(folder: str | os.PathLike, *, checksums: bool = True) -> lis
 
 
 def read_manifest(folder: str | os.PathLike) -> dict[str, Any]:
-    """The manifest, of the shape :class:`Manifest` describes, or :class:`RigManifest`; AssetError when there is none
-    or it is damaged."""
+    """Return the manifest, in the form of :class:`Manifest` or :class:`RigManifest`. Raises AssetError when there is
+    none or it is damaged."""
     path = Path(folder) / MANIFEST
     try:
         text = read_text(path)
@@ -473,7 +475,7 @@ def read_manifest(folder: str | os.PathLike) -> dict[str, Any]:
 
 
 def manifest_problems(folder: str | os.PathLike) -> list[str]:
-    """Whether a manifest is what was written, by its hash of itself. Those of format_version 1 have none."""
+    """Return whether a manifest is what was written, by its hash of itself. Those of format_version 1 have none."""
     text = read_text(Path(folder) / MANIFEST)
     record = parse(text)
     if record["format_version"] == 1 and SEAL not in record:
@@ -483,7 +485,7 @@ def manifest_problems(folder: str | os.PathLike) -> list[str]:
 
 
 def digest_of(path: Path) -> dict[str, Any]:
-    """A file's line in a manifest."""
+    """Return a file's line in a manifest."""
     digest, size = hashlib.sha256(), 0
     with open(open_regular(path), "rb") as file:
         while block := file.read(1 << 20):

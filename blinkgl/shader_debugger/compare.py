@@ -434,7 +434,7 @@ def _not_graded(reports: list[BufferReport], left_out: list[str]) -> str:
 
 def as_text(found: dict) -> list[str]:
     """Lines."""
-    lines = [f"{program}: the shader does not use '{name}' any more" for program, name in found["unused"]]
+    lines = [f"{program}: the shader no longer uses '{name}'" for program, name in found["unused"]]
     first = found["first"]
     if first is None:
         return lines

@@ -1,6 +1,7 @@
-"""What the commands print. Nothing here makes a result, and no other room prints.
+"""Output of the commands. Nothing here computes a result, and no other room prints.
 
 In:    a command's options.
-Out:   one call into the library behind a display, words and tables for people, the command's exit status.
-Start: generate.py; one module per command, of its name, with ``run``. doctor.py also examines the machine for others.
+Out:   one library call behind a display, text and tables for users, the command's exit status.
+Start: generate.py; one module per command, with the same name and a function ``run``. Others use doctor.py to examine
+the machine.
 """

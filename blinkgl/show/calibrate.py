@@ -1,4 +1,4 @@
-"""``blinkgl calibrate``: a bar while it runs, then what was fitted and how near it came; a sensor file and a page."""
+"""``blinkgl calibrate``: a progress bar, then the fitted values and their accuracy; a sensor file and a page."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from blinkgl.report.calibration import page, parameters, rows
 from blinkgl.show.simulate import emulator_options
 
 PIXELS = "pixels"
-"""In the place of an emulator's name: the noise of single pixels, which stands beside any emulator."""
+"""Used instead of an emulator's name: the noise of single pixels, which is added to any emulator."""
 
 
 def run(
@@ -37,14 +37,14 @@ def run(
     quiet: bool = False,
     **options: Any,
 ) -> int:
-    """``options``: of :func:`~blinkgl.recordings.calibration.calibrate` and of its FrameReading. Writes the sensor file
-    ``out`` and, beside it, a page of the same name that ends in .html; both or neither."""
+    """Fit an emulator and write the sensor file ``out`` and a page of the same name that ends in .html; both or
+    neither. ``options``: of :func:`~blinkgl.recordings.calibration.calibrate` and of its FrameReading."""
     target = Path(out)
     if target.suffix.lower() not in (".yaml", ".yml"):
         raise OutputError("not the name of a sensor file", where=out, accepted="a name that ends in .yaml")
     beside = target.with_suffix(".html")
     for path in (target, beside):
-        if path.exists() and not overwrite:  # before the work, not after it
+        if path.exists() and not overwrite:  # before the fit, not after it
             raise OutputError("output file exists", where=str(path), accepted="a new name, or --overwrite")
     if emulator == PIXELS:
         return _pixels(recording, frames, target, sensor, overrides, overwrite, quiet, options)
@@ -90,14 +90,17 @@ def _pixels(
     quiet: bool,
     options: dict[str, Any],
 ) -> int:
-    """The noise of single pixels in the place of an emulator."""
+    """Fit the noise of single pixels instead of an emulator."""
     if not options["still"] or frames is not None:
         raise ConfigError(
-            "the noise of single pixels shows where nothing moves", where="--emulator", value=PIXELS, accepted="--still"
+            "the noise of single pixels is measured in a static scene",
+            where="--emulator",
+            value=PIXELS,
+            accepted="--still",
         )
     for option, value in (("--sensor", sensor), ("--set", overrides)):
         if value:
-            raise ConfigError("says something of an emulator", where=option, accepted=f"none with --emulator {PIXELS}")
+            raise ConfigError("this is an option of emulators", where=option, accepted=f"none with --emulator {PIXELS}")
     console = plain_console(quiet=quiet)
     with _bar(console, quiet) as bar:
         task = bar.add_task("reading", total=1.0)
@@ -133,7 +136,7 @@ def _bar(console: Console, quiet: bool) -> Progress:
 
 
 def _write(target: Path, sensor: str, page_: str, overwrite: bool) -> None:
-    """The sensor file and the page beside it; both or neither."""
+    """Write the sensor file and the page beside it; both or neither."""
     beside = target.with_suffix(".html")
     with atomic_file(beside, overwrite=overwrite) as html, atomic_file(target, overwrite=overwrite) as file:
         with output_errors(target):

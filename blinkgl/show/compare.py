@@ -1,4 +1,4 @@
-"""``blinkgl compare``: two recordings side by side as a table, and as files where they are asked for."""
+"""``blinkgl compare``: prints two recordings side by side as a table, and writes files if requested."""
 
 from __future__ import annotations
 

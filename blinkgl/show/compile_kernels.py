@@ -1,4 +1,4 @@
-"""Compile the kernels ahead, once per machine: ``python -m blinkgl.show.compile_kernels``, which ``make`` runs."""
+"""Compile the kernels in advance, once per machine: ``python -m blinkgl.show.compile_kernels``, which ``make`` runs."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from blinkgl.recordings.simulation import frames_to_events
 
 
 def compile_ahead() -> float:
-    """Compiles the kernels of all emulators, for frames of either type, and what else a sequence needs, on all cores,
-    so that no later process has to. Wall seconds that it took, 0 where there was nothing to compile."""
-    # The longest first; a sequence's own beside the emulator that it has by default.
+    """Compile the kernels of all emulators, for both frame types, and the other kernels of a sequence, on all cores, so
+    that no later process has to. Returns the wall time, s; 0 where there was nothing to compile."""
+    # The longest first; a sequence's own kernels together with its default emulator.
     default, began = EmulatorConfig.members.default, time.perf_counter()
     parts = [*((kind,) for kind in sorted(EMULATORS) if kind != default), (default, None)]
     workers = min(len(os.sched_getaffinity(0)), len(parts))
@@ -33,7 +33,7 @@ def compile_ahead() -> float:
 
 
 def _compile_part(emulators: tuple[str | None, ...]) -> float:
-    """The kernels of these emulators; None: of a sequence. Seconds spent compiling."""
+    """Compile the kernels of these emulators; None: of a sequence. Returns the time, s."""
     before = compiled_s()
     for emulator in emulators:
         if emulator is None:
@@ -54,7 +54,7 @@ def _of_an_emulator(emulator: str) -> None:
 
 
 def _of_a_sequence() -> None:
-    """Paths, occlusion, preview."""
+    """Compile the kernels of paths, occlusion and preview."""
     small = {
         "camera": {"width": 64, "height": 48},
         "time": {"duration": 0.02, "label_rate": 50},
@@ -67,7 +67,7 @@ def _of_a_sequence() -> None:
             for _ in generate_run(RunTemplate(small, Path(".")), folder + "/out"):
                 pass
         except GLError:
-            pass  # `blinkgl doctor` says what is missing; this is not the place
+            pass  # `blinkgl doctor` reports what is missing
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""``blinkgl configs``: the runs that ship, and what each of them is."""
+"""``blinkgl configs``: prints the shipped runs and their descriptions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from blinkgl.machine.terminal import plain_console
 
 
 def run() -> int:
-    """One line a run: its name, and the sentence that its file begins with."""
+    """Print one line per run: its name and the first sentence of its file."""
     table = Table(show_header=False, box=None)
     table.add_column(no_wrap=True)
     for name, path in sorted(shipped_runs().items()):

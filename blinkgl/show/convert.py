@@ -1,4 +1,4 @@
-"""``blinkgl convert``: one line about what was written."""
+"""``blinkgl convert``: prints one line about the output."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def run(source: str, target: str, *, size: str | None = None, **options: Any) ->
 
 
 def size_of(text: str | None) -> tuple[int, int] | None:
-    """(height, width) of what ``--size`` says. Raises ConfigError."""
+    """Return (height, width) of the option ``--size``. Raises ConfigError."""
     if text is None:
         return None
     width, cross, height = text.lower().partition("x")

@@ -1,4 +1,4 @@
-"""``blinkgl doctor``: what is examined; sections, then what is missing with the commands that mend it."""
+"""``blinkgl doctor``: prints the examined parts, then the missing ones and the commands that install them."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from blinkgl.machine.extras import EXTRAS, install, python
 from blinkgl.machine.terminal import plain_console, say
 
 # ---------------------------------------------------------------------------------------------------------------------
-# ``blinkgl doctor``: what this machine offers, what is missing, and the command that mends it.
+# ``blinkgl doctor``: what this machine offers, what is missing, and the command that installs it.
 #
-# Every check *does* the thing (renders, encodes, compresses, compiles) and compares the result: a driver that
-# advertises 32-bit float targets and rounds them is found here and not in a data set.
+# Every check *does* the operation (renders, encodes, compresses, compiles) and compares the result: a driver that
+# advertises 32-bit float targets but rounds them fails here and not in a data set.
 
 
 @dataclass(frozen=True)
@@ -41,13 +41,13 @@ class Check:
 
 @dataclass(frozen=True)
 class Report:
-    """What was found, check by check."""
+    """The results of all checks."""
 
     checks: tuple[Check, ...]
 
     @property
     def ok(self) -> bool:
-        """All required parts are there."""
+        """Whether all required parts are present."""
         return all(check.status != "missing" for check in self.checks)
 
     def to_json(self) -> str:
@@ -60,7 +60,7 @@ def examine(backend: str = "auto", device: int = 0) -> Report:
 
 
 def _try(section: str, name: str, action: Callable[[], str], remedy: str) -> Check:
-    """``action`` returns the text of success and raises anything on failure."""
+    """Return the check of an action; ``action`` returns the text of success and raises any exception on failure."""
     try:
         return Check(section, name, "ok", action())
     except Exception as error:  # noqa: BLE001 - whatever a broken installation throws, the line has to appear
@@ -139,7 +139,7 @@ def _opengl(backend: str, device: int) -> Iterator[Check]:
 
 
 def _to_torch(gl, section: str) -> Check:
-    """How frames go from this context to torch; on a card after one was drawn, copied and compared."""
+    """Check the transfer of frames from this context to torch; on a GPU a frame is drawn, copied and compared."""
     name = "frames for torch"
     if gl.is_software:  # torch takes seconds to import
         return Check(section, name, "info", "in the processor's memory, where they are drawn")
@@ -207,8 +207,8 @@ def _draw_exactly(gl, name: str) -> str:
 
 
 def _draw_depth(gl) -> str:
-    """near/z from 0.01 to 1e6 units to one float32 rounding; and of two surfaces 1e-6 apart
-    at 1e5 the nearer one wins."""
+    """Check near/z from 0.01 to 1e6 units to one float32 rounding, and that of two surfaces 1e-6 apart at 1e5 units the
+    nearer one is drawn."""
     import moderngl
 
     near = 0.01
@@ -340,7 +340,7 @@ def _codecs() -> Iterator[Check]:
 
 
 def _blender(value: str, purpose: str) -> tuple[list[str], str, str]:
-    """Blender may be another interpreter's: what is lacking, what to say, the remedy."""
+    """Return missing parts, a description and the remedy; Blender may run in another interpreter."""
     from blinkgl.blender import process
 
     missing = process.available()
@@ -368,7 +368,7 @@ _MARKS = {"ok": ("ok", "green"), "missing": ("MISSING", "bold red"), "absent": (
 
 
 def run(backend: str = "auto", device: int = 0, as_json: bool = False) -> int:
-    """Status 2 when something required is missing."""
+    """Print the report. Status 2 when something required is missing."""
     report = examine(backend, device)
     if as_json:
         say(plain_console(), report.to_json())
@@ -378,7 +378,7 @@ def run(backend: str = "auto", device: int = 0, as_json: bool = False) -> int:
 
 
 def show(report: Report) -> None:
-    """Print for people: sections, then what is missing with the commands that mend it."""
+    """Print for people: sections, then what is missing with the commands that install it."""
     console = plain_console(highlight=False)
     if not console.is_terminal:
         console = plain_console(highlight=False, width=200)  # piped: one check, one line, for grep

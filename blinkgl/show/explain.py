@@ -1,4 +1,4 @@
-"""``blinkgl explain``: what a run will model, leave out and cost, as tables."""
+"""``blinkgl explain``: prints what a run models, leaves out and costs, as tables."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from blinkgl.machine.terminal import plain_console, say
 
 
 def run(config: str, *, sequence: int | None = None, seed: int | None = None, overrides: Sequence[str] = ()) -> int:
-    """``sequence``: default the first of the run."""
+    """Explain a run. ``sequence``: default the first of the run."""
     show(explain(load_run(config, overrides, seed=seed), sequence), plain_console())
     return 0
 
 
 def show(result: Explanation, console: Console) -> None:
-    """Three tables and the cost."""
+    """Print three tables and the cost."""
     scene = Table(title="what is modelled", title_justify="left", show_header=False)
     for key, value in result.scene.items():
         scene.add_row(key, value)

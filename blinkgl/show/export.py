@@ -1,4 +1,4 @@
-"""``blinkgl export``: what was written, and what to know of it."""
+"""``blinkgl export``: prints what was written, and notes on it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SHARDS = "webdataset"
 
 
 def refuse_early(out: str, layout: str) -> None:
-    """Raises ConfigError: no such layout; OutputError: ``out`` exists. For what exports after hours of other work."""
+    """Raise ConfigError for an unknown layout, OutputError if ``out`` exists. For exports after hours of other work."""
     if layout != SHARDS:
         layout_of(layout)
     if Path(out).exists():
@@ -32,7 +32,7 @@ def run(root: str, out: str, *, layout: str | None, shard_mb: float | None = Non
             shards = f"{len(counts)} shard{'s' * (len(counts) != 1)}"
             say(console, f"{out}/{split}-*.tar: {sum(counts):,} samples in {shards}")
         return 0
-    layout_of(layout)  # an unknown one is refused before what others have no use for
+    layout_of(layout)  # refuses an unknown layout before the check of options
     for name, value in (("--shard-mb", shard_mb), ("--seed", seed)):
         if value is not None:
             raise ConfigError(f"layout '{layout}' has no shards", where=name, value=value, accepted=f"it with {SHARDS}")

@@ -1,4 +1,4 @@
-"""``blinkgl generate``: one display over all workers while it runs, a table when it is done."""
+"""``blinkgl generate``: one display of all workers, and a table at the end."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from blinkgl.machine.terminal import causes_line, plain_column, plain_console, s
 from blinkgl.show import export
 
 MAX_NOTES = 20
-"""Files of which it is said what is not drawn; beyond, that there are more."""
+"""Number of files whose undrawn features are listed."""
 SET_ASIDE = 3
-"""Exit status of a run that is over but lacks sequences."""
+"""Exit status of a finished run with missing sequences."""
 
 
 def run(
@@ -44,10 +44,10 @@ def run(
     view: bool = False,
     layout: str | None = None,
 ) -> int:
-    """:func:`~blinkgl.dataset.run.run_dataset` behind a display; status :data:`SET_ASIDE` when sequences are missing,
-    whose names and reasons are said even when ``quiet``. view : show each sequence in a browser when it is whole, and
-    all until Ctrl-C. layout : when no sequence is missing, write them as ``OUT-LAYOUT``, too (`blinkgl export`).
-    Raises what these raise, and ConfigError without the extra [view]."""
+    """Run :func:`~blinkgl.dataset.run.run_dataset` behind a display; status :data:`SET_ASIDE` when sequences are
+    missing, whose names and reasons are printed even when ``quiet``. view : show each sequence in a browser when it is
+    complete, and all until Ctrl-C. layout : when no sequence is missing, also write them as ``OUT-LAYOUT`` (`blinkgl
+    export`). Raises their errors, and ConfigError without the extra [view]."""
     exported = f"{out.rstrip('/')}-{layout}"
     if layout is not None:
         export.refuse_early(exported, layout)
@@ -75,7 +75,7 @@ def run(
 
 
 def _shown(view: bool, out: Path, display: Listener | None) -> AbstractContextManager[Listener | None]:
-    """Whom the run tells, inside of a page in the browser where that is asked for."""
+    """Return the context that shows the run's progress, with a page in the browser if requested."""
     if not view:
         return nullcontext(display)
     from blinkgl.show.view import watching
@@ -84,8 +84,8 @@ def _shown(view: bool, out: Path, display: Listener | None) -> AbstractContextMa
 
 
 class Display:
-    """Sequences, events, frames/s, what is left, disk used and expected: a bar per sequence at work on a terminal, a
-    line per finished sequence elsewhere."""
+    """Shows sequences, events, frames/s, remaining time, disk space used and expected: on a terminal a bar per sequence
+    in progress, elsewhere a line per finished sequence."""
 
     def __init__(self, console: Console, out: Path):
         self._console, self._out = console, out
@@ -100,14 +100,14 @@ class Display:
             disable=not console.is_terminal,
         )
         self._tasks: dict[str, TaskID] = {}
-        self._at_work: dict[str, tuple[float, int, int]] = {}  # fraction, frames, events of what is being made
+        self._at_work: dict[str, tuple[float, int, int]] = {}  # fraction, frames and events of sequences in progress
         self._done = self._frames = self._events = self._bytes = self._given_up = 0
         self._notes: set[str] = set()
 
     def begin(self, plan: Plan, outcome: Outcome) -> None:
         self._todo, self._started = len(plan.tasks) - outcome.found, time.monotonic()
         if outcome.found:
-            self._say(f"{outcome.found} of {len(plan.tasks)} sequences are whole already")
+            self._say(f"{outcome.found} of {len(plan.tasks)} sequences are complete already")
         for name, problem in outcome.damaged.items():
             self._say(f"{name} was damaged ({problem}); moved to .run/damaged, will be made again")
         self._bars.start()
@@ -116,7 +116,7 @@ class Display:
     def message(self, name: str, message: Message) -> None:
         kind = message["kind"]
         if kind == "said":
-            if message["text"] not in self._notes:  # several workers say the same
+            if message["text"] not in self._notes:  # several workers report the same
                 self._notes.add(message["text"])
                 self._say(message["text"])
             return
@@ -159,7 +159,7 @@ class Display:
         self._bars.stop()
 
     def summary(self) -> str:
-        """ "12/20, 85 frames/s, 1.2 M events/s, 0:03:10 left, 0.21 GB of about 0.35 GB"."""
+        """Return "12/20, 85 frames/s, 1.2 M events/s, 0:03:10 left, 0.21 GB of about 0.35 GB"."""
         elapsed = max(time.monotonic() - self._started, 1e-3)
         frames = self._frames + sum(f for _, f, _ in self._at_work.values())
         events = self._events + sum(e for _, _, e in self._at_work.values())
@@ -180,7 +180,7 @@ class Display:
         return ", ".join(parts)
 
     def _note(self, lines: Iterable[str]) -> None:
-        """Says what is not drawn, once, however many sequences and workers use the file."""
+        """Print what is not drawn, once per file, for all sequences and workers."""
         for line in lines:
             if line in self._notes:
                 continue
@@ -195,7 +195,7 @@ class Display:
 
 
 def _shares(seconds: dict[str, float]) -> str:
-    """ "render 63 %, events 12 %": where most of the time has gone so far."""
+    """Return "render 63 %, events 12 %": the stages that took most of the time so far."""
     total = sum(seconds.values()) or 1.0
     largest = sorted(STAGES, key=lambda name: -seconds.get(name, 0.0))[:2]
     return ", ".join(f"{name} {100 * seconds.get(name, 0.0) / total:.0f} %" for name in largest)
@@ -206,7 +206,7 @@ def _size(size: float) -> str:
 
 
 def show_outcome(console: Console, outcome: Outcome, out: Path) -> None:
-    """The final table, and what was set aside."""
+    """Print the final table and the failed sequences."""
     if line := compiling_line(outcome.made.compile_s):
         say(console, line)
     if outcome.made:
@@ -214,7 +214,7 @@ def show_outcome(console: Console, outcome: Outcome, out: Path) -> None:
     else:
         say(
             console,
-            f"nothing to make: all {outcome.found} sequences are whole"
+            f"nothing to make: all {outcome.found} sequences are complete"
             if not outcome.set_aside
             else "no sequence was made",
         )
@@ -236,10 +236,10 @@ def _line(report: SequenceReport) -> str:
 
 
 def show_table(console: Console, made: Totals, elapsed_s: float | None = None) -> None:
-    """The final table: what was made, how fast, and where the time went. ``elapsed_s``: of the run, where several
-    workers each spent wall time at once."""
+    """Print the final table: counts, speed and time per stage. ``elapsed_s``: of the run, where several workers ran at
+    once."""
     s, first = made.summary(), made.first
-    assert first is not None, "there is nothing to show of no sequences"
+    assert first is not None, "there are no sequences to show"
     table = Table(
         title=f"{s['sequences']} sequence{'s' if s['sequences'] != 1 else ''}, {s['simulated_s']:g} simulated seconds",
         title_justify="left",
@@ -258,7 +258,7 @@ def show_table(console: Console, made: Totals, elapsed_s: float | None = None) -
     table.add_section()
     for name in (*STAGES, "other"):
         seconds = s[f"{name}_s"]
-        if name == "images" and not seconds:  # nobody asked for any
+        if name == "images" and not seconds:  # no images requested
             continue
         table.add_row(name, f"{seconds:.2f} s  {100 * seconds / s['total_s']:4.0f} %")
     console.print(table)
@@ -267,13 +267,13 @@ def show_table(console: Console, made: Totals, elapsed_s: float | None = None) -
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# From the options of ``blinkgl generate`` to an executor.
+# Choose an executor from the options of ``blinkgl generate``.
 
 
 def choose_executor(
     name: str, workers: int | None, *, address: str | None = None, gpus: float = 0.0, devices: str | None = None
 ) -> Executor:
-    """``local`` without ``workers`` is this process itself. Raises ConfigError: unknown name,
+    """Return the executor; ``local`` without ``workers`` is this process itself. Raises ConfigError: unknown name,
     options of another executor, no Ray."""
     if name not in ("local", "ray"):
         raise ConfigError("unknown executor", where="--executor", value=name, accepted="local or ray")

@@ -1,4 +1,4 @@
-"""``blinkgl import``: what came, what could not, and the lines of YAML that play it."""
+"""``blinkgl import``: prints what was converted, what was not, and YAML to play it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn
 from blinkgl.config.reader import to_short_yaml
 from blinkgl.machine.terminal import plain_column, plain_console, say
 
-_LONGER_SIDE = 640  # px: an event camera's, not a film's
+_LONGER_SIDE = 640  # px, typical of an event camera
 
 
 def run(source: str, target: str, *, as_json: bool = False, quiet: bool = False, **options: Any) -> int:
@@ -47,7 +47,7 @@ def run(source: str, target: str, *, as_json: bool = False, quiet: bool = False,
 
 
 def _recipe(target: str, came: Any) -> str:
-    """The YAML that plays what was imported, as far as the file decides it."""
+    """Return the YAML that plays the imported file, as far as the file determines it."""
     if not came.counts["meshes"]:
         return f"scene.objects: {{mesh: …, animation: {{file: {target}}}}}    (a clip, for a figure with these joints)"
     scene: dict[str, Any] = {"kind": "file", "path": target}

@@ -1,4 +1,4 @@
-"""``blinkgl report``: where the page is."""
+"""``blinkgl report``: prints the path of the page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``blinkgl simulate``: a bar while it runs, then what was made and what was lost."""
+"""``blinkgl simulate``: a progress bar, then counts of events made and lost."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
     from blinkgl.recordings.simulation import SimulationReport
 
 FAR_PX = 2.0
-"""px between frames above which linear interpolation is warned of: at 2 px it loses up to 20 % of the events."""
+"""px between frames above which linear interpolation gives a warning: at 2 px it loses up to 20 % of the events."""
 
 
 def emulator_options(
     name: str, config: str | None, overrides: Sequence[str], sensor: str | None = None
 ) -> dict[str, Any]:
-    """``emulator``, ``readout``, ``size`` and what is known of a sensor's ``own`` frames: from an emulator's name, an
-    optional YAML mapping (it may name the emulator itself), ``key=value`` overrides, and an optional sensor whose
-    values hold where nothing else is said."""
+    """Return ``emulator``, ``readout``, ``size`` and the properties of a sensor's ``own`` frames from an emulator's
+    name, an optional YAML mapping (which may name the emulator itself), ``key=value`` overrides, and an optional sensor
+    that gives the defaults."""
     data: dict[str, Any] = {}
     if config is not None:
         data = read_table(config, "emulator parameters, key: value")
@@ -38,7 +38,7 @@ def emulator_options(
         if not equals:
             raise ConfigError("not key=value", where="--set", value=item)
         data[key.strip()] = parse_yaml(value, f"--set {key.strip()}")
-    if "recipe" in data:  # a video is one camera: the middle of what the recipe draws
+    if "recipe" in data:  # a video is one camera: the middle of the recipe's distributions
         data = middle(expanded({"events": data}, Path.cwd())["events"])
     if sensor is None:
         return {"emulator": data, "readout": None, "size": None, "own": None}
@@ -67,7 +67,7 @@ def run(
     keep_noise: bool = False,
     **options: Any,
 ) -> int:
-    """``size``: "WIDTHxHEIGHT" in place of the sensor's.   ``options``: of
+    """Convert a file. ``size``: "WIDTHxHEIGHT" instead of the sensor's.   ``options``: of
     :func:`~blinkgl.recordings.simulation.file_to_events`."""
     from blinkgl.config.sensor import load_sensor
     from blinkgl.machine.compiling import announced_compiling
@@ -107,7 +107,7 @@ def run(
 
 
 def _told(console: Console, target: str, report: SimulationReport) -> None:
-    """What was made and what was lost, a line each."""
+    """Print counts of events made and lost, one line each."""
     from blinkgl.machine.compiling import compiled_s, compiling_line
 
     rate = report.events / report.duration_s if report.duration_s else 0.0
@@ -130,8 +130,8 @@ def _told(console: Console, target: str, report: SimulationReport) -> None:
     if report.guessed_over_px > FAR_PX:
         say(
             console,
-            f"warning: things move up to {report.guessed_over_px:.0f} px between frames, and what happens in between "
-            "is guessed: --interpolate motion, or a faster video",
+            f"warning: things move up to {report.guessed_over_px:.0f} px between frames, and the "
+            "motion in between is guessed: --interpolate motion, or a faster video",
         )
     if report.displacement is not None:
         say(console, str(report.displacement))

@@ -1,4 +1,4 @@
-"""``blinkgl trade --suite``: what was measured over all scenes, as a table, and the files."""
+"""``blinkgl trade --suite``: prints the results over all scenes as a table, and writes the files."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ def run(
     cost: str,
     others: dict[str, bool],
 ) -> int:
-    """Measures the scenes and writes the files. others : options of one scene, and whether they were given. Returns 3
-    where a scene is missing, so that a script knows. Raises BlinkGLError."""
+    """Measure the scenes and write the files. others : options of one scene, and whether they were given. Returns 3
+    where a scene is missing, for scripts. Raises BlinkGLError."""
     check_cost(cost)
     if given := [name for name, said in others.items() if said]:
-        raise ConfigError("is for one scene", where=", ".join(given), accepted="without --suite")
+        raise ConfigError("these are options of a single scene", where=", ".join(given), accepted="without --suite")
     console = plain_console()
     options = replace(OPTIONS, limit_us=round(limit_ms * 1000))
     result = run_suite(
@@ -49,7 +49,7 @@ def run(
 
 
 def show(result: dict, console: Console) -> None:
-    """All settings over all scenes, and what does not count and why."""
+    """Print all settings over all scenes, and the rows that do not count, with reasons."""
     console.width = max(console.width, 140)
     table = Table(title="settings over all scenes (means are geometric), cheapest first", title_justify="left")
     headings = ("setting", "counts in", "not beaten in", "beaten by", "cost", "voxel", "worst voxel", "worst in")

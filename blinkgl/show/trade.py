@@ -1,4 +1,4 @@
-"""``blinkgl trade``: the settings that nothing beats as a table, and the files."""
+"""``blinkgl trade``: prints the best settings as a table, and writes the files."""
 
 from __future__ import annotations
 
@@ -33,11 +33,13 @@ def run(
     reference_set: list[str] | None = None,
     seed: int | None = None,
 ) -> int:
-    """Measures, writes the files, and names the settings that nothing beats. Raises BlinkGLError."""
+    """Measure the settings, write the files, and print those that no other one beats. Raises BlinkGLError."""
     if config is None:
-        raise ConfigError("which scene?", where="trade", accepted="a YAML file, or --suite for the shipped scenes")
+        raise ConfigError("no scene given", where="trade", accepted="a YAML file, or --suite for the shipped scenes")
     if suite_options:
-        raise ConfigError("is of the suite", where=", ".join(suite_options), accepted="together with --suite")
+        raise ConfigError(
+            "these are options of the suite", where=", ".join(suite_options), accepted="together with --suite"
+        )
     check_cost(cost)
     template = load_run(config, overrides, seed=seed)
     options = QUICK if quick else Options()
@@ -69,13 +71,13 @@ def run(
 
 
 def check_cost(cost: str) -> None:
-    """Raises ConfigError where it is neither wall nor cpu."""
+    """Raise ConfigError for a cost that is neither wall nor cpu."""
     if cost not in ("wall", "cpu"):
         raise ConfigError("unknown cost", where="--cost", value=cost, accepted="wall or cpu")
 
 
 def show(result: dict, console: Console) -> None:
-    """The front as a table, and how far the reference can be trusted."""
+    """Print the front as a table, and how far the reference can be trusted."""
     console.width = max(console.width, 120)
     table = Table(title="settings that no other one beats in cost and error, cheapest first", title_justify="left")
     table.add_column("setting")

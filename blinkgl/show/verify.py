@@ -1,4 +1,4 @@
-"""``blinkgl verify``: what is wrong, place by place, and a last line."""
+"""``blinkgl verify``: prints the problems by place, and a summary."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _MOST_LINES = 20
 
 
 def run(folder: str, *, deep: int = 0, seed: int = 0, base: str | None = None) -> int:
-    """:func:`~blinkgl.dataset.verify.verify_dataset` in words; status 2 when something is wrong."""
+    """Print the result of :func:`~blinkgl.dataset.verify.verify_dataset`; status 2 when something is wrong."""
     console = plain_console()
     with console.status("looking") as status:
         result = verify_dataset(
@@ -31,8 +31,8 @@ def run(folder: str, *, deep: int = 0, seed: int = 0, base: str | None = None) -
 
 
 def last_line(result: Verification, deep: bool) -> str:
-    """ "20 sequences, 3 made again and compared bit by bit: no problem found"; says also what
-    was compared in part or not at all."""
+    """Return "20 sequences, 3 made again and compared bit by bit: no problem found"; it also counts what was compared
+    in part or not at all."""
     parts = [f"{result.sequences} sequences"]
     if deep:
         parts.append(f"{len(result.deep) - len(result.in_part)} made again and compared bit by bit")

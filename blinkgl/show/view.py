@@ -1,4 +1,4 @@
-"""``blinkgl view``: where the page is, or the file that was written; and ``generate --view``."""
+"""``blinkgl view`` and ``generate --view``: print the page's address, or the file that was written."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def run(sequences: Sequence[str], *, port: int | None = None, save: str | None = None, overwrite: bool = False) -> int:
-    """Serves the sequences until interrupted, or writes one of them as a file. Raises ConfigError: no viser, more than
+    """Serve the sequences until interrupted, or write one of them as a file. Raises ConfigError: no viser, more than
     one sequence for a file; AssetError: no sequence; OutputError: a port in use, a file that exists."""
     check_extra("view")
     from blinkgl.viewer.views import sequences_in
@@ -55,12 +55,12 @@ def run(sequences: Sequence[str], *, port: int | None = None, save: str | None =
 
 def _save(console: Console, folders: list[Path], out: Path, port: int | None, overwrite: bool) -> int:
     if port is not None:
-        raise ConfigError("is of a server", where="--port", value=port, accepted="it without --save")
+        raise ConfigError("this is an option of the server", where="--port", value=port, accepted="it without --save")
     if out.suffix.lower() not in (".html", ".htm"):
         raise OutputError("not the name of a page", where="--save", value=str(out), accepted="NAME.html")
     if len(folders) != 1:
         one = f"one, such as {folders[0]}"
-        raise ConfigError("a file is of one sequence", where="--save", value=len(folders), accepted=one)
+        raise ConfigError("a file shows one sequence", where="--save", value=len(folders), accepted=one)
     if out.exists() and not overwrite:  # before the work, not after it
         raise OutputError("output file exists", where=str(out), accepted="a new name, or --overwrite")
     from blinkgl.viewer.page import save
@@ -72,14 +72,14 @@ def _save(console: Console, folders: list[Path], out: Path, port: int | None, ov
 
 
 def check_extra(option: str) -> None:
-    """Raises ConfigError where the extra [view] is missing."""
+    """Raise ConfigError where the extra [view] is missing."""
     if importlib.util.find_spec("viser") is None:
         remedy = f"run {install(*EXTRAS['view'][0])}"
-        raise ConfigError("viser is not installed, which shows sequences", where=option, accepted=remedy)
+        raise ConfigError("viser, which shows sequences, is not installed", where=option, accepted=remedy)
 
 
 class Watched:
-    """A run's listener that hands everything on and puts each finished sequence on a page."""
+    """A run's listener that forwards everything and adds each finished sequence to a page."""
 
     def __init__(self, page: Page, out: Path, display: Listener | None):
         self._page, self._out, self._display = page, out, display
@@ -88,7 +88,7 @@ class Watched:
         if self._display is not None:
             self._display.begin(plan, outcome)
         if self._out.is_dir():
-            for folder in made_folders(self._out):  # of the run that is resumed
+            for folder in made_folders(self._out):  # sequences of the resumed run
                 self._page.add(folder)
 
     def message(self, name: str, message: Message) -> None:
@@ -104,7 +104,7 @@ class Watched:
 
 @contextmanager
 def watching(console: Console, out: Path, display: Listener | None) -> Iterator[Watched]:
-    """A page beside a run; when that is over, until Ctrl-C. Raises ConfigError without viser."""
+    """Show a page during a run and afterwards until Ctrl-C. Raises ConfigError without viser."""
     check_extra("--view")
     from blinkgl.viewer.page import Page
     from blinkgl.viewer.server import LocalServer
@@ -113,7 +113,7 @@ def watching(console: Console, out: Path, display: Listener | None) -> Iterator[
     page = Page(server)
     drawing = threading.Thread(target=page.run, daemon=True)
     try:
-        say(console, f"{server.url}  (each sequence appears there when it is whole)")
+        say(console, f"{server.url}  (each sequence appears there when it is complete)")
         drawing.start()
         yield Watched(page, out, display)
         if page.folders:

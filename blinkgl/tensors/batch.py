@@ -214,7 +214,9 @@ class Batch(ABC):
             state[k].shape == v.shape and state[k].dtype == v.dtype for k, v in mine.items()
         )
         if not fits:
-            raise EventDataError("saved state is of other emulators", value=sorted(state), accepted=", ".join(mine))
+            raise EventDataError(
+                "the saved state belongs to other emulators", value=sorted(state), accepted=", ".join(mine)
+            )
         for name, tensor in mine.items():
             tensor.copy_(state[name])
 

@@ -119,7 +119,7 @@ class DeviceV2e(_OnDevice, V2e):
             pixels = events.y.astype(np.int64) * self.width + events.x
             if np.bincount(pixels // BLOCK).max() > share:
                 raise EventDataError(
-                    "more events in a step than the processor would keep",
+                    "more events in a step than the CPU would keep",
                     where="events.max_events_per_step",
                     value=self.config.max_events_per_step,
                     accepted="a higher limit, or events.device: cpu",
@@ -147,15 +147,15 @@ def _problem(kind: Any, config: Any, device: Any) -> EventDataError | None:
     """Why this device does not make these events; None: it does."""
     if kind not in KINDS:
         return EventDataError(
-            "not made on tensors", where="events.device", value=config.device, accepted="cpu, or auto"
+            "not computed on tensors", where="events.device", value=config.device, accepted="cpu, or auto"
         )
     if torch.device(device).type == "cuda" and not torch.cuda.is_available():
         return EventDataError(
-            "torch sees no CUDA card", where="events.device", value=config.device, accepted="cpu, or auto"
+            "torch finds no CUDA GPU", where="events.device", value=config.device, accepted="cpu, or auto"
         )
     if not same_events(kind, config, device):
         return EventDataError(
-            "the card's events of a trial are not the processor's",
+            "the GPU's events of a trial differ from the CPU's",
             where="events.device",
             value=config.device,
             accepted="cpu, or another driver",

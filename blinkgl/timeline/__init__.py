@@ -1,9 +1,9 @@
-"""When to draw the next event frame.
+"""The times of event frames.
 
 In:    a configuration, small pictures of image velocity or luminance.
 Out:   frame times, int64 ns, increasing.
-Start: strategy.py (``make_timeline``); sampling.py has the arithmetic,
-interpolate.py invents frames of a video.
+Start: strategy.py (``make_timeline``); sampling.py has the arithmetic, interpolate.py interpolates frames of a
+video.
 """
 
 from blinkgl.timeline.sampling import Ticks, bounded_times, displacement_times, uniform_times

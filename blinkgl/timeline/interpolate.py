@@ -1,5 +1,5 @@
-"""Frames between frames, for sources too slow for their motion. The generator passes the given frames on unchanged and
-adds frames in between; it needs one frame of look-ahead and keeps nothing else.
+"""Interpolated frames, for sources too slow for their motion. The generator passes the given frames on unchanged and
+adds frames in between; it needs one frame of look-ahead and stores nothing else.
 
 Input and output: iterators of (luminance, t_ns), luminance (H, W) float32 linear light.
 """
@@ -22,8 +22,7 @@ _EPS = np.float32(1e-3)
 
 @dataclass
 class Displacement:
-    """How far things move from one given frame to the next, px, as the dense flow says;
-    filled while :func:`motion` runs."""
+    """Displacements between given frames, px, from dense flow; filled while :func:`motion` runs."""
 
     pairs: int = 0
     median: float = 0.0
@@ -49,15 +48,15 @@ class Displacement:
 def motion(
     frames: Iterable[Timed], max_px: float = 1.0, *, most: int = 64, displacement: Displacement | None = None
 ) -> Iterator[Timed]:
-    """So many frames in between that no more than ``max_px`` (99.5 % of the pixels) are moved
-    per step, at most ``most`` per pair.
+    """Add enough frames that at most ``max_px`` (99.5 % of the pixels) of motion remain per step, at most ``most`` per
+    pair.
 
-    Dense flow (OpenCV's DIS) both ways; both frames are warped to the intermediate time by linearly combined flows and
-    blended by distance in time; where the flows contradict each other (occlusion) only the frame that sees the pixel
-    counts. What lies between pixels is a cubic of ln(1e-3 + I) (Catmull and Rom 1974), held within the four pixels
-    round it: a straight line loses contrast, and events with it, and a cubic of the light makes some up beside dark
-    pixels. What no frame shows is guessed: the result is an interpolation and
-    ``displacement`` says over how many pixels.
+    Dense flow (OpenCV's DIS) is computed in both directions. Both frames are warped to the intermediate time by
+    linearly combined flows and blended by distance in time; where the flows contradict each other (occlusion), only the
+    frame that sees the pixel counts. Between pixels the value is a cubic of ln(1e-3 + I) (Catmull and Rom 1974),
+    limited to the range of the four pixels around: linear interpolation loses contrast and so events, and a cubic of
+    the light adds false events beside dark pixels. Surfaces that no frame shows are guessed; ``displacement`` tells
+    over how many pixels.
     """
     dense = DenseFlow()
     statistics = displacement if displacement is not None else Displacement()
@@ -78,11 +77,11 @@ def motion(
 
 
 def watched(frames: Iterable[Timed], moved_px: list[float]) -> Iterator[Timed]:
-    """Pass the frames on unchanged. ``moved_px`` gains the 99th percentile of the dense flow between a few pairs:
-    those that end at frame 1, 2, 4 and 8, and at every 16th. Frames too small for dense flow are not looked at.
+    """Yield the frames unchanged. ``moved_px`` gets the 99th percentile of the dense flow between a few pairs: those
+    that end at frame 1, 2, 4 and 8, and at every 16th. Frames too small for dense flow are skipped.
 
     frames : luminance (H, W) float32, or uint8 codes, and t_ns."""
-    # A quarter of the time of the medium preset, and as good for a percentile.
+    # It takes a quarter of the time of the medium preset and is as good for a percentile.
     dense = DenseFlow(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     last: np.ndarray | None = None
     for number, (frame, t) in enumerate(frames):
@@ -96,17 +95,19 @@ def watched(frames: Iterable[Timed], moved_px: list[float]) -> Iterator[Timed]:
 
 
 class DenseFlow:
-    """OpenCV's DIS (Kroeger et al. 2016): the medium preset, which :func:`motion` follows, or another."""
+    """OpenCV's DIS flow (Kroeger et al. 2016): the medium preset, which :func:`motion` uses, or another."""
 
     LEAST = 16
-    """px, of a side: below, OpenCV's dense flow raises, returns NaN or ends the process, depending on the other side"""
+    """Smallest side, px: below it OpenCV's dense flow raises, returns NaN or ends the process, depending on the other
+    side."""
 
     def __init__(self, preset: int = cv2.DISOPTICAL_FLOW_PRESET_MEDIUM) -> None:
         self._dis = cv2.DISOpticalFlow_create(preset)
 
     @classmethod
     def codes(cls, frame: np.ndarray) -> np.ndarray:
-        """(H, W) uint8, what it looks at, of linear light or codes. EventDataError: a side of less than ``LEAST``."""
+        """Return the input of the flow, (H, W) uint8, from linear light or codes. Raises EventDataError: a side below
+        ``LEAST``."""
         if min(frame.shape[:2]) < cls.LEAST:
             raise EventDataError(
                 "too small for dense flow",
@@ -117,11 +118,11 @@ class DenseFlow:
         return frame if frame.dtype == np.uint8 else to_srgb8(frame)
 
     def forward(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Flow (H, W, 2) float32 px from a to b, of codes."""
+        """Return the flow (H, W, 2) float32 px from a to b, of codes."""
         return self._dis.calc(a, b, None)
 
     def __call__(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Flow (H, W, 2) float32 px from a to b and from b to a, of codes."""
+        """Return the flow (H, W, 2) float32 px from a to b and from b to a, of codes."""
         return self.forward(a, b), self.forward(b, a)
 
 
@@ -130,7 +131,7 @@ def _between(a, b, t_a, t_b, forward, backward, steps) -> Iterator[Timed]:
         return
     height, width = a.shape
     grid = np.stack(np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)), axis=-1)
-    # Flow is read at integer pixels and between them.
+    # Reads flow at integer pixels and between them.
     look = lambda image, flow: cv2.remap(image, grid + flow, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     pictures = [(np.ascontiguousarray(one, np.float32), np.log(one + _EPS)) for one in (a, b)]
     seen_a, seen_b = _consistent(forward, look(backward, forward)), _consistent(backward, look(forward, backward))
@@ -141,7 +142,7 @@ def _between(a, b, t_a, t_b, forward, backward, steps) -> Iterator[Timed]:
         # Super SloMo).
         to_a = forward * f(-s * (1 - s)) + backward * f(s * s)
         to_b = forward * f((1 - s) ** 2) - backward * f(s * (1 - s))
-        # What b does not see (a's inconsistent pixels) comes from a, and the other way round.
+        # Pixels that b does not see (a's inconsistent ones) come from a, and vice versa.
         weight_a, weight_b = f(1 - s) * look(seen_b, to_b), f(s) * look(seen_a, to_a)
         moved = [np.empty(a.shape, np.float32) for _ in pictures]
         for (light, log), to, out in zip(pictures, (to_a, to_b), moved):
@@ -174,7 +175,7 @@ def _look(light, log, places, out):
                 for m in range(4):
                     part += wx[m] * line[min(max(i + m - 1, 0), width - 1)]
                 total += wy[n] * part
-            # The four pixels around, between which the result is held.
+            # The four pixels around limit the result.
             right, below = i + (x > i), j + (y > j)
             a, b, c, d = light[j, i], light[j, right], light[below, i], light[below, right]
             value = np.exp(total) - _EPS
@@ -183,7 +184,7 @@ def _look(light, log, places, out):
 
 @kernel
 def _catmull_rom(f, out):
-    """Compute the weights of the four samples around a place that is ``f`` beyond the second: exact for parabolas."""
+    """Compute the weights of the four samples around a place ``f`` beyond the second: exact for parabolas."""
     half, one = np.float32(0.5), np.float32(1)
     out[0] = half * f * (f * (np.float32(2) - f) - one)
     out[1] = half * (f * f * (np.float32(3) * f - np.float32(5)) + np.float32(2))

@@ -1,7 +1,8 @@
-"""The strategies of ``timeline:``: frame times that adapt to what is drawn.
+"""The strategies of ``timeline:``: frame times that adapt to the scene.
 
 timeline = make_timeline(config.timeline, t0_ns, t1_ns, renderer,
-emulator_of(config.events).response(config.events)) for t_ns in timeline:
+                         emulator_of(config.events).response(config.events))
+for t_ns in timeline:
     luminance = ...                              # the frame at t_ns
 """
 
@@ -19,20 +20,20 @@ from blinkgl.events.response import Response
 from blinkgl.timeline.sampling import bounded_times, uniform_times
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What a timeline needs of a small picture: a percentile and the largest of what moves in it, two numbers.
+# What a timeline needs of a small picture: two numbers, a percentile and the maximum of what moves in it.
 
 SLOWEST = np.float32(2.0**-40)
-"""What moves (px/s) or changes (per second) by less than these 1e-12 stands still."""
+"""Values (px/s, or per second) below this, about 1e-12, count as still."""
 
 
 class Drawn(Protocol):
-    """What has been drawn, wherever it is."""
+    """A rendered picture, in any memory."""
 
     def read(self) -> np.ndarray: ...
 
 
 class Ranked(NamedTuple):
-    """Of the values that move. count : how many.   percentile, largest : 0.0 where there are none."""
+    """Statistics of the moving values. count : their number.   percentile, largest : 0.0 where there are none."""
 
     count: int
     percentile: float
@@ -43,19 +44,19 @@ STILL = Ranked(0, 0.0, 0.0)
 
 
 def speeds(drawn: Drawn, percent: float) -> Ranked:
-    """Of the lengths of (h, w, 2) float32 vectors."""
+    """Return the statistics of the lengths of (h, w, 2) float32 vectors."""
     return ranked(np.linalg.norm(drawn.read(), axis=-1), percent)
 
 
 def changes(drawn: Drawn, response: Response, percent: float) -> Ranked:
-    """Of |d(signal)/dt|, per second, of (h, w, 2) float32 luminances and their rates."""
+    """Return the statistics of |d(signal)/dt|, per second, of (h, w, 2) float32 luminances and their rates."""
     picture = drawn.read()
     return ranked(np.abs(response.change(picture[..., 0], picture[..., 1])), percent)
 
 
 def ranked(values: np.ndarray, percent: float) -> Ranked:
-    """Of float32 values of any shape >= 0: those that neither stand still nor are beyond all bounds (a surface in the
-    camera plane); a still background has no say in a percentile."""
+    """Return the statistics of float32 values >= 0 of any shape, without still ones, which would lower a percentile,
+    and without infinite ones (a surface in the camera plane)."""
     values = values.ravel()
     values = values[(values >= SLOWEST) & np.isfinite(values)]
     if not len(values):
@@ -68,16 +69,17 @@ def ranked(values: np.ndarray, percent: float) -> Ranked:
 
 
 def place(count: int, percent: float) -> tuple[int, float]:
-    """Which of ``count`` values in order, and how far on to the next one [0, 1), in double precision."""
+    """Return the index of a percentile among ``count`` sorted values, and the fraction [0, 1) to the next, in double
+    precision."""
     at = (count - 1) * (percent / 100)
-    # percent = 100 would give the place behind the last by rounding.
+    # percent = 100 would give an index beyond the last by rounding.
     k = min(math.floor(at), count - 1)
     return k, at - k
 
 
 def between(below: np.float32, above: np.float32, share: float) -> float:
     # NumPy interpolates from the nearer neighbour, which rounds otherwise than from below.
-    """From one value towards the next in single precision, as NumPy's percentile rounds (from the nearer of them)."""
+    """Return a value between two in single precision, rounded as NumPy's percentile (from the nearer neighbour)."""
     apart = above - below
     if share < 0.5:
         return float(below + apart * np.float32(share))
@@ -85,18 +87,18 @@ def between(below: np.float32, above: np.float32, share: float) -> float:
 
 
 class SmallPictures(Protocol):
-    """What a timeline asks of a renderer: every n-th pixel in x and y."""
+    """The small pictures that a timeline requests of a renderer: every n-th pixel in x and y."""
 
     def velocity_of_movers(self, t_ns: int, every: int) -> Drawn:
-        """(h, w, 2) float32 image velocity, px/s of the whole image."""
+        """Return (h, w, 2) float32 image velocity, px/s of the whole image."""
 
     def brightness(self, t_ns: int, every: int) -> Drawn:
-        """(h, w, 2) float32 luminance and its rate of change per second."""
+        """Return (h, w, 2) float32 luminance and its rate of change per second."""
 
 
 class Timeline:
-    """Iterates over frame times, int64 ns, from t0 to t1, both included, strictly increasing;
-    each is decided when asked for. ``stops_ns``: times of impacts, that adaptive kinds do not step over."""
+    """Iterator over frame times, int64 ns, from t0 to t1, both included, strictly increasing; each is decided when
+    requested. ``stops_ns``: times of impacts, which adaptive kinds do not cross."""
 
     def __init__(
         self,
@@ -110,9 +112,9 @@ class Timeline:
         self.config, self.t0_ns, self.t1_ns, self.pictures, self.response = config, t0_ns, t1_ns, pictures, response
         self.stops_ns = stops_ns
         self.looks = 0
-        """Small pictures asked for so far."""
+        """Number of small pictures requested so far."""
         self.others: tuple[Timeline, ...] = ()
-        """Of other cameras, whose pace is kept, too (:mod:`blinkgl.timeline.strategy`)."""
+        """Timelines of other cameras whose pace also limits this one (:mod:`blinkgl.timeline.strategy`)."""
 
     def __iter__(self) -> Iterator[int]:
         c = self.config
@@ -120,7 +122,7 @@ class Timeline:
         return bounded_times(self._counted, least, most, self.t0_ns, self.t1_ns, self.stops_ns)
 
     def pace(self, t_ns: int) -> float:
-        """Steps per second that the scene asks for at one time."""
+        """Return the steps per second that the scene needs at one time."""
         raise NotImplementedError
 
     # The strictest camera decides.
@@ -130,14 +132,14 @@ class Timeline:
 
 
 class Uniform(Timeline):
-    """``fps`` frames a second, whatever happens."""
+    """``fps`` frames per second, independent of the scene."""
 
     def __iter__(self) -> Iterator[int]:
         return uniform_times(self.config.fps, self.t0_ns, self.t1_ns)
 
 
 class Displacement(Timeline):
-    """Steps in which pixels move ``max_px``, by the image velocity of those that move."""
+    """Steps in which pixels move ``max_px``, by the image velocity of moving pixels."""
 
     def pace(self, t_ns: int) -> float:
         c = self.config
@@ -166,17 +168,17 @@ def make_timeline(
     response: Response,
     stops_ns: Sequence[int] = (),
 ) -> Timeline:
-    """Of any ``timeline:`` configuration.   stops_ns : increasing; times of impacts, that
-    adaptive kinds do not step over."""
+    """Return the timeline of any ``timeline:`` configuration.   stops_ns : increasing; times of impacts, which adaptive
+    kinds do not cross."""
     return _KINDS[config.kind](config, t0_ns, t1_ns, pictures, response, stops_ns)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# One timeline of several cameras: frames are drawn when the strictest of them asks.
+# One timeline of several cameras: the strictest one decides the times.
 
 
 class Shared(Timeline):
-    """One of several timelines, with the times of all."""
+    """One of several timelines that share their times."""
 
     def __init__(self, own: Timeline, times: Iterator[int]):
         self._times = times
@@ -187,9 +189,9 @@ class Shared(Timeline):
 
 
 def together(timelines: Sequence[Timeline]) -> list[Timeline]:
-    """As many timelines of the same times, at which no step is longer than any of ``timelines`` (of one configuration)
-    allows. A time is decided when the first of them is asked for it; those that lag behind get it later. A single one
-    stays as it is."""
+    """Return one timeline per timeline, all with the same times; no step is longer than any of ``timelines`` (of one
+    configuration) allows. A time is decided when the first of them requests it, and stored for the others. A single one
+    is returned unchanged."""
     if len(timelines) < 2:
         return list(timelines)
     lead = timelines[0]

@@ -1,6 +1,6 @@
-"""What accuracy costs (``blinkgl trade``).
+"""Cost of accuracy (``blinkgl trade``).
 
 In:    one configuration, settings to try.
-Out:   their cost and error against a reference that is refined until it stands still.
-Start: run.py (``trade``); measure.py times, matching.py and metrics.py judge.
+Out:   their cost, and their error against a reference that is refined until it converges.
+Start: run.py (``trade``); measure.py times, matching.py and metrics.py compute the errors.
 """

@@ -1,13 +1,13 @@
-"""Which event of one stream is which event of the other: optimal one-to-one matching within pixel and polarity.
+"""Optimal one-to-one matching of the events of two streams, within pixel and polarity.
 
 The matching of two event trains of a pixel and polarity minimises
 
     sum over matched pairs |t_a - t_b|  +  limit / 2 * (events without a partner),    |t_a - t_b| <= limit,
 
 which is the spike-train metric of Victor and Purpura (J. Neurophysiology 76, 1996) with cost 2 / limit per unit of
-time: moving an event is cheaper than losing one and inventing another as long as it moves by no more than ``limit``. An
-optimal matching keeps the order of time, so dynamic programming over the two sorted trains finds it; only partners
-within ``limit`` are looked at.
+time: moving an event is cheaper than removing it and adding another one if it moves by at most ``limit``. An optimal
+matching keeps the order of time, so dynamic programming over the two sorted trains finds it; only partners within
+``limit`` are considered.
 """
 
 from __future__ import annotations
@@ -24,10 +24,11 @@ _MISSED, _EXTRA, _MATCH = np.uint8(0), np.uint8(1), np.uint8(2)
 
 @dataclass(frozen=True, eq=False)
 class Matching:
-    """partner : (len(reference),) int64, index of each reference event's partner in the
-    judged stream; -1: it was missed.
-    dt_us : (len(reference),) int64, judged minus reference time, µs; 0 where missed.   extra
-    : judged events without a partner."""
+    """A matching of two streams.
+
+    partner : (len(reference),) int64, index of each reference event's partner in the judged stream; -1: it was missed.
+    dt_us : (len(reference),) int64, judged minus reference time, µs; 0 where missed.   extra : judged events without a
+    partner."""
 
     partner: np.ndarray
     dt_us: np.ndarray
@@ -35,14 +36,14 @@ class Matching:
 
     @property
     def matched(self) -> np.ndarray:
-        """(len(reference),) bool."""
+        """Return which reference events have a partner, (len(reference),) bool."""
         return self.partner >= 0
 
 
 def match_events(reference: Events, judged: Events, height: int, width: int, limit_us: int) -> Matching:
-    """Matches two streams of one sensor. Events need not be sorted by more than time.
+    """Match two streams of one sensor. Events must be sorted by time only.
 
-    limit_us : partners are at most this far apart (> 0). ValueError: limit or an event off the sensor."""
+    limit_us : largest time between partners (> 0). Raises ValueError: limit or an event off the sensor."""
     if limit_us <= 0:
         raise ValueError("match_events: limit_us must be positive")
     for events in (reference, judged):
@@ -60,7 +61,7 @@ def match_events(reference: Events, judged: Events, height: int, width: int, lim
 
 
 def _trains(events: Events, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Events grouped by pixel and polarity: (starts (2 H W + 1,), order (N,)); train k is
+    """Return events grouped by pixel and polarity: (starts (2 H W + 1,), order (N,)); train k is
     ``order[starts[k]:starts[k + 1]]``, by time."""
     starts = np.zeros(2 * height * width + 1, np.int64)
     order = np.empty(len(events), np.int64)
@@ -70,7 +71,7 @@ def _trains(events: Events, height: int, width: int) -> tuple[np.ndarray, np.nda
 
 @kernel
 def _group(x, y, p, width, starts, order):
-    """Counting sort, stable: the order of time is kept within a train."""
+    """Sort by counting; the sort is stable, so the order of time is kept within a train."""
     for i in range(len(x)):
         starts[2 * (np.int64(y[i]) * width + x[i]) + p[i] + 1] += 1
     for k in range(1, len(starts)):
@@ -84,10 +85,10 @@ def _group(x, y, p, width, starts, order):
 
 @kernel
 def _match(starts_a, order_a, t_a, starts_b, order_b, t_b, limit, partner):
-    """Dynamic programming per train. cost[i][j]: the least cost (in half µs, so that integers suffice) of the first i
-    events of a and the first j of b. Row i holds j from low[i], the number of b's events too early for event i - 1 of
-    a, to high[i], the number of those not too late for it: outside, events can only be
-    lost, at ``limit`` half µs each."""
+    """Match each train by dynamic programming. cost[i][j] is the least cost (in half µs, so that integers suffice) of
+    the first i events of a and the first j of b. Row i holds j from low[i], the number of b's events too early for
+    event i - 1 of a, to high[i], the number of those not too late for it. Outside, events are always unmatched, at
+    ``limit`` half µs each."""
     low, high = np.empty(64, np.int64), np.empty(64, np.int64)
     row_start = np.empty(64, np.int64)
     cost, choice = np.empty(256, np.int64), np.empty(256, np.uint8)

@@ -1,8 +1,8 @@
-"""Times settings and judges their events: the measurement behind ``blinkgl trade``.
+"""Times settings and computes the errors of their events: the measurement of ``blinkgl trade``.
 
-The events of a clip are simulated as ``blinkgl generate`` simulates them
+The events of a clip are simulated as by ``blinkgl generate``
 (:func:`~blinkgl.sequence.simulate.simulate_sequence`; nothing is written), once per setting and round. Rounds are
-interleaved, so that a busy moment of the machine falls on all settings alike.
+interleaved, so that other load on the machine affects all settings equally.
 """
 
 from __future__ import annotations
@@ -37,26 +37,26 @@ from blinkgl.trade.settings import SIZES, Setting
 from blinkgl.types.events import Events
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The reference that settings are judged by: the same scene drawn so finely in space and time that it does not matter
-# any more.
+# The reference of the settings: the same scene drawn so densely in space and time that a higher density changes
+# nothing.
 #
-# Only some rectangles of the image are drawn (and judged): a whole image at 32 x 32 samples a pixel is out of reach,
-# and a few thousand pixels in many places say as much about errors as all of them. Each pixel is the mean of
-# ``scale`` x ``scale`` samples on a regular grid, which converges to the box-filtered image of the full textures
-# however each sample is drawn. How fast it gets there is another matter: samples that are points of trilinear
-# textures are off by 1 / scale at silhouettes and still blurred where a surface is seen at a grazing angle (RMS of
-# the log at 64 x 64: 0.0055); samples drawn as `edges` with sharper mip maps fall with its square (0.0003), and end
-# where the others do (``tests/trade/test_suite.py``).
+# Only some rectangles of the image are drawn (and compared): a whole image at 32 x 32 samples per pixel is too
+# expensive, and a few thousand pixels in many places represent the errors of all. Each pixel is the mean of ``scale`` x
+# ``scale`` samples on a regular grid, which converges to the box-filtered image of the full textures for any kind of
+# sample. The rate of convergence depends on the samples: point samples of trilinear textures have an error of 1 / scale
+# at silhouettes and are still blurred where a surface is seen at a grazing angle (RMS of the log at 64 x 64: 0.0055);
+# the error of samples drawn as `edges` with sharper mip maps falls with its square (0.0003), to the same limit
+# (``tests/trade/test_suite.py``).
 
 SAMPLES = RenderConfig(antialiasing="edges", mip_bias=-1.0)
-"""How the samples are drawn."""
+"""Settings of each sample."""
 FrameSource = Callable[[Iterable[int]], Iterator[np.ndarray]]
-"""Times in ns -> luminance frames (H, W) float32, linear light; only the judged pixels count."""
+"""Times in ns -> luminance frames (H, W) float32, linear light; only the compared pixels count."""
 MAX_STEP_NS = 20_000_000
 
 
 class FineTiles(Cutouts):
-    """Rectangles of a scene's image at ``scale`` x ``scale`` samples a pixel, and the times that they want. A context
+    """Rectangles of a scene's image at ``scale`` x ``scale`` samples per pixel, and their frame times. A context
     manager; calling it is a FrameSource."""
 
     def __init__(
@@ -65,7 +65,7 @@ class FineTiles(Cutouts):
         super().__init__(gl, scene, tiles, scale, samples)
 
     def speed(self, t_ns: int) -> float:
-        """Largest image speed in the rectangles, px/s."""
+        """Return the largest image speed in the rectangles, px/s."""
         largest = 0.0
         for camera in self._cameras:
             self._renderer.look_through(camera)
@@ -75,7 +75,7 @@ class FineTiles(Cutouts):
         return largest
 
     def times(self, max_px: float, t0_ns: int, t1_ns: int) -> Iterator[int]:
-        """Times between which nothing in the rectangles moves by more than ``max_px``."""
+        """Yield times between which nothing in the rectangles moves by more than ``max_px``."""
         return displacement_times(max_px, 1000, MAX_STEP_NS, t0_ns, t1_ns, self.speed)
 
 
@@ -88,25 +88,26 @@ def reference_events(
     seed: int,
     mask: np.ndarray,
 ) -> tuple[Events, int]:
-    """Events (of the masked pixels) of the frames of a source, linear in time between them; and the number of frames.
+    """Return the events (of the masked pixels) of the frames of a source, linear in time between them, and the number
+    of frames.
 
-    Linear, because the times are so dense that it does not matter, and no scheme that is judged should judge."""
+    Linear, because the times are dense enough, and because the reference must not use a scheme under test."""
     camera, times = EventCamera(config, None, height, width, seed), list(times)
     chunks = [masked(events, mask) for _, events in emulate(map(EventFrame, times, source(times)), camera)]
     return Events.concatenate(chunks), camera.frames
 
 
 JUDGED = ("time_median_us", "time_p95_us", "wrong", "voxel")
-"""The errors whose movement decides whether the reference has converged."""
+"""The errors whose change decides whether the reference has converged."""
 ENOUGH = 0.1
-"""Of the smallest error judged: by how much the reference may move."""
+"""Largest allowed change of the reference, as a fraction of the smallest error."""
 
 
 @dataclass(frozen=True)
 class Density:
-    """How dense a reference has to be depends on the scene: first frames come closer, at few samples a pixel, until
-    that moves the events by less than ``share`` of what is allowed (:data:`ENOUGH`); then samples are doubled at that
-    step. What the last halving of the step moved is added to what the last doubling of the samples did.
+    """A rule that finds the density of the reference for each scene. First the frame distance is halved, at few samples
+    per pixel, until that changes the events by less than ``share`` of the allowed change (:data:`ENOUGH`); then the
+    samples are doubled at that step. The change of the last halving is added to that of the last doubling.
 
     scales : samples per pixel side, rising.   steps : px between frames, falling."""
 
@@ -115,7 +116,7 @@ class Density:
     share: float = 0.4
 
     def next(self, levels: list[Level]) -> tuple[int, float] | None:
-        """Samples and step of the level after these; None: there is none."""
+        """Return the samples and step of the level after these; None: there is none."""
         if not levels:
             return self.scales[0], self.steps[0]
         last = levels[-1]
@@ -131,12 +132,14 @@ class Density:
 
 @dataclass(frozen=True)
 class Options:
-    """clip_s : simulated seconds; 0: one label interval.   tiles : columns, rows, width,
-    height of the judged rectangles.
-    levels : (samples per pixel side, px between frames) of the reference, rising until it has
-    converged or ``reference_s`` is spent. A :class:`Density` instead: each scene's own.
-    reference_set : overrides of the scene, "scene.a.b=c", that the reference alone has: effects that are left out.
-    rounds, rounds_s : at most so many rounds, and no new one when so many seconds are gone."""
+    """Options of a measurement.
+
+    clip_s : simulated seconds; 0: one label interval.   tiles : columns, rows, width, height of the compared
+    rectangles.
+    levels : (samples per pixel side, px between frames) of the reference, rising until it has converged or
+    ``reference_s`` is spent; or a :class:`Density`, for each scene its own.
+    reference_set : overrides of the scene, "scene.a.b=c", only for the reference: effects that settings leave out.
+    rounds, rounds_s : largest number of rounds, and the time after which no new one starts, s."""
 
     clip_s: float = 0.0
     tiles: tuple[int, int, int, int] = (4, 3, 20, 15)
@@ -148,7 +151,7 @@ class Options:
     sequence: int = 0
     reference_set: tuple[str, ...] = ()
     labels: bool = True
-    """Whether flow labels are judged, too."""
+    """Whether the errors of flow labels are computed, too."""
 
 
 QUICK = Options(
@@ -163,7 +166,7 @@ QUICK = Options(
 
 @dataclass(eq=False)
 class Measured:
-    """One setting. wall_s, cpu_s : seconds (processor: of all threads) per simulated second, one per round."""
+    """One setting. wall_s, cpu_s : seconds (cpu: of all threads) per simulated second, one per round."""
 
     setting: Setting
     frames_per_s: float = 0.0
@@ -175,16 +178,16 @@ class Measured:
     events: Events | None = field(default=None, repr=False)
     errors: EventErrors | None = None
     moved: dict[str, float] = field(default_factory=dict)
-    """What the reference moved last, in parts of this setting's own errors."""
+    """Last change of the reference, as a fraction of this setting's errors."""
 
     @property
     def trusted(self) -> bool:
-        """Whether the reference stands still by a tenth of what it says of this setting."""
+        """Return whether the reference has converged to a tenth of this setting's error."""
         return bool(self.moved) and max(self.moved.values()) <= ENOUGH
 
     @property
     def cost(self) -> float:
-        """Wall seconds per simulated second, median of the rounds."""
+        """Return wall seconds per simulated second, median of the rounds."""
         return float(np.median(self.wall_s))
 
     def to_dict(self) -> dict:
@@ -210,8 +213,8 @@ class Measured:
 
 @dataclass(eq=False)
 class Level:
-    """One reference of the ladder. movement : errors of the level before, judged by this one; smallest : the smallest
-    error of any setting judged by this one."""
+    """One level of the reference. movement : errors of the level before against this one; smallest : the smallest error
+    of any setting against this one."""
 
     scale: int
     max_px: float
@@ -219,10 +222,10 @@ class Level:
     seconds: float
     events: Events = field(repr=False)
     movement: dict[str, float] | None = None
-    """Includes what the level's step moved where only its samples were changed."""
+    """Includes the change by the level's step where only its samples were changed."""
     smallest: dict[str, float] | None = None
     whole: bool = True
-    """Whether samples and step have both been changed: half a movement shows nothing."""
+    """Whether samples and step have both been changed: one change alone shows nothing."""
 
     @property
     def ratio(self) -> dict[str, float]:
@@ -251,7 +254,7 @@ class Level:
 
 
 class Bench:
-    """One sequence at one image size: its scenes, its clip, its judged pixels."""
+    """One sequence at one image size: its scenes, its clip, its compared pixels."""
 
     def __init__(
         self,
@@ -264,9 +267,10 @@ class Bench:
         self.gl, self.options, self.say = gl, options, say
         base = template.sequence(options.sequence)
         if base.frames is not None:
-            raise ConfigError("nothing is rendered from recorded frames, so there is nothing to trade", where="frames")
-        # Labels and previews take no part in this; noise, and a bus that makes events late, would drown the errors that
-        # are asked for.
+            raise ConfigError(
+                "nothing is rendered from recorded frames, so there are no settings to compare", where="frames"
+            )
+        # Labels and previews are not measured; noise, and a bus that delays events, would hide the errors of interest.
         self.emulator = emulator_of(base.events).noiseless(base.events)
         tree = apply_overrides(template.tree, ["quality=null", *_sized(base, SIZES[size])])
         self._template = RunTemplate({**tree, "events": self.emulator.model_dump()}, template.base)
@@ -276,7 +280,7 @@ class Bench:
         for text in options.reference_set:
             if not text.startswith("scene."):
                 raise ConfigError(
-                    "the reference differs in what it shows alone",
+                    "the reference may differ only in the scene",
                     where="--reference-set",
                     value=text,
                     accepted="a key of the scene, such as scene.light.shadows=soft",
@@ -311,10 +315,10 @@ class Bench:
     # ---- settings ------------------------------------------------------------------------------------------------
 
     def measure(self, settings: Iterable[Setting]) -> list[Measured]:
-        """Every setting, in interleaved rounds."""
+        """Return measurements of every setting, in interleaved rounds."""
         results = [Measured(s) for s in settings]
         configs = [self.config(m.setting.overrides) for m in results]
-        groups: dict[str, list[int]] = {}  # settings that draw alike share a renderer
+        groups: dict[str, list[int]] = {}  # settings with equal drawing share a renderer
         for i, c in enumerate(configs):
             groups.setdefault(json.dumps([c.render.model_dump(), c.scene.model_dump()], sort_keys=True), []).append(i)
         started = time.perf_counter()
@@ -343,7 +347,7 @@ class Bench:
                 SequenceRequest(config, self.options.sequence, labels=False, renderer=renderer, window_ns=window_ns)
             )
 
-        for _ in clip(self.t0_ns + (self.t1_ns - self.t0_ns) // 20):  # programs, targets, kernels: made the first time
+        for _ in clip(self.t0_ns + (self.t1_ns - self.t0_ns) // 20):  # compile programs, targets and kernels first
             pass
         run, drawn = clip(self.t1_ns), renderer.stats.triangles
         chunks: list[Events] = []
@@ -355,7 +359,7 @@ class Bench:
                 wall += time.perf_counter() - paused[0]
                 cpu += time.process_time() - paused[1]
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        # n steps take n + 1 frames: of a short clip that one would count for much, of a sequence it does not.
+        # n steps take n + 1 frames: this matters for a short clip, not for a sequence.
         steps = max(run.frames - 1, 1)
         result.wall_s.append(wall * steps / run.frames / self.duration_s)
         result.cpu_s.append(cpu * steps / run.frames / self.duration_s)
@@ -367,7 +371,7 @@ class Bench:
     # ---- judging -------------------------------------------------------------------------------------------------
 
     def speeds(self) -> SpeedMaps:
-        """Analytic image speed all over the clip, every 5 ms."""
+        """Return the analytic image speed over the clip, every 5 ms."""
         count = max(2, round(self.duration_s / 0.005) + 1)
         times = np.linspace(self.t0_ns, self.t1_ns, count).astype(np.int64)
         with Renderer(self.gl, self.scene, self.base.render) as renderer:
@@ -375,7 +379,8 @@ class Bench:
         return SpeedMaps(times // 1000, np.stack(maps))
 
     def judge(self, results: list[Measured], speeds: SpeedMaps) -> list[Level]:
-        """Raises the reference until it has converged (or time is up) and fills in the results' errors."""
+        """Refine the reference until it has converged (or time is up), fill in the results' errors, and return the
+        levels."""
         levels: list[Level] = []
         begun = time.perf_counter()
         while (asked := self._next(levels)) is not None:
@@ -417,7 +422,7 @@ class Bench:
 
     @staticmethod
     def _carried(levels: list[Level]) -> dict[str, float]:
-        """What the step moved the last time that it alone was changed."""
+        """Return the change by the step the last time that it alone was changed."""
         halved = [b.movement for a, b in pairwise(levels) if a.scale == b.scale and b.movement]
         return halved[-1] if halved else dict.fromkeys(JUDGED, 0.0)
 
@@ -432,7 +437,7 @@ class Bench:
 
 
 def _sized(config: SequenceConfig, factor: float) -> list[str]:
-    """Overrides that shrink the image, its field of view kept."""
+    """Return overrides that shrink the image and keep its field of view."""
     if factor == 1:
         return []
     return ["camera=" + json.dumps(config.camera.scaled(factor))]

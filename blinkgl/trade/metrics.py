@@ -1,6 +1,6 @@
-"""How wrong a stream of events is, judged by another one of the same scene, sensor and thresholds.
+"""Errors of an event stream relative to a reference of the same scene, sensor and thresholds.
 
-Everything looks at the same window [t0, t1) and the same pixels; what lies outside is not judged.
+All measures use the same window [t0, t1) and the same pixels; the rest is ignored.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from blinkgl.trade.matching import match_events
 from blinkgl.types.events import Events
 
 BINS = 15
-"""Of a clip's voxel grid."""
+"""Bins of a clip's voxel grid."""
 
 
 @dataclass(frozen=True)
@@ -26,12 +26,12 @@ class EventErrors:
     """Errors of a stream against the reference. Times are absolute differences of matched events.
 
     time_*_us : µs.
-    shift_*_px : the same times the image speed at the event's pixel and time: how far the edge is from where it should
-    have been.
+    shift_*_px : the same times the image speed at the event's pixel and time: the distance of the edge from its correct
+    position.
     missed, extra : events without a partner, relative to the reference's count.
     count : events relative to the reference's count, minus 1.
     voxel : ||V - V_ref|| / ||V_ref|| of signed 15-bin voxel grids.
-    NaN where there is nothing to judge by."""
+    NaN where there is nothing to compare."""
 
     events: int
     reference_events: int
@@ -49,7 +49,7 @@ class EventErrors:
 
     @property
     def wrong(self) -> float:
-        """Missed and extra events together."""
+        """Return missed plus extra events."""
         return self.missed + self.extra
 
     def to_dict(self) -> dict[str, float]:
@@ -64,7 +64,7 @@ class SpeedMaps:
     speed: np.ndarray
 
     def at(self, x: np.ndarray, y: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """(N,) float32, from the map nearest in time."""
+        """Return (N,) float32 speeds from the map nearest in time."""
         middle = (self.times_us[:-1] + self.times_us[1:]) / 2
         return self.speed[np.searchsorted(middle, t), y, x]
 
@@ -79,7 +79,7 @@ def event_errors(
     limit_us: int,
     mask: np.ndarray | None = None,
 ) -> EventErrors:
-    """Errors of ``judged`` in [t0_us, t1_us); mask : (H, W) bool, the pixels that count (default: all).
+    """Return the errors of ``judged`` in [t0_us, t1_us); mask : (H, W) bool, the pixels that count (default: all).
 
     limit_us : longest distance between partners; see :func:`blinkgl.trade.matching.match_events`."""
     height, width = speeds.speed.shape[1:]
@@ -107,24 +107,23 @@ def event_errors(
 
 
 def _spread(values: np.ndarray) -> tuple[float, float]:
-    """Median and 95th percentile; NaN of nothing."""
+    """Return the median and the 95th percentile; NaN for no values."""
     return tuple(float(v) for v in np.percentile(values, (50, 95))) if len(values) else (float("nan"),) * 2
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# How wrong the flow labels of a setting are, by casting float64 rays at a sample of pixels into the scene as it was
-# described.
+# Errors of a setting's flow labels, by casting float64 rays into the exact scene at a sample of pixels.
 
 PIXELS = 300
 _AROUND = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)], float)
 
 
 def flow_errors(scene: Scene, renderer: Renderer, t_ns: int, t_next_ns: int, seed: int = 0) -> dict[str, float]:
-    """Error of the forward flow in px, median and maximum, over ``PIXELS`` random pixels off
-    silhouettes; NaN where there are none.
+    """Return the error of the forward flow in px, median and maximum, over ``PIXELS`` random pixels off silhouettes;
+    NaN where there are none.
 
-    scene : the scene with all its triangles, whatever the renderer draws instead of it. A pixel counts where it and its
-    four neighbours see one instance, the renderer agrees on which, and the flow is valid on both sides."""
+    scene : the scene with all its triangles, also where the renderer draws simplified ones. A pixel counts where it and
+    its four neighbours see one instance, the renderer sees the same one, and the flow is valid on both sides."""
     height, width = renderer.height, renderer.width
     rng = np.random.default_rng(seed)
     xy = np.stack([rng.integers(0, width, PIXELS), rng.integers(0, height, PIXELS)], axis=1)

@@ -1,4 +1,4 @@
-"""The picture: what every setting costs against how wrong its events are."""
+"""The plot of every setting's cost against its event error."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PANELS = (
 
 
 def pareto(result: dict) -> bytes:
-    """PNG bytes."""
+    """Return the plot as PNG bytes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -42,14 +42,14 @@ def pareto(result: dict) -> bytes:
         ax.set_title(title, fontsize=11)
     size = result["sizes"][result["size"]]
     figure.suptitle(
-        "Speed against accuracy: left is cheaper, down is better; nothing is below and left of the line\n"
-        f"{size['width']}x{size['height']} px, {size['clip_s']:g} s simulated",
+        "Speed against accuracy: left is cheaper, down is better; no setting is below and left of "
+        f"the line\n{size['width']}x{size['height']} px, {size['clip_s']:g} s simulated",
         fontsize=12.5,
     )
     axes[0].set_ylabel("error of the events: difference of the voxel grids a network sees, relative")
     _legend(axes[0], rows)
     canvas.draw()
-    # Until the names, whose length on the axis is not known beforehand, have room left of their points.
+    # Until the names, whose length on the axis is not known in advance, fit beside their points.
     for _ in range(8):
         names = _label(axes[0], [r for r in rows if r["on_front"]], cost, canvas.get_renderer())
         if all(name.get_window_extent(canvas.get_renderer()).x0 > axes[0].bbox.x0 + 5 for name in names):
@@ -126,7 +126,7 @@ def _legend(ax, rows: list[dict]) -> None:
 
 
 def _label(ax, rows: list[dict], cost: str, renderer) -> list:
-    """Names of the front's settings, below and left of their points, where by definition there is nothing; pushed down
+    """Add the names of the front's settings below and left of their points, where there are no others; move them down
     until they do not overlap."""
     factor, floor = PANELS[0][2], np.inf
     height, names = None, []
@@ -152,11 +152,11 @@ def _label(ax, rows: list[dict], cost: str, renderer) -> list:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The page to read: one self-contained HTML file in the style of the data-set report.
+# The page: one self-contained HTML file in the style of the data-set report.
 
 
 def page(result: dict, picture: bytes) -> str:
-    """The HTML text. picture : the PNG of the plot."""
+    """Return the HTML text. picture : the PNG of the plot."""
     from blinkgl.trade.run import NAMES, convergence_line
 
     size = result["sizes"][result["size"]]
@@ -179,7 +179,7 @@ def page(result: dict, picture: bytes) -> str:
     )
     return render(
         "trade/trade.html",
-        title="What accuracy costs",
+        title="Cost of accuracy",
         result=result,
         settings=result["settings"],
         tiles=tiles,

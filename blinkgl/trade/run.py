@@ -1,4 +1,4 @@
-"""``blinkgl trade``: the sweep, and its files."""
+"""``blinkgl trade``: the sweep and its files."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ COLUMNS = (
 
 
 def chosen(settings: tuple[Setting, ...], only: list[str], skip: list[str] = ()) -> tuple[Setting, ...]:
-    """The settings whose name contains one of ``only`` (all, when there is none) and none of ``skip``. Raises
-    ConfigError when none is left."""
+    """Return the settings whose name contains one of ``only`` (default: all) and none of ``skip``. Raises ConfigError
+    when none is left."""
     has = lambda s, texts: any(text.lower() in s.name.lower() for text in texts)
     found = tuple(s for s in settings if (not only or has(s, only)) and not has(s, skip))
     if not found:
         raise ConfigError(
-            "no setting is called that",
+            "no setting has this name",
             where="--only, --skip",
             value=", ".join([*only, *skip]),
             accepted="part of a name such as " + ", ".join(f"'{s.name}'" for s in settings[:3]),
@@ -68,10 +68,10 @@ def trade(
     settings: tuple[Setting, ...] | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """The whole measurement as plain data (what trade.json holds).
+    """Return the whole measurement as plain data (the content of trade.json).
 
-    cost : "wall_s" or "cpu_s", what the front is drawn over. settings : instead of the designed set.
-    Raises BlinkGLError: what generating the sequence would raise, or no setting of that name."""
+    cost : "wall_s" or "cpu_s", the cost axis of the front. settings : instead of the designed set.
+    Raises BlinkGLError: errors of generating the sequence, or no setting of that name."""
     started = time.perf_counter()
     options = options or (QUICK if quick else Options())
     base = template.sequence(options.sequence)
@@ -94,7 +94,7 @@ def trade(
             rows += [{**r.to_dict(), "width": bench.width, "height": bench.height} for r in results]
             sizes[size or "full"] = _judged_by(bench, levels)
         machine = machine_line(gl.renderer)
-    main = rows[0]["size"]  # sizes are different data sets: one front, over the largest
+    main = rows[0]["size"]  # sizes are different data sets: the front uses only the largest
     best = {r["name"] for r in pareto_front([r for r in rows if r["size"] == main], cost, "voxel")}
     for r in rows:
         r["on_front"] = r["name"] in best
@@ -120,7 +120,7 @@ def trade(
 
 
 def _judged_by(bench: Bench, levels: list[Level]) -> dict[str, Any]:
-    """What one size was judged by, as plain data."""
+    """Return the reference of one size as plain data."""
     return {
         "width": bench.width,
         "height": bench.height,
@@ -136,7 +136,7 @@ def _judged_by(bench: Bench, levels: list[Level]) -> dict[str, Any]:
 
 
 def convergence_line(result: dict, size: str = "full") -> str:
-    """One sentence on how far the reference can be trusted."""
+    """Return one sentence on how far the reference can be trusted."""
     levels = result["sizes"][size]["levels"]
     last = levels[-1]
     samples = f"{last['scale']}x{last['scale']} samples a pixel"
@@ -144,17 +144,14 @@ def convergence_line(result: dict, size: str = "full") -> str:
     if more := result.get("reference_set"):
         what += f", with {', '.join(more)}"
     if not last["ratio"]:
-        return f"the reference, {what}, was NOT checked: there was time for one level only"
+        return f"the reference, {what}, was NOT checked: there was time for only one level"
     moved = ", ".join(f"{NAMES[k]} {100 * v:.2g} %" for k, v in last["ratio"].items())
     verdict = (
         "converged"
         if result["sizes"][size]["converged"]
         else f"did NOT converge to a tenth ({100 * result['enough']:.0f} %) within the limits"
     )
-    return (
-        f"the reference {verdict}: {what}; from the level before it moved by, in parts of the smallest error judged: "
-        f"{moved}"
-    )
+    return f"the reference {verdict}: {what}; change from the level before, relative to the smallest error: {moved}"
 
 
 NAMES = {
@@ -166,7 +163,7 @@ NAMES = {
 
 
 def write(result: dict, out: str | Path) -> list[Path]:
-    """trade.json, trade.csv, pareto.png and trade.html in the folder ``out``. Raises OutputError."""
+    """Write trade.json, trade.csv, pareto.png and trade.html to the folder ``out``. Raises OutputError."""
     from blinkgl.trade.plot import page, pareto
 
     out = Path(out)
@@ -186,7 +183,7 @@ def write(result: dict, out: str | Path) -> list[Path]:
 
 
 def plain(value: Any) -> Any:
-    """For JSON, which has no NaN."""
+    """Return a value for JSON, which has no NaN."""
     if isinstance(value, dict):
         return {k: plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):

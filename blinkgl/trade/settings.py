@@ -1,12 +1,12 @@
-"""The settings that are measured: named points on five axes, each a few lines of YAML.
+"""The settings to measure: named points on five axes, each a few lines of YAML.
 
-Not the full product: it would be thousands of settings, most of them silly. What is there and why:
+The full product would have thousands of settings, most of them useless. The design is:
 
-1. displacement x anti-aliasing, in full: the two axes that matter most, and they interact,
-   because each hides the other's error; and both with sharper mip maps, where presets are looked for.
+1. displacement x anti-aliasing, in full: the two most important axes, which interact because each hides the other's
+   error; and both with sharper mip maps, where presets are looked for.
 2. every other way to choose the times (uniform, brightness) at one anti-aliasing, so that each is a curve to compare.
-3. anisotropy and texture size one at a time: they change what a frame is, not when it is drawn.
-4. half the image size: another data set, with a reference of its own; it says what a pixel costs.
+3. anisotropy and texture size one at a time: they change the frame, not its time.
+4. half the image size: another data set, with its own reference; it shows the cost per pixel.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Setting:
 
     @property
     def overrides(self) -> tuple[str, ...]:
-        """As ``--set`` options; the size is not among them."""
+        """Return the setting as ``--set`` options, without the size."""
         return (
             *SAMPLINGS[self.sampling],
             *ANTIALIASINGS[self.antialiasing],
@@ -76,8 +76,8 @@ _SHARPER = ("mip bias -0.5", "mip bias -1")
 
 
 def design(quick: bool, random_scene: bool = True) -> tuple[Setting, ...]:
-    """The settings of a sweep, without repetitions. random_scene : the scene has pools,
-    whose textures can be made smaller."""
+    """Return the settings of a sweep, without repetitions. random_scene : the scene has pools, whose textures can be
+    reduced."""
     one = _displacement(1)[0]
     contrasts = [s for s in SAMPLINGS if s.startswith("brightness")]
     others = [o for o in OTHERS if o and o not in _SHARPER and (random_scene or not o.startswith("textures"))]
@@ -97,9 +97,9 @@ def design(quick: bool, random_scene: bool = True) -> tuple[Setting, ...]:
 
 
 def suite_design() -> tuple[Setting, ...]:
-    """The settings that every scene of the suite is drawn with: all that a preset may be, what presets have to beat,
-    and rows for two questions. Where do more frames help (displacement with and without filtering)? Do steps by
-    contrast x speed (brightness) need fewer?"""
+    """Return the settings of the suite for every scene: all candidates for presets, their competitors, and rows for two
+    questions. Where do more frames help (displacement with and without filtering)? Do steps by contrast x speed
+    (brightness) need fewer?"""
     sharp = _SHARPER[1]
     points = [Setting(s, a) for s in _displacement(2, 1, 0.5, 0.25) for a in ("none", "edges")]
     points += [Setting(s, a, sharp) for s in _displacement(2, 1) for a in ("none", "taps4")]
@@ -112,12 +112,12 @@ def suite_design() -> tuple[Setting, ...]:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Which settings are worth having: those that no other one beats in cost and error at once.
+# The best settings: those that no other one beats in cost and error at once.
 
 
 def pareto_front(rows: Sequence[dict], cost: str, error: str) -> list[dict]:
-    """The non-dominated rows, cheapest first. A row is dominated when another is no worse in both and better in one; of
-    rows that are equal in both the first stays. Rows whose error is not a number are left out."""
+    """Return the non-dominated rows, cheapest first. A row is dominated when another is no worse in both and better in
+    one; of equal rows the first stays. Rows whose error is not a number are left out."""
     result: list[dict] = []
     for row in sorted((r for r in rows if math.isfinite(r[error])), key=lambda r: (r[cost], r[error])):
         if not result or row[error] < result[-1][error]:
@@ -126,7 +126,7 @@ def pareto_front(rows: Sequence[dict], cost: str, error: str) -> list[dict]:
 
 
 def excess(row: dict, rows: Sequence[dict], cost: str, error: str) -> float:
-    """By how much the best of ``rows`` beats ``row`` in cost and in error, whichever it beats less in: 0.1 where one is
+    """Return by how much the best of ``rows`` beats ``row`` in cost and error, the smaller of the two: 0.1 where one is
     a tenth better in both. At most 0: nothing beats it."""
     ratio = lambda mine, other: mine / other if other else (1.0 if not mine else math.inf)
     others = [r for r in rows if r is not row and math.isfinite(r[error])]

@@ -1,10 +1,10 @@
-"""``blinkgl trade --suite``: the same settings on scenes that differ in what is hard.
+"""``blinkgl trade --suite``: the same settings on scenes with different difficulties.
 
-One scene says little: what is bought by filtering textures is not bought by filtering silhouettes. Each scene of
-``configs/trade/`` is measured as :func:`blinkgl.trade.run.trade` measures one, with a reference of its own density, and
-the file is written after each, so that whatever ends the run leaves what was measured, marked as a part.
+One scene is not enough: filtering textures and filtering silhouettes help in different scenes. Each scene of
+``configs/trade/`` is measured as by :func:`blinkgl.trade.run.trade`, with its own reference density. The file is
+written after each scene, so that an interrupted run leaves its results, marked as partial.
 
-A row, one setting in one scene, counts only where the reference stands still by a tenth of what it says of that row.
+A row, one setting in one scene, counts only where the reference has converged to a tenth of the row's error.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Trial:
-    """A scene of the suite. what : the first sentence of its file: what is hard about it."""
+    """A scene of the suite. what : the first sentence of its file: its difficulty."""
 
     name: str
     path: Path
@@ -63,18 +63,18 @@ class Trial:
 
 
 def clips(folder: str | Path | None = None, only: Sequence[str] = ()) -> tuple[Trial, ...]:
-    """The scenes of a folder (None: the shipped ones), by name; those whose name contains one of ``only``. Raises
+    """Return the scenes of a folder (None: the shipped ones), by name, whose name contains one of ``only``. Raises
     ConfigError where there is none."""
     place = Path(str(resources.files("blinkgl.configs"))) / "trade" if folder is None else Path(folder)
     if not place.is_dir():
         raise ConfigError("the suite is a folder of scenes", where=str(folder), accepted="a folder with .yaml files")
     every = tuple(Trial(path.stem, path) for path in sorted(place.glob("*.yaml")))
     if not every:
-        raise ConfigError("no scenes there", where=str(folder), accepted="a folder with .yaml files")
+        raise ConfigError("the folder has no scenes", where=str(folder), accepted="a folder with .yaml files")
     found = tuple(c for c in every if not only or any(text.lower() in c.name.lower() for text in only))
     if not found:
         raise ConfigError(
-            "no scene is called that",
+            "no scene has this name",
             where="--scene",
             value=", ".join(only),
             accepted="part of one of " + ", ".join(c.name for c in every),
@@ -94,10 +94,10 @@ def run_suite(
     cost: str = "cpu_s",
     say: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Measures every scene and writes suite.json and suite.csv to the folder ``out``, after each scene anew; returns
-    what the first holds.
+    """Measure every scene and write suite.json and suite.csv to the folder ``out``, again after each scene; return the
+    content of the first.
 
-    A scene that cannot be measured has a line that says why. Raises BlinkGLError when none can."""
+    A scene that cannot be measured has a line with the reason. Raises BlinkGLError when none can."""
     out = Path(out)
     settings = chosen(settings or suite_design(), list(only), list(skip))
     asked = {"settings": [s.name for s in settings], "overrides": list(overrides), "cost": cost}
@@ -125,7 +125,7 @@ def _measured(
     cost: str,
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    # What generates the scene usually is no business of the measurement: labels, previews, read-outs are left out.
+    # The scene's usual labels, previews and read-outs are left out of the measurement.
     template = load_run(scene.path, list(overrides))
     result = trade(template, options=options, cost=cost, settings=settings, say=say)
     size = result["sizes"]["full"]
@@ -165,7 +165,7 @@ def _whole(done: dict[str, dict], scenes: Sequence[Trial], asked: dict[str, Any]
 
 
 def preset_names(names: Iterable[str]) -> dict[str, str]:
-    """Quality -> name of the setting that it is, of those among ``names``."""
+    """Return quality -> name of its setting, for those among ``names``."""
     wanted = {_meaning(_as_overrides(quality)): quality for quality in QUALITIES}
     known = {s.name: s for s in suite_design()}
     found = {
@@ -180,17 +180,17 @@ def _as_overrides(quality: str) -> tuple[str, ...]:
 
 
 def _meaning(overrides: Iterable[str]) -> str:
-    """Timeline and render that overrides mean, every value filled in."""
+    """Return the timeline and render settings that overrides give, with every value filled in."""
     tree = apply_overrides({"quality": None}, list(overrides))
     config: SequenceConfig = RunTemplate(tree, Path()).sequence(0)
     return json.dumps([config.timeline.model_dump(), config.render.model_dump()], sort_keys=True)
 
 
 def standing(scenes: dict[str, dict], cost: str) -> list[dict[str, Any]]:
-    """Per setting, over the scenes where its row counts: how often nothing beats it, and the worst.
+    """Return per setting, over the scenes where its row counts, how often nothing beats it, and its worst result.
 
-    excess : 0.1 says that another setting is better by 10 % in cost and error both. The largest error is of all
-    scenes, the name of that scene beside it."""
+    excess : 0.1 means that another setting is 10 % better in both cost and error. The largest error is over all scenes,
+    with the name of that scene."""
     names = dict.fromkeys(row["name"] for scene in scenes.values() for row in scene.get("settings", ()))
     result = []
     for name in names:
@@ -218,13 +218,13 @@ def standing(scenes: dict[str, dict], cost: str) -> list[dict[str, Any]]:
 
 
 def _mean(values: Iterable[float]) -> float:
-    """Geometric: scenes differ by factors."""
+    """Return the geometric mean: scenes differ by factors."""
     logs = [math.log(max(v, 1e-12)) for v in values]
     return math.exp(sum(logs) / len(logs))
 
 
 def write(result: dict[str, Any], out: Path) -> None:
-    """suite.json and suite.csv. Raises OutputError."""
+    """Write suite.json and suite.csv. Raises OutputError."""
     with atomic_file(out / FILE) as path, output_errors(out / FILE):
         path.write_text(json.dumps(plain(result), indent=1) + "\n", encoding="utf-8")
     with (

@@ -1,4 +1,4 @@
-"""The page: one time slider over pictures and space, in panels on either side."""
+"""The page: one time slider, with pictures and the 3-D scene in panels."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ SPEEDS = ("1x", "1/2x", "1/5x", "1/10x", "1/20x", "1/50x", "1/100x")
 _TICK_S = 0.05
 _PICTURES_PX, _CONTROLS_PX = 380, 330
 SPACE_WINDOWS = 5
-"""A window of events in space is so many times as long as in a picture: its shape is seen only then."""
+"""A window of events in 3-D is this many times as long as in a picture, which shows its shape."""
 SAVED_STEPS, SAVED_S = 40, 12.0
-"""Moments in a saved file, and how long it plays."""
+"""Moments in a saved file, and its duration."""
 
 
 class Page:
-    """What a server shows: sequences to choose from, and the chosen one at a time.
+    """The content of a server: sequences to choose from, and the chosen one at a time.
 
-    Callbacks of the browser only ask for the page to be drawn anew; one thread draws it, so that a slider that is
-    dragged shows its last place and not each on the way."""
+    Callbacks of the browser only request a redraw; one thread draws, so that a dragged slider shows its last position
+    and not every one on the way."""
 
     def __init__(self, server: LocalServer):
         self.server = server
@@ -44,7 +44,7 @@ class Page:
         server.gui.add_markdown("Waiting for the first sequence …")
 
     def add(self, folder: Path) -> None:
-        """Another sequence to choose; the first is shown."""
+        """Add a sequence to choose; the first is shown."""
         name = folder.name if folder.name not in self.folders else str(folder)
         self.folders[name] = folder
         self._chosen = self._chosen or name
@@ -54,7 +54,7 @@ class Page:
     # ---- the thread that draws -----------------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Draws until :meth:`end`."""
+        """Draw until :meth:`end`."""
         last = time.monotonic()
         while not self._ended:
             now = time.monotonic()
@@ -69,7 +69,7 @@ class Page:
         self._changed.set()
 
     def draw(self) -> None:
-        """What has changed since it was last drawn. A sequence that cannot be read is said on the page."""
+        """Draw what has changed. The page reports a sequence that cannot be read."""
         if not self._changed.is_set():
             return
         self._changed.clear()
@@ -91,7 +91,7 @@ class Page:
     # ---- one sequence --------------------------------------------------------------------------------------------
 
     def _open(self, name: str) -> None:
-        """Builds the page of a sequence, unless it is there already and only the list has grown."""
+        """Build the page of a sequence, unless it exists and only the list has grown."""
         if self.sequence is not None and self.sequence.folder == self.folders[name]:
             if len(self.folders) > 1 and self._choice is None:
                 self._add_choice()
@@ -158,7 +158,7 @@ class Page:
         self._choice.on_update(chosen)
 
     def _panels(self, sequence: SequenceView) -> None:
-        """The pictures, a tab for each camera and one for each inertial unit."""
+        """Add the pictures, a tab for each camera and one for each inertial unit."""
         panel = self.server.gui.add_panel()
         panel.dock_left()
         panel.set_width(_PICTURES_PX)
@@ -170,7 +170,7 @@ class Page:
                 self._curves += [self._curve(unit, *what) for what in (("rate", "rad/s"), ("acceleration", "m/s²"))]
 
     def _curve(self, unit: dict[str, np.ndarray], name: str, measure: str) -> tuple[Any, tuple[np.ndarray, ...]]:
-        """A plot that is filled up to the time that is shown, and all that it will hold."""
+        """Return a plot that is filled up to the displayed time, and its complete data."""
         t_ms = unit["t_ns"] / 1e6
         data = (t_ms, *unit[name].T)
         low, high = float(unit[name].min(initial=0)), float(unit[name].max(initial=0))
@@ -207,7 +207,7 @@ class Page:
     def _picture(self, sensor: str, one: Picture) -> None:
         images = self._images.setdefault(sensor, {})
         said = f"{one.heading} · {one.note}" if one.note else one.heading
-        times = max(1, _PICTURES_PX // one.image.shape[1])  # else small ones are shown as small as they are
+        times = max(1, _PICTURES_PX // one.image.shape[1])  # otherwise small pictures would not be enlarged
         image = one.image.repeat(times, axis=0).repeat(times, axis=1)
         if one.heading not in images:
             with self._tabs[sensor]:
@@ -218,7 +218,7 @@ class Page:
             images[one.heading].image = image
 
     def _look_at(self, what: str) -> None:
-        """Shows the world, or the events beside it, and turns every browser's view there."""
+        """Show the world, or the events beside it, and turn every browser's view there."""
         self.stage.world.visible, self.stage.space.visible = what == "world", what == "events"
         eye, at = self.stage.views()[what]
         cameras = [client.camera for client in self.server.get_clients().values()]
@@ -230,7 +230,7 @@ _XYZ = ("#d62728", "#2ca02c", "#1f77b4")
 
 
 def _speed(said: str) -> float:
-    """ "1/10x" → 0.1."""
+    """Convert "1/10x" to 0.1."""
     whole, _, part = said.rstrip("x").partition("/")
     return float(whole) / float(part or 1)
 
@@ -246,8 +246,8 @@ def _about(sequence: SequenceView) -> str:
 
 
 def save(folder: Path, out: Path) -> None:
-    """Writes a sequence as one HTML file that plays without a server: the world, the events, and all pictures on a
-    wall. Raises AssetError as :class:`SequenceView`, OutputError."""
+    """Write a sequence as one HTML file that plays without a server: the world, the events, and all pictures on a wall.
+    Raises AssetError as :class:`SequenceView`, OutputError."""
     sequence, server = SequenceView(folder), LocalServer(0)
     try:
         stage = Stage(server.scene, sequence, pictures=True)

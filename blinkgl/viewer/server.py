@@ -1,4 +1,4 @@
-"""viser's server, for this machine alone: it listens on 127.0.0.1, talks to its own pages, and shares nothing."""
+"""viser's server, for this machine only: it listens on 127.0.0.1, serves only its own pages, and shares nothing."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ _OWN_PAGES = re.compile(r"http://(127\.0\.0\.1|localhost):\d{1,5}")
 class LocalServer(viser.ViserServer):
     """A :class:`viser.ViserServer` without its tunnel, its prints and visitors from other web sites.
 
-    port : None takes the first that is free from :data:`PORT` on; 0 any. Raises OutputError: the port is in use;
-    ConfigError: it is none."""
+    port : None takes the first free one from :data:`PORT`; 0 any. Raises OutputError: the port is in use; ConfigError:
+    it is not a port."""
 
     def __init__(self, port: int | None = None):
         if port is not None and not 0 <= port <= 65535:
@@ -40,7 +40,7 @@ class LocalServer(viser.ViserServer):
         return f"http://{HOST}:{self.get_port()}"
 
     def request_share_url(self, verbose: bool = True) -> None:
-        """Do nothing: what pages ask for by viser's protocol, button or not, opens no tunnel to its makers' host."""
+        """Do nothing: a request by viser's protocol opens no tunnel to its makers' host."""
 
     def stop(self) -> None:
         with _quiet():
@@ -48,7 +48,7 @@ class LocalServer(viser.ViserServer):
 
 
 def _check_free(port: int) -> None:
-    """Raises OutputError; viser itself would take the next port."""
+    """Raise OutputError for a port in use; viser itself would take the next one."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -64,8 +64,8 @@ def _quiet() -> contextlib.AbstractContextManager:
 
 @contextlib.contextmanager
 def _only_own_pages() -> Iterator[None]:
-    """While a server starts: websockets are of pages from this machine. viser has no option for it, so any web site
-    that is open in the same browser could connect and read what is shown."""
+    """Accept, while a server starts, only websockets of pages from this machine. viser has no option for it, so any web
+    site open in the same browser could connect and read what is shown."""
     serve = websockets.asyncio.server.serve
     own: Any = functools.partial(serve, origins=[_OWN_PAGES, None])
     websockets.asyncio.server.serve = own

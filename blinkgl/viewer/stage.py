@@ -1,4 +1,4 @@
-"""What is seen in space: cameras, objects, points of the world, and events in x, y and time."""
+"""The 3-D view: cameras, objects, points of the world, and events in x, y and time."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ if TYPE_CHECKING:
     import viser
 
 LAYERS = {"points": "points (depth)", "boxes": "boxes", "tracks": "tracks"}
-"""What may be switched off in the world: name, and what it is called."""
+"""Parts of the world that can be switched off: key, and displayed name."""
 _DEPTH = 1.3
-"""How long a window of events is in space, in widths of their picture."""
+"""Length of a window of events in 3-D, in widths of their picture."""
 _EVENTS_AT = 2.1
-"""How far beside the world's middle the events are, in radii."""
+"""Distance of the events from the world's middle, in radii."""
 _EDGES = np.array(
     [[a, b] for a in np.ndindex(2, 2, 2) for b in np.ndindex(2, 2, 2) if a < b and sum(np.abs(np.subtract(a, b))) == 1]
 )
 """(12, 2, 3): the edges of a box, by corners of 0 and 1."""
 _ON, _OFF, _PALE = (40, 90, 235), (225, 50, 50), (170, 170, 180)
 FOV = math.radians(45)
-"""Of the eye; viser's own 75 degrees make everything small."""
+"""Field of view of the eye; viser's own 75 degrees make everything small."""
 
 
 class Stage:
@@ -59,7 +59,7 @@ class Stage:
         return self._middle + distance * self._turn[:, 0]
 
     def views(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """By what is looked at: place of the eye, and the point that it looks at."""
+        """Return, for each target, the position of the eye and the point that it looks at."""
         right, forward, up = self._turn.T
         radius, aside = self._radius, self._aside(_EVENTS_AT * self._radius)
         world = self._middle - 1.5 * radius * forward + 0.9 * radius * up - 1.3 * radius * right
@@ -74,7 +74,7 @@ class Stage:
         }
 
     def has(self, layer: str) -> bool:
-        """Whether there is anything of a layer of the world."""
+        """Return whether a layer of the world has anything."""
         sensors, start = self._sequence.sensors, self._sequence.start_us
         found = {
             "points": lambda s: s.depth_cloud(start),
@@ -106,7 +106,7 @@ class Stage:
         return sensor, frustum
 
     def _volume(self, sensor: CameraView, k: int) -> None:
-        """The frame in which a window of events stands, and its words; its points come with the time."""
+        """Add the frame of a window of events, and its text; its points come with the time."""
         tall, size = sensor.source.height / sensor.source.width, self._radius
         corners = (_EDGES - [0.5, 1.0, 0.5]) * [1, _DEPTH, tall] * size
         root = f"/events/{sensor.name}"
@@ -133,7 +133,7 @@ class Stage:
     def show(
         self, t_us: int, window_us: int, pictures: dict[str, list[Picture]], layers: Collection[str] = tuple(LAYERS)
     ) -> None:
-        """Puts everything where it is at a time. pictures : of each sensor, by its name, at that time."""
+        """Show everything at a time. pictures : of each sensor, by its name, at that time."""
         for sensor, frustum in self._cameras:
             pose = sensor.camera_pose(t_us)
             assert pose is not None
@@ -142,7 +142,7 @@ class Stage:
             if image is not None:
                 frustum.image = image
         self._bodies(t_us, "boxes" in layers)
-        # Of one camera: those of a rig see much the same.
+        # Of one camera: those of a rig see nearly the same.
         seen = next((c for s in self._sequence.sensors if (c := self._depth(s, t_us)) is not None), None)
         self._cloud("/world/points", [] if seen is None else [seen], 0.006 * self._radius, "points" in layers)
         followed = [c for s in self._sequence.sensors if (c := s.track_cloud(t_us)) is not None]
@@ -153,7 +153,7 @@ class Stage:
             self._wall(pictures)
 
     def _depth(self, sensor: CameraView, t_us: int) -> Cloud | None:
-        """The cloud of the label's time, made once."""
+        """Return the cloud of the label's time, made once."""
         key, k = f"depth {sensor.name}", sensor.label(t_us)
         if self._shown.get(key, (None,))[0] != k:
             self._shown[key] = (k, sensor.depth_cloud(t_us))
@@ -167,7 +167,7 @@ class Stage:
             self._shown[name][0].visible = visible
             return
         colours = np.concatenate([c.colours for c in clouds])
-        near = points - self._middle  # as half floats: right to a thousandth of the scene's radius
+        near = points - self._middle  # as half floats: accurate to a thousandth of the scene's radius
         node = self._scene.add_point_cloud(
             name, near, colours, point_size=size, point_shape="circle", position=self._middle, visible=visible
         )
@@ -188,7 +188,7 @@ class Stage:
         (points, on), size, root = sensor.event_points(t_us, window_us), self._radius, f"/events/{sensor.name}"
         points = points[:, [0, 2, 1]] * [1, -_DEPTH, -1]
         for name, which, colour in (("ON", on, _ON), ("OFF", ~on, _OFF)):
-            # Half floats of a picture's widths are right to a tenth of a pixel.
+            # Half floats of a picture's widths are accurate to a tenth of a pixel.
             self._scene.add_point_cloud(
                 f"{root}/{name}", points[which], colour, point_size=0.004, scale=size, point_shape="circle"
             )
@@ -200,7 +200,7 @@ class Stage:
             self._image(f"{root}/picture", _small(frame), (0, 0.01 * size, 0), size)
 
     def _wall(self, pictures: dict[str, list[Picture]]) -> None:
-        """All pictures, side by side."""
+        """Show all pictures, side by side."""
         found = [(f"{name}: {one.heading}", one.image) for name, some in pictures.items() for one in some]
         columns = math.ceil(math.sqrt(max(len(found), 1)))
         size = 2.4 * self._radius / columns
@@ -213,7 +213,7 @@ class Stage:
             row, column = divmod(number, columns)
             at = size * np.array([column - (columns - 1) / 2, 0, 0.95 * ((columns - 1) / 2 - row)])
             known, plain = self._shown.get(name), name.replace("/", " ")
-            if known is None:  # beside the picture: what is below a node goes when that is made anew
+            if known is None:  # beside the picture: nodes below another are removed when that is made again
                 above = (0, 0, 0.53 * size * image.shape[0] / image.shape[1])
                 self._label(f"/pictures/names/{plain}", name, at + above)
             if known is None or not np.array_equal(known, image):
@@ -221,7 +221,7 @@ class Stage:
             self._shown[name] = image
 
     def _image(self, name: str, image: np.ndarray, at: Sequence[float] | np.ndarray, width: float) -> None:
-        """A picture that stands upright: viser's lie in x and y, with y down."""
+        """Add an upright picture: viser's lie in x and y, with y down."""
         self._scene.add_image(
             name,
             image,
@@ -235,7 +235,7 @@ class Stage:
 
 
 def _facing(sequence: SequenceView) -> np.ndarray:
-    """(3, 3) columns right, forward, up: level, and as the first camera looks when it begins."""
+    """Return (3, 3) columns right, forward, up: level, in the first camera's initial direction."""
     for sensor in sequence.sensors:
         pose = sensor.camera_pose(sequence.start_us)
         if pose is not None and np.linalg.norm(pose[:2, 2]) > 1e-6:
@@ -245,12 +245,12 @@ def _facing(sequence: SequenceView) -> np.ndarray:
 
 
 def _wxyz(pose: np.ndarray) -> np.ndarray:
-    """Quaternion of a (3, 3) rotation, or of that of a (4, 4) pose."""
+    """Return the quaternion of a (3, 3) rotation, or of that of a (4, 4) pose."""
     return np.roll(Rotation.from_matrix(pose[:3, :3]).as_quat(), 1)
 
 
 def _small(image: np.ndarray) -> np.ndarray:
-    """At most 512 px wide."""
+    """Return the image, at most 512 px wide."""
     if image.shape[1] <= 512:
         return image
     return cv2.resize(image, (512, round(image.shape[0] * 512 / image.shape[1])), interpolation=cv2.INTER_AREA)

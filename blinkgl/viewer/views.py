@@ -1,6 +1,7 @@
-"""What a sequence has to show at a time, as plain arrays: pictures, events, points and boxes in space.
+"""The displayed data of a sequence at a time, as plain arrays: pictures, events, points and boxes in 3-D.
 
-Times are µs on the sequence's clock. Labels and poses are known at label times: until the next one, the last is shown.
+Times are µs on the sequence's clock. Labels and poses are known at label times: the last one is shown until the
+next.
 """
 
 from __future__ import annotations
@@ -31,14 +32,15 @@ from blinkgl.types.boxes import Boxes
 from blinkgl.types.events import Events
 
 EVERYWHERE = ("sky", "ground")
-"""Objects that surround all others: they have no box, and their points would hide everything else."""
+"""Objects around all others: they have no box, and their points would hide everything else."""
 MAX_POINTS, MAX_EVENTS = 30_000, 15_000
-"""In space at a time: what a browser without a graphics card still turns smoothly; more events would be a cloud."""
+"""Largest numbers in 3-D at a time, for browsers without a graphics card."""
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """heading : what it is, one for each.   note : its time and scale, in words.   image : (H, W, 3) uint8."""
+    """A displayed picture. heading : its unique title.   note : its time and scale, in words.   image : (H, W, 3)
+    uint8."""
 
     heading: str
     note: str
@@ -65,7 +67,7 @@ class Body:
 
 
 class CameraView:
-    """What one camera of a sequence has to show."""
+    """The displayed data of one camera of a sequence."""
 
     def __init__(self, source: Source, name: str):
         self.source, self.name = source, name
@@ -83,14 +85,14 @@ class CameraView:
         return 0 if self._events is None else self._events.count
 
     def label(self, t_us: int) -> int:
-        """Number of the last label at or before a time; the first one before that."""
+        """Return the number of the last label at or before a time; the first one before that."""
         return max(int(np.searchsorted(self._label_us, t_us, side="right")) - 1, 0)
 
     # ---- pictures ------------------------------------------------------------------------------------------------
 
     def pictures(self, t_us: int, window_us: int) -> list[Picture]:
-        """All that there is of a time: frame, images of a frame camera, events of [t - window, t), then labels, those
-        of motion first. What the sequence lacks is absent."""
+        """Return all pictures of a time: frame, images of a frame camera, events of [t - window, t), then labels, those
+        of motion first. Missing kinds are left out."""
         found = [*self._frame(t_us), *self._of_frame_camera(t_us)]
         if self._events is not None:
             events = self.events(t_us, window_us)
@@ -104,7 +106,7 @@ class CameraView:
         return found + self._known[k]
 
     def _frame(self, t_us: int) -> list[Picture]:
-        """The image of the last label's time, with the objects' boxes and the tracks of points over it."""
+        """Return the image at the last label's time, with the objects' boxes and the tracks of points over it."""
         k = self.label(t_us)
         has_image, boxes = self.source.has(LABELS["images"].forms[0].file(k)), self._boxes(k)
         if not has_image and boxes is None and self.tracks is None:
@@ -121,7 +123,7 @@ class CameraView:
         return [Picture("frame", when, image)]
 
     def _of_frame_camera(self, t_us: int) -> list[Picture]:
-        """The images whose exposure was over last; before that the first."""
+        """Return the images with the last completed exposure; before that the first."""
         if not self._exposures:
             return []
         about = self.source.manifest["frame_camera"]
@@ -163,24 +165,24 @@ class CameraView:
     # ---- events --------------------------------------------------------------------------------------------------
 
     def events(self, t_us: int, window_us: int) -> Events:
-        """Those of [t - window, t)."""
+        """Return the events of [t - window, t)."""
         assert self._events is not None, self.name
         return self._events.slice(t_us - window_us, t_us)
 
     def event_points(self, t_us: int, window_us: int) -> tuple[np.ndarray, np.ndarray]:
-        """(N, 3) float32 and (N,) bool: events of [t - window, t) as points, and which are ON. x and y go from -0.5 to
-        0.5 of the picture's width, right and down, z from 0, a window ago, to 1, now. Every n-th where there are more
-        than :data:`MAX_EVENTS`."""
+        """Return (N, 3) float32 and (N,) bool: events of [t - window, t) as points, and which are ON. x and y go from
+        -0.5 to 0.5 of the picture's width, right and down, z from 0, a window ago, to 1, now. Every n-th where there
+        are more than :data:`MAX_EVENTS`."""
         events = self.events(t_us, window_us)
         some = slice(None, None, 1 + len(events) // MAX_EVENTS)
         width, height = self.source.width, self.source.height
-        x = (events.x[some] - (width - 1) / 2) / width  # the middle of the picture is between its middle pixels
+        x = (events.x[some] - (width - 1) / 2) / width  # the centre of the picture is between its middle pixels
         y = (events.y[some] - (height - 1) / 2) / width
         z = (events.t[some] - (t_us - window_us)) / window_us
         return np.stack([x, y, z], axis=-1).astype(np.float32), events.p[some] > 0
 
     def usual_window_us(self) -> int:
-        """A window whose picture is neither empty nor a blot: an event in about three pixels."""
+        """Return a window with a readable picture: an event in about three pixels."""
         span = max(self.source.end_us - self.source.start_us, 1)
         wanted = self.source.height * self.source.width / 3
         steps = 1000 * np.array([1, 2, 5, 10, 20, 50, 100])
@@ -192,16 +194,16 @@ class CameraView:
         return max(int(np.searchsorted(self._poses_us, t_us, side="right")) - 1, 0)
 
     def camera_pose(self, t_us: int) -> np.ndarray | None:
-        """T_world_cam (4, 4), OpenCV's axes; None where a recording has none."""
+        """Return T_world_cam (4, 4), OpenCV's axes; None where a recording has none."""
         return self.source.poses["T_world_cam"][self._pose(t_us)] if self.source.poses else None
 
     @property
     def camera_path(self) -> np.ndarray:
-        """(M, 3) places of the camera."""
+        """Return the positions of the camera, (M, 3)."""
         return self.source.poses["T_world_cam"][:, :3, 3] if self.source.poses else np.zeros((0, 3))
 
     def label_camera(self) -> CameraModel | None:
-        """The camera whose pixels labels are of."""
+        """Return the camera whose pixels labels use."""
         camera = self.source.camera
         return rectified(camera) if camera is not None and self._is_rectified(camera) else camera
 
@@ -209,8 +211,8 @@ class CameraView:
         return not isinstance(camera, PinHole) and self.source.rectified
 
     def bodies(self, t_us: int) -> list[Body]:
-        """Boxes of the objects but :data:`EVERYWHERE`, as they are at the last label: those of ``boxes`` for what is in
-        the picture, else those of the shapes at rest."""
+        """Return boxes of the objects, without :data:`EVERYWHERE`, at the last label: those of ``boxes`` for visible
+        objects, else those of the shapes at rest."""
         poses, m = self.source.poses, self._pose(t_us)
         seen: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         if len(self._label_us) and self._label_us[0] <= t_us and (boxes := self._boxes(self.label(t_us))) is not None:
@@ -234,8 +236,8 @@ class CameraView:
         return {int(i) for i, kind in zip(poses.get("object_ids", ()), kinds) if kind in EVERYWHERE}
 
     def depth_cloud(self, t_us: int) -> Cloud | None:
-        """What the last label's depth shows, in the world, in the image's colours (else the ids', else grey), without
-        sky and ground: by ids, or else what lies in some object's box. None: no depth, or no poses."""
+        """Return the points of the last label's depth in the world, in the image's colours (else the ids', else grey),
+        without sky and ground: by ids, or else points inside some object's box. None: no depth, or no poses."""
         k, camera = self.label(t_us), self.label_camera()
         form, pose = LABELS["depth"].forms[0], self.camera_pose(int(self._label_us[k]) if len(self._label_us) else 0)
         if not self.source.has(form.file(k)) or camera is None or pose is None:
@@ -248,7 +250,7 @@ class CameraView:
         y, x = np.nonzero(shown)
         some = slice(None, None, 1 + len(x) // MAX_POINTS)
         y, x = y[some], x[some]
-        rays = camera.rays(np.stack([x, y], axis=-1).astype(float))  # pixels' centres are at whole numbers
+        rays = camera.rays(np.stack([x, y], axis=-1).astype(float))  # pixel centres are at whole numbers
         points = rays / rays[:, 2:] * depth[y, x, None] @ pose[:3, :3].T + pose[:3, 3]
         if self.source.has(LABELS["images"].forms[0].file(k)):
             colours = self.source.image(k)[y, x]
@@ -260,7 +262,7 @@ class CameraView:
         return Cloud(points.astype(np.float32), colours)
 
     def track_cloud(self, t_us: int) -> Cloud | None:
-        """Tracked points in the world at the last of their times, in their objects' colours, hidden ones grey."""
+        """Return tracked points in the world at their last time, in their objects' colours, hidden ones grey."""
         if self.tracks is None:
             return None
         m = max(int(np.searchsorted(self.tracks["t_us"], t_us, side="right")) - 1, 0)
@@ -274,12 +276,12 @@ class CameraView:
 
 
 def _rank(label: Label) -> int:
-    """Flow first, then what else is motion; the rest as the table has it."""
+    """Return a sort key: flow first, then other motion; the rest in the table's order."""
     return 2 if label.kind != "motion" else int(label.towards is None)
 
 
 def _inside(points: np.ndarray, body: Body) -> np.ndarray:
-    """(N,) bool: which of (N, 3) points lie in a body's box, or within a hundredth of its size of it."""
+    """Return (N,) bool: which of (N, 3) points lie in a body's box, or within a hundredth of its size of it."""
     local = (points - body.pose[:3, 3]) @ body.pose[:3, :3]
     return np.all(abs(local) <= 0.51 * body.size + 1e-3, axis=1)
 
@@ -288,7 +290,7 @@ class SequenceView:
     """A sequence, or a rig's: its cameras and inertial units, on one clock."""
 
     def __init__(self, folder: Path):
-        """Raises AssetError: damaged, or there is nothing in it to show."""
+        """Open a sequence. Raises AssetError: damaged, or it has nothing to show."""
         self.folder, self.name = folder, folder.name
         rig = is_rig_folder(folder)
         places = {name: folder / name for name in read_rig(folder)} if rig else {"camera": folder}
@@ -301,14 +303,14 @@ class SequenceView:
         for unit in self.units.values():
             self.end_us = max(self.end_us, int(unit["t_ns"][-1] // 1000))
         if self.end_us <= self.start_us or not (self.units or any(s.pictures(self.end_us, 1) for s in self.sensors)):
-            raise AssetError("an empty sequence: it has nothing to show", where=str(folder))
+            raise AssetError("the sequence is empty", where=str(folder))
 
     @property
     def has_space(self) -> bool:
         return any(s.source.poses for s in self.sensors)
 
     def extent(self) -> tuple[np.ndarray, float]:
-        """Middle (3,) and radius of where things are: cameras' paths, and objects when it begins."""
+        """Return the middle (3,) and radius of the cameras' paths and of the objects at the start."""
         bodies = [b.pose[:3, 3] for s in self.sensors for b in s.bodies(self.start_us)]
         places = np.concatenate([s.camera_path for s in self.sensors] + [np.reshape(bodies, (-1, 3))])
         if not len(places):
@@ -322,10 +324,13 @@ class SequenceView:
 
 
 def sequences_in(path: str | Path) -> list[Path]:
-    """Folders of the sequences at or below a path, in order; of a rig its own. Raises AssetError: there are none."""
+    """Return folders of the sequences at or below a path, in order; of a rig its own. Raises AssetError: there are
+    none."""
     path = Path(path)
     if not path.is_dir():
         raise AssetError("no such folder", where=str(path), accepted="a sequence, or a folder of sequences")
     if not (found := list(made_folders(path))):
-        raise AssetError("no sequence in it", where=str(path), accepted="a folder that 'blinkgl generate' wrote")
+        raise AssetError(
+            "the folder has no sequence", where=str(path), accepted="a folder that 'blinkgl generate' wrote"
+        )
     return found

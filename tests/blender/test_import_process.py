@@ -48,12 +48,12 @@ def test_blender_stays_in_its_own_programs():
 @pytest.mark.parametrize(
     "name, options, error, words",
     [
-        ("a.max", {}, AssetError, "a.max: not a kind of scene that Blender reads; expected .blend, .fbx"),
+        ("a.max", {}, AssetError, "a.max: Blender cannot read this format; expected .blend, .fbx"),
         ("a.glb", {}, AssetError, "a glTF file is used as it is"),
         ("missing.blend", {}, AssetError, "missing.blend: cannot read the scene: No such file or directory"),
         ("folder.fbx", {}, AssetError, "folder.fbx: cannot read the scene: Is a directory"),
         ("empty.usd", {}, AssetError, "empty.usd: the file is empty"),
-        ("a.blend", {"frames": (9, 2)}, ConfigError, r"--frames: no range of frames \(got \(9, 2\)\)"),
+        ("a.blend", {"frames": (9, 2)}, ConfigError, r"--frames: not a range of frames \(got \(9, 2\)\)"),
         ("a.blend", {"fps": 0.0}, ConfigError, "--fps: out of range"),
         ("a.blend", {"keys_per_frame": 0}, ConfigError, "--keys-per-frame: out of range"),
         ("a.blend", {"time_limit_s": float("nan")}, ConfigError, "--time-limit: out of range"),
@@ -175,7 +175,7 @@ def test_the_table_and_the_recipe(blend, tmp_path, fake, monkeypatch, capsys):
         ("say(report=REPORT)", r"stopped \(status 0\)"),
         ("(folder / 'scene.glb').write_bytes(glb)", r"stopped \(status 0\)"),
         (WRITES + "os.abort()", r"crashed \(SIGABRT\)"),
-        ("print('[1, 2')", r"answer cannot be read"),
+        ("print('[1, 2')", r"output cannot be read"),
         (
             "say(error='the scene shows no shape', where=job['shown'], accepted='a scene with a mesh')",
             r"a scene\.blend: the scene shows no shape; expected a scene with a mesh$",
@@ -200,7 +200,7 @@ def test_blender_that_hangs_is_ended_with_what_it_started(blend, tmp_path, fake)
         f"Path({str(tmp_path / 'fake' / 'child')!r}).write_text(str(child))\n"
         "say(doing=\"baking the colours of 'Wall'\"); time.sleep(600)\n"
     )
-    with pytest.raises(BlinkGLError, match=r"did not come to an end in 1 s \(while baking the colours of 'Wall'\)"):
+    with pytest.raises(BlinkGLError, match=r"did not finish within 1 s \(while baking the colours of 'Wall'\)"):
         import_scene(blend, tmp_path / "out.glb", time_limit_s=1)
     nothing_left(tmp_path, blend.name)
     for pid in ((tmp_path / "who").read_text().split()[0], (tmp_path / "fake" / "child").read_text()):

@@ -151,13 +151,13 @@ def test_newton_converges_up_to_the_edge_with_tangential_distortion():
 def test_distortion_that_folds_in_the_picture_is_refused_with_the_radius():
     with pytest.raises(
         ConfigError,
-        match=r"^Radtan: the distortion turns back inside the picture \(got '70.3 px from the principal point'\); "
-        r"expected coefficients that reach the picture's corners, up to 89.6 px",
+        match=r"^Radtan: the distortion folds inside the image \(got '70.3 px from the principal point'\); "
+        r"expected coefficients that are monotonic up to the image corners,  89.6 px",
     ):
         Radtan(140, 112, 100.0, 100.0, 69.5, 55.5, 0.05, k1=-0.3)
     assert Radtan(90, 60, 100.0, 100.0, 44.5, 29.5, 0.05, k1=-0.3).reach == pytest.approx(2 / 3 / math.sqrt(0.9))
     with pytest.raises(
-        ConfigError, match=r"^Equidistant: the distortion turns back inside the picture \(got '62.8 px .*70.7 px"
+        ConfigError, match=r"^Equidistant: the distortion folds inside the image \(got '62.8 px .*70.7 px"
     ):
         Equidistant(100, 100, 20.0, 20.0, 49.5, 49.5)
     with pytest.raises(ConfigError, match=r"^Radtan.k2: not a coefficient \(got nan\); expected a finite number"):

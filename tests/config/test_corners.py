@@ -79,7 +79,7 @@ MIXED = [
             "readout": {"events_per_second": {"uniform": [1e4, 1e7]}, "queue_events": {"integer": [1, 2**24]}},
             "time": {"duration": {"uniform": [1, 3000]}, "start": 0},
         },
-        "time.duration: events that wait",
+        "time.duration: delayed events",
     ),
     (
         {"time": {"duration": {"uniform": [1000, 4000]}, "label_rate": {"uniform": [1, 300]}}},
@@ -97,7 +97,7 @@ MIXED = [
             "sensor": {"choice": [None, {"name": "x", "width": 9, "height": 9, "readout": {"queue_events": 16384}}]},
             "readout": {"choice": [None, {"events_per_second": 1}]},
         },
-        "readout.queue_events: the last event of a full queue would wait for more than an hour",
+        "readout.queue_events: the last event of a full queue would wait more than an hour",
     ),
     ({"scene": {"objects": {"count": {"uniform": [1, 9]}}}}, "scene.objects.count: not a whole number"),
     ({"labels": {"depth": {"uniform": [0, 1]}}}, "labels.depth: not true or false"),

@@ -27,16 +27,16 @@ def read(tmp_path, **changes):
         (
             {"exposure_us": 40_000, "rate": 30},
             (
-                "images.exposure_us: an exposure lasts into the next image's (got 40000.0); expected at most 33333.3, "
-                "or a lower rate"
+                "images.exposure_us: the exposure is longer than the image interval (got 40000.0); "
+                "expected at most 33333.3, or a lower rate"
             ),
         ),
-        ({"row_us": 200, "rate": 30}, "images.row_us: the rows are not read before the next image begins"),
+        ({"row_us": 200, "rate": 30}, "images.row_us: the read-out of the rows is longer than the image interval"),
         ({"row_us": 10_000, "rate": 0.1}, "images.exposure_us: no exposure fits into the sequence"),
         ({"times": [0.1, 1.2]}, "images.times: an exposure outside the sequence (got 1.2); expected from 0 to 1.095"),
         ({"times": [-0.1]}, "images.times: an exposure outside the sequence (got -0.1)"),
-        ({"times": [0.2, 0.1]}, "images.times: times of exposures are out of order"),
-        ({"times": [0.2, 0.201]}, "images.times: times of exposures are out of order, or nearer"),
+        ({"times": [0.2, 0.1]}, "images.times: exposure times are out of order"),
+        ({"times": [0.2, 0.201]}, "images.times: exposure times are out of order, or closer"),
         ({"times": []}, "images.times: too few entries"),
         (
             {"times": [0.2, 0.3], "rate": 20},
@@ -46,14 +46,17 @@ def read(tmp_path, **changes):
             {"times": [0.2, 0.3], "rate": 24, "preset": "deblurring"},
             "images.rate: images are taken at a rate or at times (got 24.0)",
         ),
-        ({"rate": None}, "images.rate: nothing says when images are taken (got None); expected a rate"),
-        ({"times": [0.2, 0.21], "row_us": 100}, "images.times: the rows are not read before the next image begins"),
+        ({"rate": None}, "images.rate: neither a rate nor times are given (got None); expected a rate"),
+        (
+            {"times": [0.2, 0.21], "row_us": 100},
+            "images.times: the read-out of the rows is longer than the image interval",
+        ),
         ({"bits": 7}, "images.bits: too small (got 7); expected a whole number from 8 to 16"),
         ({"bits": 17}, "images.bits: too large"),
         ({"response": "log"}, "images.response: unknown choice (got 'log')"),
-        ({"gamma": 1.8}, "images.gamma: only `response: gamma` has a gamma (got 1.8); expected response: gamma"),
+        ({"gamma": 1.8}, "images.gamma: gamma needs `response: gamma` (got 1.8); expected response: gamma"),
         ({"bayer": "rgbg"}, "images.bayer: unknown choice"),
-        ({"also": ["sharp", "sharp"]}, "images.also: named twice"),
+        ({"also": ["sharp", "sharp"]}, "images.also: given twice"),
         ({"lens": {"aperture": 0.1}}, "images.lens.focus: is required"),
         ({"lens": {"aperture": 0.1, "focus": 0}}, "images.lens.focus: too small"),
         ({"preset": "night"}, "images.preset: unknown choice (got 'night')"),
@@ -61,16 +64,16 @@ def read(tmp_path, **changes):
         (
             {"auto_exposure": {"longest_us": 1000}},
             (
-                "images.exposure_us: automatic exposure begins with an exposure outside its limits (got 5000.0); "
+                "images.exposure_us: the first exposure is outside the limits of auto_exposure (got 5000.0); "
                 "expected from 20 to 1000 (auto_exposure)"
             ),
         ),
         (
             {"auto_exposure": {"longest_us": 40_000}},
-            "images.auto_exposure.longest_us: an exposure lasts into the next image's (got 40000.0)",
+            "images.auto_exposure.longest_us: the exposure is longer than the image interval (got 40000.0)",
         ),
         ({"auto_exposure": {"shortest_us": 9e4}}, "images.auto_exposure.shortest_us: the shortest exposure exceeds"),
-        ({"auto_exposure": {}, "gain_db": 30}, "images.gain_db: automatic exposure begins with a gain above its limit"),
+        ({"auto_exposure": {}, "gain_db": 30}, "images.gain_db: the first gain is above the limit of auto_exposure"),
     ],
 )
 def test_what_cannot_be_is_one_line(tmp_path, images, said):

@@ -80,7 +80,7 @@ def test_a_group_does_not_depend_on_the_others(tmp_path):
     [
         ({"groups": {}}, "groups: not a table of groups"),
         ({"groups": {"a": 3}}, "groups.a: not a group"),
-        ({"groups": {"a": {"enabled": "maybe"}}}, "groups.a.enabled: not a switch"),
+        ({"groups": {"a": {"enabled": "maybe"}}}, "groups.a.enabled: not true or false"),
         (
             {"groups": {"a": {"output": {"name": "x"}}, "b": {"output": {"name": "x"}}}},
             "groups.b.output: writes the same folders as group 'a'",
@@ -93,7 +93,7 @@ def test_a_group_does_not_depend_on_the_others(tmp_path):
             {"groups": {"a": {"output": {"split": {"choice": ["train", "test"]}}}}},
             "output: in group 'a': belongs to the whole run and cannot be drawn",
         ),
-        ({"groups": {"a": {"enabled": False}}}, "groups: every group is switched off"),
+        ({"groups": {"a": {"enabled": False}}}, "groups: all groups are disabled"),
         (
             {
                 "events": {
@@ -215,7 +215,7 @@ def test_a_scene_from_another_file(tmp_path):
     for given, message in (
         ("scenes/two.yaml", "two.yaml: no such file"),
         (3, "scene.from: not a file"),
-        ("recipe.yaml", "scene.from: the file has no scene of its own"),
+        ("recipe.yaml", "scene.from: the file has no table scene"),
     ):
         with pytest.raises(ConfigError, match=message):
             load(tmp_path, {"scene": {"from": given}})
@@ -279,7 +279,7 @@ def test_keys_beside_a_recipe_win_and_groups_and_choices_have_recipes(tmp_path):
 def test_what_is_no_recipe(tmp_path):
     with pytest.raises(ConfigError, match="one of blinkflow, e2vid, etap"):
         events_of(tmp_path, "events: {recipe: etapp}")
-    with pytest.raises(ConfigError, match="the recipe is of another emulator"):
+    with pytest.raises(ConfigError, match="the recipe uses another emulator"):
         events_of(tmp_path, "events: {recipe: etap, emulator: v2e}")
 
 

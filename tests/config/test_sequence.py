@@ -158,7 +158,7 @@ def test_field_of_view_is_horizontal_and_the_principal_point_the_centre():
         ("events: {emulator: easim}", "events.emulator: unknown choice (got 'easim')"),
         (
             "labels: {flow: [sideways]}",
-            "labels.flow.0: no direction, and no interval (got 'sideways'); expected forward, backward",
+            "labels.flow.0: not a direction or an interval (got 'sideways'); expected forward, backward",
         ),
         (
             "output: {name: ../escape}",
@@ -263,9 +263,9 @@ ROWS = [
     ("scene.light.shadow_size", 30000, "scene.light.shadow_size: too large (got 30000)"),
     ("scene.light.environment", {"map": "no.hdr"}, "scene.light.environment.map: no such file (got 'no.hdr')"),
     ("scene.light.environment", {"map": "a", "strength": INF}, "environment.strength: not a finite number (got inf)"),
-    ("scene.light", {"unlit": True, "shadows": "hard"}, "scene.light.shadows: nothing is lit by them"),
+    ("scene.light", {"unlit": True, "shadows": "hard"}, "scene.light.shadows: these lights have no effect"),
     ("scene.materials.m.normal_map", "no.png", "scene.materials.m.normal_map: no such file (got 'no.png')"),
-    ("scene.materials.m.emission_map", "a.png", "scene.materials.m.emission: a map of light that is none"),
+    ("scene.materials.m.emission_map", "a.png", "scene.materials.m.emission: emission_map has no effect"),
     ("scene.materials.m.normal_scale", NAN, "scene.materials.m.normal_scale: not a finite number (got nan)"),
     ("scene.materials.m.metallic", 2, "scene.materials.m.metallic: too large (got 2); expected a number from 0 to 1"),
     ("scene.fog", {"density": -1}, "scene.fog.density: too small (got -1)"),

@@ -83,7 +83,7 @@ def test_a_cluster_of_ones_own_listens_on_the_loopback_alone(tmp_path, monkeypat
 def test_a_ray_that_cannot_be_told_is_refused(tmp_path, monkeypatch, capsys):
     monkeypatch.delattr("ray._private.ray_constants.ENABLE_RAY_CLUSTER")
     assert run(["generate", str(recipe_file(tmp_path)), "--out", str(tmp_path / "out"), "--executor", "ray"]) == 2
-    assert "this Ray cannot be told to listen to this machine alone" in capsys.readouterr().err
+    assert "this version of Ray cannot be restricted to this machine" in capsys.readouterr().err
     assert not ray.is_initialized() and not (tmp_path / "out").exists()
 
 

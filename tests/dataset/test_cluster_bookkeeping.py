@@ -189,7 +189,7 @@ class Worker:
     [
         ("e", "a", None),
         ("f", "a", "differs from the run's first in version or hardware: v f and e"),
-        ("e", "b", "sees other meshes"),
+        ("e", "b", "finds other meshes"),
     ],
 )
 def test_a_worker_looks_before_its_first_task(monkeypatch, environment, assets, said):

@@ -166,7 +166,7 @@ def test_a_temporary_that_is_deleted_costs_an_attempt_and_no_half_sequence_appea
 @pytest.mark.parametrize("executor", [Inline(), Local(1)], ids=["inline", "local"])
 def test_an_output_folder_that_is_deleted_stops_the_run(tmp_path, executor):
     out = tmp_path / "out"
-    with pytest.raises(OutputError, match="out: was deleted, moved or replaced while the run was at work in it"):
+    with pytest.raises(OutputError, match="out: was deleted, moved or replaced during the run"):
         run_dataset(template(tmp_path), out, executor, listener=Listener(lambda *_: shutil.rmtree(out), "done"))
     assert not temporaries(out) and not (out / "index.jsonl").exists() and not (out / ".run/run.json").exists()
     assert all(verify_dataset(manifest.parent).clean for manifest in out.rglob("manifest.json")), (
@@ -193,7 +193,7 @@ def test_a_driver_that_meets_another_takes_nothing_of_it_away(tmp_path):
     out = tmp_path / "out"
     first, second = RunFolder(out), RunFolder(out)
     with first.locked():
-        with pytest.raises(OutputError, match="another run is at work"), second.locked():
+        with pytest.raises(OutputError, match="another run uses this folder"), second.locked():
             raise AssertionError
         assert out.is_dir() and first.in_place
         shutil.rmtree(out)

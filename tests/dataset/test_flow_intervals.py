@@ -84,7 +84,7 @@ def test_damaged_files_are_one_line(made, tmp_path):
     row, file = LABELS["flow_intervals"], folder / "flow/intervals/000000.h5"
     value = row.forms[0].read(file)
     for changes, said in (
-        ({"interval_ns": value.interval_ns[::-1]}, "not intervals that increase"),
+        ({"interval_ns": value.interval_ns[::-1]}, "the intervals do not increase"),
         ({"valid": value.valid[1:]}, "arrays of different sizes"),
     ):
         file.write_bytes(row.forms[0].encode(Flows(**{**vars(value), **changes})))
@@ -107,7 +107,7 @@ def test_explain_python_and_shards(made):
         assert np.array_equal(frame.occlusion_intervals.occluded[1], frame.forward.occluded)
         with pytest.raises(KeyError, match="no flow over 0.5 s; there is flow over -0.01, 0.02 s"):
             frame.flow_intervals.over(0.5)
-        with pytest.raises(ConfigError, match="no direction, and no interval"):
+        with pytest.raises(ConfigError, match="not a direction or an interval"):
             renderer.frame(0.1, labels=[0.0])
     labels = record(load(made / "run.yaml"), labels=[0.1]).labels
     assert [len(one.flow_intervals.interval_ns) for one in labels] == [1, 1, 1, 0]
@@ -117,16 +117,16 @@ def test_explain_python_and_shards(made):
 @pytest.mark.parametrize(
     "flow, said",
     [
-        ([0.0], "labels.flow.0: no direction, and no interval (got 0.0); expected forward, backward, or an interval"),
-        (["forward", "1/0"], "labels.flow.1: no direction, and no interval (got '1/0')"),
-        (["1/"], "labels.flow.0: no direction, and no interval (got '1/')"),
-        (["1e999999999"], "labels.flow.0: no direction, and no interval (got '1e999999999')"),
-        (["fowards"], "labels.flow.0: no direction, and no interval (got 'fowards')"),
-        ([True], "labels.flow.0: no direction, and no interval (got True)"),
-        ([float("nan")], "labels.flow.0: no direction, and no interval (got nan)"),
-        ([1e9], "labels.flow.0: no direction, and no interval (got 1000000000.0)"),
-        ([0.01, "1/100"], "labels.flow: an interval twice (got 0.01); expected each once"),
-        ([0.25], "labels.flow: no label's flow leads so far: it would end outside the sequence (got 0.25); expected"),
+        ([0.0], "labels.flow.0: not a direction or an interval (got 0.0); expected forward, backward, or an interval"),
+        (["forward", "1/0"], "labels.flow.1: not a direction or an interval (got '1/0')"),
+        (["1/"], "labels.flow.0: not a direction or an interval (got '1/')"),
+        (["1e999999999"], "labels.flow.0: not a direction or an interval (got '1e999999999')"),
+        (["fowards"], "labels.flow.0: not a direction or an interval (got 'fowards')"),
+        ([True], "labels.flow.0: not a direction or an interval (got True)"),
+        ([float("nan")], "labels.flow.0: not a direction or an interval (got nan)"),
+        ([1e9], "labels.flow.0: not a direction or an interval (got 1000000000.0)"),
+        ([0.01, "1/100"], "labels.flow: an interval is given twice (got 0.01); expected each once"),
+        ([0.25], "labels.flow: the interval is too long: the flow would end outside the sequence (got 0.25); expected"),
         ([-0.21], "expected intervals of at most 0.2 s, or a longer time.duration"),
     ],
 )
@@ -195,9 +195,7 @@ def test_a_table_that_fits_nothing_is_refused(made_of_shown_labels, tmp_path, ca
     (tmp_path / "a.yaml").write_text(to_yaml(tree), encoding="utf-8")
     assert run(["generate", str(tmp_path / "a.yaml"), "--out", str(tmp_path / "out")]) != 0
     said = " ".join(capsys.readouterr().err.split())
-    assert (
-        "labels.semantics: no object has a name that one of the patterns fits (got ['car*', 'bus']); expected" in said
-    )
+    assert "labels.semantics: no object's name matches a pattern (got ['car*', 'bus']); expected" in said
     assert "cuboid" in said and "Traceback" not in said and not list((tmp_path / "out").rglob("manifest.json"))
     with Renderer(load(tmp_path / "a.yaml")) as renderer:
         assert renderer.frame(0.05, labels=["semantics"]).semantics.max() > 1  # by kinds of shape

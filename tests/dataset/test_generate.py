@@ -345,5 +345,5 @@ def test_a_damaged_list_of_exposures_is_one_line(made_of_frame_camera_runs, tmp_
 
 
 def test_no_list_of_exposures_is_said(tmp_path):
-    with pytest.raises(AssetError, match="no frame camera here"):
+    with pytest.raises(AssetError, match="the sequence has no frame camera"):
         read_exposures(tmp_path)

@@ -210,7 +210,7 @@ def test_another_recipe_is_refused(tmp_path):
     other = load_run(recipe_file(tmp_path), ["groups.probe.camera.width=80"])
     for resume in (False, True):
         with pytest.raises(
-            OutputError, match=r"holds the run of another recipe \(different: probe\); expected .*--mixed"
+            OutputError, match=r"contains a run of another recipe \(different: probe\); expected .*--mixed"
         ):
             run_dataset(other, tmp_path / "out", resume=resume)
     with pytest.raises(OutputError, match="exists; expected a new folder name, or --resume"):
@@ -265,5 +265,5 @@ def test_a_group_that_is_switched_off_is_not_planned(tmp_path):
     assert [task.name for task in plan.tasks] == [name for name in NAMES if "fly" in name]
     assert plan.tasks.number("test/probe_000000") is None and plan.tasks.splits == ["train"]
     off = {name: {**group, "enabled": False} for name, group in RECIPE["groups"].items()}
-    with pytest.raises(ConfigError, match="groups: every group is switched off; expected enabled: true"):
+    with pytest.raises(ConfigError, match="groups: all groups are disabled; expected enabled: true"):
         Plan.of(load_run(recipe_file(tmp_path, groups=off)))

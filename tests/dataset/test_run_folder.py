@@ -58,9 +58,9 @@ def test_files_that_are_not_those_the_run_began_with(tmp_path, before, now, said
     folder.check(plan({"": "a"}), now, True)
     with pytest.raises(OutputError) as caught:
         folder.check(plan({"": "a"}), now, False)
-    assert f"the pools are not those the run began with: {said}; expected" in str(caught.value) or str(
+    assert f"the pools have changed since the run began: {said}; expected" in str(caught.value) or str(
         caught.value
-    ).split("began with: ")[1].startswith(said + ";")
+    ).split("have changed since the run began: ")[1].startswith(said + ";")
 
 
 def test_another_installation(tmp_path):
@@ -153,7 +153,9 @@ def test_groups_that_ask_for_different_opengl(tmp_path, monkeypatch):
         renderer="r", version="v", release=lambda: made.append("released")
     ))  # fmt: skip
     monkeypatch.setattr(Plan, "check_assets", lambda self: {"a": "b"})
-    with pytest.raises(ConfigError, match="gl: the groups ask for different OpenGL; expected one gl section"):
+    with pytest.raises(
+        ConfigError, match="gl: the groups need different OpenGL implementations; expected one gl section"
+    ):
         Maker(recipe(tmp_path, a={"gl": {"device": 1}}, b={"gl": {"device": 2}})).open()
     assert made == []
     for device, expected in ((None, 3), (0, 0), (5, 5)):

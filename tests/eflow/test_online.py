@@ -198,8 +198,8 @@ def test_sources_that_make_no_sense(tmp_path, source, said):
 @pytest.mark.parametrize(
     ("changes", "where", "said"),
     [
-        ({"labels.flow": []}, "labels.flow", "no flow to learn from"),
-        ({"groups.one.enabled": False, "groups.two.enabled": False}, "output.split", "nothing of split 'train'"),
+        ({"labels.flow": []}, "labels.flow", "no flow labels to learn from"),
+        ({"groups.one.enabled": False, "groups.two.enabled": False}, "output.split", "no sequences of split 'train'"),
         ({"scene.objects.count": -1}, "scene.objects.count", "count"),
         ({"frames": {"folders": ["x"], "images": "i", "fps": 10}}, "frames", "recorded frames are not rendered"),
     ],

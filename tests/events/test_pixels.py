@@ -153,7 +153,9 @@ def test_the_bus_does_not_care_from_when_the_clock_counts():
     made, again = early.step(Events(x, y, t, p)), late.step(Events(x, y, t + shift, p))
     assert_same(again, replace(made, t=made.t + shift))
     assert late.dropped == early.dropped > 0
-    with pytest.raises(EventDataError, match="counts from the first event .got '110 days'.; expected at most 100"):
+    with pytest.raises(
+        EventDataError, match="the time since the first event is too long .got '110 days'.; expected at most 100"
+    ):
         late.step(Events(x[:1], y[:1], np.array([shift + 110 * 86_400_000_000]), p[:1]))
 
 

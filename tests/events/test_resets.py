@@ -96,5 +96,5 @@ def test_the_signal_of_any_emulator_jumps_by_so_many_thresholds(config, kick, ex
 
 
 def test_a_jump_that_lasts_into_the_next_is_refused():
-    with pytest.raises(ConfigError, match="length_ms: the jump lasts into the next one .*at most 9,"):
+    with pytest.raises(ConfigError, match="length_ms: the jump does not end before the next one .*at most 9,"):
         validate(ReadoutConfig, {"frame_resets": {"interval_ms": 10, "kick": 0.1, "length_ms": 10}})

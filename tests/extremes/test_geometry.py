@@ -177,7 +177,7 @@ def test_an_image_beyond_opengl_is_refused(gl):
     for width, antialiasing in ((5000, "ssaa4"), (16384, "ssaa2")):
         with (
             Renderer(gl, sized(width, 2), RenderConfig(antialiasing=antialiasing)) as renderer,
-            pytest.raises(GLError, match="beyond this OpenGL's limit"),
+            pytest.raises(GLError, match="exceeds this OpenGL's limit"),
         ):
             renderer.luminance(0).read()
 

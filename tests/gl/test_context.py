@@ -266,7 +266,7 @@ def test_a_process_forked_after_a_context_is_told_so_and_does_not_hang():
     new, old, parent = forked(True, "new", "inherited")
     for line in (new, old):
         assert (
-            "this process was forked from one that had opened OpenGL, and would hang; use "
+            "this process was forked from one that uses OpenGL, and would hang; use "
             "multiprocessing.get_context('spawn')"
         ) in line
     assert parent == "parent 2", "the parent goes on"
@@ -293,7 +293,7 @@ def test_a_context_that_draws_no_more_is_noticed(gl):
 
     with create_context() as other:
         other.idle = Gone
-        said = r"^llvmpipe.*: the card has lost its context.*; expected another try, in a new context"
+        said = r"^llvmpipe.*: the GPU has lost its context.*; expected another try, in a new context"
         with pytest.raises(GLError, match=said) as caught:
             other.check()
         assert other.lost and may_pass(caught.value)
@@ -395,7 +395,7 @@ def test_a_context_of_another_thread_is_refused_and_nothing_of_ours_is_freed(gl)
         gl.make_current()
         with gl.framebuffer(4, 4, ("R32F",), depth=False) as target:
             target.clear(1.0)
-            with pytest.raises(GLError, match="in use by another thread"):
+            with pytest.raises(GLError, match="another thread uses this context"):
                 box["other"].release()
             target.clear(2.0)
             assert (target.read(0) == 2.0).all()

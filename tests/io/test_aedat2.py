@@ -173,7 +173,7 @@ START = len(header())
         (b"\x89PNG", r"not an AEDAT file: wrong magic \(got b'\\x89PNG'\)"),
         (b"", r"not an AEDAT file: wrong magic"),
         (header(None) + records([0], [1]), r"no camera named in the header"),
-        (header("ch.unizh.ini.jaer.chip.retina.DVS128"), r"a camera whose addresses are not known \(got 'DVS128'\)"),
+        (header("ch.unizh.ini.jaer.chip.retina.DVS128"), r"a camera with unknown addresses \(got 'DVS128'\)"),
     ],
 )
 def test_files_that_are_not_opened(tmp_path, data, message):
@@ -193,9 +193,9 @@ def test_files_that_are_not_opened(tmp_path, data, message):
         (records([0, 1 << 31 | 200 << 22], [1, 2]), rf"outside the sensor: record 1, at byte {START + 8}"),
         (
             records([0] * 4, [100, 200, 150, 300]),
-            rf"times run backwards: record 2, at byte {START + 16} \(got 150\); expected at least 200 µs, or a wrap",
+            rf"times decrease: record 2, at byte {START + 16} \(got 150\); expected at least 200 µs, or a wrap",
         ),
-        (records([0] * 2, [2**32 - 1, 2**31 + 10]), rf"times run backwards: record 1, at byte {START + 8}"),
+        (records([0] * 2, [2**32 - 1, 2**31 + 10]), rf"times decrease: record 1, at byte {START + 8}"),
     ],
 )
 def test_damage_is_refused_by_its_place(tmp_path, data, message):

@@ -120,5 +120,5 @@ def test_frames_whose_times_do_not_increase(monkeypatch, times):
 def test_samples_whose_times_run_backwards(monkeypatch):
     rows = np.zeros(3, [("t", "<u8")])
     rows["t"] = (5, 9, 8)
-    with pytest.raises(EventDataError, match=r"times run backwards at sample 2 of the inertial unit \(got \(9, 8\)\)"):
+    with pytest.raises(EventDataError, match=r"times decrease at sample 2 of the inertial unit \(got \(9, 8\)\)"):
         recorded(monkeypatch, "imus", [rows]).imu()

@@ -115,14 +115,14 @@ def one(x=0, y=0, t=0, p=0) -> Events:
 @pytest.mark.parametrize(
     "second, message",
     [
-        (one(t=9), r"run backwards at event 1 .*10, 9"),
+        (one(t=9), r"decrease at event 1 .*10, 9"),
         (one(t=10, x=64), r"outside the sensor.*x < 64"),
         (one(t=10, y=48), "outside the sensor"),
         (one(t=10, p=2), "polarity"),
         (one(t=10 + 2**32), "71.6 minutes"),
         (
             Events(*(np.array(v, d) for v, d in (([1, 1], "u2"), ([1, 1], "u2"), ([30, 20], "i8"), ([0, 0], "u1")))),
-            "run backwards at event 2",
+            "decrease at event 2",
         ),
     ],
 )

@@ -125,7 +125,7 @@ def test_a_vector_may_not_leave_the_row(tmp_path, words, bad):
     """The last pixel is 2047; a bit beyond it is damage, a clear one is nothing."""
     with pytest.raises(
         AssetError,
-        match=rf"damaged at byte {len(b'% evt 3.0' + b'% end') + 2 + 2 * bad}: no EVT3 word can stand here .got "
+        match=rf"damaged at byte {len(b'% evt 3.0' + b'% end') + 2 + 2 * bad}: no valid EVT3 word .got "
         rf"'0x{words[bad]:04x}'",
     ):
         decoded(tmp_path / "e.raw", "evt3", words)
@@ -140,7 +140,7 @@ def test_a_vector_may_not_leave_the_row(tmp_path, words, bad):
 def test_kinds_of_words_that_do_not_exist(tmp_path, version, kinds):
     shift = 28 if version == "evt2" else 12
     for kind in kinds:
-        with pytest.raises(AssetError, match=f"damaged at byte .*no {version.upper()} word"):
+        with pytest.raises(AssetError, match=f"damaged at byte .*no valid {version.upper()} word"):
             decoded(tmp_path / "e.raw", version, [8 << shift, kind << shift])
 
 
@@ -202,7 +202,7 @@ def one(t: int) -> Events:
     [
         ([-1], "got '?-1'?.; expected 0 to less"),
         ([1 << 34], f"got '?{1 << 34}'?.; expected 0 to less"),
-        ([(1 << 34) - 1, 5], "backwards at event 1"),
+        ([(1 << 34) - 1, 5], "decrease at event 1"),
     ],
 )
 def test_times_beyond_the_writers_limits(tmp_path, times, said):

@@ -70,7 +70,7 @@ def test_files_that_lead_elsewhere_are_refused(tmp_path, how, message, kind):
             del file[name]
             how(file, name, secret)
         read = lambda: open_events(path).read()
-    with pytest.raises(AssetError, match=rf"e.h5: '.*' is {message}, which leads to other files; refused"):
+    with pytest.raises(AssetError, match=rf"e.h5: '.*' is {message}, which refers to other files; refused"):
         read()
 
 
@@ -111,9 +111,9 @@ def test_claims_without_data(tmp_path):
         file["one"] = np.uint64(5)
     with open_hdf5(tmp_path / "a.h5") as file:
         for name, message in (
-            ("chunked", "claims 1000000000000 values, but fewer"),
-            ("plain", "but fewer"),
-            ("chunk", "chunks too large"),
+            ("chunked", "declares 1000000000000 values, but stores fewer"),
+            ("plain", "but stores fewer"),
+            ("chunk", "chunks that are too large"),
         ):
             with pytest.raises(AssetError, match=message):
                 dataset(file, name, tmp_path / "a.h5", shape=(None,))
@@ -149,7 +149,7 @@ def test_blosc_without_its_parameters_does_not_crash(tmp_path):
     path.write_bytes(data)
     with (
         open_hdf5(path) as file,
-        pytest.raises(AssetError, match="m.h5: damaged HDF5 file: dataset 'd' lacks what Blosc needs"),
+        pytest.raises(AssetError, match="m.h5: damaged HDF5 file: dataset 'd' lacks data that Blosc needs"),
     ):
         dataset(file, "d", path, shape=(64,), kinds="f")
 

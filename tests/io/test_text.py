@@ -101,7 +101,7 @@ def test_coordinates_and_polarities_that_are_none(tmp_path, line):
     ],
 )
 def test_units_of_time_do_not_mix(tmp_path, text, lines):
-    with pytest.raises(AssetError, match=f"line {lines} has its time in another unit"):
+    with pytest.raises(AssetError, match=f"line {lines} has a time in another unit"):
         read(tmp_path / "e.txt", text)
 
 
@@ -132,7 +132,7 @@ def test_the_unit_that_a_name_says_binds(tmp_path, head, unit):
         if unit is None or (unit == 0.5) == seconds:
             assert read(path, f"{head}\n{t} 1 2 1\n").t.tolist() == [microseconds]
         else:
-            with pytest.raises(AssetError, match="line 2 has its time in another unit"):
+            with pytest.raises(AssetError, match="line 2 has a time in another unit"):
                 read(path, f"{head}\n{t} 1 2 1\n")
 
 

@@ -298,7 +298,7 @@ def test_refusals(data, sequence, tmp_path):
         export_layout(tmp_path / "cut", tmp_path / "new", "dsec")
     shutil.copytree(sequence, tmp_path / "twice/train/a")
     shutil.copytree(sequence, tmp_path / "twice/test/a")
-    with pytest.raises(OutputError, match="two sequences would be written to one place"):
+    with pytest.raises(OutputError, match="two sequences would be written to the same place"):
         export_layout(tmp_path / "twice", tmp_path / "new", "eraft")
     assert not (tmp_path / "new").exists()
     assert run(["export", str(data), "--layout", "dsec", "--seed", "3", "--out", str(tmp_path / "new")]) == 2

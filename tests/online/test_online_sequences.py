@@ -145,7 +145,7 @@ def test_batches_are_the_same_however_many_loader_processes(recipe):
         ({"window_ms": float("nan")}, "window_ms: not a finite number"),
         ({"steps": 0, "kind": "streams"}, "steps: not a whole number in range"),
         ({"split": "val"}, "split: unknown split (got 'val'); expected train, test"),
-        ({"split": "test"}, "the recipe has nothing of split 'test'"),
+        ({"split": "test"}, "the recipe has no sequences of split 'test'"),
         ({"workers": -1}, "workers: not a whole number in range"),
         ({"rank": 2, "world": 2}, "rank: not a whole number in range"),
         ({"first": 1.5}, "first: not a whole number in range"),
@@ -183,7 +183,7 @@ def test_a_context_that_is_lost_costs_no_sample(recipe, monkeypatch):
         calls.append(self)
         if len(calls) in (1, 3):
             self.lost = True
-            raise GLError("the card has lost its context")
+            raise GLError("the GPU has lost its context")
         check(self)
 
     monkeypatch.setattr(GLContext, "check", lose)

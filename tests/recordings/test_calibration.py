@@ -150,7 +150,7 @@ def test_from_files_to_a_sensor_file_and_a_page(tmp_path, capsys):
     assert found["log_eps"] == 0.03
     emulator_config({"emulator": "esim", **found})
     page = (tmp_path / "mine.html").read_text()
-    assert "data:image/png" in page and "asked to stay as it was" in page
+    assert "data:image/png" in page and "kept fixed by request" in page
     assert run(["calibrate", str(camera), "--frames", str(frames), "--out", str(out)]) == 2
     assert "output file exists" in capsys.readouterr().err
 
@@ -216,7 +216,7 @@ def test_known_values_come_back(tmp_path, seed):
     "what, said",
     [
         ("no frames", "the recording has no frames"),
-        ("other size", "frames are of another size than the recording .*got '64x80'.*80x64"),
+        ("other size", "frames and recording have different sizes .*got '64x80'.*80x64"),
         ("no times", "frames without times"),
         ("other scene", "events and frames do not match"),
         ("other clock", "events and frames do not match"),
@@ -225,7 +225,7 @@ def test_known_values_come_back(tmp_path, seed):
         ("two frames", r"fewer than two intervals .*got \[\(\d"),
         ("no motion", "events and frames do not match"),
         ("unknown key", "speed"),
-        ("ratio", "fitted one by one"),
+        ("ratio", "fitted separately"),
         ("interpolation", "interpolate: unknown interpolation"),
         ("still and frames", "a still scene needs no frames"),
     ],
@@ -264,7 +264,7 @@ def test_one_line_and_nothing_written(tmp_path, capsys, what, said):
 
 def test_an_emulator_that_says_nothing_and_a_file_of_another_kind(tmp_path, capsys):
     camera, frames = files(tmp_path)
-    with pytest.raises(ConfigError, match="nothing is left to be fitted"):
+    with pytest.raises(ConfigError, match="no parameter is left to fit"):
         calibrate(camera, frames, fixed=emulator_config("esim").fitted)
     with pytest.raises(BlinkGLError, match="no such file"):
         calibrate(tmp_path / "none.npz", frames)

@@ -147,7 +147,7 @@ def flickering(count: int) -> np.ndarray:
         (noisy(scene(2), 4 * CODE**2, 0.0), "own noise is"),
         (np.round(scene(6) * 255).astype(np.uint8), "0 events"),
     ],
-    ids=["flicker", "clipped", "four bits", "two frames", "nothing moves"],
+    ids=["flicker", "clipped", "four bits", "two frames", "in a static scene"],
 )
 def test_frames_with_a_caveat(tmp_path, capsys, frames, said):
     np.save(tmp_path / "v.npy", frames)

@@ -72,9 +72,9 @@ def test_the_command_writes_a_sensor_file_that_can_be_used(tmp_path, capsys):
     assert run(["calibrate", str(tmp_path / "still.npz"), *options]) == 2  # not written over
     assert "mine.yaml: output file exists" in capsys.readouterr().err
     for wrong, said in (
-        (["--emulator", "pixels"], "--emulator: the noise of single pixels shows where nothing moves"),
-        (["--emulator", "pixels", "--still", "--set", "a=1"], "--set: says something of an emulator"),
-        (["--emulator", "pixels", "--still", "--sensor", "DVXplorer"], "--sensor: says something of an emulator"),
+        (["--emulator", "pixels"], "--emulator: the noise of single pixels is measured in a static scene"),
+        (["--emulator", "pixels", "--still", "--set", "a=1"], "--set: this is an option of emulators"),
+        (["--emulator", "pixels", "--still", "--sensor", "DVXplorer"], "--sensor: this is an option of emulators"),
     ):
         assert run(["calibrate", str(tmp_path / "still.npz"), *wrong, "--out", str(tmp_path / "no.yaml")]) == 2
         error = capsys.readouterr().err
@@ -83,7 +83,7 @@ def test_the_command_writes_a_sensor_file_that_can_be_used(tmp_path, capsys):
 
 
 def test_too_few_events_are_refused():
-    with pytest.raises(EventDataError, match="too few events to tell the noise of single pixels"):
+    with pytest.raises(EventDataError, match="too few events to estimate the noise of single pixels"):
         fit_pixels_of(recorded(PixelsConfig(rate_hz=0.001)), SIZE)
 
 

@@ -171,7 +171,9 @@ def test_semantics_are_the_first_pattern_that_fits(made):
     assert [class_of(one) for one in what.objects][:3] == ["cuboid", "wall", "Chair"]
     assert category_of(what.objects[0], BY_NAME) == 4 and category_of(what.objects[2], BY_NAME) == 255
     row, labels = LABELS["semantics"], LabelsConfig(semantics={"car*": 1, "bus": 2})
-    with pytest.raises(ConfigError, match=r"labels.semantics: no object has a name .*patterns of cuboid, wall, Chair"):
+    with pytest.raises(
+        ConfigError, match=r"labels.semantics: no object's name matches .*patterns of cuboid, wall, Chair"
+    ):
         row.check(what, labels)
     row.check(what, LabelsConfig(semantics={"car*": 1, "*": 0}))
     facts = row.facts(what, LabelsConfig(semantics={"cuboid*": 7}))

@@ -140,7 +140,7 @@ def test_mistakes_of_a_pass_are_named(gl):
     with Renderer(gl, mixed_scene(48, 36), PLAIN) as renderer:
         with pytest.raises(GLError, match="Geometry: the pass has no such output .got 'depht'.; expected ids"):
             renderer.draw(Wrong(), 0)
-        with pytest.raises(GLError, match="Geometry: the pass keeps no depth buffer that can be read"):
+        with pytest.raises(GLError, match="Geometry: the pass has no readable depth buffer"):
             renderer.draw(NoDepth(), 0)
         with pytest.raises(ShaderError, match="no such shader file .got '.*nowhere.glsl'"):
             renderer.draw(Nowhere(), 0)
@@ -200,7 +200,7 @@ def test_a_frame_that_was_drawn_over_says_so(gl):
         image = first.read()
         second = renderer.luminance(SECOND // 2)
         for use in (first.read, first.view, first.texture):
-            with pytest.raises(GLError, match="frame at 0 s: this frame is no longer on the card"):
+            with pytest.raises(GLError, match="frame at 0 s: this frame is no longer on the GPU"):
                 use()
         assert not np.array_equal(image, second.read())
         np.testing.assert_array_equal(image, other.read()[..., 0])

@@ -137,7 +137,7 @@ def test_another_camera_takes_nothing_from_the_first(gl):
         assert last.changed_since(first) and last.rows_changed_since(first) is not None
         renderer.labels(0, request, SECOND // 9)
         renderer.look_through(other)
-        with pytest.raises(GLError, match="no longer on the card"):
+        with pytest.raises(GLError, match="no longer on the GPU"):
             last.view()
         frame = renderer.luminance(SECOND // 9)
         assert frame.changed is None and frame.changed_since(last) is None and frame.rows_changed_since(last) is None

@@ -33,7 +33,7 @@ def test_a_frame_as_a_tensor_is_what_is_read(gl):
         renderer.luminance(10**8)
         assert np.array_equal(kept.numpy(), wanted), "a tensor is the caller's own"
         assert first.moment is not None
-        with pytest.raises(GLError, match="no longer on the card"):
+        with pytest.raises(GLError, match="no longer on the GPU"):
             first.tensor("cpu")
 
 

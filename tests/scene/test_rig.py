@@ -102,7 +102,7 @@ def test_disparity_is_focal_length_times_baseline_over_depth(gl):
 @pytest.mark.parametrize(
     "make, message",
     [
-        (lambda: Rig(StaticPath(np.eye(4)), ()), r"^Rig.sensors: a rig without a sensor; expected one or more"),
+        (lambda: Rig(StaticPath(np.eye(4)), ()), r"^Rig.sensors: the rig has no sensor; expected one or more"),
         (
             lambda: Rig(StaticPath(np.eye(4)), (Sensor(CAMERA, folder="a"), Sensor(CAMERA, folder="a"))),
             r"^Rig.sensors: two sensors have one folder \(got 'a'\); expected a folder each",
@@ -188,10 +188,10 @@ def test_a_spot_light_fades_by_the_square_of_the_cosines_ramp():
         ({"lights": [{"kind": "point", "position": [0, 0, 1], "angle": 4}]}, "lights.0.*angle"),
         ({"lights": [{**SPOT, "look_at": [1, 2, 3]}]}, "look_at: must differ from the position"),
         ({"lights": [SPOT] * 32}, "scene.light.lights: too many lights .got 32.; expected at most 31"),
-        ({"environment": {"map": "a.hdr"}, "unlit": True}, "scene.light.environment: nothing is lit by them"),
+        ({"environment": {"map": "a.hdr"}, "unlit": True}, "scene.light.environment: these lights have no effect"),
         ({"environment": {}}, "scene.light.environment.map"),
         ({"environment": {"map": "a.hdr", "strength": -1}}, "environment.strength.*got -1"),
-        ({"lights": [SPOT], "unlit": True}, "scene.light.lights: nothing is lit by them"),
+        ({"lights": [SPOT], "unlit": True}, "scene.light.lights: these lights have no effect"),
     ],
 )
 def test_what_is_refused(tree, expected):
@@ -224,10 +224,13 @@ def test_bad_random_lights():
         ({"lights": {"count": [0, 99]}}, "lights.count.1"),
         ({"lights": {"angle": [10, 179]}}, "lights.angle: out of range"),
         ({"lights": {"kinds": []}}, "lights.kinds"),
-        ({"lights": {}, "light": {"unlit": True}}, "lights: nothing is lit by them"),
-        ({"sky": {"lights": True}}, "sky.lights: only panoramas light"),
-        ({"sky": {"lights": True, "panoramas": "a.hdr"}, "light": {"unlit": True}}, "sky.lights: nothing is lit"),
-        ({"light": {"environment": {"map": "a.hdr"}}}, "light.environment: a random world is lit by its own sky"),
+        ({"lights": {}, "light": {"unlit": True}}, "lights: these lights have no effect"),
+        ({"sky": {"lights": True}}, "sky.lights: only panoramas can light the scene"),
+        (
+            {"sky": {"lights": True, "panoramas": "a.hdr"}, "light": {"unlit": True}},
+            "sky.lights: these lights have no effect",
+        ),
+        ({"light": {"environment": {"map": "a.hdr"}}}, "light.environment: a random world uses the light of its sky"),
     ):
         with pytest.raises(ConfigError, match=expected):
             validate(RandomSceneConfig, tree, where="scene")

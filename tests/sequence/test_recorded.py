@@ -98,7 +98,7 @@ def test_times_of_frames_do_not_drift(clip, fps):
 
 @pytest.mark.parametrize("given", [{"window_ns": (0, 1)}, {"scene": object()}, {"renderer": object()}])
 def test_nothing_is_drawn_of_them(clip, given):
-    with pytest.raises(ConfigError, match="frames: nothing is drawn of recorded frames"):
+    with pytest.raises(ConfigError, match="frames: recorded frames are not drawn"):
         opened(clip, **given)
 
 
@@ -112,9 +112,9 @@ def test_nothing_is_drawn_of_them(clip, given):
         ("3_flow", {"count": 4}, None),
         ("3_mask", {"count": 4}, None),
         ("3_mask", {"first": 1, "count": 3}, None),
-        ("1_flow", {"count": 4}, "2_flow.npy: the files do not go with the frames.*go with 1.png"),
-        ("1_mask", {"count": 4}, "2_mask.npy: the files do not go with the frames"),
-        ("0_flow", {"count": 4}, "1_flow.npy: the files do not go with the frames"),
+        ("1_flow", {"count": 4}, "2_flow.npy: the files do not match the frames.*go with 1.png"),
+        ("1_mask", {"count": 4}, "2_mask.npy: the files do not match the frames"),
+        ("0_flow", {"count": 4}, "1_flow.npy: the files do not match the frames"),
     ],
 )
 def test_a_flow_file_for_every_pair_that_is_used(clip, gone, frames, said):

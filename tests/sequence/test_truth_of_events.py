@@ -108,10 +108,10 @@ def test_the_events_are_those_that_come_without_it():
 
 def test_what_has_no_place_for_it_says_so(tmp_path):
     scene = apart()
-    with pytest.raises(ConfigError, match="belongs to events, not to a time"):
+    with pytest.raises(ConfigError, match="a label of events has no value at a time"):
         render_frame(scene, 0.0, labels=["events"])
     events = record(scene, labels=["events"]).events
-    with pytest.raises(OutputError, match="event files do not hold what made the events"):
+    with pytest.raises(OutputError, match="event files cannot store what caused the events"):
         write_events(tmp_path / "e.h5", events, 48, 72)
     assert not list(tmp_path.iterdir())
 

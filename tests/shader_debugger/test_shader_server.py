@@ -254,7 +254,7 @@ def test_edits_are_taken_errors_keep_the_last_good_program(served):
     label.write_text(good)
     unused = next_version(server, broken["version"])
     assert unused["generation"] == now["generation"]
-    assert "the shader does not use 'in_position' any more" in unused["errors"][0]["text"]
+    assert "the shader no longer uses 'in_position'" in unused["errors"][0]["text"]
 
     vertex.write_text(whole)
     mended = next_version(server, unused["version"])

@@ -172,8 +172,8 @@ def test_a_mistake_in_a_term_is_found(shader, living, shaders, mutant):
     "wrong, status, words",
     [
         # With every vertex at one place the compiler leaves no attribute at all.
-        ("return vec3(0.0);", 2, "error: debug.glsl: the shader does not use 'in_position' any more"),
-        ("return p;", 1, "label.glsl: the shader does not use 'in_weights_0' any more"),
+        ("return vec3(0.0);", 2, "error: debug.glsl: the shader no longer uses 'in_position'"),
+        ("return p;", 1, "label.glsl: the shader no longer uses 'in_weights_0'"),
     ],
 )
 def test_what_the_compiler_removed_is_named(shader, living, shaders, wrong, status, words):
@@ -190,11 +190,11 @@ def test_a_run_with_edited_shaders_names_what_they_do_not_use(living, shaders):
     with create_context() as gl:
         gl.shaders = ShaderLoader(gl.ctx, shaders)
         with Renderer(gl, subject.scene, subject.config.render) as renderer:
-            with pytest.raises(ShaderError, match=r"^luminance.glsl: the shader does not use 'in_position' any more"):
+            with pytest.raises(ShaderError, match=r"^luminance.glsl: the shader no longer uses 'in_position'"):
                 renderer.luminance(0)
             gl.shaders.clear()
             edit(shaders / "include/motion.glsl", "vec3 d = rate * vec4(local, 1.0);", "vec3 d = local;")
-            with pytest.raises(ShaderError, match=r"^velocity.glsl: the shader does not use 'rate' any more"):
+            with pytest.raises(ShaderError, match=r"^velocity.glsl: the shader no longer uses 'rate'"):
                 renderer.velocity(0)
 
 

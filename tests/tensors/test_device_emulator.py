@@ -44,7 +44,7 @@ def test_auto_takes_a_card_that_can_do_it(card, monkeypatch):
     monkeypatch.setattr(devices, "_trials", {})
     monkeypatch.setattr(devices, "same_events", lambda *_: False)
     assert made(CARD) == "cpu"
-    with pytest.raises(EventDataError, match=r"^events\.device: the card's events of a trial"):
+    with pytest.raises(EventDataError, match=r"^events\.device: the GPU's events of a trial"):
         made(CARD, device="cuda")
 
 
@@ -69,7 +69,7 @@ def test_a_step_that_the_processor_would_cut_is_refused(card):
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a card")
 def test_without_a_card_it_is_said():
     assert made(CARD) == "cpu"
-    with pytest.raises(EventDataError, match=r"^events\.device: torch sees no CUDA card.*cpu, or auto"):
+    with pytest.raises(EventDataError, match=r"^events\.device: torch finds no CUDA GPU.*cpu, or auto"):
         made(None, device="cuda")
 
 

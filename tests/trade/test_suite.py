@@ -93,10 +93,10 @@ def test_no_rival_beats_a_preset_measured_again(measured):
 def test_a_scene_that_cannot_be_measured_has_a_line_and_the_others_stay(measured, folder):
     result, out = measured
     assert result["missing"] == ["broken"] and not result["complete"]
-    assert "nothing to trade" in result["scenes"]["broken"]["error"]
+    assert "no settings to compare" in result["scenes"]["broken"]["error"]
     assert json.loads((out / "suite.json").read_text())["missing"] == ["broken"]
     assert (out / "suite.csv").read_text().count("\nworld,") == len(result["scenes"]["world"]["settings"])
-    with pytest.raises(ConfigError, match="nothing to trade"):
+    with pytest.raises(ConfigError, match="no settings to compare"):
         run_suite([Trial("broken", folder / "broken.yaml")], out / "alone", options=OPTIONS)
 
 
@@ -140,12 +140,12 @@ def test_samples_of_a_reference_end_where_plain_ones_do(gl, folder):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--suite", "--scene", "moon"], "--scene: no scene is called that"),
+        (["--suite", "--scene", "moon"], "--scene: no scene has this name"),
         (["--suite", "nowhere"], "nowhere: the suite is a folder of scenes"),
-        (["--suite", "--quick"], "--quick: is for one scene"),
-        (["--suite", "--only", "raytracing"], "no setting is called that"),
-        ([], "which scene?"),
-        (["c.yaml", "--scene", "moon"], "--scene: is of the suite"),
+        (["--suite", "--quick"], "--quick: these are options of a single scene"),
+        (["--suite", "--only", "raytracing"], "no setting has this name"),
+        ([], "no scene given"),
+        (["c.yaml", "--scene", "moon"], "--scene: these are options of the suite"),
     ],
 )
 def test_bad_input(arguments, message, tmp_path, capsys):

@@ -210,10 +210,10 @@ def test_a_port_in_use_is_refused():
         (["/nowhere"], "no such folder"),
         (["{root}/single", "--port", "70000"], "--port: no port (got 70000); expected 0 to 65535"),
         (["{root}/single", "--save", "x.png"], "--save: not the name of a page (got 'x.png')"),
-        (["{root}/single", "{root}/rig", "--save", "x.html"], "--save: a file is of one sequence (got 2)"),
-        (["{root}/single", "--save", "x.html", "--port", "1"], "--port: is of a server"),
+        (["{root}/single", "{root}/rig", "--save", "x.html"], "--save: a file shows one sequence (got 2)"),
+        (["{root}/single", "--save", "x.html", "--port", "1"], "--port: this is an option of the server"),
         (["{root}/single", "--save", "{root}/single.html"], "output file exists"),
-        (["{root}/empty"], "no sequence in it"),
+        (["{root}/empty"], "the folder has no sequence"),
     ],
 )
 def test_bad_input_is_refused_in_one_line(made, arguments, said, capsys):
@@ -229,7 +229,7 @@ def test_bad_input_is_refused_in_one_line(made, arguments, said, capsys):
 def test_without_viser_it_says_how_to_install_it(arguments, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert run([a.format(tmp=tmp_path) for a in arguments]) == 2
-    assert "viser is not installed" in (said := capsys.readouterr().err)
+    assert "viser, which shows sequences, is not installed" in (said := capsys.readouterr().err)
     assert "pip install 'viser>=1.1,<2'" in said
     assert not (tmp_path / "never").exists()
 

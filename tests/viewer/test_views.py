@@ -177,14 +177,14 @@ def test_events_alone_are_a_recording_without_space(tmp_path):
 def test_an_empty_sequence_is_refused(tmp_path):
     with SequenceWriter(tmp_path / "nothing", 12, 16, config_yaml="{}", events=False) as writer:
         writer.info = {"duration_us": 1000}
-    with pytest.raises(AssetError, match="nothing: an empty sequence: it has nothing to show"):
+    with pytest.raises(AssetError, match="nothing: the sequence is empty"):
         SequenceView(tmp_path / "nothing")
 
 
 def test_what_is_no_sequence_is_refused(tmp_path, single):
     with pytest.raises(AssetError, match="no such folder"):
         sequences_in(tmp_path / "gone")
-    with pytest.raises(AssetError, match="no sequence in it"):
+    with pytest.raises(AssetError, match="the folder has no sequence"):
         sequences_in(tmp_path)
     assert sequences_in(single.parents[1]) == [single]
     damaged = shutil.copytree(single, tmp_path / "damaged")

@@ -1,4 +1,4 @@
-"""The passes: each is a value that says what is drawn, by which program, from which other passes, into what.
+"""The passes: each is a value that defines what is drawn, by which program, from which other passes, into what.
 
 In:    a :class:`~blinkgl.render.moment.Moment` and frames of other passes.
 Out:   a :class:`~blinkgl.render.canvas.Frame`, by ``Renderer.draw``.
@@ -23,7 +23,7 @@ PASSES: tuple[type[Pass], ...] = (
     Gather,
     ShadowMap,
 )
-"""Those that a renderer draws of itself."""
+"""The passes that a renderer uses itself."""
 
 __all__ = [
     "PASSES",

@@ -1,4 +1,4 @@
-"""What a pass is. See docs/extending.md, "A pass"."""
+"""Base classes of passes. See docs/extending.md, "A pass"."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Output(NamedTuple):
     """An attachment: ``layout(location = i)`` of the fragment stage for the i-th output of a pass.
 
     format : key of :data:`blinkgl.gl.FORMATS`.
-    components : how many of its format's are given out, the first ones; 0: all."""
+    components : how many of its format's are returned, the first ones; 0: all."""
 
     name: str
     format: str
@@ -29,9 +29,9 @@ class Output(NamedTuple):
 
 
 class Input(NamedTuple):
-    """What a pass reads of another one, at the same moment. sampler : the uniform that gets it.
-    output : name of an output of ``of`` (default: its first), or ``DEPTH_BUFFER``, where
-    ``of`` keeps that as a texture."""
+    """Another pass's output that a pass reads, at the same moment. sampler : its uniform.
+    output : name of an output of ``of`` (default: its first), or ``DEPTH_BUFFER``, where ``of`` keeps that as a
+    texture."""
 
     sampler: str
     of: Pass
@@ -40,7 +40,7 @@ class Input(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """What one drawing of a pass is given. ends : moments at other times, by name ("forward", "backward").
+    """The arguments of one drawing of a pass. ends : moments at other times, by name ("forward", "backward").
     inputs : frames of the passes it reads, by sampler."""
 
     moment: Moment
@@ -51,26 +51,27 @@ class Shot:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Of the target, (width, height) px."""
+        """Return (width, height) of the target, px."""
         return self.target.width, self.target.height
 
 
 class Pass:
     """One kind of picture of a scene: what is drawn, by which program, into what. A pass is a value (a frozen
-    dataclass) and holds nothing; equal passes share their programs, target and memory, which belong to the renderer:
-    ``renderer.draw(pass, t_ns)`` gives a Frame.
+    dataclass) without resources; equal passes share their programs, target and memory, which belong to the renderer:
+    ``renderer.draw(pass, t_ns)`` returns a Frame.
 
     program : file in shaders/, or the absolute path of one of your own (its includes are those of shaders/).
-    outputs : what it writes.   inputs : what it reads, drawn before it.   samples, every : its size beside the image's.
-    depth : whether it has a depth buffer; "texture": one that a later pass may read; "texture of 16 bits": the same,
-    not of floats.
-    still : whether a camera that stands still has only what moves drawn again.
-    lit : whether its program asks light.glsl for the light, and fog.glsl for what of it arrives.
-    one_channel : whether one channel of it will do, where the surface is of one colour.
-    common : it hangs on the time and the scene more than on who looks, so that what was drawn for one sensor of a rig
+    outputs : what it writes.   inputs : what it reads, drawn first.   samples, every : its size relative to the
+    image's.
+    depth : whether it has a depth buffer; "texture": one that a later pass may read; "texture of 16 bits": the same, of
+    16-bit integers.
+    still : whether only moving objects are redrawn for a camera that stands still.
+    lit : whether its program uses light.glsl for the light, and fog.glsl for the fog.
+    one_channel : whether one channel suffices for surfaces of one colour.
+    common : it depends on the time and the scene more than on the viewer, so that the picture for one sensor of a rig
     is used for the others where it :meth:`serves`.
-    pointwise : each pixel comes of the inputs' pixel at the same place (or where :meth:`changed` says), so that it does
-    not change where they do not."""
+    pointwise : each pixel depends only on the inputs' pixel at the same place (or where :meth:`changed` says), so it
+    changes only where they do."""
 
     program: ClassVar[str]
     outputs: tuple[Output, ...]
@@ -85,51 +86,51 @@ class Pass:
     pointwise: ClassVar[bool] = False
 
     def size(self, width: int, height: int) -> tuple[int, int]:
-        """Of its target, px, for an image of width x height: ``samples.grid`` times as fine,
-        or every n-th pixel, at least one."""
+        """Return the size of its target, px, for an image of width x height: ``samples.grid`` times as fine, or every
+        n-th pixel, at least one."""
         return max(1, width * self.samples.grid // self.every), max(1, height * self.samples.grid // self.every)
 
     def background(self, scene: Scene) -> tuple[float, ...]:
-        """The first output where nothing is hit; 0 where it ends, and in all others."""
+        """Return the first output's value where nothing is hit; missing components and all other outputs are 0."""
         return ()
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
-        """Of the program variant, for a kind of material (None: no material at all);
-        TEXTURED, LIT and TWO_SIDED come on top,
-        and, of a pass that is ``lit``, those of the scene's light."""
+        """Return the defines of the program variant, for a kind of material (None: no material at all); TEXTURED, LIT
+        and TWO_SIDED are added, and, for a ``lit`` pass, those of the scene's light."""
         return {}
 
     def stands_still(self, whole: bool) -> bool:
-        """Whether only what moves is drawn again. whole : no pass of the camera's is to be drawn so."""
+        """Return whether only moving objects are redrawn. whole : no pass of the camera's is to be drawn so."""
         return self.still and not whole
 
     def changed(self, painter: Painter, rectangles: list[Rectangle]) -> list[Rectangle]:
-        """Where a pass that is ``pointwise`` changes when its inputs change in these rectangles."""
+        """Return where a ``pointwise`` pass changes when its inputs change in these rectangles."""
         return rectangles
 
     def seen(self, moment: Moment) -> Moment:
-        """The moment as this pass looks at it: the camera's, unless it draws for another one
+        """Return the moment as this pass sees it: the camera's, unless it draws for another one
         (``moment.from_place``)."""
         return moment
 
     def serves(self, drawn: Moment, moment: Moment) -> bool:
-        """Of a pass that is ``common``: whether what it last drew, as it saw it then, will do for a moment."""
+        """Return, for a ``common`` pass, whether its last picture, of the moment ``drawn``, can be used for a
+        moment."""
         return drawn.t_ns == moment.t_ns
 
     def begin(self, painter: Painter, shot: Shot) -> None:
-        """Before :meth:`paint`: clears what it does not write everywhere."""
+        """Prepare :meth:`paint`: clear what it does not write everywhere."""
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
-        """Draws into ``shot.target``. items : these alone, of a pass that draws the scene."""
+        """Draw into ``shot.target``. items : only these, for a pass that draws the scene."""
         raise NotImplementedError
 
     @classmethod
     def every_kind(cls) -> Iterator[Pass]:
-        """A pass of every program variant that somebody may ask for: what `blinkgl shader check` compiles."""
+        """Yield a pass of every program variant that can be requested; `blinkgl shader check` compiles them."""
         yield cls()
 
     def bind(self, uniforms: Uniforms, shot: Shot) -> None:
-        """Hands the inputs to a program. Unit 0 is the material's."""
+        """Bind the inputs to a program. Unit 0 is the material's."""
         for unit, one in enumerate(self.inputs, 1):
             shot.inputs[one.sampler].texture(one.output).use(unit)
             uniforms[one.sampler].value = unit
@@ -139,14 +140,14 @@ class ScenePass(Pass):
     """A pass that draws the scene's items."""
 
     def items(self, moment: Moment) -> list[DrawItem]:
-        """What is drawn, in this order."""
+        """Return what is drawn, in this order."""
         return moment.visible
 
     def begin(self, painter: Painter, shot: Shot) -> None:
         painter.begin(shot.target, self.background(shot.scene))
 
     def set(self, painter: Painter, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
-        """Textures and uniforms of the program besides those that every program of the scene has."""
+        """Set textures and uniforms of the program besides those that every program of the scene has."""
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
         programs = painter.programs(self)
@@ -154,12 +155,12 @@ class ScenePass(Pass):
             self.draw_item(painter, shot, item, programs[item.kind])
 
     def draw_item(self, painter: Painter, shot: Shot, item: DrawItem, uniforms: Uniforms) -> None:
-        """One of them, by the program that ``uniforms`` belong to."""
+        """Draw one item with the program that ``uniforms`` belong to."""
         self.dress_item(painter, shot, item, uniforms)
         painter.draw(uniforms, item)
 
     def dress_item(self, painter: Painter, shot: Shot, item: DrawItem, uniforms: Uniforms) -> None:
-        """Hands a program all that it takes of an item."""
+        """Set all that a program needs of an item."""
         painter.place(uniforms, item, shot.moment)
         if item.deformer is not None:
             painter.deform(uniforms, item, shot)
@@ -175,7 +176,7 @@ class ScreenPass(Pass):
     depth: ClassVar[bool | str] = False
 
     def set(self, uniforms: Uniforms, shot: Shot) -> None:
-        """Uniforms of the program besides its inputs."""
+        """Set uniforms of the program besides its inputs."""
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
         uniforms, array = painter.cover(self)

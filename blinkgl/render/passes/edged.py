@@ -1,4 +1,4 @@
-"""Silhouettes and creases by the areas of their surfaces: the last part of anti-aliasing."""
+"""Silhouettes and creases filtered by the areas of their surfaces: the last step of anti-aliasing."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ _CROSSINGS_UNIT = 8
 
 
 _REACH = 13
-"""px: how far from a pixel its lines look for their surfaces (edges.glsl: ALONG and two)."""
+"""px: distance within which a pixel's lines look for their surfaces (edges.glsl: ALONG and two)."""
 _CHANNELS = {"R32F": 1, "RG32F": 2}
 
 
 @dataclass(frozen=True)
 class Edged(Pass):
-    """Another pass's picture, of one output, in which the pixels that a silhouette or a crease goes through have the
-    mean of the surfaces on its two sides, by the areas that they have in the pixel's square. Outputs and grid as its:
-    of a finer picture the pixels are those of its grid.
+    """One output of another pass's picture, in which pixels on a silhouette or a crease have the mean of the surfaces
+    on its two sides, weighted by their areas in the pixel's square. Outputs and grid are those of the pass: with a
+    finer picture, pixels are those of its grid.
 
-    The areas are exact, of the lines of ``contours.py``; the two values are those of the pixels around, on the
-    surfaces that the depth buffer shows there, so that no surface is drawn again. Where none of the pixels around
-    shows the line's own surface (it is narrower than a pixel, and between all centres), nothing is changed."""
+    The areas are exact, from the lines of ``contours.py``. The two values are those of pixels around, on the surfaces
+    that the depth buffer shows there, so no surface is drawn again. Where no pixel around shows the line's own surface
+    (it is narrower than a pixel, between all centres), nothing is changed."""
 
     of: Pass
     program: ClassVar[str] = "edges.glsl"
@@ -72,7 +72,7 @@ class Edged(Pass):
         drawn = [item for item in (moment.visible if items is None else items) if item.layer != SKY]
         strokes.upload(moment, drawn, *shot.size)
         uniforms, array = strokes.program(self.program, self.defines(None))
-        # Nothing in the picture has an edge.
+        # The picture has no edges.
         if array is None:
             return
         self.bind(uniforms, shot)
@@ -92,6 +92,6 @@ class Edged(Pass):
 
 
 def filtered(pass_: Pass) -> Pass:
-    """A pass that gives one value per pixel: ``pass_`` itself, with its edges filtered, the mean of its samples."""
+    """Return a pass with one value per pixel: ``pass_`` with its edges filtered, the mean of its samples."""
     sharp = Edged(pass_) if pass_.samples.edges else pass_
     return sharp if pass_.samples.stored == 1 else Mean(sharp)

@@ -1,4 +1,4 @@
-"""A lens's picture out of the flat one that was drawn (:mod:`blinkgl.render.lens`)."""
+"""The lens's picture from the pinhole picture that was drawn (:mod:`blinkgl.render.lens`)."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ _FREE_UNIT = 8
 
 @dataclass(frozen=True)
 class Gather(ScreenPass):
-    """What each pixel of a lens's picture sees of another pass, all of whose outputs it has: of its nearest pixel or,
-    ``smooth``, of one output, the mean over its own area. At every n-th pixel where the other has every n-th."""
+    """The value of another pass at each pixel of a lens's picture: all outputs of its nearest pixel or, with
+    ``smooth``, the mean of one output over its own area. It has every n-th pixel where the other has."""
 
     of: Pass
     camera: CameraModel
@@ -49,7 +49,7 @@ class Gather(ScreenPass):
         return max(1, self.camera.width // every), max(1, self.camera.height // every)
 
     def changed(self, painter: Painter, rectangles: list[Rectangle]) -> list[Rectangle]:
-        """All of it, where anything of the flat picture has changed."""
+        """Return the whole picture, where anything of the pinhole picture has changed."""
         width, height = self.size(self.camera.width, self.camera.height)
         return [Rectangle(0, 0, width, height)] if rectangles else []
 
@@ -71,7 +71,7 @@ class Gather(ScreenPass):
         self.bind(uniforms, shot)
         if self.smooth:
             texture = shot.inputs["picked_0"].texture(self.inputs[0].output)
-            # The mean reads between texels; beyond the edge the outermost one counts.
+            # The mean reads between texels; beyond the edge the outermost one is repeated.
             texture.filter, texture.repeat_x, texture.repeat_y = (LINEAR, LINEAR), False, False
             lens.slopes(*shot.size).use(_FREE_UNIT + 3)
             uniforms["slopes"].value = _FREE_UNIT + 3
@@ -91,6 +91,6 @@ class Gather(ScreenPass):
 
 
 def one_value(pass_: Pass) -> Pass:
-    """``pass_``, with its edges filtered, but not the mean of a finer
-    grid: a gathering pass is a mean over that anyway."""
+    """Return ``pass_`` with its edges filtered but without the mean of a finer grid: a gathering pass computes a mean
+    anyway."""
     return Edged(pass_) if pass_.samples.edges else pass_

@@ -1,4 +1,4 @@
-"""The label pass, any subset of the labels that the shader draws in one go; and the small picture of velocity."""
+"""The label pass, which draws any subset of the shader's labels at once; and the small picture of velocity."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
 MADE.append(includes)
 LENS_UNIT = 7
-"""Texture unit of what a lens's pixels look at."""
+"""Texture unit of the sample offsets of a lens's pixels."""
 MOST_BUFFERS = 8
-"""Outputs that every OpenGL 4 has (GL_MAX_DRAW_BUFFERS)."""
+"""Number of outputs that every OpenGL 4 has (GL_MAX_DRAW_BUFFERS)."""
 _OF_THE_PASS = {
     "", "mvp", "inverse_depths", "image_size", "clip_rate", "clip_forward", "clip_backward", "coverage", "cutoff",
     "lens_claims", "target_size", "lens_plane", "lens_focal", "lens_limit", "lens_k",
@@ -33,10 +33,10 @@ _OF_THE_PASS = {
 @dataclass(frozen=True)
 class Geometry(ScenePass):
     """Outputs by the names of their labels, as the shader writes them; 0 where nothing is hit. One sample, at the
-    pixel's centre. Labels that lead to another time want the moment there, "forward" or "backward".
+    pixel's centre. Labels that lead to another time need the moment there, "forward" or "backward".
 
-    lens : macro of the camera model that the flat picture is drawn for: fragments are evaluated where its pixels' rays
-    pass (:mod:`blinkgl.render.lens`), and motion is in its pixels; "": a pin-hole camera's own picture.
+    lens : macro of the camera model for which the pinhole picture is drawn: fragments are evaluated where its pixels'
+    rays pass (:mod:`blinkgl.render.lens`), and motion is in its pixels; "": the pinhole camera's own picture.
 
     Raises TypeError, at the first frame, for a label whose ``uniforms`` are not those of its ``glsl``."""
 
@@ -71,7 +71,7 @@ class Geometry(ScenePass):
                 uniforms["image_size"].value = shot.size
             if "target_size" in uniforms:
                 uniforms["target_size"].value = shot.size
-            # Uniforms of the lens: which ray looks at a fragment, and its model.
+            # Uniforms of the lens: the ray through a fragment, and its model.
             if self.lens:
                 assert painter.lens is not None
                 painter.lens.set(uniforms, shot, LENS_UNIT)
@@ -83,7 +83,7 @@ class Geometry(ScenePass):
             painter.draw(uniforms, item)
 
     def _values(self, shot: Shot) -> dict[str, tuple[str, list[bytes]]]:
-        """Uniform -> the label that gives it, and its bytes for each object."""
+        """Return uniform -> the label that gives it, and its bytes for each object."""
         count, values = len(shot.scene.objects), {}
         for label in (LABELS[name] for name in self.names):
             given = label.uniforms(shot)
@@ -99,15 +99,15 @@ class Geometry(ScenePass):
                         f"label '{label.name}': `uniforms` gives '{name}', which "
                         f"{values[name][0] if name in values else 'the pass'} gives, too"
                     )
-                # GLSL's matrices are stored by columns.
+                # GLSL stores matrices by columns.
                 columns = np.swapaxes(array, 1, 2) if array.ndim == 3 else array
                 kind = {"u": np.uint32, "i": np.int32}.get(array.dtype.kind, np.float32)
                 values[name] = (label.name, [row.tobytes() for row in np.ascontiguousarray(columns, kind)])
         return values
 
     def _check(self, uniforms: Uniforms, values: dict[str, tuple[str, list[bytes]]], item: DrawItem) -> None:
-        """Every uniform that the program has is given, and none that it has not (of shaders that
-        somebody is editing it may have fewer)."""
+        """Check that every uniform of the program is given, and no other (shaders that are being edited may have
+        fewer)."""
         of_the_shape = item.deformer.textures if item.deformer is not None else ()
         if missing := uniforms.keys() - values.keys() - _OF_THE_PASS - {*of_the_shape}:
             name = min(missing)
@@ -121,15 +121,15 @@ class Geometry(ScenePass):
             try:
                 uniforms[name]
             except ShaderError:
-                # A file of the shader folder that somebody edited is no mistake of the label's class.
+                # An edited file of the shader folder is not an error of the label's class.
                 if LABELS[label].glsl is None:
                     raise
                 raise TypeError(f"label '{label}': `uniforms` gives '{name}', which its `glsl` does not use") from None
 
     @classmethod
     def every_kind(cls) -> Iterator[Pass]:
-        """Each label alone, which lacks what it leaves to another, and all at once, where two get in each other's way:
-        of subsets there are twice as many with every label more."""
+        """Yield each label alone, so that missing declarations show, and all at once, so that conflicts show; all
+        subsets would be too many."""
         drawn = [name for name, label in LABELS.items() if label.buffer]
         yield from (cls((name,)) for name in drawn)
         yield cls(tuple(drawn[:MOST_BUFFERS]))
@@ -142,10 +142,10 @@ class Geometry(ScenePass):
 
 @dataclass(frozen=True)
 class Velocity(ScenePass):
-    """Output "velocity", (h, w, 2) float32 px/s of the full-size image, 0 where nothing is
-    hit, on every n-th pixel in x and y.
+    """Output "velocity", (h, w, 2) float32 px/s of the full-size image, 0 where nothing is hit, on every n-th pixel in
+    x and y.
     moving_only : leaves out objects that stand still, also where they hide something.
-    lens : macro of the camera model in whose pixels motion is, where a flat picture is drawn for it."""
+    lens : macro of the camera model whose pixels are used, where a pinhole picture is drawn for it."""
 
     every: int = 1
     moving_only: bool = False
@@ -165,7 +165,7 @@ class Velocity(ScenePass):
         uniforms["image_size"].value = width, height
         if self.lens:
             assert painter.lens is not None
-            # With a lens motion is in its own pixels at any size, so there is no scale.
+            # With a lens, motion is in its own pixels at any size, so there is no scale.
             painter.lens.set(uniforms, shot, 0)
         elif self.every != 1:
             camera = shot.moment.view.camera

@@ -1,4 +1,4 @@
-"""Pictures of light: luminance of event frames, its rate of change in small pictures, colour, and means of several."""
+"""Passes of light: luminance of event frames, its rate of change in small pictures, colour, and means of samples."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ class _Luminance(Shaded):
             uniforms["albedo"].value = tuple(LUMA * np.asarray(item.material.base_color, np.float64))
         else:
             uniforms["albedo"].value = painter.resources.albedo_luminance(item.material)
-        # What is neither textured nor lit does not change; its program has none of these.
+        # A surface without texture and light is constant; its program has no rates.
         if "rate" in uniforms:
             uniforms["rate"].write(rows_xyw_bytes(shot.moment.rates.mvp[item.object_index]))
             uniforms["image_size"].value = shot.size
         if "sun_rate" in uniforms:
-            # Rates of directions in the object's axes, as painter.place sets the directions.
+            # Rates of directions in the object's axes, in the same form as painter.place.
             dR = shot.moment.rates.T_world_obj[item.object_index, :3, :3]
             uniforms["sun_rate"].value = tuple(shot.scene.light.sun_direction @ dR)
             uniforms["up_rate"].value = tuple(dR[2])
@@ -62,7 +62,7 @@ class Luminance(_Luminance):
     outputs: ClassVar[tuple[Output, ...]] = (Output("luminance", "R32F"),)
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
-        # Taps are for textures; an even colour needs none.
+        # Taps are for textures; a uniform colour needs none.
         taps = {"TAPS4": 1} if self.samples.taps == 4 and kind.textured else {}
         return taps | ({"STRETCHED": 1} if taps and self.samples.edges else {})
 
@@ -116,12 +116,12 @@ class Colour(Shaded):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# One value per pixel of a picture that was drawn finer.
+# One value per pixel from a picture of higher resolution.
 
 
 @dataclass(frozen=True)
 class Mean(ScreenPass):
-    """The mean of each pixel's samples of another pass, of one output; outputs as its."""
+    """The mean of each pixel's samples of one output of another pass."""
 
     of: Pass
     program: ClassVar[str] = "downsample.glsl"

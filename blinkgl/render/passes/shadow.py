@@ -1,4 +1,4 @@
-"""What lamps see: a pass before those that are lit by them."""
+"""Shadow maps: passes drawn before those that use their light."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
 
 
 FINEST = 1 / 32
-"""Of a texel's width: what a map's depth need not tell. What is compared is moved by a quarter of one, and more."""
+"""Required depth resolution, in widths of a texel. The comparison is offset by a quarter of one or more."""
 
 
 @dataclass(frozen=True)
 class ShadowMap(ScenePass):
-    """Depth buffer of what casts a lamp's shadows, (texels, texels), reversed: 0 where nothing does. Drawn
-    again only where something that casts has moved.
+    """Depth buffer of what casts a lamp's shadows, (texels, texels), reversed: 0 where nothing does. It is redrawn only
+    where a caster has moved.
 
-    box : of a sun.   soft : whether those who read it look at the depths themselves.
-    crowd : whether most of what casts moves, so that all of it is drawn again."""
+    box : of a sun.   soft : whether its readers use the depths themselves.
+    crowd : whether most casters move, so that all are redrawn."""
 
     lamp: Lamp
     box: Box | None
@@ -49,7 +49,8 @@ class ShadowMap(ScenePass):
 
     @property
     def depth(self) -> str:
-        """Half the memory where that is exact to a fraction of a texel: of a sun's, whose steps are equal."""
+        """Return the depth format: half the memory where that is exact to a fraction of a texel, as for a sun, whose
+        steps are equal."""
         if self.box is None:
             return "texture"
         # 16 bits resolve 1/65535 of the map's depth.
@@ -57,7 +58,7 @@ class ShadowMap(ScenePass):
         return "texture of 16 bits" if step < FINEST * scale_of(self.lamp, self.box, self.texels)[0] else "texture"
 
     def stands_still(self, whole: bool) -> bool:
-        """Whatever the camera does: the lamp's place is what counts."""
+        """Return whether the lamp stands still; the camera does not matter."""
         return self.lamp.path.is_static and not self.crowd
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
@@ -77,9 +78,9 @@ class ShadowMap(ScenePass):
 
 
 def shadow_maps(scene: Scene, items: Sequence[DrawItem]) -> tuple[ShadowMap, ...]:
-    """Of the scene's light, suns first; none where it asks for none or nothing casts."""
+    """Return the maps of the scene's light, suns first; none where there are no shadows or no casters."""
     lamps, light = lamps_of(scene.light), scene.light
-    # Of what moves the size counts, which has to be restored, of what stands still the triangles, which are drawn.
+    # The cost of moving casters is their area, which must be restored; that of static ones their triangles.
     moving, standing = ([i for i in items if i.casts and i.moves == moves] for moves in (True, False))
     room = sum(i.radius**2 for i in moving)
     crowd = bool(moving) and room > sum(i.radius**2 for i in standing) and _faces(standing) <= _faces(moving)
@@ -94,7 +95,7 @@ def _faces(items: Iterable[DrawItem]) -> int:
 
 
 class Shaded(ScenePass):
-    """A pass that is lit. shadows : maps of the lamps whose shadows it draws, a field of the pass."""
+    """A lit pass. shadows : maps of the lamps whose shadows it draws, a field of the pass."""
 
     lit: ClassVar[bool] = True
     shadows: tuple[ShadowMap, ...]
@@ -107,8 +108,8 @@ class Shaded(ScenePass):
         for unit, (name, map_) in enumerate(zip(_SAMPLERS, self.shadows), 1):
             if name in uniforms:
                 texture = shot.inputs[name].texture(DEPTH_BUFFER)
-                # The sampler compares: 1 where the surface is at least as near as what the map holds,
-                # filtered over four texels.
+                # The sampler compares, filtered over four texels: 1 where the surface is at least as near as the map's
+                # depth.
                 if not map_.soft and texture.compare_func != ">=":
                     texture.compare_func, texture.filter = ">=", (LINEAR, LINEAR)
                 texture.use(unit)
@@ -132,5 +133,5 @@ _SAMPLERS = tuple(f"shadow_map_{k}" for k in range(MAX_SHADOWS))
 
 @lru_cache(maxsize=64)
 def _scales(maps: tuple[ShadowMap, ...]) -> np.ndarray:
-    """(maps, 4) float32, ``shadow_scale`` of shadows.glsl."""
+    """Return ``shadow_scale`` of shadows.glsl, (maps, 4) float32."""
     return np.array([scale_of(one.lamp, one.box, one.texels) for one in maps], np.float32)

@@ -1,4 +1,4 @@
-"""Triangles.
+"""Triangle meshes.
 
 In:    arrays, parameters, triangles of files.
 Out:   :class:`~blinkgl.scene.types.Mesh`, checked.

@@ -1,9 +1,9 @@
-"""The body of a figure: one watertight skin round a skeleton's capsules, with weights and texture coordinates.
+"""The body of a figure: one watertight skin around a skeleton's capsules, with weights and texture coordinates.
 
-Each bone has capsules; where they meet they are blended, and a vertex follows the bones it is near, so that joints
-bend smoothly. Texture coordinates are an atlas: each part of the body lies in a rectangle of its own
-(:data:`CHARTS`), once round it from left to right, from its upper end down, in one scale all over, so that any pattern
-looks as cloth; the seams are behind, under the soles and at the palms.
+Each bone has capsules; they are blended where they meet, and a vertex follows the nearby bones, so that joints bend
+smoothly. Texture coordinates are an atlas: each part of the body has its own rectangle (:data:`CHARTS`), once around it
+from left to right, from its upper end down, all in one scale, so that any pattern looks like cloth; the seams are at
+the back, under the soles and at the palms.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from blinkgl.scene.shapes.gait import JOINTS, PARENTS, J, Proportions
 from blinkgl.scene.shapes.skeleton import Locals, Skeleton, Still
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A closed surface round whatever a function says is inside: naive surface nets (Gibson 1998), then Newton's method.
+# The closed surface of an implicit function: naive surface nets (Gibson 1998), then Newton's method.
 #
 # points, faces, normals = isosurface(distance, low, high, step)
 
@@ -36,21 +36,21 @@ _EDGES = [
 def isosurface(
     distance: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray, step: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """((V, 3) points, (F, 3) int32 faces, (V, 3) unit normals) of where ``distance`` ((N, 3) points to (N,)) is zero;
-    it is negative inside, changes by at most 1.2 per unit and need not be exact. Cells of edge ``step`` fill the box
-    low to high, (3,); its outermost cells have to lie outside. Faces are counter-clockwise seen from outside."""
+    """Return ((V, 3) points, (F, 3) int32 faces, (V, 3) unit normals) of where ``distance`` ((N, 3) points to (N,)) is
+    zero; it is negative inside, changes by at most 1.2 per unit and need not be exact. Cells of edge ``step`` fill the
+    box low to high, (3,); its outermost cells must lie outside. Faces are counter-clockwise seen from outside."""
     shape = np.ceil((np.asarray(high) - low) / step).astype(int) + 1
     grid = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1)
     values = _values(distance, low + step * grid, step)
     inside = values < 0
-    # How many of a cell's eight corners are inside: 1 to 7 where the surface passes.
+    # Number of a cell's eight corners that are inside: 1 to 7 where the surface passes.
     count = sum(
         inside[tuple(slice(o, n - 1 + o) for o, n in zip(corner, shape))].astype(int) for corner in np.ndindex(2, 2, 2)
     )
     cells = np.argwhere((count > 0) & (count < 8))
     number = np.full(shape - 1, -1)
     number[tuple(cells.T)] = np.arange(len(cells))
-    # Its vertex is the mean of the places at which the surface crosses its edges.
+    # The cell's vertex is the mean of the surface's crossings of its edges.
     total, crossings = np.zeros((len(cells), 3)), np.zeros(len(cells))
     for a, b in _EDGES:
         u, v = values[tuple((cells + a).T)], values[tuple((cells + b).T)]
@@ -60,8 +60,7 @@ def isosurface(
         crossings += crossed
     points = low + step * (cells + total / crossings[:, None])
     faces = []
-    # Where the function changes sign between neighbours on the grid the four cells around that edge
-    # make a quadrilateral.
+    # Where the sign changes between neighbours on the grid, the four cells around that edge form a quadrilateral.
     for axis in range(3):
         turned = [axis, (axis + 1) % 3, (axis + 2) % 3]
         solid, cell = np.transpose(inside, turned), np.transpose(number, turned)
@@ -88,14 +87,14 @@ def isosurface(
 
 
 def _values(distance: Callable[[np.ndarray], np.ndarray], grid: np.ndarray, step: float) -> np.ndarray:
-    """Return the values at the points of a (X, Y, Z, 3) grid: exact where a block of them can be near the surface,
-    of the right sign elsewhere."""
-    # Blocks of four points a side are judged by one in their middle.
+    """Return the values at the points of a (X, Y, Z, 3) grid: exact where the surface may be near, with the right sign
+    elsewhere."""
+    # Each block of four points per side is tested at its middle.
     shape, middles = grid.shape[:3], [np.minimum(np.arange(2, n + 4, 4), n - 1) for n in grid.shape[:3]]
     coarse = distance(grid[np.ix_(*middles)].reshape(-1, 3)).reshape([len(m) for m in middles])
     blocks = [np.arange(n) // 4 for n in shape]
     values = coarse[np.ix_(*blocks)]
-    # Values change by at most 1.2 per unit: farther than 1.2 diagonals of a block its sign is certain.
+    # Values change by at most 1.2 per unit: farther than 1.2 diagonals of a block the sign is certain.
     near = np.abs(values) < 1.2 * 4 * math.sqrt(3) * step
     values[near] = distance(grid[near])
     return values
@@ -107,11 +106,11 @@ def _gradient(distance: Callable[[np.ndarray], np.ndarray], points: np.ndarray, 
 
 
 ATLAS = 1.5
-"""m of an average body that the texture covers in either direction."""
+"""m of an average body that the texture covers in both directions."""
 
 
 class Chart(NamedTuple):
-    """A part of the body in the texture, in m of the atlas: left and upper edge, once round, length."""
+    """A part of the body in the texture, in m of the atlas: left and upper edge, circumference, length."""
 
     left: float
     top: float
@@ -139,11 +138,11 @@ _STEP = 0.026  # m of an average body: about 4,000 vertices
 _BLEND = 0.014
 _SOFT = 0.022  # m over which the weights of neighbouring bones change
 _BIND = {"arm_l": 42.0, "arm_r": -42.0, "thigh_l": 4.0, "thigh_r": -4.0, "foot_l": -4.0, "foot_r": 4.0}
-"""Degrees about x in which limbs are bound: away from each other."""
+"""Bind pose of limbs, degrees about x: apart from each other."""
 
 
 class Body(NamedTuple):
-    """vertices, normals : (V, 3).   faces : (F, 3).   uvs : (V, 2).   joints, weights : (V, 4).
+    """A bound body. vertices, normals : (V, 3).   faces : (F, 3).   uvs : (V, 2).   joints, weights : (V, 4).
     inverse_bind : (21, 4, 4)."""
 
     vertices: np.ndarray
@@ -166,7 +165,7 @@ class _Piece(NamedTuple):
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         scale = 1 / np.array([*self.flat, 1.0])
-        # Space is squeezed so that the flattened capsule is round.
+        # Space is scaled so that the flattened capsule is round.
         along, p = (self.b - self.a) * scale, (points - self.a) * scale
         t = np.clip(p @ along / max(along @ along, 1e-12), 0, 1)
         radius = self.radii[0] + (self.radii[1] - self.radii[0]) * t
@@ -175,18 +174,18 @@ class _Piece(NamedTuple):
 
 @lru_cache(maxsize=64)
 def body_of(body: Proportions) -> Body:
-    """The skin of a body, bound with its limbs apart, its soles on z = 0: the average one, each bone made longer and
-    thicker. Not to be written to."""
+    """Return the skin of a body in the bind pose, its limbs apart, its soles on z = 0: the average one with each bone
+    scaled in length and thickness. Read only."""
     points, normals, faces, uvs, joints, weights = _average()
     bind, shape = _bind(body), _shape(body)
     turns = bind[:, :3, :3]
     # The scale acts in each joint's own axes: R S R^T.
     shape = turns * shape[:, None] @ turns.transpose(0, 2, 1)
-    # Relative to the joint, scaled, and put at the joint of the new body; weighted over the bones.
+    # Relative to the joint, scaled, and placed at the joint of the new body; weighted over the bones.
     local = points[:, None] - _bind(Proportions())[joints, :3, 3]
     placed = (shape[joints] @ local[..., None])[..., 0] + bind[joints, :3, 3]
     vertices = (weights[..., None] * placed).sum(axis=1)
-    # Normals take the inverse of what positions take.
+    # Normals are transformed by the inverse of the positions' scale.
     outward = (weights[..., None] * (np.linalg.inv(shape)[joints] @ normals[:, None, :, None])[..., 0]).sum(axis=1)
     floor = bind[J["foot_l"], 2, 3] - body.ankle
     # The soles go to z = 0, and the joints with them.
@@ -200,7 +199,8 @@ def body_of(body: Proportions) -> Body:
 
 
 def _shape(body: Proportions) -> np.ndarray:
-    """(21, 3): how many times an average body's size each bone is, in its own frame: z along it, but for the feet."""
+    """Return the scale of each bone relative to an average body, in its own frame, (21, 3): z along it, except for the
+    feet."""
     out = np.full((len(JOINTS), 3), body.unit)
     for number, name in enumerate(JOINTS):
         bone = name.partition("_")[0]
@@ -218,18 +218,18 @@ def _shape(body: Proportions) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def _average() -> tuple[np.ndarray, ...]:
-    """Of an average body, as bound, the pelvis where its joints say: (V, 3) points, (V, 3) normals, (F, 3) faces,
-    (V, 2) texture coordinates, (V, 4) joints and their weights. Vertices are split where the texture has a seam."""
+    """Return an average body in the bind pose: (V, 3) points, (V, 3) normals, (F, 3) faces, (V, 2) texture coordinates,
+    (V, 4) joints and their weights. Vertices are split at the texture's seams."""
     body = Proportions()
     bind = _bind(body)
     pieces = _pieces(body, bind)
     floor = bind[J["foot_l"], 2, 3] - body.ankle
 
     def distance(points: np.ndarray) -> np.ndarray:
-        """Of the blend of all, cut off below the soles."""
+        """Return the distance to the blend of all capsules, cut off below the soles."""
         near = np.stack([p.distance(points) for p in pieces])
         least = near.min(axis=0)
-        # A smooth minimum: -b ln sum exp(-d / b), relative to the least so that nothing overflows.
+        # A smooth minimum: -b ln sum exp(-d / b), relative to the smallest so that nothing overflows.
         blend = least - _BLEND * np.log(np.exp(-np.maximum(near - least, 0) / _BLEND).sum(axis=0))
         return np.maximum(blend, floor - points[:, 2])
 
@@ -257,7 +257,7 @@ def _average() -> tuple[np.ndarray, ...]:
 
 
 def _bind(body: Proportions) -> np.ndarray:
-    """Return the (21, 4, 4) poses of the joints as they are bound."""
+    """Return the (21, 4, 4) poses of the joints in the bind pose."""
     rest = Locals.rest(len(JOINTS))
     rest.translation[:] = body.offsets
     for name, degrees in _BIND.items():
@@ -267,7 +267,7 @@ def _bind(body: Proportions) -> np.ndarray:
 
 
 def _pieces(body: Proportions, bind: np.ndarray) -> list[_Piece]:
-    """Return the capsules of an average body's bones. Places are m in the joint's frame."""
+    """Return the capsules of an average body's bones. Positions are m in the joint's frame."""
     made = []
 
     def add(joint: str, a, b, r0: float, r1: float, flat=(1.0, 1.0)) -> None:
@@ -306,7 +306,7 @@ def _pieces(body: Proportions, bind: np.ndarray) -> list[_Piece]:
 
 
 def _weights(points: np.ndarray, faces: np.ndarray, pieces: list[_Piece]) -> np.ndarray:
-    """(V, 21): the nearer a bone, the larger; of bones that are no further than two joints from the nearest one."""
+    """Return (V, 21) weights: larger for nearer bones; only bones within two joints of the nearest one."""
     far = np.full((len(points), len(JOINTS)), np.inf)
     for piece in pieces:
         far[:, piece.bone] = np.minimum(far[:, piece.bone], piece.distance(points))
@@ -368,7 +368,7 @@ def _unwrapped(
             outward = normals[faces[here]] @ T[:3, :3]
             top_, bottom_, ahead = (np.array(v, float) for v in (top, bottom, middle))
             mirror = paired and right
-            # Right limbs are the mirror image of left ones, so that the pattern runs alike.
+            # Right limbs are the mirror image of left ones, so that the pattern is symmetric.
             if mirror:
                 local, outward, ahead = (v * [1, -1, 1] for v in (local, outward, ahead))
                 ahead = np.array(middle, float)
@@ -376,11 +376,10 @@ def _unwrapped(
             across = np.cross(down, ahead)
             # Cylindrical coordinates about the part's axis.
             p = local - top_
-            # Caps: the direction of the surface says more of what is round than the place does.
+            # Caps: the direction of the surface determines the angle better than the position does.
             q = p + 0.03 * outward
             angle = np.arctan2(q @ across, q @ ahead) / (2 * math.pi)
-            # Angles of a face are brought within half a turn of its first, so that no face spans the
-            # chart.
+            # Angles of a face are brought within half a turn of its first, so that no face spans the chart.
             first = angle[:, :1]
             angle = first + (angle - first + 0.5) % 1.0 - 0.5
             if mirror:

@@ -1,4 +1,4 @@
-"""Primitives that move by themselves: people, cloth in wind, fish."""
+"""Primitives with their own motion: people, cloth in wind, fish."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ def figure(
     phase: float = 0.0,
     coat: int = 0,
 ) -> tuple[Surface, Deformer]:
-    """A person on z = 0, looking along x: walks, runs, dances, waves or stands, on the spot (an object's `way` takes it
-    along). The texture is an atlas in which each part of the body has its place, in one scale all over."""
+    """A person on z = 0, facing along x, who walks, runs, dances, waves or stands, in place (an object's `way` moves
+    it). The texture is an atlas in which each part of the body has its place, all in one scale."""
     if height > 1000:
         raise AssetError("bad parameter", where="figure.height", value=height, accepted="a number up to 1000")
     proportions = Proportions(height, build, legs, arms, head)
@@ -56,13 +56,13 @@ def flag(
     coat: int = 0,
 ) -> tuple[Surface, Deformer]:
     """Cloth in wind, from its held edge at x = 0 along x, from z = 0 up, waving in y; the texture once on each side,
-    seen through from the other."""
+    mirrored on the back."""
     # Two sheets with a thin rim, so that the mesh is closed.
     thick = 0.004 * min(width, height)
     rows = max(round(subdivisions * height / width), 1)
     front = square((0, -thick, 0), (width, 0, 0), (0, 0, height), subdivisions, rows)
     back = square((width, thick, 0), (-width, 0, 0), (0, 0, height), subdivisions, rows)
-    # The back shows the texture's mirror image, as cloth that light shines through.
+    # The back shows the texture's mirror image, like translucent cloth.
     back[2][:, 0] = 1 - back[2][:, 0]
     rim = [
         square((0, thick, 0), (0, -2 * thick, 0), (0, 0, height), 1, rows),
@@ -70,7 +70,7 @@ def flag(
         square((0, thick, 0), (width, 0, 0), (0, -2 * thick, 0), subdivisions, 1),
         square((0, -thick, height), (width, 0, 0), (0, 2 * thick, 0), subdivisions, 1),
     ]
-    # More wind beats faster and wider.
+    # More wind gives faster and larger waves.
     beat = Beat(0.75 / wind**0.7, -2 * math.pi * phase)
     config = FlagConfig(amplitude=0.1 * wind**0.3, period=beat.period, phase=360 * phase)
     low, high = np.array([0, -thick, 0]), np.array([width, thick, height])
@@ -96,7 +96,7 @@ def fish(
     under = length * deep * (0.215 * body + 0.17 * tail + 0.05 * np.exp(-(((s - 0.55) / 0.06) ** 2)) + stalk)
     wide = length * (0.105 * body + 0.010 * np.sin(math.pi * s) ** 0.5)
     angle = 2 * math.pi * np.arange(segments + 1) / segments
-    # Fins are thin: what is higher than the body itself tapers off.
+    # Fins are thin: parts higher than the body itself taper off.
     z = np.where(np.cos(angle) > 0, up[:, None], under[:, None]) * np.cos(angle)
     core = length * deep * (0.225 * body + stalk)[:, None]
     thin = np.clip((1 - np.clip(np.abs(z) / (core + 1e-9) - 0.25, 0, 1) ** 2), 0.06, 1)
@@ -108,10 +108,10 @@ def fish(
     # The rings at nose and tail shrink to a point.
     positions = np.stack([x, y, z], axis=2)
     positions[[0, -1]] = positions[[0, -1]].mean(axis=1, keepdims=True)
-    # Rows run to the tail, so the faces are turned round to look outwards.
+    # Rows run to the tail, so the faces are reversed to face outwards.
     faces = lattice(segments, rings)[:, ::-1]
     flat = positions.reshape(-1, 3)
-    # Triangles that collapse there are left out.
+    # Triangles that collapse there are removed.
     corners = flat[faces]
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     faces, area = (a[np.linalg.norm(area, axis=1) > 1e-12 * length**2] for a in (faces, area))
@@ -146,12 +146,11 @@ def _smooth_normals(positions: np.ndarray, faces: np.ndarray, area: np.ndarray) 
 # ``deform:`` on the parts of one object.
 
 EDGE = 1 / 12
-"""Of the object's longest side: longer edges are split, so that a box can bend."""
+"""Fraction of the object's longest side: longer edges are split, so that a box can bend."""
 
 
 def deforming(parts: Sequence[Part], config: DeformConfig) -> tuple[Part, ...]:
-    """The parts of one object, whose shape changes together as ``deform:`` says; their triangles as fine as that
-    takes."""
+    """Return the parts of one object, deformed together by ``deform:``; their triangles are as fine as that needs."""
     low, high = bounds([part.mesh for part in parts])
     deformer, edge = deformer_of(config, low, high), EDGE * float(np.max(high - low))
     return tuple(replace(part, mesh=replace(finer(part.mesh, edge), deformer=deformer)) for part in parts)

@@ -1,5 +1,5 @@
-"""From any triangles to a valid :class:`~blinkgl.scene.types.Mesh`: checked, cleaned, with normals and texture
-coordinates, and known to be closed or not."""
+"""Conversion of any triangles to a valid :class:`~blinkgl.scene.types.Mesh`: checked, cleaned, with normals and texture
+coordinates, and tested for closedness."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from blinkgl.scene.types import Mesh, Scene
 CREASE_DEGREES = 40.0
 WELD_RELATIVE = 1e-6  # vertices nearer than this times the extent are one point
 COARSE_WELD_RELATIVE = (
-    1e-3  # likewise when the fine weld leaves gaps: exporters quantise each material's part by itself
+    1e-3  # likewise when the fine weld leaves gaps: exporters quantise each material's part separately
 )
 _MAX_REPEATS = 1e9  # of a texture: float32 has no fraction left, and overflows later
-_MAX_COORDINATE = 1e15  # squares of larger coordinates lose all meaning in float32 and overflow soon after
+_MAX_COORDINATE = 1e15  # squares of larger coordinates are inaccurate in float32 and overflow soon after
 
 
 def make_mesh(
@@ -38,7 +38,7 @@ def make_mesh(
     log: list[str] | None = None,
     source: list[np.ndarray] | None = None,
 ) -> Mesh:
-    """A valid mesh from raw triangles.
+    """Return a valid mesh from raw triangles.
 
     Parameters
     ----------
@@ -50,12 +50,11 @@ def make_mesh(
     project_degenerate : also project when the given coordinates cannot carry a texture (:func:`uvs_degenerate`). They
         are kept otherwise, because palette textures use exactly such coordinates.
     log : gets a line for each repair.
-    source : gets (W,) int64, which of the given vertices each of the mesh's is; then no two of different origin are
-        joined.
+    source : gets (W,) int64, the index of the given vertex of each of the mesh's; then no two of different origin are
+    joined.
 
-    Faces without area are dropped, unused vertices removed, a closed mesh that is inside out is turned round.
-    Raises :class:`AssetError` (``where`` or ``name`` in it) for NaN or infinite vertices, indices out of range, no
-    faces.
+    Faces without area are dropped, unused vertices removed, a closed mesh that is inside out is reversed. Raises
+    :class:`AssetError` (``where`` or ``name`` in it) for NaN or infinite vertices, indices out of range, no faces.
     """
     where, label = where or name or "mesh", name or where or "mesh"
     log = [] if log is None else log
@@ -66,7 +65,7 @@ def make_mesh(
     uvs = None if uvs is None or np.shape(uvs) != (len(used), 2) else np.asarray(uvs, np.float64)[used]
 
     points, welded = weld(vertices, faces)
-    closed, inside_out = closed_or_nearly(points, welded)  # before slivers go: they close gaps of no width
+    closed, inside_out = closed_or_nearly(points, welded)  # before slivers are dropped: they close gaps of no width
     kept = _worth_drawing(vertices, faces, where, label, log)
     faces, welded = faces[kept], welded[kept]
     if normals is not None and not _usable_normals(normals, vertices, faces):
@@ -94,7 +93,8 @@ def make_mesh(
 
 
 def _checked(vertices: np.ndarray, faces: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """((V', 3) vertices that faces use, (F, 3) int64 faces over them, (V,) bool which those are). Raises AssetError."""
+    """Return ((V', 3) vertices that faces use, (F, 3) int64 faces over them, (V,) bool which those are). Raises
+    AssetError."""
     if vertices.ndim != 2 or vertices.shape[1] != 3 or (faces.size and (faces.ndim != 2 or faces.shape[1] != 3)):
         raise AssetError(f"vertices {vertices.shape} and faces {faces.shape} are no triangle mesh", where=where)
     if faces.size == 0:
@@ -117,14 +117,15 @@ def _checked(vertices: np.ndarray, faces: np.ndarray, where: str) -> tuple[np.nd
 
 
 def _wrong_coordinates(vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray | None, degenerate: bool) -> str:
-    """What is wrong with texture coordinates, in a word; "" where they can be used. degenerate : is a fault, too."""
+    """Return what is wrong with texture coordinates, in a word; "" where they can be used. degenerate : counts as
+    wrong, too."""
     if uvs is None or not (np.abs(uvs[faces]) < _MAX_REPEATS).all():  # NaN compares false
         return "broken"
     return "degenerate" if degenerate and uvs_degenerate(vertices, faces, uvs) else ""
 
 
 def _worth_drawing(vertices: np.ndarray, faces: np.ndarray, where: str, label: str, log: list[str]) -> np.ndarray:
-    """(F,) bool: faces with an area. Raises AssetError where there are none."""
+    """Return (F,) bool: faces with an area. Raises AssetError where there are none."""
     kept = _faces_with_area(vertices, faces)
     if not kept.any():
         raise AssetError("the mesh has no faces with an area", where=where, accepted="a mesh with triangles")
@@ -134,7 +135,7 @@ def _worth_drawing(vertices: np.ndarray, faces: np.ndarray, where: str, label: s
 
 
 def _faces_with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(F,) bool. A sliver is judged against its own longest edge, so that small meshes are not dropped."""
+    """Return (F,) bool. A sliver is compared with its own longest edge, so that small meshes are not dropped."""
     corners = vertices[faces]
     height, longest = _height_and_edge(corners)
     floor = 1e-14 * max(float(np.abs(corners).max()), 1e-300)
@@ -142,7 +143,7 @@ def _faces_with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _height_and_edge(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """((F,) smallest height, (F,) longest edge) of (F, 3, 3) triangles."""
+    """Return ((F,) smallest height, (F,) longest edge) of (F, 3, 3) triangles."""
     edges = corners - np.roll(corners, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
     # Products of the smallest coordinates would underflow.
@@ -151,21 +152,20 @@ def _height_and_edge(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def faces_in_float32(mesh: Mesh) -> np.ndarray:
-    """(F,) bool, faces that still have a direction when a GPU has rounded the vertices to float32.
+    """Return (F,) bool: faces that still have a direction after a GPU has rounded the vertices to float32.
 
-    Rounding moves a corner by up to half of 2^-23 times its largest coordinate in each axis, so that corners on one
-    line come out as a triangle up to sqrt(3) times 2^-23 high: what is not higher than twice that unit is a line, and
-    its normal and the slopes of all that is interpolated over it are noise. NaN and what overflows is no line: the
-    renderer refuses such meshes."""
+    Rounding moves a corner by up to half of 2^-23 times its largest coordinate in each axis, so corners on one line
+    become a triangle up to sqrt(3) times 2^-23 high. A face at most twice that high counts as a line: its normal and
+    the slopes of interpolated values are noise. NaN and overflow do not count: the renderer refuses such meshes."""
     with np.errstate(over="ignore", invalid="ignore"):
         corners = mesh.vertices.astype(np.float32)[mesh.faces].astype(np.float64)
         return ~(_height_and_edge(corners)[0] <= 2.0**-22 * np.abs(corners).max(axis=(1, 2)))
 
 
 def without_collapsed_faces(scene: Scene) -> Scene:
-    """The scene without the faces that are lines in float32 (:func:`faces_in_float32`), and a line in its log that
-    counts them; the scene itself when there are none."""
-    made: dict[int, Mesh | None] = {}  # id of a mesh -> without them; None: nothing is left
+    """Return the scene without the faces that are lines in float32 (:func:`faces_in_float32`), with a line in its log
+    that counts them; the scene itself when there are none."""
+    made: dict[int, Mesh | None] = {}  # id of a mesh -> the mesh without them; None: nothing is left
     objects, dropped = [], 0
     for obj in scene.objects:
         parts = []
@@ -193,7 +193,7 @@ def without_collapsed_faces(scene: Scene) -> Scene:
 
 
 def _face_cross(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(F, 3) outward vectors of twice the area."""
+    """Return (F, 3) outward vectors of twice the area."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return np.cross(b - a, c - a)
 
@@ -207,8 +207,8 @@ def _usable_normals(normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray
 
 
 def weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """((P, 3) float64 points, (F, 3) int64 faces over them): coinciding vertices are one point, because files split
-    vertices at seams and between materials."""
+    """Return ((P, 3) float64 points, (F, 3) int64 faces over them): coincident vertices become one point, because files
+    split vertices at seams and between materials."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     step = max(float((high - low).max()) * WELD_RELATIVE, 1e-300)
     cells = np.round((vertices - low) / step).astype(np.int64)  # below 2**20 each: one int64 holds all three
@@ -219,17 +219,17 @@ def weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _components(left: np.ndarray, right: np.ndarray, count: int) -> tuple[int, np.ndarray]:
-    """(number of, (count,) label of) the connected components of ``count`` nodes joined by edges left-right."""
+    """Return (number of, (count,) label of) the connected components of ``count`` nodes joined by edges left-right."""
     return connected_components(
         coo_matrix((np.ones(len(left), np.int8), (left, right)), shape=(count, count)), directed=False
     )
 
 
 def closedness(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool]:
-    """(closed, inside_out) of a welded mesh.
+    """Return (closed, inside_out) of a welded mesh.
 
-    Closed: every directed edge is met as often as its reverse (an oriented surface without a boundary, which also
-    admits solids that touch along an edge), and every shell has a positive volume or lies inside the bounding box of
+    Closed: every directed edge occurs as often as its reverse (an oriented surface without a boundary, which also
+    allows solids that touch along an edge), and every shell has a positive volume or lies inside the bounding box of
     one that has.
     """
     alive = (welded[:, 0] != welded[:, 1]) & (welded[:, 1] != welded[:, 2]) & (welded[:, 2] != welded[:, 0])
@@ -243,7 +243,7 @@ def closedness(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool]:
     _, shell = _components(start, end, count)
     a, b, c = ((points - points.mean(axis=0))[welded[:, i]] for i in range(3))
     volumes = np.bincount(shell[welded[:, 0]], weights=np.einsum("ij,ij->i", a, np.cross(b, c)) / 6)
-    # A sheet made of two coincident layers has no volume and is as good as closed.
+    # A sheet made of two coincident layers has no volume and counts as closed.
     noise = 1e-9 * float(np.linalg.norm(points.max(axis=0) - points.min(axis=0))) ** 3
     inside_out = bool(volumes.sum() < -noise)
     volumes = -volumes if inside_out else volumes
@@ -260,8 +260,8 @@ def closedness(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool]:
 
 
 def closed_or_nearly(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool]:
-    """:func:`closedness`; when that fails also over points merged within ``COARSE_WELD_RELATIVE`` of the extent, gaps
-    that no pixel can show."""
+    """Return :func:`closedness`; when that fails, also over points merged within ``COARSE_WELD_RELATIVE`` of the
+    extent, which closes gaps that no pixel can show."""
     closed, inside_out = closedness(points, welded)
     if closed:
         return closed, inside_out
@@ -282,8 +282,8 @@ def closed_or_nearly(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool
 def crease_normals(
     vertices: np.ndarray, faces: np.ndarray, welded: np.ndarray, crease_degrees: float = CREASE_DEGREES
 ) -> np.ndarray:
-    """(F, 3, 3) float64 unit corner normals: angle-weighted mean over the fan of faces around the corner's point that
-    are joined by edges bent less than ``crease_degrees``."""
+    """Return (F, 3, 3) float64 unit corner normals: angle-weighted mean over the fan of faces around the corner's point
+    that are joined by edges bent less than ``crease_degrees``."""
     cross = _face_cross(vertices, faces)
     unit = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300)
     corners = vertices[faces]
@@ -325,9 +325,9 @@ _BOX_SIDES = {
 
 
 def box_project(vertices: np.ndarray, faces: np.ndarray, uv_size: float | None = None) -> np.ndarray:
-    """(F, 3, 2) float64 corner texture coordinates: each face is projected along the axis nearest to its normal, never
-    mirrored, upright (z up). One repeat measures ``uv_size``; by default the largest side of the bounding box, then the
-    coordinates lie in [0, 1]."""
+    """Return (F, 3, 2) float64 corner texture coordinates: each face is projected along the axis nearest to its normal,
+    never mirrored, upright (z up). One repeat measures ``uv_size``; by default the largest side of the bounding box,
+    then the coordinates lie in [0, 1]."""
     low, high = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
     size = float((high - low).max()) if uv_size is None else float(uv_size)
     centred = (vertices[faces] - (low + high) / 2) / max(size, 1e-300)
@@ -343,7 +343,7 @@ def box_project(vertices: np.ndarray, faces: np.ndarray, uv_size: float | None =
 
 
 def uvs_degenerate(vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray) -> bool:
-    """True when more than half of the surface has (next to) no area in the texture."""
+    """Return whether more than half of the surface has (next to) no area in the texture."""
     a, b, c = (uvs[faces[:, i]] for i in range(3))
     uv_area = np.abs((b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]))
     area = np.linalg.norm(_face_cross(vertices, faces), axis=1)
@@ -353,8 +353,8 @@ def uvs_degenerate(vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray) -> 
 def _from_corners(
     positions: np.ndarray, normals: np.ndarray, uvs: np.ndarray, origin: np.ndarray | None = None, **fields
 ) -> tuple[Mesh, np.ndarray]:
-    """Corners with equal position, normal and coordinates, and of one origin where that is given, become one vertex.
-    Also (W,) which corner, of all one after the other, each vertex was first."""
+    """Return a mesh in which corners with equal position, normal and coordinates (and of one origin, if given) are one
+    vertex. Also (W,), the corner, of all one after the other, that each vertex was first."""
     positions = positions.reshape(-1, 3)
     normals = normals.reshape(-1, 3)
     normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
@@ -371,7 +371,7 @@ def _from_corners(
     )
     whole = [("", np.int64)] * rows.shape[1]
     _, first, index = np.unique(np.ascontiguousarray(rows).view(whole).ravel(), return_index=True, return_inverse=True)
-    # Vertices in order of first use: good for the vertex cache, and independent of how np.unique sorts.
+    # Vertices in order of first use: good for the vertex cache, and independent of np.unique's sort order.
     order = np.argsort(first, kind="stable")
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
@@ -387,8 +387,8 @@ def _from_corners(
 
 
 def transform_mesh(mesh: Mesh, matrix: np.ndarray) -> Mesh:
-    """Mesh under an affine (4, 4) or linear (3, 3) map; a mirroring one turns the faces
-    round so that they keep facing out."""
+    """Return the mesh under an affine (4, 4) or linear (3, 3) map; a reflection reverses the faces so that they face
+    out."""
     matrix = np.asarray(matrix, np.float64)
     linear = matrix[:3, :3]
     vertices = mesh.vertices @ linear.T + (matrix[:3, 3] if matrix.shape[0] == 4 else 0.0)
@@ -403,7 +403,7 @@ def transform_mesh(mesh: Mesh, matrix: np.ndarray) -> Mesh:
 
 
 def _transformed(mesh: Mesh, linear: np.ndarray, shift: np.ndarray) -> Deformer | None:
-    """The mesh's deformer under an affine map."""
+    """Return the mesh's deformer under an affine map."""
     if mesh.deformer is None:
         return None
     matrix = np.eye(4)
@@ -412,12 +412,12 @@ def _transformed(mesh: Mesh, linear: np.ndarray, shift: np.ndarray) -> Deformer 
 
 
 def scale_mesh(mesh: Mesh, scale: float) -> Mesh:
-    """The mesh, ``scale`` times as large."""
+    """Return the mesh, ``scale`` times as large."""
     return replace(mesh, vertices=mesh.vertices * scale, deformer=_transformed(mesh, np.eye(3) * scale, np.zeros(3)))
 
 
 def bounds(meshes: Sequence[Mesh]) -> tuple[np.ndarray, np.ndarray]:
-    """((3,), (3,)) corners of the common bounding box."""
+    """Return the corners of the common bounding box, ((3,), (3,))."""
     return (
         np.min([m.vertices.min(axis=0) for m in meshes], axis=0),
         np.max([m.vertices.max(axis=0) for m in meshes], axis=0),
@@ -425,15 +425,15 @@ def bounds(meshes: Sequence[Mesh]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def normalise(meshes: tuple[Mesh, ...], where: str = "mesh") -> tuple[Mesh, ...]:
-    """The meshes of one object together, moved so that the bounding box is centred on the origin and scaled to bounding
-    radius 1. Of a mesh that deforms all that it sweeps counts."""
+    """Return the meshes of one object, moved so that the bounding box is centred on the origin and scaled to bounding
+    radius 1. For a deforming mesh its whole region counts."""
     room = [(m.vertices, 0.0) if m.deformer is None else filled(m) for m in meshes]
     low = np.min([points.min(axis=0) - margin for points, margin in room], axis=0)
     high = np.max([points.max(axis=0) + margin for points, margin in room], axis=0)
     centre = (low + high) / 2
     radius = max(float(np.sqrt(((points - centre) ** 2).sum(axis=1).max())) + margin for points, margin in room)
     if not radius > 0:
-        raise AssetError("the mesh has no extent", where=where)
+        raise AssetError("the mesh has size zero", where=where)
     return tuple(
         replace(
             m, vertices=(m.vertices - centre) / radius, deformer=_transformed(m, np.eye(3) / radius, -centre / radius)
@@ -443,7 +443,7 @@ def normalise(meshes: tuple[Mesh, ...], where: str = "mesh") -> tuple[Mesh, ...]
 
 
 def finer(mesh: Mesh, edge: float, max_faces: int = 5_000) -> Mesh:
-    """The same surface of smaller triangles: each is split into four until no edge is longer than ``edge``, or
+    """Return the same surface with smaller triangles: each is split into four until no edge is longer than ``edge``, or
     there would be more than ``max_faces``."""
     while True:
         corners = mesh.vertices[mesh.faces]
@@ -470,7 +470,7 @@ def finer(mesh: Mesh, edge: float, max_faces: int = 5_000) -> Mesh:
 
 
 def concatenate(meshes: tuple[Mesh, ...], *, name: str = "", source_hash: str = "") -> Mesh:
-    """One mesh of several; closed when they are closed together (see :func:`closed_together`)."""
+    """Return one mesh of several; closed when they are closed together (see :func:`closed_together`)."""
     if len(meshes) == 1:
         return replace(meshes[0], name=name or meshes[0].name, source_hash=source_hash or meshes[0].source_hash)
     offsets = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
@@ -486,7 +486,7 @@ def concatenate(meshes: tuple[Mesh, ...], *, name: str = "", source_hash: str = 
 
 
 def closed_together(meshes: tuple[Mesh, ...]) -> bool:
-    """Whether the union of the meshes is closed: files often split one solid by material."""
+    """Return whether the union of the meshes is closed: files often split one solid by material."""
     if all(m.closed for m in meshes):
         return True
     offsets = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])

@@ -55,11 +55,11 @@ PARAMETERS = {
     "subdivisions": "cells per edge; die: per rounded edge; icosphere: how often each of 20 triangles is cut into "
     "four, 0 to 7",
 }
-"""What the builders' parameters mean, for the documentation. Metres are world units, before the object's scale."""
+"""The builders' parameters, for the documentation. Metres are world units, before the object's scale."""
 
 _LEAST = {"segments": 3, "sides": 3, "tube_segments": 3, "rings": 2, "subdivisions": 1, "variant": 0, "coat": 0}
 _MAX_SEGMENTS = 4096
-# "variant" and "coat" pick from many; their numbers are no sizes.
+# "variant" and "coat" are indices, not sizes.
 _MOST = {"variant": 10**9, "coat": 10**9}
 _WORDS = {"clip": tuple(CLIPS)}
 _PART = (0.7, 1.4)
@@ -68,19 +68,19 @@ _RANGES |= {"fish.deep": (0.6, 1.6), "phase": (0.0, 1.0), "tempo": (0.1, 4.0), "
 
 
 BUILDERS: dict[str, Callable[..., Mesh]] = {}
-"""By kind."""
+"""Builders by kind."""
 Surface = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """positions (V, 3), normals (V, 3), uvs (V, 2), faces (F, 3)"""
 
 
 def parameter_hash(*parts: object) -> str:
-    """32 hex digits, stable across platforms and load order."""
+    """Return 32 hex digits, stable across platforms and load order."""
     return hashlib.blake2b(repr(parts).encode(), digest_size=16).hexdigest()
 
 
 def _checked(where: str, key: str, value: Any, default: Any) -> Any:
-    """A parameter's value, of its default's type. Raises AssetError naming ``where`` and ``key``."""
-    # A range for this primitive alone comes before that of all.
+    """Return a parameter's value, of its default's type. Raises AssetError naming ``where`` and ``key``."""
+    # A range for this primitive alone precedes the general one.
     within = _RANGES.get(f"{where}.{key}", _RANGES.get(key))
     if isinstance(default, str):
         right, accepted = value in _WORDS[key], "one of " + ", ".join(_WORDS[key])
@@ -106,8 +106,8 @@ def _checked(where: str, key: str, value: Any, default: Any) -> Any:
 
 
 def primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Callable[..., Mesh]:
-    """Makes a builder of a kind in ``config/primitives.py``, which checks the parameters and stamps name, hash and
-    closedness; puts it into :data:`BUILDERS`. Raises TypeError for a name that is not there."""
+    """Return a builder of a kind in ``config/primitives.py`` that checks the parameters and sets name, hash and
+    closedness; add it to :data:`BUILDERS`. Raises TypeError for a name that is not there."""
     if build.__name__ not in PRIMITIVES:
         raise TypeError(f"no primitive '{build.__name__}' in config/primitives.py")
     signature = inspect.signature(build)
@@ -150,15 +150,16 @@ def primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Calla
 
 
 def join(pieces: Sequence[Surface]) -> Surface:
-    """One body of several (positions, normals, uvs, faces)."""
-    # Numbers of vertices count on from piece to piece.
+    """Return one body of several (positions, normals, uvs, faces)."""
+    # Vertex numbers are continued from piece to piece.
     offsets = np.cumsum([0] + [len(p[0]) for p in pieces[:-1]])
     positions, normals, uvs = (np.concatenate([p[i] for p in pieces]) for i in range(3))
     return positions, normals, uvs, np.concatenate([p[3] + o for p, o in zip(pieces, offsets)])
 
 
 def lattice(columns: int, rows: int) -> np.ndarray:
-    """(2*columns*rows, 3) faces of a vertex lattice numbered row by row (row r+1 above row r), counter-clockwise."""
+    """Return (2*columns*rows, 3) faces of a vertex lattice numbered row by row (row r+1 above row r),
+    counter-clockwise."""
     # A cell's two triangles: (i, right, above right) and (i, above right, above).
     c, r = np.meshgrid(np.arange(columns), np.arange(rows))
     i = (r * (columns + 1) + c).ravel()
@@ -167,7 +168,7 @@ def lattice(columns: int, rows: int) -> np.ndarray:
 
 
 def square(origin: ArrayLike, right: ArrayLike, up: ArrayLike, columns: int, rows: int) -> Surface:
-    """Flat parallelogram seen counter-clockwise; uv (0, 0) at its top left."""
+    """Return a flat parallelogram seen counter-clockwise; uv (0, 0) at its top left."""
     s, t = (a.ravel() for a in np.meshgrid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1)))
     origin, right, up = (np.asarray(a, float) for a in (origin, right, up))
     positions = origin + s[:, None] * right + t[:, None] * up
@@ -233,29 +234,28 @@ def cuboid(extents: Sequence[float] = (1.0, 1.0, 1.0), subdivisions: int = 1) ->
 
 
 DIE_FACES = 2, 3
-"""Rows and columns of a die's texture: 1 2 3 above 4 5 6, a face each."""
+"""Rows and columns of a die's texture: 1 2 3 above 4 5 6, one face each."""
 
 
 @primitive
 def die(size: float = 1.0, rounding: float = 0.12, subdivisions: int = 4) -> Surface:
-    """Cube with rounded edges and corners, of ``subdivisions`` cells each (``rounding`` is a part of ``size``, at most
-    a half, which is a ball). Its six faces are in one texture, 1 2 3 above 4 5 6, opposite ones 7 together: see
+    """Cube with rounded edges and corners, of ``subdivisions`` cells each (``rounding`` is a fraction of ``size``, at
+    most a half, which is a ball). Its six faces are in one texture, 1 2 3 above 4 5 6; opposite ones sum to 7: see
     `procedural: pips`."""
     if rounding > 0.5:
         raise AssetError("bad parameter", where="die.rounding", value=rounding, accepted="at most 0.5")
     half, radius = 0.5 * size, rounding * size
-    # Over an edge equal angles, not equal lengths.
+    # Equal angles over an edge, not equal lengths.
     turn = np.tan(np.linspace(0, math.pi / 4, subdivisions + 1))
     edge = half - radius + radius * turn
     ticks = np.concatenate([-edge[::-1], edge]) if rounding < 0.5 else np.concatenate([-edge[:0:-1], edge])
     across, up = np.meshgrid(ticks, ticks)
     n, cells, sides = len(ticks) - 1, lattice(len(ticks) - 1, len(ticks) - 1), []
     x, y, z = np.eye(3)
-    # Seen from outside: what is out of the face, to its right, up in it.
+    # Seen from outside: the directions out of the face, to its right, and up.
     faces = ((z, x, y), (x, y, z), (y, -x, z), (-y, x, z), (-x, -y, z), (-z, -x, y))
     for number, (out, right, above) in enumerate(faces):
-        # A point of the cube, the nearest point of the core inside it, and the rounding's normal
-        # between them.
+        # A point of the cube, the nearest point of the core inside it, and the rounding's normal between them.
         cube = half * out + across[..., None] * right + up[..., None] * above
         core = np.clip(cube, -(half - radius), half - radius)
         normals = (cube - core) / np.linalg.norm(cube - core, axis=2, keepdims=True)
@@ -416,7 +416,7 @@ def prism(sides: int = 6, radius: float = 0.5, height: float = 1.0) -> Surface:
 
 @primitive
 def pyramid(sides: int = 4, radius: float = 0.5, height: float = 1.0) -> Surface:
-    """Pyramid over a regular polygon, flat-shaded; each side carries the texture's triangle."""
+    """Pyramid over a regular polygon, flat-shaded; each side has the texture's triangle."""
     angle = 2 * math.pi * np.arange(sides + 1) / sides
     rim = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(sides + 1, -height / 2)], axis=1)
     rim[-1] = rim[0]
@@ -436,5 +436,5 @@ def pyramid(sides: int = 4, radius: float = 0.5, height: float = 1.0) -> Surface
 
 
 def parameters(kind: str) -> dict[str, float | int | str | tuple[float, ...]]:
-    """Names and defaults of a builder's parameters."""
+    """Return names and defaults of a builder's parameters."""
     return {name: parameter.default for name, parameter in inspect.signature(BUILDERS[kind]).parameters.items()}

@@ -16,13 +16,13 @@ from blinkgl.scene.types import Mesh
 
 
 class _Dice:
-    """Draws the proportions of one body. index : its number among its kind."""
+    """Draws the proportions of one body. index : its number within its kind."""
 
     def __init__(self, kind: str, index: int):
         self.rng, self.index = np.random.default_rng([seed_of(kind), index]), index
 
     def between(self, low: float, high: float) -> float:
-        """Log-uniform, and rounded: the last bit of exp differs between platforms."""
+        """Return a log-uniform value, rounded: the last bit of exp differs between platforms."""
         return round(math.exp(self.rng.uniform(math.log(low), math.log(high))), 6)
 
     def whole(self, low: int, high: int) -> int:
@@ -82,16 +82,16 @@ RANDOM: dict[str, Callable[[_Dice], Mesh]] = {
     "flag": _flag,
     "fish": _fish,
 }
-"""Kind -> a body of it, about one unit large. Every kind that a pool may hold has one."""
+"""Kind -> a function that draws a body of it, about one unit large. Every kind of a pool has one."""
 
 
 def random_primitive(kind: str, index: int) -> Mesh:
-    """Return the ``index``-th body of a kind. No two have the same proportions, so that bodies of different indices may
-    be told apart by a train/test split; ``source_hash`` is of (kind, index)."""
+    """Return the ``index``-th body of a kind. No two have the same proportions, so a train/test split can separate
+    bodies of different indices; ``source_hash`` is of (kind, index)."""
     mesh = RANDOM[kind](_Dice(kind, index))
     return replace(mesh, source_hash=random_primitive_hash(kind, index), name=f"{kind}-{index}")
 
 
 def random_primitive_hash(kind: str, index: int) -> str:
-    """``source_hash`` of :func:`random_primitive`, without making it."""
+    """Return the ``source_hash`` of :func:`random_primitive`, without making it."""
     return parameter_hash("random primitive", 1, kind, index)

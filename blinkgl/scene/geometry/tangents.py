@@ -1,7 +1,7 @@
-"""Which way a texture runs over a surface: what a normal map's x and y are.
+"""Tangents: the direction of a texture on a surface, which a normal map's x and y need.
 
-From the texture coordinates alone, whatever a file says of tangents: at a vertex the mean over its triangles of dp/du,
-weighted by angle, made perpendicular to the normal where it is used. y is upwards in the picture, against v.
+They come from the texture coordinates alone, not from a file's tangents: at a vertex the mean over its triangles of
+dp/du, weighted by angle, made perpendicular to the normal when it is used. y is upwards in the image, against v.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ _kept: WeakKeyDictionary[Mesh, np.ndarray] = WeakKeyDictionary()
 
 
 def tangents(mesh: Mesh) -> np.ndarray:
-    """(V, 4) float32 unit tangents, object axes, of the mesh at rest, and 1 or -1: with n and t the bitangent is
-    this times n x t. Where the coordinates say nothing, any direction in the surface. Kept with the mesh."""
+    """Return (V, 4) float32 unit tangents, object axes, of the mesh at rest, and 1 or -1: with n and t the bitangent is
+    this times n x t. Where the coordinates are degenerate, any direction in the surface. Stored with the mesh."""
     if mesh not in _kept:
         _kept[mesh] = _tangents(mesh)
     return _kept[mesh]
 
 
 def _of_faces(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Return (F, 3) dp/du, of any length, and the (F,) area in (u, -v), below 0 where the picture is mirrored."""
+    """Return (F, 3) dp/du, of any length, and the (F,) area in (u, -v), below 0 where the image is mirrored."""
     p, uv = mesh.vertices[mesh.faces], mesh.uvs[mesh.faces].astype(np.float64)
     # dp/du from p = p0 + u dp/du + v dp/dv at the triangle's two sides.
     e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     (u1, v1), (u2, v2) = (uv[:, 1] - uv[:, 0]).T, (uv[:, 2] - uv[:, 0]).T
-    # v runs downwards.
+    # v points downwards.
     area = u2 * v1 - u1 * v2
     return (e2 * v1[:, None] - e1 * v2[:, None]) * np.sign(area)[:, None], area
 
@@ -60,11 +60,11 @@ def _tangents(mesh: Mesh) -> np.ndarray:
 
 
 def split_mirrored(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
-    """The mesh with two vertices in the place of each at which a picture meets its mirror image, whose tangents would
-    cancel, and (W,) int64, which of the given vertices each is. The mesh has no deformer yet."""
+    """Return the mesh with two vertices in place of each at which an image meets its mirror image, where tangents would
+    cancel, and (W,) int64, the index of the given vertex of each. The mesh must not have a deformer."""
     _, area = _of_faces(mesh)
     mirrored, n = area < 0, len(mesh.vertices)
-    # Vertices that faces of both kinds use get a copy for the mirrored ones.
+    # Vertices that faces of both kinds use are copied for the mirrored ones.
     plain, other = (np.zeros(n, bool) for _ in range(2))
     plain[mesh.faces[~mirrored]] = True
     other[mesh.faces[mirrored]] = True

@@ -1,5 +1,5 @@
-"""What a glTF file's animations do to its shapes: clips chosen, taken from other files, and the deformers of the meshes
-that follow them."""
+"""Animations of a glTF file: selecting clips, also from other files, and the deformers of the meshes that follow
+them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from blinkgl.scene.types import Mesh
 
 
 class Animation:
-    """A file's clip as it is played. document : whose nodes move.   skeleton : all of its nodes, in the file's
+    """A clip of a file with its timing. document : whose nodes move.   skeleton : all of its nodes, in the file's
     world."""
 
     def __init__(self, document: gltf.Document, tracks: list[Track], playing: Playing):
@@ -30,11 +30,11 @@ class Animation:
         self._moved = {track.joint for track in tracks if track.path in PATHS}
 
     def moves(self, node: int) -> bool:
-        """Whether a node or one that it hangs on is moved."""
+        """Return whether a node or one of its ancestors is moved."""
         return any(self._places[step] in self._moved for step in self._chain(node))
 
     def _chain(self, node: int) -> list[int]:
-        """A node, and those that it hangs on."""
+        """Return a node and its ancestors."""
         chain, step = [], node
         while step is not None:
             chain.append(step)
@@ -42,13 +42,13 @@ class Animation:
         return chain
 
     def tracks_of(self, node: int) -> list[Track]:
-        """Those that move a node, or one that it hangs on."""
+        """Return the tracks that move a node or one of its ancestors."""
         chain = {self._places[step] for step in self._chain(node)}
         return [track for track in self.tracks if track.joint in chain and track.path in PATHS]
 
     def sample_times(self, keys: list[np.ndarray], t0_ns: int, t1_ns: int, step: float, most: int) -> np.ndarray:
-        """(N,) int64 ns in [t0, t1] to lay a path through: regular ones and, of a clip at the sequence's own times,
-        the key frames (keys : s), as far as it lasts."""
+        """Return (N,) int64 ns in [t0, t1] as the samples of a path: regular ones and, for a clip at the sequence's own
+        times, the key frames (keys : s), as far as it lasts."""
         playing = self._playing
         start, end = t0_ns * 1e-9, t1_ns * 1e-9
         plain = not playing.loop and playing.speed == 1 and playing.phase == -playing.first
@@ -59,7 +59,7 @@ class Animation:
         inside = np.concatenate(keys) if plain else np.zeros(0)
         inside = inside[(inside >= start) & (inside <= end)]
         times = np.unique(np.round(np.concatenate([inside, regular]) * 1e9).astype(np.int64))
-        # A key next to a sample adds nothing but ringing.
+        # A key next to a sample would only cause ringing.
         return times[np.concatenate([[True], np.diff(times) > 100_000])]
 
     def deformer(
@@ -71,10 +71,11 @@ class Animation:
         turn: np.ndarray,
         on_path: bool = False,
     ) -> Deformer | None:
-        """Of a mesh that was made of one of a node's raw ones; None where it is rigid, or follows the object's path.
+        """Return the deformer of a mesh made from one of a node's raw ones; None where it is rigid, or follows the
+        object's path.
 
-        source : (W,) which of the raw mesh's vertices each of the mesh's is.
-        at_rest : (4, 4) what took the raw mesh to the object's axes.
+        source : (W,) index of the raw mesh's vertex of each of the mesh's.
+        at_rest : (4, 4) from the raw mesh to the object's axes.
         turn : (4, 4) from the file's world to the object's axes.   on_path : the object's own path moves the node."""
         skin = self.document.nodes[node].skin
         bound = raw.binding if skin is not None else None
@@ -102,7 +103,7 @@ class Animation:
         return None if morphs is None else Skin.morphing(morphs, where)
 
     def _morphs(self, node: int, raw: RawMesh, source: np.ndarray, at_rest: np.ndarray) -> Morphs | None:
-        """Those targets that have a weight at any time."""
+        """Return the targets that have a weight at any time."""
         if raw.targets is None:
             return None
         positions, normals = raw.targets
@@ -132,8 +133,8 @@ class Animation:
 
 
 def play(document: gltf.Document, config: AnimationConfig, base: Path, where: str) -> Animation:
-    """A file's animation as the configuration asks for it. where : key of the configuration.
-    Raises ConfigError (a clip or file that is not there) and AssetError (what is wrong with the clip)."""
+    """Return a file's animation as configured. where : key of the configuration.
+    Raises ConfigError (a missing clip or file) and AssetError (an invalid clip)."""
     theirs = _source(document, config.file, base, f"{where}.file")
     names = clip_names(theirs)
     index = names.index(config.clip) if config.clip in names else config.clip
@@ -147,13 +148,13 @@ def play(document: gltf.Document, config: AnimationConfig, base: Path, where: st
         tracks = _by_name(theirs, tracks, document, f"{where}.file", config.file or "")
     times = [track.times for track in tracks]
     first, last = (min(t[0] for t in times), max(t[-1] for t in times)) if times else (0.0, 0.0)
-    # A clip that is held is at its own time 0 at the sequence's: as its file says.
+    # A clip that is held is at its own time 0 at the sequence's time 0, as in its file.
     phase = config.phase if config.loop else config.phase - first
     return Animation(document, tracks, Playing(float(first), float(last), config.speed, float(phase), config.loop))
 
 
 def _source(document: gltf.Document, file: str | None, base: Path, where: str) -> gltf.Document:
-    """The document whose clips are meant: ``document``, or another file."""
+    """Return the document with the clips: ``document``, or another file."""
     if file is None:
         return document
     path = Path(file).expanduser()
@@ -164,8 +165,8 @@ def _source(document: gltf.Document, file: str | None, base: Path, where: str) -
 
 
 def meshes_at_rest(document: gltf.Document, node: int) -> tuple[list[RawMesh], np.ndarray]:
-    """(meshes of a node as the file shows them at rest, (4, 4) what takes them to the file's world): a skin has its
-    joints where its nodes are, morph targets have the weights that the file gives."""
+    """Return (meshes of a node at rest, (4, 4) from them to the file's world): a skin's joints are at their nodes,
+    morph targets have the weights of the file."""
     mesh, skin = document.nodes[node].mesh, document.nodes[node].skin
     assert mesh is not None
     raws = document.raw_meshes(mesh)
@@ -176,7 +177,7 @@ def meshes_at_rest(document: gltf.Document, node: int) -> tuple[list[RawMesh], n
 
 
 def _at_rest(document: gltf.Document, node: int, raw: RawMesh, joints: Sequence[int], bind: np.ndarray) -> RawMesh:
-    """One of a node's meshes; in the file's world where there are joints."""
+    """Return one of a node's meshes; in the file's world where there are joints."""
     if raw.targets is not None:
         positions, normals = raw.targets
         weights = document.morph_weights(node, len(positions))
@@ -185,7 +186,7 @@ def _at_rest(document: gltf.Document, node: int, raw: RawMesh, joints: Sequence[
             raw = replace(raw, normals=raw.normals + np.tensordot(weights, normals, 1))
     if len(joints):
         shape = Mesh(raw.vertices, raw.faces, raw.normals, raw.uvs)  # type: ignore[arg-type]
-        if raw.binding is None:  # follows the node, and not its joints
+        if raw.binding is None:  # follows the node, without joints
             return transformed(raw, document.world(node))
         skin = Skin(document.skeleton(Still(document.rest())), joints, bind, *raw.binding, where=document.path.name)
         turned = None if raw.normals is None else skin.normals(shape, 0)
@@ -194,13 +195,13 @@ def _at_rest(document: gltf.Document, node: int, raw: RawMesh, joints: Sequence[
 
 
 def clip_names(document: gltf.Document) -> list[str]:
-    """Of a file's animations; the number of one that has none."""
+    """Return the names of a file's animations; the index of an unnamed one."""
     return [str(a.get("name", i)) for i, a in enumerate(document.tree.get("animations", []))]
 
 
 def _by_name(theirs: gltf.Document, tracks: list[Track], mine: gltf.Document, where: str, file: str) -> list[Track]:
-    """Tracks of another file's nodes on the nodes of the same names; those of nodes that are not here are left out,
-    and said."""
+    """Return tracks of another file's nodes on the nodes of the same names; those of missing nodes are left out and
+    reported."""
     places = {node.name: place for place, node in reversed(list(enumerate(mine.nodes.values())))}
     names = [node.name for node in theirs.nodes.values()]
     matrices = {node.name for node in mine.nodes.values() if node.matrix is not None}
@@ -211,7 +212,7 @@ def _by_name(theirs: gltf.Document, tracks: list[Track], mine: gltf.Document, wh
     ]
     if not found:
         raise ConfigError(
-            "the clip's file moves no joint of this file's names",
+            "the clip's file moves no joint with a name of this file",
             where=where,
             value=file,
             accepted="a file with joints such as: " + ", ".join(list(places)[:5]),

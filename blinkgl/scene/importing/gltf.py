@@ -1,14 +1,13 @@
 """Reader of glTF 2.0 (.gltf with its buffers and images, .glb): meshes, cameras, node hierarchy, skins, animations.
 
-Its own reader rather than trimesh's, because a scene's cameras, unlit and double-sided materials, node names and
-animations are wanted, and because every count and path a file claims has to be checked before it is believed.
-Reference: Khronos glTF 2.0 specification, sections 3.5 (scenes), 3.6 (accessors), 3.7 (meshes, skins), 3.10 (cameras),
-3.11 (animations). Its JSON and buffers are read by :mod:`~blinkgl.scene.importing.gltf_file`, its materials by
-:mod:`~blinkgl.scene.importing.gltf_materials`.
+It replaces trimesh's reader, because a scene needs cameras, unlit and double-sided materials, node names and
+animations, and because every count and path of a file must be checked before it is used. Reference: Khronos glTF 2.0
+specification, sections 3.5 (scenes), 3.6 (accessors), 3.7 (meshes, skins), 3.10 (cameras), 3.11 (animations).
+:mod:`~blinkgl.scene.importing.gltf_file` reads its JSON and buffers, :mod:`~blinkgl.scene.importing.gltf_materials` its
+materials.
 
-Coordinates stay as in the file (y up) until whoever asked turns them z up
-(:data:`~blinkgl.scene.importing.parts.Z_UP`). What a file asks for and is not drawn is collected in
-:attr:`Document.omissions`.
+Coordinates stay as in the file (y up); the caller turns them z up (:data:`~blinkgl.scene.importing.parts.Z_UP`).
+Features that are not drawn are collected in :attr:`Document.omissions`.
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ from blinkgl.scene.shapes.clips import PATHS, Track
 from blinkgl.scene.shapes.skeleton import Locals, Motion, Skeleton
 from blinkgl.scene.types import Material
 
-# Not drawn, and yet no reason to refuse a file that requires them: shape, base colour and motion are what they would
-# be, only light is missing from the surface. Everything else that is required (compressed geometry or images,
-# instances, other material models, what nobody has heard of) would be a scene that is not the file's.
+# Not drawn, but a file that requires these extensions is accepted: shape, base colour and motion are correct, only the
+# light on the surface is missing. Any other required extension (compressed geometry or images, instances, other
+# material models, unknown ones) would give a different scene, so it is refused.
 _LIGHTS = "KHR_lights_punctual"
 _LIGHT_ONLY = {
     _LIGHTS,
@@ -45,19 +44,19 @@ _LIGHT_ONLY = {
 }
 _DTYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-_MAX_ZEROS = 64_000_000  # bytes of an accessor without a buffer behind it (all zeros): nothing in the file bounds them
+_MAX_ZEROS = 64_000_000  # bytes of an accessor without a buffer (all zeros): the file's size does not limit them
 _MAX_TIME = 1e7  # s, of an animation's keys
 _MAX_SETS = 4  # of four joints per vertex
-_MAX_TARGET_VERTICES = 8_000_000  # of a primitive's morph targets together
+_MAX_TARGET_VERTICES = 8_000_000  # of all morph targets of a primitive
 
 
 @dataclass(eq=False)
 class Document:
     """A parsed file. ``nodes`` are those of the default scene, parents before children, by their index in the file.
 
-    tree : its JSON, of the shape that :mod:`blinkgl.scene.importing.gltf_schema` demands.
+    tree : its JSON, in the form that :mod:`blinkgl.scene.importing.gltf_schema` checks.
     materials : of the file.
-    log : repairs and decisions.   omissions : what the file asks for and is not drawn.
+    log : repairs and decisions.   omissions : features that are not drawn.
     """
 
     path: Path
@@ -73,8 +72,8 @@ class Document:
         return str(self.path)
 
     def lights(self) -> dict[int, dict[str, Any]]:
-        """Lights of the scene's nodes as KHR_lights_punctual has them, by the node's index, checked, with all that it
-        leaves out filled in."""
+        """Return the lights of the scene's nodes by node index, in the form of KHR_lights_punctual, checked, with
+        defaults filled in."""
         extension = self.tree.get("extensions", {}).get(_LIGHTS, {})
         gltf_schema.check(extension, f"{self.where}: {_LIGHTS}", gltf_schema.PunctualLights)
         table, found = gltf_schema.PunctualLights.model_validate(extension).lights, {}
@@ -92,7 +91,7 @@ class Document:
 
     # ---- geometry
     def world(self, node: int) -> np.ndarray:
-        """(4, 4) transform of a node to the file's world, at rest."""
+        """Return the rest transform of a node to the file's world, (4, 4)."""
         T = np.eye(4)
         step: int | None = node
         while step is not None:
@@ -101,18 +100,18 @@ class Document:
         return T
 
     def raw_meshes(self, mesh: int) -> list[RawMesh]:
-        """The triangles of a mesh in its own coordinates, one for each of its primitives, with bindings to joints and
+        """Return the triangles of a mesh in its own coordinates, one entry per primitive, with bindings to joints and
         morph targets; points and lines are left out."""
         primitives = item(self.tree, "meshes", mesh, self.where)["primitives"]
         made = [self._primitive(primitive, mesh) for primitive in primitives]
         return [raw for raw in made if raw is not None]
 
     def _primitive(self, primitive: dict, mesh: int) -> RawMesh | None:
-        """One primitive of a mesh; None: nothing of it is a surface that shows."""
+        """Return one primitive of a mesh; None: it has no visible surface."""
         mode, attributes = primitive.get("mode", 4), primitive["attributes"]
         if mode in (5, 6):
             raise AssetError(
-                "a mesh is made of strips or fans of triangles",
+                "a mesh consists of triangle strips or fans",
                 where=self.where,
                 value=f"mode {mode}",
                 accepted="mode 4, separate triangles, as Blender's exporter writes them",
@@ -143,7 +142,7 @@ class Document:
         return RawMesh(vertices, faces, normals, uvs, material, binding, targets, colours)
 
     def _faces(self, primitive: dict, mesh: int, count: int) -> np.ndarray:
-        """(F, 3) of a primitive of ``count`` vertices, whose order counts where it has no indices."""
+        """Return the faces of a primitive of ``count`` vertices, (F, 3); without indices the vertices' order counts."""
         if "indices" not in primitive:
             order = np.arange(count)
         else:
@@ -154,7 +153,7 @@ class Document:
         return order[: len(order) // 3 * 3].reshape(-1, 3)
 
     def _binding(self, primitive: dict, count: int) -> tuple[np.ndarray, np.ndarray] | None:
-        """((V, 4 n) joints, (V, 4 n) weights) of all the sets that a primitive has."""
+        """Return ((V, 4 n) joints, (V, 4 n) weights) of all sets of a primitive."""
         attributes, joints, weights = primitive["attributes"], [], []
         for number in range(_MAX_SETS):
             if f"JOINTS_{number}" not in attributes:
@@ -168,7 +167,8 @@ class Document:
         return (np.hstack(joints), np.hstack(weights)) if joints else None
 
     def _targets(self, primitive: dict, count: int) -> tuple[np.ndarray, np.ndarray | None] | None:
-        """Morph targets of a primitive of ``count`` vertices. One without normals leaves those of the base shape."""
+        """Return the morph targets of a primitive of ``count`` vertices. One without normals keeps those of the base
+        shape."""
         targets = primitive.get("targets", [])
         if len(targets) * count > _MAX_TARGET_VERTICES:
             raise AssetError(
@@ -186,7 +186,7 @@ class Document:
         return positions, normals if normals.any() else None
 
     def _displacements(self, target: dict, name: str, count: int) -> np.ndarray:
-        """(count, 3) of a morph target; 0 without them."""
+        """Return the displacements of a morph target, (count, 3); 0 without them."""
         if name not in target:
             return np.zeros((count, 3))
         a = item(self.tree, "accessors", target[name], self.where)
@@ -199,13 +199,12 @@ class Document:
             )
         values = self.accessor(target[name]).astype(np.float64)
         if not (np.abs(values) <= 1e12).all():  # NaN compares false
-            raise AssetError(f"a morph target is no number, or beyond 1e12 ({name})", where=self.where)
+            raise AssetError(f"a morph target is not a number, or beyond 1e12 ({name})", where=self.where)
         return values
 
     def skin(self, index: int) -> tuple[list[int], np.ndarray]:
-        """(joints as places among :attr:`nodes`, (m, 4, 4) inverse bind matrices). AssetError for a joint that is not
-        in
-        the scene, and for matrices that are missing or no numbers."""
+        """Return (joints as indices of :attr:`nodes`, (m, 4, 4) inverse bind matrices). Raises AssetError for a joint
+        that is not in the scene, and for matrices that are missing or not numbers."""
         skin = item(self.tree, "skins", index, self.where)
         joints, places = skin["joints"], self.places
         if len(joints) > MAX_NODES:
@@ -215,13 +214,13 @@ class Document:
         for joint in joints:
             if joint not in places:
                 index_of(joint, len(self.tree.get("nodes", [])), "node", self.where)
-                raise AssetError("a skin names a joint that is not in the scene", where=self.where, value=joint)
+                raise AssetError("a skin refers to a joint that is not in the scene", where=self.where, value=joint)
         bind = np.tile(np.eye(4), (len(joints), 1, 1))
         if "inverseBindMatrices" in skin:
             a = item(self.tree, "accessors", skin["inverseBindMatrices"], self.where)
             if a["type"] != "MAT4" or a["count"] < len(joints):
                 raise AssetError(
-                    "a skin has not one inverse bind matrix per joint",
+                    "a skin does not have one inverse bind matrix per joint",
                     where=self.where,
                     value=f"{a['count']} {a['type']}",
                     accepted=f"{len(joints)} MAT4",
@@ -232,11 +231,11 @@ class Document:
 
     @property
     def places(self) -> dict[int, int]:
-        """Node of the file -> its number among :attr:`nodes`, which is that of its joint in :meth:`skeleton`."""
+        """Return node of the file -> its index in :attr:`nodes`, which is that of its joint in :meth:`skeleton`."""
         return {node: place for place, node in enumerate(self.nodes)}
 
     def rest(self) -> Locals:
-        """Of all nodes; one that has a matrix has it in :meth:`skeleton`."""
+        """Return the rest transforms of all nodes; a node's matrix, if any, is in :meth:`skeleton`."""
         out = Locals.rest(len(self.nodes))
         for place, node in enumerate(self.nodes.values()):
             if node.matrix is None:
@@ -246,24 +245,27 @@ class Document:
         return out
 
     def skeleton(self, motion: Motion) -> Skeleton:
-        """All nodes, moved by ``motion``, in the file's world."""
+        """Return all nodes as a skeleton, moved by ``motion``, in the file's world."""
         places, nodes = self.places, list(self.nodes.values())
         parents = [-1 if node.parent is None else places[node.parent] for node in nodes]
         fixed = [np.eye(4) if node.matrix is None else node.matrix for node in nodes]
         return Skeleton(parents, motion, np.array(fixed).reshape(-1, 4, 4))
 
     def morph_weights(self, node: int, count: int) -> np.ndarray:
-        """(count,) of a node's mesh at rest. AssetError where there are others than targets."""
+        """Return the morph weights of a node's mesh at rest, (count,). Raises AssetError where their number differs."""
         mesh = item(self.tree, "meshes", self.nodes[node].mesh, self.where)
         given = self.nodes[node].weights if self.nodes[node].weights is not None else mesh.get("weights", [0.0] * count)
         if len(given) != count:
             raise AssetError(
-                "a mesh has not one weight per morph target", where=self.where, value=len(given), accepted=str(count)
+                "a mesh does not have one weight per morph target",
+                where=self.where,
+                value=len(given),
+                accepted=str(count),
             )
         return np.array(given, np.float64)
 
     def _attribute(self, primitive: dict, name: str, width: int, count: int) -> np.ndarray | None:
-        """(count, width) float64, None without it. Its length is checked before it is read."""
+        """Return an attribute, (count, width) float64, None without it. Its length is checked before it is read."""
         if name not in primitive["attributes"]:
             return None
         index = primitive["attributes"][name]
@@ -280,7 +282,8 @@ class Document:
     def _coloured(
         self, primitive: dict, material: Material | None, count: int
     ) -> tuple[Material | None, np.ndarray | None]:
-        """The material, times the vertices' colour (linear) where they all have the same; else (V, 3) of them."""
+        """Return the material, times the vertices' colour (linear) where they all have the same; else their colours,
+        (V, 3)."""
         if "COLOR_0" not in primitive["attributes"]:
             return material, None
         index = primitive["attributes"]["COLOR_0"]
@@ -296,14 +299,15 @@ class Document:
         return replace(material, base_color=tuple(float(c) for c in factor)), None
 
     def _without_coordinates(self, material: Material | None) -> Material | None:
-        """Of a mesh that has no texture coordinates: there is no telling which way a normal map lies."""
+        """Return the material of a mesh without texture coordinates, without normal map, whose direction is then
+        unknown."""
         if material is None or material.bumps is None:
             return material
         self.omissions.add("normal maps on meshes without texture coordinates (left out)")
         return replace(material, bumps=None)
 
     def accessor(self, index: int) -> np.ndarray:
-        """(count, n) values; normalised integers become floats."""
+        """Return (count, n) values; normalised integers become floats."""
         a = item(self.tree, "accessors", index, self.where)
         count, width, dtype = a["count"], _WIDTHS[a["type"]], np.dtype(_DTYPES[a["componentType"]]).newbyteorder("<")
         if "bufferView" in a:
@@ -343,7 +347,8 @@ class Document:
 
     # ---- animations
     def tracks(self, animation: int) -> list[Track]:
-        """What an animation moves, joints being places among :attr:`nodes`; what of it is not drawn is an omission."""
+        """Return the tracks of an animation, with joints as indices of :attr:`nodes`; undrawn parts are added to
+        omissions."""
         a = item(self.tree, "animations", animation, self.where)
         samplers, places, found = a["samplers"], self.places, []
         for channel in a["channels"]:
@@ -362,7 +367,7 @@ class Document:
             per_key = 3 if kind == "CUBICSPLINE" else 1
             keys, given = (item(self.tree, "accessors", sampler[key], self.where) for key in ("input", "output"))
             per_value = width if path == "weights" else 1  # weights are scalars, one after the other
-            # Lengths first: the two are as long as the file says, whatever is behind them.
+            # Lengths first: both are as long as the file declares.
             fits = (
                 keys["type"] == "SCALAR"
                 and given["count"] == per_key * per_value * keys["count"] > 0
@@ -391,7 +396,7 @@ class Document:
         return found
 
     def _target_count(self, node: int) -> int:
-        """Morph targets of a node's mesh; 0 for one without."""
+        """Return the number of morph targets of a node's mesh; 0 for a node without one."""
         mesh = self.nodes[node].mesh
         if mesh is None:
             return 0
@@ -407,7 +412,7 @@ def read(
     materials: bool = True,
     lights: bool = False,
 ) -> Document:
-    """Parses a file, checks its shape and its counts. lights : whether somebody asks for the file's
+    """Parse a file, check its form and its counts. lights : whether the file's lights are used
     (:meth:`Document.lights`). Raises AssetError naming it."""
     path = Path(path)
     where = str(path)
@@ -423,7 +428,7 @@ def read(
         document.nodes = nodes_of(tree, where)
         _check_faces(document, max_faces)
         for name in tree.get("extensionsUsed", []):
-            # What belongs to materials and textures is said where one is used, and lights by what they are.
+            # Extensions of materials and textures are reported where one is used, and lights by kind.
             said_there = name.startswith(("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_"))
             if name not in DRAWN | _LIGHT_ONLY | INVISIBLE_EXTENSIONS and not said_there:
                 document.omissions.add(name)
@@ -433,7 +438,7 @@ def read(
 
 
 def _check_faces(document: Document, max_faces: int) -> None:
-    """Triangles the scene would have, from the accessors' counts alone (every node that shows a mesh counts it)."""
+    """Check the number of triangles of the scene, from the accessors' counts (for every node that shows a mesh)."""
     tree, where = document.tree, document.where
     per_mesh = {}
     for node in document.nodes.values():

@@ -1,4 +1,4 @@
-"""A glTF 2.0 file's JSON and bytes, parsed and checked; nothing outside its own folder is read on its behalf.
+"""A glTF 2.0 file's JSON and bytes, parsed and checked; only files in its own folder are read.
 
 Reference: Khronos glTF 2.0 specification, sections 3.6 (buffers) and 4 (the GLB container).
 """
@@ -23,7 +23,7 @@ from blinkgl.scene.reading import contents, reading
 
 
 def parse(data: bytes, where: str) -> tuple[dict, bytes]:
-    """(the JSON, of the shape that gltf_schema demands; the bytes that a GLB carries). Raises AssetError."""
+    """Return (the JSON, checked by gltf_schema; the bytes in a GLB). Raises AssetError."""
     binary = b""
     if data[:4] == b"glTF":
         if len(data) < 20:
@@ -57,7 +57,7 @@ def parse(data: bytes, where: str) -> tuple[dict, bytes]:
 
 
 def buffers_of(tree: dict, binary: bytes, path: Path) -> list[bytes]:
-    """Contents of all buffers, as long as the file says. Raises AssetError."""
+    """Return the contents of all buffers, with the declared lengths. Raises AssetError."""
     buffers = []
     for number, buffer in enumerate(tree.get("buffers", [])):
         # EXT_meshopt_compression leaves a buffer without content as its fallback.
@@ -77,7 +77,7 @@ def buffers_of(tree: dict, binary: bytes, path: Path) -> list[bytes]:
 
 
 def fetch(uri: str, path: Path, what: str) -> bytes:
-    """What a URI of the file at ``path`` holds: embedded, or a file beside it. Raises AssetError."""
+    """Return the content of a URI of the file at ``path``: embedded, or a file beside it. Raises AssetError."""
     if uri.startswith("data:"):
         head, _, body = uri.partition(",")
         try:
@@ -92,7 +92,7 @@ def fetch(uri: str, path: Path, what: str) -> bytes:
 
 
 def buffer_contents(path: Path, data: bytes) -> list[bytes]:
-    """The external buffers of a .gltf file, in order."""
+    """Return the external buffers of a .gltf file, in order."""
     with reading("scene", str(path)):
         tree, _ = parse(data, str(path))
         uris = [b.get("uri") or "" for b in tree.get("buffers", [])]
@@ -100,8 +100,8 @@ def buffer_contents(path: Path, data: bytes) -> list[bytes]:
 
 
 def inside(folder: Path, name: str, where: str) -> Path:
-    """The file ``name`` below ``folder``. AssetError when it is absolute, leads out by
-    ``..`` or by a link, or is missing."""
+    """Return the file ``name`` below ``folder``. Raises AssetError when it is absolute, leads out by ``..`` or by a
+    link, or is missing."""
     target = Path(folder) / name
     try:
         within = (
@@ -112,7 +112,7 @@ def inside(folder: Path, name: str, where: str) -> Path:
             and target.resolve().is_relative_to(Path(folder).resolve())
         )
         found = within and target.is_file()
-    except (OSError, ValueError, RuntimeError):  # a name too long for the file system, a link to itself
+    except (OSError, ValueError, RuntimeError):  # a name too long for the file system, or a link to itself
         within, found = True, False
     if not within:
         raise AssetError(
@@ -124,7 +124,7 @@ def inside(folder: Path, name: str, where: str) -> Path:
 
 
 def needs(extension: str, where: str) -> AssetError:
-    """The error for a file that cannot be read without an extension."""
+    """Return the error for a file that cannot be read without an extension."""
     return AssetError(
         f"the file needs the extension {extension}, which BlinkGL does not draw",
         where=where,
@@ -133,13 +133,13 @@ def needs(extension: str, where: str) -> AssetError:
 
 
 def item(tree: dict, key: str, index: Any, where: str) -> dict:
-    """One of a list of the file, by a reference to it."""
+    """Return an entry of a list of the file, by a reference to it."""
     items = tree.get(key, [])
     return items[index_of(index, len(items), key, where)]
 
 
 def index_of(index: Any, count: int, what: str, where: str) -> int:
-    """A reference, checked: one of ``count`` things."""
+    """Return a checked reference: an index below ``count``."""
     if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < count:
         raise AssetError(
             f"the file is no valid glTF (a reference to {what} that does not exist)", where=where, value=index
@@ -148,15 +148,15 @@ def index_of(index: Any, count: int, what: str, where: str) -> int:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The node hierarchy of a glTF 2.0 file: which nodes its default scene has, and where they are at rest.
+# The node hierarchy of a glTF 2.0 file: the nodes of its default scene, and their rest transforms.
 
 MAX_NODES, _MAX_DEPTH = 200_000, 256
 
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """name, parent (None at the root), mesh, camera and skin index (None without), rest translation, quaternion
-    x y z w, scale or matrix; weights of the mesh's morph targets where the node says its own."""
+    """A node: name, parent (None at the root), mesh, camera and skin index (None without), rest translation, quaternion
+    x y z w, scale or matrix; weights of the mesh's morph targets where the node has its own."""
 
     name: str
     parent: int | None
@@ -170,7 +170,7 @@ class Node:
     weights: tuple | None = None
 
     def local(self) -> np.ndarray:
-        """(4, 4) transform to the parent, at rest."""
+        """Return the rest transform to the parent, (4, 4)."""
         if self.matrix is not None:
             return self.matrix
         T = np.eye(4)
@@ -180,7 +180,7 @@ class Node:
 
 
 def nodes_of(tree: dict, where: str) -> dict[int, Node]:
-    """Nodes of the default scene (of the file, when it has none), parents first."""
+    """Return the nodes of the default scene (of the file, when it has none), parents first."""
     raw, scenes = tree.get("nodes", []), tree.get("scenes", [])
     if len(raw) > MAX_NODES:
         raise AssetError("the file has too many nodes", where=where, value=len(raw), accepted=f"at most {MAX_NODES}")

@@ -24,15 +24,15 @@ DRAWN = {
     "KHR_mesh_quantization",
 }
 INVISIBLE_EXTENSIONS = {"KHR_xmp_json_ld", "KHR_xmp"}
-"""Nothing to be seen in these."""
+"""Extensions without visible effect."""
 _WRAPS: dict[int, Wrap] = {33071: "clamp", 33648: "mirror"}
 _NEAREST = 9728
 INVISIBLE = Material()
-"""Of what is cut off everywhere."""
+"""A material that is cut off everywhere."""
 
 
 class _Place(NamedTuple):
-    """Where a texture lies on a mesh: number of its set of coordinates, (3, 3) transform of them or None."""
+    """Texture coordinates of a texture: index of the set, (3, 3) transform or None."""
 
     coordinates: int
     matrix: np.ndarray | None
@@ -44,8 +44,8 @@ class _Place(NamedTuple):
 
 
 class Materials:
-    """The materials of one file, each made once. wanted : False leaves out all but the base colour, and what materials
-    ask for unsaid."""
+    """The materials of one file, each made once. wanted : False leaves out all but the base colour, and does not report
+    undrawn features."""
 
     def __init__(
         self, tree: dict, buffers: list[bytes], path: Path, max_texture: int, wanted: bool, omissions: Omissions
@@ -56,7 +56,7 @@ class Materials:
         self._textures: dict = {}
 
     def material(self, index: int | None) -> tuple[Material | None, int, np.ndarray | None]:
-        """(material, texture coordinate set, 3x3 texture transform or None)."""
+        """Return (material, texture coordinate set, 3x3 texture transform or None)."""
         if index is None:
             return None, 0, None
         if index not in self._materials:
@@ -76,8 +76,8 @@ class Materials:
         return self._materials[index]
 
     def _surface(self, material: Material, m: dict, pbr: dict, base: _Place) -> tuple[Material, _Place]:
-        """``material`` with all that glTF says of it beside its base colour, and the place of its coordinates: that of
-        the first of its textures."""
+        """Return ``material`` with everything besides its base colour, and its texture coordinates: those of the first
+        of its textures."""
         for name in m.get("extensions", {}):
             if name not in DRAWN | INVISIBLE_EXTENSIONS:
                 self.omissions.add(name)
@@ -91,14 +91,14 @@ class Materials:
             self.omissions.add("occlusion maps")
         emissive, bumps = m.get("emissiveTexture"), m.get("normalTexture")
         rough = pbr.get("metallicRoughnessTexture")
-        # Without a texture of the base colour the coordinates of the next map are the mesh's.
+        # Without a base colour texture, the next map defines the mesh's coordinates.
         if not info:
             base = _Place.of(next((one for one in (rough, bumps, emissive) if one), {}))
         strength = m.get("extensions", {}).get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
         emission = tuple(float(c * strength) for c in m.get("emissiveFactor", (0, 0, 0)))
         if any(emission):
             material = replace(material, emission=emission, emission_map=self._map(emissive, base, "colour"))
-        # The standard's defaults are a rough metal: a material that says nothing is metallic 1.
+        # The standard's defaults are a rough metal: metallic is 1 unless given.
         metallic, roughness = (min(float(pbr.get(f"{key}Factor", 1)), 1.0) for key in ("metallic", "roughness"))
         if metallic > 0 or roughness < 1 or rough:
             material = replace(material, gloss=Gloss(metallic, roughness, self._map(rough, base, "numbers")))
@@ -107,7 +107,8 @@ class Materials:
         return material, base
 
     def _masked(self, material: Material, m: dict, pbr: dict) -> Material:
-        """With its holes. One that shows wholly is not masked; one that shows nowhere is INVISIBLE."""
+        """Return the material with its holes. A fully opaque one is not masked; a fully transparent one is
+        INVISIBLE."""
         mode, factor = m.get("alphaMode", "OPAQUE"), float(pbr.get("baseColorFactor", (1, 1, 1, 1))[3])
         if mode == "OPAQUE":
             return material
@@ -116,8 +117,7 @@ class Materials:
         image = np.full((1, 1), 255, np.uint8) if alpha is None else alpha.image
         cutoff = float(m.get("alphaCutoff", 0.5)) if mode == "MASK" else 0.5
         least, most = (factor * float(v) / 255 for v in (image.min(), image.max()))
-        # Nothing here is drawn half transparent: what is mostly there is cut out, what is nowhere half there is
-        # opaque.
+        # Half-transparent surfaces are not drawn: partly opaque ones are cut out, fully opaque ones are drawn.
         if mode == "BLEND":
             if most < cutoff:
                 self.omissions.add("alpha BLEND (drawn opaque)")
@@ -128,7 +128,7 @@ class Materials:
         return replace(material, mask=Mask(image, factor, cutoff)) if least < cutoff else material
 
     def _map(self, info: dict | None, base: _Place, kind: str) -> Map | None:
-        """A texture beside that of the base colour. kind : "colour" or "numbers"."""
+        """Return a texture other than the base colour's. kind : "colour" or "numbers"."""
         if not info:
             return None
         place, texture = _Place.of(info), self._texture(info["index"], kind)
@@ -142,13 +142,13 @@ class Materials:
         if abs(np.linalg.det(first)) < 1e-12:
             at = own
         else:
-            # The mesh's coordinates are already those of the first texture: its own transform is undone.
+            # The mesh's coordinates already include the first texture's transform, which is undone here.
             at = own @ np.linalg.inv(first)
         a, b, c, d, e, f = (float(v) for v in np.round(at[:2], 12).ravel())
         return Map(texture, (a, b, c, d, e, f), self._wraps(info["index"]))
 
     def _wraps(self, index: int) -> tuple[Wrap, Wrap]:
-        """Of a texture."""
+        """Return the wrap modes of a texture."""
         sampler = item(self.tree, "textures", index, self.where).get("sampler")
         if sampler is None:
             return REPEAT
@@ -159,7 +159,8 @@ class Materials:
         return s, t
 
     def _texture(self, index: int, kind: str = "colour") -> Texture | None:
-        """kind : "colour"; "numbers", as they are stored; "alpha", (h, w), None where the image is opaque."""
+        """Return a texture. kind : "colour"; "numbers", as they are stored; "alpha", (h, w), None where the image is
+        opaque."""
         source = item(self.tree, "textures", index, self.where).get("source")
         if source is None:
             names = ", ".join(self.tree["textures"][index].get("extensions", {})) or "without an image"

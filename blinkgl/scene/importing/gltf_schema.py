@@ -1,8 +1,8 @@
-"""What a glTF 2.0 file's JSON has to look like before it is believed: types, ranges, lengths of all that is read.
+"""Schema of a glTF 2.0 file's JSON: types, ranges and lengths of everything that is read.
 
-The reader (:mod:`blinkgl.scene.importing.gltf`) works on the plain dictionaries; :func:`check` says that they have this
-shape. References from one list into another are checked where they are followed. Names are those of the specification.
-A property that nobody reads is not looked at.
+The reader (:mod:`blinkgl.scene.importing.gltf`) works on the plain dictionaries; :func:`check` guarantees their form.
+References from one list into another are checked where they are used. Names are those of the specification. Properties
+that are not read are not checked.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from blinkgl.errors import AssetError
 
 Index = Annotated[int, Field(ge=0, lt=2**31)]
 Size = Annotated[int, Field(ge=0, le=2**53)]
-# Beyond this a unit was mistaken, and products of a few of them overflow.
+# A larger value has the wrong unit, and products of a few of them overflow.
 Number = Annotated[float, Field(ge=-1e12, le=1e12)]
 Factor = Annotated[float, Field(ge=0, le=1e9)]
 Vector2 = Annotated[list[Number], Field(min_length=2, max_length=2)]
@@ -26,7 +26,7 @@ Extensions = dict[str, dict[str, Any]]
 
 
 class _Part(BaseModel):
-    # A default of None stands for "not there"; JSON's null is nowhere allowed by the specification, nor here.
+    # A default of None means "not there"; the specification does not allow JSON's null, so it is refused.
     model_config = ConfigDict(extra="ignore", strict=True, allow_inf_nan=False)
 
 
@@ -225,7 +225,7 @@ class Spot(_Part):
 
 
 class PunctualLight(_Part):
-    """Of KHR_lights_punctual: candela and lux."""
+    """A light of KHR_lights_punctual: candela and lux."""
 
     type: Literal["directional", "point", "spot"]
     color: Annotated[list[Factor], Field(min_length=3, max_length=3)] = [1, 1, 1]
@@ -259,8 +259,8 @@ class File(_Part):
 
 
 def check(tree: Any, where: str, model: type[_Part] = File) -> None:
-    """AssetError naming the first property that is not as the specification has it, and its value.
-    model : what it is checked as; an extension has one of its own."""
+    """Raise AssetError naming the first property that violates the specification, and its value.
+    model : the schema; an extension has its own."""
     try:
         model.model_validate(tree)
     except ValidationError as error:

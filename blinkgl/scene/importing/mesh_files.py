@@ -1,8 +1,8 @@
-"""Mesh files (obj, ply, stl through :mod:`blinkgl.scene.importing.trimesh_files`; glb, gltf through
+"""Mesh files (obj, ply, stl by :mod:`blinkgl.scene.importing.trimesh_files`; glb, gltf by
 :mod:`blinkgl.scene.importing.gltf`) as :class:`Asset` objects.
 
-What a file claims is checked against limits before anything is allocated for it, and nothing outside the file's own
-folder is read on its behalf.
+Sizes that a file declares are checked against limits before memory is allocated, and only files in the file's own
+folder are read.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ ClipOf = Callable[[gltf.Document], Animation]
 class Asset:
     """A loaded object: its parts in object coordinates, z up.
 
-    has_materials : the parts carry the file's own materials.   log : repairs made.
-    omissions : what the file asks for and is not drawn, in one line (:mod:`blinkgl.scene.reading`), or empty.
-    clips : names of the animations that its file has.   replay : loads it again as it plays one; None: it has none.
+    has_materials : the parts have the file's own materials.   log : repairs made.
+    omissions : undrawn features of the file, in one line (:mod:`blinkgl.scene.reading`), or empty.
+    clips : names of the file's animations.   replay : loads it again playing one; None: it has none.
     """
 
     name: str
@@ -50,7 +50,8 @@ class Asset:
     replay: Callable[[AnimationConfig], Asset] | None = None
 
     def normalised(self) -> Asset:
-        """Bounding box centred on the origin, bounding radius 1; of all that it sweeps, where it deforms."""
+        """Return it with the bounding box centred on the origin and bounding radius 1; a deforming one by its whole
+        region."""
         meshes = normalise(tuple(p.mesh for p in self.parts), self.name)
         return replace(self, parts=tuple(Part(m, p.material) for m, p in zip(meshes, self.parts)))
 
@@ -67,17 +68,17 @@ def load_asset(
     up: str = "auto",
     play: ClipOf | None = None,
 ) -> Asset:
-    """One object from a file.
+    """Return one object from a file.
 
-    play : of a glTF file, what makes the clip that it plays of it (:func:`clip_of`); None: it is at rest.
-    up : the file's axis that points up and becomes z, "y" or "z"; "auto" is y for glb and gltf, whose standard says so,
-        and z for the others, which say nothing.
+    play : for a glTF file, returns the clip that it plays (:func:`clip_of`); None: it is at rest.
+    up : the file's upward axis, which becomes z, "y" or "z"; "auto" is y for glb and gltf, by their standard, and z for
+        the others, which do not define it.
     keep_materials : parts with the file's materials; else one part, white, with texture coordinates that can carry any
         texture (projected where the file has none or degenerate ones).
-    uv_size : edge of one repeat of texture coordinates that are projected.
+    uv_size : edge of one repeat of projected texture coordinates.
     Raises AssetError naming the file: missing, corrupt, NaN, no faces, more than ``max_faces`` triangles or
-    ``max_bytes`` bytes, references outside its folder, an extension required that is not drawn; ConfigError: ``play``
-    does not find its clip.
+    ``max_bytes`` bytes, references outside its folder, a required extension that is not supported; ConfigError:
+    ``play`` does not find its clip.
     """
     path = Path(path)
     where = str(path)
@@ -104,13 +105,13 @@ def load_asset(
 
 
 def clip_of(config: AnimationConfig, base: Path | str = ".", where: str = "animation") -> ClipOf:
-    """What makes the clip that ``config`` asks for, of a document. base : folder that a path in it starts from.
+    """Return a function from a document to the clip of ``config``. base : folder that a path in it starts from.
     where : its key of the configuration."""
     return partial(play_clip, config=config, base=Path(base), where=where)
 
 
 class _Found(NamedTuple):
-    """What a file has. raws : in its own world, z up.   deformers : one of each, None: it is rigid."""
+    """The meshes of a file. raws : in its own world, z up.   deformers : one for each, None: it is rigid."""
 
     raws: list[RawMesh]
     deformers: list[DeformerOf | None]
@@ -120,7 +121,7 @@ class _Found(NamedTuple):
 
 
 def _found(path, max_faces, max_bytes, materials, max_texture, source_hash, up, play) -> tuple[_Found, str]:
-    """What the file has, and the hash of its content."""
+    """Return the meshes of the file, and the hash of its content."""
     where, suffix = str(path), path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise AssetError("unknown kind of mesh file", where=where, value=suffix, accepted=" ".join(MESH_SUFFIXES))
@@ -133,7 +134,7 @@ def _found(path, max_faces, max_bytes, materials, max_texture, source_hash, up, 
         return _of_document(document, play, turn), digest
     if play is not None:
         raise AssetError("only glTF files have animations", where=where, accepted="a gltf or glb file, or no animation")
-    # Here: trimesh takes as long to import as half of what else a worker needs, and most scenes have no such file.
+    # Here: trimesh takes half as long to import as everything else that a worker needs, and most scenes do not use it.
     from blinkgl.scene.importing.trimesh_files import read_meshes
 
     omissions = Omissions(path.name)
@@ -143,7 +144,8 @@ def _found(path, max_faces, max_bytes, materials, max_texture, source_hash, up, 
 
 
 def _of_document(document: gltf.Document, play: ClipOf | None, turn: np.ndarray | None) -> _Found:
-    """turn : (4, 4) from the file's world to the object's axes; None: they are the same."""
+    """Return the meshes of a document. turn : (4, 4) from the file's world to the object's axes; None: they are the
+    same."""
     clips, played = clip_names(document), None if play is None else play(document)
     if clips and played is None:
         document.omissions.add("animations (the rest pose is drawn)")
@@ -163,14 +165,14 @@ def _of_document(document: gltf.Document, play: ClipOf | None, turn: np.ndarray 
 
 
 def _one_part(parts: tuple[Part, ...], name: str, digest: str) -> tuple[Part, ...]:
-    """White parts as one, unless their shapes change in ways that are not one."""
+    """Return white parts as one, unless their deformations cannot be joined."""
     meshes = tuple(part.mesh for part in parts)
     whole = joined_mesh(meshes, name, digest)
     return tuple(Part(mesh, Material()) for mesh in ((whole,) if whole is not None else meshes))
 
 
 def joined_mesh(meshes: tuple[Mesh, ...], name: str, source_hash: str) -> Mesh | None:
-    """One mesh of several; None where they change their shapes in ways that are not one."""
+    """Return one mesh of several; None where their deformations cannot be joined."""
     whole = concatenate(meshes, name=name, source_hash=source_hash)
     changing = [mesh.deformer for mesh in meshes if mesh.deformer is not None]
     if not changing or len(meshes) == 1:
@@ -181,7 +183,7 @@ def joined_mesh(meshes: tuple[Mesh, ...], name: str, source_hash: str) -> Mesh |
 
 
 def dependencies(path: Path, data: bytes | None = None) -> list[bytes]:
-    """Contents of the buffer files that a .gltf refers to (they are part of what it is); [] for other files."""
+    """Return contents of the buffer files that a .gltf refers to (they are part of its content); [] for other files."""
     if path.suffix.lower() != ".gltf":
         return []
     return buffer_contents(path, contents(path, "mesh") if data is None else data)

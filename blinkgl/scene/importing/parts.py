@@ -1,4 +1,4 @@
-"""From raw meshes of a file to the parts of an object."""
+"""Conversion of a file's raw meshes to the parts of an object."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from blinkgl.scene.shapes.deformer import Deformer
 from blinkgl.scene.types import Material, Part
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Triangles as a file has them, before they are checked and become a :class:`~blinkgl.scene.types.Mesh`.
+# Triangles as stored in a file, before they are checked and become a :class:`~blinkgl.scene.types.Mesh`.
 
 # Columns: the file's x, y, z axes in a z-up world.
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
@@ -23,9 +23,9 @@ Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]
 class RawMesh:
     """Raw triangles. normals, uvs (v down) and material may be None.
 
-    binding : (V, k) joints of the node's skin and (V, k) weights; None: it has no skin.
-    targets : morph targets, (n, V, 3) positions, likewise normals or None; None: it has none.
-    colours : (V, 3) linear factors on the albedo; None: it has none."""
+    binding : (V, k) joints of the node's skin and (V, k) weights; None: no skin.
+    targets : morph targets, (n, V, 3) positions, likewise normals or None; None: none.
+    colours : (V, 3) linear factors on the albedo; None: none."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -38,11 +38,11 @@ class RawMesh:
 
 
 def transformed(raw: RawMesh, matrix: np.ndarray) -> RawMesh:
-    """The triangles under an affine (4, 4) map; a mirroring one turns the faces round, so that they keep facing out."""
+    """Return the triangles under an affine (4, 4) map; a reflection reverses the faces so that they face out."""
     linear = matrix[:3, :3]
     determinant = float(np.linalg.det(linear))
     vertices = raw.vertices @ linear.T + matrix[:3, 3]
-    # Cofactors instead of the inverse: also right for a map that flattens the mesh.
+    # Cofactors instead of the inverse: also valid for a singular map.
     cofactors = np.stack(
         [np.cross(linear[1], linear[2]), np.cross(linear[2], linear[0]), np.cross(linear[0], linear[1])]
     )
@@ -51,7 +51,7 @@ def transformed(raw: RawMesh, matrix: np.ndarray) -> RawMesh:
 
 
 DeformerOf = Callable[[RawMesh, np.ndarray], "Deformer | None"]
-"""The deformer of the mesh that is made of a raw one; (W,) which of its vertices each of the mesh's is."""
+"""Returns the deformer of the mesh made from a raw one; (W,) index of the raw vertex of each of the mesh's."""
 
 
 def part_of(
@@ -65,14 +65,14 @@ def part_of(
     uv_size: float | None = None,
     deformer: DeformerOf | None = None,
 ) -> Part:
-    """A checked mesh of a raw one, with its material; the other arguments are those of
+    """Return a checked mesh of a raw one, with its material; the other arguments are those of
     :func:`~blinkgl.scene.geometry.meshes.make_mesh`.
 
-    materials : whether it has its own; False: a white one, that any texture may replace. Raises AssetError."""
+    materials : whether it has its own; False: a white one, for any texture. Raises AssetError."""
     material = raw.material if materials and raw.material is not None else Material()
     colours = raw.colours if materials else None
     bumped = material.bumps is not None
-    # Only what counts the file's vertices has to know which of them the mesh's are.
+    # Only per-vertex data of the file needs the indices of the mesh's vertices.
     source: list[np.ndarray] | None = [] if deformer is not None or colours is not None or bumped else None
     mesh = make_mesh(
         raw.vertices,
@@ -83,7 +83,7 @@ def part_of(
         source_hash=source_hash,
         where=where,
         uv_size=uv_size,
-        # A palette picked by degenerate coordinates is fine with the file's own texture, useless with any other.
+        # Degenerate coordinates that select from a palette work with the file's own texture, but with no other.
         project_degenerate=material.texture is None,
         log=log,
         source=source,
@@ -100,7 +100,7 @@ def part_of(
 
 
 def closed_parts(parts: Iterable[Part]) -> tuple[Part, ...]:
-    """The parts, each closed where they are so together: one solid, split by material."""
+    """Return the parts, each marked closed where they are closed together: one solid, split by material."""
     parts = tuple(parts)
     if not closed_together(tuple(part.mesh for part in parts)):
         return parts

@@ -22,16 +22,16 @@ from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash, decode_i
 from blinkgl.scene.types import Material, Texture
 from blinkgl.srgb import linear_from_srgb
 
-logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # its warnings say nothing a user could act on
+logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # its warnings are of no use to a user
 
 
 def read_meshes(
     path: Path, data: bytes, kind: str, max_faces: int, max_texture: int | None, omissions: Omissions
 ) -> list[RawMesh]:
-    """Of a file of this ``kind`` ("obj", "ply", "stl").
+    """Return raw meshes of a file of this ``kind`` ("obj", "ply", "stl").
 
-    max_texture : None leaves materials out.   omissions : is told what the file asks for and is not drawn. Raises
-    AssetError: truncated, corrupt, no faces, more than ``max_faces``, references outside its folder."""
+    max_texture : None leaves materials out.   omissions : gets the undrawn features of the file. Raises AssetError:
+    truncated, corrupt, no faces, more than ``max_faces``, references outside its folder."""
     where = str(path)
     {"stl": _check_stl, "ply": _check_ply, "obj": _check_obj}[kind](data, max_faces, where)
     resolver = FolderResolver(path.parent, where, kind, omissions)
@@ -63,7 +63,7 @@ def _raw_mesh(
     mesh: trimesh.Trimesh, max_texture: int | None, omissions: Omissions, resolver: FolderResolver
 ) -> RawMesh:
     """Return raw triangles and material. max_texture : None leaves the material out."""
-    # mesh.vertex_normals would make up what the file does not have.
+    # mesh.vertex_normals would compute normals that the file does not have.
     normals = mesh._cache.cache.get("vertex_normals")  # noqa: SLF001
     uvs = getattr(mesh.visual, "uv", None)
     if uvs is not None and len(uvs) == len(mesh.vertices):
@@ -85,7 +85,7 @@ def _raw_mesh(
 
 
 def _to_linear(srgb: np.ndarray) -> tuple[float, float, float]:
-    """Linear light of an sRGB colour (3,), what lies outside 0 to 1 cut off."""
+    """Return the linear light of an sRGB colour (3,), clipped to 0 to 1."""
     r, g, b = (float(c) for c in linear_from_srgb(np.clip(srgb, 0, 1)))
     return r, g, b
 
@@ -101,7 +101,7 @@ def _material(visual, max_texture: int, omissions: Omissions, resolver: FolderRe
             omissions.add(f"{kind} colours (drawn in the most frequent one)")
         return Material(base_color=_to_linear(np.asarray(visual.main_color, float)[:3] / 255))
     image, diffuse = material.image, material.diffuse
-    # An untouched default is no material; a texture is not darkened by the usual grey diffuse default.
+    # An untouched default is not a material; the usual grey diffuse default does not darken a texture.
     if image is None and material.name is None and np.array_equal(diffuse[:3], trimesh.visual.color.DEFAULT_COLOR[:3]):
         return None
     if image is None:
@@ -110,17 +110,16 @@ def _material(visual, max_texture: int, omissions: Omissions, resolver: FolderRe
 
 
 class FolderResolver(trimesh.resolvers.Resolver):
-    """Reads material and image files beside a mesh; refuses what leads out of its folder.
+    """Reads material and image files beside a mesh; refuses paths outside its folder.
 
-    trimesh opens images with Pillow as it finds them, and does without those that it cannot open. So it is given a
-    pixel in place of each, whose colour is the image's number; :meth:`texture` decodes the file by the rules of all
-    other textures.
+    trimesh opens images with Pillow itself and ignores those that it cannot open. So it gets a pixel instead of each,
+    whose colour is the image's number; :meth:`texture` decodes the file by the rules of all other textures.
     """
 
     def __init__(self, folder: Path, where: str, kind: str, omissions: Omissions):
         self.folder, self.where, self.kind, self.omissions = Path(folder), where, kind, omissions
         self.refused: AssetError | None = None
-        self._named: set[str] = set()  # images that a material file names
+        self._named: set[str] = set()  # images named by a material file
         self._images: list[tuple[str, bytes]] = []
         self._textures: dict[int, Texture] = {}
 
@@ -128,7 +127,7 @@ class FolderResolver(trimesh.resolvers.Resolver):
         try:
             file = inside(self.folder, str(name), self.where)
             data = contents(file, "file")
-        except AssetError as error:  # trimesh swallows it; read_meshes raises it
+        except AssetError as error:  # trimesh hides it; read_meshes raises it
             if "missing" in error.problem:
                 self.omissions.add(f"'{name}', which is missing")
             else:
@@ -143,7 +142,7 @@ class FolderResolver(trimesh.resolvers.Resolver):
         return stream.getvalue()
 
     def texture(self, pixel: Image.Image, max_texture: int) -> Texture:
-        """The texture that ``pixel`` stands for. AssetError naming its file."""
+        """Return the texture of a placeholder ``pixel``. Raises AssetError naming its file."""
         red, green, blue = pixel.convert("RGB").getpixel((0, 0))
         number = red + (green << 8) + (blue << 16)
         if number not in self._textures:
@@ -152,7 +151,7 @@ class FolderResolver(trimesh.resolvers.Resolver):
         return self._textures[number]
 
     def _read_mtl(self, data: bytes) -> None:
-        """Notes the images that a material file names, and what its maps ask for beside a matt colour."""
+        """Record the images that a material file names, and undrawn features of its materials."""
         for line in data.decode("utf-8", errors="replace").splitlines():
             key, _, rest = line.strip().partition(" ")
             key, rest = key.lower(), rest.strip()
@@ -162,7 +161,7 @@ class FolderResolver(trimesh.resolvers.Resolver):
                 self.omissions.add(_MTL_MAPS[key])
 
     def write(self, name: str, data: bytes) -> NoReturn:
-        raise AssetError("a mesh loader wanted to write", where=self.where, value=name)
+        raise AssetError("a mesh loader tried to write", where=self.where, value=name)
 
     def namespaced(self, namespace: str) -> FolderResolver:
         return FolderResolver(inside(self.folder, namespace, self.where), self.where, self.kind, self.omissions)
@@ -186,7 +185,7 @@ _MTL_MAPS = {
 def _check_stl(data: bytes, max_faces: int, where: str) -> None:
     if len(data) >= 84:
         claimed = int(np.frombuffer(data[80:84], "<u4")[0])
-        # Binary when the size fits; ASCII begins with 'solid' (some binary files do too, hence the size first).
+        # Binary when the size fits; ASCII begins with 'solid' (some binary files do, too, so the size comes first).
         if data.lstrip()[:5].lower() != b"solid" or len(data) == 84 + 50 * claimed:
             if claimed > max_faces:
                 raise AssetError(
@@ -220,13 +219,13 @@ def _check_ply(data: bytes, max_faces: int, where: str) -> None:
             raise AssetError(
                 f"the mesh has too many {what}", where=where, value=count, accepted=f"at most {max_faces} faces"
             )
-        if count > len(data) - end:  # an element takes a byte at least
+        if count > len(data) - end:  # an element takes at least one byte
             raise AssetError(f"the mesh is truncated: {count} {what} in {len(data)} bytes", where=where)
 
 
 def _check_obj(data: bytes, max_faces: int, where: str) -> None:
     _limit(data.count(b"\nf ") + data.startswith(b"f "), max_faces, where)
-    # trimesh allocates as many vertices as the largest index of a face says; a file has no more of them than lines.
+    # trimesh allocates as many vertices as the largest index of a face; a file has at most one per line.
     lines = data.count(b"\n") + data.count(b"\r") + 1
     found = re.search(
         rb"(?:\A|[\r\n])f[^\r\n]*?(\d{%d,})" % (len(str(lines)) + 1),

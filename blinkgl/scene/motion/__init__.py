@@ -1,6 +1,6 @@
-"""What moves where.
+"""Motion of bodies and cameras.
 
-In:    way-points, key frames, bounds of free space.
-Out:   :class:`~blinkgl.scene.types.PosePath` objects that do not run into each other.
-Start: paths.py; trajectories.py draws random ones, collision.py keeps them apart.
+In:    waypoints, key frames, bounds of free space.
+Out:   :class:`~blinkgl.scene.types.PosePath` objects without collisions.
+Start: paths.py; trajectories.py draws random ones, collision.py prevents collisions.
 """

@@ -1,4 +1,4 @@
-"""What touches of a body: its parts as the convex solids that MuJoCo knows, chosen by the mesh itself."""
+"""Collision shapes of a body: its parts as convex solids that MuJoCo supports, chosen from the mesh."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from blinkgl.machine.kernels import kernel
 from blinkgl.scene.shapes.deformer import filled
 from blinkgl.scene.types import SceneObject
 
-_MOST_PARTS = 24  # of an object with more, all are one hull
+_MOST_PARTS = 24  # an object with more parts gets one common hull
 
 
 @dataclass(frozen=True)
 class Barrier:
-    """A plane without end that nothing passes and nobody sees: points x with ``normal . x >= offset`` are inside."""
+    """An infinite invisible plane that nothing passes: points x with ``normal . x >= offset`` are inside."""
 
     normal: tuple[float, float, float]
     offset: float
@@ -29,7 +29,7 @@ class Barrier:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A convex solid in a body's axes. kind : MuJoCo's, BOX, SPHERE, PLANE or MESH.   size : as MuJoCo has it: half
+    """A convex solid in a body's axes. kind : MuJoCo's, BOX, SPHERE, PLANE or MESH.   size : in MuJoCo's form: half
     edges, radius.   vertices : (V, 3) of a MESH's hull."""
 
     kind: str
@@ -47,11 +47,11 @@ class Shape:
 
 
 def shapes_of(obj: SceneObject, config: BodyConfig) -> list[Shape]:
-    """What touches, of an object: its parts' solids in its axes; of one that deforms the hull of all its shapes."""
+    """Return an object's collision shapes in its axes: one per part; of a deforming one the hull of all its shapes."""
     parts = [filled(part.mesh)[0] for part in obj.parts if len(part.mesh.faces)]
     if len(parts) > _MOST_PARTS:
         parts = [np.concatenate(parts)]
-    # A flat ground is an endless plane, which nothing falls off.
+    # A flat ground is an infinite plane, so that nothing falls off.
     if obj.category == "ground" and config.kind == "fixed" and len(parts) == 1:
         mesh = next(part.mesh for part in obj.parts if len(part.mesh.faces))
         centre, axes, extent = _framed(parts[0])
@@ -62,11 +62,11 @@ def shapes_of(obj: SceneObject, config: BodyConfig) -> list[Shape]:
 
 
 def _solid(points: np.ndarray) -> Shape:
-    """A box or a ball where the points are one, to rounding; else their convex hull."""
+    """Return a box or a ball where the points form one, to rounding; else their convex hull."""
     low, high = points.min(axis=0), points.max(axis=0)
     centre, half = 0.5 * (low + high), 0.5 * (high - low)
     radii = np.linalg.norm(points - centre, axis=1)
-    # Thin in its smallest principal direction: a box of a little thickness.
+    # Flat in its smallest principal direction: a thin box.
     middle, axes, extent = _framed(points)
     if extent[2] < 0.005 * extent[0]:
         return Shape("BOX", np.maximum(extent, 0.01 * extent.max()), middle, axes)
@@ -89,8 +89,8 @@ def _hull(points: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _framed(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(centre (3,), axes (3, 3) as columns, a right-handed frame, half extents (3,) along them) of a box round the
-    points, along their principal axes, longest first."""
+    """Return (centre (3,), axes (3, 3) as columns, a right-handed frame, half extents (3,) along them) of a box around
+    the points, along their principal axes, longest first."""
     mean = points.mean(axis=0)
     # Principal axes: eigenvectors of the covariance, smallest first.
     _, axes = np.linalg.eigh(np.cov(points.T, bias=True))
@@ -101,7 +101,7 @@ def _framed(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def plane_of(side: Barrier) -> Shape:
-    """Return an endless plane whose z axis is the normal."""
+    """Return an infinite plane whose z axis is the normal."""
     normal = np.asarray(side.normal, dtype=np.float64)
     rotation, _ = Rotation.align_vectors([normal], [[0.0, 0.0, 1.0]])
     return Shape("PLANE", (1.0, 1.0, 1.0), normal * side.offset, rotation.as_matrix())
@@ -113,14 +113,14 @@ def quaternions(R: np.ndarray) -> np.ndarray:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The damping of MuJoCo's soft contacts that gives back a share of a body's speed.
+# The damping of MuJoCo's soft contacts for a given restitution.
 
 
 @lru_cache(maxsize=4096)
 def damping_ratio(restitution: float, steps: float) -> float:
-    """Of the contact of so many steps that gives back this share of the speed (0 to 1), in the mean over the phases in
-    which a step meets the surface. The strongest gives back 0.02: that is what 0 becomes."""
-    # Bisection: a larger damping ratio gives back less.
+    """Return the damping ratio of a contact of ``steps`` steps that gives this restitution (0 to 1), averaged over the
+    phases in which a step meets the surface. The strongest damping gives 0.02, which is used for 0."""
+    # Bisection: a larger damping ratio gives a smaller restitution.
     low, high = 0.0, 3.0
     for _ in range(40):
         middle = 0.5 * (low + high)
@@ -134,7 +134,7 @@ def _given_back(ratio: float, steps: float) -> float:
     # w: angle of the spring per step. The contact only pushes, hence min(..., 0).
     w, total, phases = math.pi / steps, 0.0, 16
     for phase in range(phases):
-        # The phase is where within a step the surface is met.
+        # The phase is the position within a step at which the surface is met.
         depth, v = (phase + 0.5) / phases, 1.0
         while depth > 0.0:
             v += min(-(w * w * depth + 2.0 * ratio * w * v), 0.0)

@@ -1,28 +1,28 @@
-"""Collisions along trajectories, found continuously; whoever collides stays where it is.
+"""Collisions along trajectories, found continuously; bodies that collide stop.
 
     result = resolve_collisions(objects, camera_path, camera_radius, t0_ns, t1_ns)
     if result.at_start: ...                         # a placement to be drawn again
     scene = Scene(result.objects, Rig.alone(camera, result.camera_path), t0_ns, t1_ns, log=result.log)
 
 Method: conservative advancement (Mirtich 1996; Tang, Kim & Manocha, "C2A", ICRA 2009). At a time t two bodies are a
-distance d apart and over [t, t + dt] no point of theirs is faster than S = sum(|v| + |w| r), with bounds that come from
-the trajectories' polynomials (:meth:`PosePath.speed_bound`), not from samples; so nothing can touch before t + d / S,
-which is the next time looked at. A body that is thinner than its motion per frame therefore cannot be jumped over.
-Whichever pair is next in time is advanced first, so each step sees all earlier cuts.
+distance d apart and over [t, t + dt] no point of theirs is faster than S = sum(|v| + |w| r), with bounds from the
+trajectories' polynomials (:meth:`PosePath.speed_bound`), not from samples; so nothing can touch before t + d / S, which
+is the next time tested. Therefore a body that is thinner than its motion per frame cannot be jumped over. The pair with
+the earliest next time is advanced first, so each step sees all earlier cuts.
 
 Distances: bounding spheres and separating faces of convex static bodies while these suffice, otherwise exact
-triangle-triangle distances (fcl). Two bodies collide when they come within
-``tol = tolerance * (the smaller's radius)``; the cut is at a separation in (0, tol].
+triangle-triangle distances (fcl). Two bodies collide when they come within ``tol = tolerance * (the smaller's
+radius)``; the cut is at a separation in (0, tol].
 
-Rest: a body that touches the ground (or a wall) at t0 was put there. Where that is flat (or convex: a slab), the body
-may slide on it, lift off and land; only sinking more than ``rest_margin`` of its radius into it counts as a
-collision. Touching other bodies, or ground that is not convex, at t0 is a collision at t0.
+Rest: a body that touches the ground (or a wall) at t0 rests on it. Where that is flat (or convex: a slab), the body may
+slide on it, lift off and land; only sinking more than ``rest_margin`` of its radius into it counts as a collision.
+Touching other bodies, or ground that is not convex, at t0 is a collision at t0.
 
-A body that changes its shape is the convex hull of all shapes that it takes in [t0, t1], thickened by what may lie
-between the times that were looked at (:class:`~blinkgl.scene.shapes.deformer.Sweep`): what keeps clear of that keeps
-clear of each of them. Its path is cut like any other's; its shape goes on changing.
+A deforming body is the convex hull of all its shapes in [t0, t1], enlarged by the possible motion between the sampled
+times (:class:`~blinkgl.scene.shapes.deformer.Sweep`): a body clear of that is clear of each shape. Its path is cut like
+any other's; its shape continues to change.
 
-Surfaces collide, not solids: a body that starts wholly inside another's hollow touches nothing there.
+Surfaces collide, not solids: a body that starts completely inside another's hollow touches nothing there.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from blinkgl.scene.types import PosePath, SceneObject
 
 CAMERA = "camera"
 _SUPPORTS = ("ground", "wall")
-_MAX_PLANES = 24  # convex static bodies with more faces are left to fcl
+_MAX_PLANES = 24  # convex static bodies with more faces use fcl
 _REQUEST = fcl.DistanceRequest()
 
 
@@ -63,10 +63,10 @@ class Collision:
 
 @dataclass(frozen=True, eq=False)
 class CollisionResult:
-    """objects, camera_path : as given, with :class:`CutPath` where something was stopped.
+    """The result of a search. objects, camera_path : as given, with :class:`CutPath` where something was stopped.
     events   : in order of time.
-    at_start : those of ``events`` at t0: placements that were no good.
-    distance_queries : how many exact distances it took.
+    at_start : those of ``events`` at t0: invalid placements.
+    distance_queries : number of exact distances computed.
     """
 
     objects: tuple[SceneObject, ...]
@@ -89,11 +89,11 @@ def resolve_collisions(
     tolerance: float = 1e-3,
     rest_margin: float = 0.01,
 ) -> CollisionResult:
-    """Cuts every moving body's path at its first collision in [t0, t1].
+    """Cut every moving body's path at its first collision in [t0, t1].
 
     objects       : moving and static ones, ground, walls and sky included.
-    camera_radius : the camera is a sphere of this radius (at least the near distance, or the image cuts into
-                    surfaces) round its centre, > 0.
+    camera_radius : the camera is a sphere of this radius (at least the near distance, or the image cuts into surfaces)
+                    around its centre, > 0.
     tolerance     : relative to the smaller body's radius, see the module's docstring; in (0, 0.1].
     rest_margin   : how deep, relative to its radius, a body may sink into what it rests on at t0; in (0, 0.1].
     """
@@ -115,10 +115,10 @@ def resolve_collisions(
 
 @dataclass(eq=False)
 class _Body:
-    """What the search knows about a body. vertices (V, 3), faces (F, 3): all parts, local; pad: thickness added all
-    round. Derived: centre, radius: bounding ball, local; arm: |centre|; reach: largest distance of a vertex from the
-    local origin, which is what turning moves; hull: (H, 3) vertices of the convex hull, local; planes: (P, 4) world
-    (n, o) with n.x <= o inside, of a convex static body, else None."""
+    """Data of a body for the search. vertices (V, 3), faces (F, 3): all parts, local; pad: thickness added all around.
+    Derived: centre, radius: bounding ball, local; arm: |centre|; reach: largest distance of a vertex from the local
+    origin, which is what rotation moves; hull: (H, 3) vertices of the convex hull, local; planes: (P, 4) world (n, o)
+    with n.x <= o inside, of a convex static body, else None."""
 
     name: str
     category: str
@@ -134,7 +134,7 @@ class _Body:
         meshes = [part.mesh for part in obj.parts if len(part.mesh.faces)]
         swept = [None if mesh.deformer is None else mesh.deformer.sweep(mesh, t0, t1) for mesh in meshes]
         solids = [(mesh.vertices, mesh.faces) if sweep is None else sweep.hull for mesh, sweep in zip(meshes, swept)]
-        # Vertex numbers count on from part to part.
+        # Vertex numbers are continued from part to part.
         first = np.cumsum([0] + [len(vertices) for vertices, _ in solids])
         return _Body(
             obj.name,
@@ -148,12 +148,12 @@ class _Body:
 
     @staticmethod
     def of_camera(path: PosePath, radius: float) -> _Body:
-        # A point is a triangle of three equal corners: the same exact distance routine serves it.
+        # A point is a triangle of three equal corners, so that the same exact distance routine can be used.
         return _Body(CAMERA, CAMERA, CAMERA, path, np.zeros((3, 3)), np.array([[0, 1, 2]]), pad=radius)
 
     def __post_init__(self):
         self.vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
-        # The ball is round the middle of the box of vertices that faces use.
+        # The ball is around the middle of the box of vertices that faces use.
         used = self.vertices[np.unique(self.faces)]
         self.low, self.high = used.min(axis=0), used.max(axis=0)
         self.centre = 0.5 * (self.low + self.high)
@@ -163,7 +163,7 @@ class _Body:
         self.hull = _hull(used)
         self.is_static = self.path.is_static
         self.planes = None
-        # A static body's faces are in world coordinates, once and for all.
+        # A static body's faces are transformed to world coordinates once.
         if self.is_static and self.category != CAMERA:
             T = self.path.pose(self.path.t0_ns)
             self.planes = _face_planes(
@@ -184,7 +184,7 @@ class _Body:
 
 
 class _Search:
-    """Conservative advancement of all pairs, the one that is next in time first."""
+    """Conservative advancement of all pairs, the earliest next time first."""
 
     def __init__(self, bodies: list[_Body], t0: int, t1: int, tolerance: float, rest_margin: float):
         self.bodies, self.t0, self.t1, self.tolerance, self.rest_margin = bodies, t0, t1, tolerance, rest_margin
@@ -200,7 +200,7 @@ class _Search:
             a, b = self.bodies[i], self.bodies[j]
             if a.is_static and b.is_static:
                 continue
-            # Either a collision now, or the next time at which to look.
+            # Either a collision now, or the next time to test.
             later, hit = self._advance(i, j, t)
             if hit is not None:
                 yield Collision(t, a.name, b.name, hit, self._stop(t, a, b))
@@ -208,19 +208,19 @@ class _Search:
                 heapq.heappush(queue, (later, i, j))
 
     def at_start(self) -> list[Collision]:
-        """Contacts at t0; notes who rests on what and stops what moves."""
+        """Return contacts at t0; record which bodies rest on which, and stop moving ones."""
         found = []
         for i, j in self._pairs():
             a, b = self.bodies[i], self.bodies[j]
             Ta, Tb = a.path.pose(self.t0), b.path.pose(self.t0)
-            # Balls that far apart cannot touch.
+            # Balls this far apart cannot touch.
             if self._ball_gap(a, b, Ta, Tb) > self._tol(a, b):
                 continue
             if not self._rests(i, j, Ta, Tb):
                 separation = self._distance(a, b, Ta, Tb)
                 if separation <= self._tol(a, b):
                     found.append((a, b, max(separation, 0.0)))
-        # Stopped only now: every pair is judged by the same scene.
+        # Stopped only now, so that every pair is tested in the same scene.
         return [Collision(self.t0, a.name, b.name, separation, self._stop(self.t0, a, b)) for a, b, separation in found]
 
     def _pairs(self):
@@ -249,10 +249,10 @@ class _Search:
             a, b, Ta, Tb = b, a, Tb, Ta
         if b.category not in _SUPPORTS or b.planes is None or a.category == CAMERA:
             return False
-        # The plane that the body is farthest out of is the one it lies on.
+        # The plane that the body is farthest outside is the one it lies on.
         heights = _heights(b.planes, a, Ta)
         k = int(np.argmax(heights))
-        # What is padded for want of times that were looked at was put down without its padding.
+        # A body padded for its deformation was placed without its padding.
         if not -self.rest_margin * a.radius - a.pad <= heights[k] <= self._tol(a, b):
             return False
         self.resting[i, j] = b.planes[k : k + 1], min(float(heights[k]), 0.0)
@@ -273,13 +273,13 @@ class _Search:
                 return t, max(separation, 0.0)
             room, nearer = separation - 0.5 * tol, _body_speed
         later = self._later(a, b, t, room, nearer)
-        # A body that crosses the room left within a nanosecond has no later time to be looked at.
+        # A body that crosses the remaining distance within a nanosecond has no later time to test.
         return (later, None) if later > t else (t, separation)
 
     def _room(self, i: int, j: int, a: _Body, b: _Body, Ta, Tb):
-        """Return how much the two may approach before they have to be looked at again, without an exact distance,
-        and the bound on a body's share in the approach. Room 0 when only the exact distance can tell."""
-        # A resting body may sink by the margin; 0.975 of it is left before a closer look.
+        """Return how much the two may approach before they have to be tested again, without an exact distance, and the
+        bound on a body's share in the approach. Room 0 when only the exact distance can decide."""
+        # A resting body may sink by the margin; 0.975 of it is left before a closer test.
         if (i, j) in self.resting:
             plane, lowest = self.resting[i, j]
             body, T = (b, Tb) if a.category in _SUPPORTS else (a, Ta)
@@ -288,7 +288,7 @@ class _Search:
             return (room if room > 0.025 * margin else 0.0), _speed_along(plane[0, :3])
         tol = self._tol(a, b)
         gap = self._ball_gap(a, b, Ta, Tb)
-        # Far apart the balls are as good as the triangles; close by an exact distance gains much larger steps.
+        # Far apart, balls are as good as triangles; nearby, an exact distance allows much larger steps.
         if gap > max(tol, 0.3 * min(a.radius, b.radius)):
             return gap - 0.5 * tol, _centre_speed
         # The lowest point over a face of a static convex body is a separating plane.
@@ -309,7 +309,7 @@ class _Search:
             if speed * window * 1e-9 <= room:
                 return t + window
             step = int(room / speed * 1e9)
-            # The bound over a shorter interval is smaller; half the time is where a closer look stops paying.
+            # The bound over a shorter interval is smaller; below half the time a closer test does not pay.
             if 2 * step >= window:
                 break
             window = min(2 * step + 1, window)
@@ -338,8 +338,8 @@ class _Search:
 
 
 def _body_speed(body: _Body, ta: int, tb: int) -> float:
-    """Return an upper bound over [ta, tb] of the speed of any of the body's points. (A pad is round: turning moves
-    it nowhere.)"""
+    """Return an upper bound over [ta, tb] of the speed of any of the body's points. (A pad is round: rotation does not
+    move it.)"""
     v, w = body.path.speed_bound(ta, tb)
     return v + w * body.reach
 
@@ -390,7 +390,7 @@ def _face_planes(used: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> n
     planes = planes[np.sort(first)]
     if len(planes) > _MAX_PLANES:
         return None
-    # Outermost vertices on both sides: faces that look inwards (a sky box) fail the first test.
+    # Outermost vertices on both sides: faces that face inwards (a sky box) fail the first test.
     offset = used @ planes[:, :3].T - planes[:, 3]
     slack = 1e-9 * max(extent, float(np.abs(used).max()))
     if offset.max() > slack:

@@ -1,9 +1,9 @@
-"""The key `way`: a body follows a curve through points, at one speed, its x axis ahead.
+"""The key `way`: a body follows a curve through points at constant speed, its x axis forward.
 
     path = path_along_curve([(0, 0, 0), (3, 0, 0), (4, 2, 0)], speed=1.3, t0_ns=0, t1_ns=2_000_000_000)
 
-The curve is a C2 spline through the points; it is gone along by its length, so that steps of a figure, or strokes of a
-fish, fit the speed everywhere. Where it ends, the body goes straight on.
+The curve is a C2 spline through the points, parametrised by its length, so that a figure's steps or a fish's strokes
+fit the speed everywhere. Beyond its end the body continues straight.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.motion.trajectories import FreeSpace, look_rotation, waypoints
 from blinkgl.scene.types import PosePath
 
-_LEGS = 4  # way-points of a random way, besides its beginning
+_LEGS = 4  # waypoints of a random way, besides its start
 _SMOOTHNESS = 0.8
 _SAMPLES = 64  # per leg, of the curve's length
 _KNOTS = 8  # per leg, of the path
 _MAX_KNOTS = 20_000
-_STEP = 0.05  # s between knots, at least so fine
+_STEP = 0.05  # largest time between knots, s
 
 
 class ArcLengthCurve:
-    """A curve by its length. points : (K, 3), neighbours apart, K >= 2, or 3 where it is closed."""
+    """A curve parametrised by its length. points : (K, 3), distinct neighbours, K >= 2, or 3 if closed."""
 
     def __init__(self, points: ArrayLike, closed: bool = False):
         points = np.asarray(points, np.float64)
@@ -52,7 +52,7 @@ class ArcLengthCurve:
         self.length = float(self._lengths[-1])
 
     def at(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """((N, 3) places, (N, 3) unit directions) after (N,) units along the curve."""
+        """Return ((N, 3) positions, (N, 3) unit directions) after (N,) units along the curve."""
         s = np.asarray(s, np.float64)
         within = s % self.length if self.closed else np.clip(s, 0, self.length)
         # The table gives a start; two Newton steps on the length's spline make it exact to rounding.
@@ -75,11 +75,10 @@ def path_along_curve(
     start: float = 0.0,
     where: str = "way",
 ) -> KeyframePath:
-    """The motion along a way over [t0, t1]. Raises ConfigError for points that coincide with the next.
+    """Return the motion along a way over [t0, t1]. Raises ConfigError for points that coincide with the next.
 
     points : as of :class:`ArcLengthCurve`.   speed : units/s, > 0.   level : the body's z axis stays up; otherwise its
-    x axis goes up and down with the way, its y axis staying level.   start : share of the way that lies behind at
-    time 0."""
+    x axis follows the slope, its y axis staying level.   start : fraction of the way covered at time 0."""
     given = np.asarray(points, np.float64)
     after = np.roll(given, -1, axis=0) if closed else given[1:]
     for k in np.flatnonzero(np.abs(after - given[: len(after)]).max(axis=1) < 1e-6):
@@ -89,10 +88,10 @@ def path_along_curve(
     legs = len(np.asarray(points)) - (not closed)
     step = min(curve.length / (legs * _KNOTS) / speed, _STEP)
     count = min(max(math.ceil(span / step), 4), _MAX_KNOTS)
-    # A step more at both ends: labels look a little beyond.
+    # One step more at both ends: labels use times slightly beyond.
     times = np.linspace(t0_ns - span / count * 1e9, t1_ns + span / count * 1e9, count + 3).round().astype(np.int64)
     places, ahead = curve.at(start * curve.length + speed * times * 1e-9)
-    # Unwrapped, or a body would turn right round where atan2 jumps from pi to -pi.
+    # Unwrapped, because a body would turn fully where atan2 jumps from pi to -pi.
     if level:
         heading = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
         turns = Rotation.from_rotvec(heading[:, None] * [0.0, 0.0, 1.0])
@@ -112,13 +111,13 @@ def random_path_along_curve(
     speed: float,
     flat: bool,
 ) -> PosePath:
-    """A way through free space from a pose's place, gone along at ``speed`` from t0 on. flat : at one height; otherwise
-    the body's nose goes up and down with it. Stands still where there is no room to go."""
+    """Return a way through free space from a pose's position, at ``speed`` from t0 on. flat : at constant height;
+    otherwise the body's x axis follows the slope. It is static where there is no free space."""
     config = ObjectMotion(waypoints=_LEGS + 1, smoothness=_SMOOTHNESS)
     points = waypoints(rng, t0_ns, t1_ns, config, space, radius, start_pose[:3, 3], speed, flat)[1]
     apart = np.r_[True, np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-3 * radius]
     if apart.sum() < 2:
         return StaticPath(start_pose, t0_ns, t1_ns)
     curve = ArcLengthCurve(points[apart])
-    behind = -speed * t0_ns * 1e-9 / curve.length  # at time 0, so that it begins at t0
+    behind = -speed * t0_ns * 1e-9 / curve.length  # fraction at time 0, so that it begins at t0
     return path_along_curve(points[apart], speed, t0_ns, t1_ns, level=flat, start=behind)

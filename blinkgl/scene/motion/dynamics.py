@@ -1,27 +1,29 @@
-"""What falls, bounces and is thrown: rigid bodies by MuJoCo, from a scene's objects to paths, before anything is drawn.
+"""Rigid-body simulation of falling, bouncing and thrown objects by MuJoCo: from a scene's objects to paths, before
+drawing.
 
     objects, dynamics = simulate(objects, {"die": BodyConfig(velocity=(1, 0, 2))}, PhysicsConfig(), t0_ns, t1_ns)
 
-Everything that is not named moves as it did: fixed where it stands still, a pusher that nothing stops where it moves.
+Objects that are not named keep their motion: fixed where they stand still; where they move, they push others and
+nothing stops them.
 
-**Steps.** The engine is MuJoCo's semi-implicit Euler with implicit Coriolis forces, ``rate`` steps a second (20,000,
+**Steps.** The engine is MuJoCo's semi-implicit Euler with implicit Coriolis forces, ``rate`` steps per second (20,000,
 where 1,000 are usual). Such a method is a leapfrog: its velocities are those of the middle of the steps. Started half a
-step of gravity back, its positions are the parabola's exactly, and the mean of two of its velocities is the velocity at
-the time between them. Both go into the path.
+step of gravity back, its positions are exactly the parabola's, and the mean of two of its velocities is the velocity at
+the time between them. Both are used for the path.
 
 **Restitution.** MuJoCo's contacts are soft: a spring with a damper, ``solref = (-stiffness, -damping)``, per mass. A
-body that meets one leaves it after about half a period of the spring, ``IMPACT_S``, with a share e of its speed that
-hangs on the damping ratio alone. Which ratio gives which e is found with the very recurrence that the engine computes,
-over all the phases in which a step can meet the surface (body_shapes.py). What is left is the phase: at the default
-rate e varies by +-0.015 where it is 0.3, by +-0.006 where it is 0.8, and by less the more steps there are.
+body leaves a contact after about half a period of the spring, ``IMPACT_S``, with a share e of its speed that depends
+only on the damping ratio. The ratio for a given e is found with the engine's own recurrence, averaged over all phases
+in which a step can meet the surface (body_shapes.py). The phase remains as an error: at the default rate e varies by
++-0.015 where it is 0.3, by +-0.006 where it is 0.8, and by less with more steps.
 
-**Paths.** Of the steps those are kept that a cubic needs to pass all others to 2e-6 of the body's radius
-(``piecewise.thin``): few in flight, every one or two in an impact. So the velocity jumps there in the 1.6 ms that the
-contact lasts, nothing overshoots, and memory does not grow with the rate. A body at rest is asleep: its pose is
-constant to the bit.
+**Paths.** A path keeps only the steps that a cubic needs to pass all others within 2e-6 of the body's radius
+(``piecewise.thin``): few in flight, every one or two in an impact. So the velocity jumps within the 1.6 ms of the
+contact, nothing overshoots, and memory does not grow with the rate. A body at rest is asleep: its pose is bitwise
+constant.
 
-**The same again.** MuJoCo is deterministic for one build on one machine, on one thread, which is all that is used here.
-Its version is in :class:`~blinkgl.scene.types.Dynamics`, with a digest of all paths.
+**Reproducibility.** MuJoCo is deterministic for one build on one machine, on one thread, which is all that is used
+here. :class:`~blinkgl.scene.types.Dynamics` records its version and a digest of all paths.
 """
 
 from __future__ import annotations
@@ -45,28 +47,28 @@ from blinkgl.scene.motion.piecewise import thin
 from blinkgl.scene.types import Dynamics, PosePath, SceneObject
 
 IMPACT_S = 1.6e-3
-"""What an impact lasts, s: longer is softer. At a low rate it lasts ``LEAST_STEPS`` steps, which is longer."""
+"""Duration of an impact, s: longer is softer. At a low rate it lasts ``LEAST_STEPS`` steps, which is longer."""
 LEAST_STEPS = 16
-# Steps are looked at and thinned in pieces of this many.
-_CHUNK = 1000  # steps between two looks at what came of them
-_TOLERANCE = 2e-6  # of the radius, and rad: how far a path may pass a step by
-_SINK = 1e-4  # of the smaller radius: how deep a body may be in another at the start
-_LIFT, _LIFTS = 0.01, 50  # of the same: out of how much it is lifted, and in how many turns
-_IMPEDANCE = 0.9999  # the most that MuJoCo allows: 1 would be a contact that obeys its spring exactly
+# Steps are checked and thinned in pieces of this many.
+_CHUNK = 1000  # steps between two checks
+_TOLERANCE = 2e-6  # of the radius, and rad: largest distance of a path from a step
+_SINK = 1e-4  # of the smaller radius: largest overlap of two bodies at the start
+_LIFT, _LIFTS = 0.01, 50  # of the same: largest overlap that is removed by lifting, and number of iterations
+_IMPEDANCE = 0.9999  # MuJoCo's maximum: 1 would be a contact that follows its spring exactly
 _HULL_VERTICES = 500
-_SLOW_S = 5e-4  # slow is what gravity makes of rest in this time, s
-_HEAVY = 1e4  # mass of what nothing stops, of the heaviest body's
+_SLOW_S = 5e-4  # slow means less than gravity's change of speed in this time, s
+_HEAVY = 1e4  # mass of unstoppable bodies relative to the heaviest body
 
 
 class Exploded(ConfigError):
-    """body : name of the one that was nowhere, or too fast."""
+    """The simulation diverged. body : name of the body without a finite position, or too fast."""
 
     body = ""
 
 
 def engine() -> ModuleType:
-    """MuJoCo. Raises ConfigError with the command that installs it."""
-    # It would load a library of OpenGL's for pictures of its own.
+    """Return MuJoCo. Raises ConfigError with the command that installs it."""
+    # It would load an OpenGL library for its own pictures.
     said = os.environ.get("MUJOCO_GL")
     os.environ["MUJOCO_GL"] = "disable"
     try:
@@ -80,7 +82,7 @@ def engine() -> ModuleType:
             del os.environ["MUJOCO_GL"]
         else:
             os.environ["MUJOCO_GL"] = said
-    # Its own handler writes a file into the working folder; what it would say there is looked at here.
+    # Its own handler writes a file into the working folder; the checks here replace it.
     mujoco.set_mju_user_warning(_silent)  # type: ignore[missing-attribute]
     return mujoco
 
@@ -90,7 +92,7 @@ def _silent(_: str) -> None:
 
 
 def engine_version() -> str:
-    """Of the engine that is installed. Raises ConfigError where there is none."""
+    """Return the version of the installed engine. Raises ConfigError where there is none."""
     return engine().__version__
 
 
@@ -104,13 +106,11 @@ def simulate(
     camera: tuple[PosePath, float] | None = None,
     sides: Sequence[Barrier] = (),
 ) -> tuple[tuple[SceneObject, ...], Dynamics]:
-    """The objects, those that are dynamic on the paths they take over [t0, t1], and what
-    is known of how those came about.
+    """Return the objects, dynamic ones on their simulated paths over [t0, t1], and a record of the simulation.
 
-    bodies : by name of the object. Objects that it does not name: ``IN_THE_WAY``; sky: not there.
-    camera : its path and the radius of the sphere round it that nothing enters.   sides :
-    what holds bodies back unseen.
-    Raises ConfigError: no MuJoCo, bodies inside each other at t0, a simulation that explodes."""
+    bodies : by name of the object. Objects without an entry: ``IN_THE_WAY``; sky: ignored.
+    camera : its path and the radius of the sphere around it that nothing enters.   sides : invisible barriers. Raises
+    ConfigError: no MuJoCo, bodies inside each other at t0, a simulation that diverges."""
     world = _World(engine(), objects, bodies, settings, camera, sides, int(t0_ns), int(t1_ns))
     return world.run()
 
@@ -118,7 +118,8 @@ def simulate(
 @dataclass(eq=False)
 class _Body:
     """One object (or the camera) in the engine. role : dynamic, fixed or pusher.   centre : (3,) of mass, in the
-    object's axes.   volume : of its shapes, 0 until known.   at : which of those that move it is, -1: none."""
+    object's axes.
+    volume : of its shapes, 0 until known.   at : index among the moving bodies, -1: none."""
 
     name: str
     role: str
@@ -136,15 +137,15 @@ class _Body:
 
 
 class _World:
-    """A model, its state, and the paths that come of it."""
+    """A model, its state, and the resulting paths."""
 
     def __init__(self, mujoco, objects, bodies, settings, camera, sides, t0_ns, t1_ns):
         self.mujoco, self.objects, self.settings, self.sides = mujoco, tuple(objects), settings, sides
         self.t0_ns, self.t1_ns, self.step = t0_ns, t1_ns, 1.0 / settings.rate
-        # At a low rate the impact is stretched, or too few steps would lie in it.
+        # At a low rate the impact is stretched, so that it has enough steps.
         self.impact_steps = max(IMPACT_S * settings.rate, LEAST_STEPS)
         self.bodies: list[_Body] = []
-        # What is not there, has no faces, or is the sky touches nothing.
+        # Disabled objects, those without faces, and the sky do not collide.
         for obj in self.objects:
             config = bodies.get(obj.name, IN_THE_WAY)
             if obj.category == "sky" or config.kind == "none" or not any(len(p.mesh.faces) for p in obj.parts):
@@ -155,7 +156,7 @@ class _World:
             path, radius = camera
             role = "fixed" if path.is_static else "pusher"
             self.bodies.append(_Body("the camera", role, IN_THE_WAY, path, [Shape("SPHERE", (radius, 0, 0))], radius))
-        # Moving bodies have a free joint and a place in qpos and qvel; fixed ones belong to the world.
+        # Moving bodies have a free joint and entries in qpos and qvel; fixed ones belong to the world.
         self.moving = [body for body in self.bodies if body.role != "fixed"]
         for at, body in enumerate(self.moving):
             body.at = at
@@ -168,13 +169,13 @@ class _World:
     # ---- the model ---------------------------------------------------------------------------------------------------
 
     def _compile(self) -> None:
-        """Compile the model twice: with any density, to know volumes and centres of mass; then with those as the
-        bodies' origins, so that a body in flight is on a parabola."""
+        """Compile the model twice: with any density, to get volumes and centres of mass; then with those as the bodies'
+        origins, so that a body in flight follows a parabola."""
         model = self._model(weighed=False)
         for body in self.moving:
             # Body 0 of the model is the world.
             at = body.at + 1
-            # The first model has the density radius^-5, so that its masses are neither tiny nor huge.
+            # The first model has the density radius^-5, so that its masses are of moderate size.
             body.centre, body.volume = model.body_ipos[at].copy(), float(model.body_mass[at]) * body.radius**5
         self.model = self._model(weighed=True)
         self.data = self.mujoco.MjData(self.model)
@@ -184,17 +185,17 @@ class _World:
         spec = mujoco.MjSpec()
         option = spec.option
         option.timestep, option.gravity = self.step, list(self.settings.gravity)
-        # An elliptic friction cone: Coulomb's law itself, not its pyramid.
+        # An elliptic friction cone: Coulomb's law itself, not its pyramid approximation.
         option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_IMPLICIT, mujoco.mjtCone.mjCONE_ELLIPTIC
         # Friction is stiffer than contact, so that bodies at rest on a slope do not creep.
         option.impratio = 10.0
         option.sleep_tolerance = _SLOW_S * float(np.linalg.norm(self.settings.gravity))
         option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-        # Without the automatic reset an explosion shows in the state, see _check_sound.
+        # Without the automatic reset a divergence is visible in the state, see _check_sound.
         option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         heaviest = max((body.mass for body in self.dynamic), default=1.0)
-        # MuJoCo takes no inertia below 1e-15 kg m², a ball of a millimetre; in another unit of mass nothing moves
-        # otherwise.
+        # MuJoCo has a minimum inertia of 1e-15 kg m², a ball of a millimetre; below it, in another unit of mass,
+        # nothing moves.
         least = min((body.mass * body.radius**2 for body in self.dynamic), default=1.0)
         unit = max(1.0, 1e-9 / least) if weighed else 1.0
         for k, side in enumerate(self.sides):
@@ -202,8 +203,7 @@ class _World:
         for number, body in enumerate(self.bodies):
             T = body.path.pose(self.t0_ns)
             holder, density = spec.worldbody, body.radius**-5
-            # A free joint for all that moves; pushers are weightless and have their pose set at every
-            # step.
+            # A free joint for all moving bodies; pushers are weightless, and their pose is set at every step.
             if body.role != "fixed":
                 holder = spec.worldbody.add_body(
                     pos=T[:3, :3] @ body.centre + T[:3, 3],
@@ -246,8 +246,8 @@ class _World:
             solimp=[_IMPEDANCE, _IMPEDANCE, 1e-3, 0.5, 2.0],
             friction=[config.friction, rolling, rolling],
             condim=6,
-            # Dynamic bodies meet all; the others do not meet each other.
-            # Bit masks: geometries meet where one's contype and the other's conaffinity share a bit.
+            # Dynamic bodies collide with all; the others do not collide with each other. Bit masks: geometries collide
+            # where one's contype and the other's conaffinity share a bit.
             contype=1 if dynamic else 2,
             conaffinity=3 if dynamic else 0,
             **mesh,
@@ -256,8 +256,8 @@ class _World:
     # ---- the run -----------------------------------------------------------------------------------------------------
 
     def run(self) -> tuple[tuple[SceneObject, ...], Dynamics]:
-        """See :func:`simulate`. Steps are done one ahead of the poses that are kept: the velocity at a pose is the mean
-        of the velocities before and after it."""
+        """Run :func:`simulate`. Steps are one ahead of the stored poses: the velocity at a pose is the mean of the
+        velocities before and after it."""
         model, data = self.model, self.data
         # Steps up to t1; a rounding error adds none.
         count = math.ceil((self.t1_ns - self.t0_ns) * 1e-9 * self.settings.rate - 1e-6)
@@ -265,7 +265,7 @@ class _World:
         pushed = self._pushed(0)
         for body in self.dynamic:
             at, R = 6 * body.at, body.path.pose(self.t0_ns)[:3, :3]
-            # Velocities are those of half a step before: half a step of gravity is taken off.
+            # Velocities are those of half a step before: half a step of gravity is subtracted.
             data.qvel[at : at + 3] = body.config.velocity - 0.5 * self.step * model.opt.gravity
             # Angular velocity in the body's axes.
             data.qvel[at + 3 : at + 6] = np.radians(body.config.spin) @ R
@@ -292,7 +292,7 @@ class _World:
         for path in paths.values():
             for array in path.coefficients:
                 digest.update(array.tobytes())
-        # Every impact once, though both bodies record it.
+        # Every impact once, although both bodies record it.
         impacts = sorted({step for record in self.records.values() for step in record.impacts})
         times = _times(np.array(impacts, np.int64), self.t0_ns, self.settings.rate)
         return (
@@ -312,12 +312,12 @@ class _World:
         self.mujoco.mj_step(self.model, self.data)
 
     def _pushed(self, first: int) -> list[tuple[int, np.ndarray, np.ndarray]]:
-        """(which body, qpos (n, 7), qvel (n, 6)) of the pushers at steps ``first`` and after."""
+        """Return (which body, qpos (n, 7), qvel (n, 6)) of the pushers at steps ``first`` and after."""
         times = _times(np.arange(first, first + _CHUNK + 2), self.t0_ns, self.settings.rate)
         found = []
         for body in self.pushers:
             T = body.path.poses(times)
-            # A pusher's velocity is what takes it to its next pose within one step.
+            # A pusher's velocity moves it to its next pose within one step.
             q, R = quaternions(T[:, :3, :3]), Rotation.from_matrix(T[:, :3, :3])
             p = T[:, :3, 3] + T[:, :3, :3] @ body.centre
             turns = (R[:-1].inv() * R[1:]).as_rotvec()
@@ -330,8 +330,8 @@ class _World:
             self.data.qvel[6 * at : 6 * at + 6] = qvel[k]
 
     def _let_sleep(self, qvel: np.ndarray) -> None:
-        """Let bodies that were slow for a whole chunk fall asleep in the next. A body that is slow only for a moment
-        may be at the top of its flight."""
+        """Let bodies that were slow for a whole chunk sleep in the next. A body that is slow only for a moment may be
+        at the top of its flight."""
         policies = self.mujoco.mjtSleepPolicy
         for body in self.dynamic:
             v = qvel[:, 6 * body.at : 6 * body.at + 6] * np.repeat([1.0, body.radius], 3)
@@ -339,8 +339,8 @@ class _World:
             self.model.tree_sleep_policy[body.at] = int(policies.mjSLEEP_ALLOWED if slow else policies.mjSLEEP_NEVER)
 
     def _lift(self) -> None:
-        """Moves bodies out of what they are a little in at the start: the springs would throw them out. Raises
-        ConfigError where they are in deeper than that."""
+        """Move bodies out of small overlaps at the start: the springs would eject them. Raises ConfigError where they
+        overlap more."""
         deep: list[tuple[_Body, _Body, float, np.ndarray]] = []
         for _ in range(_LIFTS):
             self.mujoco.mj_forward(self.model, self.data)
@@ -350,8 +350,7 @@ class _World:
             for body, other, depth, away in deep:
                 if depth > _LIFT * min(body.radius, other.radius):
                     break
-                # Where both can move, each its half.
-                # A fixed body or a pusher cannot move aside.
+                # If both can move, each moves half; a fixed body or a pusher cannot move.
                 share = 0.5 if other.role == "dynamic" else 1.0
                 self.data.qpos[7 * body.at : 7 * body.at + 3] += share * depth * away
             else:
@@ -365,7 +364,8 @@ class _World:
         )
 
     def _touching(self) -> Iterator[tuple[_Body, _Body, float, np.ndarray]]:
-        """(a dynamic body, what it touches, how deep, the direction out of it); two dynamic ones both ways round."""
+        """Yield (a dynamic body, what it touches, overlap, the direction out of it); for two dynamic ones in both
+        orders."""
         contact, model = self.data.contact, self.model
         for pair, distance, frame in zip(contact.geom, contact.dist, contact.frame):
             names = [model.geom(int(g)).name.split()[0] for g in pair]
@@ -376,21 +376,21 @@ class _World:
                     yield body, met, -float(distance), away
 
     def _check_sound(self, first: int, qpos: np.ndarray, qvel: np.ndarray) -> None:
-        """Raises ConfigError where a body is nowhere, or faster than anything should be."""
+        """Raise ConfigError where a body has no finite position, or is too fast."""
         limit = self.settings.max_speed
         for body in self.dynamic:
             p, v = qpos[:, 7 * body.at : 7 * body.at + 7], qvel[:, 6 * body.at : 6 * body.at + 3]
-            # Overflow is what is looked for here.
+            # Overflow is expected here.
             with np.errstate(over="ignore", invalid="ignore"):
                 speed = np.where(np.isfinite(p).all(axis=1), np.linalg.norm(v, axis=1), np.inf)
             if not (speed <= limit).all():
                 k = int(np.argmin(speed <= limit))
                 error = Exploded(
-                    f"{body.name} explodes {(first + k) * self.step:.6g} s after the start: its speed in m/s",
+                    f"{body.name} diverges {(first + k) * self.step:.6g} s after the start: its speed in m/s",
                     where="scene.physics",
                     value=float(speed[k]),
-                    accepted=f"at most max_speed {limit:g}; nothing thrown faster, and room between what "
-                    "cannot give way",
+                    accepted=f"at most max_speed {limit:g}; a lower speed, or more space between bodies that "
+                    "cannot move",
                 )
                 error.body = body.name
                 raise error
@@ -405,7 +405,7 @@ class _World:
 
 
 class _Record:
-    """What is kept of one body: the poses that its path needs, and the steps of its impacts."""
+    """The stored data of one body: the poses that its path needs, and the steps of its impacts."""
 
     def __init__(self, body: _Body, step: float, impact_steps: float):
         self.body, self.step, self.impact_steps = body, step, impact_steps
@@ -415,14 +415,14 @@ class _Record:
         self._last, self._peak = -math.inf, 0.0
 
     def add(self, first: int, qpos: np.ndarray, qvel: np.ndarray, gravity: np.ndarray) -> None:
-        """qpos : (n, …) of steps ``first`` and after.   qvel : (n + 1, …), of before each
-        of them and after the last."""
+        """Add steps. qpos : (n, …) of steps ``first`` and after.   qvel : (n + 1, …), before each of them and after the
+        last."""
         at, body = self.body.at, self.body
         p, q = qpos[:, 7 * at : 7 * at + 3], qpos[:, 7 * at + 3 : 7 * at + 7]
         raw = qvel[:, 6 * at : 6 * at + 6]
         self._note_impacts(first, raw[:, :3], gravity)
         still = not raw[1:].any()
-        # A body at rest: the last piece only gets a new end.
+        # A body at rest: only the end of the last piece is moved.
         if still and self._still:  # the same pose for longer
             steps, *rest = self.pieces[-1]
             self.pieces[-1] = (np.append(steps[:-1], first + len(p) - 1), *rest)
@@ -444,7 +444,7 @@ class _Record:
         self.pieces.append((first + np.flatnonzero(keep), p[keep], v[keep], q[keep], w[keep]))
 
     def _note_impacts(self, first: int, v: np.ndarray, gravity: np.ndarray) -> None:
-        """Note the step of the hardest push of each impact. A push counts when it would stop a twentieth of the
+        """Record the step of the hardest push of each impact. A push counts when it would stop a twentieth of the
         body's own speed and is ten times gravity's."""
         # Acceleration other than gravity's.
         push = np.linalg.norm(np.diff(v, axis=0) / self.step - gravity, axis=1)[1:]

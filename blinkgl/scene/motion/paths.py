@@ -1,8 +1,8 @@
 """Rigid motions over time: the :class:`~blinkgl.scene.types.PosePath` implementations.
 
-All of them hold their end pose outside ``[t0_ns, t1_ns]`` and have a zero derivative there. Times are int64
-nanoseconds and are subtracted as integers before they become float seconds, so a path that starts at 10^6 s
-is as precise as (in fact: bit-identical to) the same path started at 0.
+All of them hold their end pose outside ``[t0_ns, t1_ns]`` and have a zero derivative there. Times are int64 nanoseconds
+and are subtracted as integers before they become float seconds, so a path that starts at 10^6 s is as precise as (in
+fact: bit-identical to) the same path started at 0.
 
     path = KeyframePath([0, 500_000_000, 1_000_000_000], positions, rotations)
     T_world_body = path.pose(250_000_000)
@@ -11,9 +11,9 @@ A piecewise path is, between key frames i and i + 1 and with u the seconds since
 
     p(u) = sum_k cp[i, k] u^k,      R(u) = R_i exp([phi(u)]x),   phi(u) = sum_k cr[i, k] u^k,   k = 0..3,
 
-which is what scipy's ``CubicSpline`` and ``RotationSpline`` evaluate; straight lines and slerp are the same form
-with two terms. The coefficients come from scipy; evaluation is compiled (piecewise.py) because a renderer asks for one
-time at a time and scipy's call overhead is ten times the work.
+which is what scipy's ``CubicSpline`` and ``RotationSpline`` evaluate; straight lines and slerp have the same form with
+two terms. The coefficients come from scipy; evaluation is compiled (piecewise.py) because a renderer requests one time
+at a time and scipy's call overhead is ten times the work.
 """
 
 from __future__ import annotations
@@ -64,11 +64,11 @@ class KeyframePath:
     times_ns      : (N,) int64, strictly increasing, N >= 1 (one key frame: a body that stays there).
     positions     : (N, 3) world coordinates of the body's origin.
     rotations     : scipy ``Rotation`` of length N, or (N, 4) quaternions (x, y, z, w).
-    interpolation : "spline": C2 (cubic, not-a-knot ends; two key frames give the straight line);
-                    "linear": straight lines and slerp, velocity jumps at the key frames (the derivative there is that
-                    of the following piece).
-    Raises ValueError on wrong shapes, non-finite values, zero quaternions or unordered times: whoever reads them from a
-    person has said what is wrong with them before.
+    interpolation : "spline": C2 (cubic, not-a-knot ends; two key frames give the straight line); "linear": straight
+                    lines and slerp, velocity jumps at the key frames (the derivative there is that of the following
+                    piece).
+    Raises ValueError on wrong shapes, non-finite values, zero quaternions or unordered times; callers check user input
+    before.
     """
 
     def __init__(
@@ -81,8 +81,8 @@ class KeyframePath:
         knots, positions, rotations = _checked_keys(times_ns, positions, rotations)
         self.t0_ns, self.t1_ns = int(knots[0]), int(knots[-1])
         if len(knots) == 1:
-            # One nanosecond of standing still, so that the evaluation below needs no special case.
-            # Both ends have the same pose, so every coefficient but the first is 0.
+            # One nanosecond without motion, so that the evaluation below needs no special case. Both ends have the same
+            # pose, so every coefficient but the first is 0.
             knots = np.array([knots[0], knots[0] + 1])
             positions, rotations = np.repeat(positions, 2, axis=0), Rotation.concatenate([rotations, rotations])
         seconds = (knots - knots[0]) * 1e-9
@@ -97,7 +97,7 @@ class KeyframePath:
             cr = np.stack([turn / h, np.zeros_like(turn)])
         self._knots = knots
         self._cp, self._cr = _ascending(cp), _ascending(cr)
-        # Rotation at the start of each piece; the polynomial phi turns on from there.
+        # Rotation at the start of each piece, which the polynomial phi continues.
         self._rot = np.ascontiguousarray(rotations[:-1].as_matrix())
         self.key_times_ns = knots[:1] if self.t0_ns == self.t1_ns else knots
         # Static: no coefficient above the constant one.
@@ -122,30 +122,30 @@ class KeyframePath:
         return T
 
     def speed_bound(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
-        """See :class:`PosePath`. Rigorous: a quadratic stays in the convex hull of its Bezier points on the interval,
-        and |w| = |J_r(phi) phi'| <= |phi'| because the right Jacobian of SO(3) has singular values 1 and
-        |sin(|phi|/2)| / (|phi|/2) <= 1."""
+        """Return upper bounds, see :class:`PosePath`. Rigorous: a quadratic stays in the convex hull of its Bezier
+        points on the interval, and |w| = |J_r(phi) phi'| <= |phi'| because the right Jacobian of SO(3) has singular
+        values 1 and |sin(|phi|/2)| / (|phi|/2) <= 1."""
         v, w = piecewise.speed_bound(int(ta_ns), int(tb_ns), self._knots, self._cp, self._cr)
         return v * _BOUND_MARGIN, w * _BOUND_MARGIN
 
     def approach_bound(self, normal: np.ndarray, reach: float, ta_ns: int, tb_ns: int) -> float:
-        """Upper bound over [ta, tb] of |n . velocity| in units/s of the body's points within ``reach`` of its origin,
-        for the world direction ``normal`` (unit). Zero (to rounding) for a body that slides and turns on a plane,
-        where :meth:`speed_bound` says nothing useful."""
+        """Return an upper bound over [ta, tb] of |n . velocity| in units/s of the body's points within ``reach`` of its
+        origin, for the world direction ``normal`` (unit). Zero (to rounding) for a body that slides and turns on a
+        plane, where :meth:`speed_bound` is not useful."""
         return _BOUND_MARGIN * piecewise.approach_bound(
             int(ta_ns), int(tb_ns), self._knots, self._cp, self._cr, self._rot, normal, reach
         )
 
 
 class HermitePath(KeyframePath):
-    """Motion through poses whose velocities are known, too: cubic between them, once continuously differentiable. What
-    an engine computed step by step; nothing is drawn over an impact, because no velocity is taken from neighbours.
+    """Motion through poses with known velocities: cubic between them, once continuously differentiable. It represents
+    the steps of an engine; impacts are not smoothed, because no velocity is taken from neighbours.
 
     times_ns      : (N,) int64, strictly increasing, N >= 1.
     positions     : (N, 3) world coordinates of the body's origin.   velocities : (N, 3) theirs, units/s.
     quaternions   : (N, 4) unit, w x y z, body to world; less than half a turn from one to the next.
     rates         : (N, 3) angular velocity in the body's axes, rad/s.
-    The poses outside [t0, t1] are held, so that a body that still moves there stops.
+    The poses outside [t0, t1] are held, so a body that still moves there stops.
     """
 
     def __init__(
@@ -187,15 +187,15 @@ class HermitePath(KeyframePath):
 
     @property
     def coefficients(self) -> tuple[np.ndarray, ...]:
-        """All that the path is: times (N,) int64 ns, polynomials of position and of rotation (N - 1, 4, 3), rotations
-        (N - 1, 3, 3)."""
+        """Return all coefficients: times (N,) int64 ns, polynomials of position and of rotation (N - 1, 4, 3),
+        rotations (N - 1, 3, 3)."""
         return self._knots, self._cp, self._cr, self._rot
 
 
 class CutPath:
-    """``path`` until ``t_cut_ns``, then standing still at the pose of that instant.
+    """``path`` until ``t_cut_ns``, then the pose of that instant.
 
-    The derivative is zero from the cut on (the derivative to the right: what happens next).
+    The derivative is zero from the cut on (the right-sided derivative).
     """
 
     def __init__(self, path: PosePath, t_cut_ns: int):
@@ -223,9 +223,9 @@ class CutPath:
 
 
 class PausedPath:
-    """``path``, standing still for ``hold_ns`` from ``stop_ns`` + ``ramp_ns`` on: it slows down and sets out again over
-    ``ramp_ns`` each (> 0), with a velocity that is continuous and never higher than ``path``'s. All that comes after is
-    later by ``hold_ns`` + ``ramp_ns``."""
+    """``path`` with a stop of ``hold_ns`` from ``stop_ns`` + ``ramp_ns`` on: it slows down and speeds up over
+    ``ramp_ns`` each (> 0), with a velocity that is continuous and never higher than ``path``'s. Everything later is
+    delayed by ``hold_ns`` + ``ramp_ns``."""
 
     is_static = False
 
@@ -234,11 +234,10 @@ class PausedPath:
         self.stop_ns, self.hold_ns, self.ramp_ns = int(stop_ns), int(hold_ns), int(ramp_ns)
 
     def _clock(self, t_ns: int) -> tuple[int, float]:
-        """Return the time on ``path``'s clock, ns, and how fast that runs, in [0, 1]."""
+        """Return the time on ``path``'s clock, ns, and the speed of that clock, in [0, 1]."""
         ramp, since = self.ramp_ns, t_ns - self.stop_ns
         if since <= 0:
-            # Before the stop, slowing down, standing, setting out, after; ramp/2 is the integral of the
-            # whole ramp.
+            # Before the stop, slowing down, standing, speeding up, after; ramp/2 is the integral of the whole ramp.
             return t_ns, 1.0
         # The rate is 1 - smoothstep, of which this is the integral.
         if since < ramp:
@@ -266,7 +265,7 @@ class PausedPath:
         return (0.0, 0.0) if a == b and before == after == 0 else self.path.speed_bound(a, b)
 
     def approach_bound(self, normal: np.ndarray, reach: float, ta_ns: int, tb_ns: int) -> float:
-        """As :meth:`KeyframePath.approach_bound`."""
+        """Return the bound of :meth:`KeyframePath.approach_bound`."""
         return self.path.approach_bound(normal, reach, self._clock(int(ta_ns))[0], self._clock(int(tb_ns))[0])
 
 
@@ -298,7 +297,7 @@ class OffsetPath:
 
 
 class SharedOriginPath:
-    """A body that stays where another is and does not turn with it: the sky around a camera."""
+    """A body that stays at another's position without rotating with it: the sky around a camera."""
 
     def __init__(self, path: PosePath):
         self.path, self.t0_ns, self.t1_ns = path, path.t0_ns, path.t1_ns
@@ -317,7 +316,7 @@ class SharedOriginPath:
 
     def poses(self, t_ns: np.ndarray) -> np.ndarray:
         out = np.tile(np.eye(4), (len(t_ns), 1, 1))
-        # One by one: the renderer asks the camera's path for one pose, and both have to be the same to the last bit.
+        # One by one: the renderer requests the camera's path for one pose, and both must be bitwise equal.
         out[:, :3, 3] = [self.path.pose(int(t))[:3, 3] for t in t_ns]
         return out
 
@@ -328,19 +327,19 @@ class SharedOriginPath:
 def smoothed(
     t_ns: np.ndarray, positions: np.ndarray, rotations: Rotation, aside_ns: int
 ) -> tuple[np.ndarray, Rotation]:
-    """(N, 3) positions and N rotations, each the mean of those within ``aside_ns`` before and after it, weighed by a
-    triangle; towards the ends the window is narrower, so that it stays even. 0: as they are.
+    """Return (N, 3) positions and N rotations, each the mean of those within ``aside_ns`` before and after it, with
+    triangular weights; towards the ends the window is narrower, so that it stays symmetric. 0: unchanged.
 
-    t_ns : (N,) int64. Rotations are means of quaternions, good where they lie near each other."""
+    t_ns : (N,) int64. Rotations are means of quaternions, accurate where they are close."""
     if not aside_ns:
         return positions, rotations
     q = rotations.as_quat()
-    # q and -q are one rotation: signs are made to agree, or means would cancel.
+    # q and -q are one rotation: signs are made consistent, or means would cancel.
     turned = np.cumprod(np.where(np.einsum("nk,nk->n", q[1:], q[:-1]) < 0, -1.0, 1.0))
     q[1:] *= turned[:, None]
     both, out = np.hstack([positions, q]), np.empty((len(q), 7))
     for i, t in enumerate(t_ns):
-        # As wide on both sides, so that the mean is not shifted.
+        # Equally wide on both sides, so that the mean is not shifted.
         wide = min(aside_ns, t - t_ns[0], t_ns[-1] - t)
         a, b = np.searchsorted(t_ns, (t - wide, t + wide), side="left")
         b = max(min(b + 1, len(t_ns)), i + 1)
@@ -350,7 +349,8 @@ def smoothed(
 
 
 def rigid(T: ArrayLike, where: str | None = None) -> np.ndarray:
-    """(4, 4) float64 copy of ``T``; ConfigError unless it is finite and a rotation with a translation (to 1e-6)."""
+    """Return a (4, 4) float64 copy of ``T``. Raises ConfigError unless it is finite and a rotation with a translation
+    (to 1e-6)."""
     T = np.array(T, dtype=np.float64)
     ok = T.shape == (4, 4) and bool(np.isfinite(T).all())
     if ok:

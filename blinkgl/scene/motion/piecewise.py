@@ -1,5 +1,5 @@
-"""Piecewise cubic motions, compiled: poses, rates, and upper bounds of both; the form is in
-:mod:`blinkgl.scene.motion.paths`.
+"""Piecewise cubic motions, compiled: poses, rates, and upper bounds of both; :mod:`blinkgl.scene.motion.paths` gives
+the form.
 
 knots : (N,) int64 ns.   cp, cr : (N - 1, 4, 3) polynomials of position and of rotation.   rot : (N - 1, 3, 3).
 """
@@ -28,18 +28,18 @@ def hermite_piece(
     cr: np.ndarray,
 ) -> float:
     """Fill ``cp`` and ``cr`` (4, 3), the cubics of one piece of ``h`` seconds (see the module's docstring), from
-    positions p, velocities v, quaternions q (w x y z) and body rates w at its ends. Returns the angle from the
-    first rotation to the last, rad.
+    positions p, velocities v, quaternions q (w x y z) and body rates w at its ends. Return the angle from the first
+    rotation to the last, rad.
 
-    phi = log(R0^T R1); the rate of phi at the end is J_r^-1(phi) w1, with J_r^-1 = I + [phi]x / 2 + k [phi]x^2,
-    k = 1 / a^2 - cot(a / 2) / (2 a), a = |phi|."""
+    phi = log(R0^T R1); the rate of phi at the end is J_r^-1(phi) w1, with J_r^-1 = I + [phi]x / 2 + k [phi]x^2, k = 1 /
+    a^2 - cot(a / 2) / (2 a), a = |phi|."""
     # conj(q0) q1
     w = q0[0] * q1[0] + q0[1] * q1[1] + q0[2] * q1[2] + q0[3] * q1[3]
     x = q0[0] * q1[1] - q0[1] * q1[0] - q0[2] * q1[3] + q0[3] * q1[2]
     y = q0[0] * q1[2] - q0[2] * q1[0] - q0[3] * q1[1] + q0[1] * q1[3]
     z = q0[0] * q1[3] - q0[3] * q1[0] - q0[1] * q1[2] + q0[2] * q1[1]
     s = math.sqrt(x * x + y * y + z * z)
-    # The short way round: atan2 with |w|, and the sign of w.
+    # The shorter way round: atan2 with |w|, and the sign of w.
     a = 2.0 * math.atan2(s, abs(w))
     f = (a / s if s > 1e-12 else 2.0) * (1.0 if w >= 0.0 else -1.0)
     phi = np.array([f * x, f * y, f * z])
@@ -68,10 +68,10 @@ def thin(
     tolerance: float,
     angle: float,
 ) -> np.ndarray:
-    """(N,) bool: which of N poses, ``step`` seconds apart, a ``HermitePath`` needs to pass all of them within
-    ``tolerance`` (units) and ``angle`` (rad); both ends are. Arrays as there. From each pose that is kept the next is
-    looked for by halving."""
-    # As large a step as passes all poses between, halved until it does.
+    """Return (N,) bool: which of N poses, ``step`` seconds apart, a ``HermitePath`` needs to pass all of them within
+    ``tolerance`` (units) and ``angle`` (rad); both ends are included. Arrays as there. From each kept pose the next is
+    found by halving."""
+    # The largest step that passes all poses between, found by halving.
     keep = np.empty(len(positions), dtype=bool)
     p, v, q, w = (np.ascontiguousarray(a, dtype=np.float64) for a in (positions, velocities, quaternions, rates))
     _thin(step, p, v, q, w, tolerance, angle, keep)
@@ -143,7 +143,7 @@ def _passes(a, b, step, positions, quaternions, cp, cr, square, half):
     return True
 
 
-# The piece that holds t; the first and last go on beyond their ends.
+# The piece that contains t; the first and last extend beyond their ends.
 @kernel
 def _piece(t, knots):
     i = np.searchsorted(knots, t, side="right") - 1
@@ -155,7 +155,7 @@ def pose(t: int, knots: np.ndarray, cp: np.ndarray, cr: np.ndarray, rot: np.ndar
     """Write the pose at a time, held beyond both ends."""
     t = min(max(t, knots[0]), knots[-1])
     i = _piece(t, knots)
-    # Integer difference first, so that times far from 0 lose nothing.
+    # Integer difference first, so that times far from 0 lose no precision.
     u = (t - knots[i]) * 1e-9
     x = ((cr[i, 3, 0] * u + cr[i, 2, 0]) * u + cr[i, 1, 0]) * u + cr[i, 0, 0]
     y = ((cr[i, 3, 1] * u + cr[i, 2, 1]) * u + cr[i, 1, 1]) * u + cr[i, 0, 1]

@@ -1,4 +1,4 @@
-"""Random 6-DoF motion: way-points in free space with random rotations, and a C2 spline through them.
+"""Random 6-DoF motion: waypoints in free space with random rotations, and a C2 spline through them.
 
     space = FreeSpace(low=(-4, -4, 0), high=(4, 4, 3), ground_z=0.0, centres=centres, radii=radii)
     rng = generator(seed, sequence, Role.TRAJECTORY)
@@ -6,15 +6,14 @@
     sliding = random_path(rng, t0_ns, t1_ns, ObjectMotion(), space, 0.3, T_world_obj, on_ground=True)
     camera = random_camera_path(rng, t0_ns, t1_ns, CameraMotion(), space, 0.2, (0, 0, 0.5), T_world_cam)
 
-How the configured speed is met: way-points are a random walk whose legs have about the right length, so that they
-can be rejected one by one; the spline through them is a fixed curve in space, and the *time* it takes is then
-stretched until the mean speed over [t0, t1] is the drawn one. Way-points therefore stay where free space was found.
-The angular rate is met by scaling the turns between key frames. ``path.t1_ns`` may lie past t1: the walk's last
-leg is rarely used up.
+How the configured speed is met: waypoints are a random walk whose legs have about the right length, so that they can be
+rejected one by one. The spline through them is a fixed curve in space, and its *duration* is then scaled until the mean
+speed over [t0, t1] is the drawn one, so waypoints stay in free space. The angular rate is met by scaling the turns
+between key frames. ``path.t1_ns`` may be after t1: the walk's last leg is rarely used completely.
 
-Way-points and the straight legs between them avoid the given obstacles and the ground, the spline between them is
-checked at samples and redrawn a few times. That makes collisions rare, not impossible:
-:func:`blinkgl.scene.motion.collision.resolve_collisions` has the last word.
+Waypoints and the straight legs between them avoid the given obstacles and the ground; the spline between them is
+checked at samples and redrawn a few times. This makes collisions rare, not impossible:
+:func:`blinkgl.scene.motion.collision.resolve_collisions` finds the rest.
 """
 
 from __future__ import annotations
@@ -31,10 +30,10 @@ from blinkgl.config.trajectory import CameraMotion, MotionConfig, ObjectMotion
 from blinkgl.scene.motion.paths import KeyframePath, PausedPath, StaticPath, rigid
 from blinkgl.scene.types import PosePath
 
-_REDRAWS = 6  # whole paths; the one that leaves free space least is kept
+_REDRAWS = 6  # whole paths; the one that leaves free space least is used
 _TRIES = 40  # directions per leg, after which the leg is halved
 _MAX_TURN = 2.0  # rad between key frames: RotationSpline needs less than pi
-_RAMP = 0.05  # of the sequence, in which a body that pauses comes to rest, and sets out again
+_RAMP = 0.05  # fraction of the sequence in which a pausing body slows down, and speeds up again
 _SAMPLES = 16  # per leg, for arc length, mean rate and the check of the curve
 
 
@@ -42,8 +41,8 @@ _SAMPLES = 16  # per leg, for arc length, mean rate and the check of the curve
 class FreeSpace:
     """A box without the inside of obstacles' bounding spheres.
 
-    low, high : (3,) corners; a body's *origin* has to stay inside.
-    ground_z  : bodies have to stay above by their radius (None: no ground).
+    low, high : (3,) corners; a body's *origin* must stay inside.
+    ground_z  : bodies must stay above it by their radius (None: no ground).
     centres, radii : (M, 3), (M,) spheres.
     """
 
@@ -60,8 +59,8 @@ class FreeSpace:
             raise ValueError("FreeSpace: low has to be below high, and each centre needs a radius")
 
     def depth(self, points: np.ndarray, radius: float, skip: np.ndarray | None = None) -> np.ndarray:
-        """(N,) how far a body's sphere at (N, 3) ``points`` is outside free space; 0 inside. ``skip``: (M,) bool
-        obstacles to leave out."""
+        """Return how far a body's sphere at (N, 3) ``points`` is outside free space, (N,); 0 inside. ``skip``: (M,)
+        bool obstacles to ignore."""
         low = self.low.copy()
         if self.ground_z is not None:
             low[2] = min(max(low[2], self.ground_z + radius), self.high[2])
@@ -74,8 +73,8 @@ class FreeSpace:
         return out
 
     def leg_is_free(self, a: np.ndarray, b: np.ndarray, radius: float) -> bool:
-        """Whether a body's sphere may go straight from ``a`` to ``b``. Where it starts outside free space (a body
-        placed close to another: bounding spheres overlap), it only has to get out, not deeper in."""
+        """Return whether a body's sphere may move straight from ``a`` to ``b``. Where it starts outside free space (a
+        body placed close to another: bounding spheres overlap), it only must not go deeper."""
         if np.any(np.maximum(self.low - b, b - self.high) > np.maximum(np.maximum(self.low - a, a - self.high), 0.0)):
             return False
         if self.ground_z is not None and b[2] < self.ground_z + radius and b[2] < a[2]:
@@ -100,12 +99,12 @@ def random_path(
     start_pose: ArrayLike,
     on_ground: bool = False,
 ) -> PosePath:
-    """Motion of one object over [t0, t1].
+    """Return the motion of one object over [t0, t1].
 
-    radius     : of its bounding sphere, kept clear of ``space``'s obstacles. Leave the object itself out of them.
+    radius     : of its bounding sphere, kept clear of ``space``'s obstacles, which must not include the object itself.
     start_pose : (4, 4) T_world_obj at t0.
-    on_ground  : it rests on the ground: its height stays and it turns about the world's vertical only.
-    Returns a StaticPath for ``kind: static``, with probability ``static_share``, and for zero speed and rate.
+    on_ground  : it rests on the ground: its height is constant and it turns only about the world's vertical. Returns a
+    StaticPath for ``kind: static``, with probability ``static_share``, and for zero speed and rate.
     """
     start = rigid(start_pose)
     still = rng.random() < config.static_share
@@ -129,11 +128,11 @@ def random_camera_path(
     target: ArrayLike,
     start_pose: ArrayLike,
 ) -> PosePath:
-    """Motion of the camera over [t0, t1], OpenCV axes.
+    """Return the motion of the camera over [t0, t1], OpenCV axes.
 
-    radius     : of the sphere round the camera centre that stays clear of obstacles (at least the near distance).
+    radius     : of the sphere around the camera centre that stays clear of obstacles (at least the near distance).
     target     : point (3,) to look at. The viewing direction stays within ``view_cone`` of it and the horizon within
-                 ``roll`` at the way-points, as far as the drawn angular rate allows.
+                 ``roll`` at the waypoints, as far as the drawn angular rate allows.
     start_pose : (4, 4) T_world_cam at t0.
     """
     start = rigid(start_pose)
@@ -152,7 +151,7 @@ def random_camera_path(
 
 
 def _heading(rng, config: CameraMotion, start: np.ndarray) -> np.ndarray | None:
-    """(3,) unit direction that the camera sets out to; None: any, and nothing is drawn."""
+    """Return the camera's initial direction, (3,) unit; None: any, and nothing is drawn."""
     if config.heading == "any":
         return None
     if config.heading == "view":
@@ -162,7 +161,7 @@ def _heading(rng, config: CameraMotion, start: np.ndarray) -> np.ndarray | None:
 
 
 def _pausing(rng, config: MotionConfig, path: KeyframePath, t0_ns: int, t1_ns: int) -> PosePath:
-    """The path, which now and then stops for a while. Nothing is drawn where nothing ever stops."""
+    """Return the path with a pause in some cases. Nothing is drawn where pauses are off."""
     if config.pauses == 0 or rng.random() >= config.pauses:
         return path
     stop, share = rng.uniform(0.1, 0.8), rng.uniform(0.1, 0.5)
@@ -171,8 +170,8 @@ def _pausing(rng, config: MotionConfig, path: KeyframePath, t0_ns: int, t1_ns: i
 
 
 def look_rotation(direction: ArrayLike) -> np.ndarray:
-    """(3, 3) R_world_cam (OpenCV axes) looking along ``direction`` with a level horizon (world z up); straight up or
-    down the image's right is the world's +x."""
+    """Return R_world_cam, (3, 3) (OpenCV axes), looking along ``direction`` with a level horizon (world z up); for
+    straight up or down the image's right is the world's +x."""
     z = np.asarray(direction, dtype=np.float64)
     length = np.linalg.norm(z)
     z = z / length if length > 1e-12 else np.array([0.0, 1.0, 0.0])
@@ -189,7 +188,7 @@ def _unit(rng: np.random.Generator, n: int | None = None) -> np.ndarray:
 
 
 def _turned(rng, config: MotionConfig, last: np.ndarray | None, flat: bool) -> np.ndarray:
-    """Next direction: the last one and a random one, mixed by smoothness."""
+    """Return the next direction: the last one and a random one, mixed by smoothness."""
     v = _unit(rng)
     if last is not None:
         v = (1.0 - config.smoothness) * v + config.smoothness * last
@@ -211,8 +210,8 @@ def waypoints(
     flat: bool,
     ahead: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Times (K,) int64 and positions (K, 3), K >= 2, of a walk whose mean speed over [t0, t1] is ``speed``.
-    ahead : (3,) unit direction that it sets out from, as far as ``smoothness`` keeps to it; None: any."""
+    """Return times (K,) int64 and positions (K, 3), K >= 2, of a walk whose mean speed over [t0, t1] is ``speed``.
+    ahead : (3,) unit initial direction, kept as far as ``smoothness`` says; None: any."""
     duration = (t1_ns - t0_ns) * 1e-9
     if duration <= 0:
         raise ValueError("a path needs t0_ns < t1_ns")
@@ -224,14 +223,14 @@ def waypoints(
         space = FreeSpace(
             np.r_[space.low[:2], -np.inf], np.r_[space.high[:2], np.inf], None, space.centres, space.radii
         )
-    # Spheres that overlap at the start cannot be left without being inside them for a while.
+    # Spheres that overlap at the start are ignored for a while, because the body must leave them first.
     entangled = np.linalg.norm(space.centres - start, axis=1) < space.radii + radius
     best, least = None, math.inf
     for _ in range(_REDRAWS):
         points = _walk(rng, config, space, radius, start, speed * duration, flat, count, ahead)
         times = _timed(points, t0_ns, t1_ns, speed)
         used = int(np.searchsorted(times, t1_ns)) + 1
-        # The spline bulges out of its straight legs: it is looked at, too.
+        # The spline leaves its straight legs, so it is checked, too.
         curve = CubicSpline((times - t0_ns) * 1e-9, points)(np.linspace(0, duration, _SAMPLES * used))
         outside = space.depth(curve, radius, skip=entangled).max()
         if outside < least:
@@ -242,13 +241,13 @@ def waypoints(
 
 
 def _walk(rng, config, space, radius, start, length, flat, count, ahead) -> np.ndarray:
-    """(K, 3) way-points from ``start``, legs of about length / (count - 1), until ``length`` is covered."""
+    """Return (K, 3) waypoints from ``start``, legs of about length / (count - 1), until ``length`` is covered."""
     leg = length / (count - 1)
     points, covered, direction = [start], 0.0, ahead
     while covered < length and len(points) <= 16 * count:
         step = leg * rng.uniform(0.6, 1.4)
         for attempt in range(4 * _TRIES):
-            # Hemmed in: shorter legs, and no more insisting on the last direction.
+            # No free direction: shorter legs, in any direction.
             direction = _turned(rng, config, direction if attempt < _TRIES else None, flat)
             reach = step * 0.5 ** (attempt // _TRIES)
             goal = points[-1] + reach * direction
@@ -262,13 +261,13 @@ def _walk(rng, config, space, radius, start, length, flat, count, ahead) -> np.n
 
 
 def _timed(points, t0_ns, t1_ns, speed) -> np.ndarray:
-    """(K,) int64 times such that the cubic spline through ``points`` has mean speed ``speed`` over [t0, t1].
+    """Return (K,) int64 times such that the cubic spline through ``points`` has mean speed ``speed`` over [t0, t1].
 
-    Affine changes of the parameter leave the curve as it is, so only the stretch has to be found. Parameter steps
-    go as the square root of the leg (centripetal parametrisation): no loops and cusps where legs differ.
+    Affine changes of the parameter do not change the curve, so only the scale has to be found. Parameter steps are
+    proportional to the square root of the leg (centripetal parametrisation): no loops and cusps where legs differ.
     """
     legs = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    # A floor on the steps, or two way-points in one place would give the spline a parameter step of 0.
+    # A minimum step, because two waypoints in one place would give the spline a parameter step of 0.
     steps = np.sqrt(np.maximum(legs, 0.05 * max(legs.max(), 1e-12)))
     parameter = np.r_[0.0, np.cumsum(steps)]
     middle = (parameter[:-1, None] + steps[:, None] * (np.arange(_SAMPLES) + 0.5) / _SAMPLES).ravel()
@@ -276,15 +275,15 @@ def _timed(points, t0_ns, t1_ns, speed) -> np.ndarray:
     arc = np.r_[0.0, np.cumsum(rate * np.repeat(steps, _SAMPLES) / _SAMPLES)]
     at = np.r_[0.0, np.cumsum(np.repeat(steps, _SAMPLES) / _SAMPLES)]
     duration = (t1_ns - t0_ns) * 1e-9
-    end = np.interp(speed * duration, arc, at)  # a body that found no way out is slower than configured
+    end = np.interp(speed * duration, arc, at)  # a body that found no free direction is slower than configured
     times = np.rint(parameter * ((t1_ns - t0_ns) / end)).astype(np.int64)
-    # Rounded times of very short legs may coincide: each is at least a nanosecond after the one before.
+    # Rounded times of very short legs may coincide: each is at least a nanosecond after the previous one.
     order = np.arange(len(times))
     return np.maximum.accumulate(times - order) + order + t0_ns
 
 
 def _split(times: np.ndarray, parts: int) -> np.ndarray:
-    """Each interval of (K,) int64 times in ``parts`` equal ones."""
+    """Return (K,) int64 times with each interval divided into ``parts`` equal ones."""
     share = np.arange(parts) / parts
     inner = times[:-1, None] + np.rint(np.diff(times)[:, None] * share).astype(np.int64)
     return np.unique(np.r_[inner.ravel(), times[-1]])
@@ -295,7 +294,8 @@ def _seconds(times: np.ndarray) -> np.ndarray:
 
 
 def _resampled(times, positions, parts):
-    """The same curve with more knots: a spline through samples at a superset of its knots is the spline itself."""
+    """Return the same curve with more knots: a spline through samples at a superset of its knots is the spline
+    itself."""
     finer = _split(times, parts)
     return finer, CubicSpline(_seconds(times), positions)((finer - times[0]) * 1e-9)
 
@@ -306,7 +306,8 @@ def _refined(times, positions, rate):
 
 
 def _random_turns(rng, config, rate, times, vertical) -> np.ndarray:
-    """(K-1, 3) body-frame rotation vectors from key frame to key frame, about ``vertical`` (body frame) if given."""
+    """Return rotation vectors in the body frame from key frame to key frame, (K-1, 3), about ``vertical`` (body frame)
+    if given."""
     angles = rate * np.diff(times) * 1e-9 * rng.uniform(0.6, 1.4, len(times) - 1)
     if vertical is not None:
         return angles[:, None] * vertical * rng.choice([-1.0, 1.0])
@@ -318,13 +319,13 @@ def _random_turns(rng, config, rate, times, vertical) -> np.ndarray:
 
 
 def _camera_turns(rng, config, rate, times, R, aims) -> np.ndarray:
-    """As :func:`_random_turns`; each turn is the first of some random ones that keeps target and horizon in bounds,
-    or else the one (turning straight to the target among them) that comes closest."""
+    """Return turns as :func:`_random_turns`; each is the first of some random ones that keeps target and horizon in
+    bounds, or else the best one (including turning straight to the target)."""
     cone, roll = math.radians(config.view_cone), math.radians(config.roll)
     turns, axis = [], None
     for k, dt in enumerate(np.diff(times) * 1e-9):
         angle = rate * dt * rng.uniform(0.6, 1.4)
-        # All are drawn whether or not an early one fits: the number of draws must not hang on the geometry.
+        # All are drawn even if an early one fits: the number of draws must not depend on the geometry.
         tries = [angle * _turned(rng, config, axis, False) for _ in range(16)]
         home = Rotation.from_matrix(R.T @ look_rotation(aims[k + 1])).as_rotvec()
         tries.append(home * min(1.0, angle / max(float(np.linalg.norm(home)), 1e-12)))
@@ -349,13 +350,13 @@ def _chained(R: np.ndarray, turns: np.ndarray) -> Rotation:
 
 
 def _rotations(R, turns, times, t0_ns, t1_ns, rate) -> Rotation:
-    """Key rotations from ``R`` by ``turns``, all scaled so that the spline's mean angular rate over [t0, t1] is
-    ``rate`` (to 0.1 %, unless turns would pass 150 degrees)."""
+    """Return key rotations from ``R`` by ``turns``, all scaled so that the spline's mean angular rate over [t0, t1] is
+    ``rate`` (to 0.1 %, unless turns would exceed 150 degrees)."""
     if rate == 0.0 or not turns.any():
         return _chained(R, 0.0 * turns)
     most = 2.6 / np.linalg.norm(turns, axis=1).max()
     middle = (np.arange(_SAMPLES * len(times)) + 0.5) / (_SAMPLES * len(times)) * ((t1_ns - t0_ns) * 1e-9)
-    factor = min(0.9, most)  # a spline winds more than the chain of its keys
+    factor = min(0.9, most)  # a spline turns more than its key frames
     for _ in range(5):
         rotations = _chained(R, factor * turns)
         mean = float(np.linalg.norm(RotationSpline(_seconds(times), rotations)(middle, 1), axis=1).mean())

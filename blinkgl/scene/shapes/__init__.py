@@ -1,7 +1,7 @@
-"""What changes the shape of a body: geometry at a time.
+"""Deforming shapes: geometry as a function of time.
 
 In:    parameters, skeletons and clips, morph targets; a mesh at rest and a time.
-Out:   positions, velocities and normals in float64, and the numbers of which the vertex stage makes the same.
-Start: deformer.py says what a :class:`~blinkgl.scene.shapes.deformer.Deformer` is; table.py lists them;
-closed_forms.py has the simple ones.
+Out:   positions, velocities and normals in float64, and the numbers for the vertex stage.
+Start: deformer.py defines :class:`~blinkgl.scene.shapes.deformer.Deformer`; table.py lists all; closed_forms.py has the
+simple ones.
 """

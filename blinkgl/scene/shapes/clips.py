@@ -1,4 +1,4 @@
-"""Clips: key frames of many joints' translations, rotations, scales, and how they run on a sequence's clock.
+"""Clips: key frames of many joints' translations, rotations and scales, and their timing on a sequence's clock.
 
 Reference: Khronos glTF 2.0 specification, 3.11 and appendix C (interpolation), of which a clip is the general form.
 Values between key frames are exact, and so are their rates: nothing is resampled.
@@ -21,7 +21,7 @@ KINDS = ("LINEAR", "STEP", "CUBICSPLINE")
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Key frames of one property. joint : number in its skeleton.   path : of PATHS, or "weights".
+    """Key frames of one property. joint : index in its skeleton.   path : of PATHS, or "weights".
     times : (K,) s, increasing.   values : (K, n), of a CUBICSPLINE (K, 3, n): in-tangent, value, out-tangent."""
 
     joint: int
@@ -31,9 +31,8 @@ class Track:
     interpolation: str = "LINEAR"
 
     def at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """((n,), (n,)): value at a time of the clip and its rate per second; held outside the key frames. Of a
-        rotation:
-        use :class:`Clip`."""
+        """Return ((n,), (n,)): value at a time of the clip and its rate per second; held outside the key frames. For a
+        rotation use :class:`Clip`."""
         times = self.times
         cubic = self.interpolation == "CUBICSPLINE"
         values = self.values[:, 1] if cubic else self.values
@@ -56,9 +55,8 @@ class Track:
 
 @dataclass(frozen=True)
 class Playing:
-    """How a clip runs on the sequence's clock. first, last : s, its own times.   speed : clip seconds per second,
-    negative:
-    backwards.   phase : clip seconds after ``first`` at time 0.   loop : begins again; otherwise it is held at its
+    """Timing of a clip on the sequence's clock. first, last : s, its own times.   speed : clip seconds per second,
+    negative: backwards.   phase : clip seconds after ``first`` at time 0.   loop : repeats; otherwise it is held at its
     ends."""
 
     first: float
@@ -69,14 +67,14 @@ class Playing:
 
     @property
     def period_ns(self) -> int | None:
-        """Of a loop."""
+        """Return the period of a loop; None otherwise."""
         if not self.loop or self.speed == 0 or self.last <= self.first:
             return None
         return max(round((self.last - self.first) / abs(self.speed) * 1e9), 1)
 
     @property
     def span_ns(self) -> int:
-        """From time 0 on after so long nothing new comes."""
+        """Return the time from 0 after which nothing changes."""
         return 0 if self.is_static else round((self.last - self.first) / abs(self.speed) * 1e9)
 
     @property
@@ -84,12 +82,12 @@ class Playing:
         return self.speed == 0 or self.last <= self.first
 
     def at(self, t_ns: int) -> tuple[float, float]:
-        """(time of the clip, its rate)."""
+        """Return (time of the clip, its rate)."""
         length, period = self.last - self.first, self.period_ns
         if length <= 0:
             return self.first, 0.0
         if self.loop:
-            # Whole periods are taken off in ns, so that a loop is the same to the last bit in every round.
+            # Whole periods are subtracted in ns, so that every round of a loop is bitwise the same.
             passed = self.speed * (int(t_ns) if period is None else int(t_ns) % period) * 1e-9 + self.phase
             # fmod has the sign of its first argument: a clip that runs backwards comes from below 0.
             within = math.fmod(passed, length)
@@ -99,7 +97,7 @@ class Playing:
 
 
 class Clip:
-    """Tracks on a skeleton. rest : where joints are that no track moves.   tracks : of those that do.   playing : when.
+    """Tracks on a skeleton. rest : transforms of joints without a track.   tracks : of the others.   playing : timing.
 
     The motion of :class:`~blinkgl.scene.shapes.skeleton.Skeleton`."""
 
@@ -135,7 +133,7 @@ class Clip:
 
 @kernel(error_model="numpy")
 def _evaluate(time, speed, joint, path, kind, first, times, values, out):
-    """Writes what the tracks give at a time of the clip into ``out``, :class:`Locals`, and rates per second of the
+    """Write the tracks' values at a time of the clip to ``out``, :class:`Locals`, with rates per second of the
     sequence's clock."""
     T, R, S, dT, dR, dS = out
     value, rate = np.zeros(4), np.zeros(4)
@@ -172,7 +170,7 @@ def _evaluate(time, speed, joint, path, kind, first, times, values, out):
                     rate[k] = (values[i + 1, 1, k] - values[i, 1, k]) / h
             else:
                 _slerp(values[i, 1], values[i + 1, 1], s, 1.0 / h, value, rate)
-        # A unit quaternion's rate has no part along the quaternion: that part is taken out.
+        # A unit quaternion's rate has no part along the quaternion: that part is removed.
         if n == 4:
             length, along = 0.0, 0.0
             for k in range(4):
@@ -195,16 +193,16 @@ def _evaluate(time, speed, joint, path, kind, first, times, values, out):
 
 @kernel(error_model="numpy")
 def _slerp(a, b, s, ds, value, rate):
-    """Along the shorter arc between unit quaternions, and its rate where s grows by ds per second."""
+    """Interpolate along the shorter arc between unit quaternions, with the rate where s grows by ds per second."""
     cosine = 0.0
     for k in range(4):
         cosine += a[k] * b[k]
-    # q and -q are one rotation; the nearer of the two is gone to.
+    # q and -q are one rotation; the nearer of the two is the target.
     side = 1.0 if cosine >= 0 else -1.0
     distance = 0.0
     for k in range(4):
         distance += (side * b[k] - a[k]) ** 2
-    angle = 2 * np.arcsin(min(0.5 * np.sqrt(distance), 1.0))  # exact for small ones, as acos is not
+    angle = 2 * np.arcsin(min(0.5 * np.sqrt(distance), 1.0))  # exact for small angles, unlike acos
     # Both sines vanish: a straight line is exact to rounding.
     if angle < 1e-9:
         for k in range(4):

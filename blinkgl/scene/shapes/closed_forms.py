@@ -1,11 +1,12 @@
 """Deformers by formula: waves, turns, scales, each with an exact rate and an exact difference between two times.
 
     wave, flag    q = p + d e(p) sum_i A_i sin(k_i . p + phi_i(t))       e(p): 1, or 0 at the held end growing to 1
-    twist, bend   q = c + R_b(a(t) u(p)) (p - c)                         u(p): 0 where it is held, 1 in one length's
-    distance breathe       q = c + (1 + a sin phi(t)) * (p - c)
+    twist, bend   q = c + R_b(a(t) u(p)) (p - c)                         u(p): 0 where it is held, 1 at one length's
+                                                                         distance
+    breathe       q = c + (1 + a sin phi(t)) * (p - c)
 
-with phi(t) = 2 pi t / period + phase. Differences between times come of ``sin x' - sin x = 2 cos((x + x') / 2)
-sin((x' - x) / 2)``.
+with phi(t) = 2 pi t / period + phase. Differences between times use
+``sin x' - sin x = 2 cos((x + x') / 2) sin((x' - x) / 2)``.
 """
 
 from __future__ import annotations
@@ -36,19 +37,19 @@ class Beat:
 
     @property
     def rate(self) -> float:
-        """d(phi)/dt, rad/s."""
+        """Return d(phi)/dt, rad/s."""
         return 2 * math.pi * 1e9 / self.period_ns
 
     def at(self, t_ns: int) -> float:
-        """phi(t) less whole turns."""
+        """Return phi(t) minus whole turns."""
         return 2 * math.pi * (int(t_ns) % self.period_ns) / self.period_ns + self.phase
 
     def half_change(self, t_ns: int, there_ns: int) -> float:
-        """(phi(t') - phi(t)) / 2 less whole turns."""
+        """Return (phi(t') - phi(t)) / 2 minus whole turns."""
         return math.pi * math.fmod(int(there_ns) - int(t_ns), 2 * self.period_ns) / self.period_ns
 
     def sine_change(self, t_ns: int, there_ns: int) -> float:
-        """sin phi(t') - sin phi(t)."""
+        """Return sin phi(t') - sin phi(t)."""
         half = self.half_change(t_ns, there_ns)
         return 2 * math.cos(self.at(t_ns) + half) * math.sin(half)
 
@@ -58,7 +59,7 @@ def _dot(points: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 
 class Waves(Deformer):
-    """Two plane waves along one direction. direction : (3,) where amplitudes of 1 lead.
+    """Two plane waves along one direction. direction : (3,) displacement for an amplitude of 1.
     envelope : ((3,), float): e(p) = e . p + e0.   numbers : ((3,) rad per unit, phase rad) of both waves.
     amplitudes : units."""
 
@@ -88,11 +89,11 @@ class Waves(Deformer):
 
     def transformed(self, matrix: np.ndarray) -> Waves:
         linear, shift = matrix[:3, :3], matrix[:3, 3]
-        # Phases and envelope are linear forms of the points: they take the inverse map of the points' coordinates.
+        # Phases and envelope are linear forms of the points, so they are transformed by the inverse map.
         inverse = np.linalg.inv(linear)
 
         def form(vector: np.ndarray, constant: float) -> tuple[np.ndarray, float]:
-            """v . p + c of the points' new coordinates."""
+            """Return v . p + c in the points' new coordinates."""
             return vector @ inverse, constant - float(vector @ inverse @ shift)
 
         first, second = (form(*wave) for wave in self.waves)
@@ -101,7 +102,7 @@ class Waves(Deformer):
         return out
 
     def _terms(self, mesh: Mesh, t_ns: int):
-        """(amplitude, wave vector, angles (V,), rate) of both waves."""
+        """Return (amplitude, wave vector, angles (V,), rate) of both waves."""
         for amplitude, (k, phase), beat in zip(self.amplitudes, self.waves, self.beats):
             yield amplitude, k, _dot(mesh.vertices, k) + phase - beat.at(t_ns), -beat.rate
 
@@ -119,8 +120,8 @@ class Waves(Deformer):
     def normals(self, mesh: Mesh, t_ns: int) -> np.ndarray:
         e, terms, n = self._envelope(mesh), list(self._terms(mesh, t_ns)), np.asarray(mesh.normals, np.float64)
         height = sum(A * np.sin(x) for A, _, x, _ in terms)
-        # The map is p + h(p) d: its Jacobian is I + d grad h^T, whose cofactor matrix takes the normals (Sherman-
-        # Morrison).
+        # The map is p + h(p) d: its Jacobian is I + d grad h^T, whose cofactor matrix transforms the normals
+        # (Sherman-Morrison).
         slope = np.outer(height, self.envelope[0]) + sum(np.outer(e * A * np.cos(x), k) for A, k, x, _ in terms)
         return n * (1 + slope @ self.direction)[:, None] - slope * (n @ self.direction)[:, None]
 
@@ -179,7 +180,7 @@ class Flag(Waves):
         pole = low
         if config.held == "high":
             along, pole = -along, np.where(along > 0, high, low)
-        # The second wave runs aslant and twice as fast, or the cloth would look like corrugated iron.
+        # The second wave is oblique and twice as fast; otherwise the cloth would look like corrugated iron.
         k = 2 * math.pi / (config.wavelength * length)
         first, second = k * along, k * (1.6 * along + 0.9 * across)
         beat = Beat(config.period, -math.radians(config.phase))
@@ -194,7 +195,7 @@ class Flag(Waves):
 
 
 class Turn(Deformer):
-    """Turned about an axis, by an angle that grows along the mesh and swings in time.
+    """A rotation about an axis by an angle that grows along the mesh and oscillates in time.
     axis : (3,) unit.   pivot : (3,).   share : ((3,), float): u(p) = s . p + s0.   angle : rad where u is 1."""
 
     glsl = "turn"
@@ -238,7 +239,7 @@ class Turn(Deformer):
         angles = self._angle(t_ns) * self._share(mesh)
         arm = self._turned(mesh.vertices - self.pivot, angles)
         n = self._turned(np.asarray(mesh.normals, np.float64), angles)
-        # d q / dp is the turn and, where the share grows, a shear along axis x arm; cofactors of a rank-one update
+        # dq/dp is the rotation plus, where the share grows, a shear along axis x arm; cofactors of a rank-one update
         # again.
         shear = np.cross(self.axis, arm)
         along = self._angle(t_ns) * self._turned(np.broadcast_to(self.share[0], arm.shape), angles)
@@ -298,7 +299,7 @@ class Bend(Turn):
 
 
 class Breathe(Deformer):
-    """``deform: {kind: breathe}``. centre : (3,).   amount : (3,) parts of the size along each axis."""
+    """``deform: {kind: breathe}``. centre : (3,).   amount : (3,) fractions of the size along each axis."""
 
     glsl = "scale"
     rows = 2  # type: ignore[assignment]
@@ -335,7 +336,7 @@ class Breathe(Deformer):
         return self._rate(t_ns) * (mesh.vertices - self.centre)
 
     def normals(self, mesh: Mesh, t_ns: int) -> np.ndarray:
-        # Of a scale the cofactors are, but for a common factor, the inverse.
+        # The cofactors of a scale are the inverse, except for a common factor.
         return np.asarray(mesh.normals, np.float64) / self._factor(t_ns)
 
     def _rows(self, centre: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -354,9 +355,9 @@ class Breathe(Deformer):
 
 
 def _similarity(deformer: Deformer, matrix: np.ndarray) -> tuple[float, np.ndarray]:
-    """(scale, (3, 3) rotation) of an affine map that is nothing else, but for a shift. Raises TypeError."""
+    """Return (scale, (3, 3) rotation) of an affine map that consists only of these and a shift. Raises TypeError."""
     linear = matrix[:3, :3]
-    # The cube root keeps the sign: a mirroring map has a negative scale and is refused.
+    # The cube root keeps the sign: a reflection has a negative scale and is refused.
     scale = float(np.cbrt(np.linalg.det(linear)))
     if scale <= 0 or not np.allclose(linear @ linear.T, scale**2 * np.eye(3), rtol=0, atol=1e-9 * scale**2):
         raise TypeError(f"{type(deformer).__name__} can be turned and scaled evenly, and nothing else")
@@ -364,8 +365,8 @@ def _similarity(deformer: Deformer, matrix: np.ndarray) -> tuple[float, np.ndarr
 
 
 def _length(low: np.ndarray, high: np.ndarray, along: np.ndarray) -> float:
-    """Of a box along an axis; of one that is flat there its largest side."""
+    """Return the length of a box along an axis; if it is flat there, its largest side."""
     sides = high - low
-    # A sheet has no length across: wavelengths and amplitudes need some length all the same.
+    # A sheet has no length across, but wavelengths and amplitudes need some length.
     length = float(along @ sides)
     return length if length > 1e-6 * sides.max() else float(sides.max())

@@ -1,9 +1,9 @@
-"""Motions that go round: every joint's angles, and the root's place, are sums of a few sines of one phase.
+"""Periodic motions: every joint's angles, and the root's position, are sums of a few sines of one phase.
 
     angle(t) = a_0 + sum_k a_k cos(k phi) + b_k sin(k phi),     phi(t) = 2 pi (t / period + phase)
 
-A loop has no seam and a rate of its own, exactly. What a figure does (:mod:`~blinkgl.scene.shapes.gait`) is made at
-some phases and put into this form once, by the fast Fourier transform.
+A loop has no seam, and its rate is exact. A figure's motion (:mod:`~blinkgl.scene.shapes.gait`) is computed at some
+phases and converted to this form once, by the fast Fourier transform.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from blinkgl.machine.kernels import kernel
 from blinkgl.scene.shapes.skeleton import Locals
 
 HARMONICS = 12
-"""k of the fastest sine, per round."""
+"""Highest harmonic k."""
 
 
 class Cycle:
     """A motion of n joints, of :class:`~blinkgl.scene.shapes.skeleton.Skeleton`.
 
     offsets : (n, 3) of each joint in its parent's frame.   angles : (N, n, 3) rad at N equal steps of one round, about
-    x, then the turned y, then the twice turned z.   root : (N, 3) what the first joint is moved by, units.
-    period : s of one round.   phase : rounds at time 0.   speed : units/s of the body along its x axis that the motion
-    goes with, 0: it stays where it is.   N has to be more than twice ``HARMONICS``."""
+    x, then the turned y, then the twice turned z.   root : (N, 3) displacement of the first joint, units.
+    period : s of one round.   phase : rounds at time 0.   speed : units/s of the body along its x axis that fit the
+    motion, 0: it stays in place.   N has to be more than twice ``HARMONICS``."""
 
     is_static = False
     goes = "upright"
@@ -40,10 +40,10 @@ class Cycle:
         self.period_ns = self.span_ns = max(round(period * 1e9), 1)
         self.phase, self.speed = phase, speed
         count = len(angles)
-        values = np.concatenate([root[:, None], angles], axis=1)  # the root's place is row 0
-        # Higher harmonics are dropped: what they hold is the corners of the keyed angles, which no body turns.
+        values = np.concatenate([root[:, None], angles], axis=1)  # the root's position is row 0
+        # Higher harmonics are dropped: they hold only the corners of the keyed angles, which no body makes.
         spectrum = np.fft.rfft(values, axis=0)[: HARMONICS + 1] / count
-        # A real signal has each wave twice in its spectrum, but for the constant.
+        # Each wave of a real signal occurs twice in its spectrum, except the constant.
         spectrum[1:] *= 2
         self._cosines = np.ascontiguousarray(spectrum.real)
         self._sines = np.ascontiguousarray(-spectrum.imag)
@@ -59,7 +59,7 @@ class Cycle:
 
 @kernel
 def _evaluate(phi, rate, cosines, sines, offsets, T, R, dT, dR):
-    """Writes the joints' places and turns at a phase, and their rates, where phi grows by ``rate`` per second."""
+    """Write the joints' positions and rotations at a phase, and their rates, where phi grows by ``rate`` per second."""
     rows = cosines.shape[1]
     value, change = cosines[0].copy(), np.zeros((rows, 3))
     for k in range(1, len(cosines)):
@@ -76,7 +76,7 @@ def _evaluate(phi, rate, cosines, sines, offsets, T, R, dT, dR):
         T[0, j] += value[0, j]
         dT[0, j] = change[0, j]
     q, d, turn, turning, p, e = np.zeros(4), np.zeros(4), np.zeros(4), np.zeros(4), np.zeros(4), np.zeros(4)
-    # Row 0 is the root's place; rows 1 on are the joints' angles.
+    # Row 0 is the root's position; rows 1 on are the joints' angles.
     for i in range(1, rows):
         q[:], d[:] = 0.0, 0.0
         q[3] = 1.0
@@ -85,7 +85,7 @@ def _evaluate(phi, rate, cosines, sines, offsets, T, R, dT, dR):
             turn[:], turning[:] = 0.0, 0.0
             turn[axis], turn[3] = np.sin(half), np.cos(half)
             turning[axis], turning[3] = half_rate * turn[3], -half_rate * turn[axis]
-            # The product rule on q turn: dq turn + q dturn, before q itself moves on.
+            # The product rule on q turn: dq turn + q dturn, before q itself changes.
             _product(q, turning, e)
             _product(d, turn, p)
             for k in range(4):
@@ -97,7 +97,7 @@ def _evaluate(phi, rate, cosines, sines, offsets, T, R, dT, dR):
 
 @kernel
 def _product(a, b, out):
-    """Of quaternions x, y, z, w."""
+    """Write the product of quaternions x, y, z, w."""
     out[0] = a[3] * b[0] + a[0] * b[3] + a[1] * b[2] - a[2] * b[1]
     out[1] = a[3] * b[1] - a[0] * b[2] + a[1] * b[3] + a[2] * b[0]
     out[2] = a[3] * b[2] + a[0] * b[1] - a[1] * b[0] + a[2] * b[3]

@@ -1,16 +1,15 @@
-"""What a deformer is: a shape ``q(p, t)`` in the place of ``p``, in the frame of its object.
+"""Base of the deformers: a shape ``q(p, t)`` replaces ``p``, in the frame of its object.
 
 A rigid body's point is at ``T(t) p``, a deforming one's at ``T(t) q(p, t)``. With the clip matrix ``MVP`` the motion
 from t to t' is
 
     MVP' (q' - q) + (MVP' - MVP) q,
 
-in which neither difference is one of rounded numbers: the second is composed in float64, the first has a form of its
-own in every deformer (:meth:`Deformer.changes`), so that a motion of 1e-6 px is as exact as one of 10 px. Rates
-likewise: ``MVP dq/dt + dMVP/dt q``.
+in which neither difference is one of rounded numbers: the second is composed in float64, and every deformer computes
+the first in its own form (:meth:`Deformer.changes`), so a motion of 1e-6 px is as exact as one of 10 px. Likewise for
+rates: ``MVP dq/dt + dMVP/dt q``.
 
-Everything here is pure data in float64; what the vertex stage computes from the same numbers stands in
-``shaders/include/deform/``.
+Everything here is plain float64 data; ``shaders/include/deform/`` has the vertex stage that uses the same numbers.
 """
 
 from __future__ import annotations
@@ -32,28 +31,28 @@ if TYPE_CHECKING:
     from blinkgl.scene.types import Mesh
 
 _SAMPLES = 32
-"""Times at which a shape is looked at to find what it sweeps, at least."""
+"""Smallest number of times at which a shape is sampled to find its bounds."""
 _MAX_SAMPLES = 256
 _STEP_NS = 50_000_000
 _MARGIN = 1.25
 
 
 class Deformer(ABC):
-    """How one mesh changes its shape. Belongs to a mesh (``Mesh.deformer``), whose vertices are the shape at rest.
+    """Deformation of one mesh. It belongs to a mesh (``Mesh.deformer``), whose vertices are the shape at rest.
 
-    What the vertex stage needs
+    For the vertex stage
         glsl : name of the source, ``shaders/include/deform/NAME.glsl``, or of ``source`` where that is given.
         source : the text itself: the five functions that ``shaders/include/deform.glsl`` names.
-        rows : numbers per time, as vec4.   attributes : more of each vertex, (V, 1 to 4) float32 by the names of GLSL.
-        textures : (h, w, 4) float32 by the names of their samplers.   sizes : more macros, whole numbers.
+        rows : numbers per time, as vec4.   attributes : further vertex attributes, (V, 1 to 4) float32 by GLSL name.
+        textures : (h, w, 4) float32 by sampler name.   sizes : further macros, whole numbers.
 
     examples : ``sizes`` of the variants that ``blinkgl shader check`` compiles.
 
-    goes : which way up a body is, and which way it goes: "anyhow"; "upright" on the ground, "level" above it, both
-    along its x axis.   speed : units/s that the shape goes with, as steps do; 0: it may stay where it is.
+    goes : orientation of a moving body: "anyhow"; "upright" on the ground, "level" above it, both along its x axis.
+    speed : units/s that fit the motion, such as steps; 0: it may stay in place.
 
-    Config : the model of ``deform:`` that asks for it; None: none does.   period_ns : after which the shape repeats;
-    None: it does not.   span_ns : from time 0 on after so long nothing new comes."""
+    Config : its model in ``deform:``; None: none.   period_ns : period of the shape; None: not periodic.   span_ns :
+    time from 0 after which the shape no longer changes."""
 
     glsl: ClassVar[str]
     source: ClassVar[str | None] = None
@@ -70,36 +69,36 @@ class Deformer(ABC):
 
     @classmethod
     def of(cls, config: Any, low: np.ndarray, high: np.ndarray) -> Deformer:
-        """What ``deform:`` asks for, of an object whose box at rest is (3,) low to high. Of classes with a
-        ``Config``."""
+        """Return the deformer of a ``deform:`` configuration, for an object whose box at rest is (3,) low to high. Only
+        for classes with a ``Config``."""
         raise NotImplementedError
 
     @property
     @abstractmethod
     def rows(self) -> int:
-        """Of the arrays that :meth:`numbers`, :meth:`rates` and :meth:`changes` give."""
+        """Return the rows of the arrays of :meth:`numbers`, :meth:`rates` and :meth:`changes`."""
 
     @property
     def is_static(self) -> bool:
-        """True when the shape is the same at all times."""
+        """Return whether the shape is the same at all times."""
         return False
 
     # ---- the shape, on the CPU -----------------------------------------------------------------------------------
 
     @abstractmethod
     def positions(self, mesh: Mesh, t_ns: int) -> np.ndarray:
-        """(V, 3) float64 q(p, t) of the mesh's vertices."""
+        """Return q(p, t) of the mesh's vertices, (V, 3) float64."""
 
     @abstractmethod
     def velocity(self, mesh: Mesh, t_ns: int) -> np.ndarray:
-        """(V, 3) float64 dq/dt, units/s, analytic."""
+        """Return dq/dt, analytic, (V, 3) float64, units/s."""
 
     @abstractmethod
     def normals(self, mesh: Mesh, t_ns: int) -> np.ndarray:
-        """(V, 3) float64 directions of the normals, not normalised."""
+        """Return directions of the normals, not normalised, (V, 3) float64."""
 
     def sweep(self, mesh: Mesh, t0_ns: int, t1_ns: int) -> Sweep:
-        """What the shape fills over [t0, t1]. Kept with the mesh."""
+        """Return the region that the shape fills over [t0, t1]. It is stored with the mesh."""
         if self.period_ns is not None and t1_ns - t0_ns >= self.period_ns:
             t0_ns, t1_ns = 0, self.period_ns
         kept = _sweeps.setdefault(mesh, {})
@@ -108,34 +107,34 @@ class Deformer(ABC):
         return kept[t0_ns, t1_ns]
 
     def bounds(self, mesh: Mesh, t0_ns: int, t1_ns: int) -> tuple[np.ndarray, np.ndarray]:
-        """((3,), (3,)) box that holds the shape over [t0, t1]."""
+        """Return the box that contains the shape over [t0, t1], ((3,), (3,))."""
         swept = self.sweep(mesh, t0_ns, t1_ns)
         return swept.low, swept.high
 
     def transformed(self, matrix: np.ndarray) -> Deformer:
-        """The same of the mesh under an affine (4, 4) map A: q_A(A p) = A q(p). TypeError where that is another
-        kind of deformer."""
+        """Return the deformer of the mesh under an affine (4, 4) map A: q_A(A p) = A q(p). Raises TypeError where that
+        would be another kind of deformer."""
         raise TypeError(f"{type(self).__name__} cannot be transformed")
 
     # ---- the shape, for the vertex stage -------------------------------------------------------------------------
 
     @abstractmethod
     def numbers(self, t_ns: int) -> np.ndarray:
-        """(rows, 4) float64 of which GLSL makes the shape at t."""
+        """Return the numbers of the shape at t for GLSL, (rows, 4) float64."""
 
     @abstractmethod
     def rates(self, t_ns: int) -> np.ndarray:
-        """(rows, 4) float64 that it needs besides for dq/dt at t."""
+        """Return the further numbers for dq/dt at t, (rows, 4) float64."""
 
     @abstractmethod
     def changes(self, t_ns: int, there_ns: int) -> np.ndarray:
-        """(rows, 4) float64 that it needs besides for q(p, there) - q(p, t)."""
+        """Return the further numbers for q(p, there) - q(p, t), (rows, 4) float64."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """What a shape fills over some time. low, high : (3,) box, the margin included.
-    margin : by how much the shape may leave the positions that were looked at, units."""
+    """The region that a shape fills over some time. low, high : (3,) box, the margin included.
+    margin : largest distance of the shape from the sampled positions, units."""
 
     deformer: Deformer
     mesh: Mesh
@@ -146,9 +145,8 @@ class Sweep:
 
     @classmethod
     def of(cls, deformer: Deformer, mesh: Mesh, t0_ns: int, t1_ns: int) -> Sweep:
-        """Positions are looked at at some times. In between a vertex leaves the straight line by at most h/4 times
-        the change of its velocity from one time to the next (h/8 if that is steady, h/4 if it jumps), of which a
-        quarter more is the margin."""
+        """Return the region from positions at sampled times. Between two, a vertex leaves the straight line by at most
+        h/4 times the change of its velocity (h/8 if that is steady, h/4 if it jumps); the margin is a quarter more."""
         count = (
             1 if deformer.is_static or t1_ns <= t0_ns else min(max(_SAMPLES, (t1_ns - t0_ns) // _STEP_NS), _MAX_SAMPLES)
         )
@@ -165,15 +163,14 @@ class Sweep:
 
     @cached_property
     def hull(self) -> tuple[np.ndarray, np.ndarray]:
-        """((K, 3) float64, (F, 3) int32, facing out): a convex body round all positions that were looked at,
-        without the margin: what lies behind a plane in each of 162 directions. A ball's is 1.5 % larger than the
-        ball."""
+        """Return ((K, 3) float64, (F, 3) int32, facing out): a convex body around all sampled positions, without the
+        margin, bounded by a plane in each of 162 directions. For a ball it is 1.5 % larger."""
         directions, halves, order = _directions()
         reach, inside = np.full(len(directions), -np.inf), np.zeros(3)
         for t in self.times:
             points = np.ascontiguousarray(self.deformer.positions(self.mesh, t))
             inside += _reach(points, halves, order, reach) / len(self.times)
-        # A little apart, so that flat ones have an inside, and those that an animation shrinks to a point.
+        # Slightly enlarged, so that flat shapes, and those that an animation shrinks to a point, have an inside.
         reach += 1e-6 * (float(np.linalg.norm(self.high - self.low)) or 1.0)
         corners = HalfspaceIntersection(np.column_stack([directions, -reach]), inside).intersections
         hull = ConvexHull(corners)
@@ -187,13 +184,12 @@ class Sweep:
 
 @kernel
 def _reach(points, halves, order, reach):
-    """Raises ``reach``, (162,) how far (V, 3) points go in each direction; the mean of those that go furthest.
-    halves, order : of :func:`_directions`. Point by point and one sign after the other, so that a processor takes
-    several directions at once."""
+    """Raise ``reach``, (162,), the largest extent of (V, 3) points in each direction, to their mean. halves, order : of
+    :func:`_directions`. Point by point and one sign after the other, so that the loop vectorises over directions."""
     x, y, z = halves[0], halves[1], halves[2]
     count = len(x)
     ahead, behind = np.full(count, -np.inf), np.full(count, -np.inf)
-    foremost, hindmost = np.zeros(count), np.zeros(count)  # numbers of points, as large as what they go with
+    foremost, hindmost = np.zeros(count), np.zeros(count)  # numbers of points, as float like the extents
     for i in range(len(points)):
         a, b, c, number = points[i, 0], points[i, 1], points[i, 2], float(i)
         for d in range(count):
@@ -214,7 +210,7 @@ def _reach(points, halves, order, reach):
 
 @kernel
 def _widen(points, low, high):
-    """Widens the box low to high, (3,) both, to hold (V, 3) points."""
+    """Enlarge the box low to high, (3,) both, to contain (V, 3) points."""
     for i in range(len(points)):
         for j in range(3):
             low[j], high[j] = min(low[j], points[i, j]), max(high[j], points[i, j])
@@ -222,7 +218,7 @@ def _widen(points, low, high):
 
 @kernel
 def _largest_difference(a, b):
-    """The largest distance between the rows of (V, 3) a and b."""
+    """Return the largest distance between the rows of (V, 3) a and b."""
     most = 0.0
     for i in range(len(a)):
         x, y, z = a[i, 0] - b[i, 0], a[i, 1] - b[i, 1], a[i, 2] - b[i, 2]
@@ -232,9 +228,9 @@ def _largest_difference(a, b):
 
 @cache
 def _directions() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """((162, 3) unit vectors, evenly spread, each with its opposite; (3, 81) one of each two; (162,) where a vector is
-    among those 81 and, after them, their opposites)."""
-    import trimesh  # here: it takes long to import, and few scenes have what changes its shape
+    """Return ((162, 3) evenly distributed unit vectors, each with its opposite; (3, 81) one of each pair; (162,) index
+    of each vector among those 81 followed by their opposites)."""
+    import trimesh  # imported here: it is slow to import, and few scenes have deforming shapes
 
     every = np.array(trimesh.creation.icosphere(subdivisions=2, radius=1.0).vertices)
     opposite = (every[:, None] == -every).all(axis=2).argmax(axis=1)
@@ -248,8 +244,8 @@ _sweeps: WeakKeyDictionary[Mesh, dict[tuple[int, int], Sweep]] = WeakKeyDictiona
 
 
 def filled(mesh: Mesh) -> tuple[np.ndarray, float]:
-    """((K, 3) points, by how much the mesh may leave their hull): its vertices, of one that deforms the corners of the
-    hull of all that it is in its time."""
+    """Return ((K, 3) points, largest distance of the mesh from their hull): its vertices, or for a deforming mesh the
+    corners of its region's hull."""
     if mesh.deformer is None:
         return mesh.vertices[np.unique(mesh.faces)], 0.0
     sweep = mesh.deformer.sweep(mesh, 0, mesh.deformer.span_ns)
@@ -257,12 +253,12 @@ def filled(mesh: Mesh) -> tuple[np.ndarray, float]:
 
 
 def normals_at(mesh: Mesh, t_ns: int) -> np.ndarray:
-    """(V, 3) normals at t, object frame; of a mesh that deforms not normalised."""
+    """Return normals at t, (V, 3), object frame; not normalised for a deforming mesh."""
     return mesh.normals if mesh.deformer is None else mesh.deformer.normals(mesh, t_ns)
 
 
 def gait(meshes: Iterable[Mesh]) -> tuple[str, float]:
-    """(which way they go, units/s that they go with) of the meshes of one object: that of the first that says any."""
+    """Return (orientation, units/s) of the motion of one object's meshes: of the first that has any."""
     for mesh in meshes:
         if mesh.deformer is not None and mesh.deformer.goes != "anyhow":
             return mesh.deformer.goes, mesh.deformer.speed

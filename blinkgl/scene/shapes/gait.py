@@ -1,10 +1,10 @@
-"""What a figure does: stand, walk, run, dance, wave, as angles of its joints over one round.
+"""Motions of a figure: stand, walk, run, dance, wave, as joint angles over one round.
 
-The pelvis and the feet are told where to be, the legs follow by the law of cosines; the rest is said in angles. In
-``walk`` and ``run`` a foot on the ground goes back, as seen from the body, exactly as fast as the body goes on, first
-on its heel, then flat, then on its ball: it does not slide but for what :mod:`~blinkgl.scene.shapes.cycle` leaves out
-of it. Angles: about x (to the side), y (positive: a leg or an arm goes back, a trunk leans on), z; all zero is a body
-that stands with its arms down. x is forward, y left, z up.
+Pelvis and feet have prescribed positions, the legs follow by the law of cosines; the other joints have prescribed
+angles. In ``walk`` and ``run`` a foot on the ground moves back, relative to the body, exactly as fast as the body moves
+forward, first on its heel, then flat, then on its ball: it does not slide, except for what
+:mod:`~blinkgl.scene.shapes.cycle` leaves out. Angles: about x (sideways), y (positive: a leg or an arm moves back, a
+trunk leans forward), z; all zero is a body that stands with its arms down. x is forward, y left, z up.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ JOINTS = (
 J = {name: number for number, name in enumerate(JOINTS)}
 PARENTS = (-1, 0, 1, 2, 3, 2, 5, 6, 7, 2, 9, 10, 11, 0, 13, 14, 15, 0, 17, 18, 19)
 STEPS = 256
-"""Phases at which a round is made."""
+"""Number of phases at which a round is computed."""
 _GRAVITY = 9.81
 _SIDES = (("l", 1.0, 0.0), ("r", -1.0, 0.5))
 
@@ -35,7 +35,7 @@ _SIDES = (("l", 1.0, 0.0), ("r", -1.0, 0.5))
 @dataclass(frozen=True)
 class Proportions:
     """Lengths of a body. height : m, from the soles to the crown.   build : thickness, 1: average.
-    legs, arms, head : lengths as parts of an average body's."""
+    legs, arms, head : lengths relative to an average body's."""
 
     height: float = 1.75
     build: float = 1.0
@@ -45,7 +45,7 @@ class Proportions:
 
     @cached_property
     def unit(self) -> float:
-        """What a length of an average body of 1.75 m is multiplied by."""
+        """Return the factor on the lengths of an average body of 1.75 m."""
         trunk, leg, head = 0.045 + 0.10 + 0.16 + 0.24, 0.075 + 0.41 + 0.43, 0.08 + 0.21
         return self.height / (trunk + leg * self.legs + head * self.head)
 
@@ -58,12 +58,12 @@ class Proportions:
 
     @property
     def hip(self) -> float:
-        """Of the joints between pelvis and thighs, above the ground, legs straight."""
+        """Return the height of the hip joints above the ground, legs straight."""
         return self.ankle + self.shank + self.thigh
 
     @cached_property
     def offsets(self) -> np.ndarray:
-        """(21, 3) of each joint in its parent's frame; the pelvis above the ground, legs straight."""
+        """Return each joint's position in its parent's frame, (21, 3); the pelvis above the ground, legs straight."""
         out, u = np.zeros((len(JOINTS), 3)), self.unit
         out[J["pelvis"]] = [0, 0, self.hip + 0.045 * u]
         out[J["spine"]], out[J["chest"]], out[J["neck"]] = [0, 0, 0.10 * u], [0, 0, 0.16 * u], [-0.01 * u, 0, 0.24 * u]
@@ -87,7 +87,7 @@ _LENGTHS = {
 
 
 class _Pose:
-    """A round being made. angles : (N, 21, 3) rad.   pelvis : (N, 3) m in the body's frame."""
+    """A round under construction. angles : (N, 21, 3) rad.   pelvis : (N, 3) m in the body's frame."""
 
     def __init__(self, body: Proportions):
         self.body = body
@@ -96,22 +96,24 @@ class _Pose:
         self.pelvis = np.tile(self.body.offsets[0], (STEPS, 1))
 
     def wave(self, times: float = 1, late: float = 0.0) -> np.ndarray:
-        """(N,) cosine that goes ``times`` round in a round, highest ``late`` of a round after its beginning."""
+        """Return (N,) a cosine with ``times`` periods per round, with its maximum at the fraction ``late`` of a
+        round."""
         return np.cos(2 * math.pi * times * (self.phi - late))
 
     def turn(self, joint: str, x=0.0, y=0.0, z=0.0) -> None:
-        """Adds degrees, numbers or (N,), to a joint's angles."""
+        """Add degrees, numbers or (N,), to a joint's angles."""
         for axis, value in enumerate((x, y, z)):
             self.angles[:, J[joint], axis] += np.radians(value)
 
     def turn_both(self, joint: str, x=0.0, y=0.0, z=0.0) -> None:
-        """The same on both sides, mirrored."""
+        """Add degrees on both sides, mirrored."""
         self.turn(f"{joint}_l", x, y, z)
         self.turn(f"{joint}_r", -np.asarray(x), y, -np.asarray(z))
 
     def plant(self, feet: dict[str, tuple[np.ndarray, ...]], reach: float = 0.985) -> None:
-        """Turns legs and feet so that the ankles are where they should be, the knees in front, and lowers the pelvis,
-        as much at all phases, so far that they can. feet : by side ((N, 3) ankle, (N,) pitch, (N,) yaw, (N,) toes)."""
+        """Turn legs and feet so that the ankles are at their positions, the knees in front, and lower the pelvis by the
+        same amount at all phases until the legs reach. feet : by side ((N, 3) ankle, (N,) pitch, (N,) yaw, (N,)
+        toes)."""
         body = self.body
         limit, turned = reach * (body.thigh + body.shank), Rotation.from_euler("XYZ", self.angles[:, 0])
         hips = {side: turned.apply(body.offsets[J[f"thigh_{side}"]]) for side in feet}
@@ -120,7 +122,7 @@ class _Pose:
             for side, foot in feet.items()
         ]
         least = min(float((r - (self.pelvis + hips[side])[:, 2]).min()) for r, side in zip(room, feet))
-        # Lowered by the same amount at all phases: a pelvis that dipped for one foot would bob.
+        # Lowered by the same amount at all phases: lowering it for one foot would make the body bob.
         self.pelvis[:, 2] += min(least, 0.0)
         for side, (ankle, pitch, yaw, toes) in feet.items():
             d = turned.inv().apply(ankle - self.pelvis - hips[side])
@@ -134,7 +136,7 @@ class _Pose:
             angles[:, 1] = np.arcsin(np.clip(-d[:, 0] / np.linalg.norm(d, axis=1), -1, 1)) - lag
             self.angles[:, J[f"shank_{side}"], 1] = knee
             leg = turned * Rotation.from_euler("XYZ", angles) * Rotation.from_euler("Y", knee[:, None])
-            # The foot's pitch and yaw are said in the world, and its joint hangs on the leg.
+            # The foot's pitch and yaw are given in the world, but its joint is attached to the leg.
             flat = Rotation.from_euler("ZY", np.stack([yaw, pitch], axis=1))
             self.angles[:, J[f"foot_{side}"]] = (leg.inv() * flat).as_euler("XYZ")
             self.angles[:, J[f"toes_{side}"], 1] = toes
@@ -144,32 +146,32 @@ class _Pose:
 
 
 def _smooth(s: np.ndarray) -> np.ndarray:
-    """From 0 to 1 with two derivatives zero at both ends."""
+    """Return a step from 0 to 1 with two zero derivatives at both ends."""
     s = np.clip(s, 0, 1)
     return s**3 * (10 - 15 * s + 6 * s**2)
 
 
 def _between(s: np.ndarray, a: float, b: float, slope: float = 0.0) -> np.ndarray:
-    """From a to b, at both ends with this slope and no curvature."""
+    """Return a curve from a to b, at both ends with this slope and no curvature."""
     return a + slope * s + (b - a - slope) * _smooth(s)
 
 
 def _feet(pose: _Pose, stride: float, duty: float, strike: float, push: float, lift: float, apart: float) -> dict:
-    """Of a body that goes on: each foot is on the ground for ``duty`` of the round, while it goes back by
-    ``duty * stride``. strike, push : rad of the foot as it comes down and as it leaves.   lift : m, of the ankle in
-    between.   apart : m from the middle."""
+    """Return the feet of a moving body: each foot is on the ground for ``duty`` of the round, while it moves back by
+    ``duty * stride``. strike, push : rad of the foot as it lands and leaves.   lift : m, of the ankle in between.
+    apart : m from the middle."""
     body, feet = pose.body, {}
     foot = np.array([body.ball, body.ball_height - body.ankle]), np.array([-body.heel, -body.ankle])
 
     def at(s):
-        """((K, 2) ankle, (K,) pitch) on the ground, at s of ``duty``, 0 to 1."""
+        """Return ((K, 2) ankle, (K,) pitch) on the ground, at s of ``duty``, 0 to 1."""
         down, up = -strike * (1 - _smooth(s / 0.2)), push * _smooth((s - 0.5) / 0.5)
         pitch = down + up
         ball, heel = (
             np.stack([np.cos(pitch) * o[0] + np.sin(pitch) * o[1], np.cos(pitch) * o[1] - np.sin(pitch) * o[0]], -1)
             for o in foot
         )
-        # It rolls over the heel while its toes are up, and over the ball afterwards.
+        # It rolls over the heel while its toes are up, and then over the ball.
         fixed = np.where((pitch < 0)[:, None], foot[1] - heel, foot[0] - ball)
         x = stride * duty * (0.43 - s) + fixed[:, 0]
         return np.stack([x, body.ankle + fixed[:, 1]], -1), pitch
@@ -179,10 +181,10 @@ def _feet(pose: _Pose, stride: float, duty: float, strike: float, push: float, l
         phi = (pose.phi - late) % 1.0
         ground, s = phi < duty, (phi - duty) / (1 - duty)
         ankle, pitch = at(np.minimum(phi / duty, 1.0))
-        # Both ends of the swing have the ground's speed, so that the foot lands and leaves without a jerk.
+        # Both ends of the swing have the ground's speed, so that the foot lands and leaves smoothly.
         back = -stride * (1 - duty)
         swing = np.stack([_between(s, last[0], first[0], back), _between(s, last[1], first[1])], -1)
-        early = np.clip(s, 0, 1) ** 0.75  # before the toes, which hang, come forward
+        early = np.clip(s, 0, 1) ** 0.75  # before the toes, which point down, come forward
         swing[:, 1] += lift * 64 * (early * (1 - early)) ** 3
         turned = _between(s, left, came)
         ankle, pitch = np.where(ground[:, None], ankle, swing), np.where(ground, pitch, turned)
@@ -193,7 +195,7 @@ def _feet(pose: _Pose, stride: float, duty: float, strike: float, push: float, l
 
 
 def _still_feet(pose: _Pose, apart: float, yaw: float = 0.2) -> dict:
-    """Both flat on the ground."""
+    """Return two feet flat on the ground."""
     zero = np.zeros(STEPS)
     return {
         side: (np.tile([0.0, sign * apart, pose.body.ankle], (STEPS, 1)), zero, zero + sign * yaw, zero)
@@ -202,9 +204,9 @@ def _still_feet(pose: _Pose, apart: float, yaw: float = 0.2) -> dict:
 
 
 def _round(body: Proportions, tempo: float, longest: float, stride: float, froude: float) -> tuple[float, float]:
-    """(m of two steps, s for them) of a gait that takes ``stride`` legs at tempo 1 and then goes at ``froude``
-    sqrt(g leg). Whoever is quicker takes longer steps, too, up to ``longest`` times as long ones."""
-    # Equal Froude numbers: legs of any length walk alike (Alexander 1976).
+    """Return (m of two steps, s for them) of a gait with steps of ``stride`` legs at tempo 1 and a speed of ``froude``
+    sqrt(g leg). A higher tempo also lengthens the steps, up to ``longest`` times."""
+    # Equal Froude numbers: legs of any length walk similarly (Alexander 1976).
     speed = froude * math.sqrt(_GRAVITY * body.hip)
     length = stride * body.hip
     return length * min(math.sqrt(tempo), longest), length / speed / tempo
@@ -275,7 +277,7 @@ def _stand(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle
 
 
 def _wave(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle:
-    """Four to and fro of a hand; every second variant the left one."""
+    """Return four swings of a hand; every second variant uses the left one."""
     pose, u = _Pose(body), body.unit
     rng = np.random.default_rng([variant, 4])
     wide, high = rng.uniform(0.8, 1.2, 2) if variant else np.ones(2)
@@ -298,7 +300,7 @@ def _wave(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle:
 
 
 def _dance(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle:
-    """Four beats of a round, at 116 to the minute: steps, hips and arms are drawn from the variant."""
+    """Return a dance of four beats per round, 116 per minute: steps, hips and arms depend on the variant."""
     pose, u = _Pose(body), body.unit
     rng = np.random.default_rng([variant, 5])
     big, loose, late = rng.uniform(0.8, 1.2), rng.uniform(0.7, 1.3), rng.uniform(-0.03, 0.03)
@@ -321,16 +323,16 @@ def _dance(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle
 
 
 def _dance_step(pose: _Pose, feet: dict, step: int, big: float) -> None:
-    """One of four steps. big : how far they go, 1 in the mean."""
+    """Add one of four steps. big : size of the movement, 1 on average."""
     u = pose.body.unit
-    if step == 0:  # heels rise with the beat, knees go in and out
+    if step == 0:  # heels rise with the beat, knees move in and out
         _tap(pose, feet, pitch=24, per_round=2)
     elif step == 1:  # from side to side
         shift = 0.13 * u * big * pose.wave(1, 0.25)
         pose.pelvis[:, 1] += 0.9 * shift
         for name, sign, _ in _SIDES:
             ankle, pitch, yaw, toes = feet[name]
-            # A foot goes over while the other one carries: quickly, and rests in between.
+            # One foot moves quickly while the other carries, then rests.
             slow = np.sin(2 * math.pi * pose.phi) + sign * 0.25 * np.cos(4 * math.pi * pose.phi)
             ankle[:, 1] += 0.13 * u * big * np.tanh(2.2 * slow) / np.tanh(2.2)
             moving = (1 - np.tanh(2.2 * slow) ** 2) ** 2
@@ -346,7 +348,7 @@ def _dance_step(pose: _Pose, feet: dict, step: int, big: float) -> None:
         for name in feet:
             ankle, pitch, yaw, toes = feet[name]
             feet[name] = ankle, pitch, yaw + np.radians(0.8 * turn), toes
-    else:  # marching on the spot, knees up
+    else:  # marching in place, knees up
         for name, _, first in _SIDES:
             ankle, pitch, yaw, toes = feet[name]
             up = np.maximum(np.sin(2 * math.pi * (2 * pose.phi - first - 0.05)), 0) ** 2
@@ -356,7 +358,7 @@ def _dance_step(pose: _Pose, feet: dict, step: int, big: float) -> None:
 
 
 def _dance_arms(pose: _Pose, arms: int, loose: float, side: np.ndarray, beat: np.ndarray) -> None:
-    """One of five things that arms do. loose : how far they swing, 1 in the mean.   side, beat : (N,) waves."""
+    """Add one of five arm movements. loose : amplitude, 1 on average.   side, beat : (N,) waves."""
     if arms == 0:  # both up, swaying
         pose.turn_both("clavicle", 16)
         pose.turn("arm_l", 138 + 14 * side, -12)
@@ -368,7 +370,7 @@ def _dance_arms(pose: _Pose, arms: int, loose: float, side: np.ndarray, beat: np
             pump = pose.wave(2, 0.5 * first + 0.05)
             pose.turn(f"arm_{name}", sign * 24, -26 - 26 * loose * pump)
             pose.turn(f"forearm_{name}", sign * 14, -95 + 22 * pump)
-    elif arms == 2:  # one hand points up and down aslant, the other on the hip
+    elif arms == 2:  # one hand points up and down diagonally, the other on the hip
         up = 0.5 + 0.5 * np.tanh(2 * pose.wave(2, 0.1)) / np.tanh(2)
         pose.turn("clavicle_r", -14 * up)
         pose.turn("arm_r", -30 - 112 * up, -30 + 16 * up)
@@ -379,7 +381,7 @@ def _dance_arms(pose: _Pose, arms: int, loose: float, side: np.ndarray, beat: np
         for name, sign, first in _SIDES:
             pose.turn(f"arm_{name}", sign * (18 + 8 * pose.wave(4, 0.5 * first)), -48 + 14 * pose.wave(4, 0.25 * first))
             pose.turn(f"forearm_{name}", -sign * 30, -80 + 26 * pose.wave(4, 0.125 * first + 0.06), -sign * 10)
-    else:  # a wave that runs from one hand to the other
+    else:  # a wave from one hand to the other
         for name, sign, _ in _SIDES:
             run = 0.06 * sign
             pose.turn(f"clavicle_{name}", sign * (6 + 6 * pose.wave(2, 0.02 - run)))
@@ -389,7 +391,7 @@ def _dance_arms(pose: _Pose, arms: int, loose: float, side: np.ndarray, beat: np
 
 
 def _tap(pose: _Pose, feet: dict, pitch: float, per_round: int) -> None:
-    """Heels that come off the ground in turn, the balls staying where they are."""
+    """Lift the heels in turn; the balls stay on the ground."""
     body = pose.body
     for name, _, late in _SIDES:
         ankle, _, yaw, _ = feet[name]
@@ -411,6 +413,6 @@ CLIPS: dict[str, Callable[[Proportions, float, float, int], Cycle]] = {
 
 
 def clip_of(name: str, body: Proportions, tempo: float = 1.0, phase: float = 0.0, variant: int = 0) -> Cycle:
-    """What a body does. name : of CLIPS.   tempo : 1: as is natural at its size.   phase : rounds at time 0.
-    variant : which of many dances, and how one walks; 0 is the plain one."""
+    """Return a motion. name : of CLIPS.   tempo : 1: natural at the body's size.   phase : rounds at time 0.
+    variant : which dance, or style of walking; 0 is the plain one."""
     return CLIPS[name](body, tempo, phase, variant)

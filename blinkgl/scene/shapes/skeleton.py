@@ -1,10 +1,10 @@
-"""Bones: a tree of joints, and what moves them.
+"""Skeletons: a tree of joints, and their motion.
 
     skeleton = Skeleton(parents, motion)
-    world, rate = skeleton.at(t_ns)                     # (n, 4, 4) each, per second the second
+    world, rate = skeleton.at(t_ns)                     # (n, 4, 4) each, the second per second
 
-A :class:`Motion` gives translation, rotation and scale of every joint to its parent, and their rates: a clip of a file
-(:mod:`~blinkgl.scene.shapes.clips`), or a formula.
+A :class:`Motion` gives translation, rotation and scale of every joint relative to its parent, and their rates: a clip
+of a file (:mod:`~blinkgl.scene.shapes.clips`), or a formula.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ _KEPT = 4
 
 
 class Locals(NamedTuple):
-    """Of n joints to their parents. translation, scale : (n, 3).   rotation : (n, 4) unit quaternions x, y, z, w.
-    The others: their rates, per second."""
+    """Transforms of n joints relative to their parents. translation, scale : (n, 3).   rotation : (n, 4) unit
+    quaternions x, y, z, w. The others: their rates, per second."""
 
     translation: np.ndarray
     rotation: np.ndarray
@@ -33,7 +33,7 @@ class Locals(NamedTuple):
 
     @classmethod
     def rest(cls, count: int) -> Locals:
-        """Of joints that lie in their parents' places."""
+        """Return identity transforms."""
         rotation = np.zeros((count, 4))
         rotation[:, 3] = 1.0
         zeros = np.zeros((count, 3))
@@ -44,8 +44,8 @@ class Locals(NamedTuple):
 
 
 class Motion(Protocol):
-    """What moves the joints of a skeleton. period_ns : after which it repeats; None: it does not.
-    span_ns : from time 0 on after so long nothing new comes."""
+    """The motion of a skeleton's joints. period_ns : its period; None: not periodic.   span_ns : time from 0 after
+    which nothing changes."""
 
     @property
     def period_ns(self) -> int | None: ...
@@ -57,7 +57,7 @@ class Motion(Protocol):
     def is_static(self) -> bool: ...
 
     def locals(self, t_ns: int) -> Locals:
-        """Arrays of the motion's own, or new ones; whoever gets them does not write to them."""
+        """Return the transforms at a time. The arrays may be reused; do not write to them."""
 
 
 class Still:
@@ -75,9 +75,10 @@ class Still:
 
 
 class Skeleton:
-    """parents : (n,) number of each joint's parent, -1: none; parents before their children.
-    motion : of the n joints.   fixed : (n, 4, 4) what stands before each joint's own transform, such as the place of a
-    root; None: nothing. Raises ValueError for a parent that does not come before."""
+    """A tree of joints. parents : (n,) index of each joint's parent, -1: none; parents before their children.
+    motion : of the n joints.   fixed : (n, 4, 4) constant transform before each joint's own, such as the position of a
+    root;
+    None: none. Raises ValueError for a parent that does not come before."""
 
     def __init__(self, parents: ArrayLike, motion: Motion, fixed: ArrayLike | None = None):
         self.parents = np.asarray(parents, np.int64).reshape(-1)
@@ -93,9 +94,9 @@ class Skeleton:
         return self.motion.is_static
 
     def at(self, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
-        """((n, 4, 4), (n, 4, 4)) float64: each joint's transform to the object's frame, and its rate, 1/s. Those of the
-        last few times are kept; not to be written to."""
-        # Positions, rates and the vertex stage ask for the same few times, one after the other.
+        """Return ((n, 4, 4), (n, 4, 4)) float64: each joint's transform to the object's frame, and its rate, 1/s. The
+        last few are kept; do not write to them."""
+        # Positions, rates and the vertex stage use the same few times in a row.
         if t_ns not in self._kept:
             world, rate = np.empty((2, len(self.parents), 4, 4))
             _world(self.parents, self.fixed, *self.motion.locals(t_ns), world, rate)
@@ -107,7 +108,7 @@ class Skeleton:
 
 @kernel(error_model="numpy")
 def _world(parents, fixed, T, R, S, dT, dR, dS, world, rate):
-    """Transforms of all joints, parents first, and their rates by the product rule."""
+    """Compute transforms of all joints, parents first, and their rates by the product rule."""
     L, D, F, G = np.zeros((4, 4)), np.zeros((4, 4)), np.empty((4, 4)), np.empty((4, 4))
     L[3, 3] = 1.0
     for i in range(len(parents)):
@@ -129,7 +130,7 @@ def _world(parents, fixed, T, R, S, dT, dR, dS, world, rate):
                 D[r, c] = D[r, c] * S[i, c] + L[r, c] * dS[i, c]
                 L[r, c] *= S[i, c]
             L[r, 3], D[r, 3] = T[i, r], dT[i, r]
-        # fixed stands before the joint's own transform and does not move: it takes transform and rate alike.
+        # fixed comes before the joint's own transform and is constant: it multiplies transform and rate.
         _times(fixed[i], L, F)
         _times(fixed[i], D, G)
         parent = parents[i]

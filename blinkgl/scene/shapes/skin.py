@@ -1,4 +1,4 @@
-"""Skins and morph targets: vertices that follow joints, and vertices that are pulled to other shapes.
+"""Skins and morph targets: vertices that follow joints, and vertices that are displaced towards other shapes.
 
     q(p, t) = sum_i w_i J_i(t) (p + sum_k m_k(t) d_k),     J_i = after . joint_i(t) . inverse bind_i . before
 
@@ -24,16 +24,16 @@ from blinkgl.scene.shapes.skeleton import Locals, Skeleton, Still
 from blinkgl.scene.types import Mesh
 
 MAX_ROWS = 1024
-"""Of numbers per time: OpenGL's blocks of 64 kB hold four times as many."""
+"""Largest number of rows per time: OpenGL's blocks of 64 kB hold four times as many."""
 MAX_WEIGHTS = 8
-"""Joints that one vertex may follow."""
+"""Largest number of joints of a vertex."""
 _TEXTURE_WIDTH = 4096
 
 
 @dataclass(frozen=True, eq=False)
 class Morphs:
-    """Shapes that a mesh is pulled to. positions : (k, V, 3) what is added at weight 1.   normals : likewise, or None.
-    weights : ((k,), (k,)) at a time in ns: how much of each, and the rate of that per second.
+    """Morph targets of a mesh. positions : (k, V, 3) displacements at weight 1.   normals : likewise, or None.
+    weights : ((k,), (k,)) at a time in ns: weight of each, and its rate per second.
     is_static, period_ns, span_ns : as of :class:`~blinkgl.scene.shapes.skeleton.Motion`."""
 
     positions: np.ndarray
@@ -44,12 +44,13 @@ class Morphs:
     span_ns: int = 0
 
     def taken(self, vertices: np.ndarray) -> Morphs:
-        """Of some of the vertices, in their order."""
+        """Return the targets of some of the vertices, in their order."""
         normals = None if self.normals is None else self.normals[:, vertices]
         return replace(self, positions=self.positions[:, vertices], normals=normals)
 
     def transformed(self, linear: np.ndarray) -> Morphs:
-        """Of the mesh under a (3, 3) map; exact for turns and even scales, which keep normals at length 1."""
+        """Return the targets of the mesh under a (3, 3) map; exact for rotations and uniform scales, which keep unit
+        normals."""
         scale = abs(float(np.linalg.det(linear))) ** (1 / 3)
         normals = None if self.normals is None else self.normals @ np.linalg.inv(linear) * scale
         return replace(self, positions=self.positions @ linear.T, normals=normals)
@@ -59,12 +60,13 @@ class Skin(Deformer):
     """Vertices that follow joints.
 
     skeleton : :class:`~blinkgl.scene.shapes.skeleton.Skeleton`, in the object's frame.
-    bones : (m,) joints of it that vertices follow.   inverse_bind : (m, 4, 4) from the mesh to each as it was bound.
-    joints : (V, k) numbers in ``bones``.   weights : (V, k), made to sum to 1.   morphs : :class:`Morphs` or None.
-    after, before : (4, 4) of the object and of the mesh, where these are turned or scaled (:meth:`transformed`).
+    bones : (m,) its joints that vertices follow.   inverse_bind : (m, 4, 4) from the mesh to each joint in the bind
+    pose.
+    joints : (V, k) indices in ``bones``.   weights : (V, k), normalised to sum 1.   morphs : :class:`Morphs` or None.
+    after, before : (4, 4) of the object and of the mesh, where these are rotated or scaled (:meth:`transformed`).
 
-    Raises AssetError naming ``where``: joints that do not exist, weights that are negative, not finite or sum to
-    zero, a matrix that is not finite, more joints than fit."""
+    Raises AssetError naming ``where``: joints that do not exist, weights that are negative, not finite or sum to zero,
+    a matrix that is not finite, more joints than fit."""
 
     glsl = "skin"
     examples = (
@@ -94,10 +96,10 @@ class Skin(Deformer):
             np.asarray(joints), np.asarray(weights, np.float64), len(self.bones), where
         )
         _check_bones(self.inverse_bind, where)
-        # What does not change with time is multiplied once.
+        # The constant matrices are multiplied once.
         self._bind = self.inverse_bind @ self.before
         targets = 0 if morphs is None else len(morphs.positions)
-        # A joint's matrix is three rows of four; morph weights are packed four to a row behind them.
+        # A joint's matrix is three rows of four; morph weights are packed four per row after them.
         self._rows = 3 * len(self.bones) + -(-targets // 4)
         if self._rows > MAX_ROWS:
             raise AssetError(
@@ -107,7 +109,7 @@ class Skin(Deformer):
                 accepted=f"three per joint and a quarter per target, at most {MAX_ROWS} together",
             )
         moving = [part for part in (skeleton.motion, morphs) if part is not None and not part.is_static]
-        # Joints and targets that repeat at different times have no common period that anybody waits for.
+        # Joints and targets with different periods have no useful common period.
         periods = {part.period_ns for part in moving}
         self.period_ns = periods.pop() if len(periods) == 1 else None
         self.span_ns = max((part.span_ns for part in moving), default=0)
@@ -135,14 +137,15 @@ class Skin(Deformer):
         after: ArrayLike | None = None,
         where: str = "skin",
     ) -> Skin:
-        """All vertices follow one joint, in whose frame they are, or are taken by ``inverse_bind`` (4, 4)."""
+        """Return a skin whose vertices all follow one joint; they are in its frame, or are transformed there by
+        ``inverse_bind`` (4, 4)."""
         bind = np.eye(4) if inverse_bind is None else np.asarray(inverse_bind)
         bound = np.zeros((vertices, 1)), np.ones((vertices, 1))
         return cls(skeleton, [joint], bind[None], *bound, morphs, after=after, where=where)
 
     @classmethod
     def morphing(cls, morphs: Morphs, where: str = "morph targets") -> Skin:
-        """No joint at all, but for one that lies still."""
+        """Return a skin with morph targets and one static joint."""
         still = Skeleton([-1], Still(Locals.rest(1)))
         return cls.rigid(still, 0, morphs.positions.shape[1], morphs, where=where)
 
@@ -163,12 +166,12 @@ class Skin(Deformer):
     # ---- the shape, on the CPU -----------------------------------------------------------------------------------
 
     def matrices(self, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
-        """((m, 4, 4), (m, 4, 4)) float64 J_i and dJ_i/dt."""
+        """Return J_i and dJ_i/dt, ((m, 4, 4), (m, 4, 4)) float64."""
         world, rate = self.skeleton.at(t_ns)
         return self.after @ world[self.bones] @ self._bind, self.after @ rate[self.bones] @ self._bind
 
     def _blend(self, matrices: np.ndarray) -> np.ndarray:
-        """(V, 3, 4) of (m, 4, 4)."""
+        """Return the vertices' blends, (V, 3, 4), of (m, 4, 4)."""
         return np.einsum("vk,vkij->vij", self.weights, matrices[:, :3][self.joints])
 
     def _morphed(self, vectors: np.ndarray, deltas: np.ndarray | None, weights: np.ndarray) -> np.ndarray:
@@ -176,7 +179,7 @@ class Skin(Deformer):
         return vectors if deltas is None else vectors + np.tensordot(weights, deltas, 1)
 
     def _follow(self, points: np.ndarray, matrices: np.ndarray, place: float = 1.0) -> np.ndarray:
-        """(V, 3) the vertices' blends of (m, 4, 4) times (V, 3) points; place : 0 for directions."""
+        """Return the vertices' blends of (m, 4, 4) times (V, 3) points, (V, 3); place : 0 for directions."""
         return _followed(
             np.ascontiguousarray(points), self.joints, self.weights, np.ascontiguousarray(matrices[:, :3]), place
         )
@@ -201,7 +204,7 @@ class Skin(Deformer):
         n = np.asarray(mesh.normals, np.float64)
         if self.morphs is not None:
             n = self._morphed(n, self.morphs.normals, self.morphs.weights(t_ns)[0])
-        # The rows of the cofactor matrix are cross products of the blended matrix's rows: right for any linear map.
+        # The rows of the cofactor matrix are cross products of the blended matrix's rows: valid for any linear map.
         return np.stack([(np.cross(p, q) * n).sum(axis=1) for p, q in ((b, c), (c, a), (a, b))], axis=1)
 
     # ---- the shape, for the vertex stage -------------------------------------------------------------------------
@@ -228,8 +231,8 @@ class Skin(Deformer):
 
 @kernel
 def _followed(points, joints, weights, matrices, place):
-    """(V, 3) of (V, 3) points, (V, k) joints and weights, (m, 3, 4) matrices whose last columns count ``place``
-    times."""
+    """Return (V, 3) from (V, 3) points, (V, k) joints and weights, (m, 3, 4) matrices whose last columns are multiplied
+    by ``place``."""
     out = np.empty((len(points), 3))
     for v in range(len(points)):
         x, y, z = points[v]
@@ -246,9 +249,8 @@ def _followed(points, joints, weights, matrices, place):
 
 
 def joined(skins: Sequence[Skin]) -> Skin | None:
-    """One skin of several meshes' vertices, one after the other; None where they cannot be one: other skeletons,
-    morph targets, too many
-    joints."""
+    """Return one skin of several meshes' vertices, one after the other; None where they cannot be joined: different
+    skeletons, morph targets, too many joints."""
     first = skins[0]
     if any(
         s.skeleton is not first.skeleton or s.morphs is not None or not np.array_equal(s.after, first.after)
@@ -277,7 +279,7 @@ def joined(skins: Sequence[Skin]) -> Skin | None:
 
 
 def _checked_weights(joints: np.ndarray, weights: np.ndarray, bones: int, where: str) -> tuple[np.ndarray, np.ndarray]:
-    """((V, k) int64, (V, k) float64), the weights of each vertex in falling order and summing to 1, as exact in
+    """Return ((V, k) int64, (V, k) float64), the weights of each vertex in descending order with sum 1, exact in
     float32."""
     bad = ~(np.isfinite(weights) & (weights >= 0)).all(axis=1)
     if bad.any():
@@ -306,12 +308,12 @@ def _checked_weights(joints: np.ndarray, weights: np.ndarray, bones: int, where:
             value=int(joints[vertex][outside[vertex]][0]),
             accepted=f"0 to {bones - 1}",
         )
-    # Heaviest first, so that what is cut off at the end weighs least.
+    # Largest first, so that the smallest weights are cut off.
     order = np.argsort(-weights, axis=1, kind="stable")
     weights, joints = np.take_along_axis(weights, order, 1), np.take_along_axis(np.where(used, joints, 0), order, 1)
     width = min(max(int(used.sum(axis=1).max()), 1), MAX_WEIGHTS)
     weights, joints = weights[:, :width], joints[:, :width].astype(np.int64)
-    # Rounded to what the vertex stage gets: CPU and GPU then follow the same joints by the same parts.
+    # Rounded as for the vertex stage: CPU and GPU then use the same weights.
     weights = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32).astype(np.float64)
     return joints, weights
 
@@ -324,7 +326,7 @@ def _check_bones(inverse_bind: np.ndarray, where: str) -> None:
             where=where,
             value=inverse_bind[first].tolist(),
         )
-    # One that flattens all that follows it is no inverse of anything; the ranks are those of the turning parts.
+    # A singular matrix is not an inverse; the ranks are those of the linear parts.
     if (flat := np.flatnonzero(np.linalg.matrix_rank(inverse_bind[:, :3, :3]) < 3)).size:
         raise AssetError(
             f"the inverse bind matrix of joint {flat[0]} of a skin is singular",
@@ -335,7 +337,7 @@ def _check_bones(inverse_bind: np.ndarray, where: str) -> None:
 
 
 def _streams(joints: np.ndarray, weights: np.ndarray) -> dict[str, np.ndarray]:
-    """Vertex attributes, four joints each."""
+    """Return vertex attributes, four joints each."""
     streams = {}
     for number, start in enumerate(range(0, weights.shape[1], 4)):
         room = ((0, 0), (0, 4 - weights[:, start : start + 4].shape[1]))
@@ -345,7 +347,8 @@ def _streams(joints: np.ndarray, weights: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _deltas_texture(morphs: Morphs) -> np.ndarray:
-    """(h, 4096, 4) float32: of target k and vertex v the texels 2 (k V + v), position, and the next, normal."""
+    """Return (h, 4096, 4) float32: for target k and vertex v, texel 2 (k V + v) is the position and the next the
+    normal."""
     count, vertices = morphs.positions.shape[:2]
     texels = np.zeros((count, vertices, 2, 4), np.float32)
     texels[:, :, 0, :3] = morphs.positions

@@ -1,11 +1,11 @@
-"""Which deformers there are: one table of classes.
+"""The table of deformer classes.
 
     @register
     class Mine(Deformer):
         Config = MineConfig               # class MineConfig(DeformConfig): kind: Literal["mine"] = "mine"; …
         glsl, source = "mine", "vec3 deformed(vec3 p) …"
 
-docs/extending.md has the whole of one.
+docs/extending.md has a complete example.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from blinkgl.scene.shapes.deformer import Deformer
 from blinkgl.scene.shapes.skin import Skin
 
 DEFORMERS: dict[str, type[Deformer]] = {}
-"""By the class's name."""
+"""Deformers by class name."""
 FUNCTIONS = (
     "vec3 deformed(vec3 p)",
     "vec3 deformed_rate(vec3 p)",
@@ -30,11 +30,11 @@ FUNCTIONS = (
     "vec3 deformed_normal(vec3 p, vec3 n)",
     "vec3 deformed_normal_rate(vec3 p, vec3 n)",
 )
-"""What the source of a deformer has to define."""
+"""Functions that the source of a deformer must define."""
 
 
 def register(deformer: type[Deformer]) -> type[Deformer]:
-    """Puts a class into the table, and its ``Config`` into ``deform:``; returns it.
+    """Add a class to the table, and its ``Config`` to ``deform:``; return it.
 
     Raises TypeError naming the class and the part that is missing or of the wrong kind; nothing is then registered."""
     name = _checked(deformer)
@@ -45,15 +45,15 @@ def register(deformer: type[Deformer]) -> type[Deformer]:
 
 
 def unregister(deformer: type[Deformer]) -> None:
-    """Takes a class out again. Raises KeyError where it is not in the table."""
+    """Remove a class. Raises KeyError where it is not in the table."""
     del DEFORMERS[deformer.__name__]
     if deformer.Config is not None:
         DeformConfig.members.remove(deformer.Config.model_fields["kind"].default)
 
 
 def deformer_of(config: DeformConfig, low: np.ndarray, high: np.ndarray) -> Deformer:
-    """What ``deform:`` asks for, of an object whose box at rest is (3,) low to high. Raises TypeError for a
-    configuration of none in the table."""
+    """Return the deformer of a ``deform:`` configuration, for an object whose box at rest is (3,) low to high. Raises
+    TypeError for a configuration without a class in the table."""
     for deformer in DEFORMERS.values():
         if deformer.Config is type(config):
             return deformer.of(config, np.asarray(low, np.float64), np.asarray(high, np.float64))
@@ -61,13 +61,12 @@ def deformer_of(config: DeformConfig, low: np.ndarray, high: np.ndarray) -> Defo
 
 
 def define_of(glsl: str) -> str:
-    """The macro that compiles a deformer's source in."""
+    """Return the macro that includes a deformer's source."""
     return f"DEFORM_{glsl.upper()}"
 
 
 def includes() -> dict[str, str]:
-    """Texts by the name that shaders include them by: deforms.glsl, and deform/NAME.glsl of those whose source is
-    their own."""
+    """Return texts by their include name: deforms.glsl, and deform/NAME.glsl of those with their own source."""
     sources = {deformer.glsl: deformer.source for deformer in DEFORMERS.values()}
     lines = [
         line for name in sources for line in (f"#ifdef {define_of(name)}", f'#include "deform/{name}.glsl"', "#endif")

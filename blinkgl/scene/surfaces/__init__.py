@@ -1,6 +1,6 @@
-"""What surfaces look like.
+"""Appearance of surfaces.
 
 In:    image files, names of procedural patterns.
-Out:   :class:`~blinkgl.scene.types.Texture` images, and hashes of what they are made of.
+Out:   :class:`~blinkgl.scene.types.Texture` images, and hashes of their sources.
 Start: images.py (``load_image``); textures.py draws patterns.
 """

@@ -1,7 +1,7 @@
-"""What living things wear where nobody says otherwise: clothes, cloths of flags, scales, drawn from a number.
+"""Default textures of living primitives: clothes, flags, scales, drawn from a number.
 
-A coat fits the texture coordinates of its primitive (:mod:`blinkgl.scene.geometry.primitives`). 0 is plain to look
-at, too; neighbouring numbers have nothing in common.
+A coat fits the texture coordinates of its primitive (:mod:`blinkgl.scene.geometry.primitives`). Neighbouring numbers
+have unrelated coats.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ _HAIRS = ((28, 22, 20), (62, 40, 26), (112, 72, 38), (188, 146, 84), (150, 62, 3
 
 
 def _colour(rng: np.random.Generator, saturation: tuple[float, float], value: tuple[float, float]) -> np.ndarray:
-    """(3,) sRGB, 0 to 255, of any hue."""
+    """Return an sRGB colour of any hue, (3,), 0 to 255."""
     return 255 * np.array(colorsys.hsv_to_rgb(rng.random(), rng.uniform(*saturation), rng.uniform(*value)))
 
 
 def _pattern(rng: np.random.Generator, x: np.ndarray, y: np.ndarray, size: float) -> np.ndarray:
-    """(h, w, 3) sRGB of cloth over places in m; ``size``: of one repeat."""
+    """Return a cloth pattern over positions in m, (h, w, 3) sRGB; ``size``: of one repeat."""
     first, second = _colour(rng, (0.35, 0.9), (0.45, 0.95)), _colour(rng, (0.1, 0.9), (0.15, 1.0))
     kind = int(rng.integers(6))
     u, v = x / size, y / size
     if kind == 0:
         mark = np.zeros_like(x)
-    elif kind == 1:  # hoops
+    elif kind == 1:  # horizontal stripes
         mark = (v % 1.0 < 0.5).astype(float)
-    elif kind == 2:  # upright stripes
+    elif kind == 2:  # vertical stripes
         mark = (u % 1.0 < 0.4).astype(float)
     elif kind == 3:  # checks of two shades
         mark = 0.5 * (u % 1.0 < 0.5) + 0.5 * (v % 1.0 < 0.5)
@@ -47,7 +47,7 @@ def _pattern(rng: np.random.Generator, x: np.ndarray, y: np.ndarray, size: float
 
 
 def clothes(seed: int) -> np.ndarray:
-    """(512, 512, 3) uint8 sRGB over the atlas of a figure."""
+    """Return clothes over the atlas of a figure, (512, 512, 3) uint8 sRGB."""
     rng = np.random.default_rng([seed, 21])
     skin, hair = (np.array(group[int(rng.integers(len(group)))], float) for group in (_SKINS, _HAIRS))
     at = (np.arange(_SIZE) + 0.5) / _SIZE * ATLAS
@@ -61,7 +61,7 @@ def clothes(seed: int) -> np.ndarray:
     sleeves, shorts, dress = rng.random() < 0.5, rng.random() < 0.3, rng.random() < 0.15
 
     def inside(name: str, top: float = 0.0, bottom: float = 1.0) -> np.ndarray:
-        """Where a chart is between two shares of its length, and a little round it."""
+        """Return where a chart is between two fractions of its length, and slightly beyond its sides."""
         chart = CHARTS[name]
         low = chart.top + (top * chart.length if top > 0 else -0.02)
         high = chart.top + (bottom * chart.length if bottom < 1 else chart.length + 0.02)
@@ -92,7 +92,7 @@ def clothes(seed: int) -> np.ndarray:
 
 
 def _face(image, x, y, skin, hair, rng) -> None:
-    """Hair, eyes, brows and a mouth on the chart of the head."""
+    """Draw hair, eyes, brows and a mouth on the chart of the head."""
     head = CHARTS["head"]
     u, v = (x - head.left) / head.around - 0.5, (y - head.top) / head.length
     on = (np.abs(u) < 0.55) & (v > -0.07) & (v < 1.07)
@@ -112,7 +112,7 @@ def _face(image, x, y, skin, hair, rng) -> None:
 
 
 def bunting(seed: int) -> np.ndarray:
-    """(512, 512, 3) uint8 sRGB of a flag: stripes, a cross, a disc, a triangle, a chequer."""
+    """Return a flag, (512, 512, 3) uint8 sRGB: stripes, a cross, a disc, a triangle or a chequer."""
     rng = np.random.default_rng([seed, 22])
     a, b, c = (_colour(rng, (0.55, 0.95), (0.4, 0.95)) for _ in range(3))
     b = b if rng.random() < 0.5 else np.array([245.0, 242, 235])
@@ -139,7 +139,7 @@ def bunting(seed: int) -> np.ndarray:
 
 
 def scales(seed: int) -> np.ndarray:
-    """(512, 512, 3) uint8 sRGB of a fish: once round it from its back, its nose above."""
+    """Return a fish, (512, 512, 3) uint8 sRGB: once around it from its back, its nose at the top."""
     rng = np.random.default_rng([seed, 23])
     back, belly = _colour(rng, (0.6, 1.0), (0.45, 0.95)), _colour(rng, (0.05, 0.4), (0.85, 1.0))
     band = _colour(rng, (0.4, 1.0), (0.15, 1.0))
@@ -165,10 +165,10 @@ def scales(seed: int) -> np.ndarray:
 
 
 COATS: dict[str, Callable[[int], np.ndarray]] = {"figure": clothes, "flag": bunting, "fish": scales}
-"""By the kind of primitive."""
+"""By kind of primitive."""
 
 
 def coat(kind: str, seed: int = 0) -> Texture:
-    """The texture that a primitive of this kind wears."""
+    """Return the default texture of a primitive of this kind."""
     image = COATS[kind](int(seed))
     return Texture(image, f"{kind} coat {seed}", content_hash(image.tobytes()))

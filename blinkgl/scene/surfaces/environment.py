@@ -1,12 +1,13 @@
-"""Panoramas that light a scene: what a matt surface receives of a picture of everything around it, in closed form.
+"""Panoramas that light a scene: the light that a matt surface receives from an image of its surroundings, in closed
+form.
 
-Diffuse light of an environment is its spherical harmonics up to order 2 (Ramamoorthi and Hanrahan, "An Efficient
-Representation for Irradiance Environment Maps", SIGGRAPH 2001): nine numbers per channel, which are a quadratic form of
-the normal. What is small and very bright is not smooth enough for that: a sun is found in the picture, taken out of it,
-and shines as a lamp, which casts shadows besides. A surface receives nothing of order 3; what it receives of order 4 is
-measured, and taken where it matters (:func:`quartic`): nine more numbers, a form of degree 4.
+Diffuse light of an environment is given by its spherical harmonics up to order 2 (Ramamoorthi and Hanrahan, "An
+Efficient Representation for Irradiance Environment Maps", SIGGRAPH 2001): nine numbers per channel, a quadratic form of
+the normal. Small, very bright sources are not smooth enough for that: a sun is found in the image, removed from it, and
+used as a lamp, which also casts shadows. Irradiance from order 3 is zero; that from order 4 is measured, and used where
+it matters (:func:`quartic`): nine more numbers, a form of degree 4.
 
-Directions are those of :func:`blinkgl.scene.surfaces.images.cube_faces`: the middle column is seen in direction +x, and
+Directions are those of :func:`blinkgl.scene.surfaces.images.cube_faces`: the middle column is in direction +x, and
 longitude grows to the right, clockwise from above.
 """
 
@@ -19,23 +20,23 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-_WIDTH = 1024  # of what is integrated: harmonics of order 2 do not see more
-PICTURE_WIDTH = 256  # of what is seen in a mirror
-_BRIGHTER = 30.0  # times the mean radiance: the least that a sun is
-_EDGE = 0.1  # of a sun's brightest: where its disc ends
-_LARGEST = math.radians(12.0)  # radius of what may be a sun; a photograph's glare is several times its disc
+_WIDTH = 1024  # for integration: harmonics of order 2 do not need more
+PICTURE_WIDTH = 256  # of the picture for reflections
+_BRIGHTER = 30.0  # times the mean radiance: the least for a sun
+_EDGE = 0.1  # fraction of a sun's peak: the edge of its disc
+_LARGEST = math.radians(12.0)  # largest radius of a sun; a photograph's glare is several times its disc
 MOST_SUNS = 4
-"""A room has lamps, not one sun: so many are taken out of a picture, the brightest first."""
-_SHARE = 0.05  # of the light on a surface that faces it: less is not worth a lamp
+"""Largest number of lamps removed from an image, the brightest first: a room has several instead of one sun."""
+_SHARE = 0.05  # smallest share of the light on a surface that faces it for a lamp of its own
 FINER = 0.0075
-"""What a panorama may lack without its order 4: of the mean light that a surface receives, the root of the mean square
-over all ways that it may face. Nine numbers are within 1 % in the mean below it."""
-_FOURTH = -1 / 24  # of a picture's order 4, what a surface receives, / pi; of orders 0, 1, 2: 1, 2/3, 1/4
+"""Largest error without order 4, relative to the mean light that a surface receives: the root mean square over all
+normals. Nine numbers are accurate to 1 % on average below it."""
+_FOURTH = -1 / 24  # a surface's response to order 4, / pi; of orders 0, 1, 2: 1, 2/3, 1/4
 
 
 class Sun(NamedTuple):
-    """towards : (3,) unit vector.   strength : (3,) radiance of a white surface that faces it.   size : rad, of its
-    disc's diameter."""
+    """A sun of a panorama. towards : (3,) unit vector.   strength : (3,) radiance of a white surface that faces it.
+    size : rad, diameter of its disc."""
 
     towards: np.ndarray
     strength: np.ndarray
@@ -43,11 +44,11 @@ class Sun(NamedTuple):
 
 
 class Environment(NamedTuple):
-    """What a panorama sends: the quadric of :func:`blinkgl.scene.lights.ambient`, (3, 4, 4), and its sun, if there is
-    one, or its brightest lamps, which are not in the quadric.
+    """The light of a panorama: the quadric of :func:`blinkgl.scene.lights.ambient`, (3, 4, 4), and its sun or brightest
+    lamps, if any, which are not in the quadric.
 
-    picture : (h, w, 3) float32 radiance, at most 256 px wide, without those suns: what shines shows.
-    quartic : (3, 9, 9), what :func:`blinkgl.scene.lights.ambient` takes besides, or None where it is below
+    picture : (h, w, 3) float32 radiance, at most 256 px wide, without those suns: for reflections.
+    quartic : (3, 9, 9), the further argument of :func:`blinkgl.scene.lights.ambient`, or None where it is below
     :data:`FINER` of the whole, in every channel."""
 
     quadric: np.ndarray
@@ -57,7 +58,7 @@ class Environment(NamedTuple):
 
 
 def environment(radiance: np.ndarray, suns: int = MOST_SUNS) -> Environment:
-    """Of an equirectangular picture (h, w, 3) float32, linear radiance. suns : that are looked for, at most."""
+    """Return the light of an equirectangular image (h, w, 3) float32, linear radiance. suns : largest number."""
     image = np.asarray(radiance, np.float32)
     height, width = image.shape[:2]
     if width > _WIDTH:
@@ -73,17 +74,17 @@ def environment(radiance: np.ndarray, suns: int = MOST_SUNS) -> Environment:
     picture = cv2.resize(image, small, interpolation=cv2.INTER_AREA).astype(np.float32)
     quadric = quadric_of_harmonics(harmonics(image, directions, solid))
     mean = np.trace(quadric, axis1=1, axis2=2) - (2 / 3) * np.trace(quadric[:, :3, :3], axis1=1, axis2=2)
-    mean = mean + sum((sun.strength / 4 for sun in found), np.zeros(3))  # a surface faces a sun by 1/4 in the mean
+    mean = mean + sum((sun.strength / 4 for sun in found), np.zeros(3))  # the mean of a sun over all normals is 1/4
     finer, size = quartic(picture, *pixel_directions(*picture.shape[:2]))
     return Environment(quadric, tuple(found), picture, finer if (size > FINER * mean).any() else None)
 
 
 def turned(given: Environment, angle: float) -> Environment:
-    """By an angle, rad, about the vertical, from +x towards +y."""
+    """Return the light rotated by an angle, rad, about the vertical, from +x towards +y."""
     T = np.eye(4)
     T[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
     suns = tuple(sun._replace(towards=T[:3, :3] @ sun.towards) for sun in given.suns)
-    columns = angle * given.picture.shape[1] / (2 * np.pi)  # azimuth falls to the right
+    columns = angle * given.picture.shape[1] / (2 * np.pi)  # azimuth decreases to the right
     whole, part = math.floor(columns), np.float32(columns - math.floor(columns))
     a, b = (np.roll(given.picture, -k, axis=1) for k in (whole, whole + 1))
     K = np.kron(T[:3, :3], T[:3, :3])
@@ -92,7 +93,8 @@ def turned(given: Environment, angle: float) -> Environment:
 
 
 def pixel_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """(h, w, 3) float64 unit vectors of a panorama's pixels, and (h,) sr that a pixel of each row covers."""
+    """Return unit vectors of a panorama's pixels, (h, w, 3) float64, and the solid angle of a pixel of each row, (h,)
+    sr."""
     edges = np.pi / 2 - np.arange(height + 1) * (np.pi / height)
     latitude = 0.5 * (edges[1:] + edges[:-1])
     azimuth = np.pi - (np.arange(width) + 0.5) * (2 * np.pi / width)
@@ -103,7 +105,7 @@ def pixel_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def harmonics(image: np.ndarray, directions: np.ndarray, solid: np.ndarray) -> np.ndarray:
-    """(9, 3) coefficients of the radiance: 1; y, z, x; xy, yz, 3 z² - 1, xz, x² - y²."""
+    """Return the coefficients of the radiance, (9, 3): 1; y, z, x; xy, yz, 3 z² - 1, xz, x² - y²."""
     x, y, z = np.moveaxis(directions, -1, 0)
     c = 0.282094792, 0.488602512, 1.092548431, 0.315391565, 0.546274215
     basis = (
@@ -115,7 +117,8 @@ def harmonics(image: np.ndarray, directions: np.ndarray, solid: np.ndarray) -> n
 
 
 def quadric_of_harmonics(L: np.ndarray) -> np.ndarray:
-    """(3, 4, 4) of (9, 3) coefficients: the radiance of a white surface with unit normal n is (n, 1) Q (n, 1)."""
+    """Return (3, 4, 4) of (9, 3) coefficients: the radiance of a white surface with unit normal n is (n, 1) Q (n,
+    1)."""
     c1, c2, c3, c4, c5 = 0.429042738, 0.511663354, 0.743123868, 0.886226925, 0.247707956
     one, y, z, x, xy, yz, zz, xz, xxyy = L
     rows = [
@@ -128,31 +131,34 @@ def quadric_of_harmonics(L: np.ndarray) -> np.ndarray:
 
 
 def quartic(image: np.ndarray, directions: np.ndarray, solid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What a surface receives of the picture's order 4: (3, 9, 9) symmetric, the radiance of a white surface with unit
+    """Return the irradiance from the image's order 4: (3, 9, 9) symmetric, the radiance of a white surface with unit
     normal n being m Q m with m = n n^T, its nine numbers in a row; and (3,) the root of its mean square over all n."""
     rows = np.einsum("hwi,hwj->hwij", directions, directions).reshape(-1, 9)
     flux = (image.astype(np.float64) * solid[:, None, None]).reshape(-1, 3)
-    M = np.stack([(rows * flux[:, c : c + 1]).T @ rows for c in range(3)])  # moments of degree 4, and so those below
-    # Of light from d it is 9/4pi P4(n.d), P4(c) = (35 c^4 - 30 c^2 + 3) / 8 (the addition theorem), and d.d = 1.
+    M = np.stack(
+        [(rows * flux[:, c : c + 1]).T @ rows for c in range(3)]
+    )  # moments of degree 4, which include the lower ones
+    # For light from d it is 9/4pi P4(n.d), P4(c) = (35 c^4 - 30 c^2 + 3) / 8 (the addition theorem), and d.d = 1.
     one = np.eye(3).ravel()
     second = M @ one
     total = second @ one
     mixed = np.einsum("ci,j->cij", second, one)
     band = 35 * M - 15 * (mixed + mixed.swapaxes(1, 2)) + 3 * total[:, None, None] * np.outer(one, one)
-    # The mean of P4(n.d) P4(n.e) over n is P4(d.e) / 9: of two lights what one's form makes of the other's moments.
+    # The mean of P4(n.d) P4(n.e) over n is P4(d.e) / 9: for two lights, the form of one applied to the other's moments.
     energy = np.einsum("cij,cij->c", band, M) / 8 / 9
     scale = _FOURTH * 9 / (4 * np.pi)
     return scale * band / 8, abs(scale) * np.sqrt(np.maximum(energy, 0.0))
 
 
 def _without_sun(image: np.ndarray, directions: np.ndarray, solid: np.ndarray) -> tuple[Sun | None, np.ndarray]:
-    """The sun, and the picture with the sky around it in its place. None where nothing is small and bright enough."""
+    """Return the sun, and the image with the surrounding sky in its place. None where nothing is small and bright
+    enough."""
     grey = image.max(axis=2)
     mean = float((grey * solid[:, None]).sum() / (solid.sum() * image.shape[1]))
     peak = np.unravel_index(int(grey.argmax()), grey.shape)
     if not grey[peak] > _BRIGHTER * mean:
         return None, image
-    wide = np.concatenate([grey, grey, grey], axis=1) > _EDGE * grey[peak]  # what the seam cuts is one
+    wide = np.concatenate([grey, grey, grey], axis=1) > _EDGE * grey[peak]  # a disc cut by the seam is one
     parts, _ = ndimage.label(wide)
     middle = slice(grey.shape[1], 2 * grey.shape[1])
     disc = (parts == parts[peak[0], peak[1] + grey.shape[1]])[:, middle]

@@ -1,12 +1,12 @@
-"""Surfaces that shine: the numbers of glTF's metal and roughness that shaders look up, in float64.
+"""Glossy surfaces: lookup tables of glTF's metal and roughness for the shaders, in float64.
 
 A lobe is GGX with the height-correlated Smith term and Schlick's Fresnel term (Walter et al. 2007, "Microfacet Models
 for Refraction through Rough Surfaces"; Heitz 2014, "Understanding the Masking-Shadowing Function"; glTF 2.0, appendix
-B). Once through it sends back ``F0 r + g`` of even light (Karis 2013, "Real Shading in Unreal Engine 4"), which is too
-little where it is rough: light that hits twice is lost. A factor ``1 + F_ms (1 / (r + g) - 1)`` gives it back, F_ms
-being what of it comes out that was reflected F_0 at a time, twice and more often (:func:`several`), so that a white
-metal under even light is white and gold is the more golden the rougher. What is no metal reflects 4 %, and scatters
-below that what is not reflected.
+B). With single reflection it returns ``F0 r + g`` of uniform light (Karis 2013, "Real Shading in Unreal Engine 4"),
+which is too little for rough surfaces, because light that is reflected twice is lost. A factor ``1 + F_ms (1 / (r + g)
+- 1)`` restores it; F_ms is the part of it that leaves after being reflected by F_0 at a time, twice and more often
+(:func:`several`), so that a white metal under uniform light is white, and gold is more saturated the rougher it is. A
+non-metal reflects 4 %, and scatters the rest below.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ import numpy as np
 from blinkgl.scene.surfaces.environment import pixel_directions
 
 SMOOTHEST = 0.05
-"""Least roughness: its highlight of a sun is as wide as the sun."""
+"""Smallest roughness: its highlight of a sun is as wide as the sun."""
 DIELECTRIC = 0.04
-"""Reflectance of what is no metal, looked at from straight above."""
+"""Reflectance of non-metals at normal incidence."""
 LEVELS = 15
-"""Roughnesses at which surroundings are blurred: 0, 1/14, ... 1; in between linearly."""
+"""Number of roughnesses at which surroundings are blurred: 0, 1/14, ... 1; linear in between."""
 COSINES = 8
-"""Cosines of the eye at the normal for which it is known where a surface looks: 0, 1/7, ... 1."""
+"""Number of cosines of the eye at the normal in the table of looks: 0, 1/7, ... 1."""
 _ANGLES, _ROUGHNESSES = 64, 32
 _SAMPLES = 1024
-_WIDE = 0.45  # roughness from which half as many pixels hold what is blurred
-# Thousandths; roughness by roughness, of each cosine five numbers.
+_WIDE = 0.45  # roughness from which blurred pictures have half the pixels
+# Thousandths; by roughness, five numbers for each cosine.
 _LOOKS = """
 1000 0 1000 0 543  1000 0 1000 0 568  1000 0 1000 0 551  1000 0 1000 0 568
 1000 0 1000 0 695  1000 0 1000 0 676  1000 0 1000 0 616  1000 0 1000 0 591
@@ -65,7 +65,7 @@ _LOOKS = """
 
 
 def lobe(nl: np.ndarray, nv: np.ndarray, nh: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """pi times the lobe without its Fresnel term, D V. Cosines at the normal: of light, eye, half way."""
+    """Return pi times the lobe without its Fresnel term, D V. Cosines at the normal: of light, eye, half vector."""
     a2 = np.maximum(roughness, SMOOTHEST) ** 4
     distribution = a2 / (nh**2 * (a2 - 1) + 1) ** 2
     return distribution * 0.5 / (nl * np.sqrt(nv**2 * (1 - a2) + a2) + nv * np.sqrt(nl**2 * (1 - a2) + a2))
@@ -74,9 +74,10 @@ def lobe(nl: np.ndarray, nv: np.ndarray, nh: np.ndarray, roughness: np.ndarray) 
 def visible(
     nv: np.ndarray, roughness: float, count: int
 ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
-    """Directions from which light is mirrored to eyes at (N,) cosines, as dense as the visible half vectors are (Dupuy
-    and Benyoub 2023, "Sampling Visible GGX Normals with Spherical Caps"): ((N, count) each of x, towards the eye, y, z,
-    along the normal), and (N, count) what of it comes out; the mean over what comes of even light is the energy."""
+    """Return directions from which light is mirrored to eyes at (N,) cosines, with the density of the visible half
+    vectors (Dupuy and Benyoub 2023, "Sampling Visible GGX Normals with Spherical Caps"): ((N, count) each of x, towards
+    the eye, y, z, along the normal), and the fraction that leaves, (N, count); its mean is the energy of uniform
+    light."""
     i = np.arange(count)
     u1, u2 = (i + 0.5) / count, (i * 0.6180339887498949 + 0.5) % 1.0
     sv = np.sqrt(np.maximum(1 - nv**2, 0))
@@ -94,15 +95,15 @@ def visible(
     nl = 2 * vh * hz - nv[:, None]
     a2 = alpha**2
     of_eye, of_light = np.sqrt(nv[:, None] ** 2 * (1 - a2) + a2), np.sqrt(np.maximum(nl, 0) ** 2 * (1 - a2) + a2)
-    # G2 / G1: what of the light that was reflected once comes out
+    # G2 / G1: the fraction of the singly reflected light that leaves
     weight = np.where(nl > 0, nl * (nv[:, None] + of_eye) / np.maximum(nl * of_eye + nv[:, None] * of_light, 1e-12), 0)
     return (2 * vh * hx - sv[:, None], 2 * vh * hy, nl), weight
 
 
 @lru_cache(maxsize=1)
 def energy() -> np.ndarray:
-    """(roughness 32, cosine 64, 2) float64 (r, g): a lobe with reflectance F0 sends back F0 r + g of even light, once
-    through. Roughness and cosine are i / (n - 1); by visible half vectors, whose weights are smooth."""
+    """Return (roughness 32, cosine 64, 2) float64 (r, g): a lobe with reflectance F0 returns F0 r + g of uniform light
+    with single reflection. Roughness and cosine are i / (n - 1); by visible half vectors, whose weights are smooth."""
     nv = np.maximum(np.arange(_ANGLES) / (_ANGLES - 1), 1e-3)
     out = np.empty((_ROUGHNESSES, _ANGLES, 2))
     sv = np.sqrt(np.maximum(1 - nv**2, 0))[:, None]
@@ -115,14 +116,15 @@ def energy() -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def mean_energy() -> np.ndarray:
-    """(roughness 32,) of :func:`energy` with reflectance 1, the mean over all directions, weighed by their cosine."""
+    """Return :func:`energy` with reflectance 1, (roughness 32,), averaged over all directions with their cosine as
+    weight."""
     E, mu = energy().sum(axis=2), np.arange(_ANGLES) / (_ANGLES - 1)
     return np.trapezoid(2 * mu * E, mu, axis=1)
 
 
 def several(F0: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """F_ms of (N, C) reflectances at (N,) roughnesses (Turquin 2019, "Practical Multiple Scattering Compensation for
-    Microfacet Models"): with F the mean of Schlick's term and E that of the energy, F E / (1 - F (1 - E))."""
+    """Return F_ms of (N, C) reflectances at (N,) roughnesses (Turquin 2019, "Practical Multiple Scattering Compensation
+    for Microfacet Models"): with F the mean of Schlick's term and E that of the energy, F E / (1 - F (1 - E))."""
     F = F0 + (1.0 - F0) / 21.0
     at = np.clip(roughness, 0, 1) * (_ROUGHNESSES - 1)
     E = np.interp(at, np.arange(_ROUGHNESSES), mean_energy())[:, None]
@@ -131,9 +133,10 @@ def several(F0: np.ndarray, roughness: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def looks() -> np.ndarray:
-    """(roughness 32, cosine 64, 5) float64, at the places of :func:`energy`: where a surface looks at its surroundings,
-    for :func:`both`. A lobe that is seen from aside is longer than the one along the normal, by which they are blurred,
-    and cut off at the horizon: two looks stand for it (``tests/scene/surfaces/lobes.py``)."""
+    """Return (roughness 32, cosine 64, 5) float64, at the places of :func:`energy`: the directions in which a surface
+    looks up its surroundings, for :func:`both`. A lobe seen from the side is longer than the one along the normal, by
+    which the surroundings are blurred, and cut off at the horizon: two looks approximate it
+    (``tests/scene/surfaces/lobes.py``)."""
     table = np.array(_LOOKS.split(), np.float64).reshape(LEVELS, COSINES, 5) * 1e-3
     x = np.linspace(0, COSINES - 1, _ANGLES)
     rows = [_bilinear(table, x, np.full(_ANGLES, y)) for y in np.linspace(0, LEVELS - 1, _ROUGHNESSES)]
@@ -145,8 +148,8 @@ Look = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def both(normal: np.ndarray, away: np.ndarray, cells: np.ndarray) -> tuple[Look, Look]:
-    """The looks of (N, 5) numbers of :func:`looks`: of each the share of the mirror's direction, ``away``, the rest
-    being the normal, and the roughness; the first one's weight. All unit vectors (N, 3)."""
+    """Return the looks of (N, 5) numbers of :func:`looks`: for each, the share of the mirror direction ``away`` (the
+    rest is the normal) and the roughness; the first one's weight. All unit vectors (N, 3)."""
     first, r1, second, r2, weight = np.moveaxis(cells[..., None], 1, 0)
 
     def look(share: np.ndarray, roughness: np.ndarray, weight: np.ndarray) -> Look:
@@ -159,15 +162,15 @@ def both(normal: np.ndarray, away: np.ndarray, cells: np.ndarray) -> tuple[Look,
 def around(
     levels: np.ndarray, normal: np.ndarray, away: np.ndarray, cosine: np.ndarray, roughness: np.ndarray
 ) -> np.ndarray:
-    """(N, 3) radiance of :func:`blurred` surroundings that surfaces of (N,) roughnesses mirror, of what comes of even
-    light the mean. cosine : (N,) of the eye at the normal."""
+    """Return the radiance, (N, 3), of :func:`blurred` surroundings mirrored by surfaces of (N,) roughnesses, relative
+    to uniform light. cosine : (N,) of the eye at the normal."""
     cells = _bilinear(looks(), cosine * (_ANGLES - 1), roughness * (_ROUGHNESSES - 1))
     first, second = (weight * mirrored(levels, way, rough) for way, rough, weight in both(normal, away, cells))
     return first + second
 
 
 def energy_at(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """(N, 2) of :func:`energy`, bilinear, at (N,) cosines and roughnesses."""
+    """Return :func:`energy`, bilinear, at (N,) cosines and roughnesses, (N, 2)."""
     return _bilinear(energy(), cosine * (_ANGLES - 1), roughness * (_ROUGHNESSES - 1))
 
 
@@ -185,8 +188,8 @@ def _bilinear(table: np.ndarray, x: np.ndarray, y: np.ndarray, around: bool = Fa
 
 
 def blurred(picture: np.ndarray) -> np.ndarray:
-    """(LEVELS, h, w, 3) float32: a panorama as surfaces of the roughnesses k / (LEVELS - 1) mirror it, looked at along
-    the normal: its mean over the lobe, weighed by the cosine. The first is the picture itself.
+    """Return (LEVELS, h, w, 3) float32: a panorama mirrored by surfaces of the roughnesses k / (LEVELS - 1), seen along
+    the normal: its mean over the lobe, weighted by the cosine. The first is the image itself.
 
     picture : (h, w, 3) float32."""
     height, width = picture.shape[:2]
@@ -203,14 +206,14 @@ def blurred(picture: np.ndarray) -> np.ndarray:
             out[k] = _blurred(picture, roughness)
             continue
         few = _blurred(half, roughness)
-        few = np.concatenate([few[:, -1:], few, few[:, :1]], axis=1).astype(np.float32)  # round the seam
+        few = np.concatenate([few[:, -1:], few, few[:, :1]], axis=1).astype(np.float32)  # across the seam
         out[k] = cv2.resize(few, (2 * few.shape[1], height), interpolation=cv2.INTER_LINEAR)[:, 2 : 2 + width]
     return out
 
 
 def _blurred(picture: np.ndarray, roughness: float) -> np.ndarray:
-    """What one pixel weighs for another depends on their rows and on how many columns lie between them: along a row
-    this is a convolution."""
+    """Return the blurred image. The weight between two pixels depends on their rows and the distance of their columns,
+    so along a row this is a convolution."""
     height, width = picture.shape[:2]
     directions, solid = pixel_directions(height, width)
     z = directions[:, 0, 2]
@@ -219,7 +222,7 @@ def _blurred(picture: np.ndarray, roughness: float) -> np.ndarray:
     cosine = (z[:, None] * z)[..., None] + (across[:, None] * across)[..., None] * turn  # n.l, of v = n
     nl = np.maximum(cosine, 0)
     a2 = max(roughness, SMOOTHEST) ** 4
-    # the lobe of v = n, for which (n.h)^2 = (1 + n.l) / 2, times the cosine, but for what all have in common
+    # the lobe for v = n, where (n.h)^2 = (1 + n.l) / 2, times the cosine, except for a common factor
     lobe = nl / ((0.5 + 0.5 * nl) * (a2 - 1) + 1) ** 2 / (nl + np.sqrt(nl**2 * (1 - a2) + a2))
     waves = np.fft.rfft(lobe * solid[:, None], axis=2)
     sums = np.einsum("ijf,jfc->ifc", waves, np.fft.rfft(picture.astype(np.float64), axis=1), optimize=True)
@@ -227,7 +230,7 @@ def _blurred(picture: np.ndarray, roughness: float) -> np.ndarray:
 
 
 def mirrored(levels: np.ndarray, directions: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """(N, 3) float64 of :func:`blurred` in (N, 3) unit directions at (N,) roughnesses, linear in between."""
+    """Return :func:`blurred` in (N, 3) unit directions at (N,) roughnesses, linear in between, (N, 3) float64."""
     height, width = levels.shape[1:3]
     x = (0.5 - np.arctan2(directions[:, 1], directions[:, 0]) / (2 * np.pi)) * width - 0.5
     y = (0.5 - np.arcsin(np.clip(directions[:, 2], -1, 1)) / np.pi) * height - 0.5

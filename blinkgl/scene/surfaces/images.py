@@ -1,7 +1,7 @@
 """Image files as :class:`~blinkgl.scene.types.Texture` images: limits checked before decoding, corrupt files refused.
 
-Pillow's guard against decompression bombs is a module-wide number far below what ``max_size`` allows, and changing it
-would change it for the whole process. So files are opened by Pillow's readers themselves, and the guard is
+Pillow's limit against decompression bombs is a module-wide number far below what ``max_size`` allows, and changing it
+would affect the whole process. So files are opened by Pillow's readers directly, and the limit is
 :data:`MAX_PIXELS`.
 """
 
@@ -25,15 +25,15 @@ from blinkgl.srgb import DECODE_8BIT, to_srgb8
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm", ".hdr", ".exr")
 _EXR = b"v/1\x01"
-MAX_SIDE = 16_384  # what the configuration's max_size allows, and what OpenGL implementations take
+MAX_SIDE = 16_384  # the configuration's limit of max_size, and OpenGL implementations'
 MAX_PIXELS = MAX_SIDE**2
 MAX_HDR_PIXELS = MAX_PIXELS // 2  # 12 bytes each: a panorama of 16384x8192
 _MAX_LINE = 1 << 20
-# Pillow knows many more; some of them run other programs (EPS), and none of them is a texture's.
+# Pillow reads many more; some run other programs (EPS), and none is a texture format.
 _FORMATS = ("PNG", "JPEG", "BMP", "WEBP", "TIFF", "PPM", "GIF", "TGA")
-_BLOCK_PIXELS = 1 << 22  # pixels converted or averaged at a time: bounds what a large image takes beside itself
-HDR_WHITE = 1.5  # brightest radiance kept of an HDR image: light sources would drown everything else
-# Not those that are mostly black (retina, hubble_deep_field): no light, no events.
+_BLOCK_PIXELS = 1 << 22  # pixels converted or averaged at a time: limits the extra memory of a large image
+HDR_WHITE = 1.5  # largest radiance kept of an HDR image: light sources would outweigh everything else
+# Without those that are mostly black (retina, hubble_deep_field): no light, no events.
 _PHOTOGRAPHS = (
     "astronaut.png",
     "brick.png",
@@ -51,7 +51,7 @@ _PHOTOGRAPHS = (
 
 
 def content_hash(*chunks: bytes) -> str:
-    """32 hex digits of the content."""
+    """Return 32 hex digits of the content's hash."""
     digest = hashlib.blake2b(digest_size=16)
     for chunk in chunks:
         digest.update(chunk)
@@ -59,7 +59,8 @@ def content_hash(*chunks: bytes) -> str:
 
 
 def photographs() -> dict[str, Path]:
-    """name -> file of the photographs inside the installed scikit-image; empty without it. Nothing is downloaded."""
+    """Return name -> file of the photographs inside the installed scikit-image; empty without it. Nothing is
+    downloaded."""
     spec = find_spec("skimage")
     if spec is None or not spec.submodule_search_locations:
         return {}
@@ -68,34 +69,36 @@ def photographs() -> dict[str, Path]:
 
 
 def load_image(path: Path, max_size: int | None = None, where: str | None = None) -> np.ndarray:
-    """(h, w, 3) uint8 sRGB, or float32 linear light for Radiance ``.hdr`` and OpenEXR; the longer side at most
+    """Return (h, w, 3) uint8 sRGB, or float32 linear light for Radiance ``.hdr`` and OpenEXR; the longer side at most
     ``max_size`` px.
 
-    HDR images are exposed so that their 90th percentile is 0.8 and clipped at :data:`HDR_WHITE`.
-    While it is reduced, an image takes at most 7 bytes per pixel of the file (HDR: 25), and some 100 MB beside it.
+    HDR images are exposed so that their 90th percentile is 0.8 and clipped at :data:`HDR_WHITE`. While it is reduced,
+    an image takes at most 7 bytes per pixel of the file (HDR: 25), and some 100 MB more.
     Raises :class:`AssetError` naming the file when it is missing, corrupt, truncated or beyond :data:`MAX_PIXELS`.
     """
     return decode_image(contents(Path(path), "image", where), max_size, where or str(path))
 
 
 def decode_image(data: bytes, max_size: int | None, where: str) -> np.ndarray:
-    """:func:`load_image` from bytes already read."""
+    """Return :func:`load_image` of bytes already read."""
     with reading("image", where):
         image = _decode_hdr(data, where) if data[:2] == b"#?" or data[:4] == _EXR else _decode_ldr(data, where)
         return shrink(image, max_size)
 
 
 def decode_numbers(data: bytes, max_size: int | None, where: str) -> np.ndarray:
-    """(h, w, 3) uint8 of a picture that is no colour but three numbers a pixel, 255 for 1 (normals, roughness): as
-    stored, made smaller by their mean. Raises AssetError as :func:`load_image`, and for high dynamic range."""
+    """Return (h, w, 3) uint8 of an image that stores three numbers per pixel, 255 for 1 (normals, roughness): as
+    stored, reduced by their mean. Raises AssetError as :func:`load_image`, and for high dynamic range."""
     with reading("image", where):
         if data[:2] == b"#?" or data[:4] == _EXR:
-            raise AssetError("a map of numbers has high dynamic range", where=where, accepted="8 or 16 bits a channel")
+            raise AssetError(
+                "a map of numbers is a high-dynamic-range image", where=where, accepted="8 or 16 bits a channel"
+            )
         return _smaller(_decode_ldr(data, where), max_size)
 
 
 def decode_alpha(data: bytes, max_size: int | None, where: str) -> np.ndarray | None:
-    """(h, w) uint8 of how opaque an image's pixels are; None where all are wholly so. Raises AssetError."""
+    """Return the opacity of an image's pixels, (h, w) uint8; None where all are opaque. Raises AssetError."""
     with reading("image", where):
         if data[:2] == b"#?" or data[:4] == _EXR:
             return None
@@ -119,7 +122,7 @@ def _smaller(numbers: np.ndarray, max_size: int | None) -> np.ndarray:
 
 
 def _open(data: bytes, where: str) -> Image.Image:
-    """``Image.open`` for the formats of textures and without its guard, which the caller replaces."""
+    """Open an image as ``Image.open`` for the formats of textures, without its limit, which the caller replaces."""
     Image.init()
     stream = io.BytesIO(data)
     for name in _FORMATS:
@@ -129,11 +132,11 @@ def _open(data: bytes, where: str) -> Image.Image:
         stream.seek(0)
         try:
             return factory(stream, "")
-        except Image.DecompressionBombError:  # some readers ask the guard themselves
+        except Image.DecompressionBombError:  # some readers check the limit themselves
             raise AssetError(
                 f"the image is too large for a {name} file", where=where, accepted="a PNG, or fewer pixels"
             ) from None
-        except (SyntaxError, IndexError, TypeError, struct.error):  # not this format after all: as Image.open does
+        except (SyntaxError, IndexError, TypeError, struct.error):  # another format after all: handled as in Image.open
             continue
     raise AssetError(
         "the image is corrupt or of an unknown format",
@@ -143,7 +146,7 @@ def _open(data: bytes, where: str) -> Image.Image:
 
 
 def _decode_ldr(data: bytes, where: str) -> np.ndarray:
-    # Pillow, because it says so when a file is truncated; OpenCV returns a half grey picture.
+    # Pillow, because it reports a truncated file; OpenCV returns a half grey image.
     with _open(data, where) as image:
         _check_size(*image.size, where)
         image.load()
@@ -159,10 +162,11 @@ def _decode_ldr(data: bytes, where: str) -> np.ndarray:
 
 
 def _sixteen_bits(grey: np.ndarray, where: str) -> np.ndarray:
-    """(h, w, 3) uint8 of 16-bit grey, white 65535 however dark the picture is. AssetError: numbers without a white."""
+    """Return (h, w, 3) uint8 of 16-bit grey, white 65535 however dark the image is. Raises AssetError: numbers without
+    a white."""
     if grey.dtype.kind == "f" or grey.min() < 0 or grey.max() > 65535:
         raise AssetError(
-            "the image does not say how bright its numbers are",
+            "the image has an unknown scale of brightness",
             where=where,
             value=f"{8 * grey.itemsize}-bit {'floats' if grey.dtype.kind == 'f' else 'integers'}",
             accepted="8 or 16 bits a channel, or Radiance HDR",
@@ -176,11 +180,11 @@ def _blocks(height: int, width: int) -> list[slice]:
 
 
 def load_panorama(path: Path, where: str | None = None) -> tuple[np.ndarray, float]:
-    """An equirectangular picture as light: (h, w, 3) float32 linear radiance as it is in the file, and the factor by
-    which :func:`load_image` exposes it (1 of a picture of 8 bits, which is as bright as it looks).
+    """Return an equirectangular image as light: (h, w, 3) float32 linear radiance as in the file, and the factor by
+    which :func:`load_image` exposes it (1 for 8-bit images).
 
-    Raises :class:`AssetError` for what :func:`load_image` refuses, and where it is no panorama: not twice as wide as it
-    is high, with pixels that are no radiance (NaN, infinite, negative), or black."""
+    Raises :class:`AssetError` for what :func:`load_image` refuses, and where it is not a panorama: not twice as wide as
+    high, with pixels that are not radiance (NaN, infinite, negative), or black."""
     where = where or str(path)
     data = contents(Path(path), "image", where)
     with reading("image", where):
@@ -195,20 +199,22 @@ def load_panorama(path: Path, where: str | None = None) -> tuple[np.ndarray, flo
             "not a panorama", where=where, value=f"{width}x{height}", accepted="twice as wide as it is high"
         )
     if image.min() < 0:
-        raise AssetError("a pixel is no radiance", where=where, value=float(image.min()), accepted="numbers from 0 on")
+        raise AssetError(
+            "a pixel is not a radiance", where=where, value=float(image.min()), accepted="numbers from 0 on"
+        )
     if not image.max() > 0:
         raise AssetError("the panorama is black", where=where)
     return image, factor
 
 
 def exposure(image: np.ndarray) -> float:
-    """The factor that takes the 90th percentile of a picture's radiance to 0.8."""
+    """Return the factor that brings the 90th percentile of an image's radiance to 0.8."""
     level = float(np.percentile(image.max(axis=2), 90))
     return 0.8 / level if level > 0 else 1.0
 
 
 def _radiance(data: bytes, where: str) -> np.ndarray:
-    """(h, w, 3) float32 of a Radiance or OpenEXR file."""
+    """Return (h, w, 3) float32 of a Radiance or OpenEXR file."""
     if data[:4] == _EXR:
         from blinkgl.io.video import decode_exr
 
@@ -224,7 +230,7 @@ def _radiance(data: bytes, where: str) -> np.ndarray:
         if not np.isfinite(image).all():
             y, x = np.argwhere(~np.isfinite(image).all(axis=2))[0].tolist()
             raise AssetError(
-                "a pixel is no radiance",
+                "a pixel is not a radiance",
                 where=f"{where}, x={x}, y={y}",
                 value=image[y, x].tolist(),
                 accepted="finite numbers",
@@ -257,15 +263,15 @@ def _most(pixels: int) -> str:
 
 
 def shrink(image: np.ndarray, max_size: int | None) -> np.ndarray:
-    """Area average in linear light down to a longer side of ``max_size`` px; smaller
-    images are returned as they are."""
+    """Return the area average in linear light, the longer side reduced to ``max_size`` px; smaller images are returned
+    unchanged."""
     height, width = image.shape[:2]
     if max_size is None or max(height, width) <= max_size:
         return image
     factor = max_size / max(height, width)
     new_width, new_height = max(1, round(width * factor)), max(1, round(height * factor))
     made = np.empty((new_height, new_width, 3), image.dtype)
-    # A block of the result at a time, across and then down: in one piece, linear light takes four times the image.
+    # A block of the result at a time, across and then down: at once, linear light would take four times the image.
     for rows in _blocks(new_height, math.ceil(width * height / new_height)):
         top, bottom = rows.start * height / new_height, rows.stop * height / new_height
         source = slice(math.floor(top), min(math.ceil(bottom - 1e-9), height))
@@ -281,17 +287,16 @@ def shrink(image: np.ndarray, max_size: int | None) -> np.ndarray:
 
 
 def cube_faces(panorama: np.ndarray, size: int, margin: float = 0.0) -> list[np.ndarray]:
-    """The six sides of a box seen from its centre, from an equirectangular image: +x, -x, +y, -y, +z, -z, each (size,
-    size, 3) of the panorama's dtype, upright, not mirrored (right is right for the viewer inside). ``margin``: the
-    image reaches this fraction of a half edge over the box's edges, so that filtering near
-    them finds what is really there.
+    """Return the six sides of a box seen from its centre, from an equirectangular image: +x, -x, +y, -y, +z, -z, each
+    (size, size, 3) of the panorama's dtype, upright, not mirrored (right is right for the viewer inside). ``margin``:
+    the image extends this fraction of a half edge beyond the box's edges, so that filtering near them is correct.
 
-    The panorama's middle column is seen in direction +x, and longitude grows to the right, i.e. clockwise from above.
+    The panorama's middle column is in direction +x, and longitude grows to the right, i.e. clockwise from above.
     """
     height, width = panorama.shape[:2]
     s = ((np.arange(size) + 0.5) / size * 2 - 1) * (1 + margin)
     right, down = np.meshgrid(s, s)
-    padded = np.concatenate([panorama[:, -2:], panorama, panorama[:, :2]], axis=1)  # the seam is interpolated across
+    padded = np.concatenate([panorama[:, -2:], panorama, panorama[:, :2]], axis=1)  # interpolated across the seam
     faces = []
     for forward, to_right, to_down in SKY_SIDES:
         ray = np.asarray(forward, float) + right[..., None] * to_right + down[..., None] * to_down

@@ -1,6 +1,6 @@
 """Procedural textures: each is one function of a seed, tileable, in colour, never black.
 
-A scalar field in [0, 1] is laid through a palette of random sRGB colours. Fields are built from integer lattices with
+A scalar field in [0, 1] is mapped to a palette of random sRGB colours. Fields are built from integer lattices with
 wrap-around, so that a texture repeats without a seam.
 """
 
@@ -12,18 +12,18 @@ from blinkgl.config.scene import TEXTURE_KINDS
 from blinkgl.scene.geometry.primitives import DIE_FACES, parameter_hash
 from blinkgl.scene.types import Texture
 
-DARKEST, BRIGHTEST = 20, 240  # sRGB: radiance stays within about (0.007, 0.87)
-MIN_CONTRAST = 70  # least difference in sRGB luma between a palette's darkest and brightest colour
+DARKEST, BRIGHTEST = 20, 240  # sRGB: radiance is within about (0.007, 0.87)
+MIN_CONTRAST = 70  # smallest difference in sRGB luma between a palette's darkest and brightest colour
 
 
 def procedural_hash(kind: str, index: int) -> str:
-    """Identity of a procedural texture for splits; independent of its size."""
+    """Return the identity of a procedural texture for splits; independent of its size."""
     return parameter_hash("procedural", 1, kind, index)
 
 
 def procedural_texture(kind: str, index: int, size: int = 512) -> Texture:
-    """The ``index``-th texture of a kind, (size, size, 3) uint8 sRGB; the same on every run."""
-    # By the kind's place in the list: data sets are told apart by it, so kinds are only ever added at the end.
+    """Return the ``index``-th texture of a kind, (size, size, 3) uint8 sRGB; the same on every run."""
+    # By the kind's index in the list, which data sets depend on: add new kinds only at the end.
     rng = np.random.default_rng([_ALL_KINDS.index(kind), index])
     if kind == "pips":
         image = _pips(rng, size)
@@ -34,7 +34,7 @@ def procedural_texture(kind: str, index: int, size: int = 512) -> Texture:
 
 
 def _palette(rng: np.random.Generator) -> np.ndarray:
-    """(2..5, 3) sRGB colours in 0..255 with at least MIN_CONTRAST between darkest and brightest."""
+    """Return (2..5, 3) sRGB colours in 0..255 with at least MIN_CONTRAST between darkest and brightest."""
     colours = rng.uniform(DARKEST, BRIGHTEST, (int(rng.integers(2, 6)), 3))
     luma = colours @ [0.299, 0.587, 0.114]
     lack = MIN_CONTRAST - (luma.max() - luma.min())
@@ -45,7 +45,7 @@ def _palette(rng: np.random.Generator) -> np.ndarray:
 
 
 def _grade(field: np.ndarray, palette: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Field (h, w) in [0, 1], or (h, w) integer labels, to (h, w, 3) uint8."""
+    """Return (h, w, 3) uint8 of a field (h, w) in [0, 1], or of (h, w) integer labels."""
     if field.dtype.kind in "iu":
         return np.round(palette).astype(np.uint8).take(field % len(palette), axis=0)
     stops = np.linspace(0, 1, len(palette))
@@ -68,7 +68,7 @@ def _smooth(t: np.ndarray) -> np.ndarray:
 
 
 def _lattice(size: int, cells: int):
-    """Per pixel along one axis: cell before, cell after (wrapped), fraction."""
+    """Return per pixel along one axis: cell before, cell after (wrapped), fraction."""
     x = (np.arange(size) + 0.5) / size * cells
     low = np.floor(x).astype(int)
     # Wrapped round, so that the texture repeats without a seam.
@@ -135,7 +135,7 @@ def _checks(rng, size):
 
 
 def _glyphs(rng, size):
-    """Lines of words in an invented alphabet of 5x7 strokes."""
+    """Return lines of words in an invented alphabet of 5x7 strokes."""
     alphabet = np.zeros((24, 7, 5), bool)
     for letter in alphabet:
         for _ in range(int(rng.integers(2, 5))):
@@ -158,7 +158,7 @@ def _glyphs(rng, size):
 
 
 def _dots(rng, size):
-    """Discs of random radius and colour, wrapped round the edges."""
+    """Return discs of random radius and colour, wrapped around the edges."""
     field = np.zeros((size, size), np.int64)
     smallest, largest = 0.01, rng.uniform(0.03, 0.12)
     for colour in range(int(rng.integers(40, 160))):
@@ -173,7 +173,7 @@ def _dots(rng, size):
 
 
 def _gradient(rng, size):
-    """A few smooth waves: low contrast almost everywhere, what event cameras find hardest."""
+    """Return a few smooth waves: low contrast almost everywhere, the hardest case for event cameras."""
     x, y = _coordinates(size)
     waves = [
         rng.uniform(0.3, 1) * np.cos(2 * np.pi * (rng.integers(-2, 3) * x + rng.integers(-2, 3) * y + rng.random()))
@@ -197,7 +197,7 @@ def _bricks(rng, size):
 
 
 _PIPS = ("4", "08", "048", "0268", "02468", "023568")
-"""Of the faces 1 to 6, on a lattice of three by three, numbered row by row."""
+"""Pips of the faces 1 to 6, on a lattice of three by three, numbered row by row."""
 
 
 _STUFFS = ((236, 226, 198), (196, 34, 40), (38, 38, 44), (32, 84, 176), (30, 128, 72), (226, 150, 34), (112, 52, 148))
@@ -205,8 +205,8 @@ _STUFFS = ((236, 226, 198), (196, 34, 40), (38, 38, 44), (32, 84, 176), (30, 128
 
 
 def _pips(rng: np.random.Generator, size: int) -> np.ndarray:
-    """(size, size, 3) uint8: the six faces of a :func:`~blinkgl.scene.geometry.primitives.die`, of marbled stuff, the
-    pips light on dark or dark on light. One of the pools' kinds it is not: it makes sense on a die alone."""
+    """Return the six faces of a :func:`~blinkgl.scene.geometry.primitives.die`, (size, size, 3) uint8, of a marbled
+    material, the pips light on dark or dark on light. It is not one of the pools' kinds, because it fits only a die."""
     base = np.array(_STUFFS[int(rng.integers(len(_STUFFS)))], float) * rng.uniform(0.85, 1.1, 3)
     grain = rng.uniform(0.1, 0.4)
     warped = _stretch(sum(0.6**k * _perlin_noise(rng, size, 8 * 2**k) for k in range(4)))

@@ -1,4 +1,4 @@
-"""Custom scenes: named meshes and materials, objects and camera with poses or key frames, as written in the YAML."""
+"""Explicit scenes: named meshes and materials, objects and camera with poses or key frames, as written in the YAML."""
 
 from __future__ import annotations
 
@@ -47,29 +47,29 @@ _LEVEL_CAMERA = Rotation.from_matrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 
 
 @dataclass(frozen=True, eq=False)
 class InMemory:
-    """Meshes and textures that are in no file, by the names of the mesh and of the material they belong to: they stand
-    instead of what the configuration says there."""
+    """Meshes and textures that are not in files, by the names of the mesh and of the material they belong to; they
+    replace what the configuration gives there."""
 
     meshes: dict[str, Mesh] = field(default_factory=dict)
     textures: dict[str, Texture] = field(default_factory=dict)
     maps: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
-    """By material and key: (h, w, 3) uint8 as the file of the key would be, (h, w) of the mask."""
+    """By material and key: (h, w, 3) uint8 as the key's file would be, (h, w) for the mask."""
 
 
 def explicit_scene(
     config: ExplicitSceneConfig, camera: CameraModel, t0_ns: int, t1_ns: int, base: Path, memory: InMemory = InMemory()
 ) -> Scene:
-    """The scene as configured; nothing is drawn at random, and collisions are looked for only if it says so.
+    """Return the configured scene; nothing is random, and collisions are searched only if configured.
 
-    Raises ConfigError (missing file, bad parameter; with ``collisions``,
-    bodies that touch at the start; with ``physics``, what :func:`simulate` raises) and AssetError."""
+    Raises ConfigError (missing file, bad parameter; with ``collisions``, bodies that touch at the start; with
+    ``physics``, what :func:`simulate` raises) and AssetError."""
     log: list[str] = []
     omissions: dict[str, None] = {}
     objects = _objects(config, t0_ns, t1_ns, base, memory, log, omissions)
     path = motion_path(config.camera, t0_ns, t1_ns, "scene.camera", base, camera=True)
     bodies = {thing.name: item.physics for thing, item in zip(objects, config.objects) if item.physics is not None}
     if config.collisions:
-        # What falls is stopped by nothing: the engine knows the others' paths, as they are after this.
+        # Nothing stops falling objects: the engine knows the others' final paths.
         falling = {name for name, body in bodies.items() if body.kind == "dynamic"}
         others = [obj for obj in objects if obj.name not in falling]
         result = resolve_collisions(others, path, 1.01 * camera.near_corner, t0_ns, t1_ns)
@@ -99,7 +99,7 @@ def _objects(
     log: list[str],
     omissions: dict[str, None],
 ) -> list[SceneObject]:
-    """The objects in their order, numbered from 1 on. log, omissions : get what there is to say of their files."""
+    """Return the objects in their order, numbered from 1. log, omissions : get the notes on their files."""
     materials = {
         name: _material(m, base, f"scene.materials.{name}", memory.textures.get(name), memory.maps.get(name, {}))
         for name, m in config.materials.items()
@@ -128,7 +128,7 @@ def _objects(
 
 
 def _parts(asset: Asset, item: ObjectConfig, material: Material | None, unlit: bool) -> list[Part]:
-    """An asset at an object's size. material : instead of its own ones."""
+    """Return an asset's parts at an object's size. material : replaces its own."""
     matrix = np.diag(np.broadcast_to(np.asarray(item.scale, float), 3))
     parts = []
     for part in asset.parts:
@@ -136,13 +136,13 @@ def _parts(asset: Asset, item: ObjectConfig, material: Material | None, unlit: b
         worn = replace(worn, unlit=worn.unlit or unlit)
         mesh = transform_mesh(part.mesh, matrix)
         if material is not None and worn.bumps is not None and mesh.deformer is None:
-            mesh, _ = split_mirrored(mesh)  # of what deforms already the seams stay: its joints count its vertices
+            mesh, _ = split_mirrored(mesh)  # a deforming mesh keeps its seams: its joints count its vertices
         parts.append(Part(mesh, worn))
     return parts
 
 
 def _object_path(item: ObjectConfig, parts: Sequence[Part], t0_ns: int, t1_ns: int, where: str, base: Path) -> PosePath:
-    """An object's pose, key frames, trajectory, or way, at the speed that its steps ask for."""
+    """Return an object's path from its pose, key frames, trajectory, or way, at the speed that its steps need."""
     way = item.way
     if way is None:
         return motion_path(item, t0_ns, t1_ns, where, base)
@@ -154,8 +154,8 @@ def _object_path(item: ObjectConfig, parts: Sequence[Part], t0_ns: int, t1_ns: i
 def motion_path(
     config: KeyedMotionConfig, t0_ns: int, t1_ns: int, where: str, base: Path, camera: bool = False
 ) -> PosePath:
-    """The configured pose over [t0, t1], or the path through its key frames (whose times are
-    seconds on the sequence's clock) or a file's poses. Raises ConfigError and AssetError."""
+    """Return the configured pose over [t0, t1], or the path through its key frames (whose times are seconds on the
+    sequence's clock) or a file's poses. Raises ConfigError and AssetError."""
     if config.trajectory is not None:
         return trajectory_path(config.trajectory, t0_ns, t1_ns, f"{where}.trajectory", base)
     if not config.keyframes:
@@ -166,8 +166,8 @@ def motion_path(
 
 
 def trajectory_path(config: TrajectoryConfig, t0_ns: int, t1_ns: int, where: str, base: Path) -> PosePath:
-    """A C2 spline through the poses of a file. Raises AssetError, as :func:`read_trajectory`, and ConfigError where the
-    file does not cover [t0, t1], or does not say where on its body the sensor is."""
+    """Return a C2 spline through the poses of a file. Raises AssetError, as :func:`read_trajectory`, and ConfigError
+    where the file does not cover [t0, t1], or lacks the sensor's pose on its body."""
     from blinkgl.io.trajectories import read_trajectory
 
     file = resolve(config.file, base)
@@ -195,7 +195,7 @@ def trajectory_path(config: TrajectoryConfig, t0_ns: int, t1_ns: int, where: str
 def _check_speeds(
     config: TrajectoryConfig, t_ns: np.ndarray, positions: np.ndarray, rotations: Rotation, where: str
 ) -> None:
-    """Raises ConfigError: the poses are farther apart than anything flies, or turns, between them."""
+    """Raise ConfigError where consecutive poses are too far apart for a real motion."""
     seconds = np.diff(t_ns) * 1e-9
     speed = np.linalg.norm(np.diff(positions, axis=0), axis=1) / seconds
     turn = np.degrees((rotations[1:] * rotations[:-1].inv()).magnitude()) / seconds
@@ -206,7 +206,7 @@ def _check_speeds(
         k = int(np.argmax(rate))
         if rate[k] > limit:
             raise ConfigError(
-                f"the trajectory goes too fast: {guess}",
+                f"the trajectory is too fast: {guess}",
                 where=f"{where}.{key}",
                 value=f"{rate[k]:.4g} {unit} at {t_ns[k] * 1e-9:.6g} s",
                 accepted=f"at most {limit:g} {unit}, or another {key}",
@@ -214,7 +214,7 @@ def _check_speeds(
 
 
 def _on_body(given: Any, where: str, base: Path) -> np.ndarray:
-    """(4, 4) T_body_sensor, of a matrix or of EuRoC's sensor.yaml."""
+    """Return T_body_sensor, (4, 4), of a matrix or of EuRoC's sensor.yaml."""
     from blinkgl.config.camchain import read_place_on_body
 
     if not isinstance(given, str):
@@ -226,15 +226,16 @@ def _on_body(given: Any, where: str, base: Path) -> np.ndarray:
 
 
 _BEYOND = 8
-"""Poses outside the sequence that its spline knows: farther ones change it by less than 1e-4 of their own size."""
+"""Number of poses outside the sequence that the spline uses: farther ones change it by less than 1e-4 of their own
+size."""
 
 
 def pose_matrix(config: PoseConfig, camera: bool = False) -> np.ndarray:
-    """(4, 4) T_world_body.
+    """Return T_world_body, (4, 4).
 
     quaternion : the rotation itself; for a camera that of its OpenCV axes.
-    euler, or nothing : turned about the world's x, then y, then z, from rest; a camera
-    at rest looks along +x with z up.
+    euler, or nothing : rotation about the world's x, then y, then z, from rest; a camera at rest looks along +x with z
+    up.
     look_at : a camera's z axis (x level), an object's x axis (y level) points there.
     """
     T = np.eye(4)
@@ -252,14 +253,14 @@ def pose_matrix(config: PoseConfig, camera: bool = False) -> np.ndarray:
 
 
 def primitive_mesh(config: MeshConfig, name: str) -> Mesh:
-    """The primitive that ``scene.meshes.name`` asks for. Raises ConfigError for a bad parameter."""
+    """Return the primitive of ``scene.meshes.name``. Raises ConfigError for a bad parameter."""
     with _parameters_of(name):
         return BUILDERS[config.primitive](**config.parameters)
 
 
 def check_primitive(kind: str, parameters: Mapping[str, Any], name: str) -> None:
-    """Raises ConfigError for what :func:`primitive_mesh` would refuse; of living things, whose parameters have nothing
-    to do with each other, without making one."""
+    """Raise ConfigError for what :func:`primitive_mesh` would refuse; for living primitives, whose parameters are
+    independent, without making one."""
     with _parameters_of(name):
         (BUILDERS[kind].checked if PRIMITIVES[kind].use == "living" else BUILDERS[kind])(**parameters)
 
@@ -347,7 +348,7 @@ def _material(
 
 
 def _map(config: MaterialConfig, key: str, base: Path, where: str, maps: Mapping[str, np.ndarray]) -> Map | None:
-    """Of the image file that a key names, or in memory; None: neither."""
+    """Return the map of the image file of a key, or in memory; None: neither."""
     if key in maps:
         return Map(Texture(maps[key], key))
     given = getattr(config, key)
@@ -360,7 +361,7 @@ def _map(config: MaterialConfig, key: str, base: Path, where: str, maps: Mapping
 
 
 def _mask(config: MaterialConfig, base: Path, where: str, maps: Mapping[str, np.ndarray]) -> Mask | None:
-    """None where nothing of it is below the cutoff. Raises ConfigError where all is."""
+    """Return the mask; None where nothing of it is below the cutoff. Raises ConfigError where all is."""
     alpha = maps.get("mask")
     if alpha is None and config.mask is None:
         return None
@@ -372,10 +373,10 @@ def _mask(config: MaterialConfig, base: Path, where: str, maps: Mapping[str, np.
             alpha = decode_numbers(data, config.max_size, said).mean(axis=2).round().astype(np.uint8)
     if alpha.max() < 255 * config.cutoff:
         raise ConfigError(
-            "nothing of the surface is left",
+            "the mask removes the whole surface",
             where=f"{where}.cutoff",
             value=config.cutoff,
-            accepted=f"a mask that reaches it; its largest value is {alpha.max() / 255:.3g}",
+            accepted=f"a mask with a value above it; the largest value is {alpha.max() / 255:.3g}",
         )
     return Mask(alpha, cutoff=config.cutoff) if alpha.min() < 255 * config.cutoff else None
 

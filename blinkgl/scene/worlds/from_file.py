@@ -1,10 +1,10 @@
-"""Finished scenes of glTF files.
+"""Complete scenes from glTF files.
 
     scene = from_document(gltf.read("room.glb"), camera, t0_ns, t1_ns)
 
-``camera`` is a :class:`~blinkgl.camera.CameraModel`. Each node that shows a mesh becomes one object; a
-node's scale is baked into its vertices, what remains is its rigid pose. Cameras, which look along -z with y up, get
-OpenCV axes. glTF's world (y up) is turned z up.
+``camera`` is a :class:`~blinkgl.camera.CameraModel`. Each node that shows a mesh becomes one object; a node's scale is
+baked into its vertices, the rest is its rigid pose. Cameras, which look along -z with y up, get OpenCV axes. glTF's
+world (y up) is turned z up.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from blinkgl.scene.worlds.pool import resolve
 from blinkgl.scene.worlds.sky import with_environment
 
 CV_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])  # its own inverse
-_ANIMATION_STEP = 1 / 60  # s between the samples that a spline is laid through
+_ANIMATION_STEP = 1 / 60  # s between the samples of a spline
 _MAX_SAMPLES = 20_000
 
 
 def scene_from_file(config: FileSceneConfig, camera: CameraModel, t0_ns: int, t1_ns: int, base: Path) -> Scene:
-    """A ``scene: {kind: file}``."""
+    """Return the scene of ``scene: {kind: file}``."""
     path = resolve(config.path, base)
     if not path.is_file():
         raise ConfigError("no such file", where="scene.path", value=config.path, accepted="a gltf or glb file")
@@ -83,17 +83,16 @@ def from_document(
     light: Light = Light(),
     lights_gain: float | None = None,
 ) -> Scene:
-    """A glTF 2.0 file, as it was read, with its materials, cameras and node animations.
+    """Return the scene of a parsed glTF 2.0 file, with its materials, cameras and node animations.
 
     camera_name : name or index of the file's camera (None: the first), unless ``camera_path`` is given.
     intrinsics : "config": those of ``camera``; "file": fx = fy = height / 2 / tan(yfov / 2), centred, near = znear.
     animation : name or index, or more (:class:`~blinkgl.config.deform.AnimationConfig`, whose files are below
-    ``base``).
-        Translations and rotations of nodes are sampled at 60 Hz and joined by a C2 spline; what a path cannot be
-        (scales that change, jumps, skins, morph targets) changes the object's shape instead, exactly.
-    lights_gain : None: ``light`` alone shines. A number: the file's own lights, times it, in the place of its sun.
-    What the file asks for and is not drawn is in the scene's ``omissions``.
-    Raises AssetError (file), ConfigError (camera, animation or lights that are not there).
+        ``base``). Translations and rotations of nodes are sampled at 60 Hz and joined by a C2 spline; what a path
+        cannot represent (changing scales, jumps, skins, morph targets) deforms the object's shape instead, exactly.
+    lights_gain : None: only ``light``. A number: the factor on the file's lights, which replace its sun. Features of
+    the file that are not drawn are in the scene's ``omissions``.
+    Raises AssetError (file), ConfigError (missing camera, animation or lights).
     """
     playing = _animation(document, animation, Path(base))
     if lights_gain is not None:
@@ -112,7 +111,7 @@ def from_document(
 
 
 def _objects(document: gltf.Document, animation: Animation | None, t0_ns: int, t1_ns: int) -> tuple[SceneObject, ...]:
-    """An object for each node that shows a mesh, numbered from 1 on, no two of one name."""
+    """Return an object for each node that shows a mesh, numbered from 1, with distinct names."""
     made: list[SceneObject] = []
     names: set[str] = set()
     for index, node in document.nodes.items():
@@ -131,7 +130,7 @@ def _objects(document: gltf.Document, animation: Animation | None, t0_ns: int, t
 def _object(
     document: gltf.Document, index: int, animation: Animation | None, t0_ns: int, t1_ns: int
 ) -> tuple[tuple[Part, ...], PosePath] | None:
-    """(parts, path) of a node that shows a mesh; None: one without faces."""
+    """Return (parts, path) of a node that shows a mesh; None: one without faces."""
     node = document.nodes[index]
     assert node.mesh is not None
     if animation is None:
@@ -145,7 +144,7 @@ def _object(
         return _parts(raws, baked, node.name, document), StaticPath(place, t0_ns, t1_ns)
     skinned = node.skin is not None and any(raw.binding is not None for raw in raws)
     if skinned or _beyond_a_path(animation, index):
-        # The shape itself moves, in the scene's own axes.
+        # The shape itself moves, in the scene's axes.
         baked = Z_UP @ world
         deformer = partial(animation.deformer, index, at_rest=baked, turn=Z_UP)
         return _parts(raws, baked, node.name, document, deformer), StaticPath(None, t0_ns, t1_ns)
@@ -157,7 +156,7 @@ def _object(
 
 
 def unlit(scene: Scene) -> Scene:
-    """The scene with radiance = albedo everywhere."""
+    """Return the scene with radiance = albedo everywhere."""
 
     def of(parts):
         return tuple(Part(p.mesh, replace(p.material, unlit=True)) for p in parts)
@@ -166,8 +165,8 @@ def unlit(scene: Scene) -> Scene:
 
 
 def split_rigid(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(T, A), both (4, 4), with matrix = T @ A: T rigid, its rotation the nearest to the linear part (polar
-    decomposition), A what is left: scale, shear, mirroring."""
+    """Return (T, A), both (4, 4), with matrix = T @ A: T rigid, its rotation the nearest to the linear part (polar
+    decomposition), A the rest: scale, shear, reflection."""
     matrix = np.asarray(matrix, np.float64)
     linear = matrix[:3, :3]
     if not np.isfinite(matrix).all() or abs(np.linalg.det(linear)) < 1e-300:
@@ -183,7 +182,7 @@ def split_rigid(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _parts(
     raws: list[RawMesh], baked: np.ndarray, name: str, document: gltf.Document, deformer: DeformerOf | None = None
 ) -> tuple[Part, ...]:
-    """Of one node. baked : (4, 4) what takes its meshes to the object's axes."""
+    """Return the parts of one node. baked : (4, 4) from its meshes to the object's axes."""
     parts = []
     for raw in (transformed(raw, baked) for raw in raws if len(raw.faces)):
         digest = content_hash(raw.vertices.tobytes(), np.ascontiguousarray(raw.faces, np.int64).tobytes())
@@ -203,7 +202,7 @@ def _animation(document: gltf.Document, given: str | int | AnimationConfig | Non
 
 
 def _beyond_a_path(animation: Animation, node: int) -> bool:
-    """Whether a node moves in a way that is no rigid path: its scale changes, or it jumps."""
+    """Return whether a node's motion is not a rigid path: its scale changes, or it jumps."""
     return any(
         track.interpolation == "STEP" or (track.path == "scale" and np.ptp(track.values, axis=0).max() > 0)
         for track in animation.tracks_of(node)
@@ -221,7 +220,7 @@ def _motion(
     t1_ns: int,
     local: np.ndarray = _HERE,
 ):
-    """(PosePath of T_world_node @ local, matrix to bake into the node's vertices)."""
+    """Return (PosePath of T_world_node @ local, matrix to bake into the node's vertices)."""
     mine = [] if animation is None else animation.tracks_of(node)
     rest, baked = split_rigid(Z_UP @ document.world(node))
     if animation is None or not mine:
@@ -244,7 +243,7 @@ def _motion(
 def _with_lights(
     document: gltf.Document, animation: Animation | None, t0_ns: int, t1_ns: int, light: Light, gain: float
 ) -> Light:
-    """The file's lights in the place of the sun: the strongest, where there are too many."""
+    """Return the light with the file's lights instead of the sun: the strongest, where there are too many."""
     found = document.lights()
     if not found:
         raise ConfigError("the file has no lights", where="scene.lights", value="file", accepted="config")

@@ -1,8 +1,8 @@
 """Pools of objects and textures, listed by content hash, split into disjoint train and test parts, loaded lazily.
 
-An entry's split depends only on its content: the same file under two names, on two machines, listed in another order or
-in a pool that has grown, is always on the same side. Entries are drawn by first choosing a source (a folder, the
-primitives, …) with equal chances and then an entry, so that six photographs are not drowned by a thousand patterns.
+An entry's split depends only on its content: the same file under two names, on two machines, in another order or in a
+larger pool is always on the same side. An entry is drawn by first choosing a source (a folder, the primitives, …) with
+equal chances and then an entry, so that a thousand patterns do not outweigh six photographs.
 """
 
 from __future__ import annotations
@@ -32,13 +32,12 @@ _MAX_FILES = 1_000_000
 
 
 def split_of(source_hash: str, test_fraction: float) -> str:
-    """'train' or 'test', from the hash alone. Raising the fraction moves entries to 'test' only."""
+    """Return 'train' or 'test', from the hash alone. Raising the fraction moves entries only to 'test'."""
     return "test" if int(source_hash[:13], 16) < test_fraction * 16**13 else "train"
 
 
 class ChangedAsset(AssetError):
-    """A file is not what it was when the pool was listed: which scenes are drawn would
-    depend on when it was looked at."""
+    """A file has changed since the pool was listed: the drawn scenes would depend on when it was read."""
 
     def __init__(self, file: Path):
         super().__init__(
@@ -48,8 +47,8 @@ class ChangedAsset(AssetError):
 
 @dataclass(frozen=True)
 class Entry:
-    """One mesh or texture that can be loaded. ``source`` is the folder or kind of source,
-    ``file`` None for generated ones."""
+    """One mesh or texture that can be loaded. ``source`` is the folder or kind of source, ``file`` None for generated
+    ones."""
 
     source_hash: str
     name: str
@@ -61,7 +60,7 @@ class Entry:
 
 class Cache:
     """What was loaded last, ``limit`` bytes of all pools together: a process that makes sequences of many groups for
-    days holds no more than one that makes a few."""
+    days uses no more memory than one that makes a few."""
 
     def __init__(self, limit: int):
         self.limit, self.held = limit, 0
@@ -71,16 +70,16 @@ class Cache:
         return len(self._kept)
 
     def get(self, key: tuple[object, str], load: Callable[[], Any]) -> Any:
-        """What is kept of this key, or ``load()``."""
+        """Return the stored content of this key, or ``load()``."""
         if key in self._kept:
             self._kept.move_to_end(key)
             return self._kept[key][0]
         loaded = load()
-        # Measured when it is loaded: textures and meshes are never written to afterwards.
+        # Measured when it is loaded: textures and meshes are not changed afterwards.
         size = _bytes_of(loaded)
         self._kept[key] = loaded, size
         self.held += size
-        # The last one stays however large it is, since its caller is about to use it.
+        # The last one stays whatever its size, since the caller uses it next.
         while self.held > self.limit and len(self._kept) > 1:
             self.held -= self._kept.popitem(last=False)[1][1]
         return loaded
@@ -93,8 +92,8 @@ _OF_ALL_POOLS = Cache(256_000_000)
 class Pool:
     """Entries in a deterministic order (by source, then hash), and what is needed to load them.
 
-    bad_assets : "error" lets AssetError through; "skip" logs it and draws again.   what, where : for messages.
-    cache : of what was loaded; the process's, unless said.
+    bad_assets : "error" raises AssetError; "skip" logs it and draws again.   what, where : for messages.
+    cache : of what was loaded; default: the process's.
     """
 
     entries: tuple[Entry, ...]
@@ -104,11 +103,11 @@ class Pool:
     what: str
     bad_assets: str = "error"
     cache: Cache = field(default=_OF_ALL_POOLS, repr=False)
-    _own: object = field(default_factory=object, repr=False)  # two pools may load the same file in two ways
+    _own: object = field(default_factory=object, repr=False)  # identity: two pools may load the same file in two ways
     _sides: dict[str, dict[str, tuple[Entry, ...]]] = field(default_factory=dict, repr=False)
 
     def split(self, split: str) -> dict[str, tuple[Entry, ...]]:
-        """source -> its entries on this side; sources without any are left out. ConfigError when nothing is left."""
+        """Return source -> its entries on this side, without empty sources. Raises ConfigError when nothing is left."""
         if split in self._sides:
             return self._sides[split]
         if split not in SPLITS:
@@ -134,20 +133,20 @@ class Pool:
         return self._sides[split]
 
     def load(self, entry: Entry) -> Any:
-        """The entry's content, which may be the cache's."""
+        """Return the entry's content, which may be the cache's."""
         return self.cache.get((self._own, entry.source_hash), lambda: self.load_entry(entry))
 
     def draw(self, rng: np.random.Generator, split: str, log: list[str] | None = None) -> Any:
-        """A random entry's content. The number of draws from ``rng`` does not depend on what the cache holds."""
+        """Return a random entry's content. The number of draws from ``rng`` does not depend on the cache."""
         sides = self.split(split)
         sources = list(sides)
         for _ in range(_MAX_REDRAWS):
-            # First a source, then one of its entries: a folder of thousands does not crowd out a few primitives.
+            # First a source, then one of its entries: a folder of thousands does not outweigh a few primitives.
             entries = sides[sources[int(rng.integers(len(sources)))]]
             entry = entries[int(rng.integers(len(entries)))]
             try:
                 return self.load(entry)
-            except ChangedAsset:  # skipping it would quietly make another scene
+            except ChangedAsset:  # skipping it would silently make another scene
                 raise
             except AssetError as error:
                 if self.bad_assets == "error":
@@ -169,9 +168,9 @@ def _bytes_of(loaded: Texture | Asset) -> int:
 
 
 def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_texture: int = 1024) -> Pool:
-    """Primitives and mesh folders. Loads :class:`~blinkgl.scene.importing.mesh_files.Asset`
-    objects that are centred on their bounding box and have bounding radius 1. Raises ConfigError for
-    a folder that is missing or holds no mesh."""
+    """Return the pool of primitives and mesh folders. It loads :class:`~blinkgl.scene.importing.mesh_files.Asset`
+    objects that are centred on their bounding box and have bounding radius 1. Raises ConfigError for a folder that is
+    missing or has no mesh."""
     entries = []
     for kind in kinds("pool") if config.primitives == "all" else config.primitives:
         for index in range(config.variants):
@@ -185,7 +184,7 @@ def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_t
 
     def load(entry: Entry) -> Asset:
         if entry.file is None:
-            # People, flags and fish have colours of their own; other primitives take a texture of the pool.
+            # People, flags and fish have their own colours; other primitives get a texture of the pool.
             wears = config.keep_materials and entry.kind in COATS
             material = Material(coat(entry.kind, entry.index)) if wears else Material()
             part = Part(random_primitive(entry.kind, entry.index), material)
@@ -199,7 +198,7 @@ def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_t
             source_hash=entry.source_hash,
             up=config.up,
         )
-        # The hash decides split and order. A file that changed since it was listed would be another scene, silently.
+        # The hash decides split and order. A file that changed since it was listed would silently be another scene.
         _same_content(entry, content_hash(contents(entry.file, "mesh", max_bytes=limit), *dependencies(entry.file)))
         return asset.normalised()
 
@@ -207,7 +206,7 @@ def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_t
 
 
 def texture_pool(config: TexturesConfig, base: Path, where: str = "scene.textures") -> Pool:
-    """Procedural textures, scikit-image's photographs and image folders. Loads
+    """Return the pool of procedural textures, scikit-image's photographs and image folders. It loads
     :class:`~blinkgl.scene.types.Texture`."""
     kinds = TEXTURE_KINDS if config.procedural is True else config.procedural or ()
     entries = [
@@ -246,13 +245,14 @@ def _same_content(entry: Entry, found: str) -> None:
 
 
 def resolve(path: str, base: Path) -> Path:
-    """A path of the YAML: ``~`` expanded, relative to the YAML file's folder."""
+    """Return a path of the YAML: ``~`` expanded, relative to the YAML file's folder."""
     path = Path(path).expanduser()
     return path if path.is_absolute() else base / path
 
 
 def files_below(folder: Path, where: str, given: str, suffixes: tuple[str, ...], what: str) -> list[Path]:
-    """Files with these suffixes, recursively, sorted by name. ConfigError when the folder is missing or holds none."""
+    """Return files with these suffixes, recursively, sorted by name. Raises ConfigError when the folder is missing or
+    has none."""
     if not folder.is_dir():
         raise ConfigError(
             "is not a folder" if folder.exists() else "no such folder",
@@ -292,7 +292,8 @@ def _folder_entries(
 
 
 def _listed(entries: Iterable[Entry]) -> tuple[Entry, ...]:
-    """Without repeated content inside a source, sources in the order of the YAML, each sorted by hash."""
+    """Return the entries without repeated content inside a source, sources in the order of the YAML, each sorted by
+    hash."""
     sources: dict[str, dict[str, Entry]] = {}
     for entry in entries:
         sources.setdefault(entry.source, {}).setdefault(entry.source_hash, entry)

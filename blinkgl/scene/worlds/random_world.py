@@ -1,7 +1,7 @@
 """Random worlds: a textured sky box, ground, and objects from a pool, resting or flying, mostly in view.
 
-After "BlinkFlow" (IROS 2023), section III: random scale, rotation, texture and placement; way-points in free space
-joined by splines; whoever collides stops. The world is z up, in metres, ground at ``ground.height``.
+After "BlinkFlow" (IROS 2023), section III: random scale, rotation, texture and placement; waypoints in free space
+joined by splines; objects that collide stop. The world is z up, in metres, ground at ``ground.height``.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ from blinkgl.scene.worlds.pool import Pool, object_pool, texture_pool
 from blinkgl.scene.worlds.sky import Panorama, drawn_panorama, panorama_light, panorama_sky, sky_box
 
 _PLACEMENTS = 300  # positions tried for an object before it is left out
-_CAMERA_PATHS = 6  # camera paths tried for one that runs into nothing; the last is cut where it does
+_CAMERA_PATHS = 6  # camera paths tried until one is free of collisions; the last is cut at its collision
 _GAP = 0.05  # m between bounding spheres at t0
-_STAND_OFF = 0.8  # m beyond the clearance that way-points keep from the camera: nothing should fill the view
+_STAND_OFF = 0.8  # m beyond the clearance that waypoints keep from the camera, so that nothing fills the view
 
 
 def random_world(
@@ -58,7 +58,7 @@ def random_world(
     sequence: int,
     base: Path,
 ) -> Scene:
-    """The ``sequence``-th random scene of a run; arguments as :func:`blinkgl.scene.build.build_scene`."""
+    """Return the ``sequence``-th random scene of a run; arguments as in :func:`blinkgl.scene.build.build_scene`."""
     rng, rng_motion, rng_texture, rng_shape = (
         generator(seed, sequence, role) for role in (Role.SCENE, Role.TRAJECTORY, Role.TEXTURE, Role.SHAPE)
     )
@@ -74,7 +74,7 @@ def random_world(
 
     dice = rng, rng_texture, rng_shape
     placed = _place(config, camera, objects, textures, dice, split, T_cam, clearance, floor, log, omissions)
-    # What goes by itself is not thrown.
+    # Objects with their own motion are not thrown.
     lifeless = [one.name for one in placed if _gait(one.parts)[0] == "anyhow"]
     bodies = _bodies(config.physics, lifeless, generator(seed, sequence, Role.PHYSICS))
     room = _Room(config, floor, placed, T_cam, clearance)
@@ -109,11 +109,11 @@ def random_world(
 
 
 def _clearance(config: RandomSceneConfig, camera: CameraModel) -> float:
-    """How far everything keeps from the camera. Raises ConfigError: the region has no room for that."""
+    """Return the distance that everything keeps from the camera. Raises ConfigError: the region is too small for it."""
     clearance = camera_radius(camera, config.camera_clearance)
     if clearance > config.region.height:
         raise ConfigError(
-            "the region is too low for a camera that keeps this far from everything",
+            "the region is too low for the camera's clearance",
             where="scene.region.height",
             value=config.region.height,
             accepted=f"at least {clearance:.4g} m (scene.camera_clearance, or the "
@@ -133,7 +133,7 @@ class _Placed(NamedTuple):
 
 
 class _Room:
-    """Where bodies of a random world may go: the region without the others' bounding spheres at t0."""
+    """Free space of a random world: the region without the others' bounding spheres at t0."""
 
     def __init__(
         self, config: RandomSceneConfig, floor: float, placed: list[_Placed], T_cam: np.ndarray, clearance: float
@@ -146,7 +146,7 @@ class _Room:
         self.camera, self.clearance = T_cam[:3, 3], clearance
 
     def beside(self, number: int) -> FreeSpace:
-        """For one of those that were placed."""
+        """Return the free space for one of the placed objects."""
         others = np.arange(len(self.radii)) != number
         centres, radii = np.vstack([self.centres[others], self.camera]), self.radii[others]
         return FreeSpace(self.low, self.high, self.ground_z, centres, np.append(radii, self.clearance + _STAND_OFF))
@@ -157,7 +157,7 @@ class _Room:
 
 
 def _backdrop(config, textures, rng, rng_texture, split, floor, base, log):
-    """([(name, category, parts, pose)] of sky and ground, the panorama on the sky or None)."""
+    """Return ([(name, category, parts, pose)] of sky and ground, the panorama on the sky or None)."""
     backdrop, panorama = [], None
     if config.sky:
         parts, panorama = _sky(config.sky, textures, rng_texture, split, base, log)
@@ -169,12 +169,12 @@ def _backdrop(config, textures, rng, rng_texture, split, floor, base, log):
         texture = textures.draw(rng_texture, split, log)
         material = Material(texture, uv_scale=(repeats, repeats), unlit=config.light.unlit)
         backdrop.append(("ground", "ground", (Part(mesh, material),), _shift(floor)))
-    rng.permutation(4)  # chose the sides of walls, which are gone: all that is drawn next stays what it was
+    rng.permutation(4)  # was used by removed walls; kept so that later draws stay the same
     return backdrop, panorama
 
 
 def _object_path(config: RandomSceneConfig, one: _Placed, space: FreeSpace, rng, t0_ns: int, t1_ns: int) -> PosePath:
-    """At random, or, of what goes by itself, along a way as fast as its steps take it."""
+    """Return a random path or, for an object with its own motion, a way at the speed of its steps."""
     goes, speed = _gait(one.parts)
     if goes == "anyhow" or (goes == "level" and speed == 0):
         turns = one.resting or goes == "level"
@@ -185,15 +185,15 @@ def _object_path(config: RandomSceneConfig, one: _Placed, space: FreeSpace, rng,
 
 
 def _resolved(objects, falling: set[str], camera_paths: Iterable[PosePath], clearance, t0_ns, t1_ns, log):
-    """(the objects, those that ran into something stopped, without those that did so at the start; the camera's path).
-    camera_paths : drawn one by one until one is not stopped: a camera that was would see a still world from then on."""
-    # What falls is stopped by nothing: the engine knows the others' paths, as they are after this.
+    """Return (the objects, stopped at collisions, without those that collide at the start; the camera's path).
+    camera_paths : drawn one by one until one is not stopped: a stopped camera would see a still world from then on."""
+    # Nothing stops falling objects: the engine knows the others' final paths.
     others = tuple(o for o in objects if o.name not in falling)
     for path in camera_paths:
         result = resolve_collisions(others, path, clearance, t0_ns, t1_ns)
         if not any("camera" in event.cut for event in result.events):
             break
-    # Bounding spheres were apart, so only one that sinks into ground or wall can touch at t0: leave it out.
+    # Bounding spheres were apart, so only one that intersects ground or wall can touch at t0: leave it out.
     ours = {o.name for o in others if o.category == "object"}
     bad = ours & {name for c in result.at_start for name in (c.first, c.second)}
     if bad:
@@ -205,14 +205,14 @@ def _resolved(objects, falling: set[str], camera_paths: Iterable[PosePath], clea
 
 
 def _fallen(config, objects, bodies, eye, floor, t0_ns, t1_ns, log):
-    """(the objects without those that explode, Dynamics or None). eye : the camera's path and clearance."""
+    """Return (the objects without those that diverge, Dynamics or None). eye : the camera's path and clearance."""
     if config.physics is None:
         return objects, None
     while any(o.name in bodies for o in objects):
         sides = _sides(config, floor)
         try:
             return simulate(objects, bodies, config.physics, t0_ns, t1_ns, camera=eye, sides=sides)
-        except Exploded as error:  # squeezed between two that nothing stops
+        except Exploded as error:  # squeezed between two that cannot be stopped
             objects = tuple(o for o in objects if o.name != error.body)
             log.append(f"left out, it came to be faster than scene.physics.max_speed: {error.body}")
     return objects, None
@@ -236,7 +236,8 @@ def _light(config: RandomSceneConfig, panorama: Panorama | None, rng, rng_lamps,
 
 
 def pools(config: RandomSceneConfig, base: Path) -> tuple[Pool, Pool]:
-    """(object pool, texture pool); the same pools, with their caches, for the same configuration in one process."""
+    """Return (object pool, texture pool); the same pools, with their caches, for the same configuration in one
+    process."""
     return _object_pool(config.pool, base.resolve(), config.textures.max_size), _texture_pool(
         config.textures, base.resolve()
     )
@@ -247,7 +248,7 @@ _texture_pool = lru_cache(maxsize=4)(texture_pool)
 
 
 def _viewpoint(config: RandomSceneConfig, rng, floor: float) -> tuple[np.ndarray, np.ndarray]:
-    """(T_world_cam at t0, point looked at): near the edge of the region, looking across its middle."""
+    """Return (T_world_cam at t0, target point): near the edge of the region, looking across its middle."""
     half = config.region.width / 2
     around = rng.uniform(0, 2 * math.pi)
     low, high = config.region.camera_height
@@ -264,13 +265,13 @@ def _viewpoint(config: RandomSceneConfig, rng, floor: float) -> tuple[np.ndarray
 def _place(
     config, camera, objects: Pool, textures: Pool, dice, split, T_cam, clearance, floor, log, omissions
 ) -> list[_Placed]:
-    """What was found a place: no two bounding spheres, nor the camera's, overlap."""
+    """Return the objects that found a place: no two bounding spheres, nor the camera's, overlap."""
     settings, region = config.objects, config.region
     rng, rng_texture, rng_shape = dice
     placed: list[_Placed] = []
     if settings.count == 0:
         return placed
-    # Of the bodies placed so far, the camera's first.
+    # The bodies placed so far, the camera first.
     centres, radii = np.empty((settings.count + 1, 3)), np.empty(settings.count + 1)
     centres[0], radii[0] = T_cam[:3, 3], clearance
     for k in range(settings.count):
@@ -314,7 +315,7 @@ def _place(
 
 
 def _playing(asset: Asset, config: RandomSceneConfig, rng) -> tuple[Asset, str]:
-    """The asset as it plays one of its file's animations, and what to say of it. Nothing is drawn for others."""
+    """Return the asset playing one of its file's animations, and a log line. Nothing is drawn for others."""
     if asset.replay is None or config.pool.animation == "rest":
         return asset, ""
     clip, speed, phase = int(rng.integers(len(asset.clips))), float(rng.uniform(0.8, 1.25)), float(rng.uniform(0, 10))
@@ -323,8 +324,8 @@ def _playing(asset: Asset, config: RandomSceneConfig, rng) -> tuple[Asset, str]:
 
 
 def _changing(asset: Asset, config: RandomDeformConfig, rng) -> tuple[Asset, str]:
-    """The asset, of bounding radius 1, as its shape changes, and what to say of it: now and then, by formula. All
-    shapes fit into the sphere of radius 1."""
+    """Return the asset, of bounding radius 1, with a deformer in some cases, and a log line. All its shapes fit into
+    the sphere of radius 1."""
     if config.share == 0 or rng.random() >= config.share or any(p.mesh.deformer is not None for p in asset.parts):
         return asset, ""
     kinds = config.kinds or tuple(DeformConfig.members.models)
@@ -339,16 +340,16 @@ def _changing(asset: Asset, config: RandomDeformConfig, rng) -> tuple[Asset, str
 
 
 def _lowest(mesh: Mesh, up: np.ndarray) -> float:
-    """Height of its lowest point at any time, along (3,) up in its axes."""
+    """Return the height of its lowest point at any time, along (3,) up in its axes."""
     if mesh.deformer is None:
         return float((mesh.vertices @ up).min())
     points, margin = filled(mesh)
-    # A figure's feet are on the ground, and not as far above it as they might be below between two times.
+    # A figure's feet are on the ground: the margin for times between samples is not used.
     return float((points @ up).min()) - (0.0 if mesh.deformer.goes == "upright" else margin)
 
 
 def _candidate(config, camera, rng, T_cam, floor, in_view, resting) -> np.ndarray:
-    """A position to try: along a pixel's ray at a log-uniform distance, or anywhere in the region."""
+    """Return a candidate position: along a pixel's ray at a log-uniform distance, or anywhere in the region."""
     region = config.region
     if not in_view:
         half = region.width / 2
@@ -365,7 +366,8 @@ def _gait(parts: Iterable[Part]) -> tuple[str, float]:
 
 
 def _rotation(rng, resting: bool) -> np.ndarray:
-    """(3, 3). Flying: uniform over rotations. Resting: any heading, upright or, for half of them, lying on its side."""
+    """Return (3, 3). Flying: uniform over rotations. Resting: any heading, upright or, for half of them, lying on its
+    side."""
     if not resting:
         return Rotation.random(rng=rng).as_matrix()
     heading, tipped, axis = rng.uniform(0, 2 * math.pi), rng.random() < 0.3, int(rng.integers(2))
@@ -374,7 +376,7 @@ def _rotation(rng, resting: bool) -> np.ndarray:
 
 
 def _dress(config, asset, radius, textures, rng, split, log) -> tuple[Part, ...]:
-    """The asset at its size, with its own materials or a random texture and tint."""
+    """Return the asset at its size, with its own materials or a random texture and tint."""
     tint = 1 - config.objects.tint * rng.random(3)
     repeats = _log_uniform(rng, config.objects.texture_scale)
     parts = []
@@ -396,7 +398,7 @@ def _dress(config, asset, radius, textures, rng, split, log) -> tuple[Part, ...]
 
 
 def _bodies(config: RandomPhysicsConfig | None, names: list[str], rng) -> dict[str, BodyConfig]:
-    """Those of the objects that fall, by name. As many numbers are drawn for each, whether it falls or not."""
+    """Return the falling objects by name. The same number of values is drawn for each object, falling or not."""
     found = {}
     for name in names if config is not None else ():
         falls, thrown, around, axis = rng.random(), rng.random(), rng.uniform(0, 2 * math.pi), rng.normal(size=3)
@@ -420,7 +422,8 @@ def _bodies(config: RandomPhysicsConfig | None, names: list[str], rng) -> dict[s
 
 
 def _sides(config: RandomSceneConfig, floor: float) -> list[Barrier]:
-    """Of the region, far enough out that no object is in one; its floor where there is no ground."""
+    """Return the sides of the region, far enough out that no object intersects one; its floor where there is no
+    ground."""
     reach = 0.5 * config.objects.size[1] + _GAP
     out = config.region.width / 2 + reach
     sides = [Barrier((sx, sy, 0.0), -out) for sx, sy in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))]
@@ -431,7 +434,7 @@ def _sides(config: RandomSceneConfig, floor: float) -> list[Barrier]:
 
 
 def _sky(config: SkyConfig, textures: Pool, rng, split, base, log) -> tuple[tuple[Part, ...], Panorama | None]:
-    """The box around everything and None, or a sky at infinity and the panorama that is on it."""
+    """Return the box around everything and None, or a sky at infinity and its panorama."""
     brightness = float(rng.uniform(*config.brightness))
     repeats = _log_uniform(rng, config.repeat)
     if config.panoramas:

@@ -1,4 +1,4 @@
-"""The sky: a box of pictures around everything, or a panorama at infinity, which can be the light, too."""
+"""The sky: a box of pictures around everything, or a panorama at infinity, which can also be the light."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from blinkgl.scene.worlds.pool import files_below, resolve, split_of
 
 _MARGIN = 1 / 16
 PANORAMA_INSET = 1 / (1 + _MARGIN)
-"""Share of a side's texture that is on its side of the box: the rest is there for the filters."""
+"""Fraction of a side's texture on its side of the box: the rest is for filtering."""
 
 
 def sky_box(
     size: float, subdivisions: int, images: Sequence[Texture], brightness: float, repeats: float, inset: float = 1.0
 ) -> tuple[Part, ...]:
-    """Six inward squares around the origin. images : of the sides +x, -x, +y, -y, +z, -z.   inset : share of each
-    texture that the side shows."""
+    """Return six inward squares around the origin. images : of the sides +x, -x, +y, -y, +z, -z.   inset : fraction of
+    each texture that the side shows."""
     half, n, parts = size / 2, subdivisions, []
     for (forward, right, down), texture, side in zip(SKY_SIDES, images, ("+x", "-x", "+y", "-y", "+z", "-z")):
         positions, normals, uvs, faces = square(
@@ -58,14 +58,14 @@ def sky_box(
 
 
 def panorama_sky(textures: Sequence[Texture], brightness: float) -> tuple[Part, ...]:
-    """A panorama of :func:`panorama_textures` as the parts of a sky at infinity.
+    """Return a panorama of :func:`panorama_textures` as the parts of a sky at infinity.
 
-    The box is so large that a view of 140 degrees, too, has no side nearer than ``FARTHEST`` along its axis."""
+    The box is so large that even in a view of 140 degrees no side is nearer than ``FARTHEST`` along its axis."""
     return sky_box(32 * FARTHEST, 4, textures, brightness, 1.0, PANORAMA_INSET)
 
 
 def panorama_textures(image: np.ndarray, name: str, digest: str) -> list[Texture]:
-    """Six textures of an equirectangular image, for :func:`panorama_sky`."""
+    """Return six textures of an equirectangular image, for :func:`panorama_sky`."""
     sides = cube_faces(image, max(image.shape[1] // 4, 1), _MARGIN)
     return [
         Texture(side, f"{name} side {k}", content_hash(digest.encode(), bytes([k]))) for k, side in enumerate(sides)
@@ -73,8 +73,8 @@ def panorama_textures(image: np.ndarray, name: str, digest: str) -> list[Texture
 
 
 def panorama_light(file: Path, angle: float, brightness: float, light: Light, where: str) -> Light:
-    """``light`` with a panorama's in the place of its sun and sky, as bright as :func:`load_image` shows it times
-    ``brightness``. angle : rad by which it is turned, from +x towards +y. Raises AssetError."""
+    """Return ``light`` with a panorama instead of its sun and sky, as bright as :func:`load_image` shows it times
+    ``brightness``. angle : rotation, rad, from +x towards +y. Raises AssetError."""
     radiance, exposure = load_panorama(file, where)
     return lit_by(turned(environment(radiance), angle), exposure * brightness, light)
 
@@ -82,7 +82,7 @@ def panorama_light(file: Path, angle: float, brightness: float, light: Light, wh
 def with_environment(
     config: EnvironmentConfig | None, light: Light, base: Path, objects: Sequence[SceneObject]
 ) -> tuple[Light, tuple[SceneObject, ...]]:
-    """(light, objects) of a scene that a panorama lights; as they are, where none does. Raises ConfigError and
+    """Return (light, objects) of a scene that a panorama lights; unchanged where none does. Raises ConfigError and
     AssetError."""
     objects = tuple(objects)
     if config is None:
@@ -104,7 +104,7 @@ def with_environment(
 
 
 class Panorama(NamedTuple):
-    """Of a sky. sides : of its box.   angle : rad by which it is turned, from +x towards +y."""
+    """The panorama of a sky. sides : of its box.   angle : rotation, rad, from +x towards +y."""
 
     file: Path
     where: str
@@ -116,7 +116,7 @@ class Panorama(NamedTuple):
 def drawn_panorama(
     config: SkyConfig, rng: np.random.Generator, split: str, test_fraction: float, base: Path, brightness: float
 ) -> Panorama:
-    """A panorama of this split, turned to a random heading."""
+    """Return a random panorama of this split, turned to a random heading."""
     files = []
     for i, given in enumerate(config.panoramas):
         path, where = resolve(given, base), f"scene.sky.panoramas.{i}"

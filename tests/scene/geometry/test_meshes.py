@@ -302,5 +302,5 @@ def test_joining_moving_and_scaling():
     low, high = M.bounds(two)
     np.testing.assert_allclose([low, high], [[-v for v in high], high])
     assert max(np.linalg.norm(m.vertices, axis=1).max() for m in two) == pytest.approx(1)
-    with pytest.raises(AssetError, match="here: the mesh has no extent"):
+    with pytest.raises(AssetError, match="here: the mesh has size zero"):
         M.normalise((M.scale_mesh(box, 0.0),), where="here")

@@ -270,9 +270,9 @@ def test_bodies_inside_each_other_are_refused():
 
 
 def test_an_explosion_is_refused():
-    with pytest.raises(ConfigError, match=r"scene.physics: ball explodes 0.10.* s after the start.*max_speed 1"):
+    with pytest.raises(ConfigError, match=r"scene.physics: ball diverges 0.10.* s after the start.*max_speed 1"):
         run([ball()], {"ball": BodyConfig()}, 0.5, max_speed=1.0)
-    with pytest.raises(ConfigError, match="explodes 0 s"):
+    with pytest.raises(ConfigError, match="diverges 0 s"):
         run([ball()], {"ball": BodyConfig(velocity=(0, 0, 500.0))}, 0.5)
 
 
@@ -285,7 +285,7 @@ def test_a_nan_is_an_explosion(monkeypatch):
         data.qpos[:] = np.nan
 
     monkeypatch.setattr(mujoco, "mj_step", broken)
-    with pytest.raises(ConfigError, match="explodes"):
+    with pytest.raises(ConfigError, match="diverges"):
         run([ball()], {"ball": BodyConfig()}, 0.1)
 
 

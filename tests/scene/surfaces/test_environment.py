@@ -181,9 +181,9 @@ def test_what_is_no_panorama(tmp_path):
     huge = written(tmp_path / "huge.hdr", image).read_bytes().replace(b"-Y 16 +X 32", b"-Y 15000 +X 30000")
     (tmp_path / "huge.hdr").write_bytes(huge)
     for path, expected in (
-        (exr(tmp_path / "nan.exr", bad), "x=5, y=3: a pixel is no radiance .got .nan"),
-        (exr(tmp_path / "inf.exr", endless), "x=1, y=7: a pixel is no radiance .got .*inf"),
-        (exr(tmp_path / "minus.exr", negative), "a pixel is no radiance .got -1"),
+        (exr(tmp_path / "nan.exr", bad), "x=5, y=3: a pixel is not a radiance .got .nan"),
+        (exr(tmp_path / "inf.exr", endless), "x=1, y=7: a pixel is not a radiance .got .*inf"),
+        (exr(tmp_path / "minus.exr", negative), "a pixel is not a radiance .got -1"),
         (written(tmp_path / "square.hdr", image[:, :16]), "not a panorama .got '16x16'.; expected twice as wide"),
         (written(tmp_path / "black.hdr", 0 * image), "the panorama is black"),
         (

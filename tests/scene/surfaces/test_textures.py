@@ -208,7 +208,7 @@ def test_sixteen_bits_of_grey(kind):
 def test_grey_without_a_white_is_refused(dtype, value):
     stream = io.BytesIO()
     Image.fromarray(np.full((2, 3), value, dtype)).save(stream, "TIFF")
-    with pytest.raises(AssetError, match="a: the image does not say how bright .*32-bit (floats|integers)"):
+    with pytest.raises(AssetError, match="a: the image has an unknown scale of brightness .*32-bit (floats|integers)"):
         I.decode_image(stream.getvalue(), None, "a")
 
 

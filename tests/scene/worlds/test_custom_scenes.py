@@ -93,8 +93,8 @@ def test_a_way_begins_where_it_is_told_and_closes():
 @pytest.mark.parametrize("keys, said", [
     ({"way": {"points": LINE}, "position": [1, 0, 0]}, "a way, a fixed pose or keyframes, not several"),
     ({"way": {"points": LINE}, "keyframes": [{"time": 0}, {"time": 1}]}, "a way, a fixed pose or keyframes"),
-    ({"way": {"points": [[0, 0, 0]]}}, r"way.points: a way needs 2 points or more \(got 1\)"),
-    ({"way": {"points": LINE[:2], "closed": True}}, "a way needs 3 points or more"),
+    ({"way": {"points": [[0, 0, 0]]}}, r"way.points: a way needs at least 2 points \(got 1\)"),
+    ({"way": {"points": LINE[:2], "closed": True}}, "a way needs at least 3 points"),
     ({"way": {"points": [[0, 0, 0], [0, 0, 0], [1, 0, 0]]}}, "way.points.0: must differ from the next point"),
     ({"way": {"points": LINE, "speed": 0}}, "way.speed"),
     ({"way": {"points": LINE, "start": 1.5}}, "way.start"),

@@ -227,7 +227,7 @@ def test_a_file_keeps_its_own_materials_unless_told_otherwise(tmp_path):
         ),
         (
             {"objects": [{"mesh": "box", "name": "a"}, {"mesh": "box", "name": "a"}]},
-            "scene.objects.1.name: the name is given to two objects (got 'a')",
+            "scene.objects.1.name: two objects have this name (got 'a')",
         ),
         ({"objects": []}, "scene.objects: "),
         (
@@ -269,7 +269,7 @@ def test_a_file_keeps_its_own_materials_unless_told_otherwise(tmp_path):
             "scene.camera: only one of quaternion, euler, look_at may be given, not euler and look_at",
         ),
         ({"camera": {"quaternion": [0, 0, 0, 0]}}, "scene.camera.quaternion: a quaternion must not be zero"),
-        ({"camera": {"keyframes": [{"time": 0}]}}, "scene.camera.keyframes: one key frame is no motion"),
+        ({"camera": {"keyframes": [{"time": 0}]}}, "scene.camera.keyframes: one key frame is not enough"),
         (
             {"camera": {"keyframes": [{"time": 1}, {"time": 1}]}},
             "scene.camera.keyframes.1.time: the key frames' times must increase",

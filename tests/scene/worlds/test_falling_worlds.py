@@ -109,10 +109,13 @@ def test_collisions_leave_what_falls_to_the_engine():
     ("changes", "message"),
     [
         ({"physics": None}, "objects.1.physics: the scene has no physics; expected scene.physics, too"),
-        ({"objects": EXPLICIT["objects"][:1]}, "physics: no object falls"),
+        ({"objects": EXPLICIT["objects"][:1]}, "physics: no object has dynamic physics"),
         (
             {"objects": [{**EXPLICIT["objects"][1], "physics": {"kind": "fixed", "spin": [0, 0, 9]}}]},
-            r"objects.0.physics.spin: a fixed body has none \(got \[0.0, 0.0, 9.0\]\); expected kind: dynamic",
+            (
+                r"objects.0.physics.spin: a fixed body does not use this key \(got \[0.0, 0.0, 9.0\]\); "
+                r"expected kind: dynamic"
+            ),
         ),
         (
             {

@@ -152,7 +152,7 @@ def test_interleaved_buffers_and_what_is_no_triangle(tmp_path):
     np.testing.assert_allclose(part.mesh.normals[part.mesh.faces].mean(axis=1), cross, atol=1e-6)
     assert scene.omissions == ("scene.glb asks for what is not drawn: points and lines",)
     primitives[1]["mode"] = 5
-    with pytest.raises(AssetError, match="strips or fans of triangles .got 'mode 5'.; expected mode 4"):
+    with pytest.raises(AssetError, match="triangle strips or fans .got 'mode 5'.; expected mode 4"):
         load(tmp_path, builder)
 
 
@@ -369,7 +369,7 @@ def test_more_lights_than_shine(tmp_path):
     "builder, tree, expected",
     [
         (animated, {}, "scene.lights: the file has no lights .got 'file'.; expected config"),
-        (lit, {"light": {"unlit": True}}, "scene.lights: nothing is lit by them .got 'file'."),
+        (lit, {"light": {"unlit": True}}, "scene.lights: these lights have no effect .got 'file'."),
         (lambda: lit(node={"light": 3}), {}, "reference to lights that does not exist.*got 3"),
         (lambda: lit(lights=[{"type": "area"}]), {}, "KHR_lights_punctual: .*lights.0.type"),
         (lambda: lit(lights=[{"type": "point", "intensity": -1}]), {}, "lights.0.intensity.*got -1"),

@@ -76,12 +76,18 @@ def test_a_mask_is_the_opacity_of_a_picture_that_has_one(folder):
         ({"normal_map": "no.png"}, r"scene\.materials\.m\.normal_map: no such file .got 'no\.png'.; expected an image"),
         (
             {"normal_map": "bright.hdr"},
-            r"materials\.m\.normal_map: bright\.hdr: a map of numbers has high dynamic range",
+            r"materials\.m\.normal_map: bright\.hdr: a map of numbers is a high-dynamic-range image",
         ),
-        ({"mask": "black.png"}, r"materials\.m\.cutoff: nothing of the surface is left .got 0\.5.; expected a mask"),
+        (
+            {"mask": "black.png"},
+            r"materials\.m\.cutoff: the mask removes the whole surface .got 0\.5.; expected a mask",
+        ),
         ({"mask": "mask.png", "cutoff": 0}, r"materials\.m\.cutoff: too small"),
-        ({"emission_map": "mask.png"}, r"materials\.m\.emission: a map of light that is none"),
-        ({"normal_map": "mask.png", "unlit": True}, r"materials\.m\.normal_map: an unlit surface shows its colour"),
+        ({"emission_map": "mask.png"}, r"materials\.m\.emission: emission_map has no effect"),
+        (
+            {"normal_map": "mask.png", "unlit": True},
+            r"materials\.m\.normal_map: this map has no effect on an unlit surface",
+        ),
         ({"normal_map": "mask.png", "normal_scale": float("inf")}, r"materials\.m\.normal_scale: not a finite number"),
     ],
 )

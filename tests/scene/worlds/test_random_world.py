@@ -228,7 +228,7 @@ def message(make):
         ({"sky": {"size": 20}}, "scene.sky.size: must be at least 36 to hold the region and its objects (got 20.0)"),
         (
             {"region": {"height": 0.5}},
-            "scene.region.height: the camera begins above it (got 0.5); expected more than 1 m",
+            "scene.region.height: the camera starts above it (got 0.5); expected more than 1 m",
         ),
     ],
 )

@@ -26,7 +26,7 @@ NETWORKS: dict[str, type[FlowModel]] = {
 """By the key ``name`` of their configuration; nothing else lists networks."""
 SIZES = ("base", "small", "tiny")
 
-_QUICK = {"size": "tiny", "quick": True, "levels": 2, "iterations": 2, "train_iterations": 2}
+_QUICK = {"size": "tiny", "quick": True, "trunk": (16, 32, 64), "levels": 2, "iterations": 1, "train_iterations": 1}
 
 PRESETS: dict[str, dict] = {
     name if size == "base" else f"{name}-{size}": {"name": name, "size": size} for name in NETWORKS for size in SIZES

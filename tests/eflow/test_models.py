@@ -104,7 +104,7 @@ def test_the_quick_eflowformer_trains_every_parameter_from_a_flow_of_its_own():
     model = build_model(model_config(preset("eflowformer-quick"))).train()
     batch = batch_for(model, 1, 72, 88)
     prediction = model(batch)
-    assert prediction.has_match and [f.shape for f in prediction.flows] == [(1, 2, 72, 88)] * 3
+    assert prediction.has_match and [f.shape for f in prediction.flows] == [(1, 2, 72, 88)] * 2
     sequence_loss(prediction, torch.ones(1, 2, 72, 88), torch.ones(1, 72, 88, dtype=torch.bool)).backward()
     assert not [n for n, p in model.named_parameters() if p.grad is None or not p.grad.abs().max() > 0]
     loud(model)

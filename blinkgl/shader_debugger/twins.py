@@ -1,5 +1,5 @@
 """Pictures that a program makes from another picture, and their float64 twins from the same picture: silhouettes by
-area (``edges.glsl``, :mod:`edges_twin`), and the picture of a lens (``gather.glsl``)."""
+area (``edges.glsl``), and the picture of a lens (``gather.glsl``)."""
 
 from __future__ import annotations
 
